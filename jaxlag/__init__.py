@@ -1,0 +1,22 @@
+"""Differentiable dynamics from a Lagrangian, in JAX."""
+
+from importlib.metadata import version as _version
+
+from jaxlag import _xla
+
+_xla.configure()
+
+from jaxlag._errors import SimulationError as SimulationError  # noqa: E402
+from jaxlag._forces import GeneralizedForce as GeneralizedForce  # noqa: E402
+from jaxlag._forces import Rayleigh as Rayleigh  # noqa: E402
+from jaxlag._inputs import Feedback as Feedback  # noqa: E402
+from jaxlag._inputs import Function as Function  # noqa: E402
+from jaxlag._inputs import Linear as Linear  # noqa: E402
+from jaxlag._inputs import ZeroOrderHold as ZeroOrderHold  # noqa: E402
+from jaxlag._simulate import simulate as simulate  # noqa: E402
+from jaxlag._solution import Solution as Solution  # noqa: E402
+from jaxlag._status import Status as Status  # noqa: E402
+from jaxlag._system import System as System  # noqa: E402
+from jaxlag._terms import Terms as Terms  # noqa: E402
+
+__version__ = _version("jaxlag")

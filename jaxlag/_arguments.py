@@ -1,0 +1,184 @@
+"""Checks of what `simulate` is given, before anything is compiled."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._errors import bad
+from jaxlag._inputs import common_range, evaluate
+from jaxlag._methods import default_tolerances
+from jaxlag._solution import QUANTITIES
+from jaxlag._system import System
+from jaxlag._vectors import vector
+
+
+def check_options(
+    system: Any,
+    formulation: Any,
+    gradient: Any,
+    project: Any,
+    assemble: Any,
+    save: Any,
+    max_steps: Any,
+) -> None:
+    """Raise on options that no value of the traced arguments could make right."""
+    if not isinstance(system, System):
+        raise bad("system", "be a jl.System", f"it was {system!r}")
+    if formulation != "auto":
+        raise bad(
+            "formulation",
+            "be 'auto'",
+            f"it was {formulation!r}",
+            "This system has neither constraints nor quasi-velocities: its state is (q, v).",
+        )
+    if gradient not in ("auto", "recorded"):
+        raise bad("gradient", "be 'auto' or 'recorded'", f"it was {gradient!r}")
+    for name, flag in (("project", project), ("assemble", assemble)):
+        if not isinstance(flag, bool):
+            raise bad(name, "be True or False", f"it was {flag!r}")
+    if isinstance(save, str):
+        raise bad("save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},).")
+    for name in save:
+        if name not in QUANTITIES:
+            raise bad("save", f"name quantities among {list(QUANTITIES)}", f"one was {name!r}")
+        if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
+            raise bad(
+                "save",
+                "name energies that the system declares",
+                f"one was {name!r}",
+                "Declare the system with kinetic= and potential=.",
+            )
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
+
+
+def concrete(*arrays: Any) -> bool:
+    return not any(isinstance(x, jax.core.Tracer) for x in arrays)
+
+
+def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array]:
+    if (v0 is None) == (u0 is None):
+        was = "neither was given" if v0 is None else "both were given"
+        raise bad("v0 and u0", "be given one at a time", was, "Pass v0=, the velocities at ts[0].")
+    if u0 is not None:
+        raise bad(
+            "u0",
+            "be given for a system with quasi-velocities only",
+            "this system has none",
+            "Pass v0= instead.",
+        )
+    vectors = []
+    for name, x in (("q0", q0), ("v0", v0)):
+        x = vector(system.coordinates, name, x)
+        if concrete(x) and not np.all(np.isfinite(x)):
+            i = int(np.argmin(np.isfinite(x)))
+            label = system.coordinates.label(i)
+            raise bad(name, "be finite", f"{name}[{i}] ({label!r}) was {x[i]}")
+        vectors.append(x)
+    dtype = jnp.result_type(*vectors)
+    return vectors[0].astype(dtype), vectors[1].astype(dtype)
+
+
+def check_times(ts: Any) -> tuple[Array, int | None]:
+    if ts is None:
+        raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
+    ts = jnp.asarray(ts, jnp.result_type(float))
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}")
+    if not concrete(ts):
+        return ts, None
+    values = np.asarray(ts)
+    if not np.all(np.isfinite(values)):
+        raise bad("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(values)))}] was not")
+    steps = np.diff(values)
+    direction = 1 if values[-1] >= values[0] else -1
+    if not np.all(steps * direction > 0):
+        i = int(np.argmin(steps * direction > 0))
+        raise bad(
+            "ts",
+            "be strictly monotone",
+            f"ts[{i}] = {values[i]}, ts[{i + 1}] = {values[i + 1]}",
+            "Sort the times and drop repeated ones.",
+        )
+    return ts, direction
+
+
+def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Array, Array]:
+    if dt is not None and (rtol is not None or atol is not None):
+        raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
+    defaults = default_tolerances(dtype)
+    rtol = jnp.asarray(defaults[0] if rtol is None else rtol, dtype)
+    atol = jnp.asarray(defaults[1] if atol is None else atol, dtype)
+    for name, x in (("rtol", rtol), ("atol", atol)):
+        if x.ndim != 0:
+            raise bad(name, "be a number", f"its shape was {x.shape}")
+        if concrete(x) and not (np.isfinite(x) and x >= 0):
+            raise bad(name, "be finite and not negative", f"it was {x}")
+    if concrete(rtol, atol):
+        if rtol == 0 and atol == 0:
+            raise bad("rtol and atol", "not both be zero", "both were")
+        least = 10 * jnp.finfo(dtype).eps
+        if 0 < rtol < least:
+            raise bad(
+                "rtol",
+                f"be 0 or at least {least:.1e}, ten roundings of {jnp.dtype(dtype).name}",
+                f"it was {rtol}",
+                "Loosen it"
+                + (
+                    "."
+                    if dtype == jnp.float64
+                    else ', or compute in float64: jax.config.update("jax_enable_x64", True) and '
+                    "q0, v0 in float64."
+                ),
+            )
+    return rtol, atol
+
+
+def check_step(dt: Any, dt0: Any) -> Array | None:
+    if dt is not None and dt0 is not None:
+        raise bad("dt and dt0", "be given one at a time", "both were given")
+    name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
+    if step is None:
+        return None
+    step = jnp.asarray(step, jnp.result_type(float))
+    if step.ndim != 0:
+        raise bad(name, "be a number", f"its shape was {step.shape}")
+    if concrete(step) and not (np.isfinite(step) and step > 0):
+        raise bad(name, "be positive, whichever way time runs", f"it was {step}")
+    return step
+
+
+def check_range(inputs: Mapping[str, Any], ts: Array) -> None:
+    """Raise where concrete tables do not cover concrete times."""
+    span = common_range(inputs)
+    if span is None or not concrete(ts, *span):
+        return
+    first, last = (float(x) for x in span)
+    low, high = float(jnp.min(ts)), float(jnp.max(ts))
+    if low < first or high > last:
+        raise bad(
+            "inputs",
+            f"cover ts, from {low} to {high} s",
+            f"their tables cover {first} to {last} s",
+            "Extend the tables or shorten ts.",
+        )
+
+
+def check_declaration(
+    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
+) -> None:
+    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
+    values = evaluate(inputs, t, q, v, params)
+    system.check_traceable(params, q.dtype, values)
+    for name in inputs:
+        if name not in values.read:
+            raise bad(
+                "inputs",
+                "hold only signals that a force reads",
+                f"no force read {name!r}",
+                "Drop it, or read inputs[name] in a GeneralizedForce.",
+            )

@@ -1,0 +1,96 @@
+"""Names and shapes of the coordinates, and the flat vector they are stored in."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._errors import bad
+
+
+class Coordinates:
+    """Immutable, hashable table of coordinate names and shapes, in the order of flat q.
+
+    Args:
+        declared: names, or a mapping from name to shape, e.g. `{"x": (8, 3), "theta": ()}`.
+
+    Raises:
+        ValueError: no names, duplicate or empty names, shapes that are not tuples of sizes.
+    """
+
+    def __init__(self, declared: Sequence[str] | Mapping[str, tuple[int, ...]]) -> None:
+        fix = 'Write coordinates=("x", "theta") or {"x": (8, 3), "theta": ()}.'
+        if isinstance(declared, str) or not isinstance(declared, Sequence | Mapping):
+            raise bad("coordinates", "be names, or names with shapes", f"it was {declared!r}", fix)
+        items = (
+            list(declared.items())
+            if isinstance(declared, Mapping)
+            else [(name, ()) for name in declared]
+        )
+        if not items:
+            raise bad("coordinates", "name at least one coordinate", "it was empty", fix)
+        for name, shape in items:
+            if not isinstance(name, str) or not name:
+                raise bad("coordinates", "be non-empty strings", f"one was {name!r}", fix)
+            if not isinstance(shape, tuple) or not all(isinstance(s, int) and s > 0 for s in shape):
+                raise bad(f"coordinates[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix)
+        names = [name for name, _ in items]
+        for name in names:
+            if names.count(name) > 1:
+                raise bad("coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times")
+        self.shapes: dict[str, tuple[int, ...]] = dict(items)
+        self.size = sum(math.prod(shape) for shape in self.shapes.values())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Declared names, in order."""
+        return tuple(self.shapes)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """One label for every entry of flat q: `theta`, or `x[2,0]` for an array coordinate."""
+        labels = []
+        for name, shape in self.shapes.items():
+            for index in np.ndindex(shape):
+                labels.append(f"{name}[{','.join(map(str, index))}]" if shape else name)
+        return tuple(labels)
+
+    def unflatten(self, q: Array) -> dict[str, Array]:
+        """Split the last axis of q, shape (..., n), into a dict of named arrays."""
+        parts, start = {}, 0
+        for name, shape in self.shapes.items():
+            stop = start + math.prod(shape)
+            parts[name] = q[..., start:stop].reshape(q.shape[:-1] + shape)
+            start = stop
+        return parts
+
+    def flatten(self, parts: Mapping[str, Any], argument: str = "q") -> Array:
+        """Inverse of `unflatten` for a single state: dict of named values to shape (n,)."""
+        if set(parts) != set(self.shapes):
+            raise bad(argument, f"name exactly {list(self.shapes)}", f"it named {list(parts)}")
+        rows = []
+        for name, shape in self.shapes.items():
+            part = jnp.asarray(parts[name])
+            if part.shape != shape:
+                raise bad(f"{argument}[{name!r}]", f"have shape {shape}", f"it was {part.shape}")
+            rows.append(part.reshape(-1))
+        return jnp.concatenate([row.astype(jnp.result_type(*rows)) for row in rows])
+
+    def label(self, index: int) -> str:
+        """Label of entry `index` of flat q."""
+        return self.labels[index]
+
+    def _key(self) -> tuple:
+        return tuple(self.shapes.items())
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Coordinates) and self._key() == other._key()
+
+    def __repr__(self) -> str:
+        return f"Coordinates({self.shapes})"

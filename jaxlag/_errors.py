@@ -1,0 +1,63 @@
+"""One sentence form for every error: argument, requirement, what it was, likely fix."""
+
+from collections.abc import Callable
+from inspect import Parameter, signature
+
+
+class SimulationError(RuntimeError):
+    """A simulation ended in a status other than `Status.ok`.
+
+    Attributes:
+        motion: the `Solution` up to the failure; rows not reached are NaN.
+    """
+
+    def __init__(self, message: str, motion: object = None) -> None:
+        super().__init__(message)
+        self.motion = motion
+
+
+def complaint(argument: str, must: str, was: str, fix: str = "") -> str:
+    """`<argument> must <must>, but <was>. <fix>`."""
+    return f"{argument} must {must}, but {was}." + (f" {fix}" if fix else "")
+
+
+def bad(argument: str, must: str, was: str, fix: str = "") -> ValueError:
+    """A `ValueError` in the form of `complaint`, to be raised by the caller."""
+    return ValueError(complaint(argument, must, was, fix))
+
+
+def accepts(function: Callable, count: int) -> bool:
+    """Whether `function` can be called with `count` positional arguments."""
+    try:
+        signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:  # builtins without a signature: let the call itself decide
+        return True
+    return True
+
+
+def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> None:
+    """Raise unless `function` is callable as `function(*names)`."""
+    form = f"({', '.join(names)})"
+    if not callable(function):
+        raise bad(argument, f"be a function of {form}", f"it was {function!r}")
+    if not accepts(function, len(names)):
+        raise bad(
+            argument,
+            f"be callable as {form}",
+            f"its signature was {signature(function)}",
+            "Add or drop arguments so that it takes exactly these, in this order.",
+        )
+
+
+def positional_count(function: Callable, fallback: int) -> int:
+    """Number of positional arguments `function` declares; `fallback` if it hides them."""
+    try:
+        parameters = signature(function).parameters.values()
+    except ValueError:
+        return fallback
+    if any(p.kind is Parameter.VAR_POSITIONAL for p in parameters):
+        return fallback
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in kinds for p in parameters)

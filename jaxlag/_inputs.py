@@ -1,0 +1,305 @@
+"""Inputs: signals that forces read by name, from tables, functions of time or the state.
+
+Table inputs have knots where the signal or its slope jumps. The driver ends a step on every
+knot, and evaluates a table throughout one step in the one interval that holds the step's
+midpoint, so that no stage ever reads the wrong side of a jump.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxlag._errors import bad, positional_count, require_arity
+
+
+class AbstractInput(eqx.Module):
+    """A signal u(t, q, v, params) of any fixed shape."""
+
+    def knots(self) -> Float[Array, " k"] | None:
+        """Times (s, increasing) at which steps must end; None if there are none."""
+        return None
+
+    def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
+        """Index of the table interval that holds t (right-continuous); None without a table."""
+        return None
+
+    def value(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        interval: Int[Array, ""] | None,
+    ) -> Array:
+        """The signal at (t, q, v), read from the given table interval."""
+        raise NotImplementedError
+
+
+def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
+    times, values = jnp.asarray(times), jnp.asarray(values)
+    if times.ndim != 1 or times.shape[0] < 2:
+        raise bad(f"{kind}: times", "be one row of at least 2 times", f"its shape was {times.shape}")
+    if values.ndim < 1 or values.shape[0] != times.shape[0]:
+        raise bad(
+            f"{kind}: values",
+            f"have one entry per time, {times.shape[0]}",
+            f"its shape was {values.shape}",
+        )
+    times, values = (
+        x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+        for x in (times, values)
+    )
+    if not isinstance(times, jax.core.Tracer):
+        steps = np.diff(np.asarray(times))
+        if not np.all(steps > 0):
+            i = int(np.argmin(steps > 0))
+            raise bad(
+                f"{kind}: times",
+                "increase strictly",
+                f"times[{i}] = {times[i]} and times[{i + 1}] = {times[i + 1]}",
+                "Sort the table and drop repeated times.",
+            )
+    if not isinstance(values, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(values))):
+        raise bad(f"{kind}: values", "be finite", "some were nan or inf")
+    return times, values
+
+
+def _interval(times: Array, t: Array, last: int) -> Array:
+    index = jnp.searchsorted(times, t, side="right").astype(jnp.int32) - 1
+    return jnp.clip(index, 0, last)
+
+
+class ZeroOrderHold(AbstractInput):
+    """A table held constant between its times: u(t) = values[i] for times[i] <= t < times[i+1].
+
+    Defined on [times[0], times[-1]]; the last value holds at the last time only. A simulation
+    that reaches beyond the table ends with `Status.input_range`.
+
+    Args:
+        times: shape (k,), s, strictly increasing, k >= 2.
+        values: shape (k, ...), in the unit the force expects.
+
+    Raises:
+        ValueError: shapes differ, times do not increase, values are not finite.
+    """
+
+    times: Array
+    values: Array
+
+    def __init__(self, times: Any, values: Any) -> None:
+        self.times, self.values = _table("ZeroOrderHold", times, values)
+
+    def knots(self) -> Float[Array, " k"] | None:
+        """The table's times."""
+        return self.times
+
+    def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
+        """Index i with times[i] <= t < times[i+1]."""
+        return _interval(self.times, t, self.times.shape[0] - 1)
+
+    def value(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        interval: Int[Array, ""] | None,
+    ) -> Array:
+        """values[interval]."""
+        return self.values[interval]
+
+
+class Linear(AbstractInput):
+    """A table interpolated linearly between its times; continuous, with kinks at the knots.
+
+    Defined on [times[0], times[-1]]; a simulation that reaches beyond ends with
+    `Status.input_range`.
+
+    Args:
+        times: shape (k,), s, strictly increasing, k >= 2.
+        values: shape (k, ...), in the unit the force expects.
+
+    Raises:
+        ValueError: shapes differ, times do not increase, values are not finite.
+    """
+
+    times: Array
+    values: Array
+
+    def __init__(self, times: Any, values: Any) -> None:
+        self.times, self.values = _table("Linear", times, values)
+
+    def knots(self) -> Float[Array, " k"] | None:
+        """The table's times."""
+        return self.times
+
+    def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
+        """Index i with times[i] <= t < times[i+1]."""
+        return _interval(self.times, t, self.times.shape[0] - 2)
+
+    def value(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        interval: Int[Array, ""] | None,
+    ) -> Array:
+        """values[i] + (values[i+1] - values[i]) (t - times[i]) / (times[i+1] - times[i])."""
+        assert interval is not None
+        start, end = self.times[interval], self.times[interval + 1]
+        first, last = self.values[interval], self.values[interval + 1]
+        fraction = ((t - start) / (end - start)).astype(first.dtype)
+        return first + (last - first) * fraction
+
+
+class Function(AbstractInput):
+    """A signal u(t) given by a smooth function of time, or of time and params.
+
+    Args:
+        f: function `f(t)` or `f(t, params)`; t in s. An equinox module keeps its arrays traced.
+
+    Raises:
+        ValueError: `f` is not callable in either form.
+    """
+
+    f: Callable
+    takes_params: bool = eqx.field(static=True)
+
+    def __init__(self, f: Callable) -> None:
+        self.takes_params = callable(f) and positional_count(f, 1) == 2
+        require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
+        self.f = f
+
+    def value(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        interval: Int[Array, ""] | None,
+    ) -> Array:
+        """f(t) or f(t, params)."""
+        return jnp.asarray(self.f(t, params) if self.takes_params else self.f(t))
+
+
+class Feedback(AbstractInput):
+    """A signal that depends on the state: u = f(t, q, v, params), e.g. a controller.
+
+    Args:
+        f: function `f(t, q, v, params)`; an equinox module keeps its arrays traced.
+
+    Raises:
+        ValueError: `f` is not callable in this form.
+    """
+
+    f: Callable
+
+    def __init__(self, f: Callable) -> None:
+        require_arity("Feedback: f", f, ("t", "q", "v", "params"))
+        self.f = f
+
+    def value(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        interval: Int[Array, ""] | None,
+    ) -> Array:
+        """f(t, q, v, params)."""
+        return jnp.asarray(self.f(t, q, v, params))
+
+
+class InputValues(dict):
+    """Values of the inputs by name; remembers which names were read."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self:
+            raise bad(
+                "inputs",
+                f"have an entry {name!r}, which a force reads",
+                f"its names were {sorted(self)}",
+                "Pass inputs={...} with this name.",
+            )
+        self.read.add(name)
+        return super().__getitem__(name)
+
+
+def check_inputs(inputs: Any) -> dict[str, Any]:
+    """`inputs` as a dict of input objects and arrays, or a ValueError saying what is wrong."""
+    if inputs is None:
+        return {}
+    if not isinstance(inputs, Mapping) or not all(isinstance(k, str) for k in inputs):
+        raise bad(
+            "inputs", "be a dict from names to input objects or arrays", f"it was {inputs!r}"
+        )
+    checked = {}
+    for name, signal in inputs.items():
+        if isinstance(signal, AbstractInput):
+            checked[name] = signal
+            continue
+        if callable(signal):
+            raise bad(
+                f"inputs[{name!r}]",
+                "be an input object or an array",
+                f"it was the function {signal!r}",
+                "Wrap it in jl.Function (of time) or jl.Feedback (of the state).",
+            )
+        checked[name] = jnp.asarray(signal)
+    return checked
+
+
+def locate(inputs: Mapping[str, Any], t: Float[Array, ""]) -> dict[str, Array | None]:
+    """Table interval of every input at time t."""
+    return {
+        name: signal.locate(t) if isinstance(signal, AbstractInput) else None
+        for name, signal in inputs.items()
+    }
+
+
+def evaluate(
+    inputs: Mapping[str, Any],
+    t: Float[Array, ""],
+    q: Float[Array, " n"],
+    v: Float[Array, " n"],
+    params: Any,
+    intervals: Mapping[str, Array | None] | None = None,
+) -> InputValues:
+    """Values of all inputs at (t, q, v); tables read at `intervals`, by default those at t."""
+    intervals = locate(inputs, t) if intervals is None else intervals
+    return InputValues(
+        {
+            name: signal.value(t, q, v, params, intervals[name])
+            if isinstance(signal, AbstractInput)
+            else signal
+            for name, signal in inputs.items()
+        }
+    )
+
+
+def all_knots(inputs: Mapping[str, Any]) -> Float[Array, " k"] | None:
+    """Knots of all inputs, unsorted; None if there are none."""
+    knots = [s.knots() for s in inputs.values() if isinstance(s, AbstractInput)]
+    present = [k for k in knots if k is not None]
+    return jnp.concatenate(present) if present else None
+
+
+def common_range(inputs: Mapping[str, Any]) -> tuple[Array, Array] | None:
+    """(first, last) time at which every table is defined; None without tables."""
+    tables = [s.knots() for s in inputs.values() if isinstance(s, AbstractInput)]
+    present = [k for k in tables if k is not None]
+    if not present:
+        return None
+    first = jnp.max(jnp.stack([k[0] for k in present]))
+    last = jnp.min(jnp.stack([k[-1] for k in present]))
+    return first, last

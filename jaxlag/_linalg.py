@@ -1,0 +1,90 @@
+"""Solves with the mass matrix: symmetric positive definite, small, factored once."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Bool, Float, Int
+
+# Up to this size the elimination is unrolled into scalar operations, which XLA fuses into the
+# surrounding loop; a library call would keep that loop from compiling to one native function.
+UNROLL_UP_TO = 8
+
+
+class MassFactor(NamedTuple):
+    """Factor of M = L D L^T, with U = D L^T (upper) and the pivots' health.
+
+    `unrolled` rows of U as scalars for small n; otherwise the lower Cholesky factor.
+    """
+
+    upper: tuple[tuple[Array, ...], ...] | None
+    cholesky: Float[Array, "n n"] | None
+    healthy: Bool[Array, " n"]
+
+
+def factor_mass(M: Float[Array, "n n"]) -> MassFactor:
+    """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.
+
+    A pivot no larger than 4 n eps M_ii is what cancellation leaves of an exactly
+    singular matrix, whatever the units of coordinate i.
+    """
+    n = M.shape[0]
+    floor = 4 * n * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
+    if n > UNROLL_UP_TO:
+        lower = jnp.linalg.cholesky(M, symmetrize_input=False)
+        pivots = jnp.diagonal(lower) ** 2
+        return MassFactor(None, lower, pivots > floor)
+    rows = [[M[i, j] if j >= i else None for j in range(n)] for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            ratio = rows[k][i] / rows[k][k]
+            for j in range(i, n):
+                rows[i][j] = rows[i][j] - ratio * rows[k][j]
+    upper = tuple(tuple(rows[i][j] for j in range(i, n)) for i in range(n))
+    pivots = jnp.stack([upper[i][0] for i in range(n)]) if n else jnp.zeros((0,), M.dtype)
+    return MassFactor(upper, None, pivots > floor)
+
+
+def first_unhealthy(factor: MassFactor) -> Int[Array, ""]:
+    """Index of the first coordinate whose pivot failed, -1 if none did."""
+    failed = ~factor.healthy
+    return jnp.where(jnp.any(failed), jnp.argmax(failed), -1).astype(jnp.int32)
+
+
+def _eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:
+    if factor.upper is None:
+        assert factor.cholesky is not None
+        return cho_solve((factor.cholesky, True), r)
+    U = factor.upper
+    n = len(U)
+    z = [r[i] for i in range(n)]
+    for k in range(n):
+        scaled = z[k] / U[k][0]
+        for i in range(k + 1, n):
+            z[i] = z[i] - U[k][i - k] * scaled
+    x: list[Array] = [jnp.zeros((), r.dtype)] * n
+    for i in reversed(range(n)):
+        # Each component ends in a true divide: XLA recomputes cheap producers in every consumer.
+        x[i] = (z[i] - sum(U[i][k - i] * x[k] for k in range(i + 1, n))) / U[i][0]
+    return jnp.stack(x)
+
+
+def solve_mass(
+    M: Float[Array, "n n"], r: Float[Array, " n"], factor: MassFactor | None = None
+) -> Float[Array, " n"]:
+    """x with M x = r; NaN where M is not positive definite.
+
+    Derivatives reuse the factor: dx = M^-1 (dr - dM x).
+
+    Args:
+        M: symmetric positive definite.
+        r: right-hand side.
+        factor: `factor_mass(M)` if it exists already.
+    """
+    factor = factor_mass(jax.lax.stop_gradient(M)) if factor is None else factor
+    factor = jax.lax.stop_gradient(factor)
+    x = jax.lax.custom_linear_solve(
+        lambda x: M @ x, r, solve=lambda _, b: _eliminate(factor, b), symmetric=True
+    )
+    return jnp.where(jnp.all(factor.healthy), x, jnp.nan)

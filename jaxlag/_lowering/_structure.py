@@ -1,0 +1,105 @@
+"""What the traced equations do and do not depend on, read from their jaxprs."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+
+class Structure(NamedTuple):
+    """Dependencies on "t", "q", "v" and "params" of the mass matrix, the bias and the Lagrangian.
+
+    Read from the traced program, never from numbers: a dependence that cancels only
+    algebraically is still listed, one that is not listed is certainly absent.
+    """
+
+    mass: frozenset[str]
+    bias: frozenset[str]
+    lagrangian: frozenset[str]
+    bias_zero: bool
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether M is free of v, so that L is quadratic in v."""
+        return "v" not in self.mass
+
+    @property
+    def mass_constant(self) -> bool:
+        """Whether M depends on params alone."""
+        return not self.mass & {"t", "q", "v"}
+
+    @property
+    def explicit_time(self) -> bool:
+        """Whether L depends on t at fixed q and v."""
+        return "t" in self.lagrangian
+
+
+def _inner(eqn: Any) -> Jaxpr | None:
+    """The jaxpr of a call-like equation whose operands map one to one; else None."""
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        inner = eqn.params.get(key)
+        jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
+        if isinstance(jaxpr, Jaxpr) and eqn.primitive.name in _CALLS:
+            if len(jaxpr.invars) == len(eqn.invars) and len(jaxpr.outvars) == len(eqn.outvars):
+                return jaxpr
+    return None
+
+
+_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"} | {
+    "custom_jvp_call",
+    "custom_vjp_call",
+}
+
+
+def _outputs_depend_on(jaxpr: Jaxpr, given: list[frozenset[str]]) -> list[frozenset[str]]:
+    nothing: frozenset[str] = frozenset()
+    known: dict[Any, frozenset[str]] = dict(zip(jaxpr.invars, given, strict=True))
+
+    def of(atom: Any) -> frozenset[str]:
+        return nothing if isinstance(atom, Literal) else known.get(atom, nothing)
+
+    for eqn in jaxpr.eqns:
+        operands = [of(atom) for atom in eqn.invars]
+        inner = _inner(eqn)
+        if inner is not None:
+            results = _outputs_depend_on(inner, operands)
+        elif eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0:
+            results = [nothing]  # x**0 is what differentiating x**1 leaves
+        else:
+            results = [nothing.union(*operands)] * len(eqn.outvars)
+        known.update(zip(eqn.outvars, results, strict=True))
+    return [of(atom) for atom in jaxpr.outvars]
+
+
+def find_structure(
+    mass: Callable, bias: Callable, lagrangian: Callable, state: tuple, params: Any
+) -> Structure:
+    """Trace M, h and L, functions of (t, q, v, params), and follow each argument.
+
+    Args:
+        mass: M(t, q, v, params).
+        bias: h(t, q, v, params).
+        lagrangian: L(t, q, v, params).
+        state: shapes and dtypes of (t, q, v).
+        params: shapes and dtypes of the traced parameters.
+    """
+
+    def depends_on(function: Any) -> frozenset[str]:
+        closed = jax.make_jaxpr(function)(*state, params)
+        given = [frozenset({name}) for name in ("t", "q", "v")]
+        given += [frozenset({"params"})] * (len(closed.jaxpr.invars) - 3)
+        return frozenset().union(*_outputs_depend_on(closed.jaxpr, given))
+
+    of_bias = depends_on(bias)
+    bias_zero = not of_bias and _vanishes(bias, state, params)
+    return Structure(depends_on(mass), of_bias, depends_on(lagrangian), bias_zero)
+
+
+def _vanishes(function: Any, state: tuple, params: Any) -> bool:
+    """Whether a function that depends on none of its arguments is zero: one value decides."""
+    with jax.ensure_compile_time_eval():
+        anywhere = jax.tree.map(lambda x: jnp.ones(jnp.shape(x), jnp.result_type(x)), state)
+        ones = jax.tree.map(lambda x: jnp.ones(jnp.shape(x), jnp.result_type(x)), params)
+        return not bool(jnp.any(function(*anywhere, ones)))

@@ -1,0 +1,80 @@
+"""Parameters: any pytree, split into what JAX traces and what the compiled program is keyed by."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class _Frozen:
+    """A concrete integer or boolean array, hashable by value."""
+
+    def __init__(self, array: Any) -> None:
+        self.array = np.asarray(array)
+        self.key = (self.array.shape, str(self.array.dtype), self.array.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Frozen) and self.key == other.key
+
+    def __repr__(self) -> str:
+        return f"{self.array.dtype}{list(self.array.shape)}"
+
+
+def _is_traced(leaf: Any) -> bool:
+    if isinstance(leaf, jax.core.Tracer):
+        return True
+    return eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
+
+
+def split(tree: Any) -> tuple[Any, Any]:
+    """(traced, static) halves of a pytree, put together again by `join`.
+
+    Inexact arrays, Python floats and tracers are traced; integers, booleans, strings and
+    functions are static: part of the key under which the compiled program is cached.
+    """
+
+    def traced_half(leaf: Any) -> Any:
+        return jnp.asarray(leaf) if _is_traced(leaf) else None
+
+    def static_half(leaf: Any) -> Any:
+        if _is_traced(leaf):
+            return None
+        return _Frozen(leaf) if eqx.is_array(leaf) or isinstance(leaf, np.ndarray) else leaf
+
+    return jax.tree.map(traced_half, tree), jax.tree.map(static_half, tree)
+
+
+def join(traced: Any, static: Any) -> Any:
+    """Inverse of `split`; frozen arrays come back as numpy arrays."""
+    thawed = jax.tree.map(lambda x: x.array if isinstance(x, _Frozen) else x, static)
+    return eqx.combine(traced, thawed)
+
+
+class Static:
+    """A pytree without traced leaves, hashable, to key compiled programs by."""
+
+    def __init__(self, tree: Any) -> None:
+        leaves, self.treedef = jax.tree.flatten(tree)
+        self.leaves = tuple(leaves)
+
+    @property
+    def tree(self) -> Any:
+        return jax.tree.unflatten(self.treedef, self.leaves)
+
+    def __hash__(self) -> int:
+        return hash((self.treedef, self.leaves))
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Static)
+            and self.treedef == other.treedef
+            and len(self.leaves) == len(other.leaves)
+            and all(
+                type(a) is type(b) and a == b for a, b in zip(self.leaves, other.leaves, strict=True)
+            )
+        )

@@ -1,0 +1,214 @@
+"""The differentiable solve: rows at the save times, with one derivative for every transform.
+
+The derivative is that of the map from (state, args, times) to the rows at the FROZEN sequence of
+accepted steps: step ends keep their distance from the start, knot or stop they are anchored to,
+and move with it. The forward loop is never differentiated; under any derivative it records its
+grid, and the steps are taken again on that grid, as a scan that JAX differentiates in any mode
+and to any order.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive, resolution
+
+# Rows interpolated at once: bounds the memory of a vmapped solve.
+ROWS_AT_ONCE = 128
+
+
+class Rows(NamedTuple):
+    """The solution at the save times, and where the solve ended."""
+
+    saved: PyTree  # leaves (s, ...), NaN where not reached
+    state: PyTree  # last good state
+    time: Float[Array, ""]  # last good time
+
+
+class Setup(NamedTuple):
+    """What a solve needs and no derivative is taken of."""
+
+    first_step: Array | None
+    allowed: Bool[Array, ""]
+    scheme: Any  # array leaves of the Scheme
+
+
+def solve(
+    y0: PyTree, args: Any, times: Times, setup: Setup, scheme: Any, max_steps: int
+) -> tuple[Rows, Outcome]:
+    """Integrate and save; differentiable in y0, args and times.
+
+    Args:
+        y0: state at the start.
+        args: passed to the vector field; inexact leaves are differentiated.
+        times: start, stop, knots, save times, in tau.
+        setup: traced values without derivative.
+        scheme: the rest of the `Scheme`, static leaves.
+        max_steps: bound on attempted steps.
+    """
+    inexact, rest = eqx.partition((y0, args, times), eqx.is_inexact_array)
+    dynamic_rest, static_rest = eqx.partition(rest, eqx.is_array)
+    static = (static_rest, scheme, max_steps)
+
+    @jax.custom_jvp
+    def run(inexact: Any, dynamic_rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
+        return _forward(inexact, dynamic_rest, setup, static, record=False)
+
+    @run.defjvp
+    def run_jvp(primals: Any, tangents: Any) -> Any:
+        inexact, dynamic_rest, setup = primals
+        frozen = jax.lax.stop_gradient(inexact)
+        rows, outcome = _forward(frozen, dynamic_rest, setup, static, record=True)
+        function = partial(_replay, dynamic_rest, setup, static, outcome)
+        rows, rows_dot = jax.jvp(function, (inexact,), (tangents[0],))
+        outcome = outcome._replace(grid=None)
+        no_tangent = jax.tree.map(_zero_tangent, outcome)
+        return (rows, outcome), (rows_dot, no_tangent)
+
+    return run(inexact, dynamic_rest, setup)
+
+
+def _zero_tangent(x: Array) -> Any:
+    if jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.zeros_like(x)
+    return jnp.zeros(x.shape, jax.dtypes.float0)
+
+
+def _unpack(inexact: Any, dynamic_rest: Any, setup: Setup, static: Any) -> Any:
+    static_rest, static_scheme, max_steps = static
+    y0, args, times = eqx.combine(inexact, eqx.combine(dynamic_rest, static_rest))
+    return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
+
+
+def _forward(
+    inexact: Any, dynamic_rest: Any, setup: Setup, static: Any, record: bool
+) -> tuple[Rows, Outcome]:
+    y0, args, times, scheme, max_steps = _unpack(inexact, dynamic_rest, setup, static)
+    outcome = drive(
+        scheme, y0, args, times, setup.first_step, setup.allowed, max_steps, record
+    )
+    if outcome.row_time is None:
+        states = jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state)
+        starts = jnp.stack([times.start, outcome.time])
+    else:
+        starts, states = outcome.row_time, outcome.row_state
+    rows = _rows(scheme, args, times, starts, states, outcome, outcome.state, outcome.time)
+    return rows, outcome._replace(row_time=None, row_state=None)
+
+
+def _rows(
+    scheme: Scheme,
+    args: Any,
+    times: Times,
+    starts: Float[Array, " s"],
+    states: PyTree,
+    outcome: Outcome,
+    state: PyTree,
+    time: Array,
+) -> Rows:
+    """Reach every save time by one step of the solver itself from the last state before it.
+
+    A step shorter than an accepted one is at least as accurate, whatever the solver: saved rows
+    keep its order, which its interpolant need not.
+    """
+    saves = times.saves
+    reached = saves <= outcome.time
+    gap = jnp.where(reached, saves - starts, 0.0)
+    inside = reached & (gap > resolution(saves))
+    if saves.shape[0] > 2:
+
+        def step(row: tuple[Array, Array, PyTree]) -> PyTree:
+            t0, t1, y = row
+            return scheme.fresh_step(t0, t1, y, args)
+
+        def step_all(states: PyTree) -> PyTree:
+            ends = jnp.where(inside, saves, starts)
+            return jax.lax.map(step, (starts, ends, states), batch_size=ROWS_AT_ONCE)
+
+        # Rows that need no step must not see one: their state may be where the field is not finite.
+        filled = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
+        stepped = jax.lax.cond(eqxi.unvmap_any(jnp.any(inside)), step_all, lambda s: s, filled)
+        states = jax.tree.map(lambda a, b: jnp.where(_like(inside, a), a, b), stepped, states)
+    saved = jax.tree.map(lambda s: jnp.where(_like(reached, s), s, jnp.nan), states)
+    return Rows(saved, state, time)
+
+
+def _like(mask: Array, leaf: Array) -> Array:
+    return mask.reshape(mask.shape + (1,) * (leaf.ndim - mask.ndim))
+
+
+def _replay(
+    dynamic_rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any
+) -> Rows:
+    """The rows as a differentiable function of `inexact`, on the recorded grid."""
+    grid = outcome.grid
+    assert grid is not None
+    # A trajectory that took no step depends on nothing but its start: keep NaN out of derivatives.
+    moved = grid.count > 0
+    inexact = jax.tree.map(lambda x: jnp.where(moved, x, jax.lax.stop_gradient(x)), inexact)
+    y0, args, times, scheme, max_steps = _unpack(inexact, dynamic_rest, setup, static)
+    scheme = eqx.tree_at(lambda s: s.solver, scheme, _scannable(scheme.solver))
+    anchors = times.anchors()
+    ends = grid.ends + (anchors - jax.lax.stop_gradient(anchors))[grid.anchor]
+    state, history = _steps(scheme, args, times.start, ends, grid.count, y0)
+    marks = jnp.concatenate([times.start[None], ends])
+    states = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest])[grid.row_step], y0, history
+    )
+    return _rows(
+        scheme, args, times, marks[grid.row_step], states, outcome, state, marks[grid.count]
+    )
+
+
+def _steps(
+    scheme: Scheme,
+    args: Any,
+    start: Array,
+    ends: Float[Array, " N"],
+    count: Array,
+    y0: PyTree,
+) -> tuple[PyTree, PyTree]:
+    """Take `count` steps ending at `ends`; the last state, and the state after every step.
+
+    The scan skips whole chunks that no lane of a vmapped solve needs. Slots past `count` repeat
+    the first step and drop its result, so that no derivative meets a state out of reach.
+    """
+    used = jnp.arange(ends.shape[0]) < count
+    begins = jnp.where(used, jnp.concatenate([start[None], ends[:-1]]), start)
+    ends = jnp.where(used, ends, ends[0])
+
+    @partial(jax.checkpoint, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
+    def step(t0: Array, t1: Array, y: PyTree) -> PyTree:
+        return scheme.fresh_step(t0, t1, y, args)
+
+    def one(y: PyTree, slot: tuple[Array, Array, Array]) -> tuple[PyTree, PyTree]:
+        t0, t1, use = slot
+        pick = partial(jax.tree.map, lambda a, b: jnp.where(use, a, b))
+        y = pick(step(t0, t1, pick(y, y0)), y)
+        return y, y
+
+    def chunk(y: PyTree, slots: tuple[Array, Array, Array]) -> tuple[PyTree, PyTree]:
+        def skip(y: PyTree) -> tuple[PyTree, PyTree]:
+            return y, jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), y)
+
+        def take(y: PyTree) -> tuple[PyTree, PyTree]:
+            return jax.lax.scan(one, y, slots)
+
+        return jax.lax.cond(eqxi.unvmap_any(slots[2]), take, skip, y)
+
+    slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used))
+    last, history = jax.lax.scan(chunk, y0, slots)
+    return last, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), history)
+
+
+def _scannable(solver: Any) -> Any:
+    """The solver with its loop over stages as a scan, which every derivative passes."""
+    if not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)

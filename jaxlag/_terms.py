@@ -1,0 +1,70 @@
+"""The terms of the equations of motion, as every lowering provides them."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+class Terms(eqx.Module):
+    """M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
+
+    One state at a time: t scalar (s), q and v of shape (n,), `inputs` the dict of input VALUES
+    there. Everything returned is in the units of the coordinates: M_ij a_j and h_i in N where
+    q_i is in m, in N m where it is in rad. A lowering turns a declared system into these
+    functions; all lowerings agree to round-off.
+    """
+
+    @abstractmethod
+    def momentum(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """p = dL/dv."""
+
+    @abstractmethod
+    def mass(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, "n n"]:
+        """M = d2L/dv2."""
+
+    @abstractmethod
+    def bias(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """h = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
+
+    @abstractmethod
+    def force(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> Float[Array, " n"]:
+        """Q, the sum of all applied generalized forces, dissipation included."""
+
+    @abstractmethod
+    def rows(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+        """(A, b) of the constraint rows; m = 0 without constraints."""
+
+    @abstractmethod
+    def gamma(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """gamma = A' v + b', so that A a + gamma = 0."""
+
+    @abstractmethod
+    def acceleration(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> Float[Array, " n"]:
+        """a, with one factorisation; NaN where M is not positive definite."""
