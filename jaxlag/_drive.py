@@ -48,18 +48,46 @@ class Scheme(eqx.Module):
     term: diffrax.AbstractTerm
     intervals: Callable = eqx.field(static=True)  # (args, tau) -> args of a step around tau
 
+    @property
+    def remembers(self) -> bool:
+        """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
+        return not isinstance(self.solver, diffrax.AbstractRungeKutta)
+
+    def begin(self, t0: Array, t1: Array, y: PyTree, args: Any) -> Any:
+        """Solver state with nothing carried over from a step before."""
+        return self.solver.init(self.term, t0, t1, y, self.intervals(args, t0 + resolution(t0)))
+
     def step(
-        self, t0: Array, t1: Array, y: PyTree, args: Any, state: Any, jump: Any
+        self, t0: Array, t1: Array, y: PyTree, args: Any, memory: Any, jump: Any
     ) -> tuple[PyTree, PyTree, Any, Bool[Array, "..."]]:
         """(y1, error estimate or None, solver state, whether implicit equations were solved)."""
         args = self.intervals(args, t0 + 0.5 * (t1 - t0))
-        y1, error, _, state, result = self.solver.step(self.term, t0, t1, y, args, state, jump)
-        return y1, error, state, result == diffrax.RESULTS.successful
+        y1, error, _, memory, result = self.solver.step(self.term, t0, t1, y, args, memory, jump)
+        return y1, error, memory, result == diffrax.RESULTS.successful
 
-    def fresh_step(self, t0: Array, t1: Array, y: PyTree, args: Any) -> PyTree:
-        """y1 of a step with nothing carried over from a step before."""
-        state = self.solver.init(self.term, t0, t1, y, self.intervals(args, t0))
-        return self.step(t0, t1, y, args, state, jnp.array(True))[0]
+    def first_step(
+        self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
+    ) -> tuple[Array, Any]:
+        """Length of the first adaptive step, and the controller's state."""
+        assert self.controller is not None
+        args = self.intervals(args, t0 + resolution(t0))
+        order = self.solver.error_order(self.term)
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        if dtype == t0.dtype:
+            end, state = self.controller.init(
+                self.term, t0, t1, y, guess, args, self.solver.func, order
+            )
+            return end - t0, state
+
+        # diffrax estimates a first step only where time and state share a dtype: count from t0.
+        def func(term: Any, elapsed: Array, y: PyTree, args: Any) -> PyTree:
+            return self.solver.func(term, t0 + elapsed.astype(t0.dtype), y, args)
+
+        guess = None if guess is None else guess.astype(dtype)
+        zero = jnp.zeros_like(t0, dtype)
+        span = (t1 - t0).astype(dtype)
+        end, state = self.controller.init(self.term, zero, span, y, guess, args, func, order)
+        return end.astype(t0.dtype), state
 
 
 class Grid(NamedTuple):
@@ -67,6 +95,7 @@ class Grid(NamedTuple):
 
     ends: Float[Array, " N"]
     anchor: Int[Array, " N"]
+    jump: Bool[Array, " N"]  # whether step k starts where the vector field jumps
     row_step: Int[Array, " s"]  # row i is reached from the state after row_step[i] steps
     count: Int[Array, ""]
 
@@ -81,7 +110,7 @@ class Outcome(NamedTuple):
     accepted: Int[Array, "..."]
     attempted: Int[Array, "..."]
     row_time: Float[Array, "s ..."] | None
-    row_state: PyTree | None
+    row_state: PyTree | None  # (y, solver memory where the solver remembers)
     grid: Grid | None
 
 
@@ -89,7 +118,7 @@ class _Carry(NamedTuple):
     t: Array
     y: PyTree
     h: Array
-    solver_state: Any
+    memory: Any  # the solver's own state
     control_state: Any
     jump: Array
     mark: Array  # number of marks of the fixed grid passed
@@ -105,6 +134,7 @@ class _Carry(NamedTuple):
     row_step: Array | None
     ends: Array | None
     ends_anchor: Array | None
+    jumps: Array | None
 
 
 def resolution(t: Array) -> Array:
@@ -140,6 +170,11 @@ def _write(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
     return jax.tree.map(write_leaf, buffer, row)
 
 
+def _whole(scheme: Scheme, y: PyTree, memory: Any) -> PyTree:
+    """All that the next step depends on."""
+    return (y, memory if scheme.remembers else None)
+
+
 def _buffer(size: int, like: PyTree, fill: float) -> PyTree:
     return jax.tree.map(lambda x: jnp.full((size, *jnp.shape(x)), fill, jnp.result_type(x)), like)
 
@@ -170,24 +205,20 @@ def drive(
     count = times.saves.shape[0]
     keep_rows = count > 2
     size = -(-max_steps // CHUNK) * CHUNK
-    start_args = scheme.intervals(args, t0 + resolution(t0))
-    solver_state = scheme.solver.init(scheme.term, t0, times.stop, y0, start_args)
-    order = scheme.solver.error_order(scheme.term)
-    control_state = None
-    h = first_step
+    memory = scheme.begin(t0, times.stop, y0, args)
     if scheme.controller is not None:
-        t1, control_state = scheme.controller.init(
-            scheme.term, t0, times.stop, y0, first_step, start_args, scheme.solver.func, order
-        )
-        h = t1 - t0
-    assert h is not None
+        h, control_state = scheme.first_step(t0, times.stop, y0, args, first_step)
+    else:
+        assert first_step is not None
+        h, control_state = first_step, None
+    whole = _whole(scheme, y0, memory)
     zero = jnp.zeros(t0.shape, jnp.int32)
     ok = zero + int(Status.ok)
     carry = _Carry(
         t=t0,
         y=y0,
         h=jnp.asarray(h, t0.dtype) + jnp.zeros_like(t0),
-        solver_state=solver_state,
+        memory=memory,
         control_state=control_state,
         jump=jnp.zeros(t0.shape, bool),
         mark=zero,
@@ -199,16 +230,17 @@ def drive(
         attempted=zero,
         rows=zero + 1,
         row_time=_write(_buffer(count, t0, jnp.nan), zero, t0) if keep_rows else None,
-        row_state=_write(_buffer(count, y0, jnp.nan), zero, y0) if keep_rows else None,
+        row_state=_write(_buffer(count, whole, 0.0), zero, whole) if keep_rows else None,
         row_step=_buffer(count, zero, 0) if keep_rows and record else None,
         ends=_buffer(size, t0, 0.0) if record else None,
         ends_anchor=_buffer(size, zero, 0) if record else None,
+        jumps=_buffer(size, zero > 0, 0) if record else None,
     )
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
 
     def turn(dynamic: Any) -> Any:
-        c = _turn(scheme, args, times, order, h, max_steps, eqx.combine(dynamic, static))
+        c = _turn(scheme, args, times, h, max_steps, eqx.combine(dynamic, static))
         return eqx.partition(c, eqx.is_array)[0]
 
     final = jax.lax.while_loop(lambda c: eqxi.unvmap_any(~c.done), turn, dynamic)
@@ -216,13 +248,14 @@ def drive(
     rows = _filled(c) if keep_rows else (None, None, jnp.stack([zero, c.accepted]))
     grid = None
     if record:
-        assert c.ends is not None and c.ends_anchor is not None and rows[2] is not None
-        grid = Grid(c.ends, c.ends_anchor, rows[2], c.accepted)
+        assert c.ends is not None and c.ends_anchor is not None and c.jumps is not None
+        assert rows[2] is not None
+        grid = Grid(c.ends, c.ends_anchor, c.jumps, rows[2], c.accepted)
     return Outcome(c.status, c.t, c.y, c.tried, c.accepted, c.attempted, *rows[:2], grid)
 
 
 def _turn(
-    scheme: Scheme, args: Any, times: Times, order: Any, dt: Array, max_steps: int, c: _Carry
+    scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c: _Carry
 ) -> _Carry:
     """One attempted step."""
     # Where the step would end, and whether it lands on a knot or on the stop instead.
@@ -233,12 +266,13 @@ def _turn(
     lands = goal >= boundary - slack
     t1 = jnp.where(lands, boundary, goal)
 
-    y1, error, solver_state, solved = scheme.step(c.t, t1, c.y, args, c.solver_state, c.jump)
+    y1, error, memory, solved = scheme.step(c.t, t1, c.y, args, c.memory, c.jump)
     finite = _all_finite(y1, c.t.ndim)
     good = finite & solved
     if scheme.controller is None:
         keep, h, control_state, jump, stuck = good, c.h, None, jnp.zeros_like(good), ~good
     else:
+        order = scheme.solver.error_order(scheme.term)
         error = jax.tree.map(lambda e: jnp.where(good, e, jnp.inf), error)
         keep, next0, next1, jump, control_state, _ = scheme.controller.adapt_step_size(
             c.t, t1, c.y, y1, args, error, order, c.control_state
@@ -277,23 +311,25 @@ def _turn(
         at_end = (rows > c.rows) & (t - last_save <= resolution(t))
         last = jnp.where(at_end, rows - 1, size)
         row_time = _write(_write(row_time, first, c.t), last, t)
-        row_state = _write(_write(row_state, first, c.y), last, y1)
+        row_state = _write(row_state, first, _whole(scheme, c.y, c.memory))
+        row_state = _write(row_state, last, _whole(scheme, y1, memory))
         if row_step is not None:
             row_step = _write(_write(row_step, first, c.accepted), last, accepted)
 
     passed = t1 >= goal - resolution(goal)
     own_anchor = jnp.zeros_like(c.anchor) if scheme.controller is None else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
-    ends, ends_anchor = c.ends, c.ends_anchor
+    ends, ends_anchor, jumps = c.ends, c.ends_anchor, c.jumps
     if ends is not None:
         slot = jnp.where(take, c.accepted, ends.shape[0])
         ends = _write(ends, slot, t1)
         ends_anchor = _write(ends_anchor, slot, anchor)
+        jumps = _write(jumps, slot, c.jump)
     return _Carry(
         t=t,
         y=_select(take, y1, c.y),
         h=jnp.where(active, h, c.h),
-        solver_state=_select(take, solver_state, c.solver_state),
+        memory=_select(take, memory, c.memory),
         control_state=_select(active, control_state, c.control_state),
         jump=jnp.where(take, jump | lands, c.jump),
         mark=c.mark + (take & passed),
@@ -309,6 +345,7 @@ def _turn(
         row_step=row_step,
         ends=ends,
         ends_anchor=ends_anchor,
+        jumps=jumps,
     )
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive, resolution
 
 # Rows interpolated at once: bounds the memory of a vmapped solve.
-ROWS_AT_ONCE = 128
+ROWS_AT_ONCE = 64
 
 
 class Rows(NamedTuple):
@@ -94,7 +94,7 @@ def _forward(
         scheme, y0, args, times, setup.first_step, setup.allowed, max_steps, record
     )
     if outcome.row_time is None:
-        states = jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state)
+        states = (jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state), None)
         starts = jnp.stack([times.start, outcome.time])
     else:
         starts, states = outcome.row_time, outcome.row_state
@@ -124,19 +124,34 @@ def _rows(
     if saves.shape[0] > 2:
 
         def step(row: tuple[Array, Array, PyTree]) -> PyTree:
-            t0, t1, y = row
-            return scheme.fresh_step(t0, t1, y, args)
+            t0, t1, state = row
+            return _step(scheme, args, t0, t1, state, jnp.array(False))[0]
 
         def step_all(states: PyTree) -> PyTree:
             ends = jnp.where(inside, saves, starts)
             return jax.lax.map(step, (starts, ends, states), batch_size=ROWS_AT_ONCE)
 
-        # Rows that need no step must not see one: their state may be where the field is not finite.
-        filled = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
-        stepped = jax.lax.cond(eqxi.unvmap_any(jnp.any(inside)), step_all, lambda s: s, filled)
-        states = jax.tree.map(lambda a, b: jnp.where(_like(inside, a), a, b), stepped, states)
-    saved = jax.tree.map(lambda s: jnp.where(_like(reached, s), s, jnp.nan), states)
+        # Rows that need no step must not see one: the field may not be finite where they are.
+        safe = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
+        stepped = jax.lax.cond(
+            eqxi.unvmap_any(jnp.any(inside)), step_all, lambda states: states[0], safe
+        )
+        y = jax.tree.map(lambda a, b: jnp.where(_like(inside, a), a, b), stepped, states[0])
+    else:
+        y = states[0]
+    saved = jax.tree.map(lambda s: jnp.where(_like(reached, s), s, jnp.nan), y)
     return Rows(saved, state, time)
+
+
+def _step(
+    scheme: Scheme, args: Any, t0: Array, t1: Array, state: PyTree, jump: Array
+) -> tuple[PyTree, Any]:
+    """One step from (y, memory); a solver without memory starts afresh."""
+    y, memory = state
+    if not scheme.remembers:
+        memory, jump = scheme.begin(t0, t1, y, args), jnp.array(True)
+    y, _, memory, _ = scheme.step(t0, t1, y, args, memory, jump)
+    return y, (memory if scheme.remembers else None)
 
 
 def _like(mask: Array, leaf: Array) -> Array:
@@ -156,54 +171,51 @@ def _replay(
     scheme = eqx.tree_at(lambda s: s.solver, scheme, _scannable(scheme.solver))
     anchors = times.anchors()
     ends = grid.ends + (anchors - jax.lax.stop_gradient(anchors))[grid.anchor]
-    state, history = _steps(scheme, args, times.start, ends, grid.count, y0)
+    memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
+    start = (y0, memory)
+    state, history = _steps(scheme, args, times.start, ends, grid, start)
     marks = jnp.concatenate([times.start[None], ends])
     states = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest])[grid.row_step], y0, history
+        lambda first, rest: jnp.concatenate([first[None], rest])[grid.row_step], start, history
     )
-    return _rows(
-        scheme, args, times, marks[grid.row_step], states, outcome, state, marks[grid.count]
-    )
+    starts = marks[grid.row_step]
+    return _rows(scheme, args, times, starts, states, outcome, state[0], marks[grid.count])
 
 
 def _steps(
-    scheme: Scheme,
-    args: Any,
-    start: Array,
-    ends: Float[Array, " N"],
-    count: Array,
-    y0: PyTree,
+    scheme: Scheme, args: Any, t0: Array, ends: Float[Array, " N"], grid: Grid, start: PyTree
 ) -> tuple[PyTree, PyTree]:
-    """Take `count` steps ending at `ends`; the last state, and the state after every step.
+    """Take the recorded steps, ending at `ends`; the last state, and the state after each.
 
-    The scan skips whole chunks that no lane of a vmapped solve needs. Slots past `count` repeat
-    the first step and drop its result, so that no derivative meets a state out of reach.
+    The scan skips whole chunks that no lane of a vmapped solve needs. Slots past the last step
+    repeat the first one and drop its result, so that no derivative meets a state out of reach.
     """
-    used = jnp.arange(ends.shape[0]) < count
-    begins = jnp.where(used, jnp.concatenate([start[None], ends[:-1]]), start)
+    used = jnp.arange(ends.shape[0]) < grid.count
+    begins = jnp.where(used, jnp.concatenate([t0[None], ends[:-1]]), t0)
     ends = jnp.where(used, ends, ends[0])
+    start = jax.tree.map(jnp.asarray, start)
 
-    @partial(jax.checkpoint, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
-    def step(t0: Array, t1: Array, y: PyTree) -> PyTree:
-        return scheme.fresh_step(t0, t1, y, args)
+    @partial(jax.checkpoint, prevent_cse=False)
+    def step(t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
+        return _step(scheme, args, t0, t1, state, jump)
 
-    def one(y: PyTree, slot: tuple[Array, Array, Array]) -> tuple[PyTree, PyTree]:
-        t0, t1, use = slot
+    def one(state: PyTree, slot: tuple[Array, Array, Array, Array]) -> tuple[PyTree, PyTree]:
+        t0, t1, use, jump = slot
         pick = partial(jax.tree.map, lambda a, b: jnp.where(use, a, b))
-        y = pick(step(t0, t1, pick(y, y0)), y)
-        return y, y
+        state = pick(step(t0, t1, pick(state, start), jump), state)
+        return state, state
 
-    def chunk(y: PyTree, slots: tuple[Array, Array, Array]) -> tuple[PyTree, PyTree]:
-        def skip(y: PyTree) -> tuple[PyTree, PyTree]:
-            return y, jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), y)
+    def chunk(state: PyTree, slots: Any) -> tuple[PyTree, PyTree]:
+        def skip(state: PyTree) -> tuple[PyTree, PyTree]:
+            return state, jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), state)
 
-        def take(y: PyTree) -> tuple[PyTree, PyTree]:
-            return jax.lax.scan(one, y, slots)
+        def take(state: PyTree) -> tuple[PyTree, PyTree]:
+            return jax.lax.scan(one, state, slots)
 
-        return jax.lax.cond(eqxi.unvmap_any(slots[2]), take, skip, y)
+        return jax.lax.cond(eqxi.unvmap_any(slots[2]), take, skip, state)
 
-    slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used))
-    last, history = jax.lax.scan(chunk, y0, slots)
+    slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used, grid.jump))
+    last, history = jax.lax.scan(chunk, start, slots)
     return last, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), history)
 
 

@@ -205,7 +205,8 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
     start_args = intervals(args, times.start)
     rate = field(times.start, y0, start_args)
     valid = _valid(values, ts * direction)
-    started = valid & in_range & jnp.all(jnp.isfinite(rate))
+    L = system.lagrangian(times.start * direction, values.q0, values.v0, params)
+    started = valid & in_range & jnp.all(jnp.isfinite(rate)) & jnp.isfinite(L)
     setup = Setup(values.step, started, scheme_arrays)
     rows, outcome = solve(y0, args, times, setup, scheme_static, plan.max_steps)
 

@@ -1,0 +1,59 @@
+"""Reference files made on the spot: one from a closed form, one from a replayed motion."""
+
+import numpy as np
+
+from systems._check import Motion
+from systems._entry import Entry
+
+
+def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2.5)):
+    """A file of mass_spring by its closed form, x = x0 cos(w s) + (v0/w) sin(w s), s = t - t0."""
+    w, s = np.sqrt(k / m), np.asarray(times) - times[0]
+    x = x0 * np.cos(w * s) + v0 / w * np.sin(w * s)
+    v = v0 * np.cos(w * s) - x0 * w * np.sin(w * s)
+    T, V = 0.5 * m * v**2, 0.5 * k * x**2
+    rows = {
+        "q": x[:, None],
+        "v": v[:, None],
+        "a": (-k / m * x)[:, None],
+        "energy.T": T,
+        "energy.V": V,
+        "energy.E": T + V,
+        "extras.H": T + V,
+        "extras.p": (m * v)[:, None],
+        "extras.p_dot": (-k * x)[:, None],
+    }
+    return _file("mass_spring", ["x"], {"m": m, "k": k}, times, rows)
+
+
+def recorded(entry: Entry, times, motion: Motion):
+    """A file of the entry's example that holds every quantity of an already replayed motion."""
+    rows = {name: np.asarray(values) for name, values in motion.rows.items()}
+    return _file(entry.name, list(entry.coordinates), dict(entry.example.params), times, rows)
+
+
+def _file(name, coordinates, params, times, rows):
+    case = {
+        "name": "base",
+        "description": "made on the spot",
+        "params": params,
+        "times": list(times),
+        "u": None,
+        "lambda": None,
+        "constraint_force": None,
+        "energy": {},
+        "invariants": {},
+        "extras": {},
+        "error_estimate": {"q": 1e-14, "v": 1e-14},
+    }
+    for field, values in rows.items():
+        group, _, member = field.rpartition(".")
+        (case[group] if group else case)[member] = values.tolist()
+    return {
+        "schema": "jaxlag-reference/1",
+        "system": name,
+        "coordinates": coordinates,
+        "quasi_velocities": [],
+        "constraints": [],
+        "cases": [case],
+    }

@@ -1,0 +1,155 @@
+"""The check: right files pass, and no number of a file can be wrong unnoticed."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from _files import harmonic, recorded
+from _paths import REFERENCE
+
+import jaxlag as jl
+from systems.__main__ import main
+from systems._catalogue import ENTRIES
+from systems._check import compare, replay, replay_case
+from systems._reference import load, read
+
+
+def written(path, raw):
+    path.write_text(json.dumps(raw))
+    return str(path)
+
+
+def places(raw, path=()):
+    """Paths of keys to every number of a parsed file."""
+    if isinstance(raw, dict | list):
+        items = raw.items() if isinstance(raw, dict) else enumerate(raw)
+        for key, item in items:
+            yield from places(item, (*path, key))
+    elif isinstance(raw, float) and not isinstance(raw, bool):
+        yield path
+
+
+def nudged(raw, path):
+    """A copy of the file with one number moved by 1e-6, relative and absolute."""
+    raw = json.loads(json.dumps(raw), parse_int=float)
+    *parents, last = path
+    target = raw
+    for key in parents:
+        target = target[key]
+    target[last] += 1e-6 * (1 + abs(target[last]))
+    return raw
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_the_reference_file_is_reproduced(name):
+    path = REFERENCE / f"{name}.json"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    reference = load(path)
+    for case in reference.cases:
+        motion = replay_case(reference.entry, case)
+        assert motion.status == jl.Status.ok
+        for deviation in compare(case, motion.rows):
+            assert deviation.ok, f"{case.name}: {deviation}"
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_every_wrong_number_is_found(name):
+    """Each number of each compared field in turn, the first rows of derived fields included."""
+    entry = ENTRIES[name]
+    times = np.linspace(0.0, 2.0, 6)
+    params = {name: np.asarray(value) for name, value in entry.example.params.items()}
+    start = (np.asarray(entry.example.q0), np.asarray(entry.example.v0))
+    motion = replay(entry, params, times, *start)
+    raw = json.loads(json.dumps(recorded(entry, times, motion)), parse_int=float)
+    (case,) = read(raw).cases
+    assert all(deviation.size == 0 for deviation in compare(case, motion.rows))
+
+    compared = [
+        path for path in places(raw) if path[2] not in ("params", "times", "error_estimate")
+    ]
+    assert len(compared) == sum(rows.size for rows in motion.rows.values())
+    for path in compared:
+        field = ".".join(key for key in path[2:] if isinstance(key, str))
+        row = next(key for key in path[2:] if isinstance(key, int))
+        (case,) = read(nudged(raw, path)).cases
+        outside = [deviation for deviation in compare(case, motion.rows) if not deviation.ok]
+        assert [(deviation.field, deviation.row) for deviation in outside] == [(field, row)]
+
+
+def test_a_right_file_passes(tmp_path, capsys):
+    assert main(["check", written(tmp_path / "right.json", harmonic())]) == 0
+    line, summary = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(
+        r"ok +right\.json +base +worst \d\.\de-\d\d of 1e-\d\d in \S+, row \d", line
+    )
+    assert summary == "files 1, cases 1: all within tolerance"
+
+
+@pytest.mark.parametrize(
+    "path", list(places(harmonic())), ids=lambda path: ".".join(map(str, path[2:]))
+)
+def test_a_wrong_number_fails_the_command(path, tmp_path, capsys):
+    """Each number of a file that is right in turn, the start and the parameters included."""
+    status = main(["check", written(tmp_path / "wrong.json", nudged(harmonic(), path))])
+    out = capsys.readouterr().out
+    if path[2] == "error_estimate":
+        assert status == 0
+        return
+    assert status == 1
+    assert out.startswith("FAIL  wrong.json")
+    assert out.splitlines()[-1] == "files 1, cases 1: 1 out of tolerance"
+    is_input = path[2] in ("params", "times") or path[2:4] in (("q", 0), ("v", 0))
+    if not is_input:
+        field = ".".join(key for key in path[2:] if isinstance(key, str))
+        row = next(key for key in path[2:] if isinstance(key, int))
+        assert f"in {field}, row {row}; out of tolerance: {field}\n" in out
+
+
+def test_other_cases_of_a_known_system_pass(tmp_path):
+    """Any parameters, start, times and number of rows: a late start, backwards, a single row."""
+    variants = [
+        harmonic(m=0.2, k=55.0, x0=-1.5, v0=3.0, times=(0.0, 0.5, 0.6, 2.0, 4.0, 6.0)),
+        harmonic(times=(7.5, 7.75, 9.0, 11.0, 11.5, 12.0)),
+        harmonic(times=(1.0, 0.5, -2.0)),
+        harmonic(times=(3.0,)),
+    ]
+    files = [written(tmp_path / f"{i}.json", raw) for i, raw in enumerate(variants)]
+    assert main(["check", *files]) == 0
+
+
+def test_new_numbers_do_not_compile_again():
+    """One compilation per system and number of rows."""
+    entry = ENTRIES["mass_spring"]
+    (first,) = read(harmonic()).cases
+    (second,) = read(harmonic(m=2.0, x0=-0.1, times=(0.0, 0.1, 0.2, 0.5, 0.7, 1.0))).cases
+    replay_case(entry, first)
+    count = replay._cache_size()
+    replay_case(entry, second)
+    assert replay._cache_size() == count
+
+
+def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
+    """A negative stiffness explodes: the file is right at its start and nowhere else."""
+    raw = harmonic()
+    raw["cases"][0]["params"]["k"] = -1e9
+    assert main(["check", written(tmp_path / "wrong.json", raw)]) == 1
+    assert capsys.readouterr().out.startswith("FAIL  wrong.json")
+
+
+def test_a_refused_file_does_not_hide_the_others(tmp_path, capsys):
+    bad = harmonic()
+    bad["cases"][0]["energy"]["W"] = [0.0] * 6
+    files = [
+        written(tmp_path / "bad.json", bad),
+        written(tmp_path / "right.json", harmonic()),
+        str(tmp_path / "none.json"),
+    ]
+    assert main(["check", *files]) == 1
+    captured = capsys.readouterr()
+    first, second = captured.err.splitlines()
+    assert first.startswith(f"{files[0]}: case 'base': energy must hold known fields only")
+    assert second == f"{files[2]}: it must be readable, but No such file or directory."
+    assert captured.out.splitlines()[0].startswith("ok    right.json")
+    assert captured.out.splitlines()[-1] == "files 3, cases 1: all within tolerance, 2 refused"
