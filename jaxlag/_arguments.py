@@ -83,25 +83,29 @@ def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array
     return vectors[0].astype(dtype), vectors[1].astype(dtype)
 
 
+def _number(x: Any, dtype: Any) -> Any:
+    """An array of this dtype; a numpy one where x is concrete, which costs no dispatch."""
+    return jnp.asarray(x, dtype) if isinstance(x, jax.core.Tracer) else np.asarray(x, dtype)
+
+
 def check_times(ts: Any) -> tuple[Array, int | None]:
     if ts is None:
         raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
-    ts = jnp.asarray(ts, jnp.result_type(float))
+    ts = _number(ts, jnp.result_type(float))
     if ts.ndim != 1 or ts.shape[0] < 2:
         raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}")
     if not concrete(ts):
         return ts, None
-    values = np.asarray(ts)
-    if not np.all(np.isfinite(values)):
-        raise bad("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(values)))}] was not")
-    steps = np.diff(values)
-    direction = 1 if values[-1] >= values[0] else -1
+    if not np.all(np.isfinite(ts)):
+        raise bad("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(ts)))}] was not")
+    steps = np.diff(ts)
+    direction = 1 if ts[-1] >= ts[0] else -1
     if not np.all(steps * direction > 0):
         i = int(np.argmin(steps * direction > 0))
         raise bad(
             "ts",
             "be strictly monotone",
-            f"ts[{i}] = {values[i]}, ts[{i + 1}] = {values[i + 1]}",
+            f"ts[{i}] = {ts[i]}, ts[{i + 1}] = {ts[i + 1]}",
             "Sort the times and drop repeated ones.",
         )
     return ts, direction
@@ -111,8 +115,8 @@ def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Array, 
     if dt is not None and (rtol is not None or atol is not None):
         raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
     defaults = default_tolerances(dtype)
-    rtol = jnp.asarray(defaults[0] if rtol is None else rtol, dtype)
-    atol = jnp.asarray(defaults[1] if atol is None else atol, dtype)
+    rtol = _number(defaults[0] if rtol is None else rtol, dtype)
+    atol = _number(defaults[1] if atol is None else atol, dtype)
     for name, x in (("rtol", rtol), ("atol", atol)):
         if x.ndim != 0:
             raise bad(name, "be a number", f"its shape was {x.shape}")
@@ -144,7 +148,7 @@ def check_step(dt: Any, dt0: Any) -> Array | None:
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
     if step is None:
         return None
-    step = jnp.asarray(step, jnp.result_type(float))
+    step = _number(step, jnp.result_type(float))
     if step.ndim != 0:
         raise bad(name, "be a number", f"its shape was {step.shape}")
     if concrete(step) and not (np.isfinite(step) and step > 0):

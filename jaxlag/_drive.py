@@ -316,7 +316,7 @@ def _turn(
         if row_step is not None:
             row_step = _write(_write(row_step, first, c.accepted), last, accepted)
 
-    passed = t1 >= goal - resolution(goal)
+    passed = t1 >= goal - slack
     own_anchor = jnp.zeros_like(c.anchor) if scheme.controller is None else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
     ends, ends_anchor, jumps = c.ends, c.ends_anchor, c.jumps

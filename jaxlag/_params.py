@@ -25,6 +25,11 @@ class _Frozen:
         return f"{self.array.dtype}{list(self.array.shape)}"
 
 
+def is_array(leaf: Any) -> bool:
+    """Whether a leaf is a numpy or JAX array, a tracer included."""
+    return eqx.is_array(leaf) or isinstance(leaf, np.ndarray)
+
+
 def _is_traced(leaf: Any) -> bool:
     if isinstance(leaf, jax.core.Tracer):
         return True
@@ -44,7 +49,7 @@ def split(tree: Any) -> tuple[Any, Any]:
     def static_half(leaf: Any) -> Any:
         if _is_traced(leaf):
             return None
-        return _Frozen(leaf) if eqx.is_array(leaf) or isinstance(leaf, np.ndarray) else leaf
+        return _Frozen(leaf) if is_array(leaf) else leaf
 
     return jax.tree.map(traced_half, tree), jax.tree.map(static_half, tree)
 

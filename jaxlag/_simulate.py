@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,10 +20,11 @@ from jaxlag._arguments import (
     check_times,
     check_tolerances,
 )
+from jaxlag._diagnosis import diagnose, start_finite, values_allowed
 from jaxlag._drive import Scheme, Times
+from jaxlag._dynamics import Arguments, Dynamics
 from jaxlag._errors import SimulationError
-from jaxlag._inputs import all_knots, check_inputs, common_range, evaluate, locate
-from jaxlag._linalg import factor_mass, first_unhealthy
+from jaxlag._inputs import all_knots, check_inputs, common_range
 from jaxlag._methods import choose
 from jaxlag._replay import Setup, solve
 from jaxlag._solution import Solution, over_rows
@@ -38,10 +38,9 @@ class _Plan(NamedTuple):
     """What the compiled program is keyed by."""
 
     system: System
-    scheme: _params.Static
     params: _params.Static
     inputs: _params.Static
-    adaptive: bool
+    scheme: _params.Static
     direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
     max_steps: int
     save: tuple[str, ...]
@@ -59,15 +58,6 @@ class _Values(NamedTuple):
     rtol: Array
     atol: Array
     step: Array | None  # dt or dt0
-
-
-class _Motion(diffrax.ODETerm):
-    """The vector field; increments keep the state's dtype where time has another."""
-
-    dtype: Any = eqx.field(static=True)
-
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
-        return (t1 - t0).astype(self.dtype)
 
 
 def simulate(
@@ -145,176 +135,108 @@ def simulate(
     rtol, atol = check_tolerances(rtol, atol, dt, q0.dtype)
     step = check_step(dt, dt0)
     params_traced, params_static = _params.split(params)
-    solver, controller = choose(method, dt is None, rtol, atol)
-    scheme_arrays, scheme_static = eqx.partition((solver, controller), eqx.is_array)
-    inputs_arrays, inputs_static = eqx.partition(inputs, eqx.is_array)
-    plan = _Plan(
-        system,
-        _params.Static(scheme_static),
-        _params.Static(params_static),
-        _params.Static(inputs_static),
-        dt is None,
-        direction,
-        max_steps,
-        tuple(save),
+    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    scheme = choose(method, dt is None, rtol, atol)
+    scheme_traced, scheme_static = eqx.partition(scheme, _params.is_array)
+    keys = (_params.Static(x) for x in (params_static, inputs_static, scheme_static))
+    plan = _Plan(system, *keys, direction, max_steps, tuple(save))
+    values = _Values(
+        q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step
     )
     _xla.warn_if_late()
-    values = _Values(q0, v0, ts, params_traced, inputs_arrays, scheme_arrays, rtol, atol, step)
     motion = _simulate(plan, values)
     if throw and not isinstance(motion.status, jax.core.Tracer):
         _raise_unless_ok(motion)
     return motion
 
 
-@partial(jax.jit, static_argnums=0)
-def _simulate(plan: _Plan, values: _Values) -> Solution:
-    """The compiled program."""
-    system, n, terms = plan.system, plan.system.size, plan.system.terms
-    inputs = eqx.combine(values.inputs, plan.inputs.tree)
-    ts = values.ts
-    sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
-    direction = sigma if plan.direction is None else plan.direction
-    params = _params.join(values.params, plan.params.tree)
-    check_declaration(system, params, inputs, ts[0], values.q0, values.v0)
+class Problem(NamedTuple):
+    """A start, the equations and the way of solving them, ready to be solved."""
 
-    def split(args: Any) -> tuple[Any, Any]:
-        params = _params.join(args[0], plan.params.tree)
-        return params, eqx.combine(args[1], plan.inputs.tree)
+    dynamics: Dynamics
+    y0: Array
+    args: Arguments
+    times: Times
+    setup: Setup
+    scheme: Any  # static half
+    max_steps: int
+    valid: Array
+    in_range: Array
+    finite: Array
 
-    def field(tau: Array, y: Array, args: Any) -> Array:
-        """d(q, v)/dtau = sigma (v, a)."""
-        params, inputs = split(args)
-        t, q, v = tau * direction, y[:n], y[n:]
-        values = evaluate(inputs, t, q, v, params, args[2])
-        a = terms.acceleration(t, q, v, params, values)
-        rate = jnp.concatenate([v, a])
-        return rate if plan.direction == 1 else rate * jnp.asarray(direction, rate.dtype)
 
-    def intervals(args: Any, tau: Array) -> Any:
-        _, inputs = split(args)
-        return (args[0], args[1], locate(inputs, tau * direction))
+def pose(plan: _Plan, values: _Values) -> Problem:
+    """The problem that a plan and its values describe."""
+    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction)
+    args = dynamics.arguments(values.params, values.inputs, values.ts)
+    params, inputs = dynamics.given(args)
+    check_declaration(plan.system, params, inputs, values.ts[0], values.q0, values.v0)
 
     y0 = jnp.concatenate([values.q0, values.v0])
     solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
-    scheme = Scheme(solver, controller, _Motion(field, y0.dtype), intervals)
-    scheme_arrays, scheme_static = eqx.partition(scheme, eqx.is_array)
-    args = (values.params, values.inputs, None)
-    times, in_range = _times(inputs, ts * direction, direction)
-
-    # Status at the start; nothing is integrated unless it is ok.
-    start_args = intervals(args, times.start)
-    rate = field(times.start, y0, start_args)
-    valid = _valid(values, ts * direction)
-    L = system.lagrangian(times.start * direction, values.q0, values.v0, params)
-    started = valid & in_range & jnp.all(jnp.isfinite(rate)) & jnp.isfinite(L)
-    setup = Setup(values.step, started, scheme_arrays)
-    rows, outcome = solve(y0, args, times, setup, scheme_static, plan.max_steps)
-
-    # What failed, and where: looked up at the last good state and at the end of the last try.
-    tried = outcome.state + (outcome.tried - outcome.time).astype(y0.dtype) * field(
-        outcome.time, outcome.state, intervals(args, outcome.time)
+    scheme = Scheme(solver, controller, dynamics.term(y0.dtype), dynamics.within)
+    scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
+    times, in_range = _times(dynamics, args, inputs, values.ts)
+    valid = values_allowed(y0, times.saves, values.rtol, values.atol, values.step)
+    finite = start_finite(dynamics, times.start, y0, args)
+    setup = Setup(values.step, valid & in_range & finite, scheme_traced)
+    return Problem(
+        dynamics, y0, args, times, setup, scheme_static, plan.max_steps, valid, in_range, finite
     )
-    status = jnp.where(started, outcome.status, int(Status.nonfinite))
-    short = (status == int(Status.ok)) & (times.stop < ts[-1] * direction)
-    status = jnp.where(short | ~in_range, int(Status.input_range), status)
-    status = jnp.where(valid, status, int(Status.bad_value)).astype(jnp.int32)
-    mass, worst = _culprits(plan, values, field, intervals, outcome, tried, args)
-    status = jnp.where(
-        (status == int(Status.nonfinite)) & (mass >= 0), int(Status.mass_singular), status
-    )
-    where = _where(status, mass, worst, y0, n)
 
-    q, v = rows.saved[:, :n], rows.saved[:, n:]
+
+@partial(jax.jit, static_argnums=0)
+def _simulate(plan: _Plan, values: _Values) -> Solution:
+    """The compiled program: pose, solve, diagnose, derive what `save` names."""
+    problem = pose(plan, values)
+    dynamics, args, times, y0 = problem.dynamics, problem.args, problem.times, problem.y0
+    rows, outcome = solve(y0, args, times, problem.setup, problem.scheme, plan.max_steps)
+    status, where = diagnose(
+        dynamics, args, times, outcome, y0, problem.valid, problem.in_range, problem.finite
+    )
+    q, v = dynamics.parts(rows.saved)
+    params, inputs = dynamics.given(args)
     saved = {
-        name: over_rows(name, system, ts, q, v, *split(args)) for name in plan.save
+        name: over_rows(name, plan.system, values.ts, q, v, params, inputs) for name in plan.save
     }
     return Solution(
-        system=system,
-        ts=ts,
+        system=plan.system,
+        ts=values.ts,
         q=q,
         v=v,
         status=status,
-        last_time=rows.time * direction,
-        last_state=(rows.state[:n], rows.state[n:]),
+        last_time=dynamics.mirror(rows.time, args),
+        last_state=dynamics.parts(rows.state),
         where=where,
         stats={
             "accepted": outcome.accepted,
             "rejected": outcome.attempted - outcome.accepted,
         },
         saved=saved,
-        _inputs=inputs,
+        inputs=inputs,
         _params=values.params,
         _static=plan.params,
     )
 
 
-def _times(inputs: Any, saves: Array, direction: Any) -> tuple[Times, Array]:
+def _times(
+    dynamics: Dynamics, args: Arguments, inputs: Mapping[str, Any], ts: Array
+) -> tuple[Times, Array]:
     """Anchors of the grid in tau, and whether the inputs are defined at the start."""
-    knots = all_knots(inputs)
-    knots = None if knots is None else jnp.sort(knots.astype(saves.dtype) * direction)
-    span = common_range(inputs)
+
+    def mirror(time: Array) -> Array:
+        return dynamics.mirror(time.astype(ts.dtype), args)
+
+    saves, knots, span = mirror(ts), all_knots(inputs), common_range(inputs)
+    knots = None if knots is None else jnp.sort(mirror(knots))
     if span is None:
         return Times(saves[0], saves[-1], knots, saves), jnp.array(True)
-    ends = jnp.stack([x.astype(saves.dtype) * direction for x in span])
+    ends = jnp.stack([mirror(time) for time in span])
     first, last = jnp.min(ends), jnp.max(ends)
     stop = jnp.where(saves[-1] <= last, saves[-1], last)
     return Times(saves[0], stop, knots, saves), (first <= saves[0]) & (saves[0] <= last)
 
 
-def _valid(values: _Values, saves: Array) -> Array:
-    """Value checks of everything that may be traced; concrete values have raised already."""
-    eps = jnp.finfo(values.q0.dtype).eps
-    rtol, atol = values.rtol, values.atol
-    checks = [
-        jnp.all(jnp.isfinite(values.q0)) & jnp.all(jnp.isfinite(values.v0)),
-        jnp.all(jnp.isfinite(saves)) & jnp.all(saves[1:] > saves[:-1]),
-        (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & ((rtol == 0) | (rtol >= 10 * eps)),
-    ]
-    if values.step is not None:
-        checks.append(jnp.isfinite(values.step) & (values.step > 0))
-    return jnp.all(jnp.stack(checks))
-
-
-def _culprits(
-    plan: _Plan, values: _Values, field: Any, intervals: Any, outcome: Any, tried: Array, args: Any
-) -> tuple[Array, Array]:
-    """(coordinate without inertia, coordinate with non-finite or largest acceleration), or -1."""
-    n = plan.system.size
-    params = _params.join(values.params, plan.params.tree)
-
-    def at(tau: Array, y: Array) -> tuple[Array, Array]:
-        t = tau if plan.direction == 1 else tau * jnp.sign(values.ts[-1] - values.ts[0])
-        M = plan.system.terms.mass(t, y[:n], y[n:], params)
-        a = jnp.abs(field(tau, y, intervals(args, tau))[n:])
-        worst = jnp.where(
-            jnp.all(jnp.isfinite(a)), jnp.argmax(a), jnp.argmin(jnp.isfinite(a))
-        )
-        return first_unhealthy(factor_mass(M)), worst.astype(jnp.int32)
-
-    last_mass, last_worst = at(outcome.time, outcome.state)
-    tried_mass, tried_worst = at(outcome.tried, tried)
-    usable = jnp.all(jnp.isfinite(tried))
-    mass = jnp.where(last_mass >= 0, last_mass, jnp.where(usable, tried_mass, -1))
-    return mass, jnp.where(usable & (last_mass < 0), tried_worst, last_worst)
-
-
-def _where(status: Array, mass: Array, worst: Array, y0: Array, n: int) -> Array:
-    """Index of the coordinate that the status concerns, -1 if it concerns none."""
-    bad_start = ~jnp.isfinite(y0)
-    start = jnp.where(jnp.any(bad_start), jnp.argmax(bad_start) % n, -1)
-    where = jnp.full((), -1, jnp.int32)
-    for kind, index in (
-        (Status.bad_value, start),
-        (Status.mass_singular, mass),
-        (Status.nonfinite, worst),
-        (Status.step_below_resolution, worst),
-        (Status.implicit_solve_failed, worst),
-    ):
-        where = jnp.where(status == int(kind), index, where)
-    return where.astype(jnp.int32)
-
-
 def _raise_unless_ok(motion: Solution) -> None:
-    statuses = np.asarray(motion.status)
-    if statuses.ndim == 0 and statuses != int(Status.ok):
+    if np.ndim(motion.status) == 0 and int(motion.status) != int(Status.ok):
         raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

@@ -58,6 +58,7 @@ class Solution(eqx.Module):
         where: index of the coordinate that a failure concerns, -1 if none.
         stats: counts: "accepted" and "rejected" steps.
         saved: quantities named in `save=`, by name.
+        inputs: the inputs of this motion, by name.
     """
 
     system: System
@@ -70,7 +71,7 @@ class Solution(eqx.Module):
     where: Int[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
     saved: dict[str, Array]
-    _inputs: Any
+    inputs: dict[str, Any]
     _params: Any
     _static: _params.Static = eqx.field(static=True)
 
@@ -78,11 +79,6 @@ class Solution(eqx.Module):
     def params(self) -> Any:
         """The params of this motion, numbers as arrays."""
         return _params.join(self._params, self._static.tree)
-
-    @property
-    def inputs(self) -> dict[str, Any]:
-        """The inputs of this motion, by name."""
-        return self._inputs
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, shape (s, *its shape)."""
@@ -147,7 +143,7 @@ class Solution(eqx.Module):
         if name in self.saved:
             return self.saved[name]
         traced, static = eqx.partition(
-            (self.ts, self.q, self.v, self._params, self._inputs), eqx.is_array
+            (self.ts, self.q, self.v, self._params, self.inputs), eqx.is_array
         )
         key = _params.Static(static)
         return _derived(name, self.system, self._static, key, self.ts.ndim - 1, traced)

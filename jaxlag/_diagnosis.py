@@ -1,0 +1,102 @@
+"""The status of a trajectory and the coordinate it concerns, inside the compiled program."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._drive import Outcome, Times
+from jaxlag._dynamics import Arguments, Dynamics
+from jaxlag._linalg import factor_mass, first_unhealthy
+from jaxlag._status import Status
+
+
+def values_allowed(
+    y0: Array, saves: Array, rtol: Any, atol: Any, step: Array | None
+) -> Bool[Array, ""]:
+    """What concrete values have raised about already, for values that are traced."""
+    floor = 10 * jnp.finfo(y0.dtype).eps
+    checks = [
+        jnp.all(jnp.isfinite(y0)),
+        jnp.all(jnp.isfinite(saves)) & jnp.all(saves[1:] > saves[:-1]),
+        (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & ((rtol == 0) | (rtol >= floor)),
+    ]
+    if step is not None:
+        checks.append(jnp.isfinite(step) & (step > 0))
+    return jnp.all(jnp.stack([jnp.asarray(check) for check in checks]))
+
+
+def start_finite(
+    dynamics: Dynamics, tau: Float[Array, ""], y0: Array, args: Arguments
+) -> Bool[Array, ""]:
+    """Whether L and the accelerations are finite at the start."""
+    (q, v), (params, _) = dynamics.parts(y0), dynamics.given(args)
+    L = dynamics.system.lagrangian(dynamics.mirror(tau, args), q, v, params)
+    a = dynamics.acceleration(tau, y0, dynamics.within(args, tau))
+    return jnp.isfinite(L) & jnp.all(jnp.isfinite(a))
+
+
+def diagnose(
+    dynamics: Dynamics,
+    args: Arguments,
+    times: Times,
+    outcome: Outcome,
+    y0: Array,
+    valid: Bool[Array, ""],
+    in_range: Bool[Array, ""],
+    finite: Bool[Array, ""],
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """(status, index of the coordinate it concerns or -1).
+
+    A failed step is explained by the state it started from and, if that is sound, by an Euler
+    step to where it was to end.
+
+    Args:
+        dynamics: equations of motion.
+        args: outside any step.
+        times: where integration was to go, and to stop.
+        outcome: where it went.
+        y0: start.
+        valid: whether all values were allowed.
+        in_range: whether the inputs were defined at the start.
+        finite: whether L and a were finite at the start.
+    """
+    status = jnp.where(finite, outcome.status, int(Status.nonfinite))
+    short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
+    status = jnp.where(short | ~in_range, int(Status.input_range), status)
+    status = jnp.where(valid, status, int(Status.bad_value))
+
+    args = dynamics.within(args, outcome.time)
+    step = (outcome.tried - outcome.time).astype(y0.dtype)
+    tried = outcome.state + step * dynamics(outcome.time, outcome.state, args)
+    sound = jnp.all(jnp.isfinite(tried))
+    mass, worst = _culprits(dynamics, outcome.time, outcome.state, args)
+    tried_mass, tried_worst = _culprits(dynamics, outcome.tried, tried, args)
+    mass = jnp.where(sound & (mass < 0), tried_mass, mass)
+    worst = jnp.where(sound, tried_worst, worst)
+
+    singular = (status == int(Status.nonfinite)) & (mass >= 0)
+    status = jnp.where(singular, int(Status.mass_singular), status)
+    start_faults = ~jnp.isfinite(y0)
+    start = jnp.where(jnp.any(start_faults), jnp.argmax(start_faults) % dynamics.system.size, -1)
+    concerns = {
+        Status.bad_value: start,
+        Status.mass_singular: mass,
+        Status.nonfinite: worst,
+        Status.step_below_resolution: worst,
+        Status.implicit_solve_failed: worst,
+    }
+    where = jnp.full((), -1)
+    for kind, index in concerns.items():
+        where = jnp.where(status == int(kind), index, where)
+    return status.astype(jnp.int32), where.astype(jnp.int32)
+
+
+def _culprits(
+    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """(coordinate without inertia or -1, coordinate of non-finite or else largest |a|)."""
+    a = jnp.abs(dynamics.acceleration(tau, y, args))
+    finite = jnp.isfinite(a)
+    worst = jnp.where(jnp.all(finite), jnp.argmax(a), jnp.argmin(finite))
+    return first_unhealthy(factor_mass(dynamics.mass(tau, y, args))), worst

@@ -1,0 +1,103 @@
+"""The equations of motion in first-order form, as solvers see them."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag import _params
+from jaxlag._inputs import evaluate, locate
+from jaxlag._system import System
+
+
+class Arguments(NamedTuple):
+    """What the vector field depends on besides time and state; all leaves are arrays."""
+
+    params: Any
+    inputs: Any
+    sigma: Float[Array, ""] | None  # direction of time where it is traced
+    intervals: Any  # table interval of every input, fixed throughout a step
+
+
+class Dynamics(eqx.Module):
+    """dy/dtau = sigma (v, a) with y = (q, v), tau = sigma t, M a + h = Q.
+
+    Attributes:
+        system: what moves.
+        params: static half of the params.
+        inputs: static half of the inputs.
+        direction: sigma, +1 or -1, where known while tracing; else None.
+    """
+
+    system: System
+    params: _params.Static = eqx.field(static=True)
+    inputs: _params.Static = eqx.field(static=True)
+    direction: int | None = eqx.field(static=True)
+
+    def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
+        """Arguments outside any step, from the traced halves of params and inputs."""
+        if self.direction is not None:
+            return Arguments(params, inputs, None, None)
+        sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
+        return Arguments(params, inputs, sigma, None)
+
+    def mirror(self, time: Array, args: Arguments) -> Array:
+        """Tau from t, and t from tau."""
+        if self.direction == 1:
+            return time
+        return -time if self.direction == -1 else time * args.sigma
+
+    def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
+        """(params, inputs) as the user passed them."""
+        return (
+            _params.join(args.params, self.params.tree),
+            eqx.combine(args.inputs, self.inputs.tree),
+        )
+
+    def within(self, args: Arguments, tau: Float[Array, ""]) -> Arguments:
+        """Arguments for a step around tau: every table read in the interval that holds tau."""
+        _, inputs = self.given(args)
+        return args._replace(intervals=locate(inputs, self.mirror(tau, args)))
+
+    def acceleration(
+        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
+    ) -> Float[Array, " n"]:
+        """a at (tau, y)."""
+        t, (q, v), (params, inputs) = self.mirror(tau, args), self.parts(y), self.given(args)
+        values = evaluate(inputs, t, q, v, params, args.intervals)
+        return self.system.terms.acceleration(t, q, v, params, values)
+
+    def mass(
+        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
+    ) -> Float[Array, "n n"]:
+        """M at (tau, y)."""
+        q, v = self.parts(y)
+        return self.system.terms.mass(self.mirror(tau, args), q, v, self.given(args)[0])
+
+    def __call__(
+        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
+    ) -> Float[Array, " 2*n"]:
+        """dy/dtau."""
+        rate = jnp.concatenate([self.parts(y)[1], self.acceleration(tau, y, args)])
+        if self.direction == 1:
+            return rate
+        return -rate if args.sigma is None else rate * args.sigma.astype(rate.dtype)
+
+    def parts(self, y: Float[Array, "*s 2*n"]) -> tuple[Array, Array]:
+        """(q, v) of y."""
+        return y[..., : self.system.size], y[..., self.system.size :]
+
+    def term(self, dtype: Any) -> diffrax.ODETerm:
+        """The vector field as diffrax takes it."""
+        return _Term(self.__call__, dtype)
+
+
+class _Term(diffrax.ODETerm):
+    """Increments keep the state's dtype where time has another."""
+
+    dtype: Any = eqx.field(static=True)
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return (t1 - t0).astype(self.dtype)
