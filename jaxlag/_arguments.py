@@ -88,7 +88,7 @@ def _number(x: Any, dtype: Any) -> Any:
     return jnp.asarray(x, dtype) if isinstance(x, jax.core.Tracer) else np.asarray(x, dtype)
 
 
-def check_times(ts: Any) -> tuple[Array, int | None]:
+def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
         raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number(ts, jnp.result_type(float))
@@ -111,7 +111,7 @@ def check_times(ts: Any) -> tuple[Array, int | None]:
     return ts, direction
 
 
-def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Array, Array]:
+def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Any, Any]:
     if dt is not None and (rtol is not None or atol is not None):
         raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
     defaults = default_tolerances(dtype)
@@ -142,7 +142,7 @@ def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Array, 
     return rtol, atol
 
 
-def check_step(dt: Any, dt0: Any) -> Array | None:
+def check_step(dt: Any, dt0: Any) -> Any:
     if dt is not None and dt0 is not None:
         raise bad("dt and dt0", "be given one at a time", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
@@ -156,7 +156,7 @@ def check_step(dt: Any, dt0: Any) -> Array | None:
     return step
 
 
-def check_range(inputs: Mapping[str, Any], ts: Array) -> None:
+def check_range(inputs: Mapping[str, Any], ts: Any) -> None:
     """Raise where concrete tables do not cover concrete times."""
     span = common_range(inputs)
     if span is None or not concrete(ts, *span):

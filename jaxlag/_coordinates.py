@@ -40,7 +40,9 @@ class Coordinates:
         names = [name for name, _ in items]
         for name in names:
             if names.count(name) > 1:
-                raise bad("coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times")
+                raise bad(
+                    "coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times"
+                )
         self.shapes: dict[str, tuple[int, ...]] = dict(items)
         self.size = sum(math.prod(shape) for shape in self.shapes.values())
 

@@ -1,19 +1,26 @@
 """The status of a trajectory and the coordinate it concerns, inside the compiled program."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._drive import Outcome, Times
+from jaxlag._drive import Outcome
 from jaxlag._dynamics import Arguments, Dynamics
 from jaxlag._linalg import factor_mass, first_unhealthy
+from jaxlag._replay import Problem
 from jaxlag._status import Status
 
 
-def values_allowed(
-    y0: Array, saves: Array, rtol: Any, atol: Any, step: Array | None
-) -> Bool[Array, ""]:
+class Start(NamedTuple):
+    """Whether a trajectory may start, and if not, why."""
+
+    valid: Array  # all values are allowed
+    in_range: Array  # the inputs are defined there
+    finite: Array  # L and the accelerations are finite there
+
+
+def values_allowed(y0: Array, saves: Array, rtol: Any, atol: Any, step: Any) -> Bool[Array, ""]:
     """What concrete values have raised about already, for values that are traced."""
     floor = 10 * jnp.finfo(y0.dtype).eps
     checks = [
@@ -37,36 +44,20 @@ def start_finite(
 
 
 def diagnose(
-    dynamics: Dynamics,
-    args: Arguments,
-    times: Times,
-    outcome: Outcome,
-    y0: Array,
-    valid: Bool[Array, ""],
-    in_range: Bool[Array, ""],
-    finite: Bool[Array, ""],
+    dynamics: Dynamics, problem: Problem, outcome: Outcome, begun: Start
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(status, index of the coordinate it concerns or -1).
 
     A failed step is explained by the state it started from and, if that is sound, by an Euler
     step to where it was to end.
-
-    Args:
-        dynamics: equations of motion.
-        args: outside any step.
-        times: where integration was to go, and to stop.
-        outcome: where it went.
-        y0: start.
-        valid: whether all values were allowed.
-        in_range: whether the inputs were defined at the start.
-        finite: whether L and a were finite at the start.
     """
-    status = jnp.where(finite, outcome.status, int(Status.nonfinite))
+    y0, times = problem.y0, problem.times
+    status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
     short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
-    status = jnp.where(short | ~in_range, int(Status.input_range), status)
-    status = jnp.where(valid, status, int(Status.bad_value))
+    status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
+    status = jnp.where(begun.valid, status, int(Status.bad_value))
 
-    args = dynamics.within(args, outcome.time)
+    args = dynamics.within(problem.args, outcome.time)
     step = (outcome.tried - outcome.time).astype(y0.dtype)
     tried = outcome.state + step * dynamics(outcome.time, outcome.state, args)
     sound = jnp.all(jnp.isfinite(tried))
@@ -86,10 +77,10 @@ def diagnose(
         Status.step_below_resolution: worst,
         Status.implicit_solve_failed: worst,
     }
-    where = jnp.full((), -1)
+    where = jnp.full((), -1, jnp.int32)
     for kind, index in concerns.items():
-        where = jnp.where(status == int(kind), index, where)
-    return status.astype(jnp.int32), where.astype(jnp.int32)
+        where = jnp.where(status == int(kind), index.astype(jnp.int32), where)
+    return status.astype(jnp.int32), where
 
 
 def _culprits(
@@ -98,5 +89,5 @@ def _culprits(
     """(coordinate without inertia or -1, coordinate of non-finite or else largest |a|)."""
     a = jnp.abs(dynamics.acceleration(tau, y, args))
     finite = jnp.isfinite(a)
-    worst = jnp.where(jnp.all(finite), jnp.argmax(a), jnp.argmin(finite))
+    worst = jnp.where(jnp.all(finite), jnp.argmax(a), jnp.argmin(finite)).astype(jnp.int32)
     return first_unhealthy(factor_mass(dynamics.mass(tau, y, args))), worst

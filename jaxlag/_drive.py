@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxlag._status import Status
 
-
 # The recorded grid is a whole number of chunks of this many steps.
 CHUNK = 64
 
@@ -91,9 +90,9 @@ class Scheme(eqx.Module):
 
 
 class Grid(NamedTuple):
-    """The accepted steps: step k ends at `ends[k]`, which moves with anchor `anchor[k]`."""
+    """The accepted steps: step k ends `offset[k]` after anchor `anchor[k]`, and moves with it."""
 
-    ends: Float[Array, " N"]
+    offset: Float[Array, " N"]
     anchor: Int[Array, " N"]
     jump: Bool[Array, " N"]  # whether step k starts where the vector field jumps
     row_step: Int[Array, " s"]  # row i is reached from the state after row_step[i] steps
@@ -111,6 +110,8 @@ class Outcome(NamedTuple):
     attempted: Int[Array, "..."]
     row_time: Float[Array, "s ..."] | None
     row_state: PyTree | None  # (y, solver memory where the solver remembers)
+    reached: Bool[Array, "s ..."]  # rows that were reached
+    inside: Bool[Array, "s ..."]  # rows that take one more step to reach
     grid: Grid | None
 
 
@@ -143,9 +144,7 @@ def resolution(t: Array) -> Array:
 
 
 def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
-    return jax.tree.map(
-        lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old
-    )
+    return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
 
 
 def _all_finite(y: PyTree, lanes: int) -> Array:
@@ -175,7 +174,7 @@ def _whole(scheme: Scheme, y: PyTree, memory: Any) -> PyTree:
     return (y, memory if scheme.remembers else None)
 
 
-def _buffer(size: int, like: PyTree, fill: float) -> PyTree:
+def _buffer(size: int, like: PyTree, fill: float | int) -> PyTree:
     return jax.tree.map(lambda x: jnp.full((size, *jnp.shape(x)), fill, jnp.result_type(x)), like)
 
 
@@ -201,7 +200,7 @@ def drive(
         max_steps: bound on attempted steps.
         record: whether to keep the grid of accepted steps, for `replay`.
     """
-    t0, lanes = times.start, times.start.ndim
+    t0 = times.start
     count = times.saves.shape[0]
     keep_rows = count > 2
     size = -(-max_steps // CHUNK) * CHUNK
@@ -246,17 +245,22 @@ def drive(
     final = jax.lax.while_loop(lambda c: eqxi.unvmap_any(~c.done), turn, dynamic)
     c: _Carry = eqx.combine(final, static)
     rows = _filled(c) if keep_rows else (None, None, jnp.stack([zero, c.accepted]))
+    saves = times.saves.reshape((-1,) + (1,) * t0.ndim)
+    reached = saves <= c.t
+    inside = jnp.zeros_like(reached)
+    if rows[0] is not None:
+        inside = reached & (saves - rows[0] > resolution(saves))
     grid = None
     if record:
         assert c.ends is not None and c.ends_anchor is not None and c.jumps is not None
         assert rows[2] is not None
-        grid = Grid(c.ends, c.ends_anchor, c.jumps, rows[2], c.accepted)
-    return Outcome(c.status, c.t, c.y, c.tried, c.accepted, c.attempted, *rows[:2], grid)
+        offset = c.ends - times.anchors()[c.ends_anchor]
+        grid = Grid(offset, c.ends_anchor, c.jumps, rows[2], c.accepted)
+    ends = (c.status, c.t, c.y, c.tried, c.accepted, c.attempted)
+    return Outcome(*ends, *rows[:2], reached, inside, grid)
 
 
-def _turn(
-    scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c: _Carry
-) -> _Carry:
+def _turn(scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c: _Carry) -> _Carry:
     """One attempted step."""
     # Where the step would end, and whether it lands on a knot or on the stop instead.
     goal = times.start + (c.mark + 1).astype(c.t.dtype) * dt if scheme.controller is None else None
@@ -288,8 +292,8 @@ def _turn(
     active = ~c.done
     take = active & keep
     t = jnp.where(take, t1, c.t)
-    attempted = c.attempted + active
-    accepted = c.accepted + take
+    attempted = c.attempted + active.astype(jnp.int32)
+    accepted = c.accepted + take.astype(jnp.int32)
     arrived = t >= times.stop
     failure = jnp.where(
         finite,
@@ -332,7 +336,7 @@ def _turn(
         memory=_select(take, memory, c.memory),
         control_state=_select(active, control_state, c.control_state),
         jump=jnp.where(take, jump | lands, c.jump),
-        mark=c.mark + (take & passed),
+        mark=c.mark + (take & passed).astype(jnp.int32),
         anchor=anchor,
         status=status,
         done=c.done | (active & (stuck | arrived | exhausted)),
@@ -364,7 +368,7 @@ def _next_boundary(times: Times, t: Array) -> tuple[Array, Array]:
 def _filled(c: _Carry) -> tuple[Array, PyTree, Array | None]:
     """Row time, state and step with every row not written taken from the last one written."""
     assert c.row_time is not None
-    index = jnp.arange(c.row_time.shape[0]).reshape((-1,) + (1,) * c.t.ndim)
+    index = jnp.arange(c.row_time.shape[0], dtype=jnp.int32).reshape((-1,) + (1,) * c.t.ndim)
     source = jax.lax.cummax(jnp.where(jnp.isnan(c.row_time), 0, index), axis=0)
 
     def fill(leaf: Array) -> Array:

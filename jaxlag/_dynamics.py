@@ -62,30 +62,30 @@ class Dynamics(eqx.Module):
         return args._replace(intervals=locate(inputs, self.mirror(tau, args)))
 
     def acceleration(
-        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
-        """a at (tau, y)."""
+        """A at (tau, y)."""
         t, (q, v), (params, inputs) = self.mirror(tau, args), self.parts(y), self.given(args)
         values = evaluate(inputs, t, q, v, params, args.intervals)
         return self.system.terms.acceleration(t, q, v, params, values)
 
     def mass(
-        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, "n n"]:
         """M at (tau, y)."""
         q, v = self.parts(y)
         return self.system.terms.mass(self.mirror(tau, args), q, v, self.given(args)[0])
 
     def __call__(
-        self, tau: Float[Array, ""], y: Float[Array, " 2*n"], args: Arguments
-    ) -> Float[Array, " 2*n"]:
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, " m"]:
         """dy/dtau."""
         rate = jnp.concatenate([self.parts(y)[1], self.acceleration(tau, y, args)])
         if self.direction == 1:
             return rate
         return -rate if args.sigma is None else rate * args.sigma.astype(rate.dtype)
 
-    def parts(self, y: Float[Array, "*s 2*n"]) -> tuple[Array, Array]:
+    def parts(self, y: Float[Array, "*s m"]) -> tuple[Array, Array]:
         """(q, v) of y."""
         return y[..., : self.system.size], y[..., self.system.size :]
 

@@ -43,7 +43,9 @@ class AbstractInput(eqx.Module):
 def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
     times, values = jnp.asarray(times), jnp.asarray(values)
     if times.ndim != 1 or times.shape[0] < 2:
-        raise bad(f"{kind}: times", "be one row of at least 2 times", f"its shape was {times.shape}")
+        raise bad(
+            f"{kind}: times", "be one row of at least 2 times", f"its shape was {times.shape}"
+        )
     if values.ndim < 1 or values.shape[0] != times.shape[0]:
         raise bad(
             f"{kind}: values",
@@ -240,9 +242,7 @@ def check_inputs(inputs: Any) -> dict[str, Any]:
     if inputs is None:
         return {}
     if not isinstance(inputs, Mapping) or not all(isinstance(k, str) for k in inputs):
-        raise bad(
-            "inputs", "be a dict from names to input objects or arrays", f"it was {inputs!r}"
-        )
+        raise bad("inputs", "be a dict from names to input objects or arrays", f"it was {inputs!r}")
     checked = {}
     for name, signal in inputs.items():
         if isinstance(signal, AbstractInput):

@@ -6,7 +6,6 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix
-from jaxtyping import Array
 
 from jaxlag._errors import bad
 
@@ -28,7 +27,7 @@ AUTO = "dopri8"
 
 
 def choose(
-    method: Any, adaptive: bool, rtol: Array, atol: Array
+    method: Any, adaptive: bool, rtol: Any, atol: Any
 ) -> tuple[diffrax.AbstractSolver, diffrax.AbstractStepSizeController | None]:
     """Solver and controller (None for a fixed step).
 
@@ -81,9 +80,10 @@ def _solver(method: Any) -> diffrax.AbstractSolver:
         method = METHODS[name]()
     if not isinstance(method, diffrax.AbstractSolver):
         raise bad("method", "be a name or a diffrax solver instance", f"it was {method!r}")
-    if not (isinstance(method.term_structure, type) and issubclass(
-        diffrax.ODETerm, method.term_structure
-    )):
+    if not (
+        isinstance(method.term_structure, type)
+        and issubclass(diffrax.ODETerm, method.term_structure)
+    ):
         raise bad(
             "method",
             "integrate an ordinary differential equation y' = f(t, y)",
@@ -95,7 +95,7 @@ def _solver(method: Any) -> diffrax.AbstractSolver:
 
 
 def _with_tolerances(
-    solver: diffrax.AbstractSolver, controller: Any, rtol: Array, atol: Array
+    solver: diffrax.AbstractSolver, controller: Any, rtol: Any, atol: Any
 ) -> diffrax.AbstractSolver:
     """Implicit solvers take the tolerances of their equations from the step-size control."""
     finder = getattr(solver, "root_finder", None)

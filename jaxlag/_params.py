@@ -80,6 +80,7 @@ class Static:
             and self.treedef == other.treedef
             and len(self.leaves) == len(other.leaves)
             and all(
-                type(a) is type(b) and a == b for a, b in zip(self.leaves, other.leaves, strict=True)
+                type(a) is type(b) and a == b
+                for a, b in zip(self.leaves, other.leaves, strict=True)
             )
         )

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive, resolution
+from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive
 
 # Rows interpolated at once: bounds the memory of a vmapped solve.
 ROWS_AT_ONCE = 64
@@ -36,42 +36,46 @@ class Setup(NamedTuple):
 
     first_step: Array | None
     allowed: Bool[Array, ""]
-    scheme: Any  # array leaves of the Scheme
+    scheme: Any  # traced half of the Scheme
 
 
-def solve(
-    y0: PyTree, args: Any, times: Times, setup: Setup, scheme: Any, max_steps: int
-) -> tuple[Rows, Outcome]:
-    """Integrate and save; differentiable in y0, args and times.
+class Problem(NamedTuple):
+    """A start, the vector field's arguments, the times, and how to solve."""
 
-    Args:
-        y0: state at the start.
-        args: passed to the vector field; inexact leaves are differentiated.
-        times: start, stop, knots, save times, in tau.
-        setup: traced values without derivative.
-        scheme: the rest of the `Scheme`, static leaves.
-        max_steps: bound on attempted steps.
-    """
-    inexact, rest = eqx.partition((y0, args, times), eqx.is_inexact_array)
-    dynamic_rest, static_rest = eqx.partition(rest, eqx.is_array)
-    static = (static_rest, scheme, max_steps)
+    y0: PyTree
+    args: Any
+    times: Times
+    setup: Setup
+    scheme: Any  # static half of the Scheme
+    max_steps: int
+
+
+def solve(problem: Problem) -> tuple[Rows, Outcome]:
+    """Integrate and save; differentiable in y0, args and times."""
+    inexact, rest, setup, static = halves(problem)
 
     @jax.custom_jvp
-    def run(inexact: Any, dynamic_rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
-        return _forward(inexact, dynamic_rest, setup, static, record=False)
+    def run(inexact: Any, rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
+        return _forward(inexact, rest, setup, static, record=False)
 
     @run.defjvp
     def run_jvp(primals: Any, tangents: Any) -> Any:
-        inexact, dynamic_rest, setup = primals
+        inexact, rest, setup = primals
         frozen = jax.lax.stop_gradient(inexact)
-        rows, outcome = _forward(frozen, dynamic_rest, setup, static, record=True)
-        function = partial(_replay, dynamic_rest, setup, static, outcome)
+        _, outcome = _forward(frozen, rest, setup, static, record=True)
+        function = partial(_replay, rest, setup, static, outcome)
         rows, rows_dot = jax.jvp(function, (inexact,), (tangents[0],))
         outcome = outcome._replace(grid=None)
-        no_tangent = jax.tree.map(_zero_tangent, outcome)
-        return (rows, outcome), (rows_dot, no_tangent)
+        return (rows, outcome), (rows_dot, jax.tree.map(_zero_tangent, outcome))
 
-    return run(inexact, dynamic_rest, setup)
+    return run(inexact, rest, setup)
+
+
+def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
+    """A problem as (differentiable leaves, other arrays, setup, static rest)."""
+    inexact, rest = eqx.partition(problem[:3], eqx.is_inexact_array)
+    rest, static = eqx.partition(rest, eqx.is_array)
+    return inexact, rest, problem.setup, (static, problem.scheme, problem.max_steps)
 
 
 def _zero_tangent(x: Array) -> Any:
@@ -80,19 +84,17 @@ def _zero_tangent(x: Array) -> Any:
     return jnp.zeros(x.shape, jax.dtypes.float0)
 
 
-def _unpack(inexact: Any, dynamic_rest: Any, setup: Setup, static: Any) -> Any:
-    static_rest, static_scheme, max_steps = static
-    y0, args, times = eqx.combine(inexact, eqx.combine(dynamic_rest, static_rest))
+def _unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
+    static_problem, static_scheme, max_steps = static
+    y0, args, times = eqx.combine(inexact, rest, static_problem)
     return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
 
 
 def _forward(
-    inexact: Any, dynamic_rest: Any, setup: Setup, static: Any, record: bool
+    inexact: Any, rest: Any, setup: Setup, static: Any, record: bool
 ) -> tuple[Rows, Outcome]:
-    y0, args, times, scheme, max_steps = _unpack(inexact, dynamic_rest, setup, static)
-    outcome = drive(
-        scheme, y0, args, times, setup.first_step, setup.allowed, max_steps, record
-    )
+    y0, args, times, scheme, max_steps = _unpack(inexact, rest, setup, static)
+    outcome = drive(scheme, y0, args, times, setup.first_step, setup.allowed, max_steps, record)
     if outcome.row_time is None:
         states = (jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state), None)
         starts = jnp.stack([times.start, outcome.time])
@@ -117,10 +119,7 @@ def _rows(
     A step shorter than an accepted one is at least as accurate, whatever the solver: saved rows
     keep its order, which its interpolant need not.
     """
-    saves = times.saves
-    reached = saves <= outcome.time
-    gap = jnp.where(reached, saves - starts, 0.0)
-    inside = reached & (gap > resolution(saves))
+    saves, reached, inside = times.saves, outcome.reached, outcome.inside
     if saves.shape[0] > 2:
 
         def step(row: tuple[Array, Array, PyTree]) -> PyTree:
@@ -158,19 +157,16 @@ def _like(mask: Array, leaf: Array) -> Array:
     return mask.reshape(mask.shape + (1,) * (leaf.ndim - mask.ndim))
 
 
-def _replay(
-    dynamic_rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any
-) -> Rows:
+def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> Rows:
     """The rows as a differentiable function of `inexact`, on the recorded grid."""
     grid = outcome.grid
     assert grid is not None
     # A trajectory that took no step depends on nothing but its start: keep NaN out of derivatives.
     moved = grid.count > 0
     inexact = jax.tree.map(lambda x: jnp.where(moved, x, jax.lax.stop_gradient(x)), inexact)
-    y0, args, times, scheme, max_steps = _unpack(inexact, dynamic_rest, setup, static)
+    y0, args, times, scheme, _max_steps = _unpack(inexact, rest, setup, static)
     scheme = eqx.tree_at(lambda s: s.solver, scheme, _scannable(scheme.solver))
-    anchors = times.anchors()
-    ends = grid.ends + (anchors - jax.lax.stop_gradient(anchors))[grid.anchor]
+    ends = times.anchors()[grid.anchor] + grid.offset
     memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
     start = (y0, memory)
     state, history = _steps(scheme, args, times.start, ends, grid, start)
@@ -190,7 +186,7 @@ def _steps(
     The scan skips whole chunks that no lane of a vmapped solve needs. Slots past the last step
     repeat the first one and drop its result, so that no derivative meets a state out of reach.
     """
-    used = jnp.arange(ends.shape[0]) < grid.count
+    used = jnp.arange(ends.shape[0], dtype=jnp.int32) < grid.count
     begins = jnp.where(used, jnp.concatenate([t0[None], ends[:-1]]), t0)
     ends = jnp.where(used, ends, ends[0])
     start = jax.tree.map(jnp.asarray, start)

@@ -20,13 +20,13 @@ from jaxlag._arguments import (
     check_times,
     check_tolerances,
 )
-from jaxlag._diagnosis import diagnose, start_finite, values_allowed
+from jaxlag._diagnosis import Start, diagnose, start_finite, values_allowed
 from jaxlag._drive import Scheme, Times
 from jaxlag._dynamics import Arguments, Dynamics
 from jaxlag._errors import SimulationError
 from jaxlag._inputs import all_knots, check_inputs, common_range
 from jaxlag._methods import choose
-from jaxlag._replay import Setup, solve
+from jaxlag._replay import Problem, Setup, solve
 from jaxlag._solution import Solution, over_rows
 from jaxlag._status import Status
 from jaxlag._system import System
@@ -140,9 +140,7 @@ def simulate(
     scheme_traced, scheme_static = eqx.partition(scheme, _params.is_array)
     keys = (_params.Static(x) for x in (params_static, inputs_static, scheme_static))
     plan = _Plan(system, *keys, direction, max_steps, tuple(save))
-    values = _Values(
-        q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step
-    )
+    values = _Values(q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
     motion = _simulate(plan, values)
     if throw and not isinstance(motion.status, jax.core.Tracer):
@@ -150,22 +148,7 @@ def simulate(
     return motion
 
 
-class Problem(NamedTuple):
-    """A start, the equations and the way of solving them, ready to be solved."""
-
-    dynamics: Dynamics
-    y0: Array
-    args: Arguments
-    times: Times
-    setup: Setup
-    scheme: Any  # static half
-    max_steps: int
-    valid: Array
-    in_range: Array
-    finite: Array
-
-
-def pose(plan: _Plan, values: _Values) -> Problem:
+def pose(plan: _Plan, values: _Values) -> tuple[Dynamics, Start, Problem]:
     """The problem that a plan and its values describe."""
     dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction)
     args = dynamics.arguments(values.params, values.inputs, values.ts)
@@ -180,22 +163,18 @@ def pose(plan: _Plan, values: _Values) -> Problem:
     valid = values_allowed(y0, times.saves, values.rtol, values.atol, values.step)
     finite = start_finite(dynamics, times.start, y0, args)
     setup = Setup(values.step, valid & in_range & finite, scheme_traced)
-    return Problem(
-        dynamics, y0, args, times, setup, scheme_static, plan.max_steps, valid, in_range, finite
-    )
+    problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps)
+    return dynamics, Start(valid, in_range, finite), problem
 
 
 @partial(jax.jit, static_argnums=0)
 def _simulate(plan: _Plan, values: _Values) -> Solution:
     """The compiled program: pose, solve, diagnose, derive what `save` names."""
-    problem = pose(plan, values)
-    dynamics, args, times, y0 = problem.dynamics, problem.args, problem.times, problem.y0
-    rows, outcome = solve(y0, args, times, problem.setup, problem.scheme, plan.max_steps)
-    status, where = diagnose(
-        dynamics, args, times, outcome, y0, problem.valid, problem.in_range, problem.finite
-    )
+    dynamics, start, problem = pose(plan, values)
+    rows, outcome = solve(problem)
+    status, where = diagnose(dynamics, problem, outcome, start)
     q, v = dynamics.parts(rows.saved)
-    params, inputs = dynamics.given(args)
+    params, inputs = dynamics.given(problem.args)
     saved = {
         name: over_rows(name, plan.system, values.ts, q, v, params, inputs) for name in plan.save
     }
@@ -205,7 +184,7 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
         q=q,
         v=v,
         status=status,
-        last_time=dynamics.mirror(rows.time, args),
+        last_time=dynamics.mirror(rows.time, problem.args),
         last_state=dynamics.parts(rows.state),
         where=where,
         stats={

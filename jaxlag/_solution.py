@@ -136,7 +136,9 @@ class Solution(eqx.Module):
 
     def _part(self, x: Array, name: str) -> Array:
         if name not in self.system.coordinates.shapes:
-            raise bad("name", f"be one of {list(self.system.coordinates.names)}", f"it was {name!r}")
+            raise bad(
+                "name", f"be one of {list(self.system.coordinates.names)}", f"it was {name!r}"
+            )
         return self.system.unflatten(x)[name]
 
     def _quantity(self, name: str) -> Array:

@@ -89,7 +89,8 @@ class System(eqx.Module):
             require_arity("lagrangian", lagrangian, ("t", "q", "v", "params"))
             self.lagrangian = lagrangian
         else:
-            assert kinetic is not None and potential is not None
+            assert kinetic is not None
+            assert potential is not None
             require_arity("kinetic", kinetic, ("t", "q", "v", "params"))
             require_arity("potential", potential, ("t", "q", "params"))
             self.lagrangian = _Difference(kinetic, potential)
@@ -124,9 +125,7 @@ class System(eqx.Module):
         """Flat vector, shape (n,), from a dict of named values."""
         return self.coordinates.flatten(parts)
 
-    def mass_matrix(
-        self, params: Any, q: Any, v: Any = None, t: Any = 0.0
-    ) -> Float[Array, "n n"]:
+    def mass_matrix(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, "n n"]:
         """M(t, q, v) = d2L/dv2, shape (n, n), kg, kg m or kg m^2 by the pair of coordinates.
 
         `v` may be left out where M does not depend on it.
@@ -219,7 +218,7 @@ class System(eqx.Module):
         return ArrayTerms(self.lagrangian, chosen).force(t, q, v, params, values)
 
     def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
-        """p = dL/dv, shape (n,), kg m/s or kg m^2/s."""
+        """P = dL/dv, shape (n,), kg m/s or kg m^2/s."""
         t, q, v, params = self._state(params, q, v, t)
         return self.terms.momentum(t, q, v, params)
 
@@ -259,7 +258,7 @@ class System(eqx.Module):
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
-        """a with M a + h = Q, shape (n,), m/s^2 or rad/s^2; NaN where M is singular.
+        """A with M a + h = Q, shape (n,), m/s^2 or rad/s^2; NaN where M is singular.
 
         Args:
             params: as the Lagrangian takes them.

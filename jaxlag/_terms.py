@@ -21,7 +21,7 @@ class Terms(eqx.Module):
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """p = dL/dv."""
+        """P = dL/dv."""
 
     @abstractmethod
     def mass(
@@ -33,7 +33,7 @@ class Terms(eqx.Module):
     def bias(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """h = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
+        """H = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
 
     @abstractmethod
     def force(
@@ -56,7 +56,7 @@ class Terms(eqx.Module):
     def gamma(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " m"]:
-        """gamma = A' v + b', so that A a + gamma = 0."""
+        """Gamma = A' v + b', so that A a + gamma = 0."""
 
     @abstractmethod
     def acceleration(

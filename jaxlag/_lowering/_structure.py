@@ -38,12 +38,14 @@ class Structure(NamedTuple):
 
 def _inner(eqn: Any) -> Jaxpr | None:
     """The jaxpr of a call-like equation whose operands map one to one; else None."""
+    if eqn.primitive.name not in _CALLS:
+        return None
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         inner = eqn.params.get(key)
         jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
-        if isinstance(jaxpr, Jaxpr) and eqn.primitive.name in _CALLS:
-            if len(jaxpr.invars) == len(eqn.invars) and len(jaxpr.outvars) == len(eqn.outvars):
-                return jaxpr
+        sizes = (len(eqn.invars), len(eqn.outvars))
+        if isinstance(jaxpr, Jaxpr) and (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
+            return jaxpr
     return None
 
 
