@@ -210,6 +210,7 @@ def drive(
     else:
         assert first_step is not None
         h, control_state = first_step, None
+    memory = jax.tree.map(lambda x: jnp.broadcast_to(x, jnp.shape(x) or t0.shape), memory)
     whole = _whole(scheme, y0, memory)
     zero = jnp.zeros(t0.shape, jnp.int32)
     ok = zero + int(Status.ok)

@@ -1,0 +1,221 @@
+"""The solve with the mass matrix, by unrolled elimination up to n = 8 and by library above.
+
+Elimination without pivoting is backward stable on symmetric positive definite matrices: the
+computed x solves a system whose M and r differ by some n EPS of their norms.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.linalg import norm
+
+from jaxlag._linalg import UNROLL_UP_TO, factor_mass, first_unhealthy, solve_mass
+
+EPS = np.finfo(float).eps
+SIZES = range(1, 13)
+BOTH = (3, UNROLL_UP_TO + 2)  # one size for each way of solving
+
+solve = jax.jit(solve_mass)
+unhealthy = jax.jit(lambda M: first_unhealthy(factor_mass(M)))
+
+
+def definite(rng, n, condition):
+    """Symmetric, eigenvalues from 1 down to 1/condition along random axes."""
+    axes, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    M = (axes * np.geomspace(1.0, 1.0 / condition, n)) @ axes.T
+    return (M + M.T) / 2
+
+
+def backward_error(M, x, r):
+    return norm(M @ x - r) / (norm(M, 2) * norm(x) + norm(r))
+
+
+def test_both_ways_of_solving_are_tested():
+    assert BOTH[0] <= UNROLL_UP_TO < BOTH[1] <= max(SIZES)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_solve_is_backward_stable(n):
+    rng = np.random.default_rng(n)
+    for condition in (1.0, 1e3, 1e6, 1e9, 1e12):
+        M, r = definite(rng, n, condition), rng.normal(size=n)
+        x = np.asarray(solve(M, r))
+        assert backward_error(M, x, r) <= 10 * n * EPS
+        assert int(unhealthy(M)) == -1
+        assert norm(x - np.linalg.solve(M, r)) <= 10 * n * EPS * np.linalg.cond(M) * norm(x)
+
+
+def test_solve_works_in_single_precision():
+    rng = np.random.default_rng(0)
+    for n in BOTH:
+        M, r = (x.astype(np.float32) for x in (definite(rng, n, 100.0), rng.normal(size=n)))
+        x = solve(M, r)
+        assert x.dtype == jnp.float32
+        assert backward_error(M, np.asarray(x), r) <= 10 * n * np.finfo(np.float32).eps
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_a_given_factor_serves_any_right_hand_side(n):
+    rng = np.random.default_rng(n)
+    M, R = definite(rng, n, 10.0), rng.normal(size=(3, n))
+    X = jax.jit(lambda M, R: [solve_mass(M, r, factor) for factor in [factor_mass(M)] for r in R])
+    for x, r in zip(X(M, R), R, strict=True):
+        np.testing.assert_array_equal(x, solve(M, r))
+
+
+# ---- Not positive definite ---------------------------------------------------------------------
+
+
+def with_pivot(rng, n, bad, pivot):
+    """Symmetric with elimination pivots 1, but `pivot` at `bad`: L D L^T in whole numbers."""
+    L = np.tril(rng.integers(-2, 3, (n, n)), -1) + np.eye(n)
+    D = np.where(np.arange(n) == bad, pivot, 1.0)
+    return (L * D) @ L.T
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("pivot", [0.0, -1.0, np.nan])
+def test_the_first_bad_pivot_is_named_and_the_solution_is_nan(n, pivot):
+    rng = np.random.default_rng(n)
+    for bad in range(n):
+        M = with_pivot(rng, n, bad, 1.0)
+        if np.isnan(pivot):
+            M[bad, bad] = np.nan
+        else:
+            M = with_pivot(rng, n, bad, pivot)
+        assert int(unhealthy(M)) == bad
+        assert np.all(np.isnan(solve(M, np.ones(n))))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_the_coordinate_without_inertia_is_named(n):
+    for bad in range(n):
+        M = np.diag(np.where(np.arange(n) == bad, 0.0, 2.0))
+        assert int(unhealthy(M)) == bad
+        assert np.all(np.isnan(solve(M, np.ones(n))))
+
+
+@pytest.mark.parametrize("n", SIZES[1:])
+def test_a_singular_matrix_is_found_through_its_rounding(n):
+    """Of rank n - 1, the rest well conditioned: the last pivot is rounding, of either sign."""
+    for seed in range(10):
+        rng = np.random.default_rng([n, seed])
+        M = np.zeros((n, n))
+        M[:-1, :-1] = definite(rng, n - 1, 4.0)
+        combination = rng.uniform(-1.0, 1.0, n - 1)  # the last row is one of the others
+        M[-1, :-1] = M[:-1, -1] = M[:-1, :-1] @ combination
+        M[-1, -1] = combination @ M[:-1, -1]
+        assert int(unhealthy(M)) == n - 1
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_a_bad_matrix_in_a_batch_harms_no_other(n):
+    rng = np.random.default_rng(n)
+    M = np.stack([definite(rng, n, 10.0), with_pivot(rng, n, 1, -1.0), definite(rng, n, 10.0)])
+    r = rng.normal(size=(3, n))
+    x = jax.jit(jax.vmap(solve_mass))(M, r)
+    np.testing.assert_array_equal(np.isnan(x), [[False] * n, [True] * n, [False] * n])
+    for i in (0, 2):
+        assert backward_error(M[i], np.asarray(x[i]), r[i]) <= 10 * n * EPS
+
+
+# ---- Units and mass ratios ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_units_of_the_coordinates_change_nothing(n):
+    """M -> D M D, r -> D r gives x -> x/D: exactly, where D are powers of two, 1e-6 to 1e6."""
+    rng = np.random.default_rng(n)
+    M, r = definite(rng, n, 100.0), rng.normal(size=n)
+    D = 2.0 ** np.round(np.linspace(-20, 20, n))[rng.permutation(n)]
+    np.testing.assert_array_equal(solve(D[:, None] * M * D, D * r), solve(M, r) / D)
+    singular = with_pivot(rng, n, n - 1, 0.0)
+    D = 10.0 ** np.linspace(-6, 6, n)[rng.permutation(n)]
+    assert int(unhealthy(D[:, None] * M * D)) == -1
+    assert int(unhealthy(D[:, None] * singular * D)) == n - 1
+
+
+@pytest.mark.parametrize(("upper", "lower"), [(1.0, 1e8), (1e8, 1.0), (1.0, 1e12), (1e12, 1.0)])
+def test_extreme_mass_ratios_are_healthy(upper, lower):
+    """A straight double pendulum of unit links: M = [[m1 + m2, m2], [m2, m2]], det = m1 m2."""
+    M, r = np.array([[upper + lower, lower], [lower, lower]]), np.array([1.0, 3.0])
+    assert int(unhealthy(M)) == -1
+    assert backward_error(M, np.asarray(solve(M, r)), r) <= 20 * EPS
+    massless = np.array([[lower, lower], [lower, lower]])
+    assert int(unhealthy(massless)) == 1
+
+
+# ---- Derivatives -------------------------------------------------------------------------------
+
+
+def curve(rng, n):
+    """Second-order polynomials M(s), r(s), their coefficients, and a direction of x."""
+    M = [definite(rng, n, 30.0), *(A + A.T for A in rng.normal(size=(2, n, n)) / n)]
+    return M, rng.normal(size=(3, n)), rng.normal(size=n)
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_derivatives_are_those_of_the_inverse(n):
+    """x' = y(r' - M' x) and x'' = y(r'' - M'' x - 2 M' x') with y = M^-1, forward and reverse."""
+    M, r, w = curve(np.random.default_rng(n), n)
+
+    def along(s):
+        powers = jnp.array([1.0, s, s**2 / 2])
+        return solve_mass(jnp.tensordot(powers, np.stack(M), 1), powers @ r)
+
+    def weighted(s):
+        return w @ along(s)
+
+    x, x1 = jax.jit(lambda: jax.jvp(along, (0.0,), (1.0,)))()
+    expected1 = np.linalg.solve(M[0], r[1] - M[1] @ x)
+    expected2 = np.linalg.solve(M[0], r[2] - M[2] @ x - 2 * M[1] @ expected1)
+    condition = np.linalg.cond(M[0])
+    size = norm(np.linalg.inv(M[0]), 2)
+    tolerance = 10 * n * EPS * condition
+    size1 = size * (norm(r[1]) + norm(M[1], 2) * norm(x))
+    size2 = size * (norm(r[2]) + norm(M[2], 2) * norm(x) + 2 * norm(M[1], 2) * size1)
+    np.testing.assert_allclose(x1, expected1, rtol=0, atol=tolerance * size1)
+    jacobians = jax.jacfwd, jax.jacrev
+    first, second = jax.jit(
+        lambda: (
+            [f(weighted)(0.0) for f in jacobians],
+            [f(g(weighted))(0.0) for f in jacobians for g in jacobians],
+        )
+    )()
+    atol1, atol2 = (tolerance * norm(w) * size for size in (size1, size2))
+    np.testing.assert_allclose(first, [w @ expected1] * 2, rtol=0, atol=atol1)
+    np.testing.assert_allclose(second, [w @ expected2] * 4, rtol=0, atol=atol2)
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_second_derivatives_agree_with_differences(n):
+    """Central differences of the first derivative, error h^2 + eps/h: 1e-10 at h = 1e-5."""
+    M, r, w = curve(np.random.default_rng(n + 1), n)
+
+    def weighted(s):
+        powers = jnp.array([1.0, s, s**2 / 2])
+        return w @ solve_mass(jnp.tensordot(powers, np.stack(M), 1), powers @ r)
+
+    first = jax.grad(weighted)
+    h = 1e-5
+    second, third, low, high = jax.jit(
+        lambda: (jax.grad(first)(0.0), jax.grad(jax.jacfwd(first))(0.0), first(-h), first(h))
+    )()
+    # Truncation is h^2/6 of the derivative after next, some kappa times the next one.
+    condition = np.linalg.cond(M[0])
+    atol = h**2 * condition * abs(third) + 10 * n * EPS * condition * max(abs(low), abs(high)) / h
+    np.testing.assert_allclose(second, (high - low) / (2 * h), rtol=0, atol=atol)
+    assert abs(second) > 1e3 * atol
+
+
+@pytest.mark.parametrize("n", BOTH)
+def test_cotangents_are_the_outer_product(n):
+    """Of w . x: lam = M^-1 w for r, and -lam x^T for M."""
+    rng = np.random.default_rng(n)
+    M, r, w = definite(rng, n, 30.0), rng.normal(size=n), rng.normal(size=n)
+    to_M, to_r = jax.jit(jax.grad(lambda M, r: w @ solve_mass(M, r), argnums=(0, 1)))(M, r)
+    lam, x = np.linalg.solve(M, w), np.linalg.solve(M, r)
+    rtol = 20 * n * EPS * np.linalg.cond(M)
+    np.testing.assert_allclose(to_r, lam, rtol=0, atol=rtol * norm(lam))
+    np.testing.assert_allclose(to_M, -np.outer(lam, x), rtol=0, atol=rtol * norm(lam) * norm(x))

@@ -1,0 +1,227 @@
+"""simulate and Solution as a user meets them: statuses, shapes, caching, saved quantities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import MOTIONS, driven, steps
+
+import jaxlag as jl
+from jaxlag import SimulationError, Status
+
+PENDULUM = MOTIONS["double_pendulum"]
+
+
+def run(**changes):
+    arguments = {
+        "q0": PENDULUM.q0,
+        "v0": PENDULUM.v0,
+        "ts": jnp.linspace(0.0, 1.0, 5),
+        "params": PENDULUM.params,
+    } | changes
+    return jl.simulate(PENDULUM.system, **arguments)
+
+
+def test_small_oscillation_has_its_closed_form():
+    """x = x0 cos wt + v0/w sin wt, to the default tolerance of 1e-9."""
+    spring = jl.System(lambda t, q, v, p: 0.5 * (p["m"] * v[0] ** 2 - p["k"] * q[0] ** 2), ("x",))
+    ts = np.linspace(0.0, 3.0, 31)
+    motion = jl.simulate(spring, {"x": 0.4}, [0.5], ts, {"m": 1.3, "k": 20.0})
+    w = np.sqrt(20.0 / 1.3)
+    np.testing.assert_allclose(
+        motion["x"], 0.4 * np.cos(w * ts) + 0.5 / w * np.sin(w * ts), atol=2e-8
+    )
+    np.testing.assert_allclose(
+        motion.rate("x"), 0.5 * np.cos(w * ts) - 0.4 * w * np.sin(w * ts), atol=1e-7
+    )
+    np.testing.assert_allclose(motion.a[:, 0], -20.0 / 1.3 * motion["x"], rtol=1e-13)
+
+
+def test_save_equals_on_demand():
+    names = ("a", "p", "energy", "kinetic", "potential", "Q")
+    plain, saved = run(), run(save=names)
+    assert set(saved.saved) == set(names)
+    for name in names:
+        np.testing.assert_allclose(saved.saved[name], getattr(plain, name), rtol=1e-12, atol=1e-12)
+
+
+def test_unrequested_quantities_are_not_computed():
+    """The marker in V is evaluated by save=("potential",) on rows; without it there are fewer."""
+
+    def count(save):
+        jaxpr = jax.make_jaxpr(lambda q0: run(q0=q0, save=save, throw=False).q)(PENDULUM.q0)
+        return str(jaxpr).count("cos ")
+
+    assert count(("a",)) > count(())
+
+
+def test_array_coordinates():
+    """Two masses in the plane on springs to the origin: names give shapes back."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 0.5 * p * jnp.sum(q**2),
+        {"x": (2, 2), "theta": ()},
+    )
+    motion = jl.simulate(system, {"x": np.eye(2), "theta": 0.3}, np.zeros(5), [0.0, 0.5, 1.0], 4.0)
+    assert motion["x"].shape == (3, 2, 2)
+    np.testing.assert_allclose(motion["x"][-1], np.cos(2.0) * np.eye(2), atol=1e-8)
+    with pytest.raises(ValueError, match=r"name must be one of \['x', 'theta'\], but it was 'y'"):
+        motion["y"]
+
+
+def test_new_values_never_recompile():
+    traces = []
+
+    def lagrangian(t, q, v, p):
+        traces.append(1)
+        return 0.5 * p["m"] * v[0] ** 2 - p["V"](q[0]) * p["k"]
+
+    system = jl.System(lagrangian, ("x",))
+    shape = lambda x: x**4  # noqa: E731
+
+    def go(m=1.0, q=0.5, v=0.0, t0=0.0, t1=1.0, **options):
+        ts = np.linspace(t0, t1, 4)
+        return jl.simulate(system, [q], [v], ts, {"m": m, "k": 2.0, "V": shape}, **options)
+
+    go(rtol=1e-6)
+    first = len(traces)
+    for changes in ({"m": 2.0}, {"q": 0.7}, {"v": 1.0}, {"t0": 0.1}, {"t1": 3.0}):
+        go(rtol=1e-6, **changes)
+    go(rtol=1e-8, atol=1e-3)
+    go(m=np.float64(3.0), rtol=1e-4)
+    assert len(traces) == first
+    go(dt=0.1)
+    fixed = len(traces)
+    go(dt=0.2)
+    assert len(traces) == fixed > first
+
+
+def test_no_host_callback_in_any_program():
+    def everything(q0):
+        loss = lambda q0: jnp.sum(run(q0=q0, save=("energy",)).saved["energy"])  # noqa: E731
+        return jax.value_and_grad(loss)(q0)
+
+    for f in (
+        everything,
+        lambda q0: run(q0=q0, method="kvaerno5").q,
+        lambda q0: run(q0=q0, dt=0.1).q,
+    ):
+        assert "callback" not in str(jax.make_jaxpr(f)(PENDULUM.q0))
+
+
+def test_max_steps_says_how_far():
+    with pytest.raises(
+        SimulationError, match=r"max_steps: last good state at t = 0\.\d+ of 1"
+    ) as e:
+        run(max_steps=3)
+    motion = e.value.motion
+    assert motion.stats["accepted"] + motion.stats["rejected"] == 3
+    reached = np.asarray(motion.ts) <= motion.last_time
+    assert np.isfinite(motion.q[reached]).all()
+    assert np.isnan(motion.q[~reached]).all()
+
+
+def test_force_that_becomes_nan_in_flight():
+    """The last good time is just short of where the force ends, and the coordinate is named."""
+    force = jl.GeneralizedForce(lambda t, q, v, p: jnp.array([0.0, 1.0]) * jnp.sqrt(p - t), "burn")
+    system = jl.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), ("x", "y"), forces=(force,))
+    with pytest.raises(
+        SimulationError, match=r"nonfinite \('y'\): last good state at t = 0\.\d+"
+    ) as e:
+        jl.simulate(system, [0.0, 0.0], [1.0, 0.0], np.linspace(0.0, 2.0, 9), 0.7)
+    motion = e.value.motion
+    assert abs(motion.last_time - 0.7) < 1e-6
+    np.testing.assert_allclose(motion.last_state[0][0], motion.last_time, rtol=1e-12)
+    with pytest.raises(SimulationError, match=r"nonfinite \('y'\)"):
+        jl.simulate(system, [0.0, 0.0], [1.0, 0.0], [0.0, 2.0], 0.7, dt=0.1)
+
+
+def test_mass_that_vanishes_in_flight():
+    """A mass m(x) that reaches zero at x = 1, approached at unit rate."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 + 0.5 * (1 - q[0]) * v[1] ** 2, ("x", "y")
+    )
+    motion = jl.simulate(system, [0.0, 0.0], [1.0, 0.0], [0.0, 0.5, 2.0], dt=0.03, throw=False)
+    assert motion.status == Status.mass_singular
+    assert motion.where == 1
+    assert 0.9 < motion.last_time <= 1.0
+
+
+def test_collision_is_a_status_with_a_time():
+    """Kepler fall from r = 1 at rest: r = 0 at pi / (2 sqrt 2)."""
+    fall = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p / q[0], ("r",))
+    motion = jl.simulate(fall, [1.0], [0.0], [0.0, 1.0, 2.0], 1.0, throw=False)
+    assert motion.status in (Status.step_below_resolution, Status.nonfinite, Status.max_steps)
+    assert abs(motion.last_time - np.pi / (2 * np.sqrt(2))) < 1e-6
+    assert np.isfinite(motion.q[1]).all()
+    assert np.isnan(motion.q[2]).all()
+
+
+def test_traced_bad_values_become_statuses():
+    def status(q0=PENDULUM.q0, ts=jnp.array([0.0, 1.0]), **options):
+        return jax.jit(lambda q0, ts, o: run(q0=q0, ts=ts, **o).status)(q0, ts, options)
+
+    assert status() == Status.ok
+    assert status(q0=jnp.array([jnp.nan, 0.0])) == Status.bad_value
+    assert status(ts=jnp.array([1.0, 1.0])) == Status.bad_value
+    assert status(ts=jnp.array([0.0, jnp.inf])) == Status.bad_value
+    assert status(rtol=-1.0) == Status.bad_value
+    assert status(rtol=1e-16) == Status.bad_value
+    assert status(rtol=0.0, atol=0.0) == Status.bad_value
+    assert status(dt=-0.1) == Status.bad_value
+    bad = jax.jit(lambda q0: run(q0=q0, throw=False))(jnp.array([0.1, jnp.nan]))
+    assert bad.where == 1
+    assert np.isnan(bad.q[1:]).all()
+
+
+def test_input_range():
+    arguments = (driven, [0.4], [0.9])
+    params = {"J": 0.15, "mgl": 3.0, "c": 0.02, "F": 0.1}
+    inputs = {"tau": steps()}
+    with pytest.raises(
+        ValueError,
+        match=r"inputs must cover ts, from 0.0 to 2.0 s, but their tables cover 0.0 to 1.6",
+    ):
+        jl.simulate(*arguments, [0.0, 2.0], params, inputs=inputs)
+    late = jax.jit(lambda ts: jl.simulate(*arguments, ts, params, inputs=inputs))
+    motion = late(jnp.array([0.0, 1.0, 2.0]))
+    assert motion.status == Status.input_range
+    np.testing.assert_allclose(motion.last_time, 1.6, rtol=1e-15)
+    assert np.isfinite(motion.q[1]).all()
+    early = late(jnp.array([-1.0, 1.0, 1.5]))
+    assert early.status == Status.input_range
+    assert early.last_time == -1.0
+    with pytest.raises(ValueError, match="have an entry 'tau', which a force reads"):
+        jl.simulate(*arguments, [0.0, 1.0], params)
+
+
+def test_solution_after_vmap():
+    starts = PENDULUM.q0 + jnp.linspace(0.0, 0.1, 3)[:, None]
+    motions = jax.jit(jax.vmap(lambda q0: run(q0=q0)))(starts)
+    assert motions.q.shape == (3, 5, 2)
+    assert motions["theta1"].shape == (3, 5)
+    assert motions.energy.shape == (3, 5)
+    for i, q0 in enumerate(starts):
+        one = run(q0=q0)
+        np.testing.assert_allclose(motions.energy[i], one.energy, rtol=1e-7)
+        np.testing.assert_allclose(motions.a[i], one.a, rtol=1e-6, atol=1e-6)
+
+
+def test_explicit_controller():
+    import diffrax
+
+    controller = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.3, icoeff=0.4)
+    motion = run(method=(diffrax.Dopri5(), controller))
+    np.testing.assert_allclose(motion.q, run().q, rtol=0, atol=1e-5)
+    with pytest.raises(
+        ValueError, match="dt must be left out when method brings its own controller"
+    ):
+        run(method=(diffrax.Dopri5(), controller), dt=0.1)
+
+
+def test_tolerance_is_kept_across_solvers():
+    """Five solvers agree within ten times the tolerance over a second."""
+    truth = run(rtol=1e-13, atol=1e-13)
+    for method in ("bosh3", "tsit5", "dopri5", "dopri8", "kvaerno4"):
+        motion = run(method=method, rtol=1e-6, atol=1e-6)
+        # Measured worst 2026-11-21: 2e-5, bosh3.
+        np.testing.assert_allclose(motion.q, truth.q, rtol=0, atol=1e-4)

@@ -1,0 +1,280 @@
+"""What is found in a Lagrangian from its program alone, and what `explain` says about it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _mechanics import GENERAL, chain
+
+import jaxlag as jl
+from jaxlag._lowering import find_structure
+from systems._catalogue import ENTRIES
+
+PAIR = ("x", "y")
+
+
+def structure(lagrangian, params=None, coordinates=PAIR):
+    return jl.System(lagrangian, coordinates).structure(params, jnp.float64)
+
+
+def of(name):
+    if name in ENTRIES:
+        return ENTRIES[name].system.structure(dict(ENTRIES[name].example.params), jnp.float64)
+    return GENERAL[name].system.structure(GENERAL[name].params, jnp.float64)
+
+
+# ---- What depends on what ------------------------------------------------------------------------
+
+
+def test_a_free_particle_has_a_constant_mass_and_no_bias():
+    found = structure(lambda t, q, v, params: 0.5 * params["m"] * v @ v, {"m": 2.0})
+    assert found == (frozenset({"params"}), frozenset(), frozenset({"v", "params"}), True)
+    assert (found.quadratic, found.mass_constant, found.explicit_time) == (True, True, False)
+    bare = structure(lambda t, q, v, params: 0.5 * v @ v)
+    assert (bare.mass, bare.bias_zero, bare.mass_constant) == (frozenset(), True, True)
+
+
+def test_a_constant_force_is_a_bias_though_it_depends_on_nothing():
+    """Zero is told from constant by value."""
+    found = structure(lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[0])
+    assert (found.bias, found.bias_zero) == (frozenset(), False)
+    with_params = structure(lambda t, q, v, params: 0.5 * v @ v - params["g"] * q[0], {"g": 0.0})
+    assert (with_params.bias, with_params.bias_zero) == (frozenset({"params"}), False)
+
+
+def test_values_of_params_never_decide():
+    """K = 0 or k = 1, one and the same structure: it is read from the program."""
+    found = [
+        structure(lambda t, q, v, params: 0.5 * v @ v - params["k"] * q @ q, {"k": k})
+        for k in (0.0, 1.0, np.nan)
+    ]
+    assert found[0] == found[1] == found[2]
+    assert found[0].bias == {"q", "params"}
+
+
+@pytest.mark.parametrize(
+    ("name", "mass", "bias", "time"),
+    [
+        ("mass_spring", {"params"}, {"q", "params"}, False),
+        ("two_mass_three_springs", {"params"}, {"q", "params"}, False),
+        ("simple_pendulum", {"params"}, {"q", "params"}, False),
+        ("double_pendulum", {"q", "params"}, {"q", "v", "params"}, False),
+        ("cart_pendulum", {"q", "params"}, {"q", "v", "params"}, False),
+        ("chain", {"q", "params"}, {"q", "v", "params"}, False),
+        ("charged", {"params"}, {"v", "params"}, False),
+        ("driven_pivot", {"q", "params"}, {"t", "q", "v", "params"}, True),
+        ("bead", {"t", "q", "params"}, {"t", "q", "v", "params"}, True),
+        ("relativistic", {"v", "params"}, {"params"}, False),
+    ],
+)
+def test_dependencies_are_those_of_the_equations(name, mass, bias, time):
+    """Or of the program, where only algebra cancels them: cos^2 + sin^2 in driven_pivot."""
+    found = of(name)
+    assert (found.mass, found.explicit_time) == (mass, time)
+    assert (found.bias, found.bias_zero) == (bias, False)
+
+
+@pytest.mark.parametrize("name", [*ENTRIES, *GENERAL])
+def test_nothing_unlisted_moves_a_term(name):
+    """Soundness at numbers: move an argument that is not listed and nothing changes at all."""
+    case = ENTRIES[name].example if name in ENTRIES else GENERAL[name]
+    system = ENTRIES[name].system if name in ENTRIES else GENERAL[name].system
+    found, params, n = of(name), dict(case.params), system.size
+    state = {"t": jnp.array(0.3), "q": jnp.linspace(0.2, 0.7, n), "v": jnp.linspace(0.5, 1.0, n)}
+
+    @jax.jit
+    def terms(t, q, v):
+        M = system.mass_matrix(params, q, v, t)
+        return {"mass": M, "bias": system.bias(params, q, v, t)}
+
+    here = terms(**state)
+    for argument, value in state.items():
+        there = terms(**(state | {argument: value + 0.37}))
+        for term in ("mass", "bias"):
+            if argument not in getattr(found, term):
+                np.testing.assert_array_equal(here[term], there[term])
+
+
+# ---- Forms of writing ----------------------------------------------------------------------------
+
+FORMS = {
+    "v @ v": lambda t, q, v, params: 0.5 * v @ v,
+    "sum v**2": lambda t, q, v, params: 0.5 * jnp.sum(v**2),
+    "sum v*v": lambda t, q, v, params: 0.5 * jnp.sum(v * v),
+    "square": lambda t, q, v, params: 0.5 * jnp.sum(jnp.square(v)),
+    "entries": lambda t, q, v, params: 0.5 * (v[0] ** 2 + v[1] * v[1]),
+    "unpacked": lambda t, q, v, params: 0.5 * (lambda a, b: a**2 + b**2)(*v),
+    "dot": lambda t, q, v, params: 0.5 * jnp.dot(v, jnp.eye(2) @ v),
+    "einsum": lambda t, q, v, params: 0.5 * jnp.einsum("i,ij,j", v, jnp.eye(2), v),
+    "vdot": lambda t, q, v, params: 0.5 * jnp.vdot(v, v),
+    "jit": lambda t, q, v, params: 0.5 * jax.jit(lambda v: v @ v)(v),
+    "checkpoint": lambda t, q, v, params: 0.5 * jax.checkpoint(lambda v: v @ v)(v),
+    "vmap": lambda t, q, v, params: 0.5 * jnp.sum(jax.vmap(lambda x: x**2)(v)),
+    "derivative": lambda t, q, v, params: (
+        0.5 * jnp.sum(jax.jvp(lambda x: 1.0 * x, (q,), (v,))[1] ** 2)
+    ),
+    "shifted": lambda t, q, v, params: 0.5 * v @ v + v[0] + 1.0,
+}
+
+OPAQUE = {
+    "v**2.0": lambda t, q, v, params: 0.5 * jnp.sum(v**2.0),
+    "loop": lambda t, q, v, params: 0.5 * jax.lax.fori_loop(0, 2, lambda i, T: T + v[i] ** 2, 0.0),
+    "scan": lambda t, q, v, params: (
+        0.5 * jax.lax.scan(lambda T, x: (T + x**2, None), jnp.zeros(()), v)[0]
+    ),
+}
+
+
+@pytest.mark.parametrize("form", OPAQUE)
+@pytest.mark.xfail(reason="all operands of a real power or a loop count as read")
+def test_a_quadratic_kinetic_energy_is_seen_through_loops(form):
+    assert structure(OPAQUE[form]).quadratic
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
+    found = structure(FORMS[form])
+    assert found.quadratic
+    assert found.mass_constant
+    assert found.bias_zero
+
+
+@pytest.mark.parametrize(
+    "lagrangian",
+    [
+        lambda t, q, v, params: 0.5 * v @ v + v[0] ** 4,
+        lambda t, q, v, params: 0.5 * v @ v + v[0] ** 3,
+        lambda t, q, v, params: -jnp.sqrt(1 - v @ v),
+        lambda t, q, v, params: jnp.cosh(v[0]) + jnp.cosh(v[1]),
+        lambda t, q, v, params: 0.5 * jnp.where(v[0] > 0, 1.0, 2.0) * v @ v,
+    ],
+    ids=["fourth", "third", "sqrt", "cosh", "where"],
+)
+def test_what_is_not_quadratic_is_seen(lagrangian):
+    found = structure(lagrangian)
+    assert "v" in found.mass
+    assert not found.quadratic
+    assert not found.mass_constant
+
+
+def test_control_flow_hides_no_dependence():
+    """Inside cond, scan and while all operands count."""
+
+    def choose(t, q, v, params):
+        return jax.lax.cond(t > 1.0, lambda: 1.0 + q[0] ** 2, lambda: 2.0 + q[0] ** 2) * v @ v
+
+    def power(t, q, v, params):
+        return jax.lax.fori_loop(0, 2, lambda _, x: x * q[0], jnp.ones(())) * v @ v
+
+    assert structure(choose).mass >= {"t", "q"}
+    assert structure(power).mass >= {"q"}
+    assert structure(power).bias >= {"q", "v"}
+
+
+def test_custom_rules_are_followed():
+    """A function with its own derivative counts by what that derivative reads."""
+
+    @jax.custom_jvp
+    def mass(x):
+        return 1.0 + 0.0 * x
+
+    @mass.defjvp
+    def _(primals, tangents):
+        return mass(primals[0]), primals[0] * tangents[0]
+
+    found = structure(lambda t, q, v, params: 0.5 * mass(q[0]) * v @ v)
+    assert (found.mass >= {"q"}, found.bias >= {"q", "v"}) == (True, True)
+
+
+def test_dependence_is_traced_per_argument():
+    """The finder itself, on functions of (t, q, v, params)."""
+    state = (jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
+
+    def nothing(t, q, v, params):
+        return jnp.ones(3)
+
+    def all_of_it(t, q, v, params):
+        return t + q[0] * v[1] + params
+
+    found = find_structure(nothing, all_of_it, lambda t, q, v, params: q, state, jnp.ones(()))
+    assert found.mass == frozenset()
+    assert found.bias == {"t", "q", "v", "params"}
+    assert found.lagrangian == {"q"}
+    assert not found.bias_zero
+
+
+# ---- Caching -------------------------------------------------------------------------------------
+
+
+def test_structure_is_traced_once_per_kind_of_params():
+    traces = []
+
+    def lagrangian(t, q, v, params):
+        traces.append(params)
+        return 0.5 * params["m"] * v @ v
+
+    system = jl.System(lagrangian, PAIR)
+    system.structure({"m": 1.0}, jnp.float64)
+    first = len(traces)
+    system.structure({"m": 7.0}, jnp.float64)
+    jl.System(lagrangian, PAIR).structure({"m": 3.0}, jnp.float64)
+    assert len(traces) == first > 0
+    system.structure({"m": 2}, jnp.float64)  # static: another program
+    assert len(traces) > first
+
+
+# ---- Explain -------------------------------------------------------------------------------------
+
+
+def said(name):
+    """What `explain` says, blanks closed up."""
+    system, params = (
+        (ENTRIES[name].system, dict(ENTRIES[name].example.params))
+        if name in ENTRIES
+        else GENERAL[name][:2]
+    )
+    lines = system.explain(params).splitlines()
+    return [" ".join(line.split()) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("mass_spring", "lagrangian depends on q, v, params; no explicit time"),
+        ("mass_spring", "mass matrix depends on params; L is quadratic in v"),
+        ("mass_spring", "bias depends on q, params"),
+        ("double_pendulum", "mass matrix depends on q, params; L is quadratic in v"),
+        ("double_pendulum", "bias depends on q, v, params"),
+        ("double_pendulum", "forces none, so no force code is compiled"),
+        ("driven_pivot", "lagrangian depends on t, q, v, params; explicit time"),
+        ("relativistic", "mass matrix depends on v, params; L is not quadratic in v"),
+        ("cart_pendulum", "coordinates 2: x, theta"),
+        (
+            "cart_pendulum",
+            "forces cart (GeneralizedForce), rod end (GeneralizedForce), damper (Rayleigh)",
+        ),
+        ("chain", "coordinates 3: theta[0], theta[1], theta[2]"),
+    ],
+)
+def test_explain_states_what_was_found(name, line):
+    assert [found for found in said(name) if found.startswith(line)] != []
+
+
+def test_explain_says_what_is_not_there():
+    lines = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR).explain(None).splitlines()
+    assert "mass matrix   depends on nothing; L is quadratic in v" in lines
+    assert "bias          zero" in lines
+
+
+def test_explain_says_how_the_mass_matrix_is_solved():
+    for n, said in ((8, "unrolled"), (9, "by library Cholesky (n > 8)")):
+        explained = chain(n).explain(GENERAL["chain"].params)
+        assert f"mass solve    one factorisation per evaluation, {said}" in explained
+
+
+def test_explain_refuses_what_is_no_lagrangian():
+    system = jl.System(lambda t, q, v, params: 0.5 * v**2, PAIR)
+    with pytest.raises(
+        ValueError, match=r"^lagrangian must return a real scalar, but it returned "
+    ):
+        system.explain(None)

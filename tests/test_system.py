@@ -1,0 +1,503 @@
+"""The equations of motion: identities at random states, then Lagrangians with known answers.
+
+Every quantity is a sum of products, each rounded to EPS of its size. Two ways of computing one
+number therefore agree to K EPS times the size of what is summed, `size` below; K = 32 roundings.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _mechanics import BEAD, GENERAL, RELATIVISTIC, Case, chain
+from numpy.linalg import norm
+
+import jaxlag as jl
+from systems._catalogue import ENTRIES
+
+K = 32
+EPS = np.finfo(float).eps
+STATES = 12
+
+BOOK = {
+    name: Case(entry.system, dict(entry.example.params), tuple(entry.example.q0))
+    for name, entry in ENTRIES.items()
+}
+CASES = BOOK | GENERAL
+QUADRATIC = [name for name in CASES if name != "relativistic"]
+
+
+def random_states(name):
+    """(params, t, q, v, x, b) with a leading axis of STATES; x, b: any acceleration and jerk."""
+    case = CASES[name]
+    rng = np.random.default_rng(sum(map(ord, name)))
+    n, speed = len(case.q0), case.largest_speed
+
+    def draw(low, high, *shape):
+        return rng.uniform(low, high, (STATES, *shape))
+
+    params = {key: value * draw(0.7, 1.3) for key, value in case.params.items()}
+    q = np.asarray(case.q0) + draw(-0.4, 0.4, n)
+    v = draw(-speed, speed, n) / np.sqrt(n)
+    return params, draw(0.0, 5.0), q, v, draw(-5.0, 5.0, n), draw(-9.0, 9.0, n)
+
+
+def quantities(system, quadratic, params, t, q, v, x, b):
+    """All that the identities compare, at one state."""
+    L = partial(system.lagrangian, params=params)
+    a = system.acceleration(params, q, v, t)
+
+    def energy(t, q, v):
+        return system.energy(params, q, v, t)
+
+    def along(s):
+        """(t, q, q') on the cubic with velocity v, acceleration x, jerk b at s = 0."""
+        return t + s, q + s * v + s**2 * x / 2 + s**3 * b / 6, v + s * x + s**2 * b / 2
+
+    momentum = jax.grad(L, argnums=2)
+    _, p_dot = jax.jvp(lambda s: momentum(*along(s)), (0.0,), (1.0,))
+    found = {
+        "M": system.mass_matrix(params, q, v, t),
+        "h": system.bias(params, q, v, t),
+        "Q": system.generalized_force(params, q, v, t),
+        "p": system.momentum(params, q, v, t),
+        "H": energy(t, q, v),
+        "L": L(t, q, v),
+        "a": a,
+        "hessian": jax.hessian(L, argnums=2)(t, q, v),
+        "H_dot": jax.jvp(energy, (t, q, v), (1.0, v, a))[1],
+        "L_t": jax.grad(L)(t, q, v),
+        "p_dot": p_dot,
+        "L_q": jax.grad(L, argnums=1)(t, q, v),
+    }
+    if quadratic:
+
+        def mass(t, q):
+            return system.mass_matrix(params, q, None, t)
+
+        found |= {
+            "C": system.coriolis_matrix(params, q, v, t),
+            "M_q": jax.jacrev(mass, argnums=1)(t, q),
+            "M_dot": jax.jvp(mass, (t, q), (1.0, v))[1],
+            "h_back": system.bias(params, q, -v, t),
+            "h_rest": system.bias(params, q, 0 * v, t),
+        }
+    if system._kinetic is not None:
+        found |= {
+            "T": system.kinetic(params, q, v, t),
+            "V": system.potential(params, q, t=t),
+            "T_q": jax.grad(system.kinetic, argnums=1)(params, q, v, t),
+            "V_q": jax.grad(system.potential, argnums=1)(params, q, t=t),
+        }
+    return found
+
+
+class Evaluated(NamedTuple):
+    states: tuple
+    found: dict
+
+    def __iter__(self):
+        """The quantities of one state after another, with t, q, v, x."""
+        _, t, q, v, x, _ = self.states
+        rows = self.found | {"t": t, "q": q, "v": v, "x": x}
+        for i in range(STATES):
+            yield {key: np.asarray(value[i]) for key, value in rows.items()}
+
+
+@pytest.fixture(scope="session")
+def evaluate():
+    """name -> Evaluated, each system compiled once."""
+    known = {}
+
+    def of(name):
+        if name not in known:
+            function = partial(quantities, CASES[name].system, name in QUADRATIC)
+            states = random_states(name)
+            known[name] = Evaluated(states, jax.jit(jax.vmap(function))(*states))
+        return known[name]
+
+    return of
+
+
+def agree(found, expected, *summed):
+    """Equal up to K roundings of everything summed."""
+    size = sum(np.max(norm(np.atleast_1d(x), axis=-1), initial=0.0) for x in summed)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=K * EPS * size)
+
+
+# ---- Identities ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_mass_matrix_is_symmetric_and_positive_definite(name, evaluate):
+    for s in evaluate(name):
+        agree(s["M"], s["M"].T, s["M"])
+        assert np.min(np.linalg.eigvalsh(s["M"])) > K * EPS * norm(s["M"], 2)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_mass_matrix_is_the_hessian_of_the_lagrangian(name, evaluate):
+    for s in evaluate(name):
+        agree(s["M"], s["hessian"], s["M"])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_acceleration_solves_the_equations_of_motion(name, evaluate):
+    for s in evaluate(name):
+        # Backward error: the solve is exact for an M that differs by n roundings.
+        agree(s["M"] @ s["a"] + s["h"], s["Q"], norm(s["M"], 2) * s["a"], s["h"], s["Q"])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_mass_and_bias_are_lagranges_equations_along_any_curve(name, evaluate):
+    """d/dt dL/dv - dL/dq = M x + h for every acceleration x, and whatever the jerk."""
+    for s in evaluate(name):
+        terms = (norm(s["M"], 2) * s["x"], s["h"], s["p_dot"], s["L_q"])
+        agree(s["p_dot"] - s["L_q"], s["M"] @ s["x"] + s["h"], *terms)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_energy_changes_by_power_and_by_explicit_time(name, evaluate):
+    """dH/dt = v . Q - dL/dt at fixed q and v, along the motion."""
+    for s in evaluate(name):
+        power = s["v"] @ s["Q"]
+        terms = [norm(s["v"]) * x for x in (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["L_q"])]
+        agree(s["H_dot"], power - s["L_t"], *terms, s["L_t"])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_energy_is_the_legendre_transform(name, evaluate):
+    for s in evaluate(name):
+        agree(s["H"], s["p"] @ s["v"] - s["L"], norm(s["p"]) * s["v"], s["L"])
+
+
+@pytest.mark.parametrize("name", QUADRATIC)
+def test_coriolis_matrix_comes_from_the_christoffel_symbols(name, evaluate):
+    for s in evaluate(name):
+        D, v = s["M_q"], s["v"]  # D_ijk = dM_ij/dq_k
+        along, across = D @ v, np.einsum("ikj,k->ij", D, v)
+        agree(s["C"], (along + across - across.T) / 2, along, across, s["M"])
+
+
+@pytest.mark.parametrize("name", QUADRATIC)
+def test_mass_rate_less_twice_coriolis_is_skew(name, evaluate):
+    for s in evaluate(name):
+        S = s["M_q"] @ s["v"] - 2 * s["C"]
+        agree(S, -S.T, s["M_q"] @ s["v"], s["C"], s["M"])
+
+
+@pytest.mark.parametrize("name", QUADRATIC)
+def test_coriolis_force_is_the_quadratic_part_of_the_bias(name, evaluate):
+    """Even in v and without its value at rest: [h(v) + h(-v)]/2 - h(0) = C v."""
+    for s in evaluate(name):
+        even = (s["h"] + s["h_back"]) / 2 - s["h_rest"]
+        agree(s["C"] @ s["v"], even, s["h"], s["h_back"], s["h_rest"], norm(s["C"], 2) * s["v"])
+
+
+@pytest.mark.parametrize("name", BOOK)
+def test_momentum_is_mass_times_velocity(name, evaluate):
+    for s in evaluate(name):
+        agree(s["p"], s["M"] @ s["v"], norm(s["M"], 2) * s["v"])
+
+
+@pytest.mark.parametrize("name", BOOK)
+def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
+    for s in evaluate(name):
+        # V itself is a sum that may cancel, as in 1 - cos: the 1 J stands for its terms.
+        agree(s["H"], s["T"] + s["V"], norm(s["p"]) * s["v"], s["T"], s["V"], 1.0)
+        agree(s["T"], s["v"] @ s["M"] @ s["v"] / 2, norm(s["M"], 2) * s["v"] @ s["v"])
+
+
+@pytest.mark.parametrize("name", BOOK)
+def test_bias_is_that_of_kinetic_and_potential_energy(name, evaluate):
+    """h = M' v - dT/dq + dV/dq."""
+    for s in evaluate(name):
+        expected = s["M_dot"] @ s["v"] - s["T_q"] + s["V_q"]
+        agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["T_q"], s["V_q"])
+
+
+def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate):
+    """None of them holds only because its terms vanish."""
+    assert len(BOOK) == 10
+    largest = {
+        key: {name for name in CASES if np.max(abs(evaluate(name).found.get(key, 0))) > 1e-2}
+        for key in ("L_t", "C", "Q", "M_q", "M_dot", "V_q", "T_q")
+    }
+    assert largest["L_t"] == {"driven_pivot", "bead"}
+    assert {"double_pendulum", "sleeve_pendulum", "chain", "bead"} <= largest["C"]
+    assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= largest["Q"]
+    assert largest["V_q"] == set(BOOK)
+    assert {"double_pendulum", "central_motion", "rotating_slender_rod"} <= largest["T_q"]
+    found = evaluate("charged").found
+    assert np.max(norm(found["p"] - (found["M"] @ random_states("charged")[3][..., None])[..., 0]))
+    assert np.max(
+        norm(evaluate("relativistic").found["M"] - evaluate("relativistic").found["M"][0])
+    )
+
+
+# ---- Lagrangians with known answers ----------------------------------------------------------
+
+
+def test_a_charge_circles_in_a_magnetic_field(evaluate):
+    """m a = e B (v_y, -v_x); p = m v + e A; H = m v^2/2."""
+    params, _, q, v, _, _ = random_states("charged")
+    found = evaluate("charged").found
+    m, e, B = (params[key][:, None] for key in ("m", "e", "B"))
+    turned, A = np.stack([v[:, 1], -v[:, 0]], 1), B / 2 * np.stack([-q[:, 1], q[:, 0]], 1)
+    np.testing.assert_allclose(found["a"], e * B / m * turned, rtol=K * EPS)
+    np.testing.assert_allclose(found["h"], -e * B * turned, rtol=K * EPS)
+    agree(found["p"], m * v + e * A, m * v, e * A)
+    agree(found["H"], m[:, 0] * np.sum(v**2, 1) / 2, found["L"], norm(found["p"]) * v)
+    assert np.max(abs(found["C"])) == 0.0  # gyroscopic terms are not Coriolis terms
+
+
+def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
+    """l theta'' = -g sin(theta) - x_p'' cos(theta), x_p = X cos(Omega t)."""
+    params, t, q, v, _, _ = random_states("driven_pivot")
+    found = evaluate("driven_pivot").found
+    length, g, X, omega = (params[key] for key in ("l", "g", "X", "Omega"))
+    pivot = -X * omega**2 * np.cos(omega * t)
+    expected = -(g * np.sin(q[:, 0]) + pivot * np.cos(q[:, 0])) / length
+    agree(found["a"][:, 0], expected, g / length, X * omega**2 / length, v**2)
+
+
+def test_a_relativistic_particle_gets_heavier(evaluate):
+    """M = gamma m (1 + gamma^2 v v^T/c^2), a = (F - (v . F) v/c^2)/(gamma m), H = gamma m c^2 + V."""
+    params, _, q, v, _, _ = random_states("relativistic")
+    found = evaluate("relativistic").found
+    m, c, g = (params[key][:, None] for key in ("m", "c", "g"))
+    gamma = 1 / np.sqrt(1 - np.sum(v**2, 1, keepdims=True) / c**2)
+    assert np.max(gamma) > 1.05
+    outer = v[:, :, None] * v[:, None, :]
+    M = (gamma * m)[:, None] * (np.eye(2) + ((gamma / c) ** 2)[:, None] * outer)
+    F = np.concatenate([-m * g, 0 * m], 1)
+    a = (F - np.sum(v * F, 1, keepdims=True) * v / c**2) / (gamma * m)
+    agree(found["M"], M, M)
+    agree(found["p"], gamma * m * v, gamma * m * v)
+    agree(found["a"], a, *(np.linalg.cond(M) * norm(g)))
+    agree(found["H"], (gamma * m * c**2 + m * g * q[:, :1])[:, 0], m * c**2)
+    # On one line, as in every text book: M = gamma^3 m, a = -g/gamma^3.
+    along = {key: value[0] for key, value in params.items()}
+    g3 = (1 - (1.5 / along["c"]) ** 2) ** -1.5
+    q, v = jnp.zeros(2), jnp.array([1.5, 0.0])
+    M = jax.jit(RELATIVISTIC.mass_matrix)(along, q, v)
+    a = jax.jit(RELATIVISTIC.acceleration)(along, q, v)
+    np.testing.assert_allclose(M[0, 0], g3 * along["m"], rtol=K * EPS)
+    np.testing.assert_allclose(a, [-along["g"] / g3, 0.0], rtol=K * EPS)
+
+
+def test_where_mass_depends_on_velocity_it_must_be_given():
+    params = GENERAL["relativistic"].params
+    with pytest.raises(
+        ValueError,
+        match=r"^mass_matrix: v must be given, since M depends on the velocities, but it was "
+        r"left out\. Call mass_matrix\(params, q, v\)\.$",
+    ):
+        RELATIVISTIC.mass_matrix(params, [0.0, 0.0])
+    with pytest.raises(
+        ValueError,
+        match=r"^coriolis_matrix must get a Lagrangian quadratic in the velocities, but its mass "
+        r"matrix d2L/dv2 depends on v\. Use bias",
+    ):
+        RELATIVISTIC.coriolis_matrix(params, [0.0, 0.0], [1.0, 0.0])
+
+
+def test_time_reaches_every_method_and_starts_at_zero():
+    params, q, v = GENERAL["bead"].params, jnp.array([0.3]), jnp.array([0.7])
+    names = ("mass_matrix", "coriolis_matrix", "momentum", "energy", "bias", "acceleration")
+
+    def values(*t):
+        return [jnp.ravel(getattr(BEAD, name)(params, q, v, *t)) for name in names]
+
+    silent, zero, later = jax.jit(lambda: (values(), values(0.0), values(10.0)))()
+    np.testing.assert_array_equal(silent, zero)
+    growth = dict(zip(names, np.divide(later, zero), strict=True))
+    for name in names[:4]:
+        np.testing.assert_allclose(growth[name], 2.0, rtol=K * EPS)  # all grow as m (1 + t/10)
+    assert abs(growth["bias"] - 2) > 0.01  # m' v stays
+    assert abs(growth["acceleration"] - 1) > 0.01
+
+
+# ---- Forms of coordinates and params ---------------------------------------------------------
+
+
+def springs(t, q, v, params):
+    """Three bodies in the plane, each on a spring from its own anchor, and a wheel theta."""
+    at, rate = NET.unflatten(q), NET.unflatten(v)
+    m, k = params["m"], params["k"]
+    T = 0.5 * jnp.sum(m[:, None] * rate["x"] ** 2) + 0.5 * params["J"] * rate["theta"] ** 2
+    return T - 0.5 * jnp.sum(k[:, None] * at["x"] ** 2) - params["J"] * at["theta"]
+
+
+NET = jl.System(springs, {"x": (3, 2), "theta": ()})
+
+
+def test_coordinates_may_be_arrays():
+    m, k = np.array([1.0, 2.0, 3.0]), np.array([4.0, 10.0, 18.0])
+    params = {"m": m, "k": k, "J": 0.5}
+    x, v = np.arange(6.0).reshape(3, 2) / 4, np.ones((3, 2))
+    q, rate = {"x": x, "theta": 0.3}, {"x": v, "theta": 0.1}
+    acceleration = jax.jit(NET.acceleration)
+    a = NET.unflatten(acceleration(params, q, rate))
+    np.testing.assert_allclose(a["x"], -(k / m)[:, None] * x, rtol=K * EPS)
+    np.testing.assert_allclose(a["theta"], -1.0, rtol=K * EPS)
+    M = jax.jit(NET.mass_matrix)(params, q)
+    np.testing.assert_array_equal(M, np.diag([1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 0.5]))
+    flat = acceleration(params, NET.flatten(q), NET.flatten(rate))
+    np.testing.assert_array_equal(flat, NET.flatten(a))
+
+
+class Spring(eqx.Module):
+    stiffness: jax.Array
+    law: object = eqx.field(static=True)
+
+    def __call__(self, x):
+        return self.stiffness * self.law(x)
+
+
+def test_params_may_be_a_module():
+    def lagrangian(t, q, v, params):
+        spring, m = params
+        return 0.5 * m * v[0] ** 2 - spring(q[0])
+
+    system = jl.System(lagrangian, ("x",))
+    params = (Spring(jnp.array(3.0), lambda x: x**4 / 4), 2.0)
+    q, v = jnp.array([2.0]), jnp.zeros(1)
+    a, slope = jax.jit(jax.value_and_grad(lambda p: system.acceleration(p, q, v)[0]))(params)
+    np.testing.assert_allclose(a, -3 * 8 / 2, rtol=K * EPS)
+    np.testing.assert_allclose(slope[0].stiffness, -8 / 2, rtol=K * EPS)
+    np.testing.assert_allclose(slope[1], 3 * 8 / 2**2, rtol=K * EPS)
+
+
+@pytest.mark.parametrize(
+    ("extra", "expected"),
+    [
+        ({"power": 2}, -6.0),
+        ({"power": 4}, -108.0),
+        ({"law": "cubic"}, -27.0),
+        ({"law": lambda x: x**2 + x}, -7.0),
+        ({"exponents": np.array([1, 3])}, -28.0),
+        ({"exponents": jnp.array([2, 2])}, -12.0),
+        ({"power": 2, "law": None, "exact": True}, -6.0),
+    ],
+)
+def test_params_may_hold_what_is_no_real_number(extra, expected):
+    """Integers, strings, functions, integer arrays, None: Python sees them as they are."""
+
+    def potential(t, q, params):
+        x, law = q[0], params.get("law")
+        if law == "cubic":
+            return x**3
+        if callable(law):
+            return law(x)
+        return sum(x ** int(n) for n in params.get("exponents", [params.get("power")]))
+
+    def kinetic(t, q, v, params):
+        return 0.5 * params["m"] * v[0] ** 2
+
+    system = jl.System(coordinates=("x",), kinetic=kinetic, potential=potential)
+    params = {"m": 1.0} | extra
+    a = jax.jit(lambda q: system.acceleration(params, q, jnp.zeros(1)))(jnp.array([3.0]))
+    np.testing.assert_allclose(a, [expected], rtol=K * EPS)
+
+
+def test_params_may_be_none():
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q[0], ("x", "y"))
+    np.testing.assert_array_equal(system.acceleration(None, [0.0, 0.0], [1.0, 2.0]), [-1.0, 0.0])
+
+
+# ---- Use ---------------------------------------------------------------------------------------
+
+
+def test_the_methods_pass_through_every_transform():
+    """d(theta'')/dg = -sin(theta)/l, its derivative in theta, over a batch, compiled."""
+    entry = ENTRIES["simple_pendulum"]
+    params = dict(entry.example.params)
+
+    def acceleration(g, theta):
+        return entry.system.acceleration(params | {"g": g}, theta[None], jnp.zeros(1))[0]
+
+    theta = jnp.linspace(-2.0, 2.0, 5)
+    slope = jax.jit(jax.vmap(jax.grad(acceleration), (None, 0)))(9.0, theta)
+    np.testing.assert_allclose(slope, -jnp.sin(theta) / params["h1"], rtol=K * EPS)
+    mixed = jax.vmap(jax.jacfwd(jax.grad(acceleration), argnums=1), (None, 0))(9.0, theta)
+    np.testing.assert_allclose(mixed, -jnp.cos(theta) / params["h1"], rtol=K * EPS)
+
+
+def test_states_may_be_lists_arrays_or_named():
+    entry = ENTRIES["two_mass_three_springs"]
+    bias = partial(entry.system.bias, entry.example.params)
+    expected = bias(jnp.array([3.0, 5.0]), jnp.array([1.0, -1.0]))
+    for q in ([3.0, 5.0], (3, 5), np.array([3, 5]), {"x2": 5.0, "x1": 3}):
+        np.testing.assert_array_equal(bias(q, [1.0, -1.0]), expected)
+        np.testing.assert_array_equal(bias(q, {"x1": 1, "x2": -1}), expected)
+
+
+def test_the_state_keeps_its_precision():
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q @ q, ("x",))
+    q, v = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
+    for x in (
+        system.mass_matrix(None, q),
+        system.bias(None, q, v),
+        system.acceleration(None, q, v),
+    ):
+        assert x.dtype == jnp.float32
+    assert system.energy(None, q, v).dtype == jnp.float32
+    assert system.acceleration(None, [1.0], [0.0]).dtype == jnp.float64
+
+
+def test_kinetic_and_potential_exist_where_declared():
+    entry = ENTRIES["mass_spring"]
+    params = {"m": 2.0, "k": 8.0}
+    assert float(entry.system.kinetic(params, [1.0], [3.0])) == 9.0
+    assert float(entry.system.potential(params, [0.5])) == 1.0
+    assert float(entry.system.potential(params, [0.5], [7.0])) == 1.0
+    whole = jl.System(entry.system.lagrangian, ("x",))
+    assert float(whole.energy(params, [0.5], [3.0])) == 10.0
+    for name in ("kinetic", "potential"):
+        with pytest.raises(
+            ValueError, match=rf"^System\.{name} must be called on a system declared by kinetic="
+        ):
+            getattr(whole, name)(params, [0.5], [3.0])
+
+
+def test_systems_of_the_same_functions_are_one():
+    L, Q = (lambda t, q, v, params: 0.5 * v @ v), (lambda t, q, v, params: q)
+
+    def declare(**changes):
+        parts = {"lagrangian": L, "coordinates": ("x",), "forces": (jl.GeneralizedForce(Q, "f"),)}
+        return jl.System(**(parts | changes))
+
+    assert declare() == declare()
+    assert hash(declare()) == hash(declare())
+    different = [
+        declare(lagrangian=lambda t, q, v, params: 0.5 * v @ v),
+        declare(coordinates=("y",)),
+        declare(coordinates={"x": (1,)}),
+        declare(forces=()),
+        declare(forces=(jl.GeneralizedForce(Q, "g"),)),
+        declare(forces=(jl.GeneralizedForce(lambda t, q, v, params: q, "f"),)),
+        declare(forces=(jl.Rayleigh(Q, "f"),)),
+    ]
+    assert all(system != declare() for system in different)
+
+
+def test_check_is_silent_where_all_is_well():
+    for name in ("cart_pendulum", "relativistic", "bead"):
+        case = CASES[name]
+        v = np.full(len(case.q0), 0.1)
+        assert case.system.check(case.params, list(case.q0), v, t=0.3) is None
+
+
+def test_a_long_chain_hangs_at_rest():
+    """n = 12, the library solve: hanging straight and at rest it stays; M_ij = m l^2 (n - max)."""
+    n, params, zero = 12, {"m": 0.4, "l": 0.3, "g": 9.81}, np.zeros(12)
+    a, M = jax.jit(
+        lambda: (chain(n).acceleration(params, zero, zero), chain(n).mass_matrix(params, zero))
+    )()
+    np.testing.assert_array_equal(a, zero)
+    index = np.arange(n)
+    agree(M, 0.4 * 0.3**2 * (n - np.maximum(index[:, None], index)), M)

@@ -1,0 +1,240 @@
+"""The programs of the equations of motion, read as jaxprs: what they do, how often, how large.
+
+A chain of N links stands for any system. Its Lagrangian may carry a mark: arrays turned round,
+an operation that is linear, so that every derivative of L repeats it and is counted with it.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _jaxprs import count, largest, names, operations
+from _mechanics import CHAIN_PARAMS, chain, chain_lagrangian
+
+import jaxlag as jl
+from jaxlag._linalg import UNROLL_UP_TO, factor_mass, solve_mass
+from systems._catalogue import ENTRIES
+
+SMALL, LARGE = 5, 12
+FACTORISATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
+MARK = 3  # entries of the marked array
+
+
+def marked(t, q, v, params):
+    """The chain's L plus a function of t, q and v in which `rev` marks one evaluation."""
+    mixed = jnp.stack([jnp.sum(q * v), jnp.sum(jnp.sin(q)), t])
+    return chain_lagrangian(t, q, v, params) + jnp.prod(jnp.sin(jax.lax.rev(mixed, (0,))))
+
+
+def evaluations(program):
+    """Evaluations of the mark, one for each array of MARK entries that is turned round."""
+    turned = [o for o in program if o.name == "rev"]
+    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in turned)
+
+
+def at_rest(n):
+    return CHAIN_PARAMS, jnp.linspace(0.1, 1.0, n), jnp.linspace(-1.0, 1.0, n)
+
+
+def gradient(function):
+    """The reverse derivative of a vector function of params, weighted by its components."""
+
+    def weighted(params, q, v):
+        return jnp.sum(function(params, q, v) * jnp.arange(1.0, q.size + 1))
+
+    return jax.grad(weighted)
+
+
+def tangent(function):
+    def moved(params, q, v):
+        return jax.jvp(partial(function, params), (q, v), (v, q))
+
+    return moved
+
+
+# ---- One factorisation -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, LARGE])
+def test_large_systems_take_one_cholesky(n, derivative):
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert count(program, "cholesky") == 1
+    assert names(program) & FACTORISATIONS == {"cholesky"}
+
+
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [2, SMALL, UNROLL_UP_TO])
+def test_small_systems_take_one_elimination(n, derivative):
+    """The only divisions are n (n - 1)/2 of the elimination, and 2 n of each solve."""
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert names(program) & FACTORISATIONS == set()
+    assert count(program, "div", without=("custom_linear_solve",)) == n * (n - 1) // 2
+    solves = count(program, "custom_linear_solve")
+    assert solves == (2 if derivative else 1)
+    assert count(program, "div") - n * (n - 1) // 2 <= 2 * n * solves
+
+
+def test_the_counts_see_a_second_factorisation():
+    """The counter itself: the two forms that the tests above forbid."""
+
+    def twice(M, r):
+        return solve_mass(M, solve_mass(M, r))
+
+    for n in (SMALL, LARGE):
+        program = operations(twice, jnp.eye(n), jnp.ones(n))
+        assert count(program, "cholesky") == (2 if n > UNROLL_UP_TO else 0)
+        if n <= UNROLL_UP_TO:
+            divisions = count(program, "div", without=("custom_linear_solve",))
+            assert divisions == n * (n - 1)
+    assert "svd" in names(operations(jnp.linalg.pinv, jnp.eye(SMALL)))
+
+
+def test_a_factor_at_hand_is_used():
+    def solve(M, r):
+        factor = factor_mass(M)
+        return solve_mass(M, r, factor), solve_mass(M, 2 * r, factor)
+
+    assert count(operations(solve, jnp.eye(LARGE), jnp.ones(LARGE)), "cholesky") == 1
+
+
+# ---- Sizes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+@pytest.mark.parametrize("derivative", [None, tangent])
+def test_no_array_is_larger_than_the_mass_matrix(n, derivative):
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert largest(program) == n * n
+    with_cubes = operations(jax.jacfwd(chain(n).mass_matrix, argnums=1), *at_rest(n))
+    assert largest(with_cubes) >= n**3  # what a derivative of M would show
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+def test_the_bias_holds_vectors_only(n):
+    assert largest(operations(chain(n).bias, *at_rest(n))) == n
+
+
+# ---- Evaluations of the Lagrangian ---------------------------------------------------------------
+
+
+def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
+    """Forward and reverse, each with its tangent: four, whatever n."""
+    found = {
+        n: evaluations(operations(jl.System(marked, {"theta": (n,)}).bias, *at_rest(n)))
+        for n in (2, 10)
+    }
+    assert found == {2: 4, 10: 4}
+
+
+def test_the_mass_matrix_evaluates_it_once_per_column():
+    """The mark does count: forward and reverse, and the tangents of both for every column."""
+    found = {
+        n: evaluations(operations(jl.System(marked, {"theta": (n,)}).mass_matrix, *at_rest(n)))
+        for n in (2, 10)
+    }
+    assert found == {2: 2 + 2 * 2, 10: 2 + 2 * 10}
+
+
+def test_the_acceleration_evaluates_what_mass_and_bias_do():
+    n = 10
+    program = operations(jl.System(marked, {"theta": (n,)}).acceleration, *at_rest(n))
+    assert evaluations(program) <= (2 + 2 * n) + 4
+
+
+# ---- What is not declared is not there -----------------------------------------------------------
+
+
+def push(t, q, v, params):
+    return jnp.sin(jax.lax.rev(q, (0,)))
+
+
+def drag(t, q, v, params):
+    return jnp.sum(jnp.cosh(v))
+
+
+PUSHED = (jl.GeneralizedForce(push, "push"), jl.Rayleigh(drag, "drag"))
+
+
+def test_no_force_code_without_forces():
+    """A free chain is M, h and the solve of -h, not one operation more."""
+    n, free = 4, chain(4)
+
+    def bare(params, q, v):
+        return solve_mass(free.mass_matrix(params, q, v), -free.bias(params, q, v))
+
+    program = operations(free.acceleration, *at_rest(n))
+    expected = operations(bare, *at_rest(n))
+    assert sorted(o.name for o in program) == sorted(o.name for o in expected)
+    assert names(program).isdisjoint({"rev", "sinh", "cosh"})
+    pushed = operations(chain(n, PUSHED).acceleration, *at_rest(n))
+    assert {"rev", "sinh"} <= names(pushed)
+
+
+def test_only_the_forces_asked_for_are_computed():
+    force = chain(4, PUSHED).generalized_force
+    found = {
+        chosen: names(operations(partial(force, names=chosen), *at_rest(4))) & {"rev", "sinh"}
+        for chosen in [(), ("push",), ("drag",), ("push", "drag")]
+    }
+    assert found == {
+        (): set(),
+        ("push",): {"rev"},
+        ("drag",): {"sinh"},
+        ("push", "drag"): {"rev", "sinh"},
+    }
+
+
+def test_tables_are_searched_only_where_there_are_tables():
+    def pulled(t, q, v, params, inputs):
+        return inputs["u"] * q
+
+    system = chain(4, (jl.GeneralizedForce(pulled, "pull"),))
+
+    def acceleration(signal, params, q, v):
+        return system.acceleration(params, q, v, inputs={"u": signal})
+
+    table = jl.Linear(jnp.arange(5.0), jnp.ones(5))
+    free = names(operations(chain(4).acceleration, *at_rest(4)))
+    with_number = names(operations(acceleration, jnp.array(2.0), *at_rest(4)))
+    with_table = names(operations(acceleration, table, *at_rest(4)))
+    assert with_number == free
+    assert with_table - free >= {"scan", "dynamic_slice"}  # of jnp.searchsorted
+
+
+# ---- The protocol --------------------------------------------------------------------------------
+
+
+def test_terms_without_constraints_have_no_rows():
+    system = ENTRIES["double_pendulum"].system
+    params = dict(ENTRIES["double_pendulum"].example.params)
+    t, q, v = jnp.zeros(()), jnp.ones(2), jnp.ones(2)
+    A, b = system.terms.rows(t, q, v, params)
+    assert (A.shape, b.shape, system.terms.gamma(t, q, v, params).shape) == ((0, 2), (0,), (0,))
+    assert isinstance(system.terms, jl.Terms)
+
+
+def test_terms_are_those_of_the_public_methods():
+    entry = ENTRIES["cart_pendulum"]
+    params = dict(entry.example.params)
+    t, q, v = jnp.array(0.7), jnp.array([0.2, 0.9]), jnp.array([-1.0, 2.0])
+
+    @jax.jit
+    def both():
+        terms, system = entry.system.terms, entry.system
+        return [
+            (terms.mass(t, q, v, params), system.mass_matrix(params, q, v, t)),
+            (terms.bias(t, q, v, params), system.bias(params, q, v, t)),
+            (terms.momentum(t, q, v, params), system.momentum(params, q, v, t)),
+            (terms.force(t, q, v, params, {}), system.generalized_force(params, q, v, t)),
+            (terms.acceleration(t, q, v, params, {}), system.acceleration(params, q, v, t)),
+        ]
+
+    for found, expected in both():
+        np.testing.assert_array_equal(found, expected)
+        assert np.any(found)
