@@ -86,8 +86,11 @@ def diagnose(
 def _culprits(
     dynamics: Dynamics, tau: Array, y: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """(coordinate without inertia or -1, coordinate of non-finite or else largest |a|)."""
-    a = jnp.abs(dynamics.acceleration(tau, y, args))
-    finite = jnp.isfinite(a)
-    worst = jnp.where(jnp.all(finite), jnp.argmax(a), jnp.argmin(finite)).astype(jnp.int32)
-    return first_unhealthy(factor_mass(dynamics.mass(tau, y, args))), worst
+    """(coordinate without inertia or -1, coordinate of non-finite Q - h, else of largest |a|)."""
+    a, effort = dynamics.acceleration(tau, y, args), dynamics.effort(tau, y, args)
+    # A non-finite component spreads through the solve: look at the right-hand side first.
+    suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
+    finite = jnp.isfinite(suspect)
+    worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
+    without_inertia = first_unhealthy(factor_mass(dynamics.mass(tau, y, args)))
+    return without_inertia, worst.astype(jnp.int32)

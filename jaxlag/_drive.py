@@ -31,9 +31,9 @@ class Times(NamedTuple):
     start: Float[Array, "..."]
     stop: Float[Array, "..."]
     knots: Float[Array, " k"] | None
-    saves: Float[Array, " s"]
+    saves: Float[Array, "s ..."]
 
-    def anchors(self) -> Float[Array, " a"]:
+    def anchors(self) -> Float[Array, "a ..."]:
         """Start, stop and knots in one row; `Grid.anchor` indexes it."""
         ends = jnp.stack([self.start, self.stop])
         return ends if self.knots is None else jnp.concatenate([ends, self.knots])
@@ -201,6 +201,9 @@ def drive(
         record: whether to keep the grid of accepted steps, for `replay`.
     """
     t0 = times.start
+    if times.saves.ndim == 1:  # shared by all lanes
+        saves = times.saves.reshape((-1,) + (1,) * t0.ndim)
+        times = times._replace(saves=jnp.broadcast_to(saves, times.saves.shape + t0.shape))
     count = times.saves.shape[0]
     keep_rows = count > 2
     size = -(-max_steps // CHUNK) * CHUNK
@@ -246,16 +249,17 @@ def drive(
     final = jax.lax.while_loop(lambda c: eqxi.unvmap_any(~c.done), turn, dynamic)
     c: _Carry = eqx.combine(final, static)
     rows = _filled(c) if keep_rows else (None, None, jnp.stack([zero, c.accepted]))
-    saves = times.saves.reshape((-1,) + (1,) * t0.ndim)
-    reached = saves <= c.t
+    reached = times.saves <= c.t
     inside = jnp.zeros_like(reached)
     if rows[0] is not None:
-        inside = reached & (saves - rows[0] > resolution(saves))
+        inside = reached & (times.saves - rows[0] > resolution(times.saves))
     grid = None
     if record:
-        assert c.ends is not None and c.ends_anchor is not None and c.jumps is not None
+        assert c.ends is not None
+        assert c.ends_anchor is not None
+        assert c.jumps is not None
         assert rows[2] is not None
-        offset = c.ends - times.anchors()[c.ends_anchor]
+        offset = c.ends - jnp.take_along_axis(times.anchors(), c.ends_anchor, axis=0)
         grid = Grid(offset, c.ends_anchor, c.jumps, rows[2], c.accepted)
     ends = (c.status, c.t, c.y, c.tried, c.accepted, c.attempted)
     return Outcome(*ends, *rows[:2], reached, inside, grid)
@@ -308,11 +312,10 @@ def _turn(scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c:
     row_time, row_state, row_step, rows = c.row_time, c.row_state, c.row_step, c.rows
     if row_time is not None:
         size = times.saves.shape[0]
-        saves = times.saves.reshape((-1,) + (1,) * c.t.ndim)
-        rows = jnp.where(take, jnp.sum(saves <= t, axis=0, dtype=jnp.int32), c.rows)
+        rows = jnp.where(take, jnp.sum(times.saves <= t, axis=0, dtype=jnp.int32), c.rows)
         # Rows inside this step continue from its start; a row at its end is the end itself.
         first = jnp.where(rows > c.rows, c.rows, size)
-        last_save = times.saves[rows - 1]
+        last_save = jnp.take_along_axis(times.saves, rows[None] - 1, axis=0)[0]
         at_end = (rows > c.rows) & (t - last_save <= resolution(t))
         last = jnp.where(at_end, rows - 1, size)
         row_time = _write(_write(row_time, first, c.t), last, t)

@@ -64,10 +64,21 @@ class Dynamics(eqx.Module):
     def acceleration(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
-        """A at (tau, y)."""
-        t, (q, v), (params, inputs) = self.mirror(tau, args), self.parts(y), self.given(args)
-        values = evaluate(inputs, t, q, v, params, args.intervals)
+        """Acceleration a at (tau, y)."""
+        t, q, v, params, values = self._at(tau, y, args)
         return self.system.terms.acceleration(t, q, v, params, values)
+
+    def effort(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, " n"]:
+        """Q - h at (tau, y): what M a is equal to."""
+        t, q, v, params, values = self._at(tau, y, args)
+        terms = self.system.terms
+        return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
+
+    def _at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
+        t, (q, v), (params, inputs) = self.mirror(tau, args), self.parts(y), self.given(args)
+        return t, q, v, params, evaluate(inputs, t, q, v, params, args.intervals)
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments

@@ -73,7 +73,7 @@ def _eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:
 def solve_mass(
     M: Float[Array, "n n"], r: Float[Array, " n"], factor: MassFactor | None = None
 ) -> Float[Array, " n"]:
-    """X with M x = r; NaN where M is not positive definite.
+    """The x with M x = r; NaN where M is not positive definite.
 
     Derivatives reuse the factor: dx = M^-1 (dr - dM x).
 

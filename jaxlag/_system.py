@@ -218,7 +218,7 @@ class System(eqx.Module):
         return ArrayTerms(self.lagrangian, chosen).force(t, q, v, params, values)
 
     def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
-        """P = dL/dv, shape (n,), kg m/s or kg m^2/s."""
+        """Momentum p = dL/dv, shape (n,), kg m/s or kg m^2/s."""
         t, q, v, params = self._state(params, q, v, t)
         return self.terms.momentum(t, q, v, params)
 
@@ -258,7 +258,7 @@ class System(eqx.Module):
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
-        """A with M a + h = Q, shape (n,), m/s^2 or rad/s^2; NaN where M is singular.
+        """Acceleration a with M a + h = Q, shape (n,), m/s^2 or rad/s^2; NaN where M is singular.
 
         Args:
             params: as the Lagrangian takes them.

@@ -21,19 +21,19 @@ class Terms(eqx.Module):
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """P = dL/dv."""
+        """Momentum p = dL/dv."""
 
     @abstractmethod
     def mass(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, "n n"]:
-        """M = d2L/dv2."""
+        """Mass matrix M = d2L/dv2."""
 
     @abstractmethod
     def bias(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """H = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
+        """Bias h = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
 
     @abstractmethod
     def force(
@@ -56,7 +56,7 @@ class Terms(eqx.Module):
     def gamma(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " m"]:
-        """Gamma = A' v + b', so that A a + gamma = 0."""
+        """Vector gamma = A' v + b', so that A a + gamma = 0."""
 
     @abstractmethod
     def acceleration(

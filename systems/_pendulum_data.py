@@ -1,4 +1,4 @@
-"""Recordings of a swinging pendulum: read from a file, split, cut in windows.
+"""Recordings of a swinging pendulum: read from a file, cut in windows.
 
 Angles are in rad from the hanging position, positive counterclockwise, not wrapped. A recording
 is one or more segments sampled evenly, each with a number of its own; where the shaft is driven,
@@ -6,23 +6,23 @@ the motor's torque (N m) is recorded with the angle.
 """
 
 import gzip
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Bool, Float, Int
 
-# Columns of an angle, and the angle at which the pendulum hangs in each (rad).
+# Columns of an angle, and what each shows where the pendulum hangs (rad).
 ANGLES = {"q": 0.0, "theta1": np.pi}
-# Columns that are known but not used: velocities there are filtered, the angle is not.
+# Columns that may be there but are not used: recorded velocities are filtered, angles are not.
 UNUSED = ("v", "omega1")
-LONGEST_GAP = 1.5  # between samples, over the median spacing
+LONGEST_GAP = 1.5  # between samples, over their median spacing
+FEWEST_SAMPLES = 10  # in a window
+SHORTEST = 0.2  # s, of a window
 
 
 class DataError(ValueError):
-    """A recording that cannot be used, saying which argument, what it must be and what it was."""
+    """A recording that cannot be used: which argument, what it must be, what it was."""
 
 
 class Segment(NamedTuple):
@@ -40,9 +40,13 @@ class Segment(NamedTuple):
     q: np.ndarray
     tau: np.ndarray | None
 
+    def part(self, rows: np.ndarray | slice) -> "Segment":
+        """Some of its rows."""
+        tau = None if self.tau is None else self.tau[rows]
+        return Segment(self.number, self.t[rows], self.q[rows], tau)
 
-@dataclass(frozen=True)
-class Recording:
+
+class Recording(NamedTuple):
     """Segments of one measurement, in the order of time."""
 
     name: str
@@ -58,13 +62,9 @@ class Recording:
         """Median time between samples, s."""
         return float(np.median(np.diff(self.segments[0].t)))
 
-    def only(self, keep: Callable[[int], bool]) -> "Recording":
-        """The recording with those segments whose number passes `keep`."""
-        return replace(self, segments=tuple(s for s in self.segments if keep(s.number)))
-
 
 class Windows(NamedTuple):
-    """Equally long pieces of motion, w windows of s samples; a pytree.
+    """Equally long pieces of motion, w windows of s samples, or one; a pytree, traced by JAX.
 
     Attributes:
         t: times since each window's start (w, s), s.
@@ -72,18 +72,14 @@ class Windows(NamedTuple):
         tau: measured torques (w, s), N m; None for a free swing.
     """
 
-    t: Float[Array | np.ndarray, "*w s"]
-    q: Float[Array | np.ndarray, "*w s"]
-    tau: Float[Array | np.ndarray, "*w s"] | None
+    t: Float[np.ndarray, "*w s"]
+    q: Float[np.ndarray, "*w s"]
+    tau: Float[np.ndarray, "*w s"] | None
 
     def every(self, stride: int) -> "Windows":
         """Every `stride`-th sample."""
-        return Windows(*(None if x is None else x[..., ::stride] for x in self))
-
-    def first(self, seconds: float) -> "Windows":
-        """The samples up to `seconds` after each window's start, at least 5 of them."""
-        count = max(5, round(seconds / float(self.t[0, 1])))
-        return Windows(*(None if x is None else x[..., :count] for x in self))
+        tau = None if self.tau is None else self.tau[..., ::stride]
+        return Windows(self.t[..., ::stride], self.q[..., ::stride], tau)
 
 
 def bad(argument: str, must: str, was: str, fix: str) -> DataError:
@@ -91,18 +87,31 @@ def bad(argument: str, must: str, was: str, fix: str) -> DataError:
     return DataError(f"{argument} must {must}, but {was}. {fix}")
 
 
-def cut(recording: Recording, seconds: float | None) -> Windows:
-    """Windows of `seconds`, side by side from each segment's start; None: whole segments.
+def cut(
+    recording: Recording, seconds: float | None = None
+) -> tuple[Windows, Int[np.ndarray, " w"]]:
+    """Windows of `seconds`, side by side from each segment's start, and their segments' numbers.
 
-    A remainder shorter than a window is left out; segments taken whole are cut to the shortest.
+    A remainder shorter than a window is left out. Without `seconds` every segment is one window,
+    cut to the length of the shortest.
 
     Raises:
-        DataError: a window has fewer than 10 samples, there is no whole window, or nothing moves.
+        DataError: a window would be too short, no segment is as long as one, or angle or torque
+            never change.
     """
     sizes = [len(segment.t) for segment in recording.segments]
-    size = min(sizes) if seconds is None else round(seconds / recording.spacing)
-    if size < 10:
-        raise bad("--window", "hold 10 samples or more", f"it holds {size}", "Make it longer.")
+    size = min(sizes)
+    if seconds is not None:
+        size = round(seconds / recording.spacing) if np.isfinite(seconds) else 0
+    if size < FEWEST_SAMPLES or size * recording.spacing < SHORTEST:
+        raise bad(
+            f"every segment of {recording.name}" if seconds is None else "--window",
+            f"last {max(SHORTEST, FEWEST_SAMPLES * recording.spacing):.3g} s or more",
+            f"one lasts {size * recording.spacing:.3g} s"
+            if seconds is None
+            else f"it was {seconds} s",
+            "Drop short segments." if seconds is None else "Make it longer.",
+        )
     if max(sizes) < size:
         raise bad(
             recording.name,
@@ -110,49 +119,49 @@ def cut(recording: Recording, seconds: float | None) -> Windows:
             f"its longest segment lasts {max(sizes) * recording.spacing:.3g} s",
             "Record longer, or make --window shorter.",
         )
-    pieces = [piece for segment in recording.segments for piece in _pieces(segment, size)]
+    pieces = [
+        segment.part(slice(i, i + size))
+        for segment in recording.segments
+        for i in range(0, len(segment.t) - size + 1, size)
+    ]
     # To the nanosecond, so that multiples of the spacing are recognised as such.
     t = np.stack([np.round(piece.t - piece.t[0], 9) for piece in pieces])
     q = np.stack([piece.q for piece in pieces])
-    if np.ptp(q) == 0:
-        raise bad(recording.name, "move", f"its angle was always {q[0, 0]}", "Let it swing.")
     tau = np.stack([p.tau for p in pieces if p.tau is not None]) if recording.driven else None
-    return Windows(t, q, tau)
+    if np.ptp(q) == 0:
+        raise bad(recording.name, "move", f"its angle was always {q[0, 0]:g}", "Let it swing.")
+    if tau is not None and np.ptp(tau) == 0:
+        raise bad(
+            f"tau_meas of {recording.name}",
+            "vary",
+            f"it was always {tau[0, 0]:g}",
+            "Drop the column if the pendulum swings freely.",
+        )
+    return Windows(t, q, tau), np.array([piece.number for piece in pieces])
 
 
-def split(recording: Recording, seconds: float) -> tuple[Recording, Recording]:
-    """(train, test): a third of the segments is test, those whose number is divisible by 3.
+def held_out(recording: Recording, numbers: Int[np.ndarray, " w"]) -> Bool[np.ndarray, " w"]:
+    """Which windows are kept for the test: a third.
 
-    A recording in one segment is first cut into segments of `seconds`.
+    Those of the segments whose number is divisible by 3; every third window where there is one
+    segment only.
 
     Raises:
-        DataError: one of the two would be empty.
+        DataError: that leaves none to train on, or none to test on.
     """
-    if len(recording.segments) == 1:
-        size = max(1, round(seconds / recording.spacing))
-        pieces = tuple(_pieces(recording.segments[0], size))
-        recording = replace(recording, segments=pieces)
-    train = recording.only(lambda number: number % 3 != 0)
-    test = recording.only(lambda number: number % 3 == 0)
-    if not train.segments or not test.segments:
+    test = numbers % 3 == 0 if len(recording.segments) > 1 else np.arange(len(numbers)) % 3 == 0
+    if test.all() or not test.any():
         raise bad(
             recording.name,
             "have windows to train on and windows to test on",
-            f"it has {len(recording.segments)} in all",
+            f"it has {len(numbers)}, in segments {sorted(set(numbers.tolist()))}",
             "Record longer, make --window shorter, or name another recording by --test.",
         )
-    return train, test
-
-
-def _pieces(segment: Segment, size: int) -> Iterator[Segment]:
-    """Pieces of `size` samples, side by side and numbered from 0."""
-    for i in range(0, len(segment.t) - size + 1, size):
-        t, q, tau = (None if x is None else x[i : i + size] for x in segment[1:])
-        yield Segment(i // size, t, q, tau)
+    return test
 
 
 def read(path: Path) -> Recording:
-    """A recording from a CSV file, gzipped or not.
+    """A recording from a CSV file, gzipped if its name ends in .gz.
 
     Lines that start with # are skipped; the next line names the columns: `t` (s), the angle as
     `q` (rad, 0 hanging) or `theta1` (rad, 0 upright), and optionally `seg` (integer segment
@@ -162,26 +171,22 @@ def read(path: Path) -> Recording:
         DataError: no such file, or its content is not such a table.
     """
     names, rows = _table(path)
-    angle = [name for name in names if name in ANGLES]
+    angles = [name for name in names if name in ANGLES]
     unknown = set(names) - {"t", "seg", "tau_meas", *ANGLES, *UNUSED}
-    if len(angle) != 1 or "t" not in names or unknown or len(set(names)) < len(names):
+    if len(angles) != 1 or "t" not in names or unknown or len(set(names)) < len(names):
         raise bad(
             f"the header of {path.name}",
             "name t, one angle (q, 0 hanging, or theta1, 0 upright) and at most "
-            "seg, tau_meas, v, omega1",
+            "seg, tau_meas, v, omega1 besides",
             f"it names {', '.join(names)}",
             "Rename or drop columns.",
         )
-    column = dict(zip(names, rows.T, strict=True))
-    seg = column.get("seg", np.zeros(len(rows)))
+    columns = dict(zip(names, rows.T, strict=True))
+    numbers = columns.get("seg", np.zeros(len(rows)))
+    q = columns[angles[0]] - ANGLES[angles[0]]
     segments = tuple(
-        Segment(
-            int(number),
-            column["t"][seg == number],
-            column[angle[0]][seg == number] - ANGLES[angle[0]],
-            column["tau_meas"][seg == number] if "tau_meas" in column else None,
-        )
-        for number in np.unique(seg)
+        Segment(int(number), columns["t"], q, columns.get("tau_meas")).part(numbers == number)
+        for number in np.unique(numbers)
     )
     for segment in segments:
         _check_times(path.name, segment)
@@ -195,14 +200,12 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     except (OSError, EOFError, UnicodeDecodeError) as error:
         raise bad(
             "the recording",
-            "be a CSV file that can be read, gzipped where its name ends in .gz",
-            f"{path}: {error}",
+            "be a CSV file that can be read, gzipped if its name ends in .gz",
+            f"{path} gave {type(error).__name__}: {error}",
             "Check the path.",
         ) from error
     if len(lines) < 3:
-        raise bad(
-            path.name, "have a header and rows", f"it has {len(lines)} lines", "Check the file."
-        )
+        raise bad(path.name, "have a header and rows", f"it has {len(lines)} lines", "Fill it.")
     try:
         rows = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
     except ValueError as error:
@@ -211,7 +214,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     if rows.shape[1] != len(names):
         raise bad(
             path.name,
-            f"have {len(names)} columns as its header says",
+            f"have as many columns as its header names, {len(names)}",
             f"its rows have {rows.shape[1]}",
             "Mend the header.",
         )
@@ -220,21 +223,21 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
         raise bad(
             path.name,
             "hold finite numbers",
-            f"column {names[column]} of row {row + 1} was {rows[row, column]}",
-            "Drop such rows, and number the pieces on either side in a column seg.",
+            f"{names[column]} was {rows[row, column]} in row {row + 1}",
+            "Drop such rows, and number the pieces between them in a column seg.",
         )
     return names, rows
 
 
 def _check_times(name: str, segment: Segment) -> None:
-    steps = np.diff(segment.t)
-    if len(steps) == 0:
+    if len(segment.t) < 2:
         raise bad(
-            f"segment {segment.number} of {name}",
-            "have 2 rows or more",
-            f"it has {len(segment.t)}",
+            name,
+            "have 2 rows or more in every segment",
+            f"segment {segment.number} has {len(segment.t)}",
             "Drop it.",
         )
+    steps = np.diff(segment.t)
     if np.min(steps) <= 0:
         i = int(np.argmax(steps <= 0))
         raise bad(
@@ -247,8 +250,7 @@ def _check_times(name: str, segment: Segment) -> None:
         i = int(np.argmax(steps))
         raise bad(
             f"t of {name}",
-            f"be sampled evenly, steps at most {LONGEST_GAP} times their median",
+            f"be sampled evenly, no step longer than {LONGEST_GAP} times the median",
             f"{segment.t[i]} s is followed by {segment.t[i + 1]} s",
             "Number the pieces on either side of a gap in a column seg.",
         )
-

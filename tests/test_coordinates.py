@@ -5,7 +5,6 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from _user import unchecked  # noqa: F401
 
 from jaxlag._coordinates import Coordinates

@@ -1,5 +1,7 @@
 """The loop: order, rows as accurate as steps, landing on knots, fixed grids, lanes, direction."""
 
+import itertools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -31,20 +33,32 @@ def error(motion, reference):
 
 
 @pytest.mark.parametrize(
-    ("method", "order", "h"),
-    [("midpoint", 2, 1e-3), ("bosh3", 3, 1e-2), ("tsit5", 5, 2e-2), ("dopri8", 8, 8e-2)],
+    ("method", "order", "h"), [("midpoint", 2, 2e-3), ("bosh3", 3, 1e-2), ("tsit5", 5, 2.5e-2)]
 )
-def test_order_by_slope(reference, method, order, h):
-    """Error at t = 4 over two halvings of a fixed step, within the asymptotic range."""
-    ts = np.array([0.0, 4.0])
-    errors = [
-        np.abs(run(ts, method=method, dt=h / 2**k).q[-1] - reference.q[-1]).max() for k in range(3)
-    ]
+def test_order_by_slope(method, order, h):
+    """Error at t = 12 of a central motion over two halvings of a fixed step.
+
+    Order 8 has no such window in float64: its leading coefficient is so small that the error is
+    round-off (1e-14) before it stops falling like h^9.
+    """
+    motion, ts = MOTIONS["central_motion"], np.array([0.0, 12.0])
+
+    def end(**options):
+        m = jl.simulate(
+            motion.system, motion.q0, motion.v0, ts, motion.params, max_steps=30_000, **options
+        )
+        return np.concatenate([m.q[-1], m.v[-1]])
+
+    truth = end(rtol=1e-14, atol=1e-14)
+    errors = [np.linalg.norm(end(method=method, dt=h / 2**k) - truth) for k in range(3)]
     slope = np.log2(errors[0] / errors[2]) / 2
     assert abs(slope - order) < 0.1, (slope, errors)
 
 
-@pytest.mark.parametrize("method", ["dopri8", "tsit5", "bosh3", "kvaerno5"])
+@pytest.mark.parametrize(
+    "method",
+    ["dopri8", "tsit5", *(pytest.param(m, marks=pytest.mark.full) for m in ("bosh3", "kvaerno5"))],
+)
 def test_rows_are_as_accurate_as_step_ends(reference, method):
     """501 rows: the worst error at most twice the worst at the ends of the same steps.
 
@@ -232,6 +246,7 @@ def test_far_from_time_zero(reference):
     np.testing.assert_allclose(motion.q, reference.q, rtol=0, atol=1e-7)
 
 
+@pytest.mark.full
 def test_solver_with_memory_keeps_it_in_its_derivative():
     """A two-step method: the derivative is that of the two-step recurrence."""
 
@@ -294,7 +309,7 @@ def test_driven_system_matches_scipy():
         driven, [0.4], [0.9], [0.0, 0.5, 1.5], params, inputs={"tau": table}, rtol=1e-12, atol=1e-12
     )
     y, marks = np.array([0.4, 0.9]), [*np.asarray(table.times[:-1]), 1.5]
-    for k, (a, b) in enumerate(zip(marks, marks[1:], strict=False)):
+    for k, (a, b) in enumerate(itertools.pairwise(marks)):
         tau = float(table.values[k])
 
         def rate(t, y, tau=tau):

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from _user import unchecked  # noqa: F401
 
 import jaxlag as jl
@@ -201,11 +200,14 @@ def pushed_by(force):
 def test_a_force_must_have_one_real_component_per_coordinate(force, was, ask):
     system = pushed_by(force)
     must = "force 'push' must return 2 real components, one per coordinate, but it returned "
+    asked = {
+        "check": system.check,
+        "acceleration": system.acceleration,
+        "generalized_force": system.generalized_force,
+        "simulate": lambda _, q, v: jl.simulate(system, q, v, [0.0, 1.0], method="euler", dt=0.5),
+    }
     with pytest.raises(ValueError, match="^" + re.escape(must + was)):
-        if ask == "simulate":
-            jl.simulate(system, Q, V, [0.0, 1.0], method="euler", dt=0.5)
-        else:
-            getattr(system, ask)(None, Q, V)
+        asked[ask](None, Q, V)
 
 
 @pytest.mark.usefixtures("unchecked")

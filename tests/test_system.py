@@ -74,23 +74,17 @@ def quantities(system, quadratic, params, t, q, v, x, b):
         "L_q": jax.grad(L, argnums=1)(t, q, v),
     }
     if quadratic:
-
-        def mass(t, q):
-            return system.mass_matrix(params, q, None, t)
-
+        h = jax.vmap(lambda v: system.bias(params, q, v, t))(jnp.stack([-v, 0 * v]))
         found |= {
             "C": system.coriolis_matrix(params, q, v, t),
-            "M_q": jax.jacrev(mass, argnums=1)(t, q),
-            "M_dot": jax.jvp(mass, (t, q), (1.0, v))[1],
-            "h_back": system.bias(params, q, -v, t),
-            "h_rest": system.bias(params, q, 0 * v, t),
+            "M_q": jax.jacfwd(lambda q: system.mass_matrix(params, q, t=t))(q),
+            "h_back": h[0],
+            "h_rest": h[1],
         }
     if system._kinetic is not None:
         found |= {
             "T": system.kinetic(params, q, v, t),
             "V": system.potential(params, q, t=t),
-            "T_q": jax.grad(system.kinetic, argnums=1)(params, q, v, t),
-            "V_q": jax.grad(system.potential, argnums=1)(params, q, t=t),
         }
     return found
 
@@ -212,30 +206,32 @@ def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
 
 
 @pytest.mark.parametrize("name", BOOK)
-def test_bias_is_that_of_kinetic_and_potential_energy(name, evaluate):
-    """h = M' v - dT/dq + dV/dq."""
+def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evaluate):
+    """h = M' v - d(T - V)/dq where p = M v and M is free of time."""
     for s in evaluate(name):
-        expected = s["M_dot"] @ s["v"] - s["T_q"] + s["V_q"]
-        agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["T_q"], s["V_q"])
+        expected = s["M_q"] @ s["v"] @ s["v"] - s["L_q"]
+        agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["L_q"])
 
 
 def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate):
     """None of them holds only because its terms vanish."""
     assert len(BOOK) == 10
-    largest = {
-        key: {name for name in CASES if np.max(abs(evaluate(name).found.get(key, 0))) > 1e-2}
-        for key in ("L_t", "C", "Q", "M_q", "M_dot", "V_q", "T_q")
+    large = {
+        key: {
+            name
+            for name in CASES
+            if np.max(np.abs(np.asarray(evaluate(name).found.get(key, 0.0)))) > 1e-2
+        }
+        for key in ("L_t", "C", "Q", "M_q", "h_rest", "L_q")
     }
-    assert largest["L_t"] == {"driven_pivot", "bead"}
-    assert {"double_pendulum", "sleeve_pendulum", "chain", "bead"} <= largest["C"]
-    assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= largest["Q"]
-    assert largest["V_q"] == set(BOOK)
-    assert {"double_pendulum", "central_motion", "rotating_slender_rod"} <= largest["T_q"]
+    assert large["L_t"] == {"driven_pivot", "bead"}
+    assert {"double_pendulum", "sleeve_pendulum", "chain", "bead"} <= large["C"] <= large["M_q"]
+    assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= large["Q"]
+    assert set(BOOK) <= large["h_rest"]
+    assert set(BOOK) <= large["L_q"]
+    params, _, _, v, *_ = random_states("charged")
     found = evaluate("charged").found
-    assert np.max(norm(found["p"] - (found["M"] @ random_states("charged")[3][..., None])[..., 0]))
-    assert np.max(
-        norm(evaluate("relativistic").found["M"] - evaluate("relativistic").found["M"][0])
-    )
+    assert np.min(norm(found["p"] - params["m"][:, None] * v, axis=1)) > 1e-2  # not M v
 
 
 # ---- Lagrangians with known answers ----------------------------------------------------------
@@ -265,7 +261,7 @@ def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
 
 
 def test_a_relativistic_particle_gets_heavier(evaluate):
-    """M = gamma m (1 + gamma^2 v v^T/c^2), a = (F - (v . F) v/c^2)/(gamma m), H = gamma m c^2 + V."""
+    """M = gamma m (1 + gamma^2 v v^T/c^2), gamma m a = F - (v . F) v/c^2, H = gamma m c^2 + V."""
     params, _, q, v, _, _ = random_states("relativistic")
     found = evaluate("relativistic").found
     m, c, g = (params[key][:, None] for key in ("m", "c", "g"))
@@ -340,14 +336,18 @@ def test_coordinates_may_be_arrays():
     params = {"m": m, "k": k, "J": 0.5}
     x, v = np.arange(6.0).reshape(3, 2) / 4, np.ones((3, 2))
     q, rate = {"x": x, "theta": 0.3}, {"x": v, "theta": 0.1}
-    acceleration = jax.jit(NET.acceleration)
-    a = NET.unflatten(acceleration(params, q, rate))
+
+    @jax.jit
+    def both(q, rate, flat_q, flat_rate):
+        named = NET.acceleration(params, q, rate)
+        return named, NET.acceleration(params, flat_q, flat_rate), NET.mass_matrix(params, q)
+
+    named, flat, M = both(q, rate, NET.flatten(q), NET.flatten(rate))
+    np.testing.assert_array_equal(named, flat)
+    a = NET.unflatten(named)
     np.testing.assert_allclose(a["x"], -(k / m)[:, None] * x, rtol=K * EPS)
     np.testing.assert_allclose(a["theta"], -1.0, rtol=K * EPS)
-    M = jax.jit(NET.mass_matrix)(params, q)
     np.testing.assert_array_equal(M, np.diag([1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 0.5]))
-    flat = acceleration(params, NET.flatten(q), NET.flatten(rate))
-    np.testing.assert_array_equal(flat, NET.flatten(a))
 
 
 class Spring(eqx.Module):
@@ -406,7 +406,8 @@ def test_params_may_hold_what_is_no_real_number(extra, expected):
 
 def test_params_may_be_none():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q[0], ("x", "y"))
-    np.testing.assert_array_equal(system.acceleration(None, [0.0, 0.0], [1.0, 2.0]), [-1.0, 0.0])
+    a = jax.jit(system.acceleration)(None, jnp.zeros(2), jnp.ones(2))
+    np.testing.assert_array_equal(a, [-1.0, 0.0])
 
 
 # ---- Use ---------------------------------------------------------------------------------------
@@ -421,9 +422,10 @@ def test_the_methods_pass_through_every_transform():
         return entry.system.acceleration(params | {"g": g}, theta[None], jnp.zeros(1))[0]
 
     theta = jnp.linspace(-2.0, 2.0, 5)
-    slope = jax.jit(jax.vmap(jax.grad(acceleration), (None, 0)))(9.0, theta)
+    slope, mixed = jax.jit(jax.vmap(jax.jvp, in_axes=(None, 0, 0)), static_argnums=0)(
+        lambda theta: jax.grad(acceleration)(9.0, theta), (theta,), (jnp.ones(5),)
+    )
     np.testing.assert_allclose(slope, -jnp.sin(theta) / params["h1"], rtol=K * EPS)
-    mixed = jax.vmap(jax.jacfwd(jax.grad(acceleration), argnums=1), (None, 0))(9.0, theta)
     np.testing.assert_allclose(mixed, -jnp.cos(theta) / params["h1"], rtol=K * EPS)
 
 
@@ -439,14 +441,11 @@ def test_states_may_be_lists_arrays_or_named():
 def test_the_state_keeps_its_precision():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q @ q, ("x",))
     q, v = jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32)
-    for x in (
-        system.mass_matrix(None, q),
-        system.bias(None, q, v),
-        system.acceleration(None, q, v),
-    ):
-        assert x.dtype == jnp.float32
-    assert system.energy(None, q, v).dtype == jnp.float32
-    assert system.acceleration(None, [1.0], [0.0]).dtype == jnp.float64
+    assert jax.eval_shape(system.mass_matrix, None, q).dtype == jnp.float32
+    for method in (system.bias, system.acceleration, system.momentum, system.energy):
+        assert jax.eval_shape(method, None, q, v).dtype == jnp.float32
+        assert jax.eval_shape(method, None, q, jnp.zeros(1)).dtype == jnp.float64
+        assert jax.eval_shape(lambda m=method: m(None, [1], [0.0])).dtype == jnp.float64
 
 
 def test_kinetic_and_potential_exist_where_declared():
@@ -486,10 +485,8 @@ def test_systems_of_the_same_functions_are_one():
 
 
 def test_check_is_silent_where_all_is_well():
-    for name in ("cart_pendulum", "relativistic", "bead"):
-        case = CASES[name]
-        v = np.full(len(case.q0), 0.1)
-        assert case.system.check(case.params, list(case.q0), v, t=0.3) is None
+    case = CASES["bead"]
+    assert case.system.check(case.params, case.q0, [0.1], t=0.3) is None
 
 
 def test_a_long_chain_hangs_at_rest():

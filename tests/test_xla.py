@@ -18,7 +18,8 @@ pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("t
 run = lambda q0: jl.simulate(pendulum, q0, [0.0], [0.0, 1.0], 9.81).q
 text = jax.jit(run).lower(jnp.array([1.0])).compile().as_text()
 # The outermost loop, not only small ones inside it.
-print("entry loops left:", sum(" while(" in line for line in text[text.index("ENTRY"):].splitlines()))
+entry = text[text.index("ENTRY"):].splitlines()
+print("entry loops left:", sum(" while(" in line for line in entry))
 print("small_call" in text)
 print(pendulum.explain(9.81))
 """

@@ -26,7 +26,7 @@ class ArrayTerms(Terms):
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """P = dL/dv by one reverse pass."""
+        """Momentum p = dL/dv by one reverse pass."""
         return jax.grad(self.lagrangian, argnums=2)(t, q, v, params)
 
     def mass(
@@ -42,7 +42,7 @@ class ArrayTerms(Terms):
     def bias(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
-        """H = dp/dt at a = 0, less dL/dq: one derivative of (dL/dq, p) along (t', q') = (1, v)."""
+        """Bias h = dp/dt - dL/dq at a = 0: one derivative of (dL/dq, p) along (t', q') = (1, v)."""
 
         def gradients(t: Array, q: Array) -> tuple[Array, Array]:
             return jax.grad(self.lagrangian, argnums=(1, 2))(t, q, v, params)

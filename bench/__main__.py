@@ -1,0 +1,51 @@
+"""Command line: `python -m bench list | NAME [--quick]`."""
+
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import import_module
+
+import jax
+
+from bench import _results
+from bench._harness import BENCHMARKS
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one benchmark; 0 if every target was met, 1 if one was missed, 2 without benchmark."""
+    parser = ArgumentParser(prog="python -m bench", description="Measure jaxlag.")
+    parser.add_argument("name", metavar="NAME", help="a benchmark, or 'list'")
+    parser.add_argument("--quick", action="store_true", help="fewer cases and repeats: a minute")
+    arguments = parser.parse_args(argv)
+    if arguments.name == "list":
+        for name in BENCHMARKS:
+            print(f"{name:<10} {_headline(name)}")
+        return 0
+    if arguments.name not in BENCHMARKS:
+        near = get_close_matches(arguments.name, BENCHMARKS, n=3)
+        hint = f"Did you mean {' or '.join(near)}?" if near else f"Known: {', '.join(BENCHMARKS)}."
+        print(f"NAME must be a benchmark, but it was {arguments.name!r}. {hint}", file=sys.stderr)
+        return 2
+    jax.config.update("jax_enable_x64", True)
+    circumstances = _results.circumstances()
+    report = import_module(f"bench.{arguments.name}").run(arguments.quick)
+    path = _results.save(
+        arguments.name,
+        _headline(arguments.name),
+        report,
+        circumstances,
+        arguments.quick,
+        _results.FOLDER,
+    )
+    print(_results.text(report))
+    print(f"\nwritten to {path}")
+    return 0 if all(target.met for target in report.targets) else 1
+
+
+def _headline(name: str) -> str:
+    return (import_module(f"bench.{name}").__doc__ or "").splitlines()[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

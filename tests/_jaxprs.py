@@ -1,0 +1,62 @@
+"""Programs read as jaxprs: which operations they do, how often, and on arrays of which size."""
+
+import math
+from typing import NamedTuple
+
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+
+class Operation(NamedTuple):
+    """One equation of a jaxpr: its primitive, its outputs' shapes, how often it is executed."""
+
+    name: str
+    shapes: tuple[tuple[int, ...], ...]
+    times: int
+    inside: tuple[str, ...]
+
+
+def operations(function, *args):
+    """Every operation that one call of `function` executes, those of nested programs included."""
+    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, ()))
+
+
+def names(program):
+    return {operation.name for operation in program}
+
+
+def count(program, name, without=()):
+    """How often operation `name` is executed outside the nested programs `without`."""
+    return sum(o.times for o in program if o.name == name and not set(without) & set(o.inside))
+
+
+def largest(program):
+    """Number of entries of the largest array that the program computes."""
+    return max(math.prod(shape) for operation in program for shape in operation.shapes)
+
+
+def _walk(jaxpr, times, inside):
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        shapes = tuple(getattr(v.aval, "shape", ()) for v in eqn.outvars)
+        yield Operation(name, shapes, times, inside)
+        repeats = eqn.params["length"] if name == "scan" else 1
+        for inner in _executed(name, eqn.params):
+            yield from _walk(inner, times * repeats, (*inside, name))
+
+
+def _executed(name, params):
+    if name == "while":
+        raise AssertionError("a while loop has no number of turns to count")
+    if name == "custom_linear_solve":  # its products and its transpose serve derivatives only
+        return [params["jaxprs"].solve.jaxpr]
+    found = [leaf for value in params.values() for leaf in _leaves(value)]
+    return [leaf.jaxpr if isinstance(leaf, ClosedJaxpr) else leaf for leaf in found]
+
+
+def _leaves(value):
+    if isinstance(value, ClosedJaxpr | Jaxpr):
+        return [value]
+    if isinstance(value, tuple | list):
+        return [leaf for item in value for leaf in _leaves(item)]
+    return []
