@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -11,6 +10,7 @@ from jaxtyping import Array
 from jaxlag._errors import bad
 from jaxlag._inputs import common_range, evaluate
 from jaxlag._methods import default_tolerances
+from jaxlag._params import concrete
 from jaxlag._solution import QUANTITIES
 from jaxlag._system import System
 from jaxlag._vectors import vector
@@ -56,10 +56,6 @@ def check_options(
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
 
 
-def concrete(*arrays: Any) -> bool:
-    return not any(isinstance(x, jax.core.Tracer) for x in arrays)
-
-
 def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array]:
     if (v0 is None) == (u0 is None):
         was = "neither was given" if v0 is None else "both were given"
@@ -85,7 +81,7 @@ def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array
 
 def _number(x: Any, dtype: Any) -> Any:
     """An array of this dtype; a numpy one where x is concrete, which costs no dispatch."""
-    return jnp.asarray(x, dtype) if isinstance(x, jax.core.Tracer) else np.asarray(x, dtype)
+    return np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
 
 
 def check_times(ts: Any) -> tuple[Any, int | None]:

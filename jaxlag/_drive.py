@@ -76,17 +76,17 @@ class Scheme(eqx.Module):
             end, state = self.controller.init(
                 self.term, t0, t1, y, guess, args, self.solver.func, order
             )
-            return end - t0, state
+            return jnp.asarray(end - t0), state
 
         # diffrax estimates a first step only where time and state share a dtype: count from t0.
-        def func(term: Any, elapsed: Array, y: PyTree, args: Any) -> PyTree:
-            return self.solver.func(term, t0 + elapsed.astype(t0.dtype), y, args)
+        def func(term: Any, elapsed: Any, y: PyTree, args: Any) -> PyTree:
+            return self.solver.func(term, t0 + jnp.asarray(elapsed, t0.dtype), y, args)
 
         guess = None if guess is None else guess.astype(dtype)
         zero = jnp.zeros_like(t0, dtype)
         span = (t1 - t0).astype(dtype)
         end, state = self.controller.init(self.term, zero, span, y, guess, args, func, order)
-        return end.astype(t0.dtype), state
+        return jnp.asarray(end, t0.dtype), state
 
 
 class Grid(NamedTuple):
@@ -281,13 +281,13 @@ def _turn(scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c:
     if scheme.controller is None:
         keep, h, control_state, jump, stuck = good, c.h, None, jnp.zeros_like(good), ~good
     else:
-        order = scheme.solver.error_order(scheme.term)
+        order: Any = scheme.solver.error_order(scheme.term)
         error = jax.tree.map(lambda e: jnp.where(good, e, jnp.inf), error)
         keep, next0, next1, jump, control_state, _ = scheme.controller.adapt_step_size(
             c.t, t1, c.y, y1, args, error, order, c.control_state
         )
         keep = keep & good
-        h = (next1 - next0).astype(c.t.dtype)
+        h = jnp.asarray(next1 - next0, c.t.dtype)
         # A step cut short by a boundary says nothing against the length proposed before it.
         h = jnp.where(keep & lands, jnp.maximum(h, c.h), h)
         span = times.stop - times.start

@@ -47,7 +47,7 @@ class Dynamics(eqx.Module):
         """Tau from t, and t from tau."""
         if self.direction == 1:
             return time
-        return -time if self.direction == -1 else time * args.sigma
+        return -time if args.sigma is None else time * args.sigma
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
         """(params, inputs) as the user passed them."""
@@ -102,7 +102,8 @@ class Dynamics(eqx.Module):
 
     def term(self, dtype: Any) -> diffrax.ODETerm:
         """The vector field as diffrax takes it."""
-        return _Term(self.__call__, dtype)
+        field: Any = self.__call__
+        return _Term(field, dtype)
 
 
 class _Term(diffrax.ODETerm):

@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag._errors import bad, positional_count, require_arity
+from jaxlag._params import concrete
 
 
 class AbstractInput(eqx.Module):
@@ -56,8 +56,8 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
         x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
         for x in (times, values)
     )
-    if not isinstance(times, jax.core.Tracer):
-        steps = np.diff(np.asarray(times))
+    if concrete(times):
+        steps = np.diff(np.asarray(times, float))
         if not np.all(steps > 0):
             i = int(np.argmin(steps > 0))
             raise bad(
@@ -66,7 +66,7 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
                 f"times[{i}] = {times[i]} and times[{i + 1}] = {times[i + 1]}",
                 "Sort the table and drop repeated times.",
             )
-    if not isinstance(values, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(values))):
+    if concrete(values) and not bool(jnp.all(jnp.isfinite(values))):
         raise bad(f"{kind}: values", "be finite", "some were nan or inf")
     return times, values
 

@@ -35,13 +35,13 @@ def factor_mass(M: Float[Array, "n n"]) -> MassFactor:
         lower = jnp.linalg.cholesky(M, symmetrize_input=False)
         pivots = jnp.diagonal(lower) ** 2
         return MassFactor(None, lower, pivots > floor)
-    rows = [[M[i, j] if j >= i else None for j in range(n)] for i in range(n)]
+    rows = [[M[i, j] for j in range(i, n)] for i in range(n)]  # row i holds columns i to n - 1
     for k in range(n):
         for i in range(k + 1, n):
-            ratio = rows[k][i] / rows[k][k]
+            ratio = rows[k][i - k] / rows[k][0]
             for j in range(i, n):
-                rows[i][j] = rows[i][j] - ratio * rows[k][j]
-    upper = tuple(tuple(rows[i][j] for j in range(i, n)) for i in range(n))
+                rows[i][j - i] = rows[i][j - i] - ratio * rows[k][j - k]
+    upper = tuple(tuple(row) for row in rows)
     pivots = jnp.stack([upper[i][0] for i in range(n)]) if n else jnp.zeros((0,), M.dtype)
     return MassFactor(upper, None, pivots > floor)
 

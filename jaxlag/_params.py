@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 class _Frozen:
@@ -30,8 +31,13 @@ def is_array(leaf: Any) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray)
 
 
+def concrete(*arrays: Any) -> bool:
+    """Whether all of these have values, rather than being traced by a transform."""
+    return not any(isinstance(x, Tracer) for x in arrays)
+
+
 def _is_traced(leaf: Any) -> bool:
-    if isinstance(leaf, jax.core.Tracer):
+    if not concrete(leaf):
         return True
     return eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
 

@@ -151,12 +151,19 @@ def simulate(
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     scheme = choose(method, dt is None, rtol, atol)
     scheme_traced, scheme_static = eqx.partition(scheme, _params.is_array)
-    keys = (_params.Static(x) for x in (params_static, inputs_static, scheme_static))
-    plan = _Plan(system, *keys, direction, max_steps, tuple(save))
+    plan = _Plan(
+        system=system,
+        params=_params.Static(params_static),
+        inputs=_params.Static(inputs_static),
+        scheme=_params.Static(scheme_static),
+        direction=direction,
+        max_steps=max_steps,
+        save=tuple(save),
+    )
     values = _Values(q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
     motion = _simulate(plan, values)
-    if throw and not isinstance(motion.status, jax.core.Tracer):
+    if throw and _params.concrete(motion.status):
         _raise_unless_ok(motion)
     return motion
 
@@ -206,8 +213,8 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
         },
         saved=saved,
         inputs=inputs,
-        _params=values.params,
-        _static=plan.params,
+        _params_traced=values.params,
+        _params_static=plan.params,
     )
 
 

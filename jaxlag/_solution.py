@@ -72,13 +72,13 @@ class Solution(eqx.Module):
     stats: dict[str, Int[Array, "*batch"]]
     saved: dict[str, Array]
     inputs: dict[str, Any]
-    _params: Any
-    _static: _params.Static = eqx.field(static=True)
+    _params_traced: Any
+    _params_static: _params.Static = eqx.field(static=True)
 
     @property
     def params(self) -> Any:
         """The params of this motion, numbers as arrays."""
-        return _params.join(self._params, self._static.tree)
+        return _params.join(self._params_traced, self._params_static.tree)
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, shape (s, *its shape)."""
@@ -145,10 +145,10 @@ class Solution(eqx.Module):
         if name in self.saved:
             return self.saved[name]
         traced, static = eqx.partition(
-            (self.ts, self.q, self.v, self._params, self.inputs), eqx.is_array
+            (self.ts, self.q, self.v, self._params_traced, self.inputs), eqx.is_array
         )
         key = _params.Static(static)
-        return _derived(name, self.system, self._static, key, self.ts.ndim - 1, traced)
+        return _derived(name, self.system, self._params_static, key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:
         names = ", ".join(self.system.coordinates.names)

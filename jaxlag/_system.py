@@ -414,7 +414,7 @@ def _structure(
         return lambda t, q, v, traced: function(t, q, v, _params.join(traced, static.tree))
 
     terms = system.terms
-    functions = (with_params(f) for f in (terms.mass, terms.bias, system.lagrangian))
+    mass, bias, lagrangian = map(with_params, (terms.mass, terms.bias, system.lagrangian))
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     q = jax.ShapeDtypeStruct((system.size,), dtype)
-    return find_structure(*functions, (t, q, q), avals.tree)
+    return find_structure(mass, bias, lagrangian, (t, q, q), avals.tree)

@@ -103,19 +103,18 @@ def cut(
     size = min(sizes)
     if seconds is not None:
         size = round(seconds / recording.spacing) if np.isfinite(seconds) else 0
-    if size < FEWEST_SAMPLES or size * recording.spacing < SHORTEST:
+    length, least = size * recording.spacing, max(SHORTEST, FEWEST_SAMPLES * recording.spacing)
+    if length < 0.999 * least:
         raise bad(
             f"every segment of {recording.name}" if seconds is None else "--window",
-            f"last {max(SHORTEST, FEWEST_SAMPLES * recording.spacing):.3g} s or more",
-            f"one lasts {size * recording.spacing:.3g} s"
-            if seconds is None
-            else f"it was {seconds} s",
+            f"last {least:.3g} s or more",
+            f"one lasts {length:.3g} s" if seconds is None else f"it was {seconds:g} s",
             "Drop short segments." if seconds is None else "Make it longer.",
         )
     if max(sizes) < size:
         raise bad(
             recording.name,
-            f"last one window of {size * recording.spacing:.3g} s or more",
+            f"last one window of {length:.3g} s or more",
             f"its longest segment lasts {max(sizes) * recording.spacing:.3g} s",
             "Record longer, or make --window shorter.",
         )
@@ -201,7 +200,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
         raise bad(
             "the recording",
             "be a CSV file that can be read, gzipped if its name ends in .gz",
-            f"{path} gave {type(error).__name__}: {error}",
+            f"{path}: {getattr(error, 'strerror', None) or error}",
             "Check the path.",
         ) from error
     if len(lines) < 3:
@@ -209,7 +208,8 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     try:
         rows = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
     except ValueError as error:
-        raise bad(path.name, "be a table of numbers", str(error), "Mend that row.") from error
+        was = str(error).rstrip(".")
+        raise bad(path.name, "be a table of numbers", was, "Mend that row.") from error
     names = [name.strip() for name in lines[0].split(",")]
     if rows.shape[1] != len(names):
         raise bad(

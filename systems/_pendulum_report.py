@@ -59,8 +59,7 @@ def trials(
 ) -> Iterator[str]:
     """Lines of the table of models fitted to windows, and what it means."""
     symbols = DRIVEN if recording.driven else FREE
-    beat_train = TO_BEAT.get(recording.name, {}) if recording.driven else {}
-    beat_test = TO_BEAT.get(other.name, {}) if other else {}
+    beat_train, beat_test = (TO_BEAT.get(r.name, {}) if other else {} for r in (recording, other))
     heads = ["train", "test", f"from {EARLY:g} s"]
     rows = list(_head(symbols, heads))
     if truth:
@@ -80,7 +79,7 @@ def trials(
     yield from _aligned(rows)
     yield ""
     yield (
-        "rms in mrad over all samples (in brackets, a figure to beat); "
+        "rms in mrad over all samples (in brackets one to beat, of a fit to that recording itself); "
         "beneath, the mean of the windows' own rms."
         if beat_train or beat_test
         else "rms in mrad over all samples; beneath, the mean of the windows' own rms."
