@@ -2,12 +2,14 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._drive import Outcome
 from jaxlag._dynamics import Arguments, Dynamics
-from jaxlag._linalg import factor_mass, first_unhealthy
+from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
 from jaxlag._replay import Problem
 from jaxlag._status import Status
 
@@ -18,6 +20,11 @@ class Start(NamedTuple):
     valid: Array  # all values are allowed
     in_range: Array  # the inputs are defined there
     finite: Array  # L and the accelerations are finite there
+
+
+def _frozen(tree: Any) -> Any:
+    """Without derivative: a status has none, and differentiating its making would cost."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def values_allowed(y0: Array, saves: Array, rtol: Any, atol: Any, step: Any) -> Bool[Array, ""]:
@@ -37,6 +44,7 @@ def start_finite(
     dynamics: Dynamics, tau: Float[Array, ""], y0: Array, args: Arguments
 ) -> Bool[Array, ""]:
     """Whether L and the accelerations are finite at the start."""
+    tau, y0, args = _frozen((tau, y0, args))
     (q, v), (params, _) = dynamics.parts(y0), dynamics.given(args)
     L = dynamics.system.lagrangian(dynamics.mirror(tau, args), q, v, params)
     a = dynamics.acceleration(tau, y0, dynamics.within(args, tau))
@@ -48,23 +56,24 @@ def diagnose(
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(status, index of the coordinate it concerns or -1).
 
-    A failed step is explained by the state it started from and, if that is sound, by an Euler
-    step to where it was to end.
+    A failed step is explained by the state it started from and, if that is sound, by the state
+    it was heading for, q + (t1 - t0) v.
     """
+    problem, outcome = _frozen((problem, outcome))
     y0, times = problem.y0, problem.times
     status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
     short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
     status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
     status = jnp.where(begun.valid, status, int(Status.bad_value))
 
+    # Both states in one batch: the terms are traced and compiled once.
+    q, v = dynamics.parts(outcome.state)
+    tried = jnp.concatenate([q + (outcome.tried - outcome.time).astype(q.dtype) * v, v])
+    taus, states = jnp.stack([outcome.time, outcome.tried]), jnp.stack([outcome.state, tried])
     args = dynamics.within(problem.args, outcome.time)
-    step = (outcome.tried - outcome.time).astype(y0.dtype)
-    tried = outcome.state + step * dynamics(outcome.time, outcome.state, args)
-    sound = jnp.all(jnp.isfinite(tried))
-    mass, worst = _culprits(dynamics, outcome.time, outcome.state, args)
-    tried_mass, tried_worst = _culprits(dynamics, outcome.tried, tried, args)
-    mass = jnp.where(sound & (mass < 0), tried_mass, mass)
-    worst = jnp.where(sound, tried_worst, worst)
+    masses, worsts = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
+    mass = jnp.where(masses[0] >= 0, masses[0], masses[1])
+    worst = jnp.where(jnp.all(jnp.isfinite(tried)), worsts[1], worsts[0])
 
     singular = (status == int(Status.nonfinite)) & (mass >= 0)
     status = jnp.where(singular, int(Status.mass_singular), status)
@@ -87,10 +96,11 @@ def _culprits(
     dynamics: Dynamics, tau: Array, y: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(coordinate without inertia or -1, coordinate of non-finite Q - h, else of largest |a|)."""
-    a, effort = dynamics.acceleration(tau, y, args), dynamics.effort(tau, y, args)
+    M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
+    factor = factor_mass(M)
     # A non-finite component spreads through the solve: look at the right-hand side first.
+    a = solve_mass(M, effort, factor)
     suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
     finite = jnp.isfinite(suspect)
     worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
-    without_inertia = first_unhealthy(factor_mass(dynamics.mass(tau, y, args)))
-    return without_inertia, worst.astype(jnp.int32)
+    return first_unhealthy(factor), worst.astype(jnp.int32)

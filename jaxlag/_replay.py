@@ -7,6 +7,7 @@ grid, and the steps are taken again on that grid, as a scan that JAX differentia
 and to any order.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -128,7 +129,7 @@ def _rows(
 
         def step_all(states: PyTree) -> PyTree:
             ends = jnp.where(inside, saves, starts)
-            return jax.lax.map(step, (starts, ends, states), batch_size=ROWS_AT_ONCE)
+            return _in_batches(step, (starts, ends, states), saves.shape[0])
 
         # Rows that need no step must not see one: the field may not be finite where they are.
         safe = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
@@ -140,6 +141,21 @@ def _rows(
         y = states[0]
     saved = jax.tree.map(lambda s: jnp.where(_like(reached, s), s, jnp.nan), y)
     return Rows(saved, state, time)
+
+
+def _in_batches(function: Callable, rows: PyTree, count: int) -> PyTree:
+    """function over `count` rows, in equal batches; the last row fills the last batch up."""
+    batches = -(-count // ROWS_AT_ONCE)
+    size = -(-count // batches)
+
+    def batch(leaf: Array) -> Array:
+        filled = jnp.minimum(jnp.arange(batches * size), count - 1)
+        return leaf[filled].reshape(batches, size, *leaf.shape[1:])
+
+    if batches == 1:
+        return jax.vmap(function)(rows)
+    results = jax.lax.map(jax.vmap(function), jax.tree.map(batch, rows))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], results)
 
 
 def _step(

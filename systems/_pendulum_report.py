@@ -167,14 +167,24 @@ def can_plot() -> bool:
     return find_spec("matplotlib") is not None
 
 
+def require_figure(path: Path) -> None:
+    """Complain before the work begins.
+
+    Raises:
+        DataError: matplotlib is missing, or the folder.
+    """
+    if not can_plot():
+        raise bad("--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB)
+    if not path.parent.is_dir():
+        raise bad("--plot", "name a file in a folder that exists", f"it was {path}", "Make it.")
+
+
 def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
     """Measured against simulated angles in some test windows, residuals of all models beneath.
 
     Raises:
-        DataError: matplotlib is missing, or the file cannot be written.
+        DataError: the file cannot be written.
     """
-    if not can_plot():
-        raise bad("--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -220,5 +230,5 @@ def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:
-        fix = "Name a .png, .pdf or .svg in a folder that exists."
+        fix = "Name a .png, .pdf or .svg."
         raise bad("--plot", "name a file that can be written", str(error), fix) from error

@@ -73,6 +73,8 @@ def _parser() -> ArgumentParser:
 
 
 def _run(path: Path | None, test: Path | None, seconds: float, plot: Path | None) -> None:
+    if plot is not None:
+        report.require_figure(plot)
     truth = TRUTH if path is None else None
     recording = synthetic(TRUTH, False, NOISE) if path is None else read(path)
     other = None if test is None else read(test)
