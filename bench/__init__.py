@@ -6,5 +6,5 @@ A full run is kept in `bench/results/NAME.json`, which holds the latest run on e
 jax; a quick run, of fewer cases and repeats, in `bench/results/quick/NAME.json`, not in git.
 
 What the numbers cannot show: one small system on one CPU. Ratios within a run carry over to
-another machine, milliseconds do not.
+another machine, milliseconds do not; references in time come from another machine.
 """

@@ -58,8 +58,8 @@ def _cases(sizes: tuple[int, ...]) -> list[Case]:
     by_hand, naive = (
         pendulum.with_diffrax(field, TIMES) for field in (pendulum.by_hand, pendulum.naive)
     )
-    shared = (pendulum.params(), jnp.asarray(pendulum.TOLERANCE))
-    starts = {lanes: (_starts(lanes), *shared) for lanes in sizes}
+    common = (pendulum.params(), jnp.asarray(pendulum.TOLERANCE))
+    starts = {lanes: (_starts(lanes), *common) for lanes in sizes}
     axes = (0, None, None)
 
     def in_turn(y0: Array, params: Any, tolerance: Array) -> Ended:

@@ -36,6 +36,7 @@ TO_BEAT = {
 }
 NEEDS_MATPLOTLIB = 'matplotlib is missing: pip install -e ".[plot]"'
 COLOURS = ("tab:orange", "tab:green", "tab:blue")
+SUFFIXES = (".png", ".pdf", ".svg")
 SHOWN = 4  # windows in the figure
 
 
@@ -59,7 +60,8 @@ def trials(
 ) -> Iterator[str]:
     """Lines of the table of models fitted to windows, and what it means."""
     symbols = DRIVEN if recording.driven else FREE
-    beat_train, beat_test = (TO_BEAT.get(r.name, {}) if other else {} for r in (recording, other))
+    beat_train = TO_BEAT.get(recording.name, {}) if other else {}
+    beat_test = TO_BEAT.get(other.name, {}) if other else {}
     heads = ["train", "test", f"from {EARLY:g} s"]
     rows = list(_head(symbols, heads))
     if truth:
@@ -79,7 +81,7 @@ def trials(
     yield from _aligned(rows)
     yield ""
     yield (
-        "rms in mrad over all samples (in brackets one to beat, of a fit to that recording itself); "
+        "rms in mrad over all samples (in brackets, one to beat, of a fit to that recording); "
         "beneath, the mean of the windows' own rms."
         if beat_train or beat_test
         else "rms in mrad over all samples; beneath, the mean of the windows' own rms."
@@ -171,12 +173,13 @@ def require_figure(path: Path) -> None:
     """Complain before the work begins.
 
     Raises:
-        DataError: matplotlib is missing, or the folder.
+        DataError: matplotlib is missing, or the folder, or the name ends in another way.
     """
     if not can_plot():
         raise bad("--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB)
-    if not path.parent.is_dir():
-        raise bad("--plot", "name a file in a folder that exists", f"it was {path}", "Make it.")
+    if path.suffix not in SUFFIXES or not path.parent.is_dir():
+        must = f"name a {', '.join(SUFFIXES)} in a folder that exists"
+        raise bad("--plot", must, f"it was {path}", "Rename it, or make the folder.")
 
 
 def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
@@ -229,6 +232,6 @@ def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=8)
     try:
         figure.savefig(path)
-    except (OSError, ValueError) as error:
-        fix = "Name a .png, .pdf or .svg."
-        raise bad("--plot", "name a file that can be written", str(error), fix) from error
+    except OSError as error:
+        must = "name a file that can be written"
+        raise bad("--plot", must, str(error), "Choose another folder.") from error

@@ -20,9 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from systems import _pendulum_report as report
-from systems._pendulum_data import DataError, Recording, Segment, Windows, read
-from systems._pendulum_fit import MRAD, NAMES, simulate
-from systems._pendulum_trials import fit_segments, try_models
+from systems._pendulum_data import DataError, Recording, Segment, Windows
+from systems._pendulum_data import cut as cut
+from systems._pendulum_data import read as read
+from systems._pendulum_fit import MRAD as MRAD
+from systems._pendulum_fit import NAMES, simulate
+from systems._pendulum_fit import free as free
+from systems._pendulum_fit import rms as rms
+from systems._pendulum_trials import choose as choose
+from systems._pendulum_trials import fit_segments as fit_segments
+from systems._pendulum_trials import try_models as try_models
 
 # Without a recording: per J, as in a free swing.
 TRUTH = {"J": 1.0, "mgl": 60.0, "c": 0.05, "f": 0.2, "zero": 0.01}

@@ -100,6 +100,7 @@ def test_nothing_unlisted_moves_a_term(name):
 FORMS = {
     "v @ v": lambda t, q, v, params: 0.5 * v @ v,
     "sum v**2": lambda t, q, v, params: 0.5 * jnp.sum(v**2),
+    "sum v**1 v": lambda t, q, v, params: 0.5 * jnp.sum(v**1 * v),
     "sum v*v": lambda t, q, v, params: 0.5 * jnp.sum(v * v),
     "square": lambda t, q, v, params: 0.5 * jnp.sum(jnp.square(v)),
     "entries": lambda t, q, v, params: 0.5 * (v[0] ** 2 + v[1] * v[1]),
@@ -221,6 +222,15 @@ def test_structure_is_traced_once_per_kind_of_params():
     assert len(traces) == first > 0
     system.structure({"m": 2}, jnp.float64)  # static: another program
     assert len(traces) > first
+
+
+def test_python_numbers_take_the_precision_of_the_state():
+    """Weakly typed in the structure as in the program: no promotion that strict JAX refuses."""
+    system = jl.System(lambda t, q, v, params: 0.5 * params["m"] * v @ v, PAIR)
+    assert system.structure({"m": 2.0}, jnp.float32).quadratic
+    M = system.mass_matrix({"m": 2.0}, np.zeros(2, np.float32))
+    np.testing.assert_array_equal(M, 2 * np.eye(2, dtype=np.float32))
+    assert M.dtype == jnp.float32
 
 
 # ---- Explain -------------------------------------------------------------------------------------
