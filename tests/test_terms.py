@@ -204,7 +204,7 @@ def test_tables_are_searched_only_where_there_are_tables():
     with_number = names(operations(acceleration, jnp.array(2.0), *at_rest(4)))
     with_table = names(operations(acceleration, table, *at_rest(4)))
     assert with_number == free
-    assert with_table - free >= {"scan", "dynamic_slice"}  # of jnp.searchsorted
+    assert "dynamic_slice" in with_table - free
 
 
 # ---- The protocol --------------------------------------------------------------------------------
