@@ -1,6 +1,6 @@
 """Checks of what `simulate` is given, before anything is compiled."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._errors import bad
-from jaxlag._inputs import common_range, evaluate
+from jaxlag._inputs import evaluate
 from jaxlag._methods import default_tolerances
 from jaxlag._params import concrete
 from jaxlag._solution import QUANTITIES
@@ -42,6 +42,8 @@ def check_options(
             raise bad(name, "be True or False", f"it was {flag!r}")
     if isinstance(save, str):
         raise bad("save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},).")
+    if not isinstance(save, Sequence):
+        raise bad("save", "be a sequence of names", f"it was {save!r}")
     for name in save:
         if name not in QUANTITIES:
             raise bad("save", f"name quantities among {list(QUANTITIES)}", f"one was {name!r}")
@@ -79,15 +81,18 @@ def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array
     return vectors[0].astype(dtype), vectors[1].astype(dtype)
 
 
-def _number(x: Any, dtype: Any) -> Any:
+def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
     """An array of this dtype; a numpy one where x is concrete, which costs no dispatch."""
-    return np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
+    try:
+        return np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
+    except (TypeError, ValueError) as error:
+        raise bad(argument, must, f"it was {x!r}") from error
 
 
 def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
         raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
-    ts = _number(ts, jnp.result_type(float))
+    ts = _number("ts", "be one row of times", ts, jnp.result_type(float))
     if ts.ndim != 1 or ts.shape[0] < 2:
         raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}")
     if not concrete(ts):
@@ -111,8 +116,8 @@ def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Any, An
     if dt is not None and (rtol is not None or atol is not None):
         raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
     defaults = default_tolerances(dtype)
-    rtol = _number(defaults[0] if rtol is None else rtol, dtype)
-    atol = _number(defaults[1] if atol is None else atol, dtype)
+    rtol = _number("rtol", "be a number", defaults[0] if rtol is None else rtol, dtype)
+    atol = _number("atol", "be a number", defaults[1] if atol is None else atol, dtype)
     for name, x in (("rtol", rtol), ("atol", atol)):
         if x.ndim != 0:
             raise bad(name, "be a number", f"its shape was {x.shape}")
@@ -126,7 +131,7 @@ def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Any, An
             raise bad(
                 "rtol",
                 f"be 0 or at least {least:.1e}, ten roundings of {jnp.dtype(dtype).name}",
-                f"it was {rtol}",
+                f"it was {rtol:g}",
                 "Loosen it"
                 + (
                     "."
@@ -144,28 +149,12 @@ def check_step(dt: Any, dt0: Any) -> Any:
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
     if step is None:
         return None
-    step = _number(step, jnp.result_type(float))
+    step = _number(name, "be a number", step, jnp.result_type(float))
     if step.ndim != 0:
         raise bad(name, "be a number", f"its shape was {step.shape}")
     if concrete(step) and not (np.isfinite(step) and step > 0):
         raise bad(name, "be positive, whichever way time runs", f"it was {step}")
     return step
-
-
-def check_range(inputs: Mapping[str, Any], ts: Any) -> None:
-    """Raise where concrete tables do not cover concrete times."""
-    span = common_range(inputs)
-    if span is None or not concrete(ts, *span):
-        return
-    first, last = (float(x) for x in span)
-    low, high = float(jnp.min(ts)), float(jnp.max(ts))
-    if low < first or high > last:
-        raise bad(
-            "inputs",
-            f"cover ts, from {low} to {high} s",
-            f"their tables cover {first} to {last} s",
-            "Extend the tables or shorten ts.",
-        )
 
 
 def check_declaration(

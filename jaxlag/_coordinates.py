@@ -75,7 +75,11 @@ class Coordinates:
             raise bad(argument, f"name exactly {list(self.shapes)}", f"it named {list(parts)}")
         rows = []
         for name, shape in self.shapes.items():
-            part = jnp.asarray(parts[name])
+            try:
+                part = jnp.asarray(parts[name])
+            except (TypeError, ValueError) as error:
+                was = f"it was {parts[name]!r}"
+                raise bad(f"{argument}[{name!r}]", "be numeric", was) from error
             if part.shape != shape:
                 raise bad(f"{argument}[{name!r}]", f"have shape {shape}", f"it was {part.shape}")
             rows.append(part.reshape(-1))

@@ -33,6 +33,7 @@ def values_allowed(y0: Array, saves: Array, rtol: Any, atol: Any, step: Any) -> 
     checks = [
         jnp.all(jnp.isfinite(y0)),
         jnp.all(jnp.isfinite(saves)) & jnp.all(saves[1:] > saves[:-1]),
+        jnp.isfinite(rtol) & jnp.isfinite(atol),
         (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & ((rtol == 0) | (rtol >= floor)),
     ]
     if step is not None:
@@ -97,10 +98,10 @@ def _culprits(
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(coordinate without inertia or -1, coordinate of non-finite Q - h, else of largest |a|)."""
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
-    factor = factor_mass(M)
     # A non-finite component spreads through the solve: look at the right-hand side first.
+    factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
     suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
     finite = jnp.isfinite(suspect)
     worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
-    return first_unhealthy(factor), worst.astype(jnp.int32)
+    return first_unhealthy(M, factor), worst.astype(jnp.int32)

@@ -249,7 +249,8 @@ def drive(
     final = jax.lax.while_loop(lambda c: eqxi.unvmap_any(~c.done), turn, dynamic)
     c: _Carry = eqx.combine(final, static)
     rows = _filled(c) if keep_rows else (None, None, jnp.stack([zero, c.accepted]))
-    reached = times.saves <= c.t
+    reached = (times.saves <= c.t) & allowed
+    reached = reached.at[0].set(True)
     inside = jnp.zeros_like(reached)
     if rows[0] is not None:
         inside = reached & (times.saves - rows[0] > resolution(times.saves))

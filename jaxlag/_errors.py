@@ -2,6 +2,10 @@
 
 from collections.abc import Callable
 from inspect import Parameter, signature
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
 
 
 class SimulationError(RuntimeError):
@@ -24,6 +28,35 @@ def complaint(argument: str, must: str, was: str, fix: str = "") -> str:
 def bad(argument: str, must: str, was: str, fix: str = "") -> ValueError:
     """A `ValueError` in the form of `complaint`, to be raised by the caller."""
     return ValueError(complaint(argument, must, was, fix))
+
+
+def real_scalar(argument: str, function: Callable) -> Callable:
+    """`function`, raising in our form while it is traced unless it returns a real scalar."""
+
+    def checked(*arguments: Any) -> Any:
+        value = function(*arguments)
+        must, fix = "return a real scalar", "Sum over bodies with jnp.sum; use real energies."
+        if not eqx.is_array_like(value):
+            raise bad(argument, "return an array", f"it returned {value!r}", fix)
+        value = jnp.asarray(value)
+        if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+            raise bad(argument, must, f"it returned {value.dtype} of shape {value.shape}", fix)
+        return value
+
+    return checked
+
+
+def wants(function: Callable, position: int, name: str) -> bool:
+    """Whether `function` asks for a positional argument there: required, or called `name`."""
+    try:
+        parameters = list(signature(function).parameters.values())
+    except ValueError:
+        return False
+    if any(p.kind is Parameter.VAR_POSITIONAL for p in parameters):
+        return True
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    there = [p for p in parameters if p.kind in kinds][position : position + 1]
+    return any(p.default is Parameter.empty or p.name == name for p in there)
 
 
 def accepts(function: Callable, count: int) -> bool:
@@ -49,15 +82,3 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
             f"its signature was {signature(function)}",
             "Add or drop arguments so that it takes exactly these, in this order.",
         )
-
-
-def positional_count(function: Callable, fallback: int) -> int:
-    """Number of positional arguments `function` declares; `fallback` if it hides them."""
-    try:
-        parameters = signature(function).parameters.values()
-    except ValueError:
-        return fallback
-    if any(p.kind is Parameter.VAR_POSITIONAL for p in parameters):
-        return fallback
-    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in kinds for p in parameters)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from jaxlag._errors import bad, positional_count, require_arity
+from jaxlag._errors import accepts, bad, real_scalar, require_arity, wants
 
 
 def _require_name(kind: str, name: object) -> None:
@@ -53,7 +53,7 @@ class GeneralizedForce(AbstractForce):
 
     def __init__(self, Q: Callable, name: str) -> None:
         _require_name("GeneralizedForce", name)
-        self.takes_inputs = callable(Q) and positional_count(Q, 5) != 4
+        self.takes_inputs = not (callable(Q) and accepts(Q, 4)) or wants(Q, 4, "inputs")
         names = ("t", "q", "v", "params", "inputs")
         require_arity(f"force {name!r}: Q", Q, names if self.takes_inputs else names[:4])
         self.Q, self.name = Q, name
@@ -102,4 +102,5 @@ class Rayleigh(AbstractForce):
         inputs: Mapping[str, Any],
     ) -> Float[Array, " n"]:
         """-dR/dv, shape (n,)."""
-        return -jax.grad(self.R, argnums=2)(t, q, v, params)
+        R = real_scalar(f"Rayleigh {self.name!r}: R", self.R)
+        return -jax.grad(R, argnums=2)(t, q, v, params)

@@ -5,7 +5,7 @@ knot, and evaluates a table throughout one step in the one interval that holds t
 midpoint, so that no stage ever reads the wrong side of a jump.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlag._errors import bad, positional_count, require_arity
+from jaxlag._errors import accepts, bad, require_arity, wants
 from jaxlag._params import concrete
 
 
@@ -174,7 +174,7 @@ class Function(AbstractInput):
     takes_params: bool = eqx.field(static=True)
 
     def __init__(self, f: Callable) -> None:
-        self.takes_params = callable(f) and positional_count(f, 1) == 2
+        self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
         require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
         self.f = f
 
@@ -218,15 +218,15 @@ class Feedback(AbstractInput):
         return jnp.asarray(self.f(t, q, v, params))
 
 
-class InputValues(dict):
+class InputValues(Mapping[str, Any]):
     """Values of the inputs by name; remembers which names were read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
+        self._values = dict(values)
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self:
+        if name not in self._values:
             raise bad(
                 "inputs",
                 f"have an entry {name!r}, which a force reads",
@@ -234,7 +234,22 @@ class InputValues(dict):
                 "Pass inputs={...} with this name.",
             )
         self.read.add(name)
-        return super().__getitem__(name)
+        return self._values[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The value, or `default` where there is no such input."""
+        if name not in self:
+            return default
+        return self[name]
 
 
 def check_inputs(inputs: Any) -> dict[str, Any]:
@@ -255,7 +270,11 @@ def check_inputs(inputs: Any) -> dict[str, Any]:
                 f"it was the function {signal!r}",
                 "Wrap it in jl.Function (of time) or jl.Feedback (of the state).",
             )
-        checked[name] = jnp.asarray(signal)
+        try:
+            checked[name] = jnp.asarray(signal)
+        except (TypeError, ValueError) as error:
+            must = "be an input object or an array"
+            raise bad(f"inputs[{name!r}]", must, f"it was {signal!r}") from error
     return checked
 
 
@@ -303,3 +322,20 @@ def common_range(inputs: Mapping[str, Any]) -> tuple[Array, Array] | None:
     first = jnp.max(jnp.stack([k[0] for k in present]))
     last = jnp.min(jnp.stack([k[-1] for k in present]))
     return first, last
+
+
+def check_range(inputs: Mapping[str, Any], times: Any, argument: str = "ts") -> None:
+    """Raise where concrete tables do not cover concrete times, called `argument`."""
+    span = common_range(inputs)
+    if span is None or not concrete(times, *span):
+        return
+    first, last = (float(x) for x in span)
+    low, high = float(np.min(times)), float(np.max(times))
+    if low < first or high > last:
+        asked = f"from {low} to {high} s" if low < high else f"{low} s"
+        raise bad(
+            "inputs",
+            f"cover {argument}, {asked}",
+            f"their tables cover {first} to {last} s",
+            f"Extend the tables or change {argument}.",
+        )

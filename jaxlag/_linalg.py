@@ -26,11 +26,12 @@ class MassFactor(NamedTuple):
 def factor_mass(M: Float[Array, "n n"]) -> MassFactor:
     """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.
 
-    A pivot no larger than 4 n eps M_ii is what cancellation leaves of an exactly
-    singular matrix, whatever the units of coordinate i.
+    A pivot below 4 n eps M_ii is what cancellation leaves of a singular matrix, whatever the
+    units of coordinate i. A singular matrix whose other pivots are ill-conditioned themselves can
+    pass: its round-off is larger than that.
     """
     n = M.shape[0]
-    floor = 4 * n * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
+    floor = _floor(M)
     if n > UNROLL_UP_TO:
         lower = jnp.linalg.cholesky(M, symmetrize_input=False)
         pivots = jnp.diagonal(lower) ** 2
@@ -46,10 +47,31 @@ def factor_mass(M: Float[Array, "n n"]) -> MassFactor:
     return MassFactor(upper, None, pivots > floor)
 
 
-def first_unhealthy(factor: MassFactor) -> Int[Array, ""]:
-    """Index of the first coordinate whose pivot failed, -1 if none did."""
-    failed = ~factor.healthy
-    return jnp.where(jnp.any(failed), jnp.argmax(failed), -1).astype(jnp.int32)
+def first_unhealthy(M: Float[Array, "n n"], factor: MassFactor | None = None) -> Int[Array, ""]:
+    """Index of the coordinate whose pivot fails first, -1 if M is positive definite.
+
+    A library factorisation that fails does not say where, so a plain elimination looks again.
+
+    Args:
+        M: symmetric.
+        factor: `factor_mass(M)` if it exists already.
+    """
+    factor = factor_mass(M) if factor is None else factor
+    n = M.shape[0]
+
+    def eliminate(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+        below = (jnp.arange(n) > k)[:, None]
+        return jnp.where(below, M - jnp.outer(M[:, k] / M[k, k], M[k]), M)
+
+    pivots = jnp.diagonal(jax.lax.fori_loop(0, n, eliminate, M))
+    failed = ~(pivots > _floor(M))
+    weakest = jnp.argmin(pivots / jnp.diagonal(M))
+    first = jnp.where(jnp.any(failed), jnp.argmax(failed), weakest)
+    return jnp.where(jnp.all(factor.healthy), -1, first).astype(jnp.int32)
+
+
+def _floor(M: Float[Array, "n n"]) -> Float[Array, " n"]:
+    return 4 * M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
 
 
 def _eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -13,7 +13,7 @@ class _Frozen:
     """A concrete integer or boolean array, hashable by value."""
 
     def __init__(self, array: Any) -> None:
-        self.array = np.asarray(array)
+        self.array = np.array(array)  # a copy: the caller may change theirs
         self.key = (self.array.shape, str(self.array.dtype), self.array.tobytes())
 
     def __hash__(self) -> int:

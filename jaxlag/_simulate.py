@@ -14,7 +14,6 @@ from jaxlag import _params, _xla
 from jaxlag._arguments import (
     check_declaration,
     check_options,
-    check_range,
     check_start,
     check_step,
     check_times,
@@ -24,7 +23,7 @@ from jaxlag._diagnosis import Start, diagnose, start_finite, values_allowed
 from jaxlag._drive import Scheme, Times
 from jaxlag._dynamics import Arguments, Dynamics
 from jaxlag._errors import SimulationError
-from jaxlag._inputs import all_knots, check_inputs, common_range
+from jaxlag._inputs import all_knots, check_inputs, check_range, common_range
 from jaxlag._methods import choose
 from jaxlag._replay import Problem, Setup, solve
 from jaxlag._solution import Solution, over_rows

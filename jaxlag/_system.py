@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._coordinates import Coordinates
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad, real_scalar, require_arity
 from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce
-from jaxlag._inputs import InputValues, check_inputs, evaluate
-from jaxlag._linalg import factor_mass, first_unhealthy
+from jaxlag._inputs import InputValues, check_inputs, check_range, evaluate
+from jaxlag._linalg import first_unhealthy
 from jaxlag._lowering import ArrayTerms, Structure, find_structure
 from jaxlag._terms import Terms
 from jaxlag._vectors import state_vectors
@@ -229,7 +229,8 @@ class System(eqx.Module):
         without applied forces if L does not contain t.
         """
         t, q, v, params = self._state(params, q, v, t)
-        L, p = jax.value_and_grad(self.lagrangian, argnums=2)(t, q, v, params)
+        lagrangian = real_scalar("lagrangian", self.lagrangian)
+        L, p = jax.value_and_grad(lagrangian, argnums=2)(t, q, v, params)
         return p @ v - L
 
     def kinetic(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
@@ -293,7 +294,7 @@ class System(eqx.Module):
         L = self.lagrangian(t, q, v, params)
         if not bool(jnp.isfinite(L)):
             raise bad("lagrangian", "be finite at the given state", f"it was {L}")
-        index = int(first_unhealthy(factor_mass(self.terms.mass(t, q, v, params))))
+        index = int(first_unhealthy(self.terms.mass(t, q, v, params)))
         if index >= 0:
             raise bad(
                 f"coordinate {self.coordinates.label(index)!r}",
@@ -318,7 +319,7 @@ class System(eqx.Module):
         """Dependencies of M, h and L, traced once per (system, shapes, dtypes)."""
         traced, static = _params.split(params)
         avals = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), traced
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced
         )
         return _structure(self, _params.Static(avals), _params.Static(static), jnp.dtype(dtype))
 
@@ -333,28 +334,14 @@ class System(eqx.Module):
         t = jax.ShapeDtypeStruct((), jnp.result_type(float))
         q = v = jax.ShapeDtypeStruct((self.size,), dtype)
         traced, static = _params.split(params)
-        L = _traced("lagrangian", self.lagrangian, t, q, v, traced, static)
-        if L.shape != () or not jnp.issubdtype(L.dtype, jnp.floating):
-            raise bad(
-                "lagrangian",
-                "return a real scalar",
-                f"it returned {L.dtype} of shape {L.shape}",
-                "Sum over bodies with jnp.sum; use real energies.",
-            )
-        if values is None:
-            return
-        for force in self.forces:
+        terms = self.terms
 
-            def call(t: Array, q: Array, v: Array, params: Any, force: Any = force) -> Array:
-                return force(t, q, v, params, values)
+        def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Array:
+            params = _params.join(traced, static)
+            p = terms.momentum(t, q, v, params)
+            return p if values is None else p + terms.force(t, q, v, params, values)
 
-            Q = _traced(f"force {force.name!r}", call, t, q, v, traced, static)
-            if Q.shape != (self.size,) or not jnp.issubdtype(Q.dtype, jnp.floating):
-                raise bad(
-                    f"force {force.name!r}",
-                    f"return {self.size} real components, one per coordinate",
-                    f"it returned {Q.dtype} of shape {Q.shape}",
-                )
+        jax.eval_shape(all_terms, t, q, v, traced)
 
     def _declared(self, name: str, function: Callable | None) -> Callable:
         if function is None:
@@ -371,7 +358,9 @@ class System(eqx.Module):
         return jnp.asarray(t, jnp.result_type(float)), q, v, _params.join(traced, static)
 
     def _inputs_at(self, inputs: Any, t: Array, q: Array, v: Array, params: Any) -> InputValues:
-        return evaluate(check_inputs(inputs), t, q, v, params)
+        inputs = check_inputs(inputs)
+        check_range(inputs, t, "t")
+        return evaluate(inputs, t, q, v, params)
 
 
 def _check_forces(forces: Any) -> tuple[AbstractForce, ...]:
@@ -392,18 +381,6 @@ def _check_forces(forces: Any) -> tuple[AbstractForce, ...]:
         if names.count(name) > 1:
             raise bad("forces", "have distinct names", f"{name!r} occurs {names.count(name)} times")
     return forces
-
-
-def _traced(argument: str, function: Callable, t: Any, q: Any, v: Any, traced: Any, static: Any):
-    """Shape and dtype of function(t, q, v, params), without computing it."""
-
-    def call(t: Array, q: Array, v: Array, traced: Any) -> Array:
-        result = function(t, q, v, _params.join(traced, static))
-        if not eqx.is_array_like(result):
-            raise bad(argument, "return an array", f"it returned {result!r}")
-        return jnp.asarray(result)
-
-    return jax.eval_shape(call, t, q, v, traced)
 
 
 @lru_cache(maxsize=256)

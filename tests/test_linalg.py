@@ -20,7 +20,7 @@ BOTH = (3, UNROLL_UP_TO + 2)  # one size for each way of solving
 @jax.jit
 def solved(M, r):
     """x with M x = r, and the index of the first coordinate without inertia."""
-    return solve_mass(M, r), first_unhealthy(factor_mass(M))
+    return solve_mass(M, r), first_unhealthy(M)
 
 
 def solve(M, r):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._errors import bad, real_scalar
 from jaxlag._forces import AbstractForce
 from jaxlag._linalg import solve_mass
 from jaxlag._terms import Terms
@@ -27,7 +28,7 @@ class ArrayTerms(Terms):
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
         """Momentum p = dL/dv by one reverse pass."""
-        return jax.grad(self.lagrangian, argnums=2)(t, q, v, params)
+        return jax.grad(real_scalar("lagrangian", self.lagrangian), argnums=2)(t, q, v, params)
 
     def mass(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -43,9 +44,10 @@ class ArrayTerms(Terms):
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
         """Bias h = dp/dt - dL/dq at a = 0: one derivative of (dL/dq, p) along (t', q') = (1, v)."""
+        lagrangian = real_scalar("lagrangian", self.lagrangian)
 
         def gradients(t: Array, q: Array) -> tuple[Array, Array]:
-            return jax.grad(self.lagrangian, argnums=(1, 2))(t, q, v, params)
+            return jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
 
         (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q), (jnp.ones_like(t), v))
         return p_dot - dL_dq
@@ -61,7 +63,7 @@ class ArrayTerms(Terms):
         """Q, summed over the declared forces."""
         total = jnp.zeros_like(q)
         for force in self.forces:
-            total = total + force(t, q, v, params, inputs)
+            total = total + _components(force, force(t, q, v, params, inputs), q)
         return total
 
     def rows(
@@ -90,3 +92,14 @@ class ArrayTerms(Terms):
         if not self.forces:
             return solve_mass(M, -h)
         return solve_mass(M, self.force(t, q, v, params, inputs) - h)
+
+
+def _components(force: AbstractForce, Q: Any, q: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The force's components, or an error while tracing if they are not one per coordinate."""
+    must = f"return {q.shape[0]} real components, one per coordinate"
+    if not eqx.is_array_like(Q):
+        raise bad(f"force {force.name!r}", "return an array", f"it returned {Q!r}")
+    Q = jnp.asarray(Q)
+    if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
+        raise bad(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
+    return Q

@@ -49,7 +49,7 @@ def _inner(eqn: Any) -> Jaxpr | None:
     return None
 
 
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "checkpoint"} | {
+_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"} | {
     "custom_jvp_call",
     "custom_vjp_call",
 }
@@ -102,6 +102,10 @@ def find_structure(
 def _vanishes(function: Any, state: tuple, params: Any) -> bool:
     """Whether a function that depends on none of its arguments is zero: one value decides."""
     with jax.ensure_compile_time_eval():
-        anywhere = jax.tree.map(lambda x: jnp.ones(jnp.shape(x), jnp.result_type(x)), state)
-        ones = jax.tree.map(lambda x: jnp.ones(jnp.shape(x), jnp.result_type(x)), params)
-        return not bool(jnp.any(function(*anywhere, ones)))
+        state, params = jax.tree.map(_ones, (state, params))
+        return not bool(jnp.any(function(*state, params)))
+
+
+def _ones(like: jax.ShapeDtypeStruct) -> Any:
+    ones = jnp.ones(like.shape, like.dtype)
+    return jnp.broadcast_to(1.0, like.shape) if like.weak_type else ones
