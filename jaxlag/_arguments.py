@@ -45,7 +45,7 @@ def check_options(
     if not isinstance(save, Sequence):
         raise bad("save", "be a sequence of names", f"it was {save!r}")
     for name in save:
-        if name not in QUANTITIES:
+        if not isinstance(name, str) or name not in QUANTITIES:
             raise bad("save", f"name quantities among {list(QUANTITIES)}", f"one was {name!r}")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise bad(
@@ -112,9 +112,29 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
     return ts, direction
 
 
-def check_tolerances(rtol: Any, atol: Any, dt: Any, dtype: Any) -> tuple[Any, Any]:
-    if dt is not None and (rtol is not None or atol is not None):
+def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
+    """Raise where two arguments would set the same thing."""
+    tolerances = rtol is not None or atol is not None
+    if dt is not None and tolerances:
         raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
+    if not isinstance(method, tuple):
+        return
+    if tolerances:
+        raise bad("rtol and atol", "be left out when method brings a controller", "both were given")
+    for name in ("step_ts", "jump_ts"):
+        if getattr(method[-1], name, None) is not None:
+            raise bad(
+                "method[1]",
+                "leave times to the inputs",
+                f"it had {name}",
+                "Steps end on the knots of ZeroOrderHold and Linear inputs.",
+            )
+
+
+def check_tolerances(method: Any, rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
+    """(rtol, atol) of the default controller, or of the one that `method` brings."""
+    if isinstance(method, tuple):
+        rtol, atol = (getattr(method[-1], name, None) for name in ("rtol", "atol"))
     defaults = default_tolerances(dtype)
     rtol = _number("rtol", "be a number", defaults[0] if rtol is None else rtol, dtype)
     atol = _number("atol", "be a number", defaults[1] if atol is None else atol, dtype)

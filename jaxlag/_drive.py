@@ -89,6 +89,18 @@ class Scheme(eqx.Module):
         return jnp.asarray(end, t0.dtype), state
 
 
+def with_stages(solver: Any, kind: str) -> Any:
+    """A Runge-Kutta solver, wrapped or not, with its loop over stages of the given kind.
+
+    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying.
+    """
+    if isinstance(solver, diffrax.HalfSolver):
+        return eqx.tree_at(lambda s: s.solver, solver, with_stages(solver.solver, kind))
+    if not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
 class Grid(NamedTuple):
     """The accepted steps: step k ends `offset[k]` after anchor `anchor[k]`, and moves with it."""
 
@@ -210,6 +222,8 @@ def drive(
     memory = scheme.begin(t0, times.stop, y0, args)
     if scheme.controller is not None:
         h, control_state = scheme.first_step(t0, times.stop, y0, args, first_step)
+        # The estimate is 0/0 where atol = 0 meets a component that is 0.
+        h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (times.stop - t0))
     else:
         assert first_step is not None
         h, control_state = first_step, None
@@ -318,6 +332,9 @@ def _turn(scheme: Scheme, args: Any, times: Times, dt: Array, max_steps: int, c:
         first = jnp.where(rows > c.rows, c.rows, size)
         last_save = jnp.take_along_axis(times.saves, rows[None] - 1, axis=0)[0]
         at_end = (rows > c.rows) & (t - last_save <= resolution(t))
+        if row_step is not None:
+            # For derivatives the row must move with its own time, not with the end of the step.
+            at_end = jnp.zeros_like(at_end)
         last = jnp.where(at_end, rows - 1, size)
         row_time = _write(_write(row_time, first, c.t), last, t)
         row_state = _write(row_state, first, _whole(scheme, c.y, c.memory))

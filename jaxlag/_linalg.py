@@ -15,7 +15,7 @@ UNROLL_UP_TO = 8
 class MassFactor(NamedTuple):
     """Factor of M = L D L^T, with U = D L^T (upper) and the pivots' health.
 
-    `unrolled` rows of U as scalars for small n; otherwise the lower Cholesky factor.
+    `upper`: rows of U as scalars for small n; otherwise `cholesky`, the lower Cholesky factor.
     """
 
     upper: tuple[tuple[Array, ...], ...] | None

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import optimistix
 
+from jaxlag._drive import with_stages
 from jaxlag._errors import bad
 
 METHODS: dict[str, type[diffrax.AbstractSolver]] = {
@@ -89,9 +90,7 @@ def _solver(method: Any) -> diffrax.AbstractSolver:
             "integrate an ordinary differential equation y' = f(t, y)",
             f"{type(method).__name__} wants terms {method.term_structure}",
         )
-    if isinstance(method, diffrax.AbstractRungeKutta) and method.scan_kind is None:
-        method = eqx.tree_at(lambda s: s.scan_kind, method, "lax", is_leaf=lambda x: x is None)
-    return method
+    return with_stages(method, "lax")
 
 
 def _with_tolerances(

@@ -33,7 +33,7 @@ def is_array(leaf: Any) -> bool:
 
 def concrete(*arrays: Any) -> bool:
     """Whether all of these have values, rather than being traced by a transform."""
-    return not any(isinstance(x, Tracer) for x in arrays)
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
 def _is_traced(leaf: Any) -> bool:

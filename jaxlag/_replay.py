@@ -11,14 +11,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive
+from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive, with_stages
+from jaxlag._status import Status
 
 # Rows interpolated at once: bounds the memory of a vmapped solve.
 ROWS_AT_ONCE = 64
@@ -101,7 +101,10 @@ def _forward(
         starts = jnp.stack([times.start, outcome.time])
     else:
         starts, states = outcome.row_time, outcome.row_state
-    rows = _rows(scheme, args, times, starts, states, outcome, outcome.state, outcome.time)
+    rows, failed = _rows(scheme, args, times, starts, states, outcome, outcome.state, outcome.time)
+    lost = failed & (outcome.status == int(Status.ok))
+    status = jnp.where(lost, int(Status.implicit_solve_failed), outcome.status)
+    outcome = outcome._replace(status=status.astype(jnp.int32))
     return rows, outcome._replace(row_time=None, row_state=None)
 
 
@@ -114,33 +117,41 @@ def _rows(
     outcome: Outcome,
     state: PyTree,
     time: Array,
-) -> Rows:
+) -> tuple[Rows, Bool[Array, ""]]:
     """Reach every save time by one step of the solver itself from the last state before it.
 
     A step shorter than an accepted one is at least as accurate, whatever the solver: saved rows
-    keep its order, which its interpolant need not.
+    keep its order, which its interpolant need not. The flag says whether one of these steps
+    failed; its row is NaN.
     """
     saves, reached, inside = times.saves, outcome.reached, outcome.inside
     if saves.shape[0] > 2:
 
-        def step(row: tuple[Array, Array, PyTree]) -> PyTree:
+        def step(row: tuple[Array, Array, PyTree]) -> tuple[PyTree, Array]:
             t0, t1, state = row
-            return _step(scheme, args, t0, t1, state, jnp.array(False))[0]
+            (y, _), solved = _step(scheme, args, t0, t1, state, jnp.array(False))
+            finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]
+            return y, solved & jnp.all(jnp.stack(finite))
 
-        def step_all(states: PyTree) -> PyTree:
+        def step_all(states: PyTree) -> tuple[PyTree, Array]:
             ends = jnp.where(inside, saves, starts)
             return _in_batches(step, (starts, ends, states), saves.shape[0])
 
         # Rows that need no step must not see one: the field may not be finite where they are.
         safe = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
-        stepped = jax.lax.cond(
-            eqxi.unvmap_any(jnp.any(inside)), step_all, lambda states: states[0], safe
+        stepped, good = jax.lax.cond(
+            eqxi.unvmap_any(jnp.any(inside)),
+            step_all,
+            lambda states: (states[0], jnp.ones_like(inside)),
+            safe,
         )
         y = jax.tree.map(lambda a, b: jnp.where(_like(inside, a), a, b), stepped, states[0])
+        missed = inside & ~good
+        reached = reached & ~missed
     else:
-        y = states[0]
+        y, missed = states[0], jnp.zeros_like(inside)
     saved = jax.tree.map(lambda s: jnp.where(_like(reached, s), s, jnp.nan), y)
-    return Rows(saved, state, time)
+    return Rows(saved, state, time), jnp.any(missed)
 
 
 def _in_batches(function: Callable, rows: PyTree, count: int) -> PyTree:
@@ -160,13 +171,13 @@ def _in_batches(function: Callable, rows: PyTree, count: int) -> PyTree:
 
 def _step(
     scheme: Scheme, args: Any, t0: Array, t1: Array, state: PyTree, jump: Array
-) -> tuple[PyTree, Any]:
-    """One step from (y, memory); a solver without memory starts afresh."""
+) -> tuple[PyTree, Bool[Array, ""]]:
+    """One step from (y, memory), and whether it was solved; without memory it starts afresh."""
     y, memory = state
     if not scheme.remembers:
         memory, jump = scheme.begin(t0, t1, y, args), jnp.array(True)
-    y, _, memory, _ = scheme.step(t0, t1, y, args, memory, jump)
-    return y, (memory if scheme.remembers else None)
+    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jump)
+    return (y, memory if scheme.remembers else None), solved
 
 
 def _like(mask: Array, leaf: Array) -> Array:
@@ -181,7 +192,7 @@ def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any
     moved = grid.count > 0
     inexact = jax.tree.map(lambda x: jnp.where(moved, x, jax.lax.stop_gradient(x)), inexact)
     y0, args, times, scheme, _max_steps = _unpack(inexact, rest, setup, static)
-    scheme = eqx.tree_at(lambda s: s.solver, scheme, _scannable(scheme.solver))
+    scheme = eqx.tree_at(lambda s: s.solver, scheme, with_stages(scheme.solver, "bounded"))
     ends = times.anchors()[grid.anchor] + grid.offset
     memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
     start = (y0, memory)
@@ -191,7 +202,7 @@ def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any
         lambda first, rest: jnp.concatenate([first[None], rest])[grid.row_step], start, history
     )
     starts = marks[grid.row_step]
-    return _rows(scheme, args, times, starts, states, outcome, state[0], marks[grid.count])
+    return _rows(scheme, args, times, starts, states, outcome, state[0], marks[grid.count])[0]
 
 
 def _steps(
@@ -209,7 +220,7 @@ def _steps(
 
     @partial(jax.checkpoint, prevent_cse=False)
     def step(t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
-        return _step(scheme, args, t0, t1, state, jump)
+        return _step(scheme, args, t0, t1, state, jump)[0]
 
     def one(state: PyTree, slot: tuple[Array, Array, Array, Array]) -> tuple[PyTree, PyTree]:
         t0, t1, use, jump = slot
@@ -229,10 +240,3 @@ def _steps(
     slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used, grid.jump))
     last, history = jax.lax.scan(chunk, start, slots)
     return last, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), history)
-
-
-def _scannable(solver: Any) -> Any:
-    """The solver with its loop over stages as a scan, which every derivative passes."""
-    if not isinstance(solver, diffrax.AbstractRungeKutta):
-        return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)

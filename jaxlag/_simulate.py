@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxlag import _params, _xla
 from jaxlag._arguments import (
     check_declaration,
+    check_method,
     check_options,
     check_start,
     check_step,
@@ -84,11 +85,12 @@ def simulate(
     """Integrate M a + h = Q from (q0, v0) at ts[0], and return the motion at ts.
 
     Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. Other values of q0, v0, ts,
-    params, inputs, rtol, atol, dt and dt0 never recompile; another number of times, method or
-    structure of params does, and so does turning the direction of time round.
+    inputs, rtol, atol, dt, dt0 and of the traced params never recompile; another number of times,
+    method, static or structure of params does, and so does turning the direction of time round.
 
     The derivative under every transform is that of the solution at the frozen sequence of
-    accepted steps, the dependence on ts and on the inputs' knots kept.
+    accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
+    coincide, only for moving them together). It is zero in dt, dt0, rtol and atol.
 
     Args:
         system: what moves.
@@ -112,8 +114,8 @@ def simulate(
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
         save: names of quantities to compute inside the solve: "a", "p", "energy", "kinetic",
             "potential", "Q". Without it the Solution computes them on demand.
-        gradient: a hint on the cost of derivatives, never on their value: "auto" or "recorded"
-            (steps taken again on the recorded grid).
+        gradient: a hint on the cost of derivatives, never on their value. "auto" and "recorded"
+            are the same so far: steps are taken again on the recorded grid.
         project: whether constraints are projected; without constraints there is nothing to do.
         assemble: whether an inconsistent start is moved onto the constraints; the same.
         throw: raise `SimulationError` where a concrete result has a status other than ok.
@@ -140,11 +142,12 @@ def simulate(
         -0.300000 0.090000 ok at t = 1.5707963267948966
     """
     check_options(system, formulation, gradient, project, assemble, save, max_steps)
+    check_method(method, rtol, atol, dt)
     q0, v0 = check_start(system, q0, v0, u0)
     ts, direction = check_times(ts)
     inputs = check_inputs(inputs)
     check_range(inputs, ts)
-    rtol, atol = check_tolerances(rtol, atol, dt, q0.dtype)
+    rtol, atol = check_tolerances(method, rtol, atol, q0.dtype)
     step = check_step(dt, dt0)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
@@ -211,9 +214,10 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
             "rejected": outcome.attempted - outcome.accepted,
         },
         saved=saved,
-        inputs=inputs,
         _params_traced=values.params,
+        _inputs_traced=values.inputs,
         _params_static=plan.params,
+        _inputs_static=plan.inputs,
     )
 
 

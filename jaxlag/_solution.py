@@ -58,7 +58,6 @@ class Solution(eqx.Module):
         where: index of the coordinate that a failure concerns, -1 if none.
         stats: counts: "accepted" and "rejected" steps.
         saved: quantities named in `save=`, by name.
-        inputs: the inputs of this motion, by name.
     """
 
     system: System
@@ -71,14 +70,20 @@ class Solution(eqx.Module):
     where: Int[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
     saved: dict[str, Array]
-    inputs: dict[str, Any]
     _params_traced: Any
+    _inputs_traced: Any
     _params_static: _params.Static = eqx.field(static=True)
+    _inputs_static: _params.Static = eqx.field(static=True)
 
     @property
     def params(self) -> Any:
         """The params of this motion, numbers as arrays."""
         return _params.join(self._params_traced, self._params_static.tree)
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The inputs of this motion, by name."""
+        return eqx.combine(self._inputs_traced, self._inputs_static.tree)
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, shape (s, *its shape)."""
@@ -144,24 +149,23 @@ class Solution(eqx.Module):
     def _quantity(self, name: str) -> Array:
         if name in self.saved:
             return self.saved[name]
-        traced, static = eqx.partition(
-            (self.ts, self.q, self.v, self._params_traced, self.inputs), eqx.is_array
-        )
-        key = _params.Static(static)
-        return _derived(name, self.system, self._params_static, key, self.ts.ndim - 1, traced)
+        key = (self._params_static, self._inputs_static)
+        traced = (self.ts, self.q, self.v, self._params_traced, self._inputs_traced)
+        return _derived(name, self.system, key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:
         names = ", ".join(self.system.coordinates.names)
         return f"Solution({names}; shape {self.q.shape}, status {self.status})"
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
-def _derived(
-    name: str, system: System, params_static: Any, key: Any, batch: int, traced: Any
-) -> Array:
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _derived(name: str, system: System, key: Any, batch: int, traced: Any) -> Array:
+    params_static, inputs_static = key
+
     def one(traced: Any) -> Array:
-        ts, q, v, params, inputs = eqx.combine(traced, key.tree)
+        ts, q, v, params, inputs = traced
         params = _params.join(params, params_static.tree)
+        inputs = eqx.combine(inputs, inputs_static.tree)
         return over_rows(name, system, ts, q, v, params, inputs)
 
     for _ in range(batch):

@@ -31,7 +31,8 @@ ADVICE = {
     Status.max_steps: "Raise max_steps, loosen rtol and atol, or shorten ts.",
     Status.step_below_resolution: (
         "The step shrank below the resolution of time: a singularity, a discontinuity that no "
-        "input knot announces, or a tolerance tighter than the dtype gives."
+        "input knot announces, atol = 0 where a component is 0, or a tolerance tighter than the "
+        "dtype gives."
     ),
     Status.nonfinite: "The Lagrangian or a force is not finite there: check its domain.",
     Status.mass_singular: (

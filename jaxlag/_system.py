@@ -128,7 +128,9 @@ class System(eqx.Module):
     def mass_matrix(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, "n n"]:
         """M(t, q, v) = d2L/dv2, shape (n, n), kg, kg m or kg m^2 by the pair of coordinates.
 
-        `v` may be left out where M does not depend on it.
+        Symmetric; `v` may be left out where M does not depend on it.
+
+        Source: Siciliano et al., Robotics, eq. 7.30.
 
         Raises:
             ValueError: q or v of wrong length; v left out although M depends on it.
@@ -150,6 +152,8 @@ class System(eqx.Module):
 
         The generalized force needed to hold a = 0; gravity and explicit time included, applied
         forces not.
+
+        Source: d/dt(dL/dv) - dL/dq (Pila, eq. 3.53) less M a.
         """
         t, q, v, params = self._state(params, q, v, t)
         return self.terms.bias(t, q, v, params)
@@ -205,6 +209,8 @@ class System(eqx.Module):
             inputs: dict from names to input objects or arrays.
             names: only these forces; by default all, dissipation included.
 
+        Source: Pila, sec. 3.3 (virtual work) and 3.7 (Rayleigh).
+
         Raises:
             ValueError: wrong lengths, unknown force names, missing inputs.
         """
@@ -218,7 +224,7 @@ class System(eqx.Module):
         return ArrayTerms(self.lagrangian, chosen).force(t, q, v, params, values)
 
     def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
-        """Momentum p = dL/dv, shape (n,), kg m/s or kg m^2/s."""
+        """Momentum p = dL/dv, shape (n,), kg m/s or kg m^2/s (Pila, sec. 3.13)."""
         t, q, v, params = self._state(params, q, v, t)
         return self.terms.momentum(t, q, v, params)
 
@@ -267,6 +273,8 @@ class System(eqx.Module):
             v: shape (n,).
             t: s.
             inputs: dict from names to input objects or arrays.
+
+        Source: Pila, eq. 3.118 without constraints.
         """
         t, q, v, params = self._state(params, q, v, t)
         values = self._inputs_at(inputs, t, q, v, params)

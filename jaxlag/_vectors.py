@@ -27,11 +27,11 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
-def state_vectors(coordinates: Coordinates, q: Any, v: Any, suffix: str = "") -> tuple[Array, Any]:
+def state_vectors(coordinates: Coordinates, q: Any, v: Any) -> tuple[Array, Any]:
     """(q, v) as flat vectors of one dtype, the result type of both; v may be None."""
-    q = vector(coordinates, "q" + suffix, q)
+    q = vector(coordinates, "q", q)
     if v is None:
         return q, None
-    v = vector(coordinates, "v" + suffix, v)
+    v = vector(coordinates, "v", v)
     dtype = jnp.result_type(q, v)
     return q.astype(dtype), v.astype(dtype)

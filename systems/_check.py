@@ -20,10 +20,10 @@ LOCAL_ERROR = 1e-13
 """Tolerance rtol = atol of the simulation, per step."""
 
 STATE_TOLERANCE = 1e-10
-"""Largest |x - reference| / (1 + |reference|) of q, v and the energies."""
+"""Largest |x - reference| / (1 + |reference|) of q, v, energies and invariants."""
 
 DERIVED_TOLERANCE = 1e-9
-"""The same for accelerations and everything else that is found from the state."""
+"""The same for accelerations, extras and everything else found from the state."""
 
 
 class Motion(NamedTuple):
@@ -131,4 +131,4 @@ def _report(path: Path, entry: Entry, case: Case) -> bool:
 
 
 def _is_state(field: str) -> bool:
-    return field in ("q", "v") or field.startswith("energy.")
+    return field in ("q", "v") or field.startswith(("energy.", "invariants."))

@@ -183,6 +183,33 @@ def test_dependence_on_times(derivatives):
     assert np.abs(by_clock[:4]).max() < 1e-9 * np.abs(y).max()
 
 
+def test_rows_move_with_their_own_time():
+    """d x(ts[i]) / d ts[i] = v, on a mark of a fixed grid and on a knot as anywhere else."""
+    free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
+    row = jax.grad(lambda ts: jl.simulate(free, [0.0], [2.0], ts, dt=0.25).q[1, 0])
+    for middle in (0.5, 0.51):
+        slope = row(jnp.array([0.0, middle, 1.0]))
+        np.testing.assert_allclose(slope, [-2.0, 2.0, 0.0], rtol=0, atol=1e-13)
+
+    def pushed(at, knot):
+        """The row at `at` under a force 5 t / knot, up to the knot."""
+        force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
+        system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
+        table = jl.Linear(jnp.stack([0.0, knot, 1.0]), jnp.array([0.0, 5.0, 1.0]))
+        ts = jnp.stack([0.0, at, 1.0])
+        return jl.simulate(system, [0.0], [0.0], ts, inputs={"u": table}).q[1, 0]
+
+    by_row, by_knot = jax.grad(pushed, argnums=(0, 1))(0.5, 0.5)
+    np.testing.assert_allclose(by_row, 5 * 0.5 / 2, rtol=1e-12)  # v = 5 t^2 / (2 knot)
+    np.testing.assert_allclose(by_knot, -5 * 0.5 / 6, rtol=1e-12)  # x = 5 t^3 / (6 knot)
+
+
+def test_derivative_by_end_given_in_a_list():
+    free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
+    slope = jax.grad(lambda end: jl.simulate(free, [0.0], [2.0], [0.0, end]).q[-1, 0])(1.0)
+    np.testing.assert_allclose(slope, 2.0, rtol=1e-14)
+
+
 def test_derivative_by_switching_time():
     """d theta(t1) / d t_switch = (Q_before - Q_after) / J (t1 - t_switch) for a free rotor."""
     rotor = jl.System(

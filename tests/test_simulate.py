@@ -194,6 +194,50 @@ def test_input_range():
         jl.simulate(*arguments, [0.0, 1.0], params)
 
 
+@pytest.mark.parametrize(
+    ("signal", "x", "a"),
+    [
+        (jl.Function(lambda t: jnp.cos(t)), 2 - np.cos(1.0), np.cos(1.0)),
+        (jl.Function(lambda t, params: params * jnp.cos(t)), 3 - 2 * np.cos(1.0), 2 * np.cos(1.0)),
+        (jl.Feedback(lambda t, q, v, params: -q[0]), np.cos(1.0), -np.cos(1.0)),
+        (0.5, 1.25, 0.5),
+    ],
+)
+def test_signals_that_are_no_tables(signal, x, a):
+    """Unit mass from x = 1 at rest over 1 s under cos t, 2 cos t, -x and 1/2."""
+    push = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(push,))
+
+    def go(q0):
+        return jl.simulate(system, q0, [0.0], [0.0, 0.3, 1.0], 2.0, inputs={"u": signal})
+
+    motion = go(jnp.array([1.0]))
+    np.testing.assert_allclose(motion.q[-1], [x], rtol=1e-8)
+    np.testing.assert_allclose(motion.a[-1], [a], rtol=1e-8)
+    np.testing.assert_array_equal(motion.Q, motion.a)
+    batch = jax.jit(jax.vmap(go))(jnp.ones((2, 1)))
+    np.testing.assert_allclose(batch.a[:, -1], [[a], [a]], rtol=1e-8)
+    assert set(motion.inputs) == {"u"}
+
+
+def test_float32_under_a_force_of_time():
+    """Time is float64; the force is cast to the state, adaptive and fixed."""
+    push = jl.GeneralizedForce(lambda t, q, v, p: jnp.cos(t)[None], "push")
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(push,))
+    start = np.float32([1.0]), np.float32([0.0])
+    for options in ({}, {"dt": 0.05}):
+        motion = jl.simulate(system, *start, [0.0, 0.5, 1.0], **options)
+        assert motion.q.dtype == jnp.float32
+        np.testing.assert_allclose(motion.q[-1], [2 - np.cos(1.0)], rtol=1e-5)
+
+
+def test_wrapped_solver():
+    import diffrax
+
+    motion = run(method=diffrax.HalfSolver(diffrax.Tsit5()), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(motion.q, run().q, rtol=0, atol=1e-5)
+
+
 def test_solution_after_vmap():
     starts = PENDULUM.q0 + jnp.linspace(0.0, 0.1, 3)[:, None]
     motions = jax.jit(jax.vmap(lambda q0: run(q0=q0)))(starts)
@@ -216,6 +260,14 @@ def test_explicit_controller():
         ValueError, match="dt must be left out when method brings its own controller"
     ):
         run(method=(diffrax.Dopri5(), controller), dt=0.1)
+    with pytest.raises(ValueError, match="rtol and atol must be left out when method brings"):
+        run(method=(diffrax.Dopri5(), controller), rtol=1e-3)
+    negative = diffrax.PIDController(rtol=-1.0, atol=1e-6)
+    with pytest.raises(ValueError, match=r"rtol must be finite and not negative, but it was -1\.0"):
+        run(method=(diffrax.Dopri5(), negative))
+    clipped = diffrax.ClipStepSizeController(controller, jump_ts=jnp.array([0.5]))
+    with pytest.raises(ValueError, match=r"method\[1\] must leave times to the inputs"):
+        run(method=(diffrax.Dopri5(), clipped))
 
 
 def test_tolerance_is_kept_across_solvers():

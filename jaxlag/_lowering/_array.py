@@ -102,4 +102,4 @@ def _components(force: AbstractForce, Q: Any, q: Float[Array, " n"]) -> Float[Ar
     Q = jnp.asarray(Q)
     if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
         raise bad(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
-    return Q
+    return Q.astype(q.dtype)  # time is float64 where x64 is on, whatever the state is
