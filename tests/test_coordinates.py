@@ -111,21 +111,21 @@ def test_bad_parts_are_refused(parts, message):
 @pytest.mark.parametrize(
     ("x", "message"),
     [
-        ([1.0], "q0 must have shape (2,), but its shape was (1,). Give one entry per coordinate, "),
-        ([1.0, 2.0, 3.0], "q0 must have shape (2,), but its shape was (3,)."),
-        (1.0, "q0 must have shape (2,), but its shape was ()."),
-        ([[1.0, 2.0]], "q0 must have shape (2,), but its shape was (1, 2)."),
-        (["one", "two"], "q0 must be 2 numbers, but it was ['one', 'two']."),
-        (None, "q0 must be 2 numbers, but it was None."),
-        ([1.0, [2.0]], "q0 must be 2 numbers, but it was [1.0, [2.0]]."),
-        ([1.0, 2.0j], "q0 must be real, but its dtype was complex128."),
+        ([1.0], "q must have shape (2,), but its shape was (1,). Give one entry per coordinate, "),
+        ([1.0, 2.0, 3.0], "q must have shape (2,), but its shape was (3,)."),
+        (1.0, "q must have shape (2,), but its shape was ()."),
+        ([[1.0, 2.0]], "q must have shape (2,), but its shape was (1, 2)."),
+        (["one", "two"], "q must be 2 numbers, but it was ['one', 'two']."),
+        (None, "q must be 2 numbers, but it was None."),
+        ([1.0, [2.0]], "q must be 2 numbers, but it was [1.0, [2.0]]."),
+        ([1.0, 2.0j], "q must be real, but its dtype was complex128."),
     ],
 )
 def test_a_bad_vector_is_refused(x, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         vector(PLAIN, "q0", x)
     with pytest.raises(ValueError, match="^" + re.escape(message)):
-        state_vectors(PLAIN, x, [0.0, 0.0], suffix="0")
+        state_vectors(PLAIN, x, [0.0, 0.0])
 
 
 def test_the_order_of_the_entries_stands_in_the_message():
