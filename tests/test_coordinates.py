@@ -123,7 +123,7 @@ def test_bad_parts_are_refused(parts, message):
 )
 def test_a_bad_vector_is_refused(x, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
-        vector(PLAIN, "q0", x)
+        vector(PLAIN, "q", x)
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         state_vectors(PLAIN, x, [0.0, 0.0])
 
