@@ -242,6 +242,8 @@ class System(eqx.Module):
     def kinetic(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
         """T(t, q, v), scalar, J, as declared by `kinetic=`.
 
+        Source: L = T - V (Pila, ch. 3).
+
         Raises:
             ValueError: the system was declared by its Lagrangian alone.
         """
@@ -250,6 +252,8 @@ class System(eqx.Module):
 
     def potential(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, ""]:
         """V(t, q), scalar, J, as declared by `potential=`; `v` is accepted and not used.
+
+        Source: L = T - V (Pila, ch. 3).
 
         Raises:
             ValueError: the system was declared by its Lagrangian alone.
@@ -290,7 +294,10 @@ class System(eqx.Module):
     ) -> None:
         """Examine the declaration at one state, with these params; silent if all is well.
 
-        Traces L and the forces, then looks at the numbers: L finite, M positive definite.
+        Traces L and the forces, then looks at the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
+        positive definite by its pivots, a with M a + h = Q finite.
+
+        Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
 
         Raises:
             ValueError: L not a real scalar or not finite, a force of wrong shape, missing
@@ -316,7 +323,11 @@ class System(eqx.Module):
             raise bad(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
 
     def explain(self, params: Any) -> str:
-        """What was found in the system, and what is therefore skipped, as text."""
+        """What was found in M a + h = Q of this system, and what is therefore skipped, as text.
+
+        Dependencies of M, h and L on t, q, v and params are read from the traced program, never
+        from numbers.
+        """
         traced, static = _params.split(params)
         params = _params.join(traced, static)
         dtype = jnp.result_type(float)
