@@ -6,15 +6,25 @@ from jaxlag import _xla
 
 _xla.configure()
 
+from jaxlag import energy as energy  # noqa: E402
+from jaxlag import math as math  # noqa: E402
+from jaxlag import rotation as rotation  # noqa: E402
+from jaxlag._errors import EquilibriumError as EquilibriumError  # noqa: E402
 from jaxlag._errors import SimulationError as SimulationError  # noqa: E402
+from jaxlag._forces import Couple as Couple  # noqa: E402
 from jaxlag._forces import GeneralizedForce as GeneralizedForce  # noqa: E402
+from jaxlag._forces import PointForce as PointForce  # noqa: E402
 from jaxlag._forces import Rayleigh as Rayleigh  # noqa: E402
 from jaxlag._inputs import Feedback as Feedback  # noqa: E402
 from jaxlag._inputs import Function as Function  # noqa: E402
 from jaxlag._inputs import Linear as Linear  # noqa: E402
 from jaxlag._inputs import ZeroOrderHold as ZeroOrderHold  # noqa: E402
+from jaxlag._inverse import inverse_dynamics as inverse_dynamics  # noqa: E402
+from jaxlag._inverse import prescribed_motion as prescribed_motion  # noqa: E402
 from jaxlag._simulate import simulate as simulate  # noqa: E402
 from jaxlag._solution import Solution as Solution  # noqa: E402
+from jaxlag._statics import Equilibrium as Equilibrium  # noqa: E402
+from jaxlag._statics import equilibrium as equilibrium  # noqa: E402
 from jaxlag._status import Status as Status  # noqa: E402
 from jaxlag._system import System as System  # noqa: E402
 from jaxlag._terms import Terms as Terms  # noqa: E402

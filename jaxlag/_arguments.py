@@ -45,8 +45,9 @@ def check_options(
     if not isinstance(save, Sequence):
         raise bad("save", "be a sequence of names", f"it was {save!r}")
     for name in save:
-        if not isinstance(name, str) or name not in QUANTITIES:
-            raise bad("save", f"name quantities among {list(QUANTITIES)}", f"one was {name!r}")
+        if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
+            known = [*QUANTITIES, "work"]
+            raise bad("save", f"name quantities among {known}", f"one was {name!r}")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise bad(
                 "save",

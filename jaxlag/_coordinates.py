@@ -69,6 +69,12 @@ class Coordinates:
             start = stop
         return parts
 
+    def part(self, x: Array, name: str) -> Array:
+        """The part of x, shape (..., n), that belongs to one coordinate."""
+        if name not in self.shapes:
+            raise bad("name", f"be one of {list(self.names)}", f"it was {name!r}")
+        return self.unflatten(x)[name]
+
     def flatten(self, parts: Mapping[str, Any], argument: str = "q") -> Array:
         """Inverse of `unflatten` for a single state: dict of named values to shape (n,)."""
         if set(parts) != set(self.shapes):

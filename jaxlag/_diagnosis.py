@@ -70,7 +70,8 @@ def diagnose(
     # Both states in one batch: the terms are traced and compiled once.
     q, v = dynamics.parts(outcome.state)
     tried = jnp.concatenate([q + (outcome.tried - outcome.time).astype(q.dtype) * v, v])
-    taus, states = jnp.stack([outcome.time, outcome.tried]), jnp.stack([outcome.state, tried])
+    last = outcome.state[: tried.shape[0]]
+    taus, states = jnp.stack([outcome.time, outcome.tried]), jnp.stack([last, tried])
     args = dynamics.within(problem.args, outcome.time)
     masses, worsts = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
     mass = jnp.where(masses[0] >= 0, masses[0], masses[1])

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._inputs import evaluate, locate
+from jaxlag._power import Power
 from jaxlag._system import System
 
 
@@ -24,17 +25,21 @@ class Arguments(NamedTuple):
 class Dynamics(eqx.Module):
     """dy/dtau = sigma (v, a) with y = (q, v), tau = sigma t, M a + h = Q.
 
+    Where work is asked for, y = (q, v, W) with one more component for each term of dH/dt.
+
     Attributes:
         system: what moves.
         params: static half of the params.
         inputs: static half of the inputs.
         direction: sigma, +1 or -1, where known while tracing; else None.
+        power: terms of dH/dt to integrate along; None for none.
     """
 
     system: System
     params: _params.Static = eqx.field(static=True)
     inputs: _params.Static = eqx.field(static=True)
     direction: int | None = eqx.field(static=True)
+    power: Power | None
 
     def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
         """Arguments outside any step, from the traced halves of params and inputs."""
@@ -91,14 +96,30 @@ class Dynamics(eqx.Module):
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " m"]:
         """dy/dtau."""
-        rate = jnp.concatenate([self.parts(y)[1], self.acceleration(tau, y, args)])
+        t, q, v, params, values = self._at(tau, y, args)
+        rates = [v, self.system.terms.acceleration(t, q, v, params, values)]
+        if self.power is not None and self.power.names:
+            rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
+        rate = jnp.concatenate(rates)
         if self.direction == 1:
             return rate
         return -rate if args.sigma is None else rate * args.sigma.astype(rate.dtype)
 
     def parts(self, y: Float[Array, "*s m"]) -> tuple[Array, Array]:
         """(q, v) of y."""
-        return y[..., : self.system.size], y[..., self.system.size :]
+        n = self.system.size
+        return y[..., :n], y[..., n : 2 * n]
+
+    def start(self, q0: Float[Array, " n"], v0: Float[Array, " n"]) -> Float[Array, " m"]:
+        """y at the start, no work done yet."""
+        terms = 0 if self.power is None else len(self.power.names)
+        return jnp.concatenate([q0, v0, jnp.zeros((terms,), q0.dtype)])
+
+    def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
+        """Work done since the start by every term of dH/dt, by name."""
+        assert self.power is not None
+        columns = jnp.moveaxis(y[..., 2 * self.system.size :], -1, 0)
+        return dict(zip(self.power.names, columns, strict=True))
 
     def term(self, dtype: Any) -> diffrax.ODETerm:
         """The vector field as diffrax takes it."""

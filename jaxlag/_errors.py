@@ -20,6 +20,18 @@ class SimulationError(RuntimeError):
         self.motion = motion
 
 
+class EquilibriumError(RuntimeError):
+    """A search for a state of rest found none.
+
+    Attributes:
+        equilibrium: the `Equilibrium` with the nearest point and the forces left there.
+    """
+
+    def __init__(self, message: str, equilibrium: object = None) -> None:
+        super().__init__(message)
+        self.equilibrium = equilibrium
+
+
 def complaint(argument: str, must: str, was: str, fix: str = "") -> str:
     """`<argument> must <must>, but <was>. <fix>`."""
     return f"{argument} must {must}, but {was}." + (f" {fix}" if fix else "")

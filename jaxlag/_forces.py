@@ -5,21 +5,46 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import accepts, bad, real_scalar, require_arity, wants
+
+EXPLICIT_TIME = "explicit time"
+"""Name of the power -dL/dt at fixed (q, v), which no force may bear."""
+
+_ARGUMENTS = ("t", "q", "v", "params", "inputs")
 
 
 def _require_name(kind: str, name: object) -> None:
     if not isinstance(name, str) or not name:
         raise bad(f"{kind}: name", "be a non-empty string", f"it was {name!r}")
+    if name == EXPLICIT_TIME:
+        raise bad(f"{kind}: name", "not be that of the power of explicit time", f"it was {name!r}")
+
+
+def _takes_inputs(argument: str, function: Callable) -> bool:
+    """Whether a function of (t, q, v, params) asks for `inputs` too; raises if it is neither."""
+    takes = not (callable(function) and accepts(function, 4)) or wants(function, 4, "inputs")
+    require_arity(argument, function, _ARGUMENTS if takes else _ARGUMENTS[:4])
+    return takes
+
+
+def _real(argument: str, value: Any) -> Array:
+    """A real array, or an error in our form while tracing."""
+    if not eqx.is_array_like(value):
+        raise bad(argument, "return an array", f"it returned {value!r}")
+    value = jnp.asarray(value)
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise bad(argument, "return real numbers", f"it returned {value.dtype}")
+    return value
 
 
 class AbstractForce(eqx.Module):
     """An applied generalized force Q(t, q, v, params, inputs), conjugate to the coordinates."""
 
     name: eqx.AbstractVar[str]
-    takes_inputs: eqx.AbstractVar[bool]
 
     def __call__(
         self,
@@ -53,9 +78,7 @@ class GeneralizedForce(AbstractForce):
 
     def __init__(self, Q: Callable, name: str) -> None:
         _require_name("GeneralizedForce", name)
-        self.takes_inputs = not (callable(Q) and accepts(Q, 4)) or wants(Q, 4, "inputs")
-        names = ("t", "q", "v", "params", "inputs")
-        require_arity(f"force {name!r}: Q", Q, names if self.takes_inputs else names[:4])
+        self.takes_inputs = _takes_inputs(f"force {name!r}: Q", Q)
         self.Q, self.name = Q, name
 
     def __call__(
@@ -68,6 +91,140 @@ class GeneralizedForce(AbstractForce):
     ) -> Float[Array, " n"]:
         """Q(t, q, v, params, inputs), shape (n,)."""
         return self.Q(t, q, v, params, inputs) if self.takes_inputs else self.Q(t, q, v, params)
+
+
+class PointForce(AbstractForce):
+    """A force F acting at a point r(t, q): `Q = (dr/dq)^T F`, by its virtual work F . dr.
+
+    One reverse derivative of `position`; the Jacobian dr/dq is never formed. Position and force
+    are components in the same axes, which must not turn (inertial, not body axes); a force known
+    in body components is turned into them by the rotation matrix of `jaxlag.rotation`.
+
+    Args:
+        position: function `position(t, q, params)` returning the point r, in m: 1, 2 or 3
+            components, shape (d,), or (k, d) for k points.
+        force: function `force(t, q, v, params, inputs)` or `force(t, q, v, params)` returning F,
+            in N, in the shape of the position.
+        name: shown in `explain()` and used to select this force.
+
+    Raises:
+        ValueError: a function is not callable in these forms, or the name is empty. While
+            tracing: a position that is not made of 1, 2 or 3 real components, a force of another
+            shape than the position.
+
+    Source: Pila, eq. 3.10 and sec. 3.10.
+    """
+
+    position: Callable = eqx.field(static=True)
+    force: Callable = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    takes_inputs: bool = eqx.field(static=True)
+
+    def __init__(self, position: Callable, force: Callable, name: str) -> None:
+        _require_name("PointForce", name)
+        require_arity(f"force {name!r}: position", position, ("t", "q", "params"))
+        self.takes_inputs = _takes_inputs(f"force {name!r}: force", force)
+        self.position, self.force, self.name = position, force, name
+
+    def __call__(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> Float[Array, " n"]:
+        """(dr/dq)^T F, shape (n,)."""
+        argument = f"force {self.name!r}: position"
+        r, pull = jax.vjp(lambda q: _real(argument, self.position(t, q, params)), q)
+        if r.ndim == 0 or r.shape[-1] not in (1, 2, 3):
+            raise bad(
+                argument,
+                "return 1, 2 or 3 components along its last axis",
+                f"it returned shape {r.shape}",
+                "Return jnp.stack([x, y]), and [x] where one axis is enough.",
+            )
+        state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
+        F = _like(f"force {self.name!r}: force", self.force(*state), r)
+        return pull(F)[0]
+
+
+class Couple(AbstractForce):
+    """A torque tau on a body of angular velocity w(t, q, v): `Q = (dw/dv)^T tau`.
+
+    The virtual work of a couple is tau . dw/dv dq, since dw/dv maps virtual displacements dq to
+    virtual rotations of the body. One reverse derivative of `angular_velocity` in v; the matrix
+    dw/dv is never formed. Angular velocity and torque are components in the same axes: both in
+    body axes, or both in inertial ones.
+
+    Args:
+        angular_velocity: function `angular_velocity(t, q, v, params)` returning w, in rad/s,
+            affine in v: shape (3,), () for a rotation about one fixed axis, or (k, 3).
+        torque: function `torque(t, q, v, params, inputs)` or `torque(t, q, v, params)` returning
+            tau, in N m, in the shape of the angular velocity; positive by the right hand.
+        name: shown in `explain()` and used to select this force.
+
+    Raises:
+        ValueError: a function is not callable in these forms, or the name is empty. While
+            tracing: an angular velocity that is neither a scalar nor made of 3 real components,
+            or not affine in v; a torque of another shape.
+
+    Source: Pila, sec. 3.12 (force and couple); eqs. 4.70 and 4.103 (body torques on Euler angles).
+    """
+
+    angular_velocity: Callable = eqx.field(static=True)
+    torque: Callable = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    takes_inputs: bool = eqx.field(static=True)
+
+    def __init__(self, angular_velocity: Callable, torque: Callable, name: str) -> None:
+        _require_name("Couple", name)
+        arguments = ("t", "q", "v", "params")
+        require_arity(f"couple {name!r}: angular_velocity", angular_velocity, arguments)
+        self.takes_inputs = _takes_inputs(f"couple {name!r}: torque", torque)
+        self.angular_velocity, self.torque, self.name = angular_velocity, torque, name
+
+    def __call__(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> Float[Array, " n"]:
+        """(dw/dv)^T tau, shape (n,)."""
+        argument = f"couple {self.name!r}: angular_velocity"
+
+        def rate(v: Array) -> Array:
+            return _real(argument, self.angular_velocity(t, q, v, params))
+
+        w, pull = jax.vjp(rate, v)
+        if w.ndim > 0 and w.shape[-1] != 3:
+            raise bad(argument, "return 3 components or a scalar", f"it returned shape {w.shape}")
+        if not _affine(rate, v, w):
+            raise bad(
+                argument,
+                "be affine in v",
+                "its derivative dw/dv depends on v",
+                "An angular velocity is W(t, q) v + w0(t, q): drop powers and products of speeds.",
+            )
+        state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
+        torque = _like(f"couple {self.name!r}: torque", self.torque(*state), w)
+        return pull(torque)[0]
+
+
+def _affine(function: Callable, v: Array, like: Array) -> bool:
+    """Whether the derivative of `function` is free of v, read from its traced program."""
+    derivative = jax.make_jaxpr(lambda v: jax.vjp(function, v)[1](jnp.ones_like(like)))(v)
+    return not frozenset().union(*outputs_depend_on(derivative.jaxpr, [frozenset({"v"})]))
+
+
+def _like(argument: str, value: Any, conjugate: Array) -> Array:
+    """A real array in the shape and precision of what it does work on."""
+    value = _real(argument, value)
+    if value.shape != conjugate.shape:
+        raise bad(argument, f"return shape {conjugate.shape}", f"it returned {value.shape}")
+    return value.astype(conjugate.dtype)  # time is float64 where x64 is on, whatever q is
 
 
 class Rayleigh(AbstractForce):
@@ -86,12 +243,11 @@ class Rayleigh(AbstractForce):
 
     R: Callable = eqx.field(static=True)
     name: str = eqx.field(static=True)
-    takes_inputs: bool = eqx.field(static=True)
 
     def __init__(self, R: Callable, name: str = "rayleigh") -> None:
         _require_name("Rayleigh", name)
         require_arity(f"Rayleigh {name!r}: R", R, ("t", "q", "v", "params"))
-        self.R, self.name, self.takes_inputs = R, name, False
+        self.R, self.name = R, name
 
     def __call__(
         self,
@@ -104,3 +260,43 @@ class Rayleigh(AbstractForce):
         """-dR/dv, shape (n,)."""
         R = real_scalar(f"Rayleigh {self.name!r}: R", self.R)
         return -jax.grad(R, argnums=2)(t, q, v, params)
+
+
+def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
+    """Forces as a tuple; raises unless each is one of the classes here, under a name of its own."""
+    if isinstance(forces, AbstractForce):
+        raise bad("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
+    forces = tuple(forces)
+    names: list[str] = []
+    for force in forces:
+        if not isinstance(force, AbstractForce):
+            raise bad(
+                "forces",
+                "contain PointForce, Couple, GeneralizedForce and Rayleigh objects",
+                f"one was {force!r}",
+                'Write jl.PointForce(position, force, "name"), jl.Rayleigh(R, "name") and so on.',
+            )
+        names.append(force.name)
+    for name in names:
+        if names.count(name) > 1:
+            raise bad("forces", "have distinct names", f"{name!r} occurs {names.count(name)} times")
+    return forces
+
+
+def components(
+    force: AbstractForce,
+    t: Float[Array, ""],
+    q: Float[Array, " n"],
+    v: Float[Array, " n"],
+    params: Any,
+    inputs: Mapping[str, Any],
+) -> Float[Array, " n"]:
+    """The force's components, or an error while tracing if they are not one per coordinate."""
+    Q = force(t, q, v, params, inputs)
+    must = f"return {q.shape[0]} real components, one per coordinate"
+    if not eqx.is_array_like(Q):
+        raise bad(f"force {force.name!r}", "return an array", f"it returned {Q!r}")
+    Q = jnp.asarray(Q)
+    if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
+        raise bad(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
+    return Q.astype(q.dtype)  # time is float64 where x64 is on, whatever the state is

@@ -113,7 +113,9 @@ def simulate(
         dt0: first step in s of an adaptive solve, positive; by default chosen from the start.
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
         save: names of quantities to compute inside the solve: "a", "p", "energy", "kinetic",
-            "potential", "Q". Without it the Solution computes them on demand.
+            "potential", "Q", "power", which the Solution computes on demand without it; and
+            "work", the integral of each term of dH/dt since ts[0], which exists only here. It is
+            integrated along with the motion, its local error bounded like that of q and v.
         gradient: a hint on the cost of derivatives, never on their value. "auto" and "recorded"
             are the same so far: steps are taken again on the recorded grid.
         project: whether constraints are projected; without constraints there is nothing to do.
@@ -172,12 +174,16 @@ def simulate(
 
 def pose(plan: _Plan, values: _Values) -> tuple[Dynamics, Start, Problem]:
     """The problem that a plan and its values describe."""
-    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction)
+    power = None
+    if "work" in plan.save:
+        params = _params.join(values.params, plan.params.tree)
+        power = plan.system.power_terms(params, values.q0.dtype)
+    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction, power)
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
     check_declaration(plan.system, params, inputs, values.ts[0], values.q0, values.v0)
 
-    y0 = jnp.concatenate([values.q0, values.v0])
+    y0 = dynamics.start(values.q0, values.v0)
     solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
     scheme = Scheme(solver, controller, dynamics.term(y0.dtype), dynamics.within)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
@@ -198,8 +204,12 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
     q, v = dynamics.parts(rows.saved)
     params, inputs = dynamics.given(problem.args)
     saved = {
-        name: over_rows(name, plan.system, values.ts, q, v, params, inputs) for name in plan.save
+        name: over_rows(name, plan.system, values.ts, q, v, params, inputs)
+        for name in plan.save
+        if name != "work"
     }
+    if "work" in plan.save:
+        saved["work"] = dynamics.work(rows.saved)
     return Solution(
         system=plan.system,
         ts=values.ts,

@@ -15,27 +15,28 @@ from jaxlag._status import ADVICE, Status
 from jaxlag._system import System
 
 # Quantities of one state, by the name `save=` and the Solution know them under.
-QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Array]] = {
+QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Any]] = {
     "a": lambda system, t, q, v, params, inputs: system.acceleration(params, q, v, t, inputs),
     "p": lambda system, t, q, v, params, inputs: system.momentum(params, q, v, t),
     "energy": lambda system, t, q, v, params, inputs: system.energy(params, q, v, t),
     "kinetic": lambda system, t, q, v, params, inputs: system.kinetic(params, q, v, t),
     "potential": lambda system, t, q, v, params, inputs: system.potential(params, q, v, t),
+    "power": lambda system, t, q, v, params, inputs: system.power(params, q, v, t, inputs),
     "Q": lambda system, t, q, v, params, inputs: system.generalized_force(params, q, v, t, inputs),
 }
 
 
 def over_rows(
     name: str, system: System, ts: Array, q: Array, v: Array, params: Any, inputs: Any
-) -> Array:
+) -> Any:
     """A quantity at every row of one motion; NaN where the motion did not get."""
     reached = jnp.isfinite(q[:, 0])
 
-    def at(t: Array, q: Array, v: Array, reached: Array) -> Array:
+    def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
         # Rows not reached are NaN: evaluate at the start instead, so that derivatives stay finite.
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
         value = QUANTITIES[name](system, t, q, v, params, inputs)
-        return jnp.where(reached, value, jnp.nan)
+        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), value)
 
     t0, q0, v0 = ts[0], q[0], v[0]
     return jax.vmap(at)(ts, q, v, reached)
@@ -69,7 +70,7 @@ class Solution(eqx.Module):
     last_state: tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]
     where: Int[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
-    saved: dict[str, Array]
+    saved: dict[str, Any]
     _params_traced: Any
     _inputs_traced: Any
     _params_static: _params.Static = eqx.field(static=True)
@@ -87,11 +88,11 @@ class Solution(eqx.Module):
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, shape (s, *its shape)."""
-        return self._part(self.q, name)
+        return self.system.coordinates.part(self.q, name)
 
     def rate(self, name: str) -> Array:
         """The velocity of a coordinate by its name, shape (s, *its shape)."""
-        return self._part(self.v, name)
+        return self.system.coordinates.part(self.v, name)
 
     @property
     def a(self) -> Float[Array, "*batch s n"]:
@@ -123,6 +124,29 @@ class Solution(eqx.Module):
         """Applied generalized forces, dissipation included, (s, n), N or N m."""
         return self._quantity("Q")
 
+    @property
+    def power(self) -> dict[str, Float[Array, "*batch s"]]:
+        """Terms of dH/dt by name, each (s,), W: see `System.power`."""
+        return self._quantity("power")
+
+    @property
+    def work(self) -> dict[str, Float[Array, "*batch s"]]:
+        """Work since ts[0] of every term of dH/dt by name, each (s,), J.
+
+        The books close: H - H(ts[0]) is the sum over all names, to the accuracy of the solve.
+
+        Raises:
+            ValueError: it was not asked for with `simulate(..., save=("work",))`.
+        """
+        if "work" not in self.saved:
+            raise bad(
+                "work",
+                "be asked for when simulating",
+                f"save was {tuple(self.saved)!r}",
+                'Write simulate(..., save=("work",)): work is integrated along with the motion.',
+            )
+        return self.saved["work"]
+
     def message(self) -> str:
         """How a single motion ended, in words, with the coordinate and the likely remedy."""
         if self.ts.ndim != 1:
@@ -139,14 +163,7 @@ class Solution(eqx.Module):
             f"{int(self.stats['rejected'])} rejected steps. {ADVICE.get(status, '')}".rstrip()
         )
 
-    def _part(self, x: Array, name: str) -> Array:
-        if name not in self.system.coordinates.shapes:
-            raise bad(
-                "name", f"be one of {list(self.system.coordinates.names)}", f"it was {name!r}"
-            )
-        return self.system.unflatten(x)[name]
-
-    def _quantity(self, name: str) -> Array:
+    def _quantity(self, name: str) -> Any:
         if name in self.saved:
             return self.saved[name]
         key = (self._params_static, self._inputs_static)
@@ -159,10 +176,10 @@ class Solution(eqx.Module):
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _derived(name: str, system: System, key: Any, batch: int, traced: Any) -> Array:
+def _derived(name: str, system: System, key: Any, batch: int, traced: Any) -> Any:
     params_static, inputs_static = key
 
-    def one(traced: Any) -> Array:
+    def one(traced: Any) -> Any:
         ts, q, v, params, inputs = traced
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)

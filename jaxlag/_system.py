@@ -13,10 +13,11 @@ from jaxlag import _params
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, real_scalar, require_arity
 from jaxlag._explain import explain
-from jaxlag._forces import AbstractForce
+from jaxlag._forces import AbstractForce, check_forces
 from jaxlag._inputs import InputValues, check_inputs, check_range, evaluate
 from jaxlag._linalg import first_unhealthy
 from jaxlag._lowering import ArrayTerms, Structure, find_structure
+from jaxlag._power import Power
 from jaxlag._terms import Terms
 from jaxlag._vectors import state_vectors
 
@@ -51,7 +52,8 @@ class System(eqx.Module):
             and v flat, `unflatten` gives the parts.
         kinetic: scalar function `T(t, q, v, params)`, in J; then L = T - V.
         potential: scalar function `V(t, q, params)`, in J.
-        forces: applied forces, `GeneralizedForce` or `Rayleigh`, each with its own name.
+        forces: applied forces, each with its own name: `PointForce`, `Couple`,
+            `GeneralizedForce`, `Rayleigh`.
 
     Raises:
         ValueError: neither or both ways of giving L, functions that cannot be called in these
@@ -96,7 +98,7 @@ class System(eqx.Module):
             self.lagrangian = _Difference(kinetic, potential)
         self._kinetic, self._potential = kinetic, potential
         self.coordinates = Coordinates(coordinates)
-        self.forces = _check_forces(forces)
+        self.forces = check_forces(forces)
 
     def __hash__(self) -> int:
         return hash((self.lagrangian, self.coordinates, self.forces))
@@ -239,6 +241,38 @@ class System(eqx.Module):
         L, p = jax.value_and_grad(lagrangian, argnums=2)(t, q, v, params)
         return p @ v - L
 
+    def power(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> dict[str, Float[Array, ""]]:
+        """Terms of dH/dt = sum_k v . Q_k - dL/dt at fixed (q, v), by name, W.
+
+        One term for each force under its name, and "explicit time" where L depends on t. A force
+        is credited with v . Q, which is all of its power unless its point of application moves
+        at fixed q.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,).
+            v: shape (n,).
+            t: s.
+            inputs: dict from names to input objects or arrays.
+
+        Source: Goldstein, Classical Mechanics, sec. 2.7, with applied forces.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        return self.power_terms(params, q.dtype)(t, q, v, params, values)
+
+    def power_terms(self, params: Any, dtype: Any) -> Power:
+        """The terms of dH/dt that this system has."""
+        explicit_time = self.structure(params, dtype).explicit_time
+        return Power(self.lagrangian, self.forces, explicit_time)
+
     def kinetic(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
         """T(t, q, v), scalar, J, as declared by `kinetic=`.
 
@@ -380,26 +414,6 @@ class System(eqx.Module):
         inputs = check_inputs(inputs)
         check_range(inputs, t, "t")
         return evaluate(inputs, t, q, v, params)
-
-
-def _check_forces(forces: Any) -> tuple[AbstractForce, ...]:
-    if isinstance(forces, AbstractForce):
-        raise bad("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
-    forces = tuple(forces)
-    names: list[str] = []
-    for force in forces:
-        if not isinstance(force, AbstractForce):
-            raise bad(
-                "forces",
-                "contain GeneralizedForce and Rayleigh objects",
-                f"one was {force!r}",
-                'Write jl.GeneralizedForce(Q, "name") or jl.Rayleigh(R, "name").',
-            )
-        names.append(force.name)
-    for name in names:
-        if names.count(name) > 1:
-            raise bad("forces", "have distinct names", f"{name!r} occurs {names.count(name)} times")
-    return forces
 
 
 @lru_cache(maxsize=256)

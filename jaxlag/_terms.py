@@ -36,6 +36,17 @@ class Terms(eqx.Module):
         """Bias h = (dp/dq) v + dp/dt - dL/dq, all that is left of Lagrange's equations at a = 0."""
 
     @abstractmethod
+    def euler_lagrange(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        a: Float[Array, " n"],
+        params: Any,
+    ) -> Float[Array, " n"]:
+        """M a + h = d/dt(dL/dv) - dL/dq along the accelerations a; M is not formed."""
+
+    @abstractmethod
     def force(
         self,
         t: Float[Array, ""],

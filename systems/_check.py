@@ -1,8 +1,8 @@
-"""Replay of reference files: simulate from the first row, then compare every number."""
+"""Replay of reference files: from what a case starts with to every number that it holds."""
 
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import partial, singledispatch
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,11 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from systems._entry import Entry
-from systems._quantities import quantities
-from systems._reference import Case, InvalidReference, load
+from systems._cases import Case
+from systems._entry import AbstractEntry, Entry, PrescribedEntry, StaticEntry
+from systems._fields import InvalidReference
+from systems._quantities import prescribed_quantities, quantities, static_quantities
+from systems._reference import load
 
 LOCAL_ERROR = 1e-13
 """Tolerance rtol = atol of the simulation, per step."""
@@ -27,7 +29,7 @@ DERIVED_TOLERANCE = 1e-9
 
 
 class Motion(NamedTuple):
-    """A replayed motion: name -> rows, shape (S, ...), and how the simulation ended."""
+    """What a case was replayed to: name -> rows, shape (S, ...), and how that ended."""
 
     rows: Mapping[str, Array]
     status: Array
@@ -79,9 +81,52 @@ def replay(entry: Entry, params: Mapping[str, Array], times: Array, q0: Array, v
     return Motion(rows, motion.status, motion.last_time)
 
 
-def replay_case(entry: Entry, case: Case) -> Motion:
-    """Replay a case from its parameters, its times and its first row of q and v alone."""
+@partial(jax.jit, static_argnums=0)
+def replay_rest(entry: StaticEntry, params: Mapping[str, Array]) -> Motion:
+    """Find the state of rest, a single row."""
+    rest = entry.rest(params)
+    rows = static_quantities(entry, params, rest.q)
+    return Motion({name: x[None] for name, x in rows.items()}, rest.status, jnp.zeros(()))
+
+
+@partial(jax.jit, static_argnums=0)
+def replay_prescribed(
+    entry: PrescribedEntry, params: Mapping[str, Array], times: Array, q: Array, v: Array, a: Array
+) -> Motion:
+    """The forces that the motion (q, v, a), each (S, n), needs at `times`.
+
+    The rows of q, v and a in the result are those of the entry's own motion law.
+    """
+    rows = jax.vmap(partial(prescribed_quantities, entry, params))(times, q, v, a)
+    law = jl.prescribed_motion(lambda t: entry.motion(t, params), times)
+    rows |= dict(zip(("q", "v", "a"), law, strict=True))
+    return Motion(rows, jnp.int32(jl.Status.ok), times[-1])
+
+
+@singledispatch
+def replay_case(entry: AbstractEntry, case: Case) -> Motion:
+    """Replay a case from what such a case starts with.
+
+    A motion from its parameters, times and first row of q and v alone, a state of rest from its
+    parameters alone, a prescribed motion from all its q, v and a.
+    """
+    raise NotImplementedError(f"cases of {entry.kind} systems cannot be replayed")
+
+
+@replay_case.register
+def _(entry: Entry, case: Case) -> Motion:
     return replay(entry, case.params, case.times, case.fields["q"][0], case.fields["v"][0])
+
+
+@replay_case.register
+def _(entry: StaticEntry, case: Case) -> Motion:
+    return replay_rest(entry, case.params)
+
+
+@replay_case.register
+def _(entry: PrescribedEntry, case: Case) -> Motion:
+    motion = (case.fields[name] for name in "qva")
+    return replay_prescribed(entry, case.params, case.times, *motion)
 
 
 def compare(case: Case, rows: Mapping[str, Array]) -> list[Deviation]:
@@ -114,7 +159,7 @@ def main(paths: Sequence[Path]) -> int:
     return 1 if failed or refused else 0
 
 
-def _report(path: Path, entry: Entry, case: Case) -> bool:
+def _report(path: Path, entry: AbstractEntry, case: Case) -> bool:
     motion = replay_case(entry, case)
     deviations = compare(case, motion.rows)
     status = jl.Status(int(motion.status))
@@ -124,9 +169,10 @@ def _report(path: Path, entry: Entry, case: Case) -> bool:
     if outside:
         finding += f"; out of tolerance: {', '.join(outside)}"
     if status != jl.Status.ok:
-        finding = f"ended with {status.name} at t = {float(motion.last_time):g} s; {finding}"
+        when = f" at t = {float(motion.last_time):g} s" if entry.kind == "trajectory" else ""
+        finding = f"ended with {status.name}{when}; {finding}"
     verdict = "ok  " if ok else "FAIL"
-    print(f"{verdict}  {path.name:<30} {case.name:<12} {finding}", flush=True)
+    print(f"{verdict}  {path.name:<42} {case.name:<12} {finding}", flush=True)
     return ok
 
 

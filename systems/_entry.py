@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import ClassVar
 
+import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 import jaxlag as jl
@@ -17,7 +18,7 @@ class Example:
     """A start and parameters worth looking at.
 
     Attributes:
-        params: parameter name -> value, in the units of `Entry.parameter_units`.
+        params: parameter name -> value, in the units of `parameter_units`.
         q0: coordinates at t = 0, in the order of the system's coordinates.
         v0: generalized velocities at t = 0.
         duration: length of the run [s].
@@ -29,9 +30,24 @@ class Example:
     duration: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class StaticExample:
+    """Parameters of a state of rest: parameter name -> value."""
+
+    params: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrescribedExample:
+    """Parameters of a prescribed motion, and for how long to follow it [s]."""
+
+    params: Mapping[str, float]
+    duration: float
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Entry:
-    """A system of the book, compared and hashed by identity.
+class AbstractEntry:
+    """What every system of the book has; compared and hashed by identity.
 
     Attributes:
         name: the name of its module.
@@ -39,34 +55,22 @@ class Entry:
         system: the declaration.
         coordinate_units: one unit per coordinate.
         parameter_units: parameter name -> unit; names every parameter.
-        example: a start and parameters to run.
-        extras: name -> function of the state, beyond the H, p and dp/dt of every system.
-        invariants: name -> function of the state that the motion keeps constant.
+        example: parameters, and a start where there is one, to run.
+        kind: what is asked of it: "trajectory", "static" or "prescribed".
     """
+
+    kind: ClassVar[str]
 
     name: str
     book: str
     system: jl.System
     coordinate_units: tuple[str, ...]
     parameter_units: Mapping[str, str]
-    example: Example
-    extras: Mapping[str, StateFunction] = field(default_factory=dict)
-    invariants: Mapping[str, StateFunction] = field(default_factory=dict)
+    example: Example | StaticExample | PrescribedExample
 
     def __post_init__(self) -> None:
         """Check that the entry speaks of one system throughout."""
-        count = len(self.coordinates)
-        lengths: dict[str, Any] = {
-            "coordinate_units": self.coordinate_units,
-            "example.q0": self.example.q0,
-            "example.v0": self.example.v0,
-        }
-        for argument, values in lengths.items():
-            if len(values) != count:
-                raise ValueError(
-                    f"{self.name}: {argument} must have one value for each of "
-                    f"{', '.join(self.coordinates)}, but it was {values!r}."
-                )
+        self._check_length("coordinate_units", self.coordinate_units)
         if set(self.example.params) != set(self.parameter_units):
             raise ValueError(
                 f"{self.name}: example.params must name the parameters "
@@ -77,3 +81,74 @@ class Entry:
     def coordinates(self) -> tuple[str, ...]:
         """Names of the coordinates, in order."""
         return self.system.coordinates.labels
+
+    def _check_length(self, argument: str, values: Sequence) -> None:
+        if len(values) != len(self.coordinates):
+            raise ValueError(
+                f"{self.name}: {argument} must have one value for each of "
+                f"{', '.join(self.coordinates)}, but it was {values!r}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Entry(AbstractEntry):
+    """A system that moves from a start.
+
+    Attributes:
+        extras: name -> function of the state, beyond the H, p and dp/dt of every system.
+        invariants: name -> function of the state that the motion keeps constant.
+    """
+
+    kind: ClassVar[str] = "trajectory"
+
+    example: Example
+    extras: Mapping[str, StateFunction] = field(default_factory=dict)
+    invariants: Mapping[str, StateFunction] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the start, too."""
+        super().__post_init__()
+        self._check_length("example.q0", self.example.q0)
+        self._check_length("example.v0", self.example.v0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StaticEntry(AbstractEntry):
+    """A system whose state of rest is asked.
+
+    Attributes:
+        guess: `guess(params)`, coordinates from which the search for the state of rest starts.
+        values: name -> function `f(q, params)` of the state of rest.
+    """
+
+    kind: ClassVar[str] = "static"
+
+    example: StaticExample
+    guess: Callable[[Mapping[str, ArrayLike]], Sequence[ArrayLike]]
+    values: Mapping[str, Callable[..., ArrayLike]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the guess, too."""
+        super().__post_init__()
+        self._check_length("guess", self.guess(self.example.params))
+
+    def rest(self, params: Mapping[str, ArrayLike]) -> jl.Equilibrium:
+        """The state of rest, with its status."""
+        guess = jnp.stack([jnp.asarray(x, float) for x in self.guess(params)])
+        return jl.equilibrium(self.system, guess, params, throw=False)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PrescribedEntry(AbstractEntry):
+    """A system led along a given motion, whose forces are asked.
+
+    Attributes:
+        motion: `motion(t, params)`, the coordinates, shape (n,), at a time t [s].
+        extras: name -> function of the state.
+    """
+
+    kind: ClassVar[str] = "prescribed"
+
+    example: PrescribedExample
+    motion: Callable[..., ArrayLike]
+    extras: Mapping[str, StateFunction] = field(default_factory=dict)

@@ -1,19 +1,50 @@
-"""Figures of a motion: coordinates by unit, and energy, against time."""
+"""Figures: panels of curves below one another."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
-import jaxlag as jl
-from systems._entry import Entry
+from systems._entry import AbstractEntry
 
 
 class PlotError(RuntimeError):
     """A figure that could not be made, saying why."""
 
 
-def save(entry: Entry, motion: jl.Solution, path: Path) -> None:
-    """Write the figure of a motion to `path`, in the format of its suffix.
+class Panel(NamedTuple):
+    """Curves over one axis.
+
+    Attributes:
+        x_label: what the curves run over, with its unit.
+        x: shape (S,).
+        y_label: what they show, with its unit.
+        curves: label -> values, shape (S,).
+        mark: a point (x, y) to show, if any.
+    """
+
+    x_label: str
+    x: ArrayLike
+    y_label: str
+    curves: Mapping[str, ArrayLike]
+    mark: tuple[float, float] | None = None
+
+
+def by_unit(entry: AbstractEntry, ts: ArrayLike, rows: ArrayLike, units: Sequence[str]) -> list:
+    """One panel over time for every unit: the components of `rows`, (S, n), that have it."""
+    panels = []
+    for unit in dict.fromkeys(units):
+        columns = [i for i, own in enumerate(units) if own == unit]
+        names = [entry.coordinates[i] for i in columns]
+        curves = {entry.coordinates[i]: np.asarray(rows)[:, i] for i in columns}
+        panels.append(Panel("t [s]", ts, f"{', '.join(names)} [{unit}]", curves))
+    return panels
+
+
+def save(entry: AbstractEntry, panels: Sequence[Panel], path: Path) -> None:
+    """Write the figure to `path`, in the format of its suffix.
 
     Raises:
         PlotError: matplotlib is missing, or the file cannot be written.
@@ -25,35 +56,23 @@ def save(entry: Entry, motion: jl.Solution, path: Path) -> None:
         message = '--plot needs matplotlib, which is missing: pip install -e ".[plot]".'
         raise PlotError(message) from error
 
-    units = tuple(dict.fromkeys(entry.coordinate_units))
-    panels = len(units) + 1
-    figure = Figure(figsize=(8, 2.4 * panels + 0.5), dpi=120, layout="constrained")
+    figure = Figure(figsize=(8, 2.4 * len(panels) + 0.5), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(f"{entry.name}\n{entry.book}", fontsize=10)
-    axes = figure.subplots(panels, 1, sharex=True)
-
-    ts = np.asarray(motion.ts)
-    for unit, ax in zip(units, axes, strict=False):
-        names = [
-            name
-            for name, own in zip(entry.coordinates, entry.coordinate_units, strict=True)
-            if own == unit
-        ]
-        for name in names:
-            ax.plot(ts, motion[name], label=name)
-        ax.set_ylabel(f"{', '.join(names)} [{unit}]")
-
-    T, V = np.asarray(motion.kinetic), np.asarray(motion.potential)
-    energy = axes[-1]
-    energy.plot(ts, T, label="T kinetic")
-    energy.plot(ts, V, label="V potential")
-    energy.plot(ts, T + V, color="black", label="E = T + V")
-    energy.set_ylabel("energy [J]")
-    energy.set_xlabel("t [s]")
-    for ax in axes:
+    shared = len({panel.x_label for panel in panels}) == 1
+    axes = figure.subplots(len(panels), 1, sharex=shared, squeeze=False)[:, 0]
+    for panel, ax in zip(panels, axes, strict=True):
+        for label, values in panel.curves.items():
+            ax.plot(np.asarray(panel.x), np.asarray(values), label=label)
+        if panel.mark is not None:
+            ax.plot(*panel.mark, "o", color="black")
+            ax.axhline(panel.mark[1], color="black", linewidth=0.8)
+        ax.set_ylabel(panel.y_label)
+        if not shared or ax is axes[-1]:
+            ax.set_xlabel(panel.x_label)
         ax.grid(alpha=0.3)
         ax.margins(x=0)
-        if len(ax.lines) > 1:
+        if len(panel.curves) > 1:
             ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     figure.align_ylabels(axes)
     try:

@@ -45,7 +45,7 @@ PARTS = {
 
 
 def test_a_force_takes_inputs_or_leaves_them_out():
-    assert (SPRING.takes_inputs, MOTOR.takes_inputs, DRAG.takes_inputs) == (False, True, False)
+    assert (SPRING.takes_inputs, MOTOR.takes_inputs) == (False, True)
     np.testing.assert_allclose(SPRING(T, Q, V, PARAMS, {}), PARTS["spring"], rtol=8 * EPS)
     found = MOTOR(T, Q, V, PARAMS, {"torque": 5.0})
     np.testing.assert_allclose(found, PARTS["motor"], rtol=8 * EPS)
@@ -171,7 +171,7 @@ def test_a_bad_declaration_is_refused(make, message):
         ),
         (
             lambda: jl.System(free, ("x",), forces=(spring,)),
-            "forces must contain GeneralizedForce and Rayleigh objects, but one was <function",
+            "forces must contain PointForce, Couple, GeneralizedForce and Rayleigh objects, but",
         ),
     ],
 )

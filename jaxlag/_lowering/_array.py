@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._errors import bad, real_scalar
-from jaxlag._forces import AbstractForce
+from jaxlag._errors import real_scalar
+from jaxlag._forces import AbstractForce, components
 from jaxlag._linalg import solve_mass
 from jaxlag._terms import Terms
 
@@ -52,6 +52,23 @@ class ArrayTerms(Terms):
         (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q), (jnp.ones_like(t), v))
         return p_dot - dL_dq
 
+    def euler_lagrange(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        a: Float[Array, " n"],
+        params: Any,
+    ) -> Float[Array, " n"]:
+        """The same derivative as in h, along (t', q', v') = (1, v, a)."""
+        lagrangian = real_scalar("lagrangian", self.lagrangian)
+
+        def gradients(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            return jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
+
+        (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q, v), (jnp.ones_like(t), v, a))
+        return p_dot - dL_dq
+
     def force(
         self,
         t: Float[Array, ""],
@@ -63,7 +80,7 @@ class ArrayTerms(Terms):
         """Q, summed over the declared forces."""
         total = jnp.zeros_like(q)
         for force in self.forces:
-            total = total + _components(force, force(t, q, v, params, inputs), q)
+            total = total + components(force, t, q, v, params, inputs)
         return total
 
     def rows(
@@ -92,14 +109,3 @@ class ArrayTerms(Terms):
         if not self.forces:
             return solve_mass(M, -h)
         return solve_mass(M, self.force(t, q, v, params, inputs) - h)
-
-
-def _components(force: AbstractForce, Q: Any, q: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The force's components, or an error while tracing if they are not one per coordinate."""
-    must = f"return {q.shape[0]} real components, one per coordinate"
-    if not eqx.is_array_like(Q):
-        raise bad(f"force {force.name!r}", "return an array", f"it returned {Q!r}")
-    Q = jnp.asarray(Q)
-    if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
-        raise bad(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
-    return Q.astype(q.dtype)  # time is float64 where x64 is on, whatever the state is

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from jaxlag._dependence import outputs_depend_on
 
 
 class Structure(NamedTuple):
@@ -36,45 +37,6 @@ class Structure(NamedTuple):
         return "t" in self.lagrangian
 
 
-def _inner(eqn: Any) -> Jaxpr | None:
-    """The jaxpr of a call-like equation whose operands map one to one; else None."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        inner = eqn.params.get(key)
-        jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
-        sizes = (len(eqn.invars), len(eqn.outvars))
-        if isinstance(jaxpr, Jaxpr) and (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
-            return jaxpr
-    return None
-
-
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"} | {
-    "custom_jvp_call",
-    "custom_vjp_call",
-}
-
-
-def _outputs_depend_on(jaxpr: Jaxpr, given: list[frozenset[str]]) -> list[frozenset[str]]:
-    nothing: frozenset[str] = frozenset()
-    known: dict[Any, frozenset[str]] = dict(zip(jaxpr.invars, given, strict=True))
-
-    def of(atom: Any) -> frozenset[str]:
-        return nothing if isinstance(atom, Literal) else known.get(atom, nothing)
-
-    for eqn in jaxpr.eqns:
-        operands = [of(atom) for atom in eqn.invars]
-        inner = _inner(eqn)
-        if inner is not None:
-            results = _outputs_depend_on(inner, operands)
-        elif eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0:
-            results = [nothing]  # x**0 is what differentiating x**1 leaves
-        else:
-            results = [nothing.union(*operands)] * len(eqn.outvars)
-        known.update(zip(eqn.outvars, results, strict=True))
-    return [of(atom) for atom in jaxpr.outvars]
-
-
 def find_structure(
     mass: Callable, bias: Callable, lagrangian: Callable, state: tuple, params: Any
 ) -> Structure:
@@ -92,7 +54,7 @@ def find_structure(
         closed = jax.make_jaxpr(function)(*state, params)
         given = [frozenset({name}) for name in ("t", "q", "v")]
         given += [frozenset({"params"})] * (len(closed.jaxpr.invars) - 3)
-        return frozenset().union(*_outputs_depend_on(closed.jaxpr, given))
+        return frozenset().union(*outputs_depend_on(closed.jaxpr, given))
 
     of_bias = depends_on(bias)
     bias_zero = not of_bias and _vanishes(bias, state, params)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from systems._check import Motion
-from systems._entry import Entry
+from systems._entry import AbstractEntry
 
 
 def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2.5)):
@@ -26,32 +26,35 @@ def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2
     return _file("mass_spring", ["x"], {"m": m, "k": k}, times, rows)
 
 
-def recorded(entry: Entry, times, motion: Motion):
-    """A file of the entry's example that holds every quantity of an already replayed motion."""
+def recorded(entry: AbstractEntry, times, motion: Motion):
+    """A file of the entry's example that holds every quantity of an already replayed case."""
     rows = {name: np.asarray(values) for name, values in motion.rows.items()}
-    return _file(entry.name, list(entry.coordinates), dict(entry.example.params), times, rows)
+    if entry.kind == "static":
+        rows = {name: values[0] for name, values in rows.items()}
+    params = dict(entry.example.params)
+    return _file(entry.name, list(entry.coordinates), params, times, rows, entry.kind)
 
 
-def _file(name, coordinates, params, times, rows):
+def _file(name, coordinates, params, times, rows, kind="trajectory"):
+    """A file with one case, with the fields and groups of its kind."""
     case = {
         "name": "base",
         "description": "made on the spot",
         "params": params,
-        "times": list(times),
-        "u": None,
-        "lambda": None,
-        "constraint_force": None,
-        "energy": {},
-        "invariants": {},
-        "extras": {},
-        "error_estimate": {"q": 1e-14, "v": 1e-14},
+        "error_estimate": 1e-14 if kind == "static" else {"q": 1e-14, "v": 1e-14},
     }
+    if kind != "static":
+        case |= {"times": list(times), "extras": {}}
+    if kind == "trajectory":
+        case |= {"u": None, "lambda": None, "constraint_force": None}
+        case |= {"energy": {}, "invariants": {}}
     for field, values in rows.items():
         group, _, member = field.rpartition(".")
         (case[group] if group else case)[member] = values.tolist()
     return {
         "schema": "jaxlag-reference/1",
         "system": name,
+        "kind": kind,
         "coordinates": coordinates,
         "quasi_velocities": [],
         "constraints": [],

@@ -11,7 +11,7 @@ from _paths import REFERENCE
 import jaxlag as jl
 from systems.__main__ import main
 from systems._catalogue import ENTRIES
-from systems._check import compare, replay, replay_case
+from systems._check import compare, replay, replay_case, replay_prescribed, replay_rest
 from systems._reference import load, read
 
 
@@ -54,14 +54,24 @@ def test_the_reference_file_is_reproduced(name):
             assert deviation.ok, f"{case.name}: {deviation}"
 
 
+def replayed(entry, times):
+    """The entry's example, replayed as a case of its kind would be."""
+    params = {name: np.asarray(value) for name, value in entry.example.params.items()}
+    if entry.kind == "static":
+        return replay_rest(entry, params)
+    if entry.kind == "prescribed":
+        motion = jl.prescribed_motion(lambda t: entry.motion(t, params), times)
+        return replay_prescribed(entry, params, times, *motion)
+    start = (np.asarray(entry.example.q0), np.asarray(entry.example.v0))
+    return replay(entry, params, times, *start)
+
+
 @pytest.mark.parametrize("name", ENTRIES)
 def test_every_wrong_number_is_found(name):
     """Each number of each compared field in turn, the first rows of derived fields included."""
     entry = ENTRIES[name]
     times = np.linspace(0.0, 2.0, 6)
-    params = {name: np.asarray(value) for name, value in entry.example.params.items()}
-    start = (np.asarray(entry.example.q0), np.asarray(entry.example.v0))
-    motion = replay(entry, params, times, *start)
+    motion = replayed(entry, times)
     raw = json.loads(json.dumps(recorded(entry, times, motion)), parse_int=float)
     (case,) = read(raw).cases
     assert all(deviation.size == 0 for deviation in compare(case, motion.rows))
@@ -72,10 +82,39 @@ def test_every_wrong_number_is_found(name):
     assert len(compared) == sum(rows.size for rows in motion.rows.values())
     for path in compared:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
-        row = next(key for key in path[2:] if isinstance(key, int))
+        row = next((key for key in path[2:] if isinstance(key, int)), 0)
+        row = 0 if entry.kind == "static" else row
         (case,) = read(nudged(raw, path)).cases
         outside = [deviation for deviation in compare(case, motion.rows) if not deviation.ok]
         assert [(deviation.field, deviation.row) for deviation in outside] == [(field, row)]
+
+
+def test_a_prescribed_motion_is_the_input():
+    """The forces are those of the file's own q, v, a; the file's motion must be the system's."""
+    entry = ENTRIES["carnival_ride"]
+    times = np.linspace(0.0, 2.0, 6)
+    raw = json.loads(json.dumps(recorded(entry, times, replayed(entry, times))), parse_int=float)
+    raw["cases"][0]["a"][2][1] += 0.5
+    (case,) = read(raw).cases
+    found = {d.field: d for d in compare(case, replay_case(entry, case).rows) if not d.ok}
+    assert set(found) == {"a", "generalized_force", "extras.torque"}
+    assert {d.row for d in found.values()} == {2}
+    # 100 kg at r(0.8 s) = 5.32 m, 0.5 rad/s^2 more: m r^2 theta'' grows by 1415.12 N m.
+    torque = 100 * (2 * 5.32 * 0.4 * 3.0 + 5.32**2 * 0.5)
+    np.testing.assert_allclose(
+        replay_case(entry, case).rows["generalized_force"][2, 1], torque, rtol=1e-12
+    )
+
+
+def test_a_state_of_rest_that_is_not_found_is_a_failure(tmp_path, capsys):
+    """Without a spring the sleeve falls: the file cannot be right."""
+    entry = ENTRIES["sleeve_pendulum_equilibrium"]
+    raw = recorded(entry, None, replayed(entry, None))
+    raw["cases"][0]["params"]["k"] = 0.0
+    assert main(["check", written(tmp_path / "wrong.json", raw)]) == 1
+    out = capsys.readouterr().out
+    assert out.startswith("FAIL  wrong.json")
+    assert "ended with implicit_solve_failed; worst" in out
 
 
 def test_a_right_file_passes(tmp_path, capsys):

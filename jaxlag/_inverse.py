@@ -1,0 +1,155 @@
+"""Inverse dynamics: the generalized forces that a given motion needs."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag import _params
+from jaxlag._arguments import check_declaration
+from jaxlag._errors import bad
+from jaxlag._inputs import check_inputs, check_range, evaluate
+from jaxlag._system import System
+
+
+def inverse_dynamics(
+    system: System,
+    q: Any,
+    v: Any,
+    a: Any,
+    params: Any = None,
+    *,
+    t: Any = 0.0,
+    inputs: Mapping[str, Any] | None = None,
+) -> Float[Array, "*s n"]:
+    """Generalized force M a + h - Q that a motion needs beyond the forces declared.
+
+    One derivative of the momentum along the motion: d/dt(dL/dv) - dL/dq - Q. M is neither formed
+    nor factored, so it may be singular (massless links). Composes with jit, vmap and every
+    derivative of JAX.
+
+    Args:
+        system: what moves, n coordinates.
+        q: coordinates, shape (n,), or (s, n) for s instants; m or rad.
+        v: velocities dq/dt, in the same shape; m/s or rad/s.
+        a: accelerations dv/dt, in the same shape; m/s^2 or rad/s^2.
+        params: as the Lagrangian takes them.
+        t: the instant in s, or the (s,) instants of the rows.
+        inputs: dict from names to input objects or arrays, as in `simulate`.
+
+    Returns:
+        In the shape of q: N where q_i is in m, N m where it is in rad; positive pushes towards
+        larger q_i.
+
+    Raises:
+        ValueError: q, v, a not of shape (n,) or (s, n), or t not one instant for each row.
+
+    Source: Pila, secs. 2.7, 2.8 (motion prescribed, forces asked) and eq. 3.53.
+
+    Example:
+        What a driven pendulum's motor must supply, theta = 0.3 sin(2 t), at t = 0.5:
+
+        >>> import jax, jax.numpy as jnp, jaxlag as jl
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * 0.4 * v[0] ** 2 + 0.4 * 9.81 * jnp.cos(q[0])
+        >>> pendulum = jl.System(lagrangian, coordinates=("theta",))
+        >>> q, v, a = jl.prescribed_motion(lambda t: 0.3 * jnp.sin(2 * jnp.array([t])), 0.5)
+        >>> print(f"{jl.inverse_dynamics(pendulum, q, v, a)[0]:.6f} N m")
+        0.576157 N m
+    """
+    q, v, a, t = _motion(system, q, v, a, t)
+    inputs = check_inputs(inputs)
+    check_range(inputs, t, "t")
+    traced, static = _params.split(params)
+    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    key = (system, _params.Static(static), _params.Static(inputs_static))
+    return _needed(key, (t, q, v, a, traced, inputs_traced))
+
+
+def prescribed_motion(
+    motion: Callable, t: Any
+) -> tuple[Float[Array, "*s n"], Float[Array, "*s n"], Float[Array, "*s n"]]:
+    """(q, v, a) of a motion given as a function of time, by two forward derivatives.
+
+    Args:
+        motion: function `motion(t)` of a scalar time in s, returning q of shape (n,).
+        t: the instant in s, or (s,) instants.
+
+    Returns:
+        q, v = dq/dt and a = d2q/dt2, each (n,) or (s, n).
+
+    Raises:
+        ValueError: `motion` does not return real numbers of shape (n,).
+    """
+    t = jnp.asarray(t, jnp.result_type(float))
+    if t.ndim > 1:
+        raise bad("prescribed_motion: t", "be an instant or a row of them", f"shape {t.shape}")
+
+    def coordinates(t: Array) -> Array:
+        q = motion(t)
+        if not eqx.is_array_like(q) or jnp.ndim(q) != 1:
+            was = f"shape {jnp.shape(q)}" if eqx.is_array_like(q) else f"{q!r}"
+            raise bad(
+                "prescribed_motion: motion",
+                "return all coordinates as one vector of shape (n,)",
+                f"it returned {was}",
+                "Use jnp.stack([q1, q2]).",
+            )
+        q = jnp.asarray(q)
+        return q if jnp.issubdtype(q.dtype, jnp.inexact) else q.astype(t.dtype)
+
+    def rate(f: Callable, t: Array) -> Array:
+        return jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
+
+    def at(t: Array) -> tuple[Array, Array, Array]:
+        velocity = partial(rate, coordinates)
+        return coordinates(t), velocity(t), rate(velocity, t)
+
+    return at(t) if t.ndim == 0 else jax.vmap(at)(t)
+
+
+def _motion(system: System, *motion: Any) -> tuple[Array, Array, Array, Array]:
+    """(q, v, a, t) of one shape and precision, or an error that names the odd one out."""
+    *vectors, t = map(jnp.asarray, motion)
+    n = system.size
+    for name, x in zip("qva", vectors, strict=True):
+        if x.ndim not in (1, 2) or x.shape[-1] != n or x.shape != vectors[0].shape:
+            same = "" if name == "q" else f", as q with {vectors[0].shape}"
+            raise bad(
+                f"inverse_dynamics: {name}",
+                f"have shape ({n},) or (s, {n}){same}: {', '.join(system.coordinates.labels)}",
+                f"its shape was {x.shape}",
+            )
+        if jnp.issubdtype(x.dtype, jnp.complexfloating):
+            raise bad(f"inverse_dynamics: {name}", "be real", f"its dtype was {x.dtype}")
+    rows = vectors[0].shape[:-1]
+    if t.shape not in ((), rows):
+        raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
+    dtype = jnp.result_type(*vectors)
+    dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
+    q, v, a = (x.astype(dtype) for x in vectors)
+    return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
+
+
+@partial(jax.jit, static_argnums=0)
+def _needed(key: Any, values: Any) -> Array:
+    system, params_static, inputs_static = key
+    t, q, v, a, params, inputs = values
+    params = _params.join(params, params_static.tree)
+    inputs = eqx.combine(inputs, inputs_static.tree)
+    first = (t, q, v) if q.ndim == 1 else (t[0], q[0], v[0])
+    check_declaration(system, params, inputs, *first)
+
+    def at(t: Array, q: Array, v: Array, a: Array) -> Array:
+        needed = system.terms.euler_lagrange(t, q, v, a, params)
+        if not system.forces:
+            return needed
+        given = evaluate(inputs, t, q, v, params)
+        return needed - system.terms.force(t, q, v, params, given)
+
+    return at(t, q, v, a) if q.ndim == 1 else jax.vmap(at)(t, q, v, a)

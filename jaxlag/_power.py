@@ -1,0 +1,49 @@
+"""Power: where the energy H of a motion comes from and goes to."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from jaxlag._errors import real_scalar
+from jaxlag._forces import EXPLICIT_TIME, AbstractForce, components
+
+
+class Power(eqx.Module):
+    """dH/dt = sum_k v . Q_k - dL/dt at fixed (q, v), term by term, H = v . dL/dv - L.
+
+    Every force has its term under its own name; EXPLICIT_TIME exists where L depends on t.
+
+    Source: Goldstein, Classical Mechanics, sec. 2.7 (the energy function h) with applied forces;
+    Pila, eq. 3.194 holds without them.
+    """
+
+    lagrangian: Callable = eqx.field(static=True)
+    forces: tuple[AbstractForce, ...]
+    explicit_time: bool = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the terms, in the order of the forces, explicit time last."""
+        names = tuple(force.name for force in self.forces)
+        return (*names, EXPLICIT_TIME) if self.explicit_time else names
+
+    def __call__(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        values: Mapping[str, Any],
+    ) -> dict[str, Float[Array, ""]]:
+        """The terms in W; `values` are those of the inputs at (t, q, v)."""
+        terms = {
+            force.name: v @ components(force, t, q, v, params, values) for force in self.forces
+        }
+        if self.explicit_time:
+            lagrangian = real_scalar("lagrangian", self.lagrangian)
+            dL_dt = jax.grad(lambda t: lagrangian(t, q, v, params))(t)
+            terms[EXPLICIT_TIME] = -dL_dt.astype(q.dtype)
+        return terms

@@ -1,0 +1,531 @@
+"""Values and derivatives to third order at, near and far from singular points.
+
+Smooth functions are compared with their power series in exact rational arithmetic, the others with
+closed forms. Tolerances are in units of EPS, about twice the worst error measured.
+"""
+
+import itertools
+import math as stdlib
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxlag._coordinates
+from jaxlag import math
+
+EPS = np.finfo(float).eps
+ELEMENTWISE = ("sqrt", "acos", "asin", "sinc", "sinc_sqrt", "one_minus_cos", "cosc", "cosc_sqrt")
+
+
+def mixes(function, order):
+    """The derivatives of one order, in every mix of forward and reverse mode."""
+    for modes in itertools.product((jax.jacfwd, jax.jacrev), repeat=order):
+        derivative = function
+        for mode in modes:
+            derivative = mode(derivative)
+        yield derivative
+
+
+def ladder(function, highest=3):
+    """x -> [value, 1st, ...]: arrays that hold all mixes of one order along their first axis."""
+    orders = [list(mixes(function, order)) for order in range(highest + 1)]
+    return jax.jit(lambda x: [jnp.stack([derivative(x) for derivative in o]) for o in orders])
+
+
+def each(function, highest=3):
+    """The ladder at every entry of x: the k-th of shape (2^k, len(x))."""
+    out = jax.vmap(ladder(function, highest))
+    return lambda x: [np.asarray(values).T for values in out(jnp.asarray(x))]
+
+
+def close(actual, expected, eps, scale=0.0):
+    """All mixes within eps EPS of the expected value, or of a scale where that is larger."""
+    actual, expected = np.asarray(actual), np.asarray(expected)
+    bound = eps * np.finfo(actual.dtype).eps * np.maximum(np.abs(expected), scale)
+    assert np.all(np.isfinite(actual))
+    assert np.all(np.abs(actual - expected) <= bound), (np.abs(actual - expected) / bound).max()
+
+
+# ---- Singular points ---------------------------------------------------------------------------
+
+PI = np.pi
+TABLE = [
+    ("sqrt", 0.0, (0, 0, 0, 0)),
+    ("sqrt", -0.0, (0, 0, 0, 0)),
+    ("acos", 1.0, (0, 0, 0, 0)),
+    ("acos", -1.0, (PI, 0, 0, 0)),
+    ("asin", 1.0, (PI / 2, 0, 0, 0)),
+    ("asin", -1.0, (-PI / 2, 0, 0, 0)),
+    ("sinc", 0.0, (1, 0, -1 / 3, 0)),
+    ("cosc", 0.0, (1 / 2, 0, -1 / 12, 0)),
+    ("sinc_sqrt", 0.0, (1, -1 / 6, 1 / 60, -1 / 840)),
+    ("cosc_sqrt", 0.0, (1 / 2, -1 / 24, 1 / 360, -1 / 6720)),
+    ("one_minus_cos", 0.0, (0, 0, 1, 0)),
+]
+
+
+@pytest.mark.parametrize(("name", "point", "expected"), TABLE)
+def test_scalars_at_their_singular_points(name, point, expected):
+    for values, value in zip(ladder(getattr(math, name))(point), expected, strict=True):
+        close(values, value, 2)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("function", [math.norm, math.unit])
+def test_vectors_at_zero(function, n):
+    for values in ladder(function)(jnp.zeros(n)):
+        assert_array_equal(values, 0.0)
+
+
+@pytest.mark.parametrize("y", [0.0, -0.0])
+@pytest.mark.parametrize("x", [0.0, -0.0])
+def test_atan2_at_the_origin(y, x):
+    value, *derivatives = ladder(lambda p: math.atan2(p[0], p[1]))(jnp.array([y, x]))
+    assert_array_equal(value, np.arctan2(y, x))
+    assert_array_equal(np.signbit(value), np.signbit(np.arctan2(y, x)))
+    for values in derivatives:
+        assert_array_equal(values, 0.0)
+
+
+def test_functions_of_jax_fail_where_these_do_not():
+    zero = jnp.zeros(2)
+    assert np.all(np.isnan(jax.hessian(jnp.linalg.norm)(zero)))
+    assert np.all(np.isnan(jax.grad(lambda x: jnp.sqrt(x @ x))(zero)))
+    assert np.isinf(jax.grad(jnp.sqrt)(0.0))
+    assert np.isinf(jax.grad(jnp.arccos)(1.0))
+    assert np.isinf(jax.grad(jnp.arcsin)(1.0))
+    assert np.isnan(jax.grad(jnp.arctan2)(0.0, 0.0))
+    assert not np.isfinite(jax.grad(jnp.arctan2)(1e-200, 1e-200))
+    assert jax.grad(jnp.arctan2)(1e200, 1e200) == 0  # 5e-201
+    assert jnp.linalg.norm(jnp.array([1e-200, 0.0])) == 0
+    assert np.isnan(jax.grad(lambda x: jnp.sin(x) / x)(0.0))
+    # 1 - x^2 and 1 - cos(x) cancel: relative errors of 1e-5 and 1e-1.
+    x = 1 - 2.0**-40
+    assert abs(jax.grad(jnp.arccos)(x) / jax.grad(math.acos)(x) - 1) > 1e-6
+    assert abs((1 - jnp.cos(1e-7)) / math.one_minus_cos(1e-7) - 1) > 1e-3
+
+
+# ---- Smooth functions --------------------------------------------------------------------------
+
+
+def series(coefficient, x, order):
+    """d^order/dx^order of sum_k coefficient(k) x^k, summed as a fraction."""
+    x, total = Fraction(float(x)), Fraction(0)
+    for k in range(order, 90):
+        total += coefficient(k) * stdlib.perm(k, order) * x ** (k - order)
+    return float(total)
+
+
+def even(coefficient):
+    """Of x where `coefficient` belongs to z = x^2."""
+    return lambda k: Fraction(0) if k % 2 else coefficient(k // 2)
+
+
+def of_sinc(k):
+    return Fraction((-1) ** k, stdlib.factorial(2 * k + 1))
+
+
+def of_cosc(k):
+    return Fraction((-1) ** k, stdlib.factorial(2 * k + 2))
+
+
+def of_one_minus_cos(k):
+    return of_cosc(k - 1) if k else Fraction(0)
+
+
+def around(threshold):
+    inside = np.nextafter(threshold, 0)
+    return [1e-300, 1e-160, 1e-8, 1e-3, 0.1, 0.5, 1.0, 1.5, 0.99 * threshold, inside, threshold]
+
+
+# Name, coefficients, end of the series, tolerance of each order in EPS: twice the worst measured.
+# Where it is large, the derivative has a zero near one of the points.
+SMOOTH = [
+    ("sinc", even(of_sinc), 2.0, (2, 4, 32, 6)),
+    ("cosc", even(of_cosc), 4.0, (3, 3, 8, 16)),
+    ("sinc_sqrt", of_sinc, 4.0, (2, 2, 4, 30)),
+    ("cosc_sqrt", of_cosc, 16.0, (3, 3, 4, 10)),
+    ("one_minus_cos", even(of_one_minus_cos), 1.0, (3, 2, 11, 2)),
+]
+
+
+@pytest.mark.parametrize(("name", "coefficient", "threshold", "worst"), SMOOTH)
+def test_smooth_functions_to_third_order(name, coefficient, threshold, worst):
+    """Relative errors: series, quotient, and both sides of the threshold alike."""
+    x = np.array([*around(threshold), 1.01 * threshold, 1.1 * threshold, 5.0])
+    if not name.endswith("sqrt"):
+        x = np.concatenate([x, -x])
+    for order, values in enumerate(each(getattr(math, name))(x)):
+        close(values, [series(coefficient, point, order) for point in x], worst[order])
+
+
+def test_functions_of_the_square_turn_hyperbolic_below_zero():
+    y = np.array([0.1, 1.0, 1.9])
+    assert_allclose(math.sinc_sqrt(-(y**2)), np.sinh(y) / y, rtol=4 * EPS)
+    assert_allclose(math.cosc_sqrt(-(y**2)), 2 * np.sinh(y / 2) ** 2 / y**2, rtol=4 * EPS)
+    assert np.isnan(math.sinc_sqrt(-4.0))
+    assert np.isnan(math.cosc_sqrt(-16.0))
+
+
+def test_rotation_by_a_vector_is_smooth_at_zero():
+    """R(w) e = e + w x e + w x (w x e)/2 + w x (w x (w x e))/6 + ...: the exponential series."""
+    e, along = jnp.array([1.0, -2.0, 0.5]), jnp.array([0.3, 0.7, -0.2])
+
+    def turned(s):
+        w = s * along
+        z, once = w @ w, jnp.cross(w, e)
+        return e + math.sinc_sqrt(z) * once + math.cosc_sqrt(z) * jnp.cross(w, once)
+
+    expected = np.asarray(e)
+    for values in ladder(turned)(0.0):
+        assert_allclose(values, np.broadcast_to(expected, values.shape), atol=4 * EPS)
+        expected = np.cross(along, expected)
+
+
+def test_conventions_do_not_carry_over_to_composed_functions():
+    """As documented: of |x|^2 and sinc(|x|), whose Hessians at 0 are 2 and -1/3 times 1."""
+    zero = jnp.zeros(2)
+    assert_array_equal(jax.hessian(lambda x: math.norm(x) ** 2)(zero), 0.0)
+    assert_array_equal(jax.hessian(lambda x: x @ x)(zero), 2 * np.eye(2))
+    assert_array_equal(jax.hessian(lambda x: math.sinc(math.norm(x)))(zero), 0.0)
+    hessian = jax.hessian(lambda x: math.sinc_sqrt(x @ x))(zero)
+    assert_allclose(hessian, -np.eye(2) / 3, rtol=2 * EPS)
+
+
+# ---- Roots and inverse functions ---------------------------------------------------------------
+
+
+def test_sqrt_far_and_near():
+    """Worst error 0.5, 0.6, 1.6 and 2.1 EPS; the third derivative is some x^(-5/2)."""
+    x = np.array([1e-120, 1e-100, 1e-8, 0.1, 1.0, 2.0, 3e8, 1e120])
+    root = np.sqrt(x)
+    expected = root, 0.5 / root, -0.25 / root / x, 0.375 / root / x / x
+    for values, value in zip(each(math.sqrt)(x), expected, strict=True):
+        close(values, value, 6)
+    assert_array_equal(math.sqrt(np.array([1e-300, 1e300, np.inf])), [1e-150, 1e150, np.inf])
+    for values in ladder(math.sqrt)(-1.0):
+        assert np.all(np.isnan(values))
+
+
+def inverse_cosine(x):
+    d = (1 - x) * (1 + x)
+    return np.arccos(x), -(d**-0.5), -x * d**-1.5, -(1 + 2 * x**2) * d**-2.5
+
+
+def test_acos_and_asin_to_the_ends():
+    """Worst relative error 0.8, 1.2, 2.8 and 5 EPS; absolute near x = 0, where they have zeros."""
+    d = np.array([2.0**-53, 1e-15, 1e-12, 1e-8, 1e-4, 0.1, 0.5])
+    x = np.concatenate([1 - d, d - 1, [0.3, 1e-3, 1e-160, 0.0]])
+    expected = inverse_cosine(x)
+    for order, (cosine, sine) in enumerate(
+        zip(each(math.acos)(x), each(math.asin)(x), strict=True)
+    ):
+        close(cosine, expected[order], 10, scale=1.0 if order == 2 else 0.0)
+        close(sine, -expected[order] if order else np.arcsin(x), 10, scale=float(order == 2))
+    for function in (math.acos, math.asin):
+        for outside in (1.5, -1.5, np.nan):
+            for values in ladder(function)(outside):
+                assert np.all(np.isnan(values))
+
+
+# ---- Length and direction ----------------------------------------------------------------------
+
+
+def derivatives_of_length(x):
+    """|x|, u, (1 - u u)/r and -(sum of P_ij u_k over the three pairs)/r^2 with P = 1 - u u."""
+    scale = np.abs(x).max()
+    r = scale * np.sqrt(np.sum((x / scale) ** 2))
+    u = x / r
+    P = np.eye(len(x)) - np.outer(u, u)
+    T = np.einsum("ij,k->ijk", P, u)
+    with np.errstate(over="ignore"):
+        return r, u, P / r, -(T + np.einsum("ikj->ijk", T) + np.einsum("kji->ijk", T)) / r / r
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_length_to_third_order(n):
+    """Worst error 3 EPS |x|^(1 - k)."""
+    rng = np.random.default_rng(n)
+    derivatives = ladder(math.norm)
+    for size in (1e-150, 1e-100, 1e-8, 1e-3, 1.0, 1e8, 1e150, 1e200, 1e300):
+        x = size * rng.normal(size=n)
+        expected = derivatives_of_length(x)
+        for order, (values, value) in enumerate(zip(derivatives(x), expected, strict=True)):
+            close(values, value, 6, scale=expected[0] ** float(1 - order))
+
+
+@pytest.mark.parametrize("size", [1e-307, 1e-300, 1e-200, 1e-160])
+def test_length_of_tiny_vectors_to_second_order(size):
+    """The third derivative, of order |x|^-2, overflows."""
+    x = size * np.array([1.0, 2.0, 2.0])
+    expected = derivatives_of_length(x)
+    for order, values in enumerate(ladder(math.norm, 2)(x)):
+        close(values, expected[order], 6, scale=expected[0] ** float(1 - order))
+
+
+def test_length_of_one_component_is_the_absolute_value():
+    for x in (3e-160, -0.1, 7.0, -1e200):
+        value, first, second, third = ladder(math.norm)(jnp.array([x]))
+        assert_array_equal(value, abs(x))
+        assert_array_equal(first, np.full_like(first, np.sign(x)))
+        assert_array_equal(second, 0.0)
+        assert_array_equal(third, 0.0)
+
+
+def test_direction_is_the_derivative_of_length():
+    rng = np.random.default_rng(0)
+    derivatives = ladder(math.unit, 2)
+    for size in (1e-150, 1e-8, 1.0, 1e8, 1e150):
+        x = size * rng.normal(size=3)
+        r, *expected = derivatives_of_length(x)
+        for order, values in enumerate(derivatives(x)):
+            close(values, expected[order], 6, scale=r ** float(-order))
+
+
+def test_length_of_no_components_and_of_what_is_not_finite():
+    assert_array_equal(math.norm(np.zeros((2, 0))), np.zeros(2))
+    assert_array_equal(math.norm([np.inf, 1.0]), np.inf)
+    assert np.isnan(math.norm([np.nan, 1.0]))
+
+
+def test_spring_of_no_length():
+    """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| drops out."""
+
+    def energy(r, rest):
+        return 7.0 / 2 * (r @ r - 2 * rest * math.norm(r) + rest**2)
+
+    for rest in (0.0, 0.5):
+        V, force, stiffness, third = ladder(lambda r, rest=rest: energy(r, rest))(jnp.zeros(3))
+        assert_array_equal(V, 7.0 / 2 * rest**2)
+        assert_array_equal(force, 0.0)
+        assert_array_equal(stiffness, np.broadcast_to(7.0 * np.eye(3), (4, 3, 3)))
+        assert_array_equal(third, 0.0)
+    # Stretched: k along the spring, k (1 - l0/|r|) across.
+    stiffness = jax.hessian(energy)(jnp.array([2.0, 0.0, 0.0]), 0.5)
+    assert_allclose(stiffness, 7.0 * np.diag([1.0, 0.75, 0.75]), rtol=4 * EPS)
+
+
+# ---- Angles ------------------------------------------------------------------------------------
+
+
+def test_atan2_values_are_those_of_numpy():
+    """In every quadrant, on the axes with either sign of zero, and across 600 orders of magnitude.
+
+    Scaling costs at most one rounding.
+    """
+    points = np.array([0.0, 1e-300, 1e-160, 0.1, 1.0, 3.0, 1e160, 1e300, np.inf])
+    points = np.concatenate([points, -points])
+    y, x = (p.ravel() for p in np.meshgrid(points, points))
+    expected = np.arctan2(y, x)
+    for value in (math.atan2(y, x), jax.jit(jax.vmap(math.atan2))(y, x)):
+        assert_array_equal(np.signbit(value), np.signbit(expected))
+        # Quotients below the smallest normal number, 2e-308, may be flushed to zero.
+        assert_allclose(value, expected, rtol=2 * EPS, atol=3e-308)
+
+
+def derivatives_of_direction(y, x):
+    """Of Im log(x + i y): k-th derivatives are those of a power, i per y."""
+    scale = np.hypot(y, x)
+    c, s = x / scale, y / scale
+    with np.errstate(over="ignore"):
+        first = np.array([c, -s]) / scale
+        cos2, sin2 = (c - s) * (c + s), 2 * c * s
+        second = np.array([[-sin2, -cos2], [-cos2, sin2]]) / scale / scale
+        sin3, cos3 = s * (3 - 4 * s**2), c * (4 * c**2 - 3)
+        yyy, yyx, yxx, xxx = np.array([-cos3, sin3, cos3, -sin3]) * 2 / scale / scale / scale
+    return first, second, np.array([[[yyy, yyx], [yyx, yxx]], [[yyx, yxx], [yxx, xxx]]])
+
+
+def test_atan2_to_third_order():
+    """Worst error 7 EPS r^-k."""
+    derivatives = ladder(lambda p: math.atan2(p[0], p[1]))
+    for size in (1e-100, 1e-8, 1.0, 1e8, 1e100, 1e200, 1e300):
+        for y, x in ((0.3, 0.7), (2.0, -0.1), (-1.0, -1.0), (1e-9, 1.0), (-1.0, 0.0), (-0.0, -1.0)):
+            _, *orders = derivatives(size * np.array([y, x]))
+            expected = derivatives_of_direction(size * y, size * x)
+            for order, (values, value) in enumerate(zip(orders, expected, strict=True), start=1):
+                close(values, value, 14, scale=np.hypot(size * y, size * x) ** float(-order))
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-200])
+def test_atan2_of_tiny_arguments_to_first_order(size):
+    """The second derivative, of order r^-2, overflows."""
+    gradient = ladder(lambda p: math.atan2(p[0], p[1]), 1)(size * np.array([0.3, -0.4]))[1]
+    close(gradient, np.array([-1.6, -1.2]) / size, 4)
+
+
+def pair(angle, lengths=(2.0, 0.7), heading=0.4):
+    """Two vectors of the plane, the second turned from the first by `angle`."""
+    turn = np.array([heading, heading + angle])
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.array(lengths)[:, None]
+
+
+def between(ab):
+    return math.angle_between(ab[0], ab[1])
+
+
+def turned(ab):
+    """The angle with its sign, as a difference of two directions."""
+    return math.atan2(ab[1, 1], ab[1, 0]) - math.atan2(ab[0, 1], ab[0, 0])
+
+
+def test_angle_to_third_order_in_the_plane():
+    """It is the angle from a to b up to sign: no digits lost near 0 and pi in any derivative."""
+    derivatives, expected = ladder(between), ladder(turned)
+    for angle in (1e-12, 1e-8, 1e-4, 0.01, 0.5, 2.0, 3.1, PI - 1e-4, PI - 1e-8, PI - 1e-12):
+        for sign in (1.0, -1.0):
+            ab = pair(sign * angle)
+            # The angle of the rounded vectors, which need not be `angle`.
+            (a, b), (c, d) = ab.tolist()
+            exact = [Fraction(x) for x in (a, b, c, d)]
+            cross = float(exact[0] * exact[3] - exact[1] * exact[2])
+            dot = float(exact[0] * exact[2] + exact[1] * exact[3])
+            value, *orders = derivatives(ab)
+            close(value, np.arctan2(abs(cross), dot), 2, scale=1.0)
+            for order, (values, signed) in enumerate(zip(orders, expected(ab)[1:], strict=True), 1):
+                # Worst error 60 EPS |b|^-k, of a third derivative 6 |b|^-3.
+                close(values, sign * np.asarray(signed)[:1], 120, scale=0.7 ** float(-order))
+
+
+@pytest.mark.parametrize("n", [3, 4, 6])
+def test_angle_in_any_dimension_far_from_its_ends(n):
+    """Against acos(a.b/(|a| |b|)), of which JAX is right there."""
+    rng = np.random.default_rng(n)
+    ab = rng.normal(size=(2, n))
+    plain = ladder(lambda ab: jnp.arccos(ab[0] @ ab[1] / jnp.sqrt(ab[0] @ ab[0] * (ab[1] @ ab[1]))))
+    for values, value in zip(ladder(between)(ab), plain(ab), strict=True):
+        close(values, np.asarray(value)[:1], 40, scale=np.abs(value).max())
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_parallel_vectors_have_angle_zero_or_pi_without_derivatives(n, dtype):
+    """b = c a rounded, components of all sizes: exactly, though the differences round."""
+    rng = np.random.default_rng(n)
+    a = rng.normal(size=(500, n)) * 10.0 ** rng.uniform(-5, 5, (500, n))
+    c = rng.normal(size=(500, 1)) * 10.0 ** rng.uniform(-5, 5, (500, 1))
+    a, b = a.astype(dtype), (a.astype(dtype) * c.astype(dtype)).astype(dtype)
+    assert n == 1 or np.any(a[:, 0] * b[:, -1] != a[:, -1] * b[:, 0])
+    ab = np.stack([a, b], axis=1)
+    value, gradient = jax.jit(jax.vmap(jax.value_and_grad(between)))(ab)
+    assert_array_equal(value, np.where(c[:, 0] > 0, 0, PI).astype(dtype))
+    assert_array_equal(gradient, 0)
+    for values in ladder(between)(ab[0])[1:]:
+        assert_array_equal(values, 0.0)
+
+
+def test_angle_far_below_rounding_of_the_vectors():
+    a, b = jnp.array([1.0, 0.0]), jnp.array([1.0, 1e-200])
+    assert_array_equal(math.angle_between(a, b), 1e-200)
+    assert_array_equal(jax.grad(math.angle_between, 1)(a, b), [-1e-200, 1.0])
+    for a, b in (([1e200, 0.0], [1e200, 1e200]), ([1e-200, 0.0], [1e-200, 1e-200])):
+        close(math.angle_between(a, b), PI / 4, 2)
+
+
+@pytest.mark.parametrize("other", [[1.0, 2.0], [-1.0, -2.0], [0.0, 0.0], [-0.0, -0.0]])
+def test_angle_with_a_vector_of_no_length(other):
+    for ab in ([[0.0, 0.0], other], [other, [-0.0, 0.0]]):
+        for values in ladder(between)(jnp.array(ab)):
+            assert_array_equal(values, 0.0)
+
+
+# ---- Batches and dtypes ------------------------------------------------------------------------
+
+BATCHES = {
+    "sqrt": [4.0, 0.0, 1e-8, 9.0],
+    "acos": [0.5, 1.0, -1.0, -0.25],
+    "asin": [0.5, 1.0, -1.0, -0.25],
+    "sinc": [0.5, 0.0, 1e200, 3.0],
+    "sinc_sqrt": [0.5, 0.0, -1.0, 1e200],
+    "cosc": [0.5, 0.0, 1e100, 9.0],
+    "cosc_sqrt": [0.5, 0.0, -1.0, 17.0],
+    "one_minus_cos": [0.5, 0.0, 3.0, 9.0],
+    "norm": [[3.0, 4.0], [0.0, 0.0], [1e-9, 0.0], [1e100, 1e100]],
+    "unit": [[3.0, 4.0], [0.0, 0.0], [1e-9, 0.0], [1e100, 1e100]],
+    "atan2": [[3.0, 4.0], [0.0, 0.0], [0.0, -1.0], [1e100, 1e100]],
+    "angle_between": [[[1.0, 0.0], [0.0, 2.0]], [[0.0, 0.0], [1.0, 2.0]], [[1.0, 2.0], [3.0, 6.0]]],
+}
+
+
+def of_one_argument(name):
+    function = getattr(math, name)
+    return (lambda x: function(x[0], x[1])) if name in ("atan2", "angle_between") else function
+
+
+def test_batches_hold_every_function():
+    public = {name for name, thing in vars(math).items() if thing.__module__ == math.__name__}
+    assert {name for name in public if not name.startswith("_")} == set(BATCHES)
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_a_singular_point_in_a_batch_harms_no_other(name):
+    x = jnp.array(BATCHES[name])
+    derivatives = ladder(of_one_argument(name))
+    for order, together in enumerate(jax.vmap(derivatives)(x)):
+        for i, point in enumerate(x):
+            alone = np.asarray(derivatives(point)[order])
+            close(together[i], alone, 8, scale=np.abs(alone).max())
+    if name not in ("atan2", "angle_between"):  # batches without vmap
+        close(getattr(math, name)(x), jax.vmap(getattr(math, name))(x), 2)
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_single_precision_stays_single(name):
+    """Against double precision at the same points: worst error 20 eps of float32."""
+    x = np.clip(np.array(BATCHES[name]), -1e8, 1e8).astype(np.float32)
+    derivatives = ladder(of_one_argument(name))
+    for point in x:
+        for single, double in zip(
+            derivatives(point), derivatives(point.astype(float)), strict=True
+        ):
+            assert single.dtype == jnp.float32
+            close(single, np.asarray(double).astype(np.float32), 40, scale=np.abs(double).max())
+
+
+@pytest.mark.parametrize("name", ELEMENTWISE)
+def test_numbers_and_integers(name):
+    function = getattr(math, name)
+    for one in (1, 1.0, np.arange(1, 2), jnp.array(1)):
+        assert function(one).dtype == jnp.float64
+        assert_array_equal(np.ravel(function(one)), function(jnp.array(1.0)))
+    for number in (1, 1.0):  # takes the dtype of what it meets, as in jnp
+        assert (function(number) * jnp.float32(2)).dtype == jnp.float32
+    with jax.enable_x64(False):
+        assert function(np.arange(1, 2)).dtype == jnp.float32
+
+
+def test_numbers_and_integers_among_vectors_and_pairs():
+    assert_array_equal(math.norm([3, 4]), 5.0)
+    assert_array_equal(math.unit(np.array([0, 4])), [0.0, 1.0])
+    assert_array_equal(math.angle_between([1, 0], [0, 1]), PI / 2)
+    assert_array_equal(math.atan2(1, jnp.float32(0)), np.float32(PI / 2))
+    assert math.atan2(1.0, jnp.float32(0)).dtype == jnp.float32
+    assert_array_equal(math.atan2(0, -1), PI)
+
+
+@pytest.mark.parametrize("name", ELEMENTWISE)
+def test_complex_numbers_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: . must be real, but its dtype was complex128"):
+        getattr(math, name)(1j)
+
+
+def test_wrong_vectors_are_refused():
+    for function in (math.norm, math.unit):
+        with pytest.raises(ValueError, match="x must be a vector, but it was a scalar"):
+            function(1.0)
+    with pytest.raises(ValueError, match="b must be a vector"):
+        math.angle_between([1.0, 0.0], 1.0)
+    with pytest.raises(ValueError, match="same number of components, but they had 2 and 1"):
+        math.angle_between([1.0, 0.0], [1.0])
+    with pytest.raises(ValueError, match="atan2: x must be real"):
+        math.atan2(1.0, 1j)
+
+
+def test_the_name_hides_nothing():
+    """Siblings that import math get the standard library's."""
+    assert jaxlag._coordinates.math is stdlib
+    assert stdlib is not math
