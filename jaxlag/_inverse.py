@@ -60,7 +60,7 @@ def inverse_dynamics(
         >>> pendulum = jl.System(lagrangian, coordinates=("theta",))
         >>> q, v, a = jl.prescribed_motion(lambda t: 0.3 * jnp.sin(2 * jnp.array([t])), 0.5)
         >>> print(f"{jl.inverse_dynamics(pendulum, q, v, a)[0]:.6f} N m")
-        0.576157 N m
+        0.576186 N m
     """
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)

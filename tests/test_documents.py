@@ -51,7 +51,7 @@ def test_readme_runs_and_prints_what_it_says():
         else:
             assert printed.strip() == str(text).strip(), f"README.md:{line}"
             compared += 1
-    assert compared == 2
+    assert compared == 3
 
 
 def test_readme_shows_the_same_numbers_twice():
@@ -97,3 +97,16 @@ def test_version_and_extras():
     assert jaxlag.__version__ == project["version"]
     assert project["version"] in (ROOT / "CHANGELOG.md").read_text()
     assert {"plot", "test"} <= set(project["optional-dependencies"])
+
+
+@pytest.mark.parametrize("name", ["energy", "math", "rotation"])
+def test_every_public_function_says_what_it_is(name):
+    module = importlib.import_module(f"jaxlag.{name}")
+    public = {
+        label: thing
+        for label, thing in vars(module).items()
+        if not label.startswith("_") and getattr(thing, "__module__", None) == module.__name__
+    }
+    assert len(public) >= 5
+    for label, thing in public.items():
+        assert thing.__doc__, label
