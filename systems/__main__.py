@@ -1,4 +1,4 @@
-"""Command line: `python -m systems list | run NAME | check FILE.json ... | fit-pendulum`."""
+"""Command line: `python -m systems list | run NAME | check FILE.json | errata | fit-pendulum`."""
 
 import sys
 from argparse import ArgumentParser
@@ -19,6 +19,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from systems import fit_pendulum
 
         return fit_pendulum.main(argv[1:])
+    if argv[:1] == ["errata"]:
+        from systems import errata
+
+        return errata.main(argv[1:])
     arguments = _parser().parse_args(argv)
     if arguments.command == "check":
         return _check.main(arguments.files)
@@ -44,6 +48,7 @@ def _parser() -> ArgumentParser:
     run.add_argument("--plot", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
     check = commands.add_parser("check", help="compare reference files with the simulation")
     check.add_argument("files", nargs="+", type=Path, metavar="FILE.json")
+    commands.add_parser("errata", help="evaluate the misprints of chapters 2 and 3")
     commands.add_parser("fit-pendulum", help="identify a pendulum from measured motion")
     return parser
 

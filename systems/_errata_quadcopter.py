@@ -1,7 +1,7 @@
 """Errata of chapter 3, Example 5: the quadcopter as a rigid body pushed by four rotors."""
 
 import jax.numpy as jnp
-from numpy import array, cos, cross, diag, sin
+from numpy import array, cos, diag, sin
 
 import jaxlag as jl
 from jaxlag.rotation import yaw_pitch_roll
@@ -48,10 +48,9 @@ _BODY = jl.System(
 
 def _rotor_kinetic(t, q, v, params):
     """T of the rotors about their shafts: 1, 3 clockwise, 2, 4 counterclockwise from above."""
-    spins = quadcopter.angular_velocity(t, q, v, params)[2] + jnp.array(
-        [-1.0, 1.0, -1.0, 1.0]
-    ) * _speeds(params)
-    return 0.5 * params["Im"] * jnp.sum(spins**2)
+    relative = jnp.array([-1.0, 1.0, -1.0, 1.0]) * _speeds(params)
+    turn = quadcopter.angular_velocity(t, q, v, params)[2]
+    return 0.5 * params["Im"] * jnp.sum((turn + relative) ** 2)
 
 
 _ROTORS = jl.System(
@@ -80,7 +79,7 @@ def _rotational_force(s: State):
 
 def _gyroscopic_torque(s: State):
     """Torque of the spinning rotors on the frame, body components; all angles are 0."""
-    still = s.params | {name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}
+    still = {**s.params, **{name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}}
     needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, still))
     return (without - needed)[:2:-1]
 
@@ -190,7 +189,7 @@ ERRATA = (
         right=lambda s: _rates_matrix(s).T @ _body_torque(s),
     ),
     Erratum(
-        place="Example 5, gyroscopic torque of pitch, at zero angles",
+        place="Ch. 3, Example 5, gyroscopic torque of pitch, at zero angles",
         wrong="-p h for +p h",
         draw=_level,
         engine=_gyroscopic_torque,
@@ -198,7 +197,7 @@ ERRATA = (
         right=lambda s: _gyroscopic(s, _SIGNED, +1),
     ),
     Erratum(
-        place="Example 5, spin h of the rotors, at zero angles",
+        place="Ch. 3, Example 5, spin h of the rotors, at zero angles",
         wrong="sum of the speeds without their signs",
         draw=_level,
         engine=_gyroscopic_torque,
@@ -222,7 +221,7 @@ ERRATA = (
         right=_right_terms,
     ),
     Erratum(
-        place="Example 5, velocity terms of yaw written out",
+        place="Ch. 3, Example 5, velocity terms of yaw written out",
         wrong="F eta' for F^T eta', and Ix, Iz interchanged",
         draw=_any,
         engine=lambda s: _velocity_terms(s)[0],
@@ -230,7 +229,7 @@ ERRATA = (
         right=lambda s: _right_terms(s)[0],
     ),
     Erratum(
-        place="Example 5, psi'', theta'', phi'' in hover",
+        place="Ch. 3, Example 5, psi'', theta'', phi'' in hover",
         wrong="torque_z/Ix and torque_x/Iz, moments interchanged",
         draw=_hover,
         engine=lambda s: _BODY.acceleration(s.params, s.q, s.v, s.t)[3:],
@@ -240,6 +239,6 @@ ERRATA = (
 )
 
 TEXT_ONLY = (
-    ("Example 5, text at 3.82", "the rotors of pitch are 1 and 3, those of roll 2 and 4"),
-    ("Example 5, text at 3.83", "the thrust is along +z of the body, as in the formulas, not -z"),
+    ("Ch. 3, Example 5, text at 3.82", "the rotors of pitch are 1 and 3, those of roll 2 and 4"),
+    ("Ch. 3, Example 5, text at 3.83", "the thrust is along +z of the body, not -z"),
 )

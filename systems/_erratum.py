@@ -40,11 +40,14 @@ class State(NamedTuple):
         return tuple(self.params[name] for name in names)
 
 
-Formula = Callable[[State], ArrayLike]
+Formula = Callable[[State], ArrayLike | Sequence[float]]
 """A number or a vector at one state."""
 
 Draw = Callable[[np.random.Generator], State]
 """A random state."""
+
+Numbers = float | Sequence[float] | np.ndarray
+"""One number for all coordinates, or one for each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,25 +107,25 @@ def examine(erratum: Erratum) -> Errors:
 def around(
     params: Mapping[str, float],
     q: Sequence[float],
-    v: ArrayLike = 0.0,
+    v: Numbers = 0.0,
     *,
-    dq: ArrayLike = 0.4,
-    dv: ArrayLike = 3.0,
-    da: ArrayLike = 3.0,
+    dq: Numbers = 0.4,
+    dv: Numbers = 3.0,
+    da: Numbers = 3.0,
 ) -> Draw:
     """States near (q, v), with parameters 0.7 to 1.4 times those given.
 
     Args:
         params: parameter name -> value.
         q: coordinates, shape (n,).
-        v: generalized velocities, shape (n,), or one for all.
-        dq: largest departure from q, shape (n,), or one for all.
+        v: generalized velocities.
+        dq: largest departure from q.
         dv: the same of v.
         da: the same of a from 0.
     """
 
     def draw(generator: np.random.Generator) -> State:
-        def within(size: ArrayLike) -> np.ndarray:
+        def within(size: Numbers) -> np.ndarray:
             return np.asarray(size) * generator.uniform(-1.0, 1.0, len(q))
 
         values = {name: value * generator.uniform(0.7, 1.4) for name, value in params.items()}
@@ -132,9 +135,9 @@ def around(
     return draw
 
 
-def around_example(entry: Entry, *, dq: ArrayLike = 0.4, dv: ArrayLike = 3.0) -> Draw:
+def around_example(entry: Entry) -> Draw:
     """States near the start of the example, at any velocity."""
-    return around(entry.example.params, entry.example.q0, dq=dq, dv=dv)
+    return around(entry.example.params, entry.example.q0)
 
 
 def rate(function: Callable, s: State, a: Any) -> jax.Array:

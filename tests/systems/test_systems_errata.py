@@ -1,0 +1,109 @@
+"""The errata: what is printed is wrong and what is said to be right is what the engine finds."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from systems import errata
+from systems.__main__ import main
+from systems._erratum import DRAWS, around, examine
+from systems.errata import ERRATA, TEXT_ONLY, TOLERANCE, WRONG, confirmed
+
+by_place = pytest.mark.parametrize("erratum", ERRATA, ids=lambda erratum: erratum.place)
+
+
+@by_place
+def test_the_right_formula_is_the_engine_s_and_the_printed_one_is_not(erratum):
+    errors = examine(erratum)
+    assert errors.right <= TOLERANCE
+    assert errors.printed > WRONG
+    assert np.isinf(errors.printed) == erratum.singular
+    assert confirmed(errors)
+
+
+@by_place
+def test_states_differ_between_draws_and_not_between_calls(erratum):
+    def numbers(state):
+        return [state.t, *state.q, *state.v, *state.a, *state.params.values()]
+
+    states = [numbers(state) for state in erratum.states()]
+    assert len(states) == DRAWS
+    for i, state in enumerate(states):
+        assert np.all(np.isfinite(state))
+        for other in states[:i]:
+            assert sum(x != y for x, y in zip(state, other, strict=True)) > 1
+    assert states == [numbers(state) for state in erratum.states()]
+
+
+def test_no_place_is_listed_twice():
+    places = [erratum.place for erratum in ERRATA] + [place for place, _ in TEXT_ONLY]
+    assert len(set(places)) == len(places)
+
+
+@pytest.mark.parametrize(
+    "places",
+    [[erratum.place for erratum in ERRATA], [place for place, _ in TEXT_ONLY]],
+    ids=["evaluated", "text"],
+)
+def test_numbered_places_are_in_the_order_of_the_book(places):
+    found = [re.match(r"(\d)\.(\d+)", place) for place in places]
+    numbers = [tuple(map(int, match.groups())) for match in found if match]
+    assert numbers == sorted(numbers)
+    chapters = [re.findall(r"[23]", place)[0] for place in places]
+    assert chapters == sorted(chapters)
+
+
+def test_the_command_prints_one_line_for_each(capsys):
+    assert main(["errata"]) == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["place", "what", "is", "wrong", "printed", "right"]
+    for erratum, line in zip(ERRATA, lines, strict=False):
+        assert re.fullmatch(
+            rf"{re.escape(erratum.place)} +{re.escape(erratum.wrong)} +(inf|\d\S+)  +\d\S+", line
+        )
+        assert len(line) == len(head)
+    rest = lines[len(ERRATA) :]
+    assert rest[0] == ""
+    assert rest[2:-2] == [f"{place}: {remark}" for place, remark in TEXT_ONLY]
+    assert rest[-1] == (f"evaluated {len(ERRATA)}: all confirmed; in words only {len(TEXT_ONLY)}")
+
+
+@pytest.mark.parametrize("field", ["right", "printed"])
+def test_what_is_not_confirmed_fails_the_command(field, monkeypatch, capsys):
+    """A right formula that is as wrong as the printed one; a printed one that is right."""
+    first, second, *_ = ERRATA
+    other = {"right": second.printed, "printed": second.right}[field]
+    monkeypatch.setattr(errata, "ERRATA", (first, replace(second, **{field: other})))
+    assert main(["errata"]) == 1
+    out = capsys.readouterr().out.splitlines()
+    assert not out[1].endswith("FAIL")
+    assert out[2].endswith("  FAIL")
+    assert out[-1].startswith("evaluated 2: 1 not confirmed;")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_right_formula_without_a_value_is_not_confirmed(value):
+    errors = examine(replace(ERRATA[0], right=lambda s: value))
+    assert not confirmed(errors)
+
+
+def test_a_formula_of_another_shape_than_the_engine_s_is_refused():
+    with pytest.raises(
+        ValueError, match=r"2\.18.* what the engine does, shape \(\), but it .*\(1,"
+    ):
+        examine(replace(ERRATA[0], right=lambda s: s.q))
+
+
+def test_states_are_drawn_around_what_is_given():
+    draw = around({"m": 2.0}, (1.0, -1.0), (0.5, 0.0), dq=(0.1, 0.0), dv=0.2, da=0.0)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        s = draw(rng)
+        assert 1.4 <= s.params["m"] <= 2.8
+        assert abs(s.q[0] - 1.0) <= 0.1
+        assert s.q[1] == -1.0
+        assert np.all(np.abs(s.v - [0.5, 0.0]) <= 0.2)
+        assert np.all(s.a == 0)
+        assert s.values("m") == (s.params["m"],)
