@@ -313,7 +313,7 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
         ({"assemble": None}, "assemble must be True or False, but it was None."),
         (
             {"save": ("a", "force")},
-            "save must name quantities among ['a', 'p', 'energy', 'kinetic', 'potential', 'Q'], "
+            "save must name quantities among ['a', 'p', 'energy', 'kinetic', 'potential', 'Q', "
             "but one was 'force'.",
         ),
         ({"save": "energy"}, "save must be a sequence of names, but it was 'energy'. Write save="),
