@@ -313,8 +313,8 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
         ({"assemble": None}, "assemble must be True or False, but it was None."),
         (
             {"save": ("a", "force")},
-            "save must name quantities among ['a', 'p', 'energy', 'kinetic', 'potential', 'Q', "
-            "but one was 'force'.",
+            "save must name quantities among ['a', 'p', 'energy', 'kinetic', 'potential', 'power', "
+            "'Q', 'work'], but one was 'force'.",
         ),
         ({"save": "energy"}, "save must be a sequence of names, but it was 'energy'. Write save="),
         ({"save": None}, "save must be a sequence of names, but it was None."),
