@@ -1,22 +1,14 @@
 """What the outputs of a traced program depend on."""
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+Names = frozenset[str]
 
-def _inner(eqn: Any) -> Jaxpr | None:
-    """The jaxpr of a call-like equation whose operands map one to one; else None."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        inner = eqn.params.get(key)
-        jaxpr = inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner
-        sizes = (len(eqn.invars), len(eqn.outvars))
-        if isinstance(jaxpr, Jaxpr) and (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
-            return jaxpr
-    return None
-
+_NOTHING: Names = frozenset()
 
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"} | {
     "custom_jvp_call",
@@ -24,30 +16,122 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpo
 }
 
 
-def outputs_depend_on(jaxpr: Jaxpr, given: list[frozenset[str]]) -> list[frozenset[str]]:
+def outputs_depend_on(jaxpr: Jaxpr, given: list[Names]) -> list[Names]:
     """Names that each output of a traced program depends on.
 
     A dependence that cancels only algebraically is still listed; one that is not listed is
-    certainly absent.
+    certainly absent. Calls, loops and branches are followed output by output.
 
     Args:
         jaxpr: the traced program.
         given: names that each of its inputs stands for; its constants stand for none.
     """
-    nothing: frozenset[str] = frozenset()
-    known: dict[Any, frozenset[str]] = dict(zip(jaxpr.invars, given, strict=True))
+    known: dict[Any, Names] = dict(zip(jaxpr.invars, given, strict=True))
+    numbers: dict[Any, Any] = {}
 
-    def of(atom: Any) -> frozenset[str]:
-        return nothing if isinstance(atom, Literal) else known.get(atom, nothing)
+    def of(atom: Any) -> Names:
+        return _NOTHING if isinstance(atom, Literal) else known.get(atom, _NOTHING)
+
+    def number(atom: Any) -> Any:
+        """Its value if it is a number that the program itself states, else None."""
+        if not isinstance(atom, Literal):
+            return numbers.get(atom)
+        return np.asarray(atom.val) if np.ndim(atom.val) == 0 else None
 
     for eqn in jaxpr.eqns:
         operands = [of(atom) for atom in eqn.invars]
-        inner = _inner(eqn)
-        if inner is not None:
-            results = outputs_depend_on(inner, operands)
-        elif eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0:
-            results = [nothing]  # x**0 is what differentiating x**1 leaves
-        else:
-            results = [nothing.union(*operands)] * len(eqn.outvars)
+        stated = [number(atom) for atom in eqn.invars]
+        if eqn.primitive.name == "sub" and all(x is not None for x in stated):
+            numbers[eqn.outvars[0]] = stated[0] - stated[1]  # y - 1 in differentiating x**y
+        results = [_NOTHING] if _is_one(eqn, stated) else _results(eqn, operands)
         known.update(zip(eqn.outvars, results, strict=True))
     return [of(atom) for atom in jaxpr.outvars]
+
+
+def _is_one(eqn: Any, stated: list[Any]) -> bool:
+    """Whether it is x**0, which is 1 for every x and what differentiating x**1 leaves."""
+    if eqn.primitive.name == "pow":
+        return stated[1] is not None and bool(stated[1] == 0)
+    return eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0
+
+
+def _results(eqn: Any, operands: list[Names]) -> list[Names]:
+    inner = _inner(eqn)
+    if inner is not None:
+        return outputs_depend_on(inner, operands)
+    follow = _CONTROL_FLOW.get(eqn.primitive.name)
+    if follow is not None:
+        return follow(eqn.params, operands)
+    return [_NOTHING.union(*operands)] * len(eqn.outvars)
+
+
+def _inner(eqn: Any) -> Jaxpr | None:
+    """The jaxpr of a call-like equation whose operands map one to one; else None."""
+    if eqn.primitive.name not in _CALLS:
+        return None
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        jaxpr = _open(eqn.params.get(key))
+        sizes = (len(eqn.invars), len(eqn.outvars))
+        if isinstance(jaxpr, Jaxpr) and (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
+            return jaxpr
+    return None
+
+
+def _open(jaxpr: Any) -> Any:
+    return jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr
+
+
+def _cond(params: Any, operands: list[Names]) -> list[Names]:
+    """Of any branch, and of the index that chooses it."""
+    index, *rest = operands
+    branches = [outputs_depend_on(_open(branch), rest) for branch in params["branches"]]
+    return [index.union(*outputs) for outputs in zip(*branches, strict=True)]
+
+
+def _scan(params: Any, operands: list[Names]) -> list[Names]:
+    """Of the start or of any turn, and of what enters a turn through the other carries."""
+    body, consts, carries = _open(params["jaxpr"]), params["num_consts"], params["num_carry"]
+    fixed, carry, rows = (
+        operands[:consts],
+        operands[consts : consts + carries],
+        operands[consts + carries :],
+    )
+    outputs: list[Names] = []
+
+    def turn(carry: list[Names]) -> list[Names]:
+        outputs[:] = outputs_depend_on(body, [*fixed, *carry, *rows])
+        return outputs[:carries]
+
+    return _fixpoint(turn, carry) + outputs[carries:]
+
+
+def _while(params: Any, operands: list[Names]) -> list[Names]:
+    """As in a scan; what decides on the number of turns reaches every carry that they change."""
+    body, condition = _open(params["body_jaxpr"]), _open(params["cond_jaxpr"])
+    first = params["cond_nconsts"]
+    second = first + params["body_nconsts"]
+    asked, fixed, carry = operands[:first], operands[first:second], operands[second:]
+    same = [x is y for x, y in zip(body.invars[second - first :], body.outvars, strict=True)]
+
+    def turn(carry: list[Names]) -> list[Names]:
+        (goes_on,) = outputs_depend_on(condition, [*asked, *carry])
+        after = outputs_depend_on(body, [*fixed, *carry])
+        return [x if is_same else x | goes_on for x, is_same in zip(after, same, strict=True)]
+
+    return _fixpoint(turn, carry)
+
+
+def _fixpoint(turn: Callable[[list[Names]], list[Names]], carry: list[Names]) -> list[Names]:
+    """The carries of a loop once further turns add no name to them; the start is kept."""
+    while True:
+        grown = [x | y for x, y in zip(carry, turn(carry), strict=True)]
+        if grown == carry:
+            return grown
+        carry = grown
+
+
+_CONTROL_FLOW: dict[str, Callable[[Any, list[Names]], list[Names]]] = {
+    "cond": _cond,
+    "scan": _scan,
+    "while": _while,
+}

@@ -205,8 +205,9 @@ class Couple(AbstractForce):
             raise bad(
                 argument,
                 "be affine in v",
-                "its derivative dw/dv depends on v",
-                "An angular velocity is W(t, q) v + w0(t, q): drop powers and products of speeds.",
+                "its derivative dw/dv depends on v, as far as its program tells",
+                "An angular velocity is W(t, q) v + w0(t, q): drop powers and products of speeds, "
+                "and choices and loops that read v, even where they cancel.",
             )
         state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
         torque = _like(f"couple {self.name!r}: torque", self.torque(*state), w)

@@ -7,13 +7,15 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
-from jaxlag._errors import bad
+from jaxlag._errors import bad, require_arity
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._system import System
+from jaxlag._vectors import common, real
 
 
 def inverse_dynamics(
@@ -34,19 +36,22 @@ def inverse_dynamics(
 
     Args:
         system: what moves, n coordinates.
-        q: coordinates, shape (n,), or (s, n) for s instants; m or rad.
-        v: velocities dq/dt, in the same shape; m/s or rad/s.
-        a: accelerations dv/dt, in the same shape; m/s^2 or rad/s^2.
+        q: coordinates, shape (n,), or (s, n) for s instants, or at one instant a dict by name;
+            m or rad.
+        v: velocities dq/dt, in the same form; m/s or rad/s.
+        a: accelerations dv/dt, in the same form; m/s^2 or rad/s^2.
         params: as the Lagrangian takes them.
         t: the instant in s, or the (s,) instants of the rows.
         inputs: dict from names to input objects or arrays, as in `simulate`.
 
     Returns:
-        In the shape of q: N where q_i is in m, N m where it is in rad; positive pushes towards
+        Shape (n,) or (s, n): N where q_i is in m, N m where it is in rad; positive pushes towards
         larger q_i.
 
     Raises:
-        ValueError: q, v, a not of shape (n,) or (s, n), or t not one instant for each row.
+        ValueError: q, v, a not real numbers of shape (n,) or (s, n), not one row at least, or,
+            where they have values, not finite (the coordinate is named); t not one instant for
+            each row; inputs that no force reads.
 
     Source: Pila, secs. 2.7, 2.8 (motion prescribed, forces asked) and eq. 3.53.
 
@@ -62,6 +67,8 @@ def inverse_dynamics(
         >>> print(f"{jl.inverse_dynamics(pendulum, q, v, a)[0]:.6f} N m")
         0.576186 N m
     """
+    if not isinstance(system, System):
+        raise bad("inverse_dynamics: system", "be a jl.System", f"it was {system!r}")
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
@@ -84,11 +91,14 @@ def prescribed_motion(
         q, v = dq/dt and a = d2q/dt2, each (n,) or (s, n).
 
     Raises:
-        ValueError: `motion` does not return real numbers of shape (n,).
+        ValueError: `motion` is no function of t, or does not return real numbers of shape (n,);
+            t is neither a number nor a row of them.
     """
-    t = jnp.asarray(t, jnp.result_type(float))
+    require_arity("prescribed_motion: motion", motion, ("t",))
+    t = real("prescribed_motion: t", t).astype(jnp.result_type(float))
     if t.ndim > 1:
-        raise bad("prescribed_motion: t", "be an instant or a row of them", f"shape {t.shape}")
+        must, was = "be an instant or a row of them", f"its shape was {t.shape}"
+        raise bad("prescribed_motion: t", must, was)
 
     def coordinates(t: Array) -> Array:
         q = motion(t)
@@ -100,8 +110,7 @@ def prescribed_motion(
                 f"it returned {was}",
                 "Use jnp.stack([q1, q2]).",
             )
-        q = jnp.asarray(q)
-        return q if jnp.issubdtype(q.dtype, jnp.inexact) else q.astype(t.dtype)
+        return real("prescribed_motion: what motion returns", q)
 
     def rate(f: Callable, t: Array) -> Array:
         return jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
@@ -113,27 +122,43 @@ def prescribed_motion(
     return at(t) if t.ndim == 0 else jax.vmap(at)(t)
 
 
-def _motion(system: System, *motion: Any) -> tuple[Array, Array, Array, Array]:
+def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Array, Array, Array]:
     """(q, v, a, t) of one shape and precision, or an error that names the odd one out."""
-    *vectors, t = map(jnp.asarray, motion)
-    n = system.size
-    for name, x in zip("qva", vectors, strict=True):
-        if x.ndim not in (1, 2) or x.shape[-1] != n or x.shape != vectors[0].shape:
-            same = "" if name == "q" else f", as q with {vectors[0].shape}"
-            raise bad(
-                f"inverse_dynamics: {name}",
-                f"have shape ({n},) or (s, {n}){same}: {', '.join(system.coordinates.labels)}",
-                f"its shape was {x.shape}",
-            )
-        if jnp.issubdtype(x.dtype, jnp.complexfloating):
-            raise bad(f"inverse_dynamics: {name}", "be real", f"its dtype was {x.dtype}")
+    vectors: list[Array] = []
+    n, labels = system.size, system.coordinates.labels
+    for name, x in (("q", q), ("v", v), ("a", a)):
+        argument = f"inverse_dynamics: {name}"
+        if isinstance(x, Mapping):
+            x = system.coordinates.flatten(x, argument)
+        x = real(argument, x)
+        shape = vectors[0].shape if vectors else x.shape
+        if x.ndim not in (1, 2) or x.shape[-1] != n or x.shape != shape:
+            same = f", as q with {shape}" if vectors else ""
+            must = f"have shape ({n},) or (s, {n}){same}: {', '.join(labels)}"
+            raise bad(argument, must, f"its shape was {x.shape}")
+        if x.size == 0:
+            raise bad(argument, "hold at least one instant", f"its shape was {x.shape}")
+        _check_finite(argument, x, labels)
+        vectors.append(x)
     rows = vectors[0].shape[:-1]
+    t = real("inverse_dynamics: t", t)
     if t.shape not in ((), rows):
         raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
-    dtype = jnp.result_type(*vectors)
-    dtype = dtype if jnp.issubdtype(dtype, jnp.inexact) else jnp.result_type(float)
-    q, v, a = (x.astype(dtype) for x in vectors)
+    if _params.concrete(t) and not np.all(np.isfinite(t)):
+        raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
+    q, v, a = common(*vectors)
     return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
+
+
+def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
+    """Raise unless a vector or rows of them with values are finite."""
+    if not _params.concrete(x) or np.all(np.isfinite(x)):
+        return
+    values = np.asarray(x)
+    *row, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
+    where = f"{argument.split()[-1]}[{', '.join(map(str, (*row, i)))}] ({labels[i]!r})"
+    fix = "Rows that a motion did not reach are NaN: leave them out." if row else ""
+    raise bad(argument, "be finite", f"{where} was {values[(*row, i)]}", fix)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,6 +1,6 @@
 """Power: where the energy H of a motion comes from and goes to."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -47,3 +47,9 @@ class Power(eqx.Module):
             dL_dt = jax.grad(lambda t: lagrangian(t, q, v, params))(t)
             terms[EXPLICIT_TIME] = -dL_dt.astype(q.dtype)
         return terms
+
+
+def in_order(terms: Mapping[str, Any], forces: Sequence[AbstractForce]) -> dict[str, Any]:
+    """Terms of dH/dt as declared, explicit time last: a dict leaves jit in alphabetical order."""
+    names = (*(force.name for force in forces), EXPLICIT_TIME)
+    return {name: terms[name] for name in names if name in terms}

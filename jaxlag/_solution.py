@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
 from jaxlag._errors import bad
+from jaxlag._power import in_order
 from jaxlag._status import ADVICE, Status
 from jaxlag._system import System
 
@@ -126,12 +127,12 @@ class Solution(eqx.Module):
 
     @property
     def power(self) -> dict[str, Float[Array, "*batch s"]]:
-        """Terms of dH/dt by name, each (s,), W: see `System.power`."""
-        return self._quantity("power")
+        """Terms of dH/dt by name, each (s,), W, in the order of `System.power`."""
+        return in_order(self._quantity("power"), self.system.forces)
 
     @property
     def work(self) -> dict[str, Float[Array, "*batch s"]]:
-        """Work since ts[0] of every term of dH/dt by name, each (s,), J.
+        """Work since ts[0] of every term of dH/dt by name, each (s,), J, ordered as `power`.
 
         The books close: H - H(ts[0]) is the sum over all names, to the accuracy of the solve.
 
@@ -145,7 +146,7 @@ class Solution(eqx.Module):
                 f"save was {tuple(self.saved)!r}",
                 'Write simulate(..., save=("work",)): work is integrated along with the motion.',
             )
-        return self.saved["work"]
+        return in_order(self.saved["work"], self.system.forces)
 
     def message(self) -> str:
         """How a single motion ended, in words, with the coordinate and the likely remedy."""

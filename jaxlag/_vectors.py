@@ -1,13 +1,45 @@
-"""States given by the user: lists, arrays or dicts by name, as flat vectors."""
+"""Numbers given by the user: lists, arrays or dicts by name, as real arrays of one precision."""
 
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad
+
+
+def real(argument: str, x: Any) -> Array:
+    """`x` as a real inexact array of any shape; raises naming `argument` if it cannot be one."""
+    try:
+        # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
+        x = jnp.asarray(float(x) if isinstance(x, int) else x)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise bad(argument, "be real numbers", f"it was {x!r}") from error
+    if jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def common(*arrays: Array) -> list[Array]:
+    """Arrays of one dtype, the result type of all, whatever the promotion JAX is set to."""
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(*arrays)
+    return [x.astype(dtype) for x in arrays]
+
+
+def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
+    """Real arrays of one dtype from (argument, value, shape); raises naming the argument."""
+    arrays = []
+    for argument, x, shape in given:
+        x = real(argument, x)
+        if x.shape != shape:
+            fix = "Use jax.vmap for batches." if x.ndim > len(shape) else ""
+            raise bad(argument, f"have shape {shape}", f"its shape was {x.shape}", fix)
+        arrays.append(x)
+    return common(*arrays)
 
 
 def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:

@@ -7,7 +7,8 @@ inertial ones, as in `jaxlag.rotation`. Functions of the configuration are writt
     dr/dt = (dr/dq) v + dr/dt at fixed q
 
 so moving frames and prescribed motions (explicit t) are included. The results are terms of T and
-V to be added up in `System(kinetic=..., potential=...)`.
+V to be added up in `System(kinetic=..., potential=...)`, in the precision of the positions and
+velocities: masses, inertias, stiffnesses and g are brought to it.
 
 Source: Pila, Introduction to Lagrangian Dynamics, secs. 2.2 to 2.5 (eq. 2.16 for rigid bodies).
 """
@@ -18,12 +19,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag import math, rotation
-from jaxlag._errors import bad
+from jaxlag import _inertia, math, rotation
+from jaxlag._errors import bad, require_arity
 from jaxlag._params import concrete
+from jaxlag._vectors import common, real, reals
 
 Pose = Callable[[Any, Any, Any], tuple[Any, Any]]
 """`pose(t, q, params)` -> (R, r_O): rotation (3, 3) of the body axes and origin O (3,), m."""
@@ -41,8 +42,12 @@ def velocity(position: Callable, t: Any, q: Any, v: Any, params: Any) -> Float[A
 
     Returns:
         dr/dt, m/s, in the shape of r and in the same axes.
+
+    Raises:
+        ValueError: `position` is no function of (t, q, params) or returns something else than an
+            array of real numbers; q and v of different shapes; t no number.
     """
-    return _along(position, t, q, v, params)[1]
+    return _along(_located(position), t, q, v, params)[1]
 
 
 def body_velocity(
@@ -62,9 +67,10 @@ def body_velocity(
         params: handed to `pose`.
 
     Raises:
-        ValueError: `pose` returns something else than a (3, 3) and a (3,) array.
+        ValueError: `pose` is no function of (t, q, params) or returns something else than a
+            (3, 3) and a (3,) array of real numbers; q and v of different shapes; t no number.
     """
-    (R, _), (R_rate, r_rate) = _along(_checked(pose), t, q, v, params)
+    (R, _), (R_rate, r_rate) = _along(_placed(pose), t, q, v, params)
     return R.T @ r_rate, rotation.body_rates(R, R_rate)
 
 
@@ -83,9 +89,17 @@ def particles(
         params: handed to `position`.
 
     Raises:
-        ValueError: positions are not vectors, masses not one for each of them.
+        ValueError: positions are not vectors, masses not one for each of them; as `velocity`.
     """
-    return 0.5 * _weighted(mass, jnp.sum(velocity(position, t, q, v, params) ** 2, axis=-1))
+    rates = velocity(position, t, q, v, params)
+    if rates.ndim not in (1, 2):
+        raise bad(
+            "position",
+            "return a vector of shape (d,), or (k, d) for k particles",
+            f"it returned shape {rates.shape}",
+            "Return jnp.stack([x, y]), and jnp.stack([x]) where one axis is enough.",
+        )
+    return 0.5 * _weighted(mass, jnp.sum(rates**2, axis=-1))
 
 
 def gravity(mass: Any, r: Any, g: Any) -> Float[Array, ""]:
@@ -99,7 +113,7 @@ def gravity(mass: Any, r: Any, g: Any) -> Float[Array, ""]:
     Raises:
         ValueError: g is not one component for each axis; masses not one for each position.
     """
-    r, g = jnp.asarray(r), jnp.asarray(g)
+    r, g = real("gravity: r", r), real("gravity: g", g)
     if g.ndim != 1 or r.ndim == 0 or r.shape[-1] != g.shape[0]:
         raise bad(
             "gravity: g",
@@ -123,15 +137,22 @@ def spring(stiffness: Any, r: Any, length: Any = 0.0) -> Float[Array, ""]:
         length: unstretched length l0 >= 0, m.
 
     Raises:
-        ValueError: r is not one vector.
+        ValueError: r is not one vector, stiffness or length not one number; a length with a value
+            that is negative.
     """
-    r = jnp.asarray(r)
+    r = real("spring: r", r)
     if r.ndim != 1:
-        raise bad("spring: r", "be one vector", f"its shape was {r.shape}")
+        was = f"its shape was {r.shape}"
+        raise bad("spring: r", "be one vector", was, "Several springs: sum over jax.vmap.")
+    k = _inertia.number("spring: stiffness", stiffness).astype(r.dtype)
+    l0 = _inertia.number("spring: length", length)
+    if concrete(l0) and not float(l0) >= 0:
+        raise bad("spring: length", "not be negative", f"it was {l0} m")
     squared = jnp.sum(r**2)
     if isinstance(length, int | float) and length == 0:
-        return 0.5 * stiffness * squared
-    return 0.5 * stiffness * (squared - 2 * length * math.norm(r) + length**2)
+        return 0.5 * k * squared
+    l0 = l0.astype(r.dtype)
+    return 0.5 * k * (squared - 2 * l0 * math.norm(r) + l0**2)
 
 
 def inertia_matrix(
@@ -141,9 +162,13 @@ def inertia_matrix(
 
     Ix = int (y^2 + z^2) dm and so on, Ixy = int x y dm and so on; off-diagonal elements are
     -Ixy, -Ixz, -Iyz (Pila, eq. 4.175 ff.).
+
+    Raises:
+        ValueError: one of them is not a real number.
     """
-    rows = [[Ix, -Ixy, -Ixz], [-Ixy, Iy, -Iyz], [-Ixz, -Iyz, Iz]]
-    return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in rows])
+    given = {"Ix": Ix, "Iy": Iy, "Iz": Iz, "Ixy": Ixy, "Ixz": Ixz, "Iyz": Iyz}
+    values = [_inertia.number(f"inertia_matrix: {name}", x) for name, x in given.items()]
+    return _inertia.of_products(values[:3], values[3:])
 
 
 def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
@@ -153,8 +178,14 @@ def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
         inertia: I_G about the mass centre, shape (3, 3), or (3,) principal moments.
         mass: m, kg.
         centre: c from O to the mass centre in the same axes, m, shape (3,).
+
+    Raises:
+        ValueError: wrong shapes; a mass with a value that is negative or not finite.
     """
-    return _matrix(inertia) + _offset(mass, jnp.asarray(centre))
+    inertia = _inertia.matrix("parallel_axis: inertia", inertia)
+    mass = _inertia.number("parallel_axis: mass", mass)
+    _inertia.check_mass("parallel_axis: mass", mass)
+    return _inertia.carried(inertia, mass, _inertia.place("parallel_axis: centre", centre))
 
 
 class RigidBody(eqx.Module):
@@ -172,9 +203,11 @@ class RigidBody(eqx.Module):
         centre: c from O to the mass centre, body components, m, shape (3,); by default O itself.
 
     Raises:
-        ValueError: wrong shapes. For concrete values: a negative mass, an inertia that is not
-            symmetric or has a negative principal moment (named). Values traced by jit are not
-            looked at: build the body, or call `System.check`, once outside.
+        ValueError: wrong shapes, or not real numbers. Where they have values: a mass that is
+            negative, numbers that are not finite, an inertia that is not symmetric, has a
+            negative principal moment, or leaves one about the mass centre, so that it is not
+            about O (named with its axis). Values traced by jit are not looked at, numbers written
+            in a traced Lagrangian are: build the body, or call `System.check`, once outside.
 
     Source: Pila, eq. 2.16; the 6 x 6 mass matrix is [[m E, -m [c]x], [m [c]x, I_O]].
     """
@@ -184,15 +217,15 @@ class RigidBody(eqx.Module):
     centre: Float[Array, "3"] | None
 
     def __init__(self, mass: Any, inertia: Any, centre: Any = None) -> None:
-        self.mass, self.inertia = jnp.asarray(mass), _matrix(inertia)
-        self.centre = None if centre is None else jnp.asarray(centre)
-        if self.mass.ndim != 0:
-            raise bad("RigidBody: mass", "be a number", f"its shape was {self.mass.shape}")
-        if self.centre is not None and self.centre.shape != (3,):
-            must, was = "be a vector of 3 components", f"its shape was {self.centre.shape}"
-            raise bad("RigidBody: centre", must, was, "Planar bodies: (x, y, 0).")
-        if concrete(self.mass, self.inertia):
-            _check_values(self.mass, self.inertia)
+        self.mass = _inertia.number("RigidBody: mass", mass)
+        self.inertia = _inertia.matrix("RigidBody: inertia", inertia)
+        self.centre = None if centre is None else _inertia.place("RigidBody: centre", centre)
+        _inertia.check_mass("RigidBody: mass", self.mass)
+        _inertia.check_inertia("RigidBody: inertia", self.inertia)
+        if self.centre is not None:
+            _inertia.check_finite("RigidBody: centre", self.centre)
+            body = (self.inertia, self.mass, self.centre)
+            _inertia.check_about_origin("RigidBody: inertia", *body)
 
     def kinetic(self, pose: Pose, t: Any, q: Any, v: Any, params: Any) -> Float[Array, ""]:
         """T, J, of the body in the pose `pose(t, q, params)` moving at rates v.
@@ -212,10 +245,16 @@ class RigidBody(eqx.Module):
         Args:
             V: velocity of O, body components, m/s, shape (3,).
             w: body rates, rad/s, shape (3,).
+
+        Raises:
+            ValueError: V or w not of shape (3,).
         """
-        V, w = jnp.asarray(V), jnp.asarray(w)
-        T = 0.5 * self.mass * (V @ V) + 0.5 * w @ (self.inertia @ w)
-        return T if self.centre is None else T + self.mass * (V @ jnp.cross(w, self.centre))
+        V, w = reals(("V", V, (3,)), ("w", w, (3,)))
+        mass, inertia = self.mass.astype(V.dtype), self.inertia.astype(V.dtype)
+        T = 0.5 * mass * (V @ V) + 0.5 * w @ (inertia @ w)
+        if self.centre is None:
+            return T
+        return T + mass * (V @ jnp.cross(w, self.centre.astype(V.dtype)))
 
     def gravity(self, pose: Pose, t: Any, q: Any, params: Any, g: Any) -> Float[Array, ""]:
         """V = -m g . (r_O + R c), J, zero where the mass centre is at the inertial origin.
@@ -227,22 +266,45 @@ class RigidBody(eqx.Module):
             params: handed to `pose`.
             g: acceleration of free fall, inertial components, m/s^2, shape (3,).
         """
-        R, r = _checked(pose)(t, q, params)
-        return gravity(self.mass, r if self.centre is None else r + R @ self.centre, g)
+        R, r = _placed(pose)(t, q, params)
+        if self.centre is not None:
+            r = r + R @ self.centre.astype(R.dtype)
+        return gravity(self.mass, r, g)
 
 
 def _along(function: Callable, t: Any, q: Any, v: Any, params: Any) -> tuple[Any, Any]:
     """(value, time derivative) of `function(t, q, params)` along (t', q') = (1, v)."""
-    t, q, v = jnp.asarray(t, jnp.result_type(float)), jnp.asarray(q), jnp.asarray(v)
+    t = _inertia.number("t", t).astype(jnp.result_type(float))
+    q, v = common(real("q", q), real("v", v))
+    if v.shape != q.shape:
+        was = f"their shapes were {v.shape} and {q.shape}"
+        raise bad("v", "have the shape of q", was, "Give one velocity for each coordinate.")
     return jax.jvp(lambda t, q: function(t, q, params), (t, q), (jnp.ones_like(t), v))
 
 
-def _checked(pose: Pose) -> Pose:
-    def checked(t: Any, q: Any, params: Any) -> tuple[Array, Array]:
+def _located(position: Callable) -> Callable:
+    """`position`, raising in our form while it is traced unless it returns a real array."""
+    require_arity("position", position, ("t", "q", "params"))
+
+    def located(t: Any, q: Any, params: Any) -> Array:
+        value = position(t, q, params)
+        if not eqx.is_array_like(value):
+            fix = "Return jnp.stack([x, y]), several points as jnp.stack([r1, r2])."
+            raise bad("position", "return an array", f"it returned {type(value).__name__}", fix)
+        return real("position", value)
+
+    return located
+
+
+def _placed(pose: Pose) -> Pose:
+    """`pose`, raising in our form unless it returns (R, r_O); both of one dtype."""
+    require_arity("pose", pose, ("t", "q", "params"))
+
+    def placed(t: Any, q: Any, params: Any) -> tuple[Array, Array]:
         value = pose(t, q, params)
         if not isinstance(value, tuple | list) or len(value) != 2:
             raise bad("pose", "return the pair (R, r_O)", f"it returned {type(value).__name__}")
-        R, r = map(jnp.asarray, value)
+        R, r = common(real("pose: R", value[0]), real("pose: r_O", value[1]))
         if R.shape != (3, 3) or r.shape != (3,):
             raise bad(
                 "pose",
@@ -252,52 +314,15 @@ def _checked(pose: Pose) -> Pose:
             )
         return R, r
 
-    return checked
+    return placed
 
 
 def _weighted(mass: Any, values: Array) -> Array:
-    mass = jnp.asarray(mass)
+    mass = real("mass", mass)
     if mass.shape not in ((), values.shape) or values.ndim > 1:
         raise bad(
             "mass",
             "be a number, or one for each of the positions",
             f"its shape was {mass.shape}, the positions' (..., d) with {values.shape} in front",
         )
-    return jnp.sum(mass * values)
-
-
-def _matrix(inertia: Any) -> Array:
-    inertia = jnp.asarray(inertia)
-    if inertia.shape == (3,):
-        return jnp.diag(inertia)
-    if inertia.shape != (3, 3):
-        must, was = "be (3, 3), or (3,) principal moments", f"its shape was {inertia.shape}"
-        raise bad("inertia", must, was, "Planar bodies: (0, 0, Iz).")
-    return inertia
-
-
-def _offset(mass: Any, c: Array) -> Array:
-    return mass * (jnp.sum(c**2) * jnp.eye(3, dtype=c.dtype) - jnp.outer(c, c))
-
-
-def _check_values(mass: Array, inertia: Array) -> None:
-    """Raise unless T is non-negative for every rotation, up to rounding; values are concrete."""
-    if not mass >= 0:
-        raise bad("RigidBody: mass", "not be negative", f"it was {mass} kg")
-    matrix = np.asarray(inertia)
-    if not np.all(np.isfinite(matrix)):
-        raise bad("RigidBody: inertia", "be finite", f"it was {matrix.tolist()}")
-    slack = 8 * np.finfo(matrix.dtype).eps * np.max(np.abs(matrix))
-    if not np.all(np.abs(matrix - matrix.T) <= slack):
-        i, j = np.unravel_index(np.argmax(np.abs(matrix - matrix.T)), (3, 3))
-        was = f"element ({i}, {j}) was {matrix[i, j]} and ({j}, {i}) was {matrix[j, i]}"
-        raise bad("RigidBody: inertia", "be symmetric", was, "Use energy.inertia_matrix.")
-    moments, axes = np.linalg.eigh(matrix)
-    if not moments[0] >= -slack:
-        axis = ", ".join(f"{x:.3g}" for x in axes[:, 0])
-        raise bad(
-            "RigidBody: inertia",
-            "have no negative principal moment",
-            f"its eigenvalue about the axis ({axis}) was {moments[0]:.6g} kg m^2",
-            "Products of inertia enter with a minus sign: see energy.inertia_matrix.",
-        )
+    return jnp.sum(mass.astype(values.dtype) * values)

@@ -16,28 +16,11 @@ from typing import Any, ClassVar, final
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxlag._errors import bad
-
-
-def _arrays(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
-    """Real arrays of one dtype from (argument, value, shape); raises naming the argument."""
-    arrays = []
-    for argument, x, shape in given:
-        try:
-            x = jnp.asarray(x)
-        except (TypeError, ValueError) as error:
-            raise bad(argument, "be real numbers", f"it was {x!r}") from error
-        if x.shape != shape:
-            fix = "Use jax.vmap for batches." if x.ndim > len(shape) else ""
-            raise bad(argument, f"have shape {shape}", f"its shape was {x.shape}", fix)
-        if jnp.issubdtype(x.dtype, jnp.complexfloating):
-            raise bad(argument, "be real", f"its dtype was {x.dtype}")
-        floating = jnp.issubdtype(x.dtype, jnp.floating)
-        arrays.append(x if floating else x.astype(jnp.result_type(float)))
-    dtype = jnp.result_type(*arrays)
-    return [x.astype(dtype) for x in arrays]
+from jaxlag._vectors import reals
 
 
 def _times(A: Array, B: Array) -> Array:
@@ -63,7 +46,7 @@ def skew(a: Any) -> Float[Array, "3 3"]:
 
     Source: Pila, ch. 1, where the symbol Omega-hat is -[w]x.
     """
-    ((x, y, z),) = _arrays(("a", a, (3,)))
+    ((x, y, z),) = reals(("a", a, (3,)))
     zero = jnp.zeros_like(x)
     return _rows((zero, -z, y), (z, zero, -x), (-y, x, zero))
 
@@ -79,12 +62,12 @@ def unskew(S: Any) -> Float[Array, "3"]:
 
     Source: inverse of [a]x (Pila, ch. 1).
     """
-    (S,) = _arrays(("S", S, (3, 3)))
+    (S,) = reals(("S", S, (3, 3)))
     return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
 
 
 def _about(axis: int, angle: Any) -> Array:
-    (angle,) = _arrays(("angle", angle, ()))
+    (angle,) = reals(("angle", angle, ()))
     s, c = jnp.sin(angle), jnp.cos(angle)
     one, zero = jnp.ones_like(s), jnp.zeros_like(s)
     about_z = _rows((c, -s, zero), (s, c, zero), (zero, zero, one))
@@ -131,7 +114,7 @@ def compose(*rotations: Any) -> Float[Array, "3 3"]:
     """
     if not rotations:
         raise bad("rotations", "hold at least one matrix", "none was given")
-    first, *others = _arrays(*((f"rotations[{i}]", R, (3, 3)) for i, R in enumerate(rotations)))
+    first, *others = reals(*((f"rotations[{i}]", R, (3, 3)) for i, R in enumerate(rotations)))
     for R in others:
         first = _times(first, R)
     return first
@@ -150,7 +133,7 @@ def direction_cosines(R: Any) -> Float[Array, "3 3"]:
 
     Source: Pila, ch. 1, eq. 1.15 ff.
     """
-    (R,) = _arrays(("R", R, (3, 3)))
+    (R,) = reals(("R", R, (3, 3)))
     return R.T
 
 
@@ -166,13 +149,13 @@ def body_rates(R: Any, R_dot: Any) -> Float[Array, "3"]:
 
     Source: Pila, ch. 1: d/dt T_I/B = T_I/B [w]x.
     """
-    R, R_dot = _arrays(("R", R, (3, 3)), ("R_dot", R_dot, (3, 3)))
+    R, R_dot = reals(("R", R, (3, 3)), ("R_dot", R_dot, (3, 3)))
     return unskew(_times(R.T, R_dot))
 
 
 def space_rates(R: Any, R_dot: Any) -> Float[Array, "3"]:
     """Angular velocity in inertial components, [w]x = R_dot R^T; else as `body_rates`."""
-    R, R_dot = _arrays(("R", R, (3, 3)), ("R_dot", R_dot, (3, 3)))
+    R, R_dot = reals(("R", R, (3, 3)), ("R_dot", R_dot, (3, 3)))
     return unskew(_times(R_dot, R.T))
 
 
@@ -205,7 +188,7 @@ class AbstractParametrisation(eqx.Module):
         Args:
             R: body to inertial, shape (3, 3), a proper rotation (not checked).
         """
-        (R,) = _arrays(("R", R, (3, 3)))
+        (R,) = reals(("R", R, (3, 3)))
         return self._from_matrix(R)
 
     def body_rate_matrix(self, x: Any) -> Float[Array, "3 n"]:
@@ -250,7 +233,7 @@ class AbstractParametrisation(eqx.Module):
         return self._from_body_rates(x, _times(self._matrix(x).T, w))
 
     def _read(self, x: Any, *others: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
-        return _arrays(("x", x, (len(self.names),)), *others)
+        return reals(("x", x, (len(self.names),)), *others)
 
     @abstractmethod
     def _matrix(self, x: Array) -> Array: ...
@@ -403,7 +386,7 @@ class Quaternion(AbstractParametrisation):
             a: shape (4,), scalar first.
             b: shape (4,), scalar first.
         """
-        a, b = _arrays(("a", a, (4,)), ("b", b, (4,)))
+        a, b = reals(("a", a, (4,)), ("b", b, (4,)))
         return _multiply(a, b)
 
     def conjugate(self, a: Any) -> Float[Array, "4"]:
@@ -412,11 +395,11 @@ class Quaternion(AbstractParametrisation):
         Args:
             a: shape (4,), scalar first.
         """
-        (a,) = _arrays(("a", a, (4,)))
+        (a,) = reals(("a", a, (4,)))
         return jnp.concatenate([a[:1], -a[1:]])
 
     def _matrix(self, x: Array) -> Array:
-        e0, e1, e2, e3 = x
+        e0, e1, e2, e3 = x / _largest(x)
         a, b, c, d = e0 * e0, e1 * e1, e2 * e2, e3 * e3
         return _rows(
             (a + b - c - d, 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)),
@@ -439,12 +422,22 @@ class Quaternion(AbstractParametrisation):
         return row / jnp.where(row[0] < 0, -norm, norm)
 
     def _body_rate_matrix(self, x: Array) -> Array:
+        scale = _largest(x)
+        x = x / scale
         e0, e1, e2, e3 = x
         rows = _rows((-e1, e0, e3, -e2), (-e2, -e3, e0, e1), (-e3, e2, -e1, e0))
-        return 2 * rows / jnp.sum(x * x)
+        return 2 * rows / jnp.sum(x * x) / scale
 
     def _from_body_rates(self, x: Array, w: Array) -> Array:
         return 0.5 * _multiply(x, jnp.concatenate([jnp.zeros_like(w[:1]), w]))
+
+
+def _largest(x: Array) -> Array:
+    """max|x_i|, by which squares neither overflow nor underflow.
+
+    R(x/s) = R(x) and W(x/s)/s = W(x) for every number s, so no derivative of s is taken.
+    """
+    return jnp.max(jnp.abs(stop_gradient(x)))
 
 
 def _multiply(a: Array, b: Array) -> Array:

@@ -55,7 +55,7 @@ def _parser() -> ArgumentParser:
 
 def _list() -> int:
     for name, entry in ENTRIES.items():
-        print(f"{name:<26} {', '.join(entry.coordinates):<16} {entry.book}")
+        print(f"{name:<32} {', '.join(entry.coordinates):<16} {entry.book}")
     return 0
 
 

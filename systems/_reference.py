@@ -13,7 +13,15 @@ from typing import Any
 from systems._cases import Case, members, read_case
 from systems._catalogue import UnknownSystem, find
 from systems._entry import AbstractEntry
-from systems._fields import InvalidReference, check_fields, check_text, check_texts, distinct, fail
+from systems._fields import (
+    InvalidReference,
+    check_fields,
+    check_text,
+    check_texts,
+    distinct,
+    fail,
+    shown,
+)
 
 SCHEMA = "jaxlag-reference/1"
 
@@ -48,8 +56,10 @@ def read(raw: Any) -> Reference:
     check_fields("the file", raw, _REQUIRED, _OPTIONAL)
     if raw["schema"] != SCHEMA:
         fail("schema", f"be {SCHEMA!r}", f"it was {raw['schema']!r}")
-    for field in ("system", *_TEXTS):
+    for field in _TEXTS:
         check_text(field, raw.get(field))
+    if not isinstance(raw["system"], str):
+        fail("system", "be text", f"it was {shown(raw['system'])}")
     try:
         entry = find(raw["system"])
     except UnknownSystem as error:
@@ -66,5 +76,9 @@ def read(raw: Any) -> Reference:
     check_texts("extras", raw.get("extras", {}), members(entry, "extras"))
     if not isinstance(raw["cases"], list) or not raw["cases"]:
         fail("cases", "be a list of at least one case", f"it was {raw['cases']!r}")
-    cases = (read_case(entry, index, case) for index, case in enumerate(raw["cases"]))
-    return Reference(entry, tuple(cases))
+    cases = tuple(read_case(entry, index, case) for index, case in enumerate(raw["cases"]))
+    names = [case.name for case in cases]
+    for name in names:
+        if names.count(name) > 1:
+            fail("cases", "have distinct names", f"{names.count(name)} were called {name!r}")
+    return Reference(entry, cases)

@@ -238,6 +238,10 @@ def test_bodies_may_be_params_and_fitted():
         ([[1, 0.9, 0], [0.9, 0.5, 0], [0, 0, 1]], "was -0.184077 kg m^2. Products of inertia"),
         ([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]], "be symmetric, but element (0, 1) was 0.1 and (1, 0"),
         (np.eye(3) * np.nan, "inertia must be finite"),
+        ([1.0, np.inf, 1.0], "inertia must be finite"),
+        ([1.0, 1.0, 1j], "inertia must be real, but its dtype was complex128"),
+        (None, "inertia must be real numbers, but it was None"),
+        ([[1, 2], [3]], "inertia must be real numbers, but it was [[1, 2], [3]]"),
         (np.eye(2), "inertia must be (3, 3), or (3,) principal moments, but its shape was (2, 2)"),
         (1.0, "inertia must be (3, 3), or (3,) principal moments, but its shape was ()"),
     ],
@@ -262,10 +266,128 @@ def test_check_finds_it_in_a_declared_system():
         system.check({"I": -0.4}, *state)
 
 
+def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
+    """Literals are values under jit too, each by itself; what is traced is left alone."""
+
+    def kinetic(mass, inertia, centre=None):
+        return energy.RigidBody(mass, inertia, centre).kinetic_from_rates(np.ones(3), np.ones(3))
+
+    principal, central = "have no negative principal moment", "use energy.parallel_axis"
+    for function, given, message in [
+        (lambda m: kinetic(m, [1.0, 2.0, -3.0]), 1.0, principal),
+        (lambda m: kinetic(1.0, [1.0, 2.0, -3.0]), 1.0, principal),
+        (lambda m: kinetic(1.0, energy.inertia_matrix(1.0, 2.0, -3.0)), 1.0, principal),
+        (lambda m: kinetic(m, energy.inertia_matrix(1, 1, 1, 3)), 1.0, principal),
+        (lambda inertia: kinetic(-1.0, inertia), np.ones(3), "mass must not be negative"),
+        (lambda m: kinetic(m, [1, 1, 1], [0, 0, np.nan]), 1.0, "centre must be finite"),
+        (lambda m: kinetic(1.0, [0.1, 0.1, 0.1], [1, 0, 0]), 1.0, central),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            jax.jit(function)(given)
+    about_g = energy.parallel_axis([0.1, 0.1, 0.1], 1.0, [1.0, 0.0, 0.0])
+    for mass in (1.0, 9.0):  # traced: the second would be refused
+        jax.jit(lambda m: kinetic(m, about_g, [1.0, 0.0, 0.0]))(mass)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_an_inertia_about_the_mass_centre_is_refused(dtype):
+    """I_G given for I_O: T = -0.45 J for a motion of 1 m/s and 1 rad/s, were it taken."""
+    central, c = np.full(3, 0.1, dtype), np.array([1.0, 0.0, 0.0], dtype)
+    message = (
+        "RigidBody: inertia must be at least that of the mass at its centre, m (|c|^2 E - c c^T), "
+        "but what is left, the inertia about the mass centre, has the eigenvalue -0.9 kg m^2 about "
+        "the axis (0, "
+    )
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        energy.RigidBody(1.0, central, c)
+    advice = "The inertia is about the body's origin: use energy.parallel_axis."
+    assert str(caught.value).endswith(advice)
+    body = energy.RigidBody(1.0, energy.parallel_axis(central, 1.0, c), c)
+    assert body.kinetic_from_rates([0, -1, 0], [0, 0, 1]) > 0
+    with pytest.raises(ValueError, match=r"about the axis \(0, 0, 1\)\. The inertia is about"):
+        energy.RigidBody(2.0, (0.0, 0.0, 0.1), (0.3, 0.2, 0.0))
+
+
+def test_a_point_mass_is_a_body():
+    """Nothing is left about the mass centre, up to rounding, wherever that is."""
+    for c in np.random.default_rng(5).normal(size=(100, 3)):
+        for dtype in (np.float64, np.float32):
+            c_mass, zero = np.array([*c, 0.7], dtype), np.zeros((3, 3), dtype)
+            inertia = energy.parallel_axis(zero, c_mass[3], c_mass[:3])
+            energy.RigidBody(c_mass[3], inertia, c_mass[:3])
+
+
 def test_slender_and_plane_bodies_are_allowed():
     energy.RigidBody(1.0, (0.2, 0.0, 0.2))
+    energy.RigidBody(1.0, (0.2, 0.0, 0.2), (0.0, 0.4, 0.0))
     energy.RigidBody(1.0, (0.0, 0.0, 0.3), (0.4, 0.1, 0.0))
+    energy.RigidBody(1.0, (0.0, 0.0, 0.0), (0.4, 0.1, 0.0))
     energy.RigidBody(0.0, np.zeros((3, 3)))
+
+
+def test_a_body_may_be_given_in_integers():
+    """Under the tests' strict promotion, too; the mass is a number to differentiate by."""
+    whole = energy.RigidBody(2, [2, 5, 5], [1, 0, 0])
+    same = energy.RigidBody(2.0, np.diag([2.0, 5.0, 5.0]), [1.0, 0.0, 0.0])
+    assert all(jnp.issubdtype(x.dtype, jnp.floating) for x in jax.tree.leaves(whole))
+    V, w = [1, 2, 3], np.array([3, 1, 2])
+    np.testing.assert_array_equal(whole.kinetic_from_rates(V, w), same.kinetic_from_rates(V, w))
+    eye = energy.RigidBody(1, np.eye(3, dtype=int))
+    np.testing.assert_array_equal(eye.kinetic_from_rates(V, w), 14)
+    np.testing.assert_array_equal(energy.inertia_matrix(1, 2, 3), np.diag([1.0, 2.0, 3.0]))
+    assert jax.grad(lambda body: body.kinetic_from_rates(V, w))(eye).mass == 7
+
+
+def test_integers_are_not_rounded_to():
+    """9.81 m/s^2 stays 9.81 along integer positions."""
+    np.testing.assert_allclose(energy.gravity(2.0, jnp.array([0, 2]), [0.0, -9.81]), 4 * 9.81)
+    np.testing.assert_allclose(energy.gravity(2, [0, 2], [0, -10]), 40)
+
+    def pose(t, q, params):
+        return jnp.eye(3, dtype=int), [0, 2, 0]
+
+    for body in (energy.RigidBody(2, [1, 1, 1]), energy.RigidBody(2.0, [1, 3, 3], [0.5, 0, 0])):
+        V = body.gravity(pose, T, [1, 2], None, [0.0, -9.81, 0.0])
+        np.testing.assert_allclose(V, 4 * 9.81)
+        assert body.kinetic(pose, T, [1, 2], [1, 2], None) == 0
+    np.testing.assert_allclose(energy.spring(2, [3, 4], 4), 1)
+
+
+def test_coordinates_and_velocities_are_brought_to_one_precision():
+    """Integers and mixed precisions, whatever promotion JAX is set to."""
+
+    def point(t, q, params):
+        return q**2
+
+    exact = energy.velocity(point, T, np.array([1.0, 2.0]), np.array([3.0, 4.0]), None)
+    np.testing.assert_array_equal(exact, [6.0, 16.0])
+    for q, v in [
+        ([1, 2], [3, 4]),
+        (np.array([1, 2], np.float32), np.array([3.0, 4.0])),
+        (np.array([1.0, 2.0]), np.array([3, 4])),
+    ]:
+        np.testing.assert_array_equal(energy.velocity(point, 0, q, v, None), exact)
+    np.testing.assert_array_equal(
+        energy.velocity(lambda t, q, params: jnp.arange(3), T, [1.0], [1.0], None), np.zeros(3)
+    )
+
+
+def test_energies_keep_the_precision_of_the_state():
+    """Bodies, masses, stiffnesses and g in float64, as Python lists are, the state in float32."""
+    q, v = (jnp.asarray(x, jnp.float32) for x in (np.ones(3), np.arange(3)))
+
+    def pose(t, q, params):
+        return jnp.eye(3, dtype=q.dtype), q
+
+    body, g = energy.RigidBody(1.0, [1.0, 2.0, 2.0], [0.1, 0.0, 0.0]), [0.0, 0.0, -9.81]
+    for found in (
+        body.kinetic(pose, T, q, v, None),
+        body.gravity(pose, T, q, None, g),
+        energy.particles(lambda t, q, params: q, np.array(2.0), T, q, v, None),
+        energy.gravity(np.array(2.0), q, g),
+        energy.spring(np.array(2.0), q, np.array(0.5)),
+    ):
+        assert found.dtype == jnp.float32
 
 
 def wrong():
@@ -295,6 +417,89 @@ def wrong():
         lambda: energy.body_velocity(lambda t, q, p: q, T, zero, zero, None),
         "pose must return the pair (R, r_O), but it returned JVPTracer",
     )
+    yield (
+        "pose numbers",
+        lambda: energy.body_velocity(lambda t, q, p: ("R", q), T, zero, zero, None),
+        "pose: R must be real numbers, but it was 'R'",
+    )
+    yield (
+        "pose arity",
+        lambda: energy.body_velocity(lambda t, q: (unit, q), T, zero, zero, None),
+        "pose must be callable as (t, q, params), but its signature was (t, q)",
+    )
+
+    def along(position, q=zero, v=zero, t=T):
+        return lambda: energy.particles(position, 1.0, t, q, v, None)
+
+    yield (
+        "scalar",
+        along(lambda t, q, p: q[0]),
+        "position must return a vector of shape (d,), or (k, d) for k particles, but it returned "
+        "shape (). Return jnp.stack([x, y])",
+    )
+    yield (
+        "list",
+        along(lambda t, q, p: [q[0], q[1]]),
+        "position must return an array, but it returned list. Return jnp.stack([x, y])",
+    )
+    yield "none", along(lambda t, q, p: None), "position must return an array, but it returned None"
+    yield (
+        "complex",
+        along(lambda t, q, p: jax.lax.complex(q, q)),
+        "position must be real, but its dtype was compl",
+    )
+    yield "arity", along(lambda t, q: q), "position must be callable as (t, q, params), but its sig"
+    here = along(lambda t, q, p: q, v=[1.0, 2.0])
+    yield "v", here, "v must have the shape of q, but their shapes were (2,) and (3,). Give one"
+    yield "q", along(lambda t, q, p: q, q="abc"), "q must be real numbers, but it was 'abc'."
+    yield "t", along(lambda t, q, p: q, t=zero), "t must be a number, but its shape was (3,)."
+    body = energy.RigidBody(1.0, unit)
+    yield "V", lambda: body.kinetic_from_rates(1.0, zero), "V must have shape (3,), but its shape"
+    yield "w", lambda: body.kinetic_from_rates(zero, None), "w must be real numbers, but it was No"
+    yield "nan", lambda: energy.RigidBody(np.nan, unit), "RigidBody: mass must be finite, but it"
+    yield "text", lambda: energy.RigidBody("1", unit), "RigidBody: mass must be real numbers, but"
+    yield "1j", lambda: energy.RigidBody(1j, unit), "RigidBody: mass must be real, but its dtype"
+    yield (
+        "infinite",
+        lambda: energy.RigidBody(1.0, unit, [0, np.inf, 0]),
+        "RigidBody: centre must be finite, but it was [0.0, inf, 0.0]",
+    )
+    yield (
+        "axis centre",
+        lambda: energy.parallel_axis(unit, 1.0, [1.0, 2.0]),
+        "parallel_axis: centre must be a vector of 3 components, but its shape was (2,)",
+    )
+    yield (
+        "axis mass",
+        lambda: energy.parallel_axis(unit, -1.0, zero),
+        "parallel_axis: mass must not be negative, but it was -1.0 kg",
+    )
+    yield (
+        "axis masses",
+        lambda: energy.parallel_axis(unit, np.ones(3), zero),
+        "parallel_axis: mass must be a number, but its shape was (3,)",
+    )
+    yield (
+        "products",
+        lambda: energy.inertia_matrix(1.0, 2.0, 3.0, Ixz=[0.1]),
+        "inertia_matrix: Ixz must be a number, but its shape was (1,)",
+    )
+    yield (
+        "stiffness",
+        lambda: energy.spring(np.ones(3), zero),
+        "spring: stiffness must be a number, but its shape was (3,)",
+    )
+    yield (
+        "length",
+        lambda: energy.spring(1.0, zero, np.ones(3)),
+        "spring: length must be a number, but its shape was (3,)",
+    )
+    yield (
+        "negative",
+        lambda: energy.spring(1.0, zero, -0.1),
+        "spring: length must not be negative, but it was -0.1 m",
+    )
+    yield "gravity r", lambda: energy.gravity(1.0, None, zero), "gravity: r must be real numbers"
 
 
 @pytest.mark.parametrize(("call", "message"), [w[1:] for w in wrong()], ids=[w[0] for w in wrong()])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from _jaxprs import names, operations
 from _mechanics import GENERAL
+from _user import unchecked  # noqa: F401
 from problems import MOTIONS
 
 import jaxlag as jl
@@ -161,6 +162,20 @@ def wrong():
     yield "t", (rows, rows, rows), {"t": np.zeros(4)}, "t must have shape () or (3,), but its shape"
     yield "ndim", (rows[None],) * 3, {}, "q must have shape (2,) or (s, 2)"
     yield "complex", (rows, rows * 1j, rows), {}, "v must be real, but its dtype was complex128"
+    yield "text", ("ab", rows, rows), {}, "q must be real numbers, but it was 'ab'."
+    yield "none", (rows, rows, None), {}, "a must be real numbers, but it was None."
+    yield "empty", (rows[:0],) * 3, {}, "q must hold at least one instant, but its shape was (0, 2)"
+    yield (
+        "nan",
+        (rows, np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]]), rows),
+        {},
+        "v must be finite, but v[1, 1] ('theta2') was nan. Rows that a motion did not reach are",
+    )
+    yield "inf", ([0.0, 1.0], [0.0, 1.0], [np.inf, 0.0]), {}, "a must be finite, but a[0] ('theta1"
+    yield "t nan", (rows, rows, rows), {"t": np.nan}, "t must be finite, but it was nan"
+    yield "t text", (rows, rows, rows), {"t": "now"}, "t must be real numbers, but it was 'now'"
+    named = {"theta1": 0.1, "theta3": 0.2}
+    yield "names", (named,) * 3, {}, "q must name exactly ['theta1', 'theta2'], but it named ['th"
 
 
 @pytest.mark.parametrize(
@@ -170,6 +185,54 @@ def test_a_motion_of_wrong_shape_is_refused(motion, rest, message):
     system = MOTIONS["double_pendulum"].system
     with pytest.raises(ValueError, match=re.escape(f"inverse_dynamics: {message}")):
         jl.inverse_dynamics(system, *motion, MOTIONS["double_pendulum"].params, **rest)
+
+
+def test_states_may_be_given_by_name():
+    """As `simulate` takes them, in any order."""
+    motion = MOTIONS["double_pendulum"]
+    system, params = motion.system, motion.params
+    plain = jl.inverse_dynamics(system, [0.1, 0.2], [0.3, -0.4], [0.5, 0.6], params)
+    q, v = {"theta2": 0.2, "theta1": 0.1}, {"theta1": 0.3, "theta2": -0.4}
+    named = jl.inverse_dynamics(system, q, v, [0.5, 0.6], params)
+    np.testing.assert_array_equal(named, plain)
+
+
+def test_precisions_are_brought_to_one():
+    motion = MOTIONS["double_pendulum"]
+    single = np.array([0.5, -0.25], np.float32)
+    mixed = jl.inverse_dynamics(motion.system, single, [1, 2], np.array([0.5, 1.0]), motion.params)
+    double = single.astype(float)
+    same = jl.inverse_dynamics(motion.system, double, [1.0, 2.0], [0.5, 1.0], motion.params)
+    assert mixed.dtype == np.float64
+    np.testing.assert_array_equal(mixed, same)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_system_is_refused():
+    with pytest.raises(ValueError, match=r"inverse_dynamics: system must be a jl\.System, but it "):
+        jl.inverse_dynamics("S", [0.1], [0.1], [0.1])
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("motion", "t", "message"),
+    [
+        (jnp.zeros(2), 0.0, "motion must be a function of (t), but it was"),
+        (lambda t, params: t, 0.0, "motion must be callable as (t), but its signature was (t, par"),
+        (
+            lambda t: jax.lax.complex(t, t)[None],
+            0.0,
+            "what motion returns must be real, but its dtype",
+        ),
+        (lambda t: t * jnp.ones(2), "now", "t must be real numbers, but it was 'now'"),
+        (lambda t: t * jnp.ones(2), None, "t must be real numbers, but it was None"),
+        (lambda t: t * jnp.ones(2), 1j, "t must be real, but its dtype was complex128"),
+        (lambda t: t * jnp.ones(2), np.ones((2, 2)), "t must be an instant or a row of them, but"),
+    ],
+)
+def test_a_motion_that_cannot_be_led_is_refused(motion, t, message):
+    with pytest.raises(ValueError, match=re.escape(f"prescribed_motion: {message}")):
+        jl.prescribed_motion(motion, t)
 
 
 @pytest.mark.parametrize("motion", [lambda t: t, lambda t: jnp.zeros((2, 2)), lambda t: None])

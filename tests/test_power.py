@@ -86,6 +86,30 @@ def test_explicit_time_has_a_term_of_its_own():
     assert motion.work == {}
 
 
+def test_the_terms_keep_the_order_of_the_forces():
+    """Explicit time last; through jit, vmap and `save`, which hand dicts back alphabetically."""
+    forces = tuple(
+        jl.GeneralizedForce(lambda t, q, v, params: -v, name) for name in ("wind", "brake", "motor")
+    )
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v - t * q[0], coordinates=("x",), forces=forces
+    )
+    order = ["wind", "brake", "motor", "explicit time"]
+    assert list(system.power(None, [0.1], [0.2])) == order
+    ts = jnp.array([0.0, 0.1])
+
+    def run(q0, save=("work", "power")):
+        return jl.simulate(system, q0, [0.2], ts, save=save)
+
+    motion = run(jnp.array([0.1]))
+    assert list(motion.work) == list(motion.power) == order
+    assert list(run(jnp.array([0.1]), ()).power) == order
+    batch = jax.jit(jax.vmap(run))(jnp.array([[0.1], [0.2]]))
+    assert list(batch.work) == list(batch.power) == order
+    for name in order:
+        np.testing.assert_array_equal(motion.work[name], motion.saved["work"][name])
+
+
 def test_power_is_the_rate_of_work():
     """The derivative of a row of work in its own time is the power there.
 

@@ -424,6 +424,40 @@ def test_from_matrix_has_no_derivative_at_gimbal_lock(kind):
             assert np.all(np.isnan(moved[jnp.array([0, 2])]))
 
 
+@pytest.mark.parametrize(("dtype", "powers"), [(np.float64, (-565, 565)), (np.float32, (-77, 90))])
+def test_quaternions_of_extreme_norms_are_rotations(dtype, powers):
+    """Squares of 2^-565 and 2^565 under- and overflow; R and its derivatives in e/s do not."""
+    e, e_dot = (np.random.default_rng(23).normal(size=(2, 4))).astype(dtype)
+
+    def rates(x, x_dot):
+        moved = jax.jvp(quaternion.matrix, (x,), (x_dot,))[1]
+        return quaternion.matrix(x), quaternion.body_rates(x, x_dot), moved
+
+    expected = rates(e, e_dot)
+    for power in powers:
+        scale = dtype(2.0) ** dtype(power)
+        for found, right in zip(rates(scale * e, scale * e_dot), expected, strict=True):
+            np.testing.assert_array_equal(found, right)
+
+
+def test_the_scale_of_a_quaternion_has_no_part_in_its_derivatives():
+    """To second order, forward and reverse, against R written out with sums of squares."""
+
+    def plain(x):
+        a, b, c, d = x
+        first = jnp.stack([a * a + b * b - c * c - d * d, 2 * (b * c + a * d), 2 * (b * d - a * c)])
+        return first / (x @ x)
+
+    def ours(x):
+        return quaternion.matrix(x)[:, 0]
+
+    x = jnp.array([0.7, -1.3, 0.2, 0.9])
+    for order in range(3):
+        found, expected = jax.jit(lambda x, f=ours, g=plain: (f(x), g(x)))(x)
+        np.testing.assert_allclose(found, expected, atol=32 * EPS * np.max(np.abs(expected)))
+        ours, plain = (jax.jacfwd if order else jax.jacrev)(ours), jax.jacfwd(plain)
+
+
 def test_the_zero_quaternion_is_no_rotation():
     assert np.all(np.isnan(quaternion.matrix(np.zeros(4))))
     assert np.all(np.isnan(quaternion.body_rates(np.zeros(4), np.ones(4))))

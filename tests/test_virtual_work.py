@@ -180,7 +180,32 @@ def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
 @pytest.mark.parametrize(
     "rates",
     [
+        lambda t, q, v, params: jax.lax.fori_loop(
+            0, 3, lambda i, w: w + jnp.sin(q[i]) * v[i], jnp.zeros(())
+        ),
+        lambda t, q, v, params: jax.lax.scan(lambda w, x: (w + x, None), jnp.zeros(()), v)[0],
+        lambda t, q, v, params: jax.lax.cond(
+            q[0] > 0, lambda v: q[1] * v[:3], lambda v: 2 * v[:3], v
+        ),
+        lambda t, q, v, params: q[0] * v[:3] ** 1.0,
+    ],
+    ids=["fori_loop", "scan", "cond on q", "real power"],
+)
+def test_an_angular_velocity_may_come_from_loops_and_choices(rates):
+    """Affine in v however it is written: dw/dv at one v is that at another."""
+    tau = jnp.ones_like(rates(T, Q, V, PARAMS))
+    found = force_of(jl.Couple(rates, lambda t, q, v, params: tau, "motor"))
+    expected = jnp.tensordot(tau, jax.jacfwd(lambda v: rates(T, Q, v, PARAMS))(0 * V + 1), tau.ndim)
+    np.testing.assert_allclose(found, expected, atol=8 * EPS)
+    assert np.max(np.abs(found)) > 0.1
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [
         lambda t, q, v, params: v[:3] ** 2,
+        lambda t, q, v, params: jax.lax.fori_loop(0, 3, lambda i, w: w * v[i], jnp.ones(())),
+        lambda t, q, v, params: jax.lax.cond(v[0] > 0, lambda v: v[:3], lambda v: 2 * v[:3], v),
         lambda t, q, v, params: v[0] * v[1],
         lambda t, q, v, params: jnp.sin(v[:3]),
         lambda t, q, v, params: jnp.where(v[0] > 0, v[:3], 2 * v[:3]),
@@ -196,7 +221,7 @@ def test_an_angular_velocity_that_is_not_affine_is_refused(rates):
         {"q": (N,)},
         forces=(jl.Couple(rates, torque, "motor"),),
     )
-    message = r"couple 'motor': angular_velocity must be affine in v, but its derivative dw/dv"
+    message = r"couple 'motor': angular_velocity must be affine in v, but its derivative dw/dv depe"
     with pytest.raises(ValueError, match=message):
         system.acceleration(PARAMS, Q, V)
     with pytest.raises(ValueError, match=message):

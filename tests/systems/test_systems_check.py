@@ -178,17 +178,19 @@ def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
 
 
 def test_a_refused_file_does_not_hide_the_others(tmp_path, capsys):
-    bad = harmonic()
+    bad, nameless = harmonic(), harmonic() | {"system": None}
     bad["cases"][0]["energy"]["W"] = [0.0] * 6
     files = [
         written(tmp_path / "bad.json", bad),
         written(tmp_path / "right.json", harmonic()),
         str(tmp_path / "none.json"),
+        written(tmp_path / "nameless.json", nameless),
     ]
     assert main(["check", *files]) == 1
     captured = capsys.readouterr()
-    first, second = captured.err.splitlines()
+    first, second, third = captured.err.splitlines()
     assert first.startswith(f"{files[0]}: case 'base': energy must hold known fields only")
     assert second == f"{files[2]}: it must be readable, but No such file or directory."
+    assert third == f"{files[3]}: system must be text, but it was None."
     assert captured.out.splitlines()[0].startswith("ok    right.json")
-    assert captured.out.splitlines()[-1] == "files 3, cases 1: all within tolerance, 2 refused"
+    assert captured.out.splitlines()[-1] == "files 4, cases 1: all within tolerance, 3 refused"

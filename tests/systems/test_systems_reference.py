@@ -90,7 +90,8 @@ COLUMN = [[0.5]] * 6
 REFUSED = [
     (("schema",), "jaxlag/2", "schema must be 'jaxlag-reference/1', but it was 'jaxlag/2'."),
     (("system",), "mass_sprin", "but it was 'mass_sprin'. Did you mean mass_spring"),
-    (("system",), 3, "system must be text or null, but it was 3.0."),
+    (("system",), 3, "system must be text, but it was 3.0."),
+    (("system",), None, "system must be text, but it was None."),
     (("kind",), "static", "kind must be 'trajectory', as mass_spring is, but it was 'static'."),
     (("kind",), [], "kind must be 'trajectory', as mass_spring is, but it was []."),
     (("coordinates",), ["y"], "coordinates must be ['x'], but it was ['y']."),
@@ -140,6 +141,17 @@ REFUSED = [
     ((*CASE, "extras", "F"), ROW, "extras must hold known fields only (H, p, p_dot), but it held"),
     ((*CASE, "invariants", "E"), ROW, "invariants must hold known fields only (nothing), but it"),
 ]
+
+
+def test_cases_have_names_of_their_own():
+    raw = as_parsed(harmonic())
+    raw["cases"] *= 2
+    with pytest.raises(
+        InvalidReference, match="cases must have distinct names, but 2 were called 'base'"
+    ):
+        read(raw)
+    raw["cases"] = [raw["cases"][0], raw["cases"][1] | {"name": "other"}]
+    assert [case.name for case in read(raw).cases] == ["base", "other"]
 
 
 @pytest.mark.parametrize(("place", "value", "message"), REFUSED)
