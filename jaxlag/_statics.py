@@ -8,11 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._status import Status
@@ -29,10 +29,15 @@ class Equilibrium(eqx.Module):
         system: what is at rest.
         q: coordinates (n,), m or rad; the nearest point found where the status is not ok.
         residual: Q - h at (q, v = 0), (n,): N or N m left unbalanced.
-        scale: (n,), N or N m: the forces that a residual is small against, |Q - h| at the start
-            of the search plus sum_j |K_ij| (1 + |q_j|).
+        scale: (n,), N or N m: the forces that a residual is small against at a root,
+            |Q| + |h| + sum_j |K_ij| (|q_j| + |q_j - q0_j|), all of them at q.
         stiffness: K = -d(Q - h)/dq at rest, (n, n); the Hessian of V where the forces derive from
             a potential.
+        damping: D = -d(Q - h)/dv at rest, (n, n): dissipation in its symmetric part, gyroscopic
+            forces in the skew one.
+        variation: (n, n), by how much K differs a small displacement away in its softest
+            direction, eps^0.4 of what q and the distance searched are, or what is left
+            open in q.
         status: int32, see `Status`: ok, implicit_solve_failed or nonfinite.
         iterations: int32, steps of the search.
     """
@@ -42,6 +47,8 @@ class Equilibrium(eqx.Module):
     residual: Float[Array, "*batch n"]
     scale: Float[Array, "*batch n"]
     stiffness: Float[Array, "*batch n n"]
+    damping: Float[Array, "*batch n n"]
+    variation: Float[Array, "*batch n n"]
     status: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
 
@@ -56,26 +63,38 @@ class Equilibrium(eqx.Module):
 
     @property
     def conservative(self) -> Bool[Array, "*batch"]:
-        """Whether K is symmetric up to rounding, as it is where the forces have a potential."""
-        K = _scaled(self.stiffness)
-        slack = 64 * K.shape[-1] * jnp.finfo(K.dtype).eps
-        return jnp.all(jnp.abs(K - jnp.swapaxes(K, -1, -2)) <= slack, axis=(-2, -1))
+        """Whether K is symmetric up to rounding, as it is where the forces have a potential.
+
+        Velocities have no say: see `damping`.
+        """
+        K = _scaled(self.stiffness, _units(self.stiffness))
+        return jnp.all(jnp.abs(K - jnp.swapaxes(K, -1, -2)) <= _slack(K), axis=(-2, -1))
 
     @property
     def stable(self) -> Bool[Array, "*batch"]:
-        """Whether the symmetric part of K is positive definite beyond rounding.
+        """Whether the symmetric part of K is positive definite and that of D not negative.
 
-        Where the forces have a potential this is the Hessian of V: a strict minimum, stable by
-        Lagrange's and Dirichlet's theorem; False means a saddle, a maximum, or that a higher
-        order decides (a coordinate on which nothing depends). Follower forces (`conservative`
-        False) can make an equilibrium flutter although this is True.
+        Where the forces at rest have a potential K is the Hessian of V: a strict minimum, stable
+        by Lagrange's and Dirichlet's theorem, which gyroscopic and dissipative forces leave so
+        (Thomson and Tait); a D that feeds energy in makes the motion grow by itself. K must be
+        positive beyond rounding and beyond its own `variation`, D not negative beyond rounding.
+
+        False means a saddle, a maximum, self-excitation, or that linear forces do not decide: a
+        coordinate on which nothing depends, a higher order (V = q^3, but also V = q^4), a D that
+        is not finite, or an edge of V such as zero length of a spring of length l0 > 0, where
+        `energy.spring` counts |r| as constant and so reports a balance. Follower forces
+        (`conservative` False) can make an equilibrium flutter although this is True.
 
         Source: Lagrange, Mecanique analytique; Gantmacher, Lectures in Analytical Mechanics,
-        sec. 34.
+        sec. 34; Merkin, Introduction to the Theory of Stability, ch. 6.
         """
-        K = _scaled(_symmetric(self.stiffness))
-        least = jnp.linalg.eigvalsh(K)[..., 0]
-        return (least > 64 * K.shape[-1] * jnp.finfo(K.dtype).eps) & (self.status == int(Status.ok))
+        units = _units(self.stiffness)
+        K, D = (_scaled(_symmetric(A), units) for A in (self.stiffness, self.damping))
+        spread = jnp.linalg.norm(_scaled(self.variation, units), axis=(-2, -1))
+        largest = jnp.max(jnp.abs(_scaled(self.damping, units)), axis=(-2, -1), initial=0.0)
+        stiff = jnp.linalg.eigvalsh(K)[..., 0] > _slack(K) + spread
+        passive = jnp.linalg.eigvalsh(D)[..., 0] >= -_slack(D) * largest
+        return stiff & passive & (self.status == int(Status.ok))
 
     def message(self) -> str:
         """How a single search ended, in words."""
@@ -112,11 +131,14 @@ def equilibrium(
 
     Solves Q_i(t, q, 0) - dV/dq_i = 0 for all i, more generally Q - h = 0 at v = 0, which keeps
     the terms of rotating frames (T_0) and of L linear in v. Levenberg-Marquardt on the n
-    equations; M is not needed and may be singular or zero. For a system that depends on t this is
-    the balance at the instant t, not a motion.
+    equations, in units in which K is about 1, so that those of q, L and Q do not matter; M is not
+    needed and may be singular or zero. For a system that depends on t this is the balance at the
+    instant t, not a motion. A root is told from forces that only die away by the Newton step
+    K^-1 (Q - h) left at q.
 
     The derivative is that of the implicit function, dq/dp = K^-1 d(Q - h)/dp, in every mode and
-    order; it is not finite where K is singular.
+    order. Where K is singular up to rounding it is the one of least norm, in the same units: zero
+    along coordinates on which nothing depends. It is NaN where the status is not ok.
 
     Args:
         system: what is at rest, n coordinates.
@@ -124,18 +146,21 @@ def equilibrium(
         params: as the Lagrangian takes them.
         t: instant, s.
         inputs: dict from names to input objects or arrays, as in `simulate`.
-        tol: residuals must be below `tol * scale` (see `Equilibrium`); by default 1e-10 in
-            float64, 1e-4 in float32.
+        tol: Newton steps must be below tol (|q_j| + |q_j - q0_j|), or below tol times the
+            length over which K changes; less than 1, by default 1e-10 in float64, 1e-4 in
+            float32.
         max_steps: bound on the steps of the search.
         throw: raise where a concrete result has a status other than ok.
 
     Raises:
-        ValueError: q0 of wrong length or not finite, tol not positive, max_steps not positive.
+        ValueError: q0 of wrong length or not finite; t not a finite number; tol not a number
+            between 0 and 1; max_steps not positive.
         EquilibriumError: none was found; says how near, and what force is left. With
             `throw=True` and concrete values.
 
     Source: Pila, eqs. 3.24, 3.25 (virtual work); Nocedal, Wright, Numerical Optimization,
-    sec. 10.3 (Levenberg-Marquardt).
+    sec. 10.3 (Levenberg-Marquardt); Deuflhard, Newton Methods for Nonlinear Problems, ch. 2
+    (what a Newton step tells).
 
     Example:
         A mass hanging on a spring stretches it by m g / k:
@@ -160,10 +185,12 @@ def equilibrium(
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
     if tol is None:
         tol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
-    tol = jnp.asarray(tol, q0.dtype)
-    if _params.concrete(tol) and not (tol.ndim == 0 and tol > 0):
+    tol = _number("tol", "be a positive number", tol, q0.dtype)
+    if _params.concrete(tol) and not tol > 0:
         raise bad("tol", "be a positive number", f"it was {tol}")
-    t = jnp.asarray(t, jnp.result_type(float))
+    if _params.concrete(tol) and not tol < 1:
+        raise bad("tol", "be less than 1", f"it was {tol}")
+    t = _number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     traced, static = _params.split(params)
@@ -175,59 +202,80 @@ def equilibrium(
     return found
 
 
+def _number(argument: str, must: str, x: Any, dtype: Any) -> Array:
+    """A scalar of this dtype, finite where it is concrete."""
+    try:
+        x = jnp.asarray(x, dtype)
+    except (TypeError, ValueError) as error:
+        raise bad(argument, must, f"it was {x!r}") from error
+    if x.ndim != 0:
+        raise bad(argument, must, f"its shape was {x.shape}")
+    if _params.concrete(x) and not np.isfinite(x):
+        raise bad(argument, "be finite", f"it was {x}")
+    return x
+
+
 @partial(jax.jit, static_argnums=0)
 def _search(key: Any, values: Any) -> Equilibrium:
     system, params_static, inputs_static, max_steps = key
-    q0, t, tol, params, inputs = values
-    params = _params.join(params, params_static.tree)
-    inputs = eqx.combine(inputs, inputs_static.tree)
+
+    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any]:
+        """(pair of Q and h, Q - h) as functions of (q, v)."""
+        params = _params.join(params, params_static.tree)
+        inputs = eqx.combine(inputs, inputs_static.tree)
+        check_declaration(system, params, inputs, t, q0, rest)
+
+        def pair(q: Array, v: Array) -> tuple[Array, Array]:
+            given = evaluate(inputs, t, q, v, params)
+            return system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
+
+        return pair, lambda q, v: jnp.subtract(*pair(q, v))
+
+    q0, t, tol, *given = values
     rest = jnp.zeros_like(q0)
-    check_declaration(system, params, inputs, t, q0, rest)
-
-    def unbalanced(q: Array) -> Array:
-        given = evaluate(inputs, t, q, rest, params)
-        Q = system.terms.force(t, q, rest, params, given)
-        return Q - system.terms.bias(t, q, rest, params)
-
+    _, unbalanced = forces(t, *given)
     q, steps = jax.lax.custom_root(
-        unbalanced, q0, partial(_solve, max_steps), _solve_tangent, has_aux=True
+        lambda q: unbalanced(q, rest), q0, partial(search, max_steps), solve_tangent, has_aux=True
     )
-    residual = unbalanced(q)
-    stiffness = -jax.jacfwd(unbalanced)(q)
-    scale = jnp.abs(unbalanced(q0)) + jnp.abs(stiffness) @ (1 + jnp.abs(q))
-    balanced = jnp.all(jnp.abs(residual) <= tol * scale)
-    finite = jnp.all(jnp.isfinite(residual)) & jnp.all(jnp.isfinite(stiffness))
-    failure = jnp.where(finite, int(Status.implicit_solve_failed), int(Status.nonfinite))
-    status = jnp.where(balanced & finite, int(Status.ok), failure).astype(jnp.int32)
-    return Equilibrium(system, q, residual, scale, stiffness, status, steps.astype(jnp.int32))
 
+    still, start, t, tol, *given = jax.lax.stop_gradient((q, q0, t, tol, *given))
+    pair, fixed = forces(t, *given)
+    Q, h = pair(still, rest)
+    present = jnp.abs(Q) + jnp.abs(h)
+    balance = judge(lambda q: fixed(q, rest), present, still, start, tol)
 
-def _solve(max_steps: int, unbalanced: Any, q0: Array) -> tuple[Array, Array]:
-    """(root or nearest point, number of steps: as a float, which has a tangent)."""
-    eps = float(jnp.finfo(q0.dtype).eps)
-    solver = optx.LevenbergMarquardt(rtol=4 * eps, atol=eps)
-    wide = jnp.result_type(float)  # optimistix keeps its damping in this dtype, whatever q's
-
-    def widened(q: Array, _: Any) -> Array:
-        return unbalanced(q.astype(q0.dtype)).astype(wide)
-
-    found = optx.least_squares(widened, solver, q0.astype(wide), max_steps=max_steps, throw=False)
-    return found.value.astype(q0.dtype), jnp.asarray(found.stats["num_steps"]).astype(q0.dtype)
-
-
-def _solve_tangent(linear: Any, y: Array) -> Array:
-    return jnp.linalg.solve(jax.jacfwd(linear)(y), y)
+    q = differentiable_if(balance.found, q)
+    failure = jnp.where(balance.finite, int(Status.implicit_solve_failed), int(Status.nonfinite))
+    return Equilibrium(
+        system,
+        q,
+        residual=unbalanced(q, rest),
+        scale=balance.scale,
+        stiffness=-jax.jacfwd(unbalanced)(q, rest),
+        damping=-jax.jacfwd(unbalanced, argnums=1)(q, rest),
+        variation=balance.variation,
+        status=jnp.where(balance.found, int(Status.ok), failure).astype(jnp.int32),
+        iterations=steps.astype(jnp.int32),
+    )
 
 
 def _symmetric(K: Array) -> Array:
     return 0.5 * (K + jnp.swapaxes(K, -1, -2))
 
 
-def _scaled(K: Array) -> Array:
-    """K with coordinates in units in which its diagonal is +-1 where it is not 0.
+def _units(K: Array) -> Array:
+    """Units of the coordinates in which the diagonal of K is +-1 where it is not 0."""
+    d = jnp.abs(jnp.diagonal(K, axis1=-2, axis2=-1))
+    return jnp.sqrt(jnp.where(d > 0, d, 1.0).astype(K.dtype))
+
+
+def _scaled(A: Array, units: Array) -> Array:
+    """A matrix in these units.
 
     Definiteness does not depend on units (Sylvester's law), rounding does.
     """
-    d = jnp.abs(jnp.diagonal(K, axis1=-2, axis2=-1))
-    d = jnp.sqrt(jnp.where(d > 0, d, 1.0).astype(K.dtype))
-    return K / (d[..., :, None] * d[..., None, :])
+    return A / (units[..., :, None] * units[..., None, :])
+
+
+def _slack(K: Array) -> float:
+    return 64 * K.shape[-1] * float(jnp.finfo(K.dtype).eps)

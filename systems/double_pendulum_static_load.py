@@ -28,7 +28,9 @@ Parameters
 V and the points are those of the moving pendulum; a state of rest needs no T. Each link hangs
 along the resultant of what pulls at its lower end:
 
-    tan(theta1) = (Fx + Bx)/((m1 + m2) g - Fy - By),   tan(theta2) = Fx/(m2 g - Fy)
+    theta1 = atan2(Fx + Bx, (m1 + m2) g - Fy - By),   theta2 = atan2(Fx, m2 g - Fy)
+
+which is the stable one of four states of rest; the others have one link or both turned by pi.
 """
 
 import jax.numpy as jnp
@@ -49,8 +51,10 @@ def end_force(t, q, v, params):
 
 
 def guess(params):
-    """Both links hanging."""
-    return 0.0, 0.0
+    """Each link along the resultant of what pulls at its lower end: the stable state itself."""
+    Fx, down = params["Fx"], params["m2"] * params["g"] - params["Fy"]
+    theta1 = jnp.arctan2(Fx + params["Bx"], params["m1"] * params["g"] + down - params["By"])
+    return theta1, jnp.arctan2(Fx, down)
 
 
 system = jl.System(
