@@ -88,9 +88,17 @@ def _cond(params: Any, operands: list[Names]) -> list[Names]:
     return [index.union(*outputs) for outputs in zip(*branches, strict=True)]
 
 
+def scan_sizes(params: Any) -> tuple[int, int]:
+    """How many operands of a scan are constants, and how many are carried; the rest are rows."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carried, _ = params["ft_in"].unpack()  # jax 0.12
+    return len(consts), len(carried)
+
+
 def _scan(params: Any, operands: list[Names]) -> list[Names]:
     """Of the start or of any turn, and of what enters a turn through the other carries."""
-    body, consts, carries = _open(params["jaxpr"]), params["num_consts"], params["num_carry"]
+    body, (consts, carries) = _open(params["jaxpr"]), scan_sizes(params)
     fixed, carry, rows = (
         operands[:consts],
         operands[consts : consts + carries],
