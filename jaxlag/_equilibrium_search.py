@@ -234,14 +234,17 @@ def judge(
     """
     n, eps = q.shape[0], float(jnp.finfo(q.dtype).eps)
     nudged = q * jnp.asarray(1 + 4 * eps * (-1.0) ** np.arange(n), q.dtype)
-    J, beside = jax.lax.map(jax.jacfwd(forces), jnp.stack([q, nudged]))
+    J, J_beside = jax.lax.map(jax.jacfwd(forces), jnp.stack([q, nudged]))
     F = forces(q)
-    here = _newton(F, J, beside - J)
+    here = _newton(F, J, J_beside - J)
     reach = jnp.abs(q) + jnp.abs(q - q0)
     scale = present + jnp.abs(here.J) @ reach
     s = here.step
     bend = 0.5 * jnp.abs(here.solve(jax.jvp(forces, (q + s,), (s,))[1] - here.J @ s))
-    rounding = 8 * n * eps * scale
+    # Forces that cancel inside F leave more rounding than its own size tells.
+    slack = jnp.asarray(4 * eps * (-1.0) ** np.arange(n), q.dtype) * reach
+    beside = jax.lax.map(forces, jnp.stack([q + slack, q - slack]))
+    rounding = 8 * n * eps * scale + 4 * jnp.max(jnp.abs(beside - F), axis=0)
     balanced = jnp.all(jnp.abs(F) <= rounding)
     near = jnp.where(balanced, tol**0.4, tol) * reach
     settled = (jnp.abs(s) <= near) | (bend <= tol * jnp.abs(s))
