@@ -9,6 +9,7 @@ _xla.configure()
 from jaxlag import energy as energy  # noqa: E402
 from jaxlag import math as math  # noqa: E402
 from jaxlag import rotation as rotation  # noqa: E402
+from jaxlag import solvers as solvers  # noqa: E402
 from jaxlag._errors import EquilibriumError as EquilibriumError  # noqa: E402
 from jaxlag._errors import SimulationError as SimulationError  # noqa: E402
 from jaxlag._forces import Couple as Couple  # noqa: E402

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxlag._status import Status
+from jaxlag.solvers import AbstractUnrolled
 
 # The recorded grid is a whole number of chunks of this many steps.
 CHUNK = 64
@@ -50,7 +51,7 @@ class Scheme(eqx.Module):
     @property
     def remembers(self) -> bool:
         """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
-        return not isinstance(self.solver, diffrax.AbstractRungeKutta)
+        return not isinstance(self.solver, diffrax.AbstractRungeKutta | AbstractUnrolled)
 
     def begin(self, t0: Array, t1: Array, y: PyTree, args: Any) -> Any:
         """Solver state with nothing carried over from a step before."""
@@ -92,10 +93,13 @@ class Scheme(eqx.Module):
 def with_stages(solver: Any, kind: str) -> Any:
     """A Runge-Kutta solver, wrapped or not, with its loop over stages of the given kind.
 
-    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying.
+    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying, where
+    stages written out would be compiled many times over.
     """
     if isinstance(solver, diffrax.HalfSolver):
         return eqx.tree_at(lambda s: s.solver, solver, with_stages(solver.solver, kind))
+    if isinstance(solver, AbstractUnrolled):
+        return solver if kind == "lax" else with_stages(solver.stock, kind)
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

@@ -1,5 +1,6 @@
 """The equations of motion in first-order form, as solvers see them."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._inputs import evaluate, locate
+from jaxlag._lowering import ScalarTerms
 from jaxlag._power import Power
 from jaxlag._system import System
 
@@ -20,6 +22,7 @@ class Arguments(NamedTuple):
     inputs: Any
     sigma: Float[Array, ""] | None  # direction of time where it is traced
     intervals: Any  # table interval of every input, fixed throughout a step
+    prepared: Any  # what accelerations need of what depends on params alone
 
 
 class Dynamics(eqx.Module):
@@ -33,6 +36,7 @@ class Dynamics(eqx.Module):
         inputs: static half of the inputs.
         direction: sigma, +1 or -1, where known while tracing; else None.
         power: terms of dH/dt to integrate along; None for none.
+        sample: values of the params, where known.
     """
 
     system: System
@@ -40,13 +44,19 @@ class Dynamics(eqx.Module):
     inputs: _params.Static = eqx.field(static=True)
     direction: int | None = eqx.field(static=True)
     power: Power | None
+    sample: _params.Sample = eqx.field(static=True)
 
     def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
         """Arguments outside any step, from the traced halves of params and inputs."""
         if self.direction is not None:
-            return Arguments(params, inputs, None, None)
+            return Arguments(params, inputs, None, None, None)
         sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
-        return Arguments(params, inputs, sigma, None)
+        return Arguments(params, inputs, sigma, None, None)
+
+    def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
+        """The arguments with all that accelerations need of what depends on params alone."""
+        _, q, _, params, values = self._at(tau, y, args)
+        return args._replace(prepared=self.system.terms.prepare(q, params, values, self.sample))
 
     def mirror(self, time: Array, args: Arguments) -> Array:
         """Tau from t, and t from tau."""
@@ -71,7 +81,7 @@ class Dynamics(eqx.Module):
     ) -> Float[Array, " n"]:
         """Acceleration a at (tau, y)."""
         t, q, v, params, values = self._at(tau, y, args)
-        return self.system.terms.acceleration(t, q, v, params, values)
+        return self.system.terms.acceleration(t, q, v, params, values, args.prepared)
 
     def effort(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -97,13 +107,26 @@ class Dynamics(eqx.Module):
     ) -> Float[Array, " m"]:
         """dy/dtau."""
         t, q, v, params, values = self._at(tau, y, args)
-        rates = [v, self.system.terms.acceleration(t, q, v, params, values)]
+        rates = [v, self.system.terms.acceleration(t, q, v, params, values, args.prepared)]
         if self.power is not None and self.power.names:
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
         rate = jnp.concatenate(rates)
         if self.direction == 1:
             return rate
         return -rate if args.sigma is None else rate * args.sigma.astype(rate.dtype)
+
+    def elements(self, tau: Array, y: Sequence[Array], args: Arguments) -> tuple[Array, ...]:
+        """dy/dtau from the elements of y, one by one; where there is a scalar program."""
+        n, terms = self.system.size, self.system.terms
+        assert isinstance(terms, ScalarTerms)
+        q, v = y[:n], y[n:]
+        t, (params, inputs) = self.mirror(tau, args), self.given(args)
+        values = evaluate(inputs, t, jnp.stack(q), jnp.stack(v), params, args.intervals)
+        a = terms.elements(t, q, v, q[0].dtype, params, values, args.prepared)
+        if self.direction == 1:
+            return (*v, *a)
+        sigma = -1.0 if args.sigma is None else args.sigma.astype(q[0].dtype)
+        return tuple(sigma * x for x in (*v, *a))
 
     def parts(self, y: Float[Array, "*s m"]) -> tuple[Array, Array]:
         """(q, v) of y."""
@@ -121,15 +144,26 @@ class Dynamics(eqx.Module):
         columns = jnp.moveaxis(y[..., 2 * self.system.size :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
 
-    def term(self, dtype: Any) -> diffrax.ODETerm:
-        """The vector field as diffrax takes it."""
+    def term(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> diffrax.ODETerm:
+        """The vector field as diffrax takes it, for states and arguments like these."""
         field: Any = self.__call__
-        return _Term(field, dtype)
+        elements: Any = self.elements if self._is_scalar(tau, y, args) else None
+        return _Term(field, elements, y.dtype)
+
+    def _is_scalar(self, tau: Array, y: Array, args: Arguments) -> bool:
+        _, q, _, params, values = self._at(tau, y, args)
+        terms = self.system.terms
+        if not isinstance(terms, ScalarTerms) or self.power is not None:
+            return False
+        return terms.lowered(q, params, values).equations is not None
 
 
 class _Term(diffrax.ODETerm):
     """Increments keep the state's dtype where time has another."""
 
+    elements: Callable | None
     dtype: Any = eqx.field(static=True)
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:

@@ -9,6 +9,7 @@ import optimistix
 
 from jaxlag._drive import with_stages
 from jaxlag._errors import bad
+from jaxlag.solvers import Dopri8
 
 METHODS: dict[str, type[diffrax.AbstractSolver]] = {
     "euler": diffrax.Euler,
@@ -18,7 +19,7 @@ METHODS: dict[str, type[diffrax.AbstractSolver]] = {
     "bosh3": diffrax.Bosh3,
     "tsit5": diffrax.Tsit5,
     "dopri5": diffrax.Dopri5,
-    "dopri8": diffrax.Dopri8,
+    "dopri8": Dopri8,
     "implicit_euler": diffrax.ImplicitEuler,
     "kvaerno3": diffrax.Kvaerno3,
     "kvaerno4": diffrax.Kvaerno4,

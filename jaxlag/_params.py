@@ -90,3 +90,29 @@ class Static:
                 for a, b in zip(self.leaves, other.leaves, strict=True)
             )
         )
+
+
+class Sample:
+    """Values that a program may be checked with, but is not keyed by: all samples are equal.
+
+    Attributes:
+        leaves: the traced leaves of the params; None where their values are not known.
+    """
+
+    def __init__(self, leaves: list[Any] | None) -> None:
+        self.leaves = leaves
+
+    def __hash__(self) -> int:
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sample)
+
+
+UNKNOWN = Sample(None)
+
+
+def sample(params: Any, other: Sample = UNKNOWN) -> Sample:
+    """The traced half of params as a sample if it has values, else the other sample."""
+    leaves = jax.tree.leaves(params)
+    return Sample(leaves) if concrete(*leaves) else other

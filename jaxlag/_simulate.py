@@ -44,6 +44,7 @@ class _Plan(NamedTuple):
     direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
     max_steps: int
     save: tuple[str, ...]
+    sample: _params.Sample
 
 
 class _Values(NamedTuple):
@@ -163,6 +164,7 @@ def simulate(
         direction=direction,
         max_steps=max_steps,
         save=tuple(save),
+        sample=_params.sample(params_traced),
     )
     values = _Values(q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
@@ -178,14 +180,16 @@ def pose(plan: _Plan, values: _Values) -> tuple[Dynamics, Start, Problem]:
     if "work" in plan.save:
         params = _params.join(values.params, plan.params.tree)
         power = plan.system.power_terms(params, values.q0.dtype)
-    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction, power)
+    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction, power, plan.sample)
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
     check_declaration(plan.system, params, inputs, values.ts[0], values.q0, values.v0)
 
     y0 = dynamics.start(values.q0, values.v0)
+    start = dynamics.mirror(values.ts[0], args)
+    args = dynamics.prepare(start, y0, args)
     solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
-    scheme = Scheme(solver, controller, dynamics.term(y0.dtype), dynamics.within)
+    scheme = Scheme(solver, controller, dynamics.term(start, y0, args), dynamics.within)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     valid = values_allowed(y0, times.saves, values.rtol, values.atol, values.step)

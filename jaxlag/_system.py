@@ -16,7 +16,7 @@ from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce, check_forces
 from jaxlag._inputs import InputValues, check_inputs, check_range, evaluate
 from jaxlag._linalg import first_unhealthy
-from jaxlag._lowering import ArrayTerms, Structure, find_structure
+from jaxlag._lowering import OPERATIONS, ArrayTerms, ScalarTerms, Structure, find_structure
 from jaxlag._power import Power
 from jaxlag._terms import Terms
 from jaxlag._vectors import state_vectors
@@ -54,6 +54,8 @@ class System(eqx.Module):
         potential: scalar function `V(t, q, params)`, in J.
         forces: applied forces, each with its own name: `PointForce`, `Couple`,
             `GeneralizedForce`, `Rayleigh`.
+        lowering: how accelerations are compiled: "auto", as straight-line code on scalars where
+            it exists and is short, else on arrays; "scalar", however long it is; "array".
 
     Raises:
         ValueError: neither or both ways of giving L, functions that cannot be called in these
@@ -66,6 +68,7 @@ class System(eqx.Module):
     lagrangian: Callable = eqx.field(static=True)
     coordinates: Coordinates = eqx.field(static=True)
     forces: tuple[AbstractForce, ...]
+    lowering: str = eqx.field(static=True)
     _kinetic: Callable | None = eqx.field(static=True)
     _potential: Callable | None = eqx.field(static=True)
 
@@ -77,6 +80,7 @@ class System(eqx.Module):
         kinetic: Callable | None = None,
         potential: Callable | None = None,
         forces: Sequence[AbstractForce] = (),
+        lowering: str = "auto",
     ) -> None:
         pair = kinetic is not None or potential is not None
         if (lagrangian is None) == (not pair) or (pair and (kinetic is None or potential is None)):
@@ -99,20 +103,26 @@ class System(eqx.Module):
         self._kinetic, self._potential = kinetic, potential
         self.coordinates = Coordinates(coordinates)
         self.forces = check_forces(forces)
+        if lowering not in ("auto", "scalar", "array"):
+            raise bad("lowering", "be 'auto', 'scalar' or 'array'", f"it was {lowering!r}")
+        self.lowering = lowering
 
     def __hash__(self) -> int:
-        return hash((self.lagrangian, self.coordinates, self.forces))
+        return hash((self.lagrangian, self.coordinates, self.forces, self.lowering))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, System) and (
-            (self.lagrangian, self.coordinates, self.forces)
-            == (other.lagrangian, other.coordinates, other.forces)
+            (self.lagrangian, self.coordinates, self.forces, self.lowering)
+            == (other.lagrangian, other.coordinates, other.forces, other.lowering)
         )
 
     @property
     def terms(self) -> Terms:
         """The lowered terms of the equations of motion."""
-        return ArrayTerms(self.lagrangian, self.forces)
+        array = ArrayTerms(self.lagrangian, self.forces)
+        if self.lowering == "array":
+            return array
+        return ScalarTerms(array, OPERATIONS if self.lowering == "auto" else None)
 
     @property
     def size(self) -> int:
@@ -360,13 +370,19 @@ class System(eqx.Module):
         """What was found in M a + h = Q of this system, and what is therefore skipped, as text.
 
         Dependencies of M, h and L on t, q, v and params are read from the traced program, never
-        from numbers.
+        from numbers; so are cyclic coordinates, blocks of M and the like. Forces that read inputs
+        are left out of the operations counted.
         """
         traced, static = _params.split(params)
         params = _params.join(traced, static)
         dtype = jnp.result_type(float)
         self.check_traceable(params, dtype, None)
-        return explain(self, self.structure(params, dtype))
+        terms, lowered = self.terms, None
+        if isinstance(terms, ScalarTerms):
+            free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
+            terms = ScalarTerms(ArrayTerms(self.lagrangian, free), terms.limit)
+            lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
+        return explain(self, self.structure(params, dtype), lowered)
 
     def structure(self, params: Any, dtype: Any) -> Structure:
         """Dependencies of M, h and L, traced once per (system, shapes, dtypes)."""

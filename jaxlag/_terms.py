@@ -7,6 +7,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from jaxlag import _params
+
 
 class Terms(eqx.Module):
     """M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
@@ -70,6 +72,20 @@ class Terms(eqx.Module):
         """Vector gamma = A' v + b', so that A a + gamma = 0."""
 
     @abstractmethod
+    def prepare(
+        self,
+        q: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample = _params.UNKNOWN,
+    ) -> Any:
+        """What accelerations need of what depends on params alone, to be computed once per solve.
+
+        Of q and the inputs' values only shapes and dtypes matter; `sample` holds values of the
+        params where these are traced.
+        """
+
+    @abstractmethod
     def acceleration(
         self,
         t: Float[Array, ""],
@@ -77,5 +93,9 @@ class Terms(eqx.Module):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
+        prepared: Any = None,
     ) -> Float[Array, " n"]:
-        """a, with one factorisation; NaN where M is not positive definite."""
+        """a, with one factorisation; NaN where M is not positive definite.
+
+        `prepared`: what `prepare` returned for these params; computed here if left out.
+        """

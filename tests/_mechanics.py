@@ -27,8 +27,8 @@ def chain_lagrangian(t, q, v, params):
 
 
 @cache
-def chain(n, forces=()):
-    return jl.System(chain_lagrangian, {"theta": (n,)}, forces=forces)
+def chain(n, forces=(), lowering="auto"):
+    return jl.System(chain_lagrangian, {"theta": (n,)}, forces=forces, lowering=lowering)
 
 
 CHAIN_PARAMS = {"m": 0.4, "l": 0.3, "g": 9.81}

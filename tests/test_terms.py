@@ -1,4 +1,4 @@
-"""The programs of the equations of motion, read as jaxprs: what they do, how often, how large.
+"""The array programs of the equations of motion, read as jaxprs: what, how often, how large.
 
 A chain of N links stands for any system. Its Lagrangian may carry a mark: arrays turned round,
 an operation that is linear, so that every derivative of L repeats it and is counted with it.
@@ -11,13 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _jaxprs import count, largest, names, operations
-from _mechanics import CHAIN_PARAMS, chain, chain_lagrangian
+from _mechanics import CHAIN_PARAMS, chain_lagrangian
+from _mechanics import chain as any_chain
 
 import jaxlag as jl
 from jaxlag._linalg import UNROLL_UP_TO, factor_mass, solve_mass
 from systems._catalogue import ENTRIES
 
 SMALL, LARGE = 5, 12
+chain = partial(any_chain, lowering="array")
 FACTORISATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
 MARK = 3  # entries of the marked array
 
@@ -126,7 +128,9 @@ def test_the_bias_holds_vectors_only(n):
 def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
     """Forward and reverse, each with its tangent: four, whatever n."""
     found = {
-        n: evaluations(operations(jl.System(marked, {"theta": (n,)}).bias, *at_rest(n)))
+        n: evaluations(
+            operations(jl.System(marked, {"theta": (n,)}, lowering="array").bias, *at_rest(n))
+        )
         for n in (2, 10)
     }
     assert found == {2: 4, 10: 4}
@@ -135,7 +139,11 @@ def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
 def test_the_mass_matrix_evaluates_it_once_per_column():
     """The mark does count: forward and reverse, and the tangents of both for every column."""
     found = {
-        n: evaluations(operations(jl.System(marked, {"theta": (n,)}).mass_matrix, *at_rest(n)))
+        n: evaluations(
+            operations(
+                jl.System(marked, {"theta": (n,)}, lowering="array").mass_matrix, *at_rest(n)
+            )
+        )
         for n in (2, 10)
     }
     assert found == {2: 2 + 2 * 2, 10: 2 + 2 * 10}
@@ -143,7 +151,9 @@ def test_the_mass_matrix_evaluates_it_once_per_column():
 
 def test_the_acceleration_evaluates_what_mass_and_bias_do():
     n = 10
-    program = operations(jl.System(marked, {"theta": (n,)}).acceleration, *at_rest(n))
+    program = operations(
+        jl.System(marked, {"theta": (n,)}, lowering="array").acceleration, *at_rest(n)
+    )
     assert evaluations(program) <= (2 + 2 * n) + 4
 
 

@@ -14,7 +14,8 @@ import jax, jax.numpy as jnp
 {first}
 import jaxlag as jl
 jax.config.update("jax_enable_x64", True)
-pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("theta",))
+L = lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0])
+pendulum = jl.System(L, ("theta",), lowering="array")
 run = lambda q0: jl.simulate(pendulum, q0, [0.0], [0.0, 1.0], 9.81).q
 text = jax.jit(run).lower(jnp.array([1.0])).compile().as_text()
 # The outermost loop, not only small ones inside it.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag import _params
 from jaxlag._errors import real_scalar
 from jaxlag._forces import AbstractForce, components
 from jaxlag._linalg import solve_mass
@@ -95,6 +96,15 @@ class ArrayTerms(Terms):
         """No rows: shape (0,)."""
         return jnp.zeros((0,), q.dtype)
 
+    def prepare(
+        self,
+        q: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample = _params.UNKNOWN,
+    ) -> None:
+        """Nothing: M is formed at every state."""
+
     def acceleration(
         self,
         t: Float[Array, ""],
@@ -102,6 +112,7 @@ class ArrayTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
+        prepared: Any = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; force code only where forces are declared."""
         M = self.mass(t, q, v, params)

@@ -1,0 +1,175 @@
+"""A jaxpr run on numpy arrays, nothing compiled: what programs are compared with.
+
+NUMPY holds primitives as functions of (equation, operands).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+
+def interpret(closed: ClosedJaxpr, *args: Any) -> list[np.ndarray]:
+    """The results of a program at given arrays; overflows and the like give inf and nan."""
+    with np.errstate(all="ignore"):
+        return _run(closed.jaxpr, [np.asarray(c) for c in closed.consts], list(args))
+
+
+def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
+    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    known.update(zip(jaxpr.invars, args, strict=True))
+    for eqn in jaxpr.eqns:
+        operands = [a.val if isinstance(a, Literal) else known[a] for a in eqn.invars]
+        results = _equation(eqn, [np.asarray(x) for x in operands])
+        known.update(zip(eqn.outvars, results, strict=True))
+    return [np.asarray(a.val) if isinstance(a, Literal) else known[a] for a in jaxpr.outvars]
+
+
+def _equation(eqn: Any, operands: list) -> list:
+    name = eqn.primitive.name
+    for key in ("jaxpr", "call_jaxpr"):
+        inner = eqn.params.get(key)
+        if name in _CALLS and inner is not None:
+            if isinstance(inner, ClosedJaxpr):
+                return _run(inner.jaxpr, [np.asarray(c) for c in inner.consts], operands)
+            return _run(inner, [], operands)
+    if name in NUMPY:
+        return [np.asarray(NUMPY[name](eqn, *operands))]
+    kinds = [v.aval.dtype for v in eqn.invars]
+    with jax.ensure_compile_time_eval():
+        given = [x.astype(kind) for x, kind in zip(operands, kinds, strict=True)]
+        out = eqn.primitive.bind(*given, **eqn.params)
+    return [np.asarray(x) for x in out] if eqn.primitive.multiple_results else [np.asarray(out)]
+
+
+_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
+_CALLS |= {"custom_jvp_call"}
+
+
+def _plain(function: Callable) -> Callable:
+    return lambda eqn, *args: function(*args)
+
+
+def _axes(function: Callable) -> Callable:
+    return lambda eqn, x: function(x, axis=tuple(eqn.params["axes"]))
+
+
+def _running(function: Callable) -> Callable:
+    def cumulative(eqn: Any, x: np.ndarray) -> Any:
+        axis = eqn.params["axis"]
+        x = np.flip(x, axis) if eqn.params["reverse"] else x
+        x = function(x, axis=axis)
+        return np.flip(x, axis) if eqn.params["reverse"] else x
+
+    return cumulative
+
+
+def _broadcast(eqn: Any, x: np.ndarray) -> Any:
+    shape, kept = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    wide = [1] * len(shape)
+    for axis, place in enumerate(kept):
+        wide[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(wide), shape)
+
+
+def _dot(eqn: Any, a: np.ndarray, b: np.ndarray) -> Any:
+    ((left, right), (left_batch, right_batch)) = eqn.params["dimension_numbers"]
+    letters = iter("abcdefghijklmnopqrstuvwxyz")
+    a_names, b_names = [""] * a.ndim, [""] * b.ndim
+    for i, j in (*zip(left_batch, right_batch, strict=True), *zip(left, right, strict=True)):
+        a_names[i] = b_names[j] = next(letters)
+    a_names = [name or next(letters) for name in a_names]
+    b_names = [name or next(letters) for name in b_names]
+    free_a = [a_names[i] for i in range(a.ndim) if i not in (*left, *left_batch)]
+    free_b = [b_names[i] for i in range(b.ndim) if i not in (*right, *right_batch)]
+    out = "".join([*(a_names[i] for i in left_batch), *free_a, *free_b])
+    return np.asarray(np.einsum(f"{''.join(a_names)},{''.join(b_names)}->{out}", a, b))
+
+
+def _slice(eqn: Any, x: np.ndarray) -> Any:
+    p = eqn.params
+    strides = p["strides"] or (1,) * x.ndim
+    bounds = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+    return x[tuple(slice(*s) for s in bounds)]
+
+
+def _select(eqn: Any, which: np.ndarray, *cases: np.ndarray) -> Any:
+    return np.choose(which.astype(int), np.broadcast_arrays(*cases))
+
+
+def _convert(eqn: Any, x: np.ndarray) -> Any:
+    new = eqn.params["new_dtype"]
+    # Everything is computed in double: a program in float32 is compared in its real arithmetic.
+    real = np.issubdtype(x.dtype, np.floating) and np.issubdtype(new, np.floating)
+    return x if real else x.astype(new)
+
+
+def _integer_pow(eqn: Any, x: np.ndarray) -> Any:
+    exponent = eqn.params["y"]
+    return x ** (exponent if exponent >= 0 else float(exponent))
+
+
+NUMPY: dict[str, Callable] = {
+    name: _plain(getattr(np, other))
+    for name, other in {
+        "add": "add",
+        "add_any": "add",
+        "sub": "subtract",
+        "mul": "multiply",
+        "neg": "negative",
+        "max": "maximum",
+        "min": "minimum",
+        "sqrt": "sqrt",
+        "square": "square",
+        "sin": "sin",
+        "cos": "cos",
+        "tan": "tan",
+        "asin": "arcsin",
+        "acos": "arccos",
+        "atan": "arctan",
+        "atan2": "arctan2",
+        "sinh": "sinh",
+        "cosh": "cosh",
+        "tanh": "tanh",
+        "exp": "exp",
+        "log": "log",
+        "abs": "abs",
+        "sign": "sign",
+        "eq": "equal",
+        "ne": "not_equal",
+        "lt": "less",
+        "le": "less_equal",
+        "gt": "greater",
+        "ge": "greater_equal",
+        "stop_gradient": "asarray",
+        "copy": "asarray",
+        "copy_p": "asarray",
+    }.items()
+}
+NUMPY |= {
+    "div": lambda e, x, y: x / y if np.issubdtype(x.dtype, np.floating) else x // y,
+    "pow": lambda e, x, y: np.power(x, y),
+    "integer_pow": lambda e, x: (
+        x ** (e.params["y"] if e.params["y"] >= 0 else float(e.params["y"]))
+    ),
+    "rsqrt": lambda e, x: 1 / np.sqrt(x),
+    "broadcast_in_dim": lambda e, x, *_: _broadcast(e, x),
+    "reshape": lambda e, x, *_: x.reshape(e.params["new_sizes"]),
+    "transpose": lambda e, x: x.transpose(e.params["permutation"]),
+    "squeeze": lambda e, x: x.squeeze(tuple(e.params["dimensions"])),
+    "concatenate": lambda e, *xs: np.concatenate(xs, axis=e.params["dimension"]),
+    "stack": lambda e, *xs: np.stack(xs, axis=e.params["axis"]),
+    "rev": lambda e, x: np.flip(x, tuple(e.params["dimensions"])),
+    "slice": _slice,
+    "select_n": _select,
+    "convert_element_type": _convert,
+    "dot_general": _dot,
+    "reduce_sum": _axes(np.sum),
+    "reduce_prod": _axes(np.prod),
+    "reduce_max": _axes(np.max),
+    "reduce_min": _axes(np.min),
+    "cumsum": _running(np.cumsum),
+    "cumprod": _running(np.cumprod),
+}
