@@ -51,10 +51,13 @@ def end_force(t, q, v, params):
 
 
 def guess(params):
-    """Each link along the resultant of what pulls at its lower end: the stable state itself."""
+    """Half a radian off the resultant of what pulls at each lower end: near the stable state.
+
+    From angles of zero, large loads lead to other states, in which a link is upside down.
+    """
     Fx, down = params["Fx"], params["m2"] * params["g"] - params["Fy"]
     theta1 = jnp.arctan2(Fx + params["Bx"], params["m1"] * params["g"] + down - params["By"])
-    return theta1, jnp.arctan2(Fx, down)
+    return theta1 + 0.5, jnp.arctan2(Fx, down) - 0.5
 
 
 system = jl.System(

@@ -309,10 +309,11 @@ def order(roots: Iterable[Node], known: Container[Node] = ()) -> list[Node]:
         if node not in found:
             found.add(node)
             stack.extend(arg for arg in node.args if arg not in found and arg not in known)
-    return sorted(found, key=_id)
+    return sorted(found, key=node_id)
 
 
-def _id(node: Node) -> int:
+def node_id(node: Node) -> int:
+    """Sorts nodes so that arguments come first."""
     return node.id
 
 

@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from jaxlag._lowering._graph import Graph, Node, order
+from jaxlag._lowering._graph import Graph, Node, node_id, order
 
 
 class Line(NamedTuple):
@@ -277,7 +277,7 @@ class _Assembly:
             if count < 2:
                 return
             self._rank(best)
-            for node in sorted(places[best], key=_id):
+            for node in sorted(places[best], key=node_id):
                 enter(node, -1)
                 groups[node] = _with_pair(groups[node], best)
                 enter(node, 1)
@@ -423,10 +423,6 @@ class _Assembly:
 
 def _count(item: tuple[Any, int]) -> int:
     return item[1]
-
-
-def _id(node: Node) -> int:
-    return node.id
 
 
 def _without(

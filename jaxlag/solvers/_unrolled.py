@@ -14,6 +14,9 @@ from jax import Array, lax
 class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
     """An explicit Runge-Kutta method without a loop over its stages.
 
+    k_i = f(t + c_i h, y + h sum_{j<i} a_ij k_j), y1 = y + h sum_i b_i k_i; the error estimate is
+    h sum_i e_i k_i. The units are those of the problem; y is any pytree of arrays.
+
     A stage is a sum of the stages before it with the zeros of the tableau left out, so that a
     step is straight-line code and a loop of steps over a small system one function without calls.
     Where the terms have a method `elements`, stages work on the elements of y one by one, and y
@@ -23,6 +26,8 @@ class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
     one of the next step.
 
     Steps, error estimates and interpolation are those of `stock`, up to the order of sums.
+
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1.
 
     Attributes:
         stock: the same method with a loop over stages.
