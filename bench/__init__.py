@@ -5,6 +5,6 @@ rows, targets (judged: one missed makes the exit status 1) and references (print
 A full run is kept in `bench/results/NAME.json`, which holds the latest run on every version of
 jax; a quick run, of fewer cases and repeats, in `bench/results/quick/NAME.json`, not in git.
 
-What the numbers cannot show: one small system on one CPU. Ratios within a run carry over to
+What the numbers cannot show: small systems on one CPU. Ratios within a run carry over to
 another machine, milliseconds do not; references in time come from another machine.
 """

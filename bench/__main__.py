@@ -1,10 +1,12 @@
-"""Command line: `python -m bench list | NAME [--quick]`."""
+"""Command line: `python -m bench list | NAME [--quick] [options of that benchmark]`."""
 
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from inspect import signature
+from typing import Any
 
 import jax
 
@@ -17,25 +19,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = ArgumentParser(prog="python -m bench", description="Measure jaxlag.")
     parser.add_argument("name", metavar="NAME", help="a benchmark, or 'list'")
     parser.add_argument("--quick", action="store_true", help="fewer cases and repeats: a minute")
+    parser.add_argument(
+        "--system", action="append", help="of work-precision: this system alone (repeatable)"
+    )
+    parser.add_argument("--python", help="of work-precision: an interpreter with another jax")
     arguments = parser.parse_args(argv)
+    options = {name: vars(arguments)[name] for name in ("system", "python")}
+    options = {name: value for name, value in options.items() if value}
     if arguments.name == "list":
         for name in BENCHMARKS:
-            print(f"{name:<10} {_headline(name)}")
+            print(f"{name:<14} {_headline(name)}")
         return 0
     if arguments.name not in BENCHMARKS:
         near = get_close_matches(arguments.name, BENCHMARKS, n=3)
         hint = f"Did you mean {' or '.join(near)}?" if near else f"Known: {', '.join(BENCHMARKS)}."
         print(f"NAME must be a benchmark, but it was {arguments.name!r}. {hint}", file=sys.stderr)
         return 2
+    run = _module(arguments.name).run
+    foreign = [name for name in options if name not in signature(run).parameters]
+    if foreign:
+        print(f"{arguments.name} has no option --{foreign[0]}.", file=sys.stderr)
+        return 2
     jax.config.update("jax_enable_x64", True)
     circumstances = _results.circumstances()
-    report = import_module(f"bench.{arguments.name}").run(arguments.quick)
+    report = run(arguments.quick, **options)
     path = _results.save(
         arguments.name,
         _headline(arguments.name),
         report,
         circumstances,
-        arguments.quick,
+        arguments.quick or "system" in options,  # in part is not what is kept
         _results.FOLDER,
     )
     print(_results.text(report))
@@ -43,8 +56,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if all(target.met for target in report.targets) else 1
 
 
+def _module(name: str) -> Any:
+    return import_module(f"bench.{name.replace('-', '_')}")
+
+
 def _headline(name: str) -> str:
-    return (import_module(f"bench.{name}").__doc__ or "").splitlines()[0]
+    return (_module(name).__doc__ or "").splitlines()[0]
 
 
 if __name__ == "__main__":

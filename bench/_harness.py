@@ -9,7 +9,16 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 
-BENCHMARKS = ("solve", "batch", "gradient")
+BENCHMARKS = (
+    "solve",
+    "batch",
+    "gradient",
+    "lowering",
+    "constraints",
+    "stability",
+    "accuracy",
+    "work-precision",
+)
 
 RUNS_PER_TURN = 3
 
@@ -51,11 +60,16 @@ class Reference(NamedTuple):
 
 
 class Report(NamedTuple):
-    """Rows with the same keys, units in the keys, and what is said of them."""
+    """Rows with the same keys, units in the keys, and what is said of them.
+
+    Attributes:
+        shown: rows for the terminal, where all are too many.
+    """
 
     rows: list[dict[str, Any]]
     targets: list[Target]
     references: list[Reference]
+    shown: list[dict[str, Any]] | None = None
 
 
 def build(function: Callable[..., Any], *args: Any) -> Program:

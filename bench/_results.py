@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -61,14 +62,24 @@ def save(
     runs.sort(key=lambda run: [int(x) for x in run["versions"]["jax"].split(".") if x.isdigit()])
     content = {"benchmark": name, "measures": headline, "runs": runs}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    path.write_text(_compact(content) + "\n")
     return path
+
+
+def _compact(content: Mapping[str, Any]) -> str:
+    """JSON with a line for every row."""
+    rows = [row for run in content["runs"] for row in run["rows"]]
+    marks = iter(range(len(rows)))
+    runs = [{**run, "rows": [f"row {next(marks)}" for _ in run["rows"]]} for run in content["runs"]]
+    lines = json.dumps({**content, "runs": runs}, indent=1)
+    return re.sub('"row ([0-9]+)"', lambda found: json.dumps(rows[int(found[1])]), lines)
 
 
 def text(report: Report) -> str:
     """Table, targets and references for the terminal."""
-    heads = list(report.rows[0])
-    cells = [heads] + [[_cell(row[head]) for head in heads] for row in report.rows]
+    rows = report.shown or report.rows
+    heads = list(rows[0])
+    cells = [heads] + [[_cell(row[head]) for head in heads] for row in rows]
     widths = [max(len(line[i]) for line in cells) for i in range(len(heads))]
     lines = [
         "  ".join(
@@ -87,6 +98,8 @@ def text(report: Report) -> str:
 
 
 def _cell(value: Any) -> str:
+    if value is None:
+        return ""
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

@@ -7,19 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxlag._constraints import Baumgarte
 from jaxlag._errors import bad
+from jaxlag._forces import reads_lam
+from jaxlag._gradient import MODES
 from jaxlag._inputs import evaluate
+from jaxlag._kkt import FORMULATIONS
 from jaxlag._methods import default_tolerances
 from jaxlag._params import concrete
 from jaxlag._solution import QUANTITIES
 from jaxlag._system import System
-from jaxlag._vectors import vector
+from jaxlag._vectors import common, vector
 
 
 def check_options(
     system: Any,
-    formulation: Any,
     gradient: Any,
+    gradient_memory: Any,
     project: Any,
     assemble: Any,
     save: Any,
@@ -28,18 +32,19 @@ def check_options(
     """Raise on options that no value of the traced arguments could make right."""
     if not isinstance(system, System):
         raise bad("system", "be a jl.System", f"it was {system!r}")
-    if formulation != "auto":
-        raise bad(
-            "formulation",
-            "be 'auto'",
-            f"it was {formulation!r}",
-            "This system has neither constraints nor quasi-velocities: its state is (q, v).",
-        )
-    if gradient not in ("auto", "recorded"):
-        raise bad("gradient", "be 'auto' or 'recorded'", f"it was {gradient!r}")
-    for name, flag in (("project", project), ("assemble", assemble)):
-        if not isinstance(flag, bool):
-            raise bad(name, "be True or False", f"it was {flag!r}")
+    if gradient not in MODES:
+        raise bad("gradient", f"be one of {', '.join(map(repr, MODES))}", f"it was {gradient!r}")
+    number = isinstance(gradient_memory, int | float | np.integer | np.floating)
+    if gradient_memory is not None and (not number or not gradient_memory > 0):
+        was = f"it was {gradient_memory!r}"
+        raise bad("gradient_memory", "be a positive number of bytes or None", was)
+    if not isinstance(assemble, bool):
+        raise bad("assemble", "be True or False", f"it was {assemble!r}")
+    if not isinstance(project, bool | Baumgarte):
+        must = "be True, False or a jl.Baumgarte(alpha, beta)"
+        raise bad("project", must, f"it was {project!r}")
+    if isinstance(project, Baumgarte) and not system.constraints:
+        raise bad("project", "be True for a system without constraints", f"it was {project!r}")
     if isinstance(save, str):
         raise bad("save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},).")
     if not isinstance(save, Sequence):
@@ -48,6 +53,9 @@ def check_options(
         if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
             known = [*QUANTITIES, "work"]
             raise bad("save", f"name quantities among {known}", f"one was {name!r}")
+        if name == "u" and system.quasi is None:
+            must, was = "name what the system has", "one was 'u' without quasi-velocities"
+            raise bad("save", must, was, "Declare the system with quasi=.")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise bad(
                 "save",
@@ -59,27 +67,63 @@ def check_options(
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
 
 
-def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Array, Array]:
+def check_formulation(
+    system: System, formulation: Any, project: Any, params: Any, dtype: Any
+) -> str:
+    """The formulation that is meant; raises where the system does not have it."""
+    known = ["auto", *FORMULATIONS] if system.constraints or system.quasi is not None else ["auto"]
+    quasi = system.quasi
+    why = "" if len(known) > 1 else "This system has no constraints: its state is (q, v)."
+    left: list[str] = []
+    if quasi is not None:
+        rows = system.rows(params, dtype)
+        if quasi.kinematics is None:
+            left = [label for label in rows.labels if label not in quasi.constrained]
+        if any(map(reads_lam, system.forces)):
+            why = "Forces that depend on multipliers need formulation='multipliers'."
+        elif left:
+            why = (
+                f"Quasi-velocities do not take care of the rows {left}: name the quasi-velocities "
+                "that vanish in constrained=, or use formulation='multipliers'."
+            )
+        elif isinstance(project, Baumgarte):
+            why = "Baumgarte's terms belong to formulation='multipliers'."
+        else:
+            known.append("quasi")
+    if formulation not in known:
+        must = f"be among {tuple(known)}" if len(known) > 1 else "be 'auto'"
+        raise bad("formulation", must, f"it was {formulation!r}", why)
+    if formulation != "auto":
+        return formulation
+    return "quasi" if "quasi" in known else FORMULATIONS[0]
+
+
+def check_start(
+    system: System, q0: Any, v0: Any, u0: Any
+) -> tuple[Array, Array | None, Array | None]:
+    """(q0, v0, u0) as arrays of one dtype; one of v0 and u0 is None."""
     if (v0 is None) == (u0 is None):
         was = "neither was given" if v0 is None else "both were given"
         raise bad("v0 and u0", "be given one at a time", was, "Pass v0=, the velocities at ts[0].")
-    if u0 is not None:
+    quasi = system.quasi
+    if u0 is not None and quasi is None:
         raise bad(
             "u0",
             "be given for a system with quasi-velocities only",
             "this system has none",
             "Pass v0= instead.",
         )
-    vectors = []
-    for name, x in (("q0", q0), ("v0", v0)):
-        x = vector(system.coordinates, name, x)
-        if concrete(x) and not np.all(np.isfinite(x)):
-            i = int(np.argmin(np.isfinite(x)))
-            label = system.coordinates.label(i)
-            raise bad(name, "be finite", f"{name}[{i}] ({label!r}) was {x[i]}")
-        vectors.append(x)
-    dtype = jnp.result_type(*vectors)
-    return vectors[0].astype(dtype), vectors[1].astype(dtype)
+    q0 = vector(system.coordinates, "q0", q0)
+    if quasi is not None and u0 is not None:
+        name, x, labels = "u0", quasi.vector("u0", u0), quasi.names
+    else:
+        name, x, labels = "v0", vector(system.coordinates, "v0", v0), system.coordinates.labels
+    for argument, values, words in (("q0", q0, system.coordinates.labels), (name, x, labels)):
+        if concrete(values) and not np.all(np.isfinite(values)):
+            i = int(np.argmin(np.isfinite(values)))
+            raise bad(argument, "be finite", f"{argument}[{i}] ({words[i]!r}) was {values[i]}")
+    q0, x = common(q0, x)
+    return (q0, None, x) if name == "u0" else (q0, x, None)
 
 
 def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:

@@ -32,6 +32,18 @@ class EquilibriumError(RuntimeError):
         self.equilibrium = equilibrium
 
 
+class AssemblyError(RuntimeError):
+    """No state near satisfies the constraints.
+
+    Attributes:
+        assembly: the `Assembly` with the nearest state and the residuals left there.
+    """
+
+    def __init__(self, message: str, assembly: object = None) -> None:
+        super().__init__(message)
+        self.assembly = assembly
+
+
 def complaint(argument: str, must: str, was: str, fix: str = "") -> str:
     """`<argument> must <must>, but <was>. <fix>`."""
     return f"{argument} must {must}, but {was}." + (f" {fix}" if fix else "")

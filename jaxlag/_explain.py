@@ -3,9 +3,13 @@
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+import jax
+
 from jaxlag import _xla
+from jaxlag._constraints import Layout
+from jaxlag._lanes import LANES
 from jaxlag._linalg import UNROLL_UP_TO
-from jaxlag._lowering import Equations, Lowered, Structure, find
+from jaxlag._lowering import Equations, Lowered, Program, Structure, find
 
 if TYPE_CHECKING:
     from jaxlag._system import System
@@ -16,13 +20,14 @@ def _list(names: frozenset[str]) -> str:
     return ", ".join(order) if order else "nothing"
 
 
-def explain(system: "System", structure: Structure, lowered: Lowered | None) -> str:
+def explain(system: "System", structure: Structure, lowered: Lowered | None, rows: Layout) -> str:
     """What was found in `system` and what follows for the compiled program.
 
     Args:
         system: the declaration.
         structure: dependencies of its terms.
         lowered: its scalar program, or why there is none; None where it was not asked for.
+        rows: its constraint rows.
     """
     forces = [f"{force.name} ({type(force).__name__})" for force in system.forces]
     lines = [
@@ -34,18 +39,47 @@ def explain(system: "System", structure: Structure, lowered: Lowered | None) -> 
         "bias          "
         + ("zero" if structure.bias_zero else f"depends on {_list(structure.bias)}"),
         f"forces        {', '.join(forces) if forces else 'none, so no force code is compiled'}",
-        "constraints   none, so no multipliers are computed",
+        *_quasi(system),
+        *_constraints(rows, system.quasi is not None),
     ]
     if lowered is not None and lowered.equations is not None:
         lines += _scalar(system, lowered, lowered.equations)
     else:
-        lines += _array(system, "as declared" if lowered is None else lowered.reason)
+        lines += _array(system, structure, "as declared" if lowered is None else lowered.reason)
     return "\n".join([*lines, f"small loops   {_xla.report()}"])
+
+
+def _quasi(system: "System") -> list[str]:
+    quasi = system.quasi
+    if quasi is None:
+        return []
+    free = [name for name in quasi.names if name not in quasi.constrained]
+    zero = f", {', '.join(quasi.constrained)} being 0" if quasi.constrained else ""
+    return [f"quasi         {', '.join(free)} make the state with q{zero}"]
+
+
+def _constraints(rows: Layout, quasi: bool) -> list[str]:
+    if not rows.size:
+        return ["constraints   none, so no multipliers are computed"]
+    kinds = zip(rows.labels, rows.holonomic, rows.driven, strict=True)
+    words = [
+        f"{label} ({'holonomic' if holonomic else 'Pfaffian'}{', driven' if driven else ''})"
+        for label, holonomic, driven in kinds
+    ]
+    return [
+        f"constraints   {rows.size} rows: {', '.join(words)}",
+        "              by formulation='quasi' they hold without multipliers"
+        if quasi
+        else "              lam eliminated with M; states projected after every step"
+        + ("; dependent rows left out from the start" if rows.size > 1 else ""),
+    ]
 
 
 def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[str]:
     program, labels = equations.program, system.coordinates.labels
     assert lowered.scene is not None
+    if lowered.scene.kinematics is not None:
+        return _in_quasi(lowered, equations)
     found = find(lowered.scene, equations)
 
     def named(indices: Iterable[int]) -> str:
@@ -69,24 +103,56 @@ def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[st
         facts.append("L = T(v) - V(q)")
     if found.linear:
         facts.append("equations linear")
-    functions = program.operations - program.count(*_ARITHMETIC)
     return [
         f"structure     {'; '.join(facts)}",
-        f"lowering      scalar program: {program.operations} operations for a, {functions} of them "
-        f"functions, {program.count('div')} divisions; {len(program.prelude)} more once per solve",
+        f"lowering      scalar program: {_operations(program, 'a')}",
         f"              h from {equations.form}; {lowered.reason}",
-        "mass solve    along the nonzeros of M, on scalars",
+        "mass solve    along the nonzeros of M"
+        + (" and A" if system.constraints else "")
+        + ", on scalars",
+        _batches(),
     ]
+
+
+def _in_quasi(lowered: Lowered, equations: Equations) -> list[str]:
+    """The same where the state is made of quasi-velocities."""
+    operations = _operations(equations.program, "v and u'")
+    return [
+        f"lowering      scalar program: {operations}",
+        f"              equations {equations.form}; {lowered.reason}",
+        "mass solve    along the nonzeros of B^T M B, on scalars",
+        _batches(),
+    ]
+
+
+def _operations(program: Program, what: str) -> str:
+    functions = program.operations - program.count(*_ARITHMETIC)
+    return (
+        f"{program.operations} operations for {what}, {functions} of them functions, "
+        f"{program.count('div')} divisions; {len(program.prelude)} more once per solve"
+    )
+
+
+def _batches() -> str:
+    return "batches       by jax.vmap: " + (
+        f"{LANES} trajectories at a time in one loop (explicit methods of jaxlag, without work)"
+        if jax.default_backend() == "cpu"
+        else "all trajectories in one loop"
+    )
 
 
 _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "select", "gt", "ge", "lt", "le", "eq", "ne")
 
 
-def _array(system: "System", reason: str) -> list[str]:
+def _array(system: "System", structure: Structure, reason: str) -> list[str]:
     n = system.size
+    often = "once per solve" if structure.mass_constant else "per evaluation"
+    ways = ["M by batched forward-over-reverse columns"]
+    if not structure.bias_zero:
+        ways.append("h by one forward derivative of (dL/dq, dL/dv)")
     return [
-        f"lowering      array program ({reason}): M by batched forward-over-reverse columns, h by "
-        "one forward derivative of (dL/dq, dL/dv)",
-        "mass solve    one factorisation per evaluation, "
+        f"lowering      array program ({reason}): {', '.join(ways)}",
+        f"mass solve    one factorisation {often}, "
         + ("unrolled" if n <= UNROLL_UP_TO else f"by library Cholesky (n > {UNROLL_UP_TO})"),
+        "batches       by jax.vmap: all trajectories in one loop",
     ]

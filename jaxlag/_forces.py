@@ -1,7 +1,7 @@
 """Applied generalized forces, each with a name."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeGuard
 
 import equinox as eqx
 import jax
@@ -64,22 +64,62 @@ class GeneralizedForce(AbstractForce):
     The virtual work is `sum_i Q_i dq_i`, so Q_i is in N where q_i is in m and in N m where q_i
     is in rad; positive Q_i pushes towards larger q_i (Pila, eq. 3.25 ff.).
 
+    With `reaction=True` the force depends on the multipliers of constraints, as friction does on
+    a normal reaction; it is solved for together with them. Where no solution exists (Painleve's
+    paradox), a contact lifts off or its sliding stops or reverses, a motion ends with the status
+    no_reaction_solution.
+
     Args:
-        Q: function `Q(t, q, v, params, inputs)` or `Q(t, q, v, params)` returning shape (n,).
+        Q: function `Q(t, q, v, params, inputs)` or `Q(t, q, v, params)` returning shape (n,); with
+            `reaction=True` of one last argument more, `lam`: a dict from row names to multipliers.
         name: shown in `explain()` and used to select this force.
+        reaction: whether Q takes `lam`.
+        contact: name of a constraint whose multipliers must not become negative.
+        sliding: function `sliding(t, q, v, params)`, the velocity of the contact point (m/s) along
+            the direction in which Q takes it to slide: a scalar whose sign must not change.
 
     Raises:
-        ValueError: `Q` is not callable in either form, or the name is empty.
+        ValueError: `Q` or `sliding` is not callable in these forms, the name is empty, or `contact`
+            or `sliding` is given without `reaction=True`.
+
+    Source: Pila, eqs. 3.173 to 3.177 (a stick sliding with friction); Lotstedt, SIAM J. Appl. Math.
+    42 (1982) 281 (existence of solutions).
     """
 
     Q: Callable = eqx.field(static=True)
     name: str = eqx.field(static=True)
     takes_inputs: bool = eqx.field(static=True)
+    reaction: bool = eqx.field(static=True)
+    contact: str | None = eqx.field(static=True)
+    sliding: Callable | None = eqx.field(static=True)
 
-    def __init__(self, Q: Callable, name: str) -> None:
+    def __init__(
+        self,
+        Q: Callable,
+        name: str,
+        *,
+        reaction: bool = False,
+        contact: str | None = None,
+        sliding: Callable | None = None,
+    ) -> None:
         _require_name("GeneralizedForce", name)
-        self.takes_inputs = _takes_inputs(f"force {name!r}: Q", Q)
-        self.Q, self.name = Q, name
+        argument = f"force {name!r}"
+        if reaction:
+            self.takes_inputs = not (callable(Q) and accepts(Q, 5)) or wants(Q, 5, "lam")
+            arguments = _ARGUMENTS if self.takes_inputs else _ARGUMENTS[:4]
+            require_arity(f"{argument}: Q", Q, (*arguments, "lam"))
+        else:
+            self.takes_inputs = _takes_inputs(f"{argument}: Q", Q)
+            for other, value in (("contact", contact), ("sliding", sliding)):
+                if value is not None:
+                    fix = "Write reaction=True and let Q take lam as its last argument."
+                    raise bad(f"{argument}: {other}", "be left out", "reaction was False", fix)
+        if contact is not None and (not isinstance(contact, str) or not contact):
+            raise bad(f"{argument}: contact", "be the name of a constraint", f"it was {contact!r}")
+        if sliding is not None:
+            require_arity(f"{argument}: sliding", sliding, ("t", "q", "v", "params"))
+        self.Q, self.name, self.reaction = Q, name, reaction
+        self.contact, self.sliding = contact, sliding
 
     def __call__(
         self,
@@ -88,9 +128,11 @@ class GeneralizedForce(AbstractForce):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
+        lam: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
-        """Q(t, q, v, params, inputs), shape (n,)."""
-        return self.Q(t, q, v, params, inputs) if self.takes_inputs else self.Q(t, q, v, params)
+        """Q, shape (n,)."""
+        state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
+        return self.Q(*state, lam) if self.reaction else self.Q(*state)
 
 
 class PointForce(AbstractForce):
@@ -284,6 +326,11 @@ def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
     return forces
 
 
+def reads_lam(force: AbstractForce) -> TypeGuard[GeneralizedForce]:
+    """Whether a force depends on the multipliers of constraints."""
+    return isinstance(force, GeneralizedForce) and force.reaction
+
+
 def components(
     force: AbstractForce,
     t: Float[Array, ""],
@@ -291,9 +338,11 @@ def components(
     v: Float[Array, " n"],
     params: Any,
     inputs: Mapping[str, Any],
+    lam: Mapping[str, Any] | None = None,
 ) -> Float[Array, " n"]:
     """The force's components, or an error while tracing if they are not one per coordinate."""
-    Q = force(t, q, v, params, inputs)
+    state = (t, q, v, params, inputs)
+    Q = force(*state, lam) if isinstance(force, GeneralizedForce) else force(*state)
     must = f"return {q.shape[0]} real components, one per coordinate"
     if not eqx.is_array_like(Q):
         raise bad(f"force {force.name!r}", "return an array", f"it returned {Q!r}")

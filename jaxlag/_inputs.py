@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -40,8 +41,18 @@ class AbstractInput(eqx.Module):
         raise NotImplementedError
 
 
+def _inexact(x: Any) -> Array:
+    """`x` as an inexact array; values that are known remain so while JAX traces what is around."""
+    if concrete(x):
+        with jax.ensure_compile_time_eval():
+            x = jnp.asarray(x)
+            return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+
+
 def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
-    times, values = jnp.asarray(times), jnp.asarray(values)
+    times, values = _inexact(times), _inexact(values)
     if times.ndim != 1 or times.shape[0] < 2:
         raise bad(
             f"{kind}: times", "be one row of at least 2 times", f"its shape was {times.shape}"
@@ -52,10 +63,6 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
             f"have one entry per time, {times.shape[0]}",
             f"its shape was {values.shape}",
         )
-    times, values = (
-        x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
-        for x in (times, values)
-    )
     if concrete(times):
         steps = np.diff(np.asarray(times, float))
         if not np.all(steps > 0):
@@ -66,7 +73,7 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
                 f"times[{i}] = {times[i]} and times[{i + 1}] = {times[i + 1]}",
                 "Sort the table and drop repeated times.",
             )
-    if concrete(values) and not bool(jnp.all(jnp.isfinite(values))):
+    if concrete(values) and not np.all(np.isfinite(values)):
         raise bad(f"{kind}: values", "be finite", "some were nan or inf")
     return times, values
 
@@ -304,6 +311,11 @@ def evaluate(
             for name, signal in inputs.items()
         }
     )
+
+
+def reads_state(inputs: Mapping[str, Any]) -> bool:
+    """Whether any of the inputs depends on (q, v)."""
+    return any(isinstance(x, Feedback) for x in inputs.values())
 
 
 def all_knots(inputs: Mapping[str, Any]) -> Float[Array, " k"] | None:

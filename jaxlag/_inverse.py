@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
 from jaxlag._errors import bad, require_arity
+from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._system import System
 from jaxlag._vectors import common, real
@@ -29,6 +30,8 @@ def inverse_dynamics(
     inputs: Mapping[str, Any] | None = None,
 ) -> Float[Array, "*s n"]:
     """Generalized force M a + h - Q that a motion needs beyond the forces declared.
+
+    What the constraints of the system exert, A^T lam, is part of it.
 
     One derivative of the momentum along the motion: d/dt(dL/dv) - dL/dq - Q. M is neither formed
     nor factored, so it may be singular (massless links). Composes with jit, vmap and every
@@ -69,6 +72,10 @@ def inverse_dynamics(
     """
     if not isinstance(system, System):
         raise bad("inverse_dynamics: system", "be a jl.System", f"it was {system!r}")
+    if any(map(reads_lam, system.forces)):
+        was = "it has some"
+        must = "be a system without forces that depend on multipliers"
+        raise bad("inverse_dynamics: system", must, was, "A motion does not say what lam is.")
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")

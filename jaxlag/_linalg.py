@@ -23,15 +23,19 @@ class MassFactor(NamedTuple):
     healthy: Bool[Array, " n"]
 
 
-def factor_mass(M: Float[Array, "n n"]) -> MassFactor:
+def factor_mass(M: Float[Array, "n n"], relative: float | None = None) -> MassFactor:
     """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.
 
     A pivot below 4 n eps M_ii is what cancellation leaves of a singular matrix, whatever the
     units of coordinate i. A singular matrix whose other pivots are ill-conditioned themselves can
     pass: its round-off is larger than that.
+
+    Args:
+        M: symmetric.
+        relative: what to multiply M_ii with instead of 4 n eps.
     """
     n = M.shape[0]
-    floor = _floor(M)
+    floor = _floor(M) if relative is None else relative * jnp.abs(jnp.diagonal(M))
     if n > UNROLL_UP_TO:
         lower = jnp.linalg.cholesky(M, symmetrize_input=False)
         pivots = jnp.diagonal(lower) ** 2
@@ -59,11 +63,11 @@ def first_unhealthy(M: Float[Array, "n n"], factor: MassFactor | None = None) ->
     factor = factor_mass(M) if factor is None else factor
     n = M.shape[0]
 
-    def eliminate(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    def one(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
         below = (jnp.arange(n) > k)[:, None]
         return jnp.where(below, M - jnp.outer(M[:, k] / M[k, k], M[k]), M)
 
-    pivots = jnp.diagonal(jax.lax.fori_loop(0, n, eliminate, M))
+    pivots = jnp.diagonal(jax.lax.fori_loop(0, n, one, M))
     failed = ~(pivots > _floor(M))
     weakest = jnp.argmin(pivots / jnp.diagonal(M))
     first = jnp.where(jnp.any(failed), jnp.argmax(failed), weakest)
@@ -74,7 +78,8 @@ def _floor(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     return 4 * M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
 
 
-def _eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:
+def eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The x with M x = r, whatever the health of the factor."""
     if factor.upper is None:
         assert factor.cholesky is not None
         return cho_solve((factor.cholesky, True), r)
@@ -107,6 +112,6 @@ def solve_mass(
     factor = factor_mass(jax.lax.stop_gradient(M)) if factor is None else factor
     factor = jax.lax.stop_gradient(factor)
     x = jax.lax.custom_linear_solve(
-        lambda x: M @ x, r, solve=lambda _, b: _eliminate(factor, b), symmetric=True
+        lambda x: M @ x, r, solve=lambda _, b: eliminate(factor, b), symmetric=True
     )
     return jnp.where(jnp.all(factor.healthy), x, jnp.nan)

@@ -1,31 +1,61 @@
 """From `method`, tolerances and dt to a diffrax solver and step-size controller."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 
-from jaxlag._drive import with_stages
+from jaxlag import _params
 from jaxlag._errors import bad
-from jaxlag.solvers import Dopri8
+from jaxlag._scheme import with_stages
+from jaxlag.solvers import (
+    AbstractFixedStep,
+    Dopri5,
+    Dopri8,
+    GaussLegendre,
+    LobattoIIIAB,
+    Prince9,
+    Splitting,
+    Tsit5,
+)
 
-METHODS: dict[str, type[diffrax.AbstractSolver]] = {
+METHODS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "euler": diffrax.Euler,
     "heun": diffrax.Heun,
     "midpoint": diffrax.Midpoint,
     "ralston": diffrax.Ralston,
     "bosh3": diffrax.Bosh3,
-    "tsit5": diffrax.Tsit5,
-    "dopri5": diffrax.Dopri5,
+    "tsit5": Tsit5,
+    "dopri5": Dopri5,
     "dopri8": Dopri8,
+    "prince9": Prince9,
     "implicit_euler": diffrax.ImplicitEuler,
     "kvaerno3": diffrax.Kvaerno3,
     "kvaerno4": diffrax.Kvaerno4,
     "kvaerno5": diffrax.Kvaerno5,
+    "splitting2": partial(Splitting, 2),
+    "splitting4": partial(Splitting, 4),
+    "splitting6": partial(Splitting, 6),
+    "splitting8": partial(Splitting, 8),
+    "gauss2": partial(GaussLegendre, 1),
+    "gauss4": partial(GaussLegendre, 2),
+    "gauss6": partial(GaussLegendre, 3),
+    "gauss8": partial(GaussLegendre, 4),
+    "variational2": partial(LobattoIIIAB, 2),
+    "variational4": partial(LobattoIIIAB, 3),
 }
-AUTO = "dopri8"
+WRITTEN_OUT = (Tsit5, Dopri5, Dopri8, Prince9)  # stage by stage
+LOOSE, TIGHT = 1e-3, 1e-12  # rtol from which order 5, and up to which order 9 is taken
+IMPLICIT = "kvaerno5"  # where explicit steps run out
+FINER = {"bosh3": "tsit5", "tsit5": "dopri8", "dopri5": "dopri8", "dopri8": "prince9"}
+# Of steps of order 8 and 9, whose errors grow by 1.1^9 where a step is 10 % too long.
+SAFETY = {Dopri8: 0.8, Prince9: 0.8}
 
 
 def choose(
@@ -57,7 +87,17 @@ def choose(
                 f"it was {type(controller).__name__}",
                 "Give dt= for fixed steps.",
             )
-    solver = _solver(method)
+    # rtol has no unit; atol has those of the coordinates.
+    known = adaptive and _params.concrete((rtol, atol))
+    solver = _solver(method, (rtol if rtol > 0 else atol) if known else None)
+    if adaptive and isinstance(solver, AbstractFixedStep):
+        raise bad(
+            "dt",
+            f"be given for {type(solver).__name__}",
+            "a step-size controller was given instead" if controller else "it was left out",
+            "Its map from step to step keeps the structure of the equations only as long as all "
+            "steps are equal: pass dt=0.01.",
+        )
     if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise bad(
             "method",
@@ -66,13 +106,48 @@ def choose(
             "Give dt= for fixed steps, or choose another method.",
         )
     if adaptive and controller is None:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol)
+        safety = SAFETY.get(type(solver), 0.9)
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, safety=safety)
+    if isinstance(method, str) and hasattr(solver, "root_finder"):
+        return _with_chord(solver, rtol, atol), controller
     return _with_tolerances(solver, controller, rtol, atol), controller
 
 
-def _solver(method: Any) -> diffrax.AbstractSolver:
+def automatic(tolerance: Any) -> str:
+    """The explicit method that is cheapest at the error of a tolerance; order 8 if it is not known.
+
+    At equal errors of the motion, on a double pendulum, a Kepler orbit of e = 0.6 and the system of
+    Henon and Heiles: order 5 takes as long as order 8 at 1e-4 and compiles in half the time, but
+    there it left errors of more than ten times the tolerance times the conditioning in 4 of 126
+    motions of the catalogue, order 8 in none of those. Order 9 takes 1.1 of order 8 at 1e-6, 0.95
+    at 1e-9 and 0.8 at 1e-12. At equal tolerance order 9 takes 1.3 to 1.8 times the evaluations of
+    order 8, and is a hundred times as accurate.
+    """
+    if tolerance is None:
+        return "dopri8"
+    if tolerance >= LOOSE:
+        return "tsit5"
+    return "prince9" if tolerance <= TIGHT else "dopri8"
+
+
+def name_of(solver: diffrax.AbstractSolver) -> str:
+    """Its name in METHODS, or else that of its class."""
+    default = type(solver).__name__
+    for name, make in METHODS.items():
+        known = make()
+        if isinstance(known, AbstractFixedStep):
+            if jax.tree.structure(known) == jax.tree.structure(solver):
+                return name
+        elif type(solver) in (type(known), type(getattr(known, "stock", known))):
+            finder = getattr(solver, "root_finder", None)
+            ours = finder is None or type(finder) is optimistix.Chord
+            return name if ours else default
+    return default
+
+
+def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
     if isinstance(method, str):
-        name = AUTO if method == "auto" else method
+        name = automatic(tolerance) if method == "auto" else method
         if name not in METHODS:
             raise bad(
                 "method",
@@ -92,6 +167,26 @@ def _solver(method: Any) -> diffrax.AbstractSolver:
             f"{type(method).__name__} wants terms {method.term_structure}",
         )
     return with_stages(method, "lax")
+
+
+def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
+    """Its equations are solved to a tenth of the tolerance, by one Jacobian per step.
+
+    The solver's own way gives up where the first turns do not converge fast, and steps are as short
+    as it takes not to: 5 times as many on a double pendulum, 20 times on an elastic pendulum of
+    stiffness 1e6, half of them rejected, with errors far below the tolerance. At equal errors it
+    takes 2 to 3 times as long.
+    """
+    dtype = jnp.result_type(rtol)
+    least = 10 * float(jnp.finfo(dtype).eps)
+    known = _params.concrete((rtol, atol))  # numpy: no dispatch
+    larger = (lambda x: np.asarray(np.maximum(x, least), dtype)) if known else None
+    bounds: Any = [
+        larger(0.1 * x) if larger else jnp.maximum(0.1 * x, least).astype(dtype)
+        for x in (rtol, atol)
+    ]
+    finder = optimistix.Chord(*bounds, norm=optimistix.rms_norm)
+    return eqx.tree_at(lambda s: s.root_finder, solver, finder)
 
 
 def _with_tolerances(

@@ -2,12 +2,10 @@
 
 The derivative is that of the map from (state, args, times) to the rows at the FROZEN sequence of
 accepted steps: step ends keep their distance from the start, knot or stop they are anchored to,
-and move with it. The forward loop is never differentiated; under any derivative it records its
-grid, and the steps are taken again on that grid, as a scan that JAX differentiates in any mode
-and to any order.
+and move with it. The loop of steps is never differentiated; under any derivative it records where
+it went, and the derivative goes the same way again.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,11 +15,30 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxlag._drive import CHUNK, Grid, Outcome, Scheme, Times, drive, with_stages
+from jaxlag import _xla
+from jaxlag._drive import Outcome, Times, drive
+from jaxlag._gradient import GradientMode, Keep
+from jaxlag._lanes import LANES, in_batches, in_lanes, lanes_first, zero_tangent
+from jaxlag._lowering import elements
+from jaxlag._scheme import Scheme
 from jaxlag._status import Status
+from jaxlag._variations import (
+    Setup,
+    changed,
+    changes,
+    filled,
+    in_loops,
+    one_step,
+    path_of,
+    unpack,
+)
+from jaxlag._walk import Clock, Walk, again
 
-# Rows interpolated at once: bounds the memory of a vmapped solve.
-ROWS_AT_ONCE = 64
+# Rows reached at once. An operation on thousands of numbers is one that XLA would share among
+# cores, and cannot in a loop that is one native function: it fails to link. Beside lanes and
+# directions of derivatives there is one row at a time; gradients of 400 rows take as long as with
+# 64 at once or less.
+ROWS_AT_ONCE = LANES
 
 
 class Rows(NamedTuple):
@@ -30,14 +47,6 @@ class Rows(NamedTuple):
     saved: PyTree  # leaves (s, ...), NaN where not reached
     state: PyTree  # last good state
     time: Float[Array, ""]  # last good time
-
-
-class Setup(NamedTuple):
-    """What a solve needs and no derivative is taken of."""
-
-    first_step: Array | None
-    allowed: Bool[Array, ""]
-    scheme: Any  # traced half of the Scheme
 
 
 class Problem(NamedTuple):
@@ -49,6 +58,7 @@ class Problem(NamedTuple):
     setup: Setup
     scheme: Any  # static half of the Scheme
     max_steps: int
+    keep: Keep
 
 
 def solve(problem: Problem) -> tuple[Rows, Outcome]:
@@ -57,17 +67,30 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
 
     @jax.custom_jvp
     def run(inexact: Any, rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
-        return _forward(inexact, rest, setup, static, record=False)
+        return lanes_first(_forward(inexact, rest, setup, static))
 
-    @run.defjvp
+    @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
         inexact, rest, setup = primals
-        frozen = jax.lax.stop_gradient(inexact)
-        _, outcome = _forward(frozen, rest, setup, static, record=True)
-        function = partial(_replay, rest, setup, static, outcome)
-        rows, rows_dot = jax.jvp(function, (inexact,), (tangents[0],))
-        outcome = outcome._replace(grid=None)
-        return (rows, outcome), (rows_dot, jax.tree.map(_zero_tangent, outcome))
+        outcome = _recorded(inexact, rest, setup, static)
+        change = changes(tangents[0], outcome)
+        assert outcome.record is not None
+        if static[1].remembers:
+            function = partial(_replay, rest, setup, static, outcome)
+            rows, rows_dot, failed = jax.jvp(
+                function, (inexact,), (filled(change, inexact),), has_aux=True
+            )
+        else:
+            on = Walk((outcome.state, None), outcome.row_state, None)
+            on_dot = changed(inexact, rest, setup, static, outcome.record, change)
+            function = partial(_reached, rest, setup, static, outcome)
+            rows, rows_dot, failed = jax.jvp(
+                function, (inexact, on), (filled(change, inexact), on_dot), has_aux=True
+            )
+        mode = _mode(outcome, static)
+        outcome = _judged(outcome, rows, failed, static[1])._replace(gradient=mode)
+        rows, outcome = lanes_first((rows, outcome))
+        return (rows, outcome), (rows_dot, jax.tree.map(zero_tangent, outcome))
 
     return run(inexact, rest, setup)
 
@@ -76,36 +99,106 @@ def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
     """A problem as (differentiable leaves, other arrays, setup, static rest)."""
     inexact, rest = eqx.partition(problem[:3], eqx.is_inexact_array)
     rest, static = eqx.partition(rest, eqx.is_array)
-    return inexact, rest, problem.setup, (static, problem.scheme, problem.max_steps)
+    return inexact, rest, problem.setup, (static, problem.scheme, problem.max_steps, problem.keep)
 
 
-def _zero_tangent(x: Array) -> Any:
-    if jnp.issubdtype(x.dtype, jnp.inexact):
-        return jnp.zeros_like(x)
-    return jnp.zeros(x.shape, jax.dtypes.float0)
+def _forward(inexact: Any, rest: Any, setup: Setup, static: Any) -> tuple[Rows, Outcome]:
+    outcome = _driven(inexact, rest, setup, static, record=False)
+    fast = static[1].by_element(lanes=True, in_loop=False)
 
+    def saved(
+        inexact: Any, rest: Any, setup: Setup, outcome: Outcome, at_once: int = ROWS_AT_ONCE
+    ) -> tuple[Rows, Array]:
+        y0, args, times, scheme, _ = unpack(inexact, rest, setup, static)
+        fast = scheme.by_element(lanes=True, in_loop=False)
+        y0 = y0 if fast is None else tuple(elements(y0))
+        if outcome.row_time is None:
+            states = (jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state), None)
+            starts = jnp.stack([times.start, outcome.time])
+        else:
+            starts, states = outcome.row_time, outcome.row_state
+        on = fast or scheme, args, times, starts, states, outcome, outcome.state, outcome.time
+        rows, failed = _rows(*on, at_once=at_once)
+        if fast is not None:
+            rows = rows._replace(saved=jnp.stack(rows.saved, -1), state=jnp.stack(rows.state))
+        return rows, failed
 
-def _unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
-    static_problem, static_scheme, max_steps = static
-    y0, args, times = eqx.combine(inexact, rest, static_problem)
-    return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
-
-
-def _forward(
-    inexact: Any, rest: Any, setup: Setup, static: Any, record: bool
-) -> tuple[Rows, Outcome]:
-    y0, args, times, scheme, max_steps = _unpack(inexact, rest, setup, static)
-    outcome = drive(scheme, y0, args, times, setup.first_step, setup.allowed, max_steps, record)
-    if outcome.row_time is None:
-        states = (jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, outcome.state), None)
-        starts = jnp.stack([times.start, outcome.time])
+    given = inexact, rest, setup, outcome
+    if fast is None or jax.default_backend() != "cpu" or outcome.row_time is None:
+        rows, failed = saved(*given)
     else:
-        starts, states = outcome.row_time, outcome.row_state
-    rows, failed = _rows(scheme, args, times, starts, states, outcome, outcome.state, outcome.time)
+        rows, failed = in_lanes(saved, partial(saved, at_once=1), *given)
+    return rows, _judged(outcome, rows, failed, static[1])
+
+
+def _judged(outcome: Outcome, rows: Rows, failed: Array, scheme: Scheme) -> Outcome:
+    """What is said of a solve, without what was kept on the way."""
     lost = failed & (outcome.status == int(Status.ok))
-    status = jnp.where(lost, int(Status.implicit_solve_failed), outcome.status)
-    outcome = outcome._replace(status=status.astype(jnp.int32))
-    return rows, outcome._replace(row_time=None, row_state=None)
+    fault = Status.projection_failed if scheme.moves else Status.implicit_solve_failed
+    status = jnp.where(lost, int(fault), outcome.status)
+    outcome = outcome._replace(status=status.astype(jnp.int32), state=rows.state)
+    return outcome._replace(row_time=None, row_state=None, record=None)
+
+
+def _mode(outcome: Outcome, static: Any) -> Array:
+    """How reverse derivatives go through the steps."""
+    assert outcome.record is not None
+    if static[3].room == 0 and not static[1].remembers:
+        return jnp.full_like(outcome.gradient, int(GradientMode.forward))
+    apart = outcome.record.stride > 1
+    modes = int(GradientMode.checkpoints), int(GradientMode.recorded)
+    return jnp.where(apart, *modes).astype(jnp.int32) + jnp.zeros_like(outcome.gradient)
+
+
+def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
+    """The loop with its record; states on the way are differentiable."""
+
+    @jax.custom_jvp
+    def run(inexact: Any, rest: Any, setup: Setup) -> Outcome:
+        return lanes_first(_driven(inexact, rest, setup, static, record=True))
+
+    @partial(run.defjvp, symbolic_zeros=True)
+    def run_jvp(primals: Any, tangents: Any) -> Any:
+        inexact, rest, setup = primals
+        outcome = _recorded(inexact, rest, setup, static)
+        dots = jax.tree.map(zero_tangent, outcome)
+        if not static[1].remembers:
+            change = changes(tangents[0], outcome)
+            record = outcome.record
+            assert record is not None
+            on = changed(inexact, rest, setup, static, record, change, points=True)
+            record = dots.record._replace(points=on.points)
+            dots = dots._replace(state=on.last[0], row_state=on.rows, record=record)
+        return outcome, dots
+
+    outcome = run(inexact, rest, setup)
+    assert outcome.record is not None
+    # Times stay where they are, or move with their anchors.
+    still = outcome.record._replace(offsets=jax.lax.stop_gradient(outcome.record.offsets))
+    row_time = jax.lax.stop_gradient(outcome.row_time)
+    return outcome._replace(record=still, row_time=row_time)
+
+
+def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) -> Outcome:
+    """The loop of steps, on elements where there is a form for them; vmapped, in chunks then."""
+
+    def single(inexact: Any, rest: Any, setup: Setup, lanes: bool = False) -> Outcome:
+        y0, args, times, scheme, max_steps = unpack(inexact, rest, setup, static)
+        if record:
+            scheme = scheme.for_derivatives(times.start, y0, args)
+        fast = scheme.by_element(lanes)
+        if fast is not None:
+            scheme, y0 = fast, tuple(elements(y0))
+        # Buffers that lanes write to at places of their own are no plain operations.
+        plain = fast is not None and not (lanes and times.saves.shape[0] > 2)
+        rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room
+        native = _xla.native if plain else None
+        return drive(scheme, y0, args, times, *rest_of_it, native, lanes or fast is None)
+
+    scheme = unpack(inexact, rest, setup, static)[3]
+    if scheme.by_element() is None or jax.default_backend() != "cpu":
+        return single(inexact, rest, setup)
+    return in_lanes(single, partial(single, lanes=True), inexact, rest, setup)
 
 
 def _rows(
@@ -117,6 +210,8 @@ def _rows(
     outcome: Outcome,
     state: PyTree,
     time: Array,
+    differentiable: bool = False,
+    at_once: int = ROWS_AT_ONCE,
 ) -> tuple[Rows, Bool[Array, ""]]:
     """Reach every save time by one step of the solver itself from the last state before it.
 
@@ -129,13 +224,13 @@ def _rows(
 
         def step(row: tuple[Array, Array, PyTree]) -> tuple[PyTree, Array]:
             t0, t1, state = row
-            (y, _), solved = _step(scheme, args, t0, t1, state, jnp.array(False))
+            (y, _), solved = one_step(scheme, args, t0, t1, state, jnp.array(False), differentiable)
             finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]
             return y, solved & jnp.all(jnp.stack(finite))
 
         def step_all(states: PyTree) -> tuple[PyTree, Array]:
             ends = jnp.where(inside, saves, starts)
-            return _in_batches(step, (starts, ends, states), saves.shape[0])
+            return in_batches(step, (starts, ends, states), saves.shape[0], at_once)
 
         # Rows that need no step must not see one: the field may not be finite where they are.
         safe = jax.tree.map(lambda s: jnp.where(_like(inside, s), s, s[:1]), states)
@@ -154,89 +249,40 @@ def _rows(
     return Rows(saved, state, time), jnp.any(missed)
 
 
-def _in_batches(function: Callable, rows: PyTree, count: int) -> PyTree:
-    """function over `count` rows, in equal batches; the last row fills the last batch up."""
-    batches = -(-count // ROWS_AT_ONCE)
-    size = -(-count // batches)
-
-    def batch(leaf: Array) -> Array:
-        filled = jnp.minimum(jnp.arange(batches * size), count - 1)
-        return leaf[filled].reshape(batches, size, *leaf.shape[1:])
-
-    if batches == 1:
-        return jax.vmap(function)(rows)
-    results = jax.lax.map(jax.vmap(function), jax.tree.map(batch, rows))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], results)
-
-
-def _step(
-    scheme: Scheme, args: Any, t0: Array, t1: Array, state: PyTree, jump: Array
-) -> tuple[PyTree, Bool[Array, ""]]:
-    """One step from (y, memory), and whether it was solved; without memory it starts afresh."""
-    y, memory = state
-    if not scheme.remembers:
-        memory, jump = scheme.begin(t0, t1, y, args), jnp.array(True)
-    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jump)
-    return (y, memory if scheme.remembers else None), solved
-
-
 def _like(mask: Array, leaf: Array) -> Array:
     return mask.reshape(mask.shape + (1,) * (leaf.ndim - mask.ndim))
 
 
-def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> Rows:
-    """The rows as a differentiable function of `inexact`, on the recorded grid."""
-    grid = outcome.grid
-    assert grid is not None
-    # A trajectory that took no step depends on nothing but its start: keep NaN out of derivatives.
-    moved = grid.count > 0
-    inexact = jax.tree.map(lambda x: jnp.where(moved, x, jax.lax.stop_gradient(x)), inexact)
-    y0, args, times, scheme, _max_steps = _unpack(inexact, rest, setup, static)
-    scheme = eqx.tree_at(lambda s: s.solver, scheme, with_stages(scheme.solver, "bounded"))
-    ends = times.anchors()[grid.anchor] + grid.offset
-    memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
-    start = (y0, memory)
-    state, history = _steps(scheme, args, times.start, ends, grid, start)
-    marks = jnp.concatenate([times.start[None], ends])
-    states = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest])[grid.row_step], start, history
-    )
-    starts = marks[grid.row_step]
-    return _rows(scheme, args, times, starts, states, outcome, state[0], marks[grid.count])[0]
+def _reached(
+    rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any, on: Walk
+) -> tuple[Rows, Array]:
+    """The rows as a differentiable function of `inexact` and of the states on the way."""
+    y0, args, times, scheme, _ = unpack(inexact, rest, setup, static)
+    scheme, record = in_loops(scheme), outcome.record
+    assert record is not None
+
+    def stacked(y: Any) -> Any:
+        return jnp.stack(y, -1) if isinstance(y, tuple) else y
+
+    clock, anchors = Clock(times, record), times.anchors()
+    last, time = stacked(on.last[0]), clock.time(record.turns - 1, anchors)
+    if on.rows is None:
+        states = (jnp.stack([y0, last]), None)
+        starts = jnp.stack([times.start, time])
+    else:
+        assert record.row_turn is not None
+        states = (stacked(on.rows[0]), on.rows[1])
+        starts = jax.vmap(lambda k: clock.time(k, anchors))(record.row_turn - 1)
+    given = scheme, args, times, starts, states, outcome, last, time
+    return _rows(*given, differentiable=True, at_once=1)
 
 
-def _steps(
-    scheme: Scheme, args: Any, t0: Array, ends: Float[Array, " N"], grid: Grid, start: PyTree
-) -> tuple[PyTree, PyTree]:
-    """Take the recorded steps, ending at `ends`; the last state, and the state after each.
-
-    The scan skips whole chunks that no lane of a vmapped solve needs. Slots past the last step
-    repeat the first one and drop its result, so that no derivative meets a state out of reach.
-    """
-    used = jnp.arange(ends.shape[0], dtype=jnp.int32) < grid.count
-    begins = jnp.where(used, jnp.concatenate([t0[None], ends[:-1]]), t0)
-    ends = jnp.where(used, ends, ends[0])
-    start = jax.tree.map(jnp.asarray, start)
-
-    @partial(jax.checkpoint, prevent_cse=False)
-    def step(t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
-        return _step(scheme, args, t0, t1, state, jump)[0]
-
-    def one(state: PyTree, slot: tuple[Array, Array, Array, Array]) -> tuple[PyTree, PyTree]:
-        t0, t1, use, jump = slot
-        pick = partial(jax.tree.map, lambda a, b: jnp.where(use, a, b))
-        state = pick(step(t0, t1, pick(state, start), jump), state)
-        return state, state
-
-    def chunk(state: PyTree, slots: Any) -> tuple[PyTree, PyTree]:
-        def skip(state: PyTree) -> tuple[PyTree, PyTree]:
-            return state, jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), state)
-
-        def take(state: PyTree) -> tuple[PyTree, PyTree]:
-            return jax.lax.scan(one, state, slots)
-
-        return jax.lax.cond(eqxi.unvmap_any(slots[2]), take, skip, state)
-
-    slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used, grid.jump))
-    last, history = jax.lax.scan(chunk, start, slots)
-    return last, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), history)
+def _replay(
+    rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any
+) -> tuple[Rows, Array]:
+    """The rows as a function of `inexact` alone, all steps taken again."""
+    y0, args, times, scheme, _ = unpack(inexact, rest, setup, static)
+    assert outcome.record is not None
+    path = path_of(scheme, y0, args, times, outcome.record, ())
+    on = again(path, path.start, [], times.anchors(), False)
+    return _reached(rest, setup, static, outcome, inexact, on)

@@ -2,17 +2,16 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxlag import _params, _xla
 from jaxlag._arguments import (
-    check_declaration,
+    check_formulation,
     check_method,
     check_options,
     check_start,
@@ -20,45 +19,27 @@ from jaxlag._arguments import (
     check_times,
     check_tolerances,
 )
-from jaxlag._diagnosis import Start, diagnose, start_finite, values_allowed
-from jaxlag._drive import Scheme, Times
-from jaxlag._dynamics import Arguments, Dynamics
-from jaxlag._errors import SimulationError
-from jaxlag._inputs import all_knots, check_inputs, check_range, common_range
-from jaxlag._methods import choose
-from jaxlag._replay import Problem, Setup, solve
+from jaxlag._constraints import Baumgarte
+from jaxlag._diagnosis import (
+    diagnose,
+    rows_hold,
+)
+from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
+from jaxlag._errors import SimulationError, bad
+from jaxlag._gradient import choose_gradient
+from jaxlag._inputs import check_inputs, check_range
+from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
+from jaxlag._pose import Plan, Values, pose, velocities_at
+from jaxlag._replay import solve
+from jaxlag._scheme import Scheme, remembers
+from jaxlag._slowness import is_stiff
 from jaxlag._solution import Solution, over_rows
 from jaxlag._status import Status
 from jaxlag._system import System
+from jaxlag.solvers import AbstractPartitioned
 
 MAX_STEPS = 16384
-
-
-class _Plan(NamedTuple):
-    """What the compiled program is keyed by."""
-
-    system: System
-    params: _params.Static
-    inputs: _params.Static
-    scheme: _params.Static
-    direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
-    max_steps: int
-    save: tuple[str, ...]
-    sample: _params.Sample
-
-
-class _Values(NamedTuple):
-    """What the compiled program takes."""
-
-    q0: Array
-    v0: Array
-    ts: Array
-    params: Any
-    inputs: Any
-    scheme: Any
-    rtol: Array
-    atol: Array
-    step: Array | None  # dt or dt0
+_PROJECTION = {True: "projection", False: None}
 
 
 def simulate(
@@ -79,15 +60,18 @@ def simulate(
     max_steps: int = MAX_STEPS,
     save: tuple[str, ...] = (),
     gradient: str = "auto",
-    project: bool = True,
+    gradient_memory: int | float | None = None,
+    project: bool | Baumgarte = True,
     assemble: bool = False,
+    estimate_error: bool = False,
     throw: bool = True,
 ) -> Solution:
-    """Integrate M a + h = Q from (q0, v0) at ts[0], and return the motion at ts.
+    """Integrate M a + h = Q + A^T lam, A v + b = 0 from (q0, v0) at ts[0]; return it at ts.
 
     Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. Other values of q0, v0, ts,
-    inputs, rtol, atol, dt, dt0 and of the traced params never recompile; another number of times,
-    method, static or structure of params does, and so does turning the direction of time round.
+    inputs, rtol, atol, dt, dt0 and of the traced params never recompile, unless a tolerance makes
+    "auto" another method; another number of times, method, static or structure of params does, and
+    so does turning the direction of time round.
 
     The derivative under every transform is that of the solution at the frozen sequence of
     accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
@@ -101,26 +85,61 @@ def simulate(
             are save times and cost no steps.
         params: pytree handed to the Lagrangian and the forces. Floats and inexact arrays are
             traced and differentiable, the rest is static.
-        u0: quasi-velocities at ts[0], for systems that declare them.
+        u0: quasi-velocities at ts[0], for systems that declare them: (k,) numbers in the order of
+            their names, or a dict by name; constrained ones are zero, and may be left out of a
+            dict; m/s or rad/s.
         inputs: dict from names to `ZeroOrderHold`, `Linear`, `Function`, `Feedback` or arrays
             (constant), read by the forces. Steps end on the knots of tables.
-        method: "auto" (order 8), a name such as "tsit5", any diffrax solver, or a pair
-            (solver, step-size controller).
-        formulation: "auto": the state is (q, v).
+        method: "auto", a name such as "tsit5", any diffrax solver, or a pair (solver, step-size
+            controller). "auto" is "dopri8"; "tsit5" where rtol is known and at least 1e-3;
+            "prince9" where it is at most 1e-12; with fixed steps "splitting8" for T(v) - V(t, q)
+            without forces and constraints (a fifth of the time of "dopri8", and as accurate or
+            better in orbits and pendulums, but not at steps beyond 1 / omega); and "kvaerno5",
+            outside of transforms, where a stiff motion took max_steps explicit steps.
+            `Solution.method` names it. Implicit methods by name solve their equations to a tenth of
+            the tolerance; instances of diffrax's classes do as they were made to.
+            Methods that keep the structure of the equations, for
+            long runs with fixed steps dt: "splitting2", "splitting4", "splitting6", "splitting8"
+            (`solvers.Splitting`) where M is constant and nothing that accelerates depends on v;
+            "gauss2" to "gauss8" (`solvers.GaussLegendre`) for any L without constraints;
+            "variational2" and "variational4" (`solvers.LobattoIIIAB`) for any L, with holonomic
+            constraints held inside the step, so that `project` has nothing to do.
+        formulation: what the state is and how accelerations are found.
+            "quasi" ("auto" where quasi-velocities are declared and take care of all rows): (q, u)
+            with the quasi-velocities that are not constrained, no multipliers.
+            "multipliers" ("auto" else): (q, v), M + A^T W A and its Schur complement, factored once
+            each. "null_space": (q, v), M on the tangent space of the constraints. Both take an M
+            that is singular, but not on that space (links without mass).
         rtol: relative bound on the local error; by default 1e-9 in float64, 1e-5 in float32.
         atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32.
         dt: fixed step in s (positive, whichever way time runs); the last one is shortened to
             land on ts[-1].
         dt0: first step in s of an adaptive solve, positive; by default chosen from the start.
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
-        save: names of quantities to compute inside the solve: "a", "p", "energy", "kinetic",
-            "potential", "Q", "power", which the Solution computes on demand without it; and
-            "work", the integral of each term of dH/dt since ts[0], which exists only here. It is
-            integrated along with the motion, its local error bounded like that of q and v.
-        gradient: a hint on the cost of derivatives, never on their value. "auto" and "recorded"
-            are the same so far: steps are taken again on the recorded grid.
-        project: whether constraints are projected; without constraints there is nothing to do.
-        assemble: whether an inconsistent start is moved onto the constraints; the same.
+        save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
+            "potential", "Q", "power", "lam", "constraint_force", which the Solution computes on
+            demand without it; and "work", the integral of each term of dH/dt since ts[0], which
+            exists only here. It is integrated along with the motion, its local error bounded like
+            that of q and v.
+        gradient: a hint on the cost of reverse derivatives, never on their value.
+            "recorded" keeps the state at the start of every step. "checkpoints" keeps about the
+            square root as many and takes the steps between two again, one more solve. "forward"
+            keeps none: reverse derivatives are put together from forward ones, the dearer the
+            more numbers move. "auto" keeps up to 512 states, which is "recorded" up to 512 steps,
+            and where `gradient_memory` is less than that the fastest mode that fits. All keep the
+            times of max_steps steps. What was done is in `motion.stats["gradient"]`. Forward
+            derivatives need the times alone.
+        gradient_memory: bound on what reverse derivatives of one motion keep, bytes; None for
+            none.
+        project: True: accepted steps and saved states are moved onto the constraints, q along
+            M^-1 A^T, then v (with quasi-velocities there is nothing to move but q). False: they are
+            left to drift. `Baumgarte(alpha, beta)`: residuals are damped instead.
+        assemble: whether an inconsistent start is moved to the nearest consistent one, as by
+            `jl.assemble`; else it ends in the status inconsistent_start.
+        estimate_error: whether to solve once more with a tenth of the tolerance and, where there
+            is one, a method of higher order, or else with half the step dt, and give in
+            `motion.error` what follows for the errors of q and v at every row (of the same method,
+            up to every row): global ones, where rtol and atol bound those of a step.
         throw: raise `SimulationError` where a concrete result has a status other than ok.
 
     Raises:
@@ -144,19 +163,30 @@ def simulate(
         >>> print(f"{motion.rate('x')[-1]:.6f} {motion.energy[-1]:.6f} {motion.message()}")
         -0.300000 0.090000 ok at t = 1.5707963267948966
     """
-    check_options(system, formulation, gradient, project, assemble, save, max_steps)
+    check_options(system, gradient, gradient_memory, project, assemble, save, max_steps)
     check_method(method, rtol, atol, dt)
-    q0, v0 = check_start(system, q0, v0, u0)
+    check_estimate(estimate_error, method)
+    q0, v0, u0 = check_start(system, q0, v0, u0)
     ts, direction = check_times(ts)
     inputs = check_inputs(inputs)
     check_range(inputs, ts)
     rtol, atol = check_tolerances(method, rtol, atol, q0.dtype)
     step = check_step(dt, dt0)
+    formulation = check_formulation(system, formulation, project, params, q0.dtype)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     scheme = choose(method, dt is None, rtol, atol)
+    if isinstance(scheme[0], AbstractPartitioned) and isinstance(project, Baumgarte):
+        must = f"be left out for {type(scheme[0]).__name__}, whose steps hold the constraints"
+        raise bad("project", must, f"it was {project!r}")
+    if gradient_memory is not None and remembers(scheme[0]):
+        must = f"be left out for {type(scheme[0]).__name__}, which keeps every step for derivatives"
+        raise bad("gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method.")
+    size = 2 * system.size
+    if gradient_memory is not None and "work" in save:
+        size += len(system.power_terms(params, q0.dtype).names)
     scheme_traced, scheme_static = eqx.partition(scheme, _params.is_array)
-    plan = _Plan(
+    plan = Plan(
         system=system,
         params=_params.Static(params_static),
         inputs=_params.Static(inputs_static),
@@ -165,50 +195,76 @@ def simulate(
         max_steps=max_steps,
         save=tuple(save),
         sample=_params.sample(params_traced),
+        formulation=formulation,
+        stabilization=project if isinstance(project, Baumgarte) else _PROJECTION[project],
+        assemble=assemble,
+        regular=system.mass_regular(params, ts[0], q0, v0),
+        keep=choose_gradient(gradient, gradient_memory, max_steps, size, q0.dtype.itemsize),
+        auto=method == "auto" and "work" not in save,
     )
-    values = _Values(q0, v0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
+    values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
     motion = _simulate(plan, values)
+    if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
+        other = _simulate(*_with_method(plan, values, IMPLICIT, rtol, atol, step))
+        if abs(other.last_time - ts[0]) > abs(motion.last_time - ts[0]):
+            motion, method = other, IMPLICIT
+            scheme = choose(IMPLICIT, True, rtol, atol)
+    if estimate_error:
+        # Half the step takes twice as many; of a tenth of the tolerance, at order 5, 1.6 times.
+        # Steps of a higher order share no errors with those of the motion.
+        room = plan._replace(max_steps=2 * max_steps)
+        steps = finer(rtol, atol, step, dt is not None)
+        better = method if dt is not None else FINER.get(name_of(scheme[0]), method)
+        beside = _simulate(*_with_method(room, values, better, *steps, fixed=dt is not None))
+        motion = with_error(motion, beside, 1.0 if better is method else LEFT)
     if throw and _params.concrete(motion.status):
         _raise_unless_ok(motion)
     return motion
 
 
-def pose(plan: _Plan, values: _Values) -> tuple[Dynamics, Start, Problem]:
-    """The problem that a plan and its values describe."""
-    power = None
-    if "work" in plan.save:
-        params = _params.join(values.params, plan.params.tree)
-        power = plan.system.power_terms(params, values.q0.dtype)
-    dynamics = Dynamics(plan.system, plan.params, plan.inputs, plan.direction, power, plan.sample)
-    args = dynamics.arguments(values.params, values.inputs, values.ts)
-    params, inputs = dynamics.given(args)
-    check_declaration(plan.system, params, inputs, values.ts[0], values.q0, values.v0)
+def _with_method(
+    plan: Plan,
+    values: Values,
+    method: Any,
+    rtol: Any,
+    atol: Any,
+    step: Any,
+    fixed: bool = False,
+) -> tuple[Plan, Values]:
+    """The same motion by another method, or with other tolerances or steps."""
+    scheme = choose(method, not fixed, rtol, atol)
+    traced, static = eqx.partition(scheme, _params.is_array)
+    plan = plan._replace(scheme=_params.Static(static))
+    return plan, values._replace(scheme=traced, rtol=rtol, atol=atol, step=step)
 
-    y0 = dynamics.start(values.q0, values.v0)
-    start = dynamics.mirror(values.ts[0], args)
-    args = dynamics.prepare(start, y0, args)
-    solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
-    scheme = Scheme(solver, controller, dynamics.term(start, y0, args), dynamics.within)
-    scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
-    times, in_range = _times(dynamics, args, inputs, values.ts)
-    valid = values_allowed(y0, times.saves, values.rtol, values.atol, values.step)
-    finite = start_finite(dynamics, times.start, y0, args)
-    setup = Setup(values.step, valid & in_range & finite, scheme_traced)
-    problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps)
-    return dynamics, Start(valid, in_range, finite), problem
+
+def _ran_out(motion: Solution) -> bool:
+    """Whether one motion, with values, took more steps than it may."""
+    single = np.ndim(motion.status) == 0 and _params.concrete(motion.status, motion.q)
+    return single and int(motion.status) == int(Status.max_steps)
 
 
 @partial(jax.jit, static_argnums=0)
-def _simulate(plan: _Plan, values: _Values) -> Solution:
+def _simulate(plan: Plan, values: Values) -> Solution:
     """The compiled program: pose, solve, diagnose, derive what `save` names."""
     dynamics, start, problem = pose(plan, values)
+    scheme: Scheme = eqx.combine(problem.setup.scheme, problem.scheme)
+    name = name_of(scheme.solver)
+    known = name in METHODS
     rows, outcome = solve(problem)
     status, where = diagnose(dynamics, problem, outcome, start)
-    q, v = dynamics.parts(rows.saved)
     params, inputs = dynamics.given(problem.args)
+    moved = outcome.accepted > 0
+    q, v = velocities_at(dynamics, values.ts, rows.saved, problem.args, moved)
+    hold, row = rows_hold(dynamics, values.ts, q, v, params)
+    broken = ~hold & (status == int(Status.ok))
+    status = jnp.where(broken, int(Status.contradictory_rows), status)
+    where = jnp.where(broken, row, where)
+    last_time = dynamics.mirror(rows.time, problem.args)
+    last = velocities_at(dynamics, last_time[None], rows.state[None], problem.args, moved)
     saved = {
-        name: over_rows(name, plan.system, values.ts, q, v, params, inputs)
+        name: over_rows(name, plan.system, plan.formulation, values.ts, q, v, params, inputs)
         for name in plan.save
         if name != "work"
     }
@@ -220,37 +276,25 @@ def _simulate(plan: _Plan, values: _Values) -> Solution:
         q=q,
         v=v,
         status=status,
-        last_time=dynamics.mirror(rows.time, problem.args),
-        last_state=dynamics.parts(rows.state),
+        last_time=last_time,
+        last_state=(last[0][0], last[1][0]),
         where=where,
         stats={
             "accepted": outcome.accepted,
             "rejected": outcome.attempted - outcome.accepted,
+            "gradient": outcome.gradient,
         },
         saved=saved,
         _params_traced=values.params,
         _inputs_traced=values.inputs,
         _params_static=plan.params,
         _inputs_static=plan.inputs,
+        formulation=plan.formulation,
+        _method=jnp.asarray(list(METHODS).index(name) if known else -1, jnp.int32),
+        _solver="" if known else name,
+        stabilization=dynamics.stabilization if dynamics.rows.size else None,
+        tolerances=None if scheme.controller is None else (values.rtol, values.atol),
     )
-
-
-def _times(
-    dynamics: Dynamics, args: Arguments, inputs: Mapping[str, Any], ts: Array
-) -> tuple[Times, Array]:
-    """Anchors of the grid in tau, and whether the inputs are defined at the start."""
-
-    def mirror(time: Array) -> Array:
-        return dynamics.mirror(time.astype(ts.dtype), args)
-
-    saves, knots, span = mirror(ts), all_knots(inputs), common_range(inputs)
-    knots = None if knots is None else jnp.sort(mirror(knots))
-    if span is None:
-        return Times(saves[0], saves[-1], knots, saves), jnp.array(True)
-    ends = jnp.stack([mirror(time) for time in span])
-    first, last = jnp.min(ends), jnp.max(ends)
-    stop = jnp.where(saves[-1] <= last, saves[-1], last)
-    return Times(saves[0], stop, knots, saves), (first <= saves[0]) & (saves[0] <= last)
 
 
 def _raise_unless_ok(motion: Solution) -> None:

@@ -7,36 +7,64 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
+from jaxlag._constraints import Baumgarte
 from jaxlag._errors import bad
+from jaxlag._methods import METHODS
 from jaxlag._power import in_order
-from jaxlag._status import ADVICE, Status
+from jaxlag._slowness import explain
+from jaxlag._status import ADVICE, CONCERNS_ROW, Status
 from jaxlag._system import System
 
 # Quantities of one state, by the name `save=` and the Solution know them under.
 QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Any]] = {
     "a": lambda system, t, q, v, params, inputs: system.acceleration(params, q, v, t, inputs),
+    "u": lambda system, t, q, v, params, inputs: system.quasi_velocities(params, q, v, t),
     "p": lambda system, t, q, v, params, inputs: system.momentum(params, q, v, t),
     "energy": lambda system, t, q, v, params, inputs: system.energy(params, q, v, t),
     "kinetic": lambda system, t, q, v, params, inputs: system.kinetic(params, q, v, t),
     "potential": lambda system, t, q, v, params, inputs: system.potential(params, q, v, t),
     "power": lambda system, t, q, v, params, inputs: system.power(params, q, v, t, inputs),
+    "lam": lambda system, t, q, v, params, inputs: system.multipliers(params, q, v, t, inputs),
+    "constraint_force": lambda system, t, q, v, params, inputs: system.constraint_force(
+        params, q, v, t, inputs
+    ),
     "Q": lambda system, t, q, v, params, inputs: system.generalized_force(params, q, v, t, inputs),
 }
 
 
+# The same without multipliers solved for, from the equations in quasi-velocities.
+_BY_QUASI = {
+    name: lambda system, t, q, v, params, inputs, name=name: system.quasi_reactions(
+        params, q, v, t, inputs
+    )[name]
+    for name in ("a", "lam", "constraint_force")
+}
+
+
 def over_rows(
-    name: str, system: System, ts: Array, q: Array, v: Array, params: Any, inputs: Any
+    name: str,
+    system: System,
+    formulation: str,
+    ts: Array,
+    q: Array,
+    v: Array,
+    params: Any,
+    inputs: Any,
 ) -> Any:
     """A quantity at every row of one motion; NaN where the motion did not get."""
     reached = jnp.isfinite(q[:, 0])
+    quantity = QUANTITIES[name]
+    if formulation == "quasi":
+        quantity = _BY_QUASI.get(name, quantity)
 
     def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
         # Rows not reached are NaN: evaluate at the start instead, so that derivatives stay finite.
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
-        value = QUANTITIES[name](system, t, q, v, params, inputs)
+        value = quantity(system, t, q, v, params, inputs)
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), value)
 
     t0, q0, v0 = ts[0], q[0], v[0]
@@ -57,9 +85,17 @@ class Solution(eqx.Module):
         status: int32, see `Status`.
         last_time: last time reached, s.
         last_state: (q, v) there, each (n,).
-        where: index of the coordinate that a failure concerns, -1 if none.
-        stats: counts: "accepted" and "rejected" steps.
+        where: index of the coordinate, or of the constraint row, that a failure concerns; -1 if
+            none.
+        stats: counts of "accepted" and "rejected" steps; "gradient", a `GradientMode`: how reverse
+            derivatives of this motion go through the steps.
         saved: quantities named in `save=`, by name.
+        formulation: "quasi" where the state was (q, u), else how accelerations were found.
+        stabilization: "projection", a `Baumgarte`, or None: what kept states on the constraints
+            between steps.
+        tolerances: (rtol, atol) of the step-size control; None with fixed steps.
+        error: with `estimate_error=True` the errors of (q, v) about to be expected at each row,
+            each (s, n), in their units; else None.
     """
 
     system: System
@@ -76,6 +112,21 @@ class Solution(eqx.Module):
     _inputs_traced: Any
     _params_static: _params.Static = eqx.field(static=True)
     _inputs_static: _params.Static = eqx.field(static=True)
+    formulation: str = eqx.field(static=True)
+    _method: Int[Array, "*batch"]  # in METHODS; -1 for another
+    _solver: str = eqx.field(static=True)  # its name, then
+    stabilization: str | Baumgarte | None = eqx.field(static=True)
+    tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch"]] | None
+    error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
+
+    @property
+    def method(self) -> str:
+        """Name of the method that was used; of its class, where it is none of the named ones."""
+        if self._solver:
+            return self._solver
+        if not _params.concrete(self._method):
+            raise bad("method", "be asked for outside jit and vmap", "the motion is traced")
+        return list(METHODS)[int(np.ravel(self._method)[0])]
 
     @property
     def params(self) -> Any:
@@ -88,7 +139,13 @@ class Solution(eqx.Module):
         return eqx.combine(self._inputs_traced, self._inputs_static.tree)
 
     def __getitem__(self, name: str) -> Array:
-        """A coordinate by its name, shape (s, *its shape)."""
+        """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,)."""
+        quasi = self.system.quasi
+        if quasi is not None and name in quasi.names:
+            return self.u[..., quasi.names.index(name)]
+        if quasi is not None and name not in self.system.coordinates.names:
+            known = [*self.system.coordinates.names, *quasi.names]
+            raise bad("name", f"be one of {known}", f"it was {name!r}")
         return self.system.coordinates.part(self.q, name)
 
     def rate(self, name: str) -> Array:
@@ -97,8 +154,17 @@ class Solution(eqx.Module):
 
     @property
     def a(self) -> Float[Array, "*batch s n"]:
-        """Accelerations (s, n), m/s^2 or rad/s^2, from M a + h = Q at the rows."""
+        """Accelerations (s, n), m/s^2 or rad/s^2, from M a + h = Q + A^T lam at the rows."""
         return self._quantity("a")
+
+    @property
+    def u(self) -> Float[Array, "*batch s k"]:
+        """Quasi-velocities (s, k), m/s or rad/s, in the order of their names.
+
+        Raises:
+            ValueError: the system has none.
+        """
+        return self._quantity("u")
 
     @property
     def p(self) -> Float[Array, "*batch s n"]:
@@ -126,9 +192,24 @@ class Solution(eqx.Module):
         return self._quantity("Q")
 
     @property
+    def lam(self) -> dict[str, Float[Array, "..."]]:
+        """Multipliers by the name of the row, each (s,) or (s, its shape).
+
+        See `System.multipliers` for sign, unit and what holds where rows depend on one another.
+        """
+        found = self._quantity("lam")
+        names = [name for c in self.system.constraints for name in c.all_names]
+        return {name: found[name] for name in names}
+
+    @property
+    def constraint_force(self) -> Float[Array, "*batch s n"]:
+        """A^T lam, (s, n), N or N m: what the constraints exert on the system."""
+        return self._quantity("constraint_force")
+
+    @property
     def power(self) -> dict[str, Float[Array, "*batch s"]]:
         """Terms of dH/dt by name, each (s,), W, in the order of `System.power`."""
-        return in_order(self._quantity("power"), self.system.forces)
+        return in_order(self._quantity("power"), self.system.forces, self.system.constraints)
 
     @property
     def work(self) -> dict[str, Float[Array, "*batch s"]]:
@@ -146,7 +227,7 @@ class Solution(eqx.Module):
                 f"save was {tuple(self.saved)!r}",
                 'Write simulate(..., save=("work",)): work is integrated along with the motion.',
             )
-        return in_order(self.saved["work"], self.system.forces)
+        return in_order(self.saved["work"], self.system.forces, self.system.constraints)
 
     def message(self) -> str:
         """How a single motion ended, in words, with the coordinate and the likely remedy."""
@@ -156,35 +237,63 @@ class Solution(eqx.Module):
         if status is Status.ok:
             return f"ok at t = {self.last_time}"
         index = int(self.where)
-        about = f" ({self.system.coordinates.label(index)!r})" if index >= 0 else ""
+        labels, more = self.system.coordinates.labels, ""
+        if status is Status.kinematics_singular:
+            assert self.system.quasi is not None
+            labels = self.system.quasi.names
+            if index < 0:
+                more = " The quasi-velocities are fewer than the freedoms that constraints leave."
+        if status in CONCERNS_ROW:
+            rows = self.system.rows(self.params, self.q.dtype)
+            labels = rows.labels
+            if status is Status.contradictory_rows:
+                more = rows.contradiction(self.system.size)
+                if self.formulation == "quasi":
+                    more = " The kinematics v = B u + c do not satisfy it."
+        about = f" ({labels[index]!r})" if index >= 0 else ""
         q, v = self.last_state
         return (
             f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
             f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
-            f"{int(self.stats['rejected'])} rejected steps. {ADVICE.get(status, '')}".rstrip()
+            f"{int(self.stats['rejected'])} rejected steps. {ADVICE.get(status, '')}{more}".rstrip()
         )
+
+    def explain(self) -> str:
+        """Why the solve took as many steps as it did, and what to change; for a single motion.
+
+        Looks at up to 8 of the rows: the fastest rates of the linear equations there (stiffness),
+        rejected steps, the component whose error sets the step, cond(M), and the number of turns
+        in which a step is moved back onto the constraints.
+
+        Returns:
+            A few lines of text, the last of them advice.
+
+        Raises:
+            ValueError: of a batch, or inside jit or vmap.
+        """
+        return explain(self)
 
     def _quantity(self, name: str) -> Any:
         if name in self.saved:
             return self.saved[name]
         key = (self._params_static, self._inputs_static)
         traced = (self.ts, self.q, self.v, self._params_traced, self._inputs_traced)
-        return _derived(name, self.system, key, self.ts.ndim - 1, traced)
+        return _derived(name, self.system, self.formulation, key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:
         names = ", ".join(self.system.coordinates.names)
         return f"Solution({names}; shape {self.q.shape}, status {self.status})"
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _derived(name: str, system: System, key: Any, batch: int, traced: Any) -> Any:
+@partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
+def _derived(name: str, system: System, formulation: str, key: Any, batch: int, traced: Any) -> Any:
     params_static, inputs_static = key
 
     def one(traced: Any) -> Any:
         ts, q, v, params, inputs = traced
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
-        return over_rows(name, system, ts, q, v, params, inputs)
+        return over_rows(name, system, formulation, ts, q, v, params, inputs)
 
     for _ in range(batch):
         one = jax.vmap(one)

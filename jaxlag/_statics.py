@@ -12,12 +12,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._constraints import Layout
 from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
+from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
+from jaxlag._kkt import least_norm
 from jaxlag._status import Status
 from jaxlag._system import System
-from jaxlag._vectors import vector
+from jaxlag._vectors import number, vector
 
 
 class Equilibrium(eqx.Module):
@@ -28,16 +31,19 @@ class Equilibrium(eqx.Module):
     Attributes:
         system: what is at rest.
         q: coordinates (n,), m or rad; the nearest point found where the status is not ok.
-        residual: Q - h at (q, v = 0), (n,): N or N m left unbalanced.
+        residual: Q - h + A^T lam at (q, v = 0), (n,): N or N m left unbalanced.
         scale: (n,), N or N m: the forces that a residual is small against at a root,
             |Q| + |h| + sum_j |K_ij| (|q_j| + |q_j - q0_j|), all of them at q.
-        stiffness: K = -d(Q - h)/dq at rest, (n, n); the Hessian of V where the forces derive from
-            a potential.
+        stiffness: K = -d(Q - h + A^T lam)/dq at rest and fixed lam, (n, n); the Hessian of
+            V - lam . phi where the forces derive from a potential.
         damping: D = -d(Q - h)/dv at rest, (n, n): dissipation in its symmetric part, gyroscopic
             forces in the skew one.
         variation: (n, n), by how much K differs a small displacement away in its softest
             direction, eps^0.4 of what q and the distance searched are, or what is left
             open in q.
+        rows: A of the constraints, (m, n).
+        multipliers: lam, (m,), with Q - h + A^T lam = 0; see `lam` for parts by name. Where rows
+            depend on one another those of least norm sum_k (|A_k| lam_k)^2.
         status: int32, see `Status`: ok, implicit_solve_failed or nonfinite.
         iterations: int32, steps of the search.
     """
@@ -49,8 +55,16 @@ class Equilibrium(eqx.Module):
     stiffness: Float[Array, "*batch n n"]
     damping: Float[Array, "*batch n n"]
     variation: Float[Array, "*batch n n"]
+    rows: Float[Array, "*batch m n"]
+    multipliers: Float[Array, "*batch m"]
     status: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
+    _layout: Layout = eqx.field(static=True)
+
+    @property
+    def lam(self) -> dict[str, Float[Array, "..."]]:
+        """Multipliers by the name of the row; A^T lam is what the constraints exert."""
+        return self._layout.unflatten(self.multipliers)
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, in its declared shape."""
@@ -58,8 +72,15 @@ class Equilibrium(eqx.Module):
 
     @property
     def eigenvalues(self) -> Float[Array, "*batch n"]:
-        """Eigenvalues of the symmetric part of K, ascending."""
-        return jnp.linalg.eigvalsh(_symmetric(self.stiffness))
+        """Eigenvalues of the symmetric part of K, ascending; under constraints on A x = 0.
+
+        Infinite for each direction that a constraint holds.
+        """
+        K = _symmetric(self.stiffness)
+        if self.rows.shape[-2] == 0:
+            return jnp.linalg.eigvalsh(K)
+        restricted, held = _restricted(K, self.rows)
+        return jnp.where(held, jnp.inf, restricted)
 
     @property
     def conservative(self) -> Bool[Array, "*batch"]:
@@ -73,6 +94,8 @@ class Equilibrium(eqx.Module):
     @property
     def stable(self) -> Bool[Array, "*batch"]:
         """Whether the symmetric part of K is positive definite and that of D not negative.
+
+        Under constraints on their tangent space A x = 0.
 
         Where the forces at rest have a potential K is the Hessian of V: a strict minimum, stable
         by Lagrange's and Dirichlet's theorem, which gyroscopic and dissipative forces leave so
@@ -92,8 +115,14 @@ class Equilibrium(eqx.Module):
         K, D = (_scaled(_symmetric(A), units) for A in (self.stiffness, self.damping))
         spread = jnp.linalg.norm(_scaled(self.variation, units), axis=(-2, -1))
         largest = jnp.max(jnp.abs(_scaled(self.damping, units)), axis=(-2, -1), initial=0.0)
-        stiff = jnp.linalg.eigvalsh(K)[..., 0] > _slack(K) + spread
-        passive = jnp.linalg.eigvalsh(D)[..., 0] >= -_slack(D) * largest
+        if self.rows.shape[-2] > 0:
+            # Displacements in these units are those times the units.
+            A = self.rows / units[..., None, :]
+            softest, weakest = (jnp.min(_restricted(X, A)[0], axis=-1) for X in (K, D))
+        else:
+            softest, weakest = (jnp.linalg.eigvalsh(X)[..., 0] for X in (K, D))
+        stiff = softest > _slack(K) + spread
+        passive = weakest >= -_slack(D) * largest
         return stiff & passive & (self.status == int(Status.ok))
 
     def message(self) -> str:
@@ -130,7 +159,8 @@ def equilibrium(
     """State of rest in which the virtual work of all forces vanishes, near q0.
 
     Solves Q_i(t, q, 0) - dV/dq_i = 0 for all i, more generally Q - h = 0 at v = 0, which keeps
-    the terms of rotating frames (T_0) and of L linear in v. Levenberg-Marquardt on the n
+    the terms of rotating frames (T_0) and of L linear in v; under holonomic constraints
+    Q - h + A^T lam = 0 and phi(t, q) = 0 for (q, lam). Levenberg-Marquardt on the n
     equations, in units in which K is about 1, so that those of q, L and Q do not matter; M is not
     needed and may be singular or zero. For a system that depends on t this is the balance at the
     instant t, not a motion. A root is told from forces that only die away by the Newton step
@@ -154,7 +184,8 @@ def equilibrium(
 
     Raises:
         ValueError: q0 of wrong length or not finite; t not a finite number; tol not a number
-            between 0 and 1; max_steps not positive.
+            between 0 and 1; max_steps not positive; constraints that are not holonomic, or forces
+            that depend on multipliers.
         EquilibriumError: none was found; says how near, and what force is left. With
             `throw=True` and concrete values.
 
@@ -178,6 +209,13 @@ def equilibrium(
     """
     if not isinstance(system, System):
         raise bad("system", "be a jl.System", f"it was {system!r}")
+    if not all(c.holonomic for c in system.constraints) or any(map(reads_lam, system.forces)):
+        raise bad(
+            "system",
+            "have holonomic constraints alone, and no forces that depend on multipliers",
+            "it has others",
+            "Under these it may be at rest in more than isolated states: declare it without them.",
+        )
     q0 = vector(system.coordinates, "q0", q0)
     if _params.concrete(q0) and not np.all(np.isfinite(q0)):
         raise bad("q0", "be finite", f"it was {q0}")
@@ -185,12 +223,12 @@ def equilibrium(
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
     if tol is None:
         tol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
-    tol = _number("tol", "be a positive number", tol, q0.dtype)
+    tol = number("tol", "be a positive number", tol, q0.dtype)
     if _params.concrete(tol) and not tol > 0:
         raise bad("tol", "be a positive number", f"it was {tol}")
     if _params.concrete(tol) and not tol < 1:
         raise bad("tol", "be less than 1", f"it was {tol}")
-    t = _number("t", "be a number", t, jnp.result_type(float))
+    t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     traced, static = _params.split(params)
@@ -202,61 +240,95 @@ def equilibrium(
     return found
 
 
-def _number(argument: str, must: str, x: Any, dtype: Any) -> Array:
-    """A scalar of this dtype, finite where it is concrete."""
-    try:
-        x = jnp.asarray(x, dtype)
-    except (TypeError, ValueError) as error:
-        raise bad(argument, must, f"it was {x!r}") from error
-    if x.ndim != 0:
-        raise bad(argument, must, f"its shape was {x.shape}")
-    if _params.concrete(x) and not np.isfinite(x):
-        raise bad(argument, "be finite", f"it was {x}")
-    return x
-
-
 @partial(jax.jit, static_argnums=0)
 def _search(key: Any, values: Any) -> Equilibrium:
     system, params_static, inputs_static, max_steps = key
+    q0, t, tol, *given = values
+    n, rest = q0.shape[0], jnp.zeros_like(q0)
+    params = _params.join(given[0], params_static.tree)
+    rows = system.rows(params, q0.dtype)
 
-    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any]:
-        """(pair of Q and h, Q - h) as functions of (q, v)."""
+    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any]:
+        """(triple of Q, h and A, Q - h + A^T lam, the same and phi of z) at (q, v)."""
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
         check_declaration(system, params, inputs, t, q0, rest)
 
-        def pair(q: Array, v: Array) -> tuple[Array, Array]:
+        def parts(q: Array, v: Array) -> tuple[Array, Array, Array]:
             given = evaluate(inputs, t, q, v, params)
-            return system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
+            Q, h = system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
+            return Q, h, system.terms.rows(t, q, rest, params)[0]
 
-        return pair, lambda q, v: jnp.subtract(*pair(q, v))
+        def unbalanced(q: Array, v: Array, lam: Array) -> Array:
+            Q, h, A = parts(q, v)
+            return Q - h + lam @ A if rows.size else Q - h
 
-    q0, t, tol, *given = values
-    rest = jnp.zeros_like(q0)
-    _, unbalanced = forces(t, *given)
-    q, steps = jax.lax.custom_root(
-        lambda q: unbalanced(q, rest), q0, partial(search, max_steps), solve_tangent, has_aux=True
+        def whole(z: Array) -> Array:
+            q, lam = z[:n], z[n:]
+            if not rows.size:
+                return unbalanced(q, rest, lam)
+            phi = system.terms.position(t, q, params)
+            return jnp.concatenate([unbalanced(q, rest, lam), phi])
+
+        return parts, unbalanced, whole
+
+    parts, unbalanced, whole = forces(t, *given)
+    z0 = q0
+    if rows.size:
+        Q, h, A = jax.lax.stop_gradient(parts(q0, rest))
+        z0 = jnp.concatenate([q0, jnp.linalg.lstsq(A.T, h - Q)[0]])
+    z, steps = jax.lax.custom_root(
+        whole, z0, partial(search, max_steps), solve_tangent, has_aux=True
     )
+    if rows.size:
+        # Of multipliers of dependent rows the search finds those nearest to where it began.
+        q, lam = z[:n], z[n:]
+        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam)])
 
-    still, start, t, tol, *given = jax.lax.stop_gradient((q, q0, t, tol, *given))
-    pair, fixed = forces(t, *given)
-    Q, h = pair(still, rest)
+    still, start, t, tol, *given = jax.lax.stop_gradient((z, z0, t, tol, *given))
+    still_parts, _, fixed = forces(t, *given)
+    Q, h, A = still_parts(still[:n], rest)
     present = jnp.abs(Q) + jnp.abs(h)
-    balance = judge(lambda q: fixed(q, rest), present, still, start, tol)
+    if rows.size:
+        present = present + jnp.abs(still[n:]) @ jnp.abs(A)
+        present = jnp.concatenate([present, jnp.zeros_like(still[n:])])
+    balance = judge(fixed, present, still, start, tol)
 
-    q = differentiable_if(balance.found, q)
+    z = differentiable_if(balance.found, z)
+    q, lam = z[:n], z[n:]
     failure = jnp.where(balance.finite, int(Status.implicit_solve_failed), int(Status.nonfinite))
     return Equilibrium(
         system,
         q,
-        residual=unbalanced(q, rest),
-        scale=balance.scale,
-        stiffness=-jax.jacfwd(unbalanced)(q, rest),
-        damping=-jax.jacfwd(unbalanced, argnums=1)(q, rest),
-        variation=balance.variation,
+        residual=unbalanced(q, rest, lam),
+        scale=balance.scale[:n],
+        stiffness=-jax.jacfwd(unbalanced)(q, rest, lam),
+        damping=-jax.jacfwd(unbalanced, argnums=1)(q, rest, lam),
+        variation=balance.variation[:n, :n],
+        rows=parts(q, rest)[2],
+        multipliers=lam,
         status=jnp.where(balance.found, int(Status.ok), failure).astype(jnp.int32),
         iterations=steps.astype(jnp.int32),
+        _layout=rows,
     )
+
+
+def _restricted(K: Array, A: Array) -> tuple[Array, Array]:
+    """(eigenvalues of K on A x = 0 among others above all of them, which these others are)."""
+    n = K.shape[-1]
+    _, sizes, axes = jnp.linalg.svd(A, full_matrices=True)
+    floor = 16 * n * float(jnp.finfo(K.dtype).eps)
+    across = sizes > floor * sizes[..., :1]
+    missing = jnp.zeros((*across.shape[:-1], n - across.shape[-1]), bool)
+    across = jnp.concatenate([across, missing], -1)
+    axes = jnp.swapaxes(axes, -1, -2)
+    in_axes = jnp.swapaxes(axes, -1, -2) @ K @ axes
+    above = 2 * jnp.sum(jnp.abs(in_axes), axis=(-2, -1))[..., None] + 1
+    free = ~(across[..., :, None] | across[..., None, :])
+    kept = jnp.where(free, in_axes, 0.0)
+    diagonal = jnp.where(across, above, 0.0)[..., None] * jnp.eye(n, dtype=K.dtype)
+    found = jnp.linalg.eigvalsh(kept + diagonal)
+    return found, found > 0.75 * above
 
 
 def _symmetric(K: Array) -> Array:

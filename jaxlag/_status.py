@@ -7,7 +7,8 @@ class Status(IntEnum):
     """Outcome of one trajectory, stored as int32 in `Solution.status`.
 
     `ok` is the only success. Every other value comes with `last_time`, `last_state`
-    and `where` (index of the coordinate or constraint row concerned, -1 if none).
+    and `where` (index of the coordinate, constraint row or, where kinematics are singular, the
+    quasi-velocity concerned, -1 if none).
     """
 
     ok = 0
@@ -27,8 +28,21 @@ class Status(IntEnum):
     bad_value = 14
 
 
+CONCERNS_ROW = {
+    Status.rank_change,
+    Status.contradictory_rows,
+    Status.no_reaction_solution,
+    Status.projection_failed,
+    Status.inconsistent_start,
+}
+"""Outcomes whose `where` is the index of a constraint row."""
+
+
 ADVICE = {
-    Status.max_steps: "Raise max_steps, loosen rtol and atol, or shorten ts.",
+    Status.max_steps: (
+        "Raise max_steps, loosen rtol and atol, or shorten ts. What held the steps short is in "
+        "motion.explain(); a stiff motion wants method='kvaerno5'."
+    ),
     Status.step_below_resolution: (
         "The step shrank below the resolution of time: a singularity, a discontinuity that no "
         "input knot announces, atol = 0 where a component is 0, or a tolerance tighter than the "
@@ -38,6 +52,29 @@ ADVICE = {
     Status.mass_singular: (
         "The mass matrix d2L/dv2 is not positive definite there: give this coordinate inertia, "
         "or drop it."
+    ),
+    Status.kinematics_singular: (
+        "There dU/dv is singular: this quasi-velocity follows from the others, and v does not "
+        "follow from u (pitch at 90 degrees, a steered wheel across the way). Use other "
+        "coordinates or quasi-velocities near it."
+    ),
+    Status.rank_change: (
+        "There this constraint row came to depend on the others, or no longer follows from them: "
+        "a dead point or a change point, where the motion may go on in more than one way. Start "
+        "beyond it, or add the row that decides."
+    ),
+    Status.no_reaction_solution: (
+        "No reaction goes with the forces that depend on it: the contact lifts off, its sliding "
+        "stops or reverses, or friction is so strong that there is no solution (Painleve)."
+    ),
+    Status.contradictory_rows: (
+        "No motion satisfies this constraint row together with the others: drop or correct one."
+    ),
+    Status.projection_failed: (
+        "The state was too far from this constraint to be moved back: reduce dt, rtol or atol."
+    ),
+    Status.inconsistent_start: (
+        "q0 and v0 do not satisfy this constraint: pass assemble=True, or q0, v0 from jl.assemble."
     ),
     Status.implicit_solve_failed: (
         "The implicit solver's equations did not converge: reduce dt or the first step dt0."

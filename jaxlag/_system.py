@@ -1,25 +1,35 @@
 """System: the declaration of a mechanical system."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array
 
 from jaxlag import _params
+from jaxlag._constraints import AbstractConstraint, Layout, check_constraints
 from jaxlag._coordinates import Coordinates
-from jaxlag._errors import bad, real_scalar, require_arity
+from jaxlag._errors import bad, require_arity
 from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce, check_forces
-from jaxlag._inputs import InputValues, check_inputs, check_range, evaluate
+from jaxlag._kkt import augmented
 from jaxlag._linalg import first_unhealthy
-from jaxlag._lowering import OPERATIONS, ArrayTerms, ScalarTerms, Structure, find_structure
-from jaxlag._power import Power
+from jaxlag._lowering import (
+    OPERATIONS,
+    ArrayTerms,
+    ScalarTerms,
+    Structure,
+    check_kinematics,
+    layout,
+)
+from jaxlag._quasi import InQuasiVelocities, QuasiVelocities, check_quasi
+from jaxlag._reactions import AbstractReactions
 from jaxlag._terms import Terms
-from jaxlag._vectors import state_vectors
 
 
 class _Difference(eqx.Module):
@@ -32,13 +42,13 @@ class _Difference(eqx.Module):
         return self.kinetic(t, q, v, params) - self.potential(t, q, params)
 
 
-class System(eqx.Module):
+class System(AbstractReactions):
     """A mechanical system given by its Lagrangian L(t, q, v, params).
 
-    Equations of motion: d/dt(dL/dv) - dL/dq = Q, that is M a + h = Q with M = d2L/dv2.
-    L may contain t, terms linear in v, and need not be quadratic in v; M must be positive
-    definite. What needs no params is checked here, everything else at first use or by
-    `check`.
+    Equations of motion: d/dt(dL/dv) - dL/dq = Q + A^T lam with A v + b = 0, that is
+    M a + h = Q + A^T lam with M = d2L/dv2. L may contain t, terms linear in v, and need not be
+    quadratic in v; M must be positive definite where A v = 0, so that links without mass are
+    possible. What needs no params is checked here, everything else at first use or by `check`.
 
     Methods that take a state are called as (params, q, v, t): `params` any pytree, q and v of
     shape (n,) in SI units (m or rad, and per s), t in s. They compose with jit, vmap and every
@@ -54,6 +64,12 @@ class System(eqx.Module):
         potential: scalar function `V(t, q, params)`, in J.
         forces: applied forces, each with its own name: `PointForce`, `Couple`,
             `GeneralizedForce`, `Rayleigh`.
+        constraints: `Holonomic` and `Pfaffian` constraints, each row with its own name.
+        quasi: `QuasiVelocities` to move by in place of v; the constrained ones among them are
+            rows of their own, beside `constraints`.
+        written_in: the velocities that L, or T, is a function of: "v", or "u", all
+            quasi-velocities, as in L(t, q, u, params); constrained ones must not be left out, since
+            their momenta enter the equations.
         lowering: how accelerations are compiled: "auto", as straight-line code on scalars where
             it exists and is short, else on arrays; "scalar", however long it is; "array".
 
@@ -68,7 +84,11 @@ class System(eqx.Module):
     lagrangian: Callable = eqx.field(static=True)
     coordinates: Coordinates = eqx.field(static=True)
     forces: tuple[AbstractForce, ...]
+    constraints: tuple[AbstractConstraint, ...]
+    quasi: QuasiVelocities | None
+    written_in: str = eqx.field(static=True)
     lowering: str = eqx.field(static=True)
+    in_u: Callable | None = eqx.field(static=True)
     _kinetic: Callable | None = eqx.field(static=True)
     _potential: Callable | None = eqx.field(static=True)
 
@@ -80,6 +100,9 @@ class System(eqx.Module):
         kinetic: Callable | None = None,
         potential: Callable | None = None,
         forces: Sequence[AbstractForce] = (),
+        constraints: Sequence[AbstractConstraint] = (),
+        quasi: QuasiVelocities | None = None,
+        written_in: str = "v",
         lowering: str = "auto",
     ) -> None:
         pair = kinetic is not None or potential is not None
@@ -91,35 +114,74 @@ class System(eqx.Module):
                 "get either lagrangian, or both kinetic and potential",
                 f"it got {' and '.join(names) or 'none of them'}",
             )
-        if lagrangian is not None:
-            require_arity("lagrangian", lagrangian, ("t", "q", "v", "params"))
-            self.lagrangian = lagrangian
-        else:
-            assert kinetic is not None
-            assert potential is not None
-            require_arity("kinetic", kinetic, ("t", "q", "v", "params"))
-            require_arity("potential", potential, ("t", "q", "params"))
-            self.lagrangian = _Difference(kinetic, potential)
-        self._kinetic, self._potential = kinetic, potential
         self.coordinates = Coordinates(coordinates)
         self.forces = check_forces(forces)
+        rows = check_constraints(constraints, self.forces)
+        if quasi is not None:
+            check_quasi(quasi, self.coordinates.size, self._taken(rows))
+            rows = check_constraints((*quasi.rows, *rows), self.forces)
+        self.constraints, self.quasi = rows, quasi
+        if written_in not in ("v", "u"):
+            raise bad("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
+        if written_in == "u" and quasi is None:
+            was = "this one has none"
+            raise bad("written_in='u'", "go with a system that has quasi-velocities", was)
+        if written_in == "u" and quasi is not None and quasi.size < self.coordinates.size:
+            speeds = [c.all_names[0] for c in self.constraints if not c.holonomic]
+            if speeds:
+                raise bad(
+                    "written_in",
+                    "be 'v' where kinematics= leave out velocities that Pfaffian rows forbid, "
+                    "since their momenta enter the equations",
+                    f"it was 'u' beside the row {speeds[0]!r}",
+                    "Give L as a function of v; or name as many quasi-velocities as coordinates, "
+                    "those that vanish in constrained=.",
+                )
+        self.written_in = written_in
+        form = ("t", "q", written_in, "params")
+        if lagrangian is None:
+            assert kinetic is not None
+            assert potential is not None
+            require_arity("kinetic", kinetic, form)
+            require_arity("potential", potential, ("t", "q", "params"))
+            whole: Callable = _Difference(kinetic, potential)
+        else:
+            require_arity("lagrangian", lagrangian, form)
+            whole = lagrangian
+        self.in_u = None
+        if written_in == "u":
+            assert quasi is not None
+            self.in_u = whole
+            kinetic = None if kinetic is None else InQuasiVelocities(kinetic, quasi)
+            whole = InQuasiVelocities(whole, quasi)
+        self.lagrangian = whole
+        self._kinetic, self._potential = kinetic, potential
         if lowering not in ("auto", "scalar", "array"):
             raise bad("lowering", "be 'auto', 'scalar' or 'array'", f"it was {lowering!r}")
         self.lowering = lowering
 
+    @property
+    def _key(self) -> tuple:
+        parts = (self.lagrangian, self.coordinates, self.forces, self.constraints)
+        return (*parts, self.quasi, self.lowering)
+
+    def _taken(self, rows: Sequence[AbstractConstraint]) -> dict[str, str]:
+        """Names that quasi-velocities must not bear -> what bears them."""
+        taken = dict.fromkeys(self.coordinates.names, "a coordinate")
+        taken |= {force.name: "a force" for force in self.forces}
+        fix = "a constraint (the row of a constrained name is declared by that name alone)"
+        return taken | {name: fix for row in rows for name in row.all_names}
+
     def __hash__(self) -> int:
-        return hash((self.lagrangian, self.coordinates, self.forces, self.lowering))
+        return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, System) and (
-            (self.lagrangian, self.coordinates, self.forces, self.lowering)
-            == (other.lagrangian, other.coordinates, other.forces, other.lowering)
-        )
+        return isinstance(other, System) and self._key == other._key
 
     @property
     def terms(self) -> Terms:
         """The lowered terms of the equations of motion."""
-        array = ArrayTerms(self.lagrangian, self.forces)
+        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
         if self.lowering == "array":
             return array
         return ScalarTerms(array, OPERATIONS if self.lowering == "auto" else None)
@@ -137,196 +199,53 @@ class System(eqx.Module):
         """Flat vector, shape (n,), from a dict of named values."""
         return self.coordinates.flatten(parts)
 
-    def mass_matrix(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, "n n"]:
-        """M(t, q, v) = d2L/dv2, shape (n, n), kg, kg m or kg m^2 by the pair of coordinates.
+    def mass_regular(self, params: Any, t: Any, q: Array, v: Array | None) -> bool:
+        """Whether M is positive definite for these params without the help of constraints.
 
-        Symmetric; `v` may be left out where M does not depend on it.
+        Looked at in the given state, where it is known, and in one other, as the mass of a link is
+        zero everywhere or nowhere; False where the params have no values, since they are traced.
+        Of use to a system with constraints alone.
+        """
+        if not self.constraints or not _params.concrete(params):
+            return False
+        states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.size)))]
+        v = jnp.zeros_like(q) if v is None else v
+        if _params.concrete((t, q, v)):
+            states.append((t, q, v))
+        floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
+        for state in states:
+            with jax.ensure_compile_time_eval():
+                traced, static = _params.split(params)
+                at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
+                M = _mass(self, _params.Static(static), *at, traced)
+            if not _params.concrete(M):
+                return False  # the Lagrangian closes over a traced value
+            M = np.asarray(M, np.float64)
+            units = np.sqrt(np.abs(np.diagonal(M)))
+            if not np.all(units > 0) or not np.all(np.isfinite(M)):
+                return False
+            if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
+                return False
+        return True
 
-        Source: Siciliano et al., Robotics, eq. 7.30.
+    def rows(self, params: Any, dtype: Any) -> Layout:
+        """Names and shapes of the constraint rows, for params like these.
 
         Raises:
-            ValueError: q or v of wrong length; v left out although M depends on it.
+            ValueError: quasi-velocities that are not affine; fewer than constraints leave.
         """
-        t, q, v, params = self._state(params, q, v, t)
-        if v is None:
-            if not self.structure(params, q.dtype).quadratic:
-                raise bad(
-                    "mass_matrix: v",
-                    "be given, since M depends on the velocities",
-                    "it was left out",
-                    "Call mass_matrix(params, q, v).",
-                )
-            v = jnp.zeros_like(q)
-        return self.terms.mass(t, q, v, params)
-
-    def bias(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
-        """h(t, q, v) = (dp/dq) v + dp/dt - dL/dq, shape (n,), N or N m.
-
-        The generalized force needed to hold a = 0; gravity and explicit time included, applied
-        forces not.
-
-        Source: d/dt(dL/dv) - dL/dq (Pila, eq. 3.53) less M a.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        return self.terms.bias(t, q, v, params)
-
-    def coriolis_matrix(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, "n n"]:
-        """C(t, q, v) from the Christoffel symbols of M, shape (n, n).
-
-        C_ij = sum_k 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k, so that
-        (v . grad_q) M - 2 C is skew-symmetric. C v is the part of h that is quadratic in v;
-        gravity, terms of L linear in v and explicit time are the rest.
-
-        Source: Siciliano et al., Robotics, eq. 7.45.
-
-        Raises:
-            ValueError: M depends on the velocities (L is not quadratic in v), where Christoffel
-                symbols do not exist.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        if not self.structure(params, q.dtype).quadratic:
+        if self.quasi is not None:
+            check_kinematics(self.quasi, params, self.size, dtype)
+        rows = layout(self.constraints, params, self.size, dtype)
+        if self.quasi is not None and len(self.quasi.free) + rows.size < self.size:
             raise bad(
-                "coriolis_matrix",
-                "get a Lagrangian quadratic in the velocities",
-                "its mass matrix d2L/dv2 depends on v",
-                "Use bias(params, q, v), which holds for every Lagrangian.",
+                "quasi: names",
+                f"leave at least {self.size - rows.size} that are not constrained, as many as "
+                f"{self.size} coordinates have freedoms under {rows.size} rows",
+                f"there were {len(self.quasi.free)}",
+                "Add quasi-velocities for the freedoms that are missing, or the constraints.",
             )
-
-        def mass(q: Array) -> Array:
-            return self.terms.mass(t, q, v, params)
-
-        def momentum_along_v(q: Array) -> Array:
-            return mass(q) @ v
-
-        _, M_dot = jax.jvp(mass, (q,), (v,))
-        gradient = jax.jacfwd(momentum_along_v)(q)  # d(M v)_i / dq_j at fixed v
-        return 0.5 * (M_dot + gradient - gradient.T)
-
-    def generalized_force(
-        self,
-        params: Any,
-        q: Any,
-        v: Any,
-        t: Any = 0.0,
-        inputs: Mapping[str, Any] | None = None,
-        names: Sequence[str] | None = None,
-    ) -> Float[Array, " n"]:
-        """Q(t, q, v, inputs), shape (n,), N or N m: the sum of the applied forces.
-
-        Args:
-            params: as the Lagrangian takes them.
-            q: shape (n,).
-            v: shape (n,).
-            t: s.
-            inputs: dict from names to input objects or arrays.
-            names: only these forces; by default all, dissipation included.
-
-        Source: Pila, sec. 3.3 (virtual work) and 3.7 (Rayleigh).
-
-        Raises:
-            ValueError: wrong lengths, unknown force names, missing inputs.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        known = [force.name for force in self.forces]
-        for name in known if names is None else names:
-            if name not in known:
-                raise bad("generalized_force: names", f"be among {known}", f"one was {name!r}")
-        chosen = tuple(f for f in self.forces if names is None or f.name in names)
-        values = self._inputs_at(inputs, t, q, v, params)
-        return ArrayTerms(self.lagrangian, chosen).force(t, q, v, params, values)
-
-    def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
-        """Momentum p = dL/dv, shape (n,), kg m/s or kg m^2/s (Pila, sec. 3.13)."""
-        t, q, v, params = self._state(params, q, v, t)
-        return self.terms.momentum(t, q, v, params)
-
-    def energy(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
-        """H = v . dL/dv - L, scalar, J.
-
-        T + V where T is homogeneous quadratic in v (Pila, eq. 3.207); constant along a motion
-        without applied forces if L does not contain t.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        lagrangian = real_scalar("lagrangian", self.lagrangian)
-        L, p = jax.value_and_grad(lagrangian, argnums=2)(t, q, v, params)
-        return p @ v - L
-
-    def power(
-        self,
-        params: Any,
-        q: Any,
-        v: Any,
-        t: Any = 0.0,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> dict[str, Float[Array, ""]]:
-        """Terms of dH/dt = sum_k v . Q_k - dL/dt at fixed (q, v), by name, W.
-
-        One term for each force under its name, and "explicit time" where L depends on t. A force
-        is credited with v . Q, which is all of its power unless its point of application moves
-        at fixed q.
-
-        Args:
-            params: as the Lagrangian takes them.
-            q: shape (n,).
-            v: shape (n,).
-            t: s.
-            inputs: dict from names to input objects or arrays.
-
-        Source: Goldstein, Classical Mechanics, sec. 2.7, with applied forces.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        values = self._inputs_at(inputs, t, q, v, params)
-        return self.power_terms(params, q.dtype)(t, q, v, params, values)
-
-    def power_terms(self, params: Any, dtype: Any) -> Power:
-        """The terms of dH/dt that this system has."""
-        explicit_time = self.structure(params, dtype).explicit_time
-        return Power(self.lagrangian, self.forces, explicit_time)
-
-    def kinetic(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
-        """T(t, q, v), scalar, J, as declared by `kinetic=`.
-
-        Source: L = T - V (Pila, ch. 3).
-
-        Raises:
-            ValueError: the system was declared by its Lagrangian alone.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        return self._declared("kinetic", self._kinetic)(t, q, v, params)
-
-    def potential(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, ""]:
-        """V(t, q), scalar, J, as declared by `potential=`; `v` is accepted and not used.
-
-        Source: L = T - V (Pila, ch. 3).
-
-        Raises:
-            ValueError: the system was declared by its Lagrangian alone.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        return self._declared("potential", self._potential)(t, q, params)
-
-    def acceleration(
-        self,
-        params: Any,
-        q: Any,
-        v: Any,
-        t: Any = 0.0,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> Float[Array, " n"]:
-        """Acceleration a with M a + h = Q, shape (n,), m/s^2 or rad/s^2; NaN where M is singular.
-
-        Args:
-            params: as the Lagrangian takes them.
-            q: shape (n,).
-            v: shape (n,).
-            t: s.
-            inputs: dict from names to input objects or arrays.
-
-        Source: Pila, eq. 3.118 without constraints.
-        """
-        t, q, v, params = self._state(params, q, v, t)
-        values = self._inputs_at(inputs, t, q, v, params)
-        return self.terms.acceleration(t, q, v, params, values)
+        return rows
 
     def check(
         self,
@@ -339,7 +258,8 @@ class System(eqx.Module):
         """Examine the declaration at one state, with these params; silent if all is well.
 
         Traces L and the forces, then looks at the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
-        positive definite by its pivots, a with M a + h = Q finite.
+        positive definite by its pivots (under constraints on their tangent space), the rows of
+        the constraints affine in v, a with M a + h = Q + A^T lam finite.
 
         Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
 
@@ -353,7 +273,11 @@ class System(eqx.Module):
         L = self.lagrangian(t, q, v, params)
         if not bool(jnp.isfinite(L)):
             raise bad("lagrangian", "be finite at the given state", f"it was {L}")
-        index = int(first_unhealthy(self.terms.mass(t, q, v, params)))
+        M = self.terms.mass(t, q, v, params)
+        if self.constraints:
+            self.rows(params, q.dtype)
+            M, _ = augmented(M, self.terms.rows(t, q, v, params)[0])
+        index = int(first_unhealthy(M))
         if index >= 0:
             raise bad(
                 f"coordinate {self.coordinates.label(index)!r}",
@@ -361,7 +285,7 @@ class System(eqx.Module):
                 f"its pivot was not positive at q = {q}, v = {v}",
                 "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
             )
-        a = self.terms.acceleration(t, q, v, params, values)
+        a = self.acceleration(params, q, v, t, inputs)
         if not bool(jnp.all(jnp.isfinite(a))):
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
             raise bad(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
@@ -380,17 +304,16 @@ class System(eqx.Module):
         terms, lowered = self.terms, None
         if isinstance(terms, ScalarTerms):
             free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
-            terms = ScalarTerms(ArrayTerms(self.lagrangian, free), terms.limit)
+            array = ArrayTerms(self.lagrangian, free, self.constraints)
+            if self.quasi is not None:
+                array = replace(array, quasi=self.quasi, in_u=self.in_u)
+            terms = ScalarTerms(array, terms.limit)
             lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
-        return explain(self, self.structure(params, dtype), lowered)
+        return explain(self, self.structure(params, dtype), lowered, self.rows(params, dtype))
 
     def structure(self, params: Any, dtype: Any) -> Structure:
-        """Dependencies of M, h and L, traced once per (system, shapes, dtypes)."""
-        traced, static = _params.split(params)
-        avals = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced
-        )
-        return _structure(self, _params.Static(avals), _params.Static(static), jnp.dtype(dtype))
+        """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes)."""
+        return ArrayTerms(self.lagrangian, ()).structure(params, self.size, dtype)
 
     def check_traceable(self, params: Any, dtype: Any, values: Any) -> None:
         """Trace L and the forces at abstract states; raise if a shape or dtype is wrong.
@@ -412,35 +335,9 @@ class System(eqx.Module):
 
         jax.eval_shape(all_terms, t, q, v, traced)
 
-    def _declared(self, name: str, function: Callable | None) -> Callable:
-        if function is None:
-            raise bad(
-                f"System.{name}",
-                "be called on a system declared by kinetic= and potential=",
-                "this one was declared by its Lagrangian alone",
-            )
-        return function
 
-    def _state(self, params: Any, q: Any, v: Any, t: Any) -> tuple[Array, Array, Any, Any]:
-        traced, static = _params.split(params)
-        q, v = state_vectors(self.coordinates, q, v)
-        return jnp.asarray(t, jnp.result_type(float)), q, v, _params.join(traced, static)
-
-    def _inputs_at(self, inputs: Any, t: Array, q: Array, v: Array, params: Any) -> InputValues:
-        inputs = check_inputs(inputs)
-        check_range(inputs, t, "t")
-        return evaluate(inputs, t, q, v, params)
-
-
-@lru_cache(maxsize=256)
-def _structure(
-    system: System, avals: _params.Static, static: _params.Static, dtype: Any
-) -> Structure:
-    def with_params(function: Callable) -> Callable:
-        return lambda t, q, v, traced: function(t, q, v, _params.join(traced, static.tree))
-
-    terms = system.terms
-    mass, bias, lagrangian = map(with_params, (terms.mass, terms.bias, system.lagrangian))
-    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    q = jax.ShapeDtypeStruct((system.size,), dtype)
-    return find_structure(mass, bias, lagrangian, (t, q, q), avals.tree)
+@partial(jax.jit, static_argnums=(0, 1))
+def _mass(
+    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system.terms.mass(t, q, v, _params.join(traced, static.tree))

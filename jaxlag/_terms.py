@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
 
@@ -60,6 +60,18 @@ class Terms(eqx.Module):
         """Q, the sum of all applied generalized forces, dissipation included."""
 
     @abstractmethod
+    def position(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, " k"]:
+        """Residuals phi(t, q) of the holonomic rows, in their order."""
+
+    @abstractmethod
+    def velocity(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """Residuals A v + b of all rows."""
+
+    @abstractmethod
     def rows(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
@@ -78,11 +90,13 @@ class Terms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
+        kept: Bool[Array, " m"] | None = None,
+        sense: Array | float = 1.0,
     ) -> Any:
         """What accelerations need of what depends on params alone, to be computed once per solve.
 
         Of q and the inputs' values only shapes and dtypes matter; `sample` holds values of the
-        params where these are traced.
+        params where these are traced, `kept` the rows that are going to be solved with.
         """
 
     @abstractmethod
@@ -94,8 +108,33 @@ class Terms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, " n"]:
-        """a, with one factorisation; NaN where M is not positive definite.
+        """a, with one factorisation; NaN where M is not positive definite where A a = 0.
 
-        `prepared`: what `prepare` returned for these params; computed here if left out.
+        `prepared`: what `prepare` returned for these params; computed here if left out. `kept`:
+        independent rows that imply the others; all if left out.
         """
+
+    @abstractmethod
+    def reactions(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(a, lam); lam of least norm where rows depend on one another."""
+
+    @abstractmethod
+    def correction(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+    ) -> Float[Array, "n m"]:
+        """M^-1 A^T (A M^-1 A^T)^-1: takes residuals c to the x nearest to 0 with A x = c."""

@@ -5,10 +5,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad
+from jaxlag._params import concrete
 
 
 def real(argument: str, x: Any) -> Array:
@@ -21,6 +23,26 @@ def real(argument: str, x: Any) -> Array:
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise bad(argument, "be real", f"its dtype was {x.dtype}")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
+    """`x` as a scalar of this dtype, finite where its value is known; raises if it cannot be one.
+
+    Args:
+        argument: as errors name it.
+        must: what it is to be, in words.
+        x: anything.
+        dtype: of the result.
+    """
+    try:
+        x = jnp.asarray(x, dtype)
+    except (TypeError, ValueError) as error:
+        raise bad(argument, must, f"it was {x!r}") from error
+    if x.ndim != 0:
+        raise bad(argument, must, f"its shape was {x.shape}")
+    if concrete(x) and not np.isfinite(x):
+        raise bad(argument, "be finite", f"it was {x}")
+    return x
 
 
 def common(*arrays: Array) -> list[Array]:

@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> ArgumentParser:
     parser = ArgumentParser(
         prog="python -m systems",
-        description='Systems of Pila, "Introduction to Lagrangian Dynamics".',
+        description='Systems of Pila, "Introduction to Lagrangian Dynamics", and a few beyond.',
     )
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="names, coordinates and places in the book")
@@ -48,7 +48,7 @@ def _parser() -> ArgumentParser:
     run.add_argument("--plot", type=Path, metavar="FILE", help="write a figure (.png, .pdf, .svg)")
     check = commands.add_parser("check", help="compare reference files with the simulation")
     check.add_argument("files", nargs="+", type=Path, metavar="FILE.json")
-    commands.add_parser("errata", help="evaluate the misprints of chapters 2 and 3")
+    commands.add_parser("errata", help="evaluate the misprints of chapters 1 to 4")
     commands.add_parser("fit-pendulum", help="identify a pendulum from measured motion")
     return parser
 

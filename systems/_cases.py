@@ -11,12 +11,8 @@ from systems._entry import AbstractEntry, Entry, PrescribedEntry, StaticEntry
 from systems._fields import check_fields, check_text, check_texts, fail, numbers, shown
 from systems._quantities import shapes
 
-_ABSENT = {
-    "u": "quasi-velocities",
-    "lambda": "constraints",
-    "constraint_force": "constraints",
-}
 _MOTION = ("q", "v", "a")
+_REACTIONS = ("lambda", "constraint_force")
 _TEXTS = ("description", "derivation", "error_method")
 _ERROR_RECORDS = (
     "error_estimate",
@@ -53,15 +49,20 @@ def read_case(entry: AbstractEntry, index: int, raw: Any) -> Case:
 
 @read_case.register
 def _(entry: Entry, index: int, raw: Any) -> Case:
-    required = ("name", "params", "times", *_MOTION, *_ABSENT, "energy", "invariants")
+    absent = {} if entry.quasi_velocities else {"u": "quasi-velocities"}
+    if not entry.file_constraints:
+        things = "constraints in its files" if entry.constraints else "constraints"
+        absent |= dict.fromkeys(_REACTIONS, things)
+    rows = tuple(field for field in (*_MOTION, "u", *_REACTIONS) if field not in absent)
+    required = ("name", "params", "times", *_MOTION, "u", *_REACTIONS, "energy", "invariants")
     where = _begin(index, raw, required, (*_OPTIONAL, "extras", "controls"))
     _check_controls(f"{where}: controls", raw.get("controls"))
-    for field, things in _ABSENT.items():
+    for field, things in absent.items():
         if raw[field] is not None:
             must = f"be null, for {entry.name} has no {things}"
             fail(f"{where}: {field}", must, f"it was {shown(raw[field])}")
     groups = {"energy": ("T", "V", "E"), "extras": (), "invariants": ()}
-    given = {field: raw[field] for field in _MOTION} | _grouped(where, entry, raw, groups)
+    given = {field: raw[field] for field in rows} | _grouped(where, entry, raw, groups)
     return _case(where, entry, raw, _read_times(where, raw["times"]), given)
 
 

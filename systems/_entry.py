@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
 from jax.typing import ArrayLike
 
 import jaxlag as jl
@@ -18,16 +21,20 @@ class Example:
     """A start and parameters worth looking at.
 
     Attributes:
-        params: parameter name -> value, in the units of `parameter_units`.
+        params: parameter name -> value, a number or an array, in the units of `parameter_units`.
         q0: coordinates at t = 0, in the order of the system's coordinates.
         v0: generalized velocities at t = 0.
         duration: length of the run [s].
+        hold: what stays as it is where q0 and v0 are a guess, to be assembled under the
+            constraints: names of coordinates and, with a prime, of velocities. None where q0 and
+            v0 satisfy the constraints themselves.
     """
 
-    params: Mapping[str, float]
+    params: Mapping[str, Any]
     q0: Sequence[float]
     v0: Sequence[float]
     duration: float
+    hold: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +52,29 @@ class PrescribedExample:
     duration: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """Independent coordinates from which all of a constrained system's follow.
+
+    Attributes:
+        coordinates: their names, among those of the system and in its order.
+        configuration: `configuration(t, q, params)`, all coordinates of the system, shape (n,),
+            from q, the values of these.
+    """
+
+    coordinates: tuple[str, ...]
+    configuration: Callable[..., Array]
+
+    def state(self, t: ArrayLike, q: ArrayLike, v: ArrayLike, params: Mapping) -> tuple:
+        """(q, v) of the system, each (n,), from the values and the rates of these coordinates."""
+        t, q, v = (jnp.asarray(x, float) for x in (t, q, v))
+
+        def along(t: Array, q: Array) -> Array:
+            return self.configuration(t, q, params)
+
+        return jax.jvp(along, (t, q), (jnp.ones_like(t), v))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AbstractEntry:
     """What every system of the book has; compared and hashed by identity.
@@ -54,8 +84,13 @@ class AbstractEntry:
         book: its place in the book.
         system: the declaration.
         coordinate_units: one unit per coordinate.
+        quasi_units: one unit per quasi-velocity.
+        multiplier_units: name of a constraint -> unit of its multiplier, in the order of the
+            constraints; every row has a name of its own.
         parameter_units: parameter name -> unit; names every parameter.
         example: parameters, and a start where there is one, to run.
+        chart: the independent coordinates that reference files are written in, which say nothing
+            of constraints then; None where they are written in all coordinates.
         kind: what is asked of it: "trajectory", "static" or "prescribed".
     """
 
@@ -66,15 +101,36 @@ class AbstractEntry:
     system: jl.System
     coordinate_units: tuple[str, ...]
     parameter_units: Mapping[str, str]
+    quasi_units: tuple[str, ...] = ()
+    multiplier_units: Mapping[str, str] = field(default_factory=dict)
     example: Example | StaticExample | PrescribedExample
+    chart: Chart | None = None
 
     def __post_init__(self) -> None:
         """Check that the entry speaks of one system throughout."""
         self._check_length("coordinate_units", self.coordinate_units)
+        if len(self.quasi_units) != len(self.quasi_velocities):
+            names = ", ".join(self.quasi_velocities) or "no quasi-velocities"
+            raise ValueError(
+                f"{self.name}: quasi_units must have one value for each of {names}, but it was "
+                f"{self.quasi_units!r}."
+            )
         if set(self.example.params) != set(self.parameter_units):
             raise ValueError(
                 f"{self.name}: example.params must name the parameters "
                 f"{', '.join(self.parameter_units)}, but it named {', '.join(self.example.params)}."
+            )
+        declared = tuple(name for c in self.system.constraints for name in c.all_names)
+        if self.constraints != declared:
+            raise ValueError(
+                f"{self.name}: multiplier_units must name the constraints {declared}, in this "
+                f"order, but it named {self.constraints}."
+            )
+        kept = tuple(name for name in self.coordinates if name in self.file_coordinates)
+        if self.file_coordinates != kept:
+            raise ValueError(
+                f"{self.name}: chart.coordinates must be among {', '.join(self.coordinates)}, in "
+                f"this order, but they were {', '.join(self.file_coordinates)}."
             )
 
     @property
@@ -82,7 +138,38 @@ class AbstractEntry:
         """Names of the coordinates, in order."""
         return self.system.coordinates.labels
 
-    def _check_length(self, argument: str, values: Sequence) -> None:
+    @property
+    def quasi_velocities(self) -> tuple[str, ...]:
+        """Names of the quasi-velocities, in order, those that vanish included."""
+        quasi = self.system.quasi
+        return () if quasi is None else quasi.names
+
+    @property
+    def free_quasi_velocities(self) -> tuple[str, ...]:
+        """Names of those that do not vanish."""
+        return tuple(name for name in self.quasi_velocities if name not in self.constraints)
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Names of the constraint rows, in order."""
+        return tuple(self.multiplier_units)
+
+    @property
+    def file_coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates that reference files are written in."""
+        return self.coordinates if self.chart is None else self.chart.coordinates
+
+    @property
+    def file_constraints(self) -> tuple[str, ...]:
+        """Names of the constraint rows that reference files speak of."""
+        return self.constraints if self.chart is None else ()
+
+    @property
+    def file_columns(self) -> np.ndarray:
+        """Where the coordinates of reference files stand among all of them."""
+        return np.array([self.coordinates.index(name) for name in self.file_coordinates])
+
+    def _check_length(self, argument: str, values: Sequence | Array) -> None:
         if len(values) != len(self.coordinates):
             raise ValueError(
                 f"{self.name}: {argument} must have one value for each of "
@@ -96,7 +183,8 @@ class Entry(AbstractEntry):
 
     Attributes:
         extras: name -> function of the state, beyond the H, p and dp/dt of every system.
-        invariants: name -> function of the state that the motion keeps constant.
+        invariants: name -> function of the state that the motion keeps constant, as long as no
+            force is applied.
     """
 
     kind: ClassVar[str] = "trajectory"
@@ -111,6 +199,14 @@ class Entry(AbstractEntry):
         self._check_length("example.q0", self.example.q0)
         self._check_length("example.v0", self.example.v0)
 
+    def start(self) -> tuple[Array, Array]:
+        """(q, v) of the example at t = 0, each (n,), assembled where it is a guess."""
+        q0, v0 = jnp.asarray(self.example.q0), jnp.asarray(self.example.v0)
+        if self.example.hold is None:
+            return q0, v0
+        state = jl.assemble(self.system, q0, v0, self.example.params, hold=self.example.hold)
+        return state.q, state.v
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StaticEntry(AbstractEntry):
@@ -118,13 +214,13 @@ class StaticEntry(AbstractEntry):
 
     Attributes:
         guess: `guess(params)`, coordinates from which the search for the state of rest starts.
-        values: name -> function `f(q, params)` of the state of rest.
+        values: name -> function `f(rest, params)` of the state of rest, a `jl.Equilibrium`.
     """
 
     kind: ClassVar[str] = "static"
 
     example: StaticExample
-    guess: Callable[[Mapping[str, ArrayLike]], Sequence[ArrayLike]]
+    guess: Callable[[Mapping[str, ArrayLike]], Sequence[ArrayLike] | Array]
     values: Mapping[str, Callable[..., ArrayLike]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from jaxlag import energy
 from systems import (
     _errata_quadcopter,
     double_pendulum,
+    double_pendulum_cartesian,
     mass_spring_dashpot,
     simple_pendulum,
 )
@@ -46,22 +47,20 @@ def _bob_masses(params):
     return jnp.stack([params["m1"], params["m2"]])
 
 
-def _weight(params, r):
-    return energy.gravity(_bob_masses(params), r.reshape(2, 2), jnp.array([0.0, -params["g"]]))
-
-
 _DOUBLE = jl.System(
     coordinates=("theta1", "theta2"),
     kinetic=lambda t, q, v, params: energy.particles(
         lambda t, q, params: _bobs(t, q, params).reshape(2, 2), _bob_masses(params), t, q, v, params
     ),
-    potential=lambda t, q, params: _weight(params, _bobs(t, q, params)),
+    potential=lambda t, q, params: double_pendulum_cartesian.potential(
+        t, _bobs(t, q, params), params
+    ),
 )
 
 _BOBS = jl.System(
     coordinates=("x1", "y1", "x2", "y2"),
-    kinetic=lambda t, q, v, params: 0.5 * jnp.repeat(_bob_masses(params), 2) @ v**2,
-    potential=lambda t, q, params: _weight(params, q),
+    kinetic=double_pendulum_cartesian.kinetic,
+    potential=double_pendulum_cartesian.potential,
 )
 """The two bobs with no strings."""
 

@@ -11,7 +11,9 @@ from systems import (
     disk_on_moving_cart,
     double_pendulum_forces,
     falling_stick,
+    falling_stick_multiplier,
     hockey_puck_cord,
+    rotating_cylinder_disk,
     sleeve_pendulum,
 )
 from systems._erratum import Erratum, State, around, around_example, motion, rate
@@ -41,46 +43,22 @@ def _joint_moment(s: State, sign: int):
     return array(s.values("Bx", "By")) @ _joint_derivative(s, sign)
 
 
-# Disk spinning on a rod that turns about the vertical, tilt delta of the rod included.
-
-
-def _rod_pose(t, q, params):
-    alpha, delta, _ = q
-    R = jl.rotation.compose(jl.rotation.about_z(alpha), jl.rotation.about_x(delta))
-    return R, jnp.zeros(3)
-
-
-def _rod_and_disk(t, q, v, params):
-    m1, m2, Iy, Iz = (params[name] for name in ("m1", "m2", "Iy", "Iz"))
-    along = jnp.array([0.0, 1.0, 0.0])
-    end = params["l"] * along
-    rod = energy.RigidBody(m1, m1 * params["l"] ** 2 / 3 * (1 - along))
-    disk = energy.RigidBody(m2, energy.parallel_axis(jnp.stack([Iz, Iy, Iz]), m2, end), end)
-    still, omega = energy.body_velocity(_rod_pose, t, q, v, params)
-    T = rod.kinetic_from_rates(still, omega)
-    return T + disk.kinetic_from_rates(still, omega + v[2] * along)
-
-
-_SPINNER = jl.System(
-    coordinates=("alpha", "delta", "beta"),
-    kinetic=_rod_and_disk,
-    potential=lambda t, q, params: jnp.zeros_like(q[0]),
-)
+# Disk spinning on a rod that turns about the vertical.
 
 
 def _steady(rod: float):
-    """The rod, of mass `rod`, held level, both rates steady: (Omega, 0, -omega1)."""
-    return around(
-        {"m1": rod, "m2": 1.6, "l": 0.7, "Iy": 0.03, "Iz": 0.02},
-        (0.0, 0.0, 0.0),
-        dq=(0.4, 0.0, 0.4),
-        dv=(3.0, 0.0, 3.0),
-        da=0.0,
-    )
+    """The rod, of mass `rod`, held level by a pivot, without gravity, both rates steady."""
+    params = {**rotating_cylinder_disk.entry.example.params, "m1": rod}
+    params |= dict.fromkeys(("tau_z0", "tau_b", "g"), 0.0)
+    return around(params, (0.0, 0.0, 0.0), dq=(0.4, 0.0, 0.4), dv=(3.0, 0.0, 3.0), da=0.0)
+
+
+def _support_torque(s: State):
+    return rotating_cylinder_disk.system.multipliers(s.params, s.q, s.v, s.t)["level"]
 
 
 def _momentum_about_vertical(s: State):
-    return _SPINNER.momentum(s.params, s.q, s.v)[0]
+    return rotating_cylinder_disk.system.momentum(s.params, s.q, s.v, s.t)[0]
 
 
 def _disk_inertia(s: State):
@@ -145,14 +123,10 @@ def _ground_force(t, q, v, params):
     return params["N"] * jnp.stack([params["mu"], jnp.ones_like(params["mu"])])
 
 
-def _stick_kinetic(t, q, v, params):
-    return 0.5 * params["m"] * (v[0] ** 2 + v[1] ** 2 + params["L"] ** 2 / 12 * v[2] ** 2)
-
-
 _STICK = jl.System(
     coordinates=("x", "y", "theta"),
-    kinetic=_stick_kinetic,
-    potential=lambda t, q, params: params["m"] * params["g"] * q[1],
+    kinetic=falling_stick_multiplier.kinetic,
+    potential=falling_stick_multiplier.potential,
     forces=(jl.PointForce(_contact, _ground_force, "ground"),),
 )
 """The stick with no ground but its force (mu N, N) at the lower end."""
@@ -321,7 +295,7 @@ ERRATA = (
         place="3.143, torque on the rod that holds it level",
         wrong="(Iy - Iz - m2 l^2) Omega omega1 for Iy Omega omega1",
         draw=_steady(0.9),
-        engine=lambda s: jl.inverse_dynamics(_SPINNER, s.q, s.v, s.a, s.params)[1],
+        engine=_support_torque,
         printed=lambda s: -(s.params["Iy"] - _disk_inertia(s)) * s.v[0] * s.v[2],
         right=lambda s: -s.params["Iy"] * s.v[0] * s.v[2],
     ),

@@ -32,14 +32,15 @@ class Panel(NamedTuple):
     mark: tuple[float, float] | None = None
 
 
-def by_unit(entry: AbstractEntry, ts: ArrayLike, rows: ArrayLike, units: Sequence[str]) -> list:
+def by_unit(
+    names: Sequence[str], ts: ArrayLike, rows: ArrayLike, units: Sequence[str]
+) -> list[Panel]:
     """One panel over time for every unit: the components of `rows`, (S, n), that have it."""
     panels = []
     for unit in dict.fromkeys(units):
         columns = [i for i, own in enumerate(units) if own == unit]
-        names = [entry.coordinates[i] for i in columns]
-        curves = {entry.coordinates[i]: np.asarray(rows)[:, i] for i in columns}
-        panels.append(Panel("t [s]", ts, f"{', '.join(names)} [{unit}]", curves))
+        curves = {names[i]: np.asarray(rows)[:, i] for i in columns}
+        panels.append(Panel("t [s]", ts, f"{', '.join(curves)} [{unit}]", curves))
     return panels
 
 

@@ -6,7 +6,9 @@ known here is an error, and so is one whose form is not as expected.
 """
 
 import json
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ SCHEMA = "jaxlag-reference/1"
 
 _REQUIRED = ("schema", "system", "coordinates", "quasi_velocities", "constraints", "cases")
 _TEXTS = ("book", "notes", "set")
-_OPTIONAL = (*_TEXTS, "kind", "parameters", "extras")
+_OPTIONAL = (*_TEXTS, "kind", "parameters", "extras", "coordinates_redundant")
 
 
 @dataclass(frozen=True)
@@ -67,18 +69,49 @@ def read(raw: Any) -> Reference:
     kind = raw.get("kind", "trajectory")
     if kind != entry.kind:
         fail("kind", f"be {entry.kind!r}, as {entry.name} is", f"it was {kind!r}")
-    if raw["coordinates"] != list(entry.coordinates):
-        fail("coordinates", f"be {list(entry.coordinates)}", f"it was {raw['coordinates']!r}")
-    for field in ("quasi_velocities", "constraints"):
-        if raw[field] != []:
-            fail(field, f"be [], for {entry.name} has none", f"it was {raw[field]!r}")
+    _check_coordinates(raw, entry)
+    quasi = list(entry.quasi_velocities)
+    if raw["quasi_velocities"] != quasi:
+        must = f"be {quasi}" if quasi else f"be [], for {entry.name} has none"
+        fail("quasi_velocities", must, f"it was {raw['quasi_velocities']!r}")
+    _check_constraints(raw["constraints"], entry)
     check_texts("parameters", raw.get("parameters", {}), entry.parameter_units)
     check_texts("extras", raw.get("extras", {}), members(entry, "extras"))
     if not isinstance(raw["cases"], list) or not raw["cases"]:
         fail("cases", "be a list of at least one case", f"it was {raw['cases']!r}")
     cases = tuple(read_case(entry, index, case) for index, case in enumerate(raw["cases"]))
-    names = [case.name for case in cases]
-    for name in names:
-        if names.count(name) > 1:
-            fail("cases", "have distinct names", f"{names.count(name)} were called {name!r}")
-    return Reference(entry, cases)
+    return Reference(entry, tuple(_numbered(cases)))
+
+
+def _numbered(cases: tuple[Case, ...]) -> Iterator[Case]:
+    """The cases, each with a name of its own: names that occur again are numbered."""
+    seen = Counter[str]()
+    for case in cases:
+        seen[case.name] += 1
+        count = seen[case.name]
+        yield case if count == 1 else replace(case, name=f"{case.name} ({count})")
+
+
+def _check_coordinates(raw: Any, entry: AbstractEntry) -> None:
+    """Those that the file is written in, and all of the system's where these are more."""
+    own, every = list(entry.file_coordinates), list(entry.coordinates)
+    if raw["coordinates"] != own:
+        fail("coordinates", f"be {own}", f"it was {raw['coordinates']!r}")
+    redundant = raw.get("coordinates_redundant", every)
+    if "coordinates_redundant" in raw and own == every:
+        must = f"be left out, for {entry.name} has none"
+        fail("coordinates_redundant", must, f"it was {redundant!r}")
+    if redundant != every:
+        fail("coordinates_redundant", f"be {every}", f"it was {redundant!r}")
+
+
+def _check_constraints(raw: Any, entry: AbstractEntry) -> None:
+    """What each constraint row is, in words: one text for each, in order."""
+    rows = entry.file_constraints
+    texts = isinstance(raw, list) and all(isinstance(text, str) for text in raw)
+    if texts and len(raw) == len(rows):
+        return
+    must = f"be a list of {len(rows)} texts, one for each of {', '.join(rows)}"
+    if not rows:
+        must = f"be [], for {entry.name} has none{' in its files' if entry.constraints else ''}"
+    fail("constraints", must, f"it was {shown(raw)}")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 import jaxlag as jl
 from systems._entry import AbstractEntry, Entry, PrescribedEntry, StaticEntry
@@ -36,7 +37,8 @@ def main(entry: AbstractEntry, plot: Path | None) -> int:
     report = run(entry)
     params = entry.example.params
     print(f"{entry.name}: {entry.book}")
-    print(", ".join(f"{name} = {params[name]:g} {u}" for name, u in entry.parameter_units.items()))
+    units = entry.parameter_units.items()
+    print(", ".join(f"{name} = {_value(params[name])}{_unit(unit)}" for name, unit in units))
     print("\n".join(["", *report.lines]))
     if plot is not None:
         try:
@@ -62,9 +64,14 @@ def _(entry: Entry) -> Report:
         "V potential": motion.potential,
         "E = T + V": motion.kinetic + motion.potential,
     }
-    panels = by_unit(entry, motion.ts, motion.q, entry.coordinate_units)
+    panels = by_unit(entry.coordinates, motion.ts, motion.q, entry.coordinate_units)
+    panels += by_unit(*_free_quasi_velocities(entry, motion))
     panels.append(Panel("t [s]", motion.ts, "energy [J]", energies))
-    return Report(list(_motion_lines(entry, motion)), panels, bool(motion.status == jl.Status.ok))
+    lines = list(_motion_lines(entry, motion))
+    if entry.constraints:
+        lines += ["", *_constraint_lines(entry, motion)]
+        panels += _constraint_panels(entry, motion)
+    return Report(lines, panels, bool(motion.status == jl.Status.ok))
 
 
 @run.register
@@ -89,9 +96,10 @@ def _(entry: PrescribedEntry) -> Report:
     heads = [*_heads(entry, ""), *_forces(entry)]
     lines = [*_table(heads, (ts, rows["q"], forces)), "", f"at t = {ts[0]:g} s"]
     lines += [f"{name} = {rows[f'extras.{name}'][0]:.6g}" for name in entry.extras]
-    panels = by_unit(entry, ts, rows["q"], entry.coordinate_units)
+    panels = by_unit(entry.coordinates, ts, rows["q"], entry.coordinate_units)
     panels += [
-        p._replace(y_label=f"force on {p.y_label}") for p in by_unit(entry, ts, forces, units)
+        p._replace(y_label=f"force on {p.y_label}")
+        for p in by_unit(entry.coordinates, ts, forces, units)
     ]
     return Report(lines, panels, bool(jnp.all(jnp.isfinite(forces))))
 
@@ -102,8 +110,7 @@ def simulate_example(entry: Entry) -> jl.Solution:
     ts = np.linspace(0.0, example.duration, SAMPLES)
     return jl.simulate(
         entry.system,
-        example.q0,
-        example.v0,
+        *entry.start(),
         ts,
         example.params,
         rtol=TOLERANCE,
@@ -122,22 +129,59 @@ def drifts(entry: Entry, motion: jl.Solution) -> Iterator[tuple[str, float]]:
 
 
 def _motion_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
-    heads = [*_heads(entry, ""), *_heads(entry, "'")[1:], "T + V [J]"]
+    heads, rates = [*_heads(entry, ""), *_heads(entry, "'")[1:]], motion.v
+    if entry.quasi_velocities:
+        names, _, rates, units = _free_quasi_velocities(entry, motion)
+        own = (f"{name} [{unit}]" for name, unit in zip(names, units, strict=True))
+        heads = [*_heads(entry, ""), *own]
     energies = motion.kinetic + motion.potential
-    yield from _table(heads, (motion.ts, motion.q, motion.v, energies))
+    yield from _table([*heads, "T + V [J]"], (motion.ts, motion.q, rates, energies))
     yield ""
     yield f"energy   {_energy(motion)}"
     for name, drift in drifts(entry, motion):
-        yield f"{name:<8} constant within {drift:.1e} (relative)"
-    yield f"steps    {', '.join(f'{name} {value}' for name, value in motion.stats.items())}"
+        yield f"{name:<8} varies by {drift:.1e} (relative)"
+    steps = (f"{motion.stats[name]} {name}" for name in ("accepted", "rejected"))
+    yield f"steps    {', '.join(steps)}"
     yield f"status   {motion.message()}"
+
+
+def _free_quasi_velocities(
+    entry: Entry, motion: jl.Solution
+) -> tuple[tuple[str, ...], jax.Array, np.ndarray, tuple[str, ...]]:
+    """(names, times, rows, units) of those that do not vanish."""
+    names = entry.free_quasi_velocities
+    columns = [entry.quasi_velocities.index(name) for name in names]
+    units = tuple(entry.quasi_units[column] for column in columns)
+    rows = np.asarray(motion.u)[:, columns] if columns else np.zeros((len(motion.ts), 0))
+    return names, motion.ts, rows, units
+
+
+def _constraint_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
+    along = jax.jit(jax.vmap(partial(entry.system.residuals, entry.example.params)))
+    positions, velocities = along(motion.q, motion.v, motion.ts)
+    kept = {"position": positions, "velocity": velocities}
+    multipliers = motion.lam
+    yield f"{'constraint':<12}{'lambda at the end':>24}  largest residuals"
+    for name, unit in entry.multiplier_units.items():
+        last = f"{float(multipliers[name][-1]):.6g} {unit}"
+        sizes = {kind: jnp.max(jnp.abs(rows[name])) for kind, rows in kept.items() if name in rows}
+        yield f"{name:<12}{last:>24}  {', '.join(f'{k} {float(x):.1e}' for k, x in sizes.items())}"
+
+
+def _constraint_panels(entry: Entry, motion: jl.Solution) -> list[Panel]:
+    """The multipliers over time."""
+    multipliers = motion.lam
+    lam = jnp.stack([multipliers[name] for name in entry.constraints], axis=-1)
+    units = tuple(entry.multiplier_units.values())
+    panels = by_unit(entry.constraints, motion.ts, lam, units)
+    return [panel._replace(y_label=f"lambda of {panel.y_label}") for panel in panels]
 
 
 def _static_lines(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> Iterator[str]:
     for name, unit, value in zip(entry.coordinates, entry.coordinate_units, rest.q, strict=True):
         yield f"{name} = {float(value):.9g} {unit}"
-    for name, value in static_quantities(entry, params, rest.q).items():
-        if name != "q":
+    for name, value in static_quantities(entry, params, rest).items():
+        if name not in ("q", *entry.coordinates):
             yield f"{name} = {float(value):.9g}"
     yield ""
     verdict = "stable" if rest.stable else "not shown to be stable"
@@ -147,19 +191,39 @@ def _static_lines(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> Ite
 
 
 def _static_panels(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> list[Panel]:
-    """The force on every coordinate as this coordinate alone moves away from rest."""
-    zero = jnp.zeros_like(rest.q)
+    """The force on every coordinate as this coordinate alone moves away from rest.
+
+    Under constraints on the independent ones, from which the others follow.
+    """
+    zero, own = jnp.zeros_like(rest.q), rest.q[entry.file_columns]
+
+    def configuration(own: jax.Array) -> jax.Array:
+        return own if entry.chart is None else entry.chart.configuration(0.0, own, params)
+
     panels = []
-    for i, (name, unit) in enumerate(zip(entry.coordinates, entry.coordinate_units, strict=True)):
-        x = rest.q[i] + jnp.linspace(-1.0, 1.0, 201) * (1.0 if unit == "rad" else 0.5)
+    for i, (column, name) in enumerate(
+        zip(entry.file_columns, entry.file_coordinates, strict=True)
+    ):
+        unit = entry.coordinate_units[column]
+        x = own[i] + jnp.linspace(-1.0, 1.0, 201) * (1.0 if unit == "rad" else 0.5)
 
         def force(x: jax.Array, i: int = i) -> jax.Array:
-            return -jl.inverse_dynamics(entry.system, rest.q.at[i].set(x), zero, zero, params)[i]
+            q, pull = jax.vjp(configuration, own.at[i].set(x))
+            return -pull(jl.inverse_dynamics(entry.system, q, zero, zero, params))[0][i]
 
         label = f"force on {name} [{_FORCE_UNITS[unit]}]"
-        mark = (float(rest.q[i]), float(rest.residual[i]))
+        mark = (float(own[i]), float(force(own[i])))
         panels.append(Panel(f"{name} [{unit}]", x, label, {name: jax.vmap(force)(x)}, mark))
     return panels
+
+
+def _value(value: ArrayLike) -> str:
+    numbers = [f"{x:g}" for x in np.ravel(np.asarray(value))]
+    return numbers[0] if np.ndim(value) == 0 else f"({', '.join(numbers)})"
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
 
 
 def _heads(entry: AbstractEntry, prime: str) -> list[str]:
@@ -173,7 +237,7 @@ def _forces(entry: AbstractEntry) -> list[str]:
     return [f"on {name} [{_FORCE_UNITS[unit]}]" for name, unit in names]
 
 
-def _table(heads: Sequence[str], columns: Sequence[jax.Array]) -> Iterator[str]:
+def _table(heads: Sequence[str], columns: Sequence[ArrayLike]) -> Iterator[str]:
     yield "  ".join(f"{head:>16}" for head in heads)
     table = np.column_stack([np.asarray(column) for column in columns])
     for row in np.linspace(0, len(table) - 1, TABLE_ROWS, dtype=int):

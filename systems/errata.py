@@ -1,4 +1,4 @@
-"""Errata of chapters 2 and 3 of Pila's book, each shown by numbers: `python -m systems errata`.
+"""Errata of chapters 1 to 4 of Pila's book, each shown by numbers: `python -m systems errata`.
 
 Every printed formula that is wrong is evaluated with its correction at a few random states, and
 both are compared with what `jaxlag` finds there by differentiation from positions, energies and
@@ -11,7 +11,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from systems import _errata_chapter2, _errata_chapter3, _errata_chapter3_end
+from systems import (
+    _errata_chapter1,
+    _errata_chapter2,
+    _errata_chapter3,
+    _errata_chapter3_end,
+    _errata_chapter4,
+    _errata_chapter4_axes,
+    _errata_chapter4_flight,
+    _errata_tricycle,
+)
 from systems._erratum import Erratum as Erratum
 from systems._erratum import Errors, examine
 
@@ -22,16 +31,26 @@ WRONG = 1e-6
 """An error above this is no rounding."""
 
 ERRATA: tuple[Erratum, ...] = (
+    *_errata_chapter1.ERRATA,
     *_errata_chapter2.ERRATA,
     *_errata_chapter3.ERRATA,
     *_errata_chapter3_end.ERRATA,
+    *_errata_chapter4.ERRATA,
+    *_errata_tricycle.ERRATA,
+    *_errata_chapter4_axes.ERRATA,
+    *_errata_chapter4_flight.ERRATA,
 )
 """The misprints that change a value, in the order of the book."""
 
 TEXT_ONLY: tuple[tuple[str, str], ...] = (
+    *_errata_chapter1.TEXT_ONLY,
     *_errata_chapter2.TEXT_ONLY,
     *_errata_chapter3.TEXT_ONLY,
     *_errata_chapter3_end.TEXT_ONLY,
+    *_errata_chapter4.TEXT_ONLY,
+    *_errata_tricycle.TEXT_ONLY,
+    *_errata_chapter4_axes.TEXT_ONLY,
+    *_errata_chapter4_flight.TEXT_ONLY,
 )
 """(place, remark) of those in words and signs, where no two formulas differ in value."""
 
@@ -68,6 +87,6 @@ def _row(widths: Sequence[int], place: str, wrong: str, printed: str, right: str
 def _parser() -> ArgumentParser:
     return ArgumentParser(
         prog="python -m systems errata",
-        description="The book's misprints in chapters 2 and 3, with the errors of the printed and "
+        description="The book's misprints in chapters 1 to 4, with the errors of the printed and "
         "of the right formula against the engine, relative to its largest value.",
     )

@@ -43,9 +43,9 @@ def guess(params):
     return params["L0"] + 0.5 * params["L2"], 0.0
 
 
-def spring_stretch(q, params):
+def spring_stretch(rest, params):
     """Stretch x1 - L0 - L2/2 of the spring [m]."""
-    return q[0] - params["L0"] - 0.5 * params["L2"]
+    return rest["x1"] - params["L0"] - 0.5 * params["L2"]
 
 
 system = jl.System(

@@ -16,18 +16,26 @@ class Operation(NamedTuple):
     inside: tuple[str, ...]
 
 
-def operations(function, *args):
-    """Every operation that one call of `function` executes, those of nested programs included."""
-    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, ()))
+def operations(function, *args, turns=None):
+    """Every operation that one call of `function` executes, those of nested programs included.
+
+    A while loop has no number of turns to count: `turns` says how many to assume.
+    """
+    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), turns))
 
 
 def names(program):
     return {operation.name for operation in program}
 
 
-def count(program, name, without=()):
-    """How often operation `name` is executed outside the nested programs `without`."""
-    return sum(o.times for o in program if o.name == name and not set(without) & set(o.inside))
+def count(program, *wanted, without=()):
+    """How often operations of these names are executed outside the nested programs `without`."""
+    return sum(o.times for o in program if o.name in wanted and not set(without) & set(o.inside))
+
+
+def loop(program):
+    """The operations inside while loops: for a solve those of its steps."""
+    return [operation for operation in program if "while" in operation.inside]
 
 
 def largest(program):
@@ -35,19 +43,20 @@ def largest(program):
     return max(math.prod(shape) for operation in program for shape in operation.shapes)
 
 
-def _walk(jaxpr, times, inside):
+def _walk(jaxpr, times, inside, turns):
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         shapes = tuple(getattr(v.aval, "shape", ()) for v in eqn.outvars)
         yield Operation(name, shapes, times, inside)
         repeats = eqn.params["length"] if name == "scan" else 1
+        if name == "while":
+            assert turns is not None, "a while loop has no number of turns to count"
+            repeats = turns
         for inner in _executed(name, eqn.params):
-            yield from _walk(inner, times * repeats, (*inside, name))
+            yield from _walk(inner, times * repeats, (*inside, name), turns)
 
 
 def _executed(name, params):
-    if name == "while":
-        raise AssertionError("a while loop has no number of turns to count")
     if name == "custom_linear_solve":  # its products and its transpose serve derivatives only
         return [params["jaxprs"].solve.jaxpr]
     found = [leaf for value in params.values() for leaf in _leaves(value)]

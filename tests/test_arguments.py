@@ -308,13 +308,20 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     [
         ({"system": kinetic}, "system must be a jl.System, but it was <function kinetic"),
         ({"formulation": "quasi"}, "formulation must be 'auto', but it was 'quasi'."),
-        ({"gradient": "adjoint"}, "gradient must be 'auto' or 'recorded', but it was 'adjoint'."),
-        ({"project": 1}, "project must be True or False, but it was 1."),
+        (
+            {"gradient": "adjoint"},
+            "gradient must be one of 'auto', 'forward', 'recorded', 'checkpoints', but it was "
+            "'adjoint'.",
+        ),
+        (
+            {"project": 1},
+            "project must be True, False or a jl.Baumgarte(alpha, beta), but it was 1.",
+        ),
         ({"assemble": None}, "assemble must be True or False, but it was None."),
         (
             {"save": ("a", "force")},
-            "save must name quantities among ['a', 'p', 'energy', 'kinetic', 'potential', 'power', "
-            "'Q', 'work'], but one was 'force'.",
+            "save must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
+            "'power', 'lam', 'constraint_force', 'Q', 'work'], but one was 'force'.",
         ),
         ({"save": "energy"}, "save must be a sequence of names, but it was 'energy'. Write save="),
         ({"save": None}, "save must be a sequence of names, but it was None."),

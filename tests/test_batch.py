@@ -47,6 +47,7 @@ def test_lanes_equal_single_runs(lanes):
     assert (np.delete(np.asarray(batch.status), BAD) == Status.ok).all()
 
 
+@pytest.mark.full
 def test_a_failing_lane_changes_no_other(lanes):
     """Bit for bit: the same program with that lane mended."""
     run = jax.jit(jax.vmap(one))

@@ -51,7 +51,7 @@ def test_readme_runs_and_prints_what_it_says():
         else:
             assert printed.strip() == str(text).strip(), f"README.md:{line}"
             compared += 1
-    assert compared == 3
+    assert compared == 6
 
 
 def test_readme_shows_the_same_numbers_twice():

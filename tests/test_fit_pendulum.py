@@ -79,6 +79,7 @@ def test_free_swing_finds_the_truth_and_its_friction(model, friction):
     assert abs(trial.fit.correlation) < 0.1
 
 
+@pytest.mark.full
 def test_driven_pendulum_finds_its_inertia():
     recording = synthetic(DRIVEN, torque=True, noise=NOISE, seed=2)
     trials = try_models(recording)

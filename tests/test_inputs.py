@@ -293,6 +293,19 @@ def test_a_bad_table_is_refused(kind, times, values, message):
         kind(times, values)
 
 
+@pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.Linear])
+@pytest.mark.parametrize("array", [list, np.array, jnp.array])
+def test_known_tables_are_as_good_under_a_transform(kind, array):
+    """Built of arrays from outside while JAX traces what is around them."""
+    times, values, worse = array(TIMES), array(VALUES), array([3.0, np.nan, 4.0, 10.0])
+    found = jax.jit(lambda t: read(kind(times, values), t))(1.25)
+    assert found == read(kind(TIMES, VALUES), jnp.array(1.25))
+    with pytest.raises(ValueError, match="values must be finite, but some were nan or inf"):
+        jax.jit(lambda t: read(kind(times, worse), t))(1.25)
+    with pytest.raises(ValueError, match="times must increase strictly"):
+        jax.jit(lambda t: read(kind(values, values), t))(1.25)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -177,7 +177,7 @@ class Counted:
 
 
 @pytest.fixture(scope="module")
-def counted():
+def counted(lowering):
     counted = Counted()
     assert counted.run({"m": 1.0, "k": 3.0, "n": 2}) == (-3.0, True)
     return counted

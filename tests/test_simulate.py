@@ -86,7 +86,7 @@ def test_new_values_never_recompile():
     first = len(traces)
     for changes in ({"m": 2.0}, {"q": 0.7}, {"v": 1.0}, {"t0": 0.1}, {"t1": 3.0}):
         go(rtol=1e-6, **changes)
-    go(rtol=1e-8, atol=1e-3)
+    go(rtol=1e-8, atol=9e-5)  # from 1e-4 on "auto" is another method
     assert len(traces) == first
     go(dt=0.1)
     fixed = len(traces)
@@ -197,7 +197,12 @@ def test_input_range():
 @pytest.mark.parametrize(
     ("signal", "x", "a"),
     [
-        (jl.Function(lambda t: jnp.cos(t)), 2 - np.cos(1.0), np.cos(1.0)),
+        pytest.param(
+            jl.Function(lambda t: jnp.cos(t)),
+            2 - np.cos(1.0),
+            np.cos(1.0),
+            marks=pytest.mark.full,
+        ),
         (jl.Function(lambda t, params: params * jnp.cos(t)), 3 - 2 * np.cos(1.0), 2 * np.cos(1.0)),
         (jl.Feedback(lambda t, q, v, params: -q[0]), np.cos(1.0), -np.cos(1.0)),
         (0.5, 1.25, 0.5),
@@ -270,6 +275,7 @@ def test_explicit_controller():
         run(method=(diffrax.Dopri5(), clipped))
 
 
+@pytest.mark.full
 def test_tolerance_is_kept_across_solvers():
     """Five solvers agree within ten times the tolerance over a second."""
     truth = run(rtol=1e-13, atol=1e-13)

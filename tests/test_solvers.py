@@ -31,12 +31,97 @@ def one_step(solver, h, y0=Y0, field=swing):
     return solver.step(term, t0, t1, y0, PUSH, memory, made_jump=False)
 
 
-def test_a_step_is_that_of_the_same_method_with_a_loop():
-    """To 32 roundings: y1, the error estimate's size h |k|, stages and the next first stage."""
-    y1, error, dense, last, _ = one_step(jl.solvers.Dopri8(), 0.2)
-    y1_, error_, dense_, (_, last_), _ = one_step(diffrax.Dopri8(), 0.2)
+PAIRS = [jl.solvers.Tsit5(), jl.solvers.Dopri5(), jl.solvers.Dopri8(), jl.solvers.Prince9()]
+NAMED = pytest.mark.parametrize("solver", PAIRS, ids=lambda solver: type(solver).__name__)
+
+
+@NAMED
+def test_a_step_is_that_of_the_same_method_with_a_loop(solver):
+    """To roundings of the largest sum: y1, the error estimate, stages and the next first stage."""
+    y1, error, dense, last, _ = one_step(solver, 0.2)
+    y1_, error_, dense_, (_, last_), _ = one_step(solver.stock, 0.2)
+    most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
     for a, b in ((y1, y1_), (error, error_), (dense["k"], dense_["k"]), (last, last_)):
-        np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * 2)
+        np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * max(most, 2))
+
+
+def trees(order):
+    """Rooted trees with that many nodes, each the sorted tuple of its branches."""
+
+    def forests(nodes, largest):
+        if nodes == 0:
+            yield ()
+            return
+        for size in range(min(nodes, largest[0]), 0, -1):
+            for index, tree in enumerate(trees(size)):
+                if (size, index) <= largest:
+                    for rest in forests(nodes - size, (size, index)):
+                        yield (tree, *rest)
+
+    if order not in _TREES:
+        _TREES[order] = list(forests(order - 1, (order - 1, len(trees(order - 1)))))
+    return _TREES[order]
+
+
+_TREES = {1: [()]}
+
+
+def weight(tree, A):
+    """(stage values of the elementary differential, gamma of the tree, its order)."""
+    parts = [weight(branch, A) for branch in tree]
+    order = 1 + sum(part[2] for part in parts)
+    values = np.prod([A @ part[0] for part in parts] or [np.ones(len(A))], axis=0)
+    return values, order * np.prod([part[1] for part in parts] or [1.0]), order
+
+
+def defect(b, A, order, s=1.0):
+    """Largest violation of the conditions of that order at the part s of the step."""
+    found = [weight(tree, A) for tree in trees(order)]
+    return max(abs(b @ values - s**n / gamma) for values, gamma, n in found)
+
+
+def coefficients(method):
+    tableau = method.tableau
+    A = np.zeros((len(tableau.c) + 1,) * 2)
+    for i, row in enumerate(tableau.a_lower, 1):
+        A[i, : len(row)] = row
+    return A, np.asarray(tableau.b_sol), np.asarray(tableau.b_sol) - np.asarray(tableau.b_error)
+
+
+@NAMED
+def test_tableaus_satisfy_the_conditions_of_their_order_and_no_more(solver):
+    """All trees: 1, 1, 2, 4, 9, 20, 48, 115, 286, 719. Stages times weights round by 1e-14."""
+    A, b, lower = coefficients(solver.stock)
+    order, embedded = solver.order(None), solver.error_order(None) - 1
+    assert len(trees(order)) == [1, 1, 2, 4, 9, 20, 48, 115, 286, 719][order - 1]
+    rounding = 1e2 * EPS * max(1.0, np.abs(A).max())
+    assert max(defect(b, A, p) for p in range(1, order + 1)) < rounding
+    assert max(defect(lower, A, p) for p in range(1, embedded + 1)) < rounding
+    # The methods of order 8 and 9 leave little by design: Prince9 1.9e-9, 1900 roundings.
+    assert defect(b, A, order + 1) > 1e3 * rounding
+    assert defect(lower, A, embedded + 1) > 1e3 * rounding
+    wrong = A.copy()
+    wrong[-2, 0] *= 1 + 1e-9
+    assert max(defect(b, wrong, p) for p in range(1, order + 1)) > rounding
+
+
+def test_output_between_steps_of_order_9_is_of_order_8():
+    from jaxlag.solvers._prince9 import _OUTPUT
+
+    A, b, _ = coefficients(jl.solvers.Prince9().stock)
+    rounding = 1e2 * EPS * np.abs(_OUTPUT).max()
+    for s in (0.2, 0.5, 0.9):
+        between = np.asarray(_OUTPUT) @ s ** np.arange(1, 9)
+        assert max(defect(between, A, p, s) for p in range(1, 9)) < rounding
+        assert defect(between, A, 9, s) > 1e-9
+    np.testing.assert_allclose(np.sum(_OUTPUT, axis=1), b, atol=rounding)
+    solver, h = jl.solvers.Prince9(), jnp.array(0.8)
+    y1, _, dense, _, _ = one_step(solver, h)
+    output = solver.interpolation_cls(t0=jnp.array(0.3), t1=0.3 + h, **dense)
+    np.testing.assert_allclose(output.evaluate(0.3 + h), y1, atol=rounding)
+    half = one_step(solver, h / 2)[0]
+    # Bound: its error at the middle falls as h^9, 8.7e-9 at h = 0.9.
+    np.testing.assert_allclose(output.evaluate(0.3 + h / 2), half, atol=8.7e-9)
 
 
 def test_states_may_be_pytrees():
@@ -69,6 +154,7 @@ def test_order_of_the_step_and_of_its_error_estimate():
     assert abs(np.polyfit(np.log(h), np.log(estimates), 1)[0] - 8) < 0.35
 
 
+@pytest.mark.full
 def test_it_is_a_solver_of_diffrax():
     """Dense output and derivatives in any mode, as from the method with a loop."""
 

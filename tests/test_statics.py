@@ -250,13 +250,14 @@ def one(potential, forces=()):
     )
 
 
-def plane(potential, forces=()):
+def plane(potential, forces=(), constraints=()):
     """A mass of 1 kg in a plane in V(q, params)."""
     return jl.System(
         coordinates=("x", "y"),
         kinetic=lambda t, q, v, params: 0.5 * v @ v,
         potential=lambda t, q, params: potential(q, params),
         forces=forces,
+        constraints=constraints,
     )
 
 
@@ -358,7 +359,10 @@ def test_a_higher_order_is_found_and_not_called_stable(order):
     assert not rest.stable
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.9, np.arctan2(0.8, 0.6)])
+@pytest.mark.parametrize(
+    "angle",
+    [np.arctan2(0.8, 0.6), *(pytest.param(x, marks=pytest.mark.full) for x in (0.0, 0.9))],
+)
 def test_two_unstressed_springs_in_line_balance(angle):
     """Across their line V is of order 4, F = 100 y^3, lost in rounding where y^3 < eps."""
     e = jnp.array([np.cos(angle), np.sin(angle)])
@@ -397,6 +401,46 @@ def test_large_loads_on_a_double_pendulum_lead_to_its_stable_branch(factor):
     theta1 = np.arctan2(Fx + params["Bx"], params["m1"] * params["g"] + down - params["By"])
     np.testing.assert_allclose(rest.q, [theta1, np.arctan2(Fx, down)], rtol=8 * EPS)
     assert rest.stable
+
+
+# ---- Constraints that depend on one another ------------------------------------------------------
+
+
+def test_multipliers_of_dependent_rows_do_not_depend_on_the_start():
+    """A rod declared twice: of least norm, as in the equations of motion, and so differentiated."""
+
+    def rod(t, q, params):
+        r, length = jnp.sqrt(q @ q), params["l"]
+        return jnp.stack([r**2 - length**2, 2.0 * (r - length)])
+
+    system = plane(
+        lambda q, params: 0.5 * params["k"] * (q[0] - 1.0) ** 2 + 9.81 * q[1],
+        constraints=(jl.Holonomic(rod, "rod"),),
+    )
+    params = {"k": 20.0, "l": 1.3}
+
+    @jax.jit
+    def found(params, q0, direction):
+        """(lam, q) and the derivative of lam along a direction of the params."""
+
+        def lam(params):
+            rest = jl.equilibrium(system, q0, params)
+            return rest.lam["rod"], rest.q
+
+        return jax.jvp(lam, (params,), (direction,))
+
+    starts = [jnp.array(q0) for q0 in ((0.3, -1.2), (0.9, -0.9), (0.5, -0.4))]
+    still = {"k": 0.0, "l": 0.0}
+    (_, q), _ = found(params, starts[0], still)
+    expected = system.multipliers(params, q, jnp.zeros(2))["rod"]
+    h = 1e-5
+    for q0 in starts:
+        np.testing.assert_allclose(found(params, q0, still)[0][0], expected, rtol=1e-13)
+        for name, value in params.items():
+            slope = found(params, q0, {**still, name: 1.0})[1][0]
+            moved = [{**params, name: value + s * h} for s in (1, -1)]
+            ahead, behind = (found(p, q0, still)[0][0] for p in moved)
+            np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-7)
 
 
 # ---- Forces of velocity --------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _consistent import onto_constraints
 from _mechanics import BEAD, GENERAL, RELATIVISTIC, Case, chain
 from numpy.linalg import norm
 
@@ -29,11 +30,26 @@ BOOK = {
     if isinstance(entry, Entry)
 }
 CASES = BOOK | GENERAL
-QUADRATIC = [name for name in CASES if name != "relativistic"]
+CONSTRAINED = {name for name, case in BOOK.items() if case.system.constraints}
+SLOW = CONSTRAINED - {"knife_edge_vehicle", "spherical_pendulum_varying", "falling_stick_friction"}
+"""Looked at with -m full alone."""
+
+
+def every(names):
+    """These names, the slow ones marked as full."""
+    return [pytest.param(x, marks=pytest.mark.full) if x in SLOW else x for x in names]
+
+
+ALL = every(CASES)
+OF_BOOK = every(BOOK)
+QUADRATIC = every(name for name in CASES if name != "relativistic")
 
 
 def random_states(name):
-    """(params, t, q, v, x, b) with a leading axis of STATES; x, b: any acceleration and jerk."""
+    """(params, t, q, v, x, b) with a leading axis of STATES; x, b: any acceleration and jerk.
+
+    Under constraints (q, v) are moved onto them.
+    """
     case = CASES[name]
     rng = np.random.default_rng(sum(map(ord, name)))
     n, speed = len(case.q0), case.largest_speed
@@ -41,10 +57,17 @@ def random_states(name):
     def draw(low, high, *shape):
         return rng.uniform(low, high, (STATES, *shape))
 
-    params = {key: value * draw(0.7, 1.3) for key, value in case.params.items()}
+    params = {
+        key: np.asarray(value) * draw(0.7, 1.3, *np.shape(value))
+        for key, value in case.params.items()
+    }
     q = np.asarray(case.q0) + draw(-0.4, 0.4, n)
     v = draw(-speed, speed, n) / np.sqrt(n)
-    return params, draw(0.0, 5.0), q, v, draw(-5.0, 5.0, n), draw(-9.0, 9.0, n)
+    t, x, b = draw(0.0, 5.0), draw(-5.0, 5.0, n), draw(-9.0, 9.0, n)
+    if case.system.constraints:
+        move = jax.jit(jax.vmap(partial(onto_constraints, case.system)))
+        q, v = map(np.asarray, move(params, t, q, v))
+    return params, t, q, v, x, b
 
 
 def quantities(system, quadratic, params, t, q, v, x, b):
@@ -65,6 +88,7 @@ def quantities(system, quadratic, params, t, q, v, x, b):
         "M": system.mass_matrix(params, q, v, t),
         "h": system.bias(params, q, v, t),
         "Q": system.generalized_force(params, q, v, t),
+        "R": system.constraint_force(params, q, v, t),
         "p": system.momentum(params, q, v, t),
         "H": energy(t, q, v),
         "L": L(t, q, v),
@@ -103,14 +127,14 @@ class Evaluated(NamedTuple):
             yield {key: np.asarray(value[i]) for key, value in rows.items()}
 
 
-@pytest.fixture(scope="session")
-def evaluate():
+@pytest.fixture(scope="module")
+def evaluate(lowering):
     """name -> Evaluated, each system compiled once."""
     known = {}
 
     def of(name):
         if name not in known:
-            function = partial(quantities, CASES[name].system, name in QUADRATIC)
+            function = partial(quantities, CASES[name].system, name != "relativistic")
             states = random_states(name)
             known[name] = Evaluated(states, jax.jit(jax.vmap(function))(*states))
         return known[name]
@@ -127,29 +151,31 @@ def agree(found, expected, *summed):
 # ---- Identities ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_mass_matrix_is_symmetric_and_positive_definite(name, evaluate):
     for s in evaluate(name):
         agree(s["M"], s["M"].T, s["M"])
         assert np.min(np.linalg.eigvalsh(s["M"])) > K * EPS * norm(s["M"], 2)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_mass_matrix_is_the_hessian_of_the_lagrangian(name, evaluate):
     for s in evaluate(name):
         agree(s["M"], s["hessian"], s["M"])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_acceleration_solves_the_equations_of_motion(name, evaluate):
+    """M a + h = Q + A^T lam; the last is zero without constraints."""
     for s in evaluate(name):
         # Backward error: the solve is exact for an M that differs by n roundings.
         # h = p' - dL/dq may be small where its two parts are not.
-        terms = (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["L_q"])
-        agree(s["M"] @ s["a"] + s["h"], s["Q"], *terms)
+        terms = (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["R"], s["L_q"])
+        agree(s["M"] @ s["a"] + s["h"], s["Q"] + s["R"], *terms)
+        assert CASES[name].system.constraints or not np.any(s["R"])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_mass_and_bias_are_lagranges_equations_along_any_curve(name, evaluate):
     """d/dt dL/dv - dL/dq = M x + h for every acceleration x, and whatever the jerk."""
     for s in evaluate(name):
@@ -157,16 +183,17 @@ def test_mass_and_bias_are_lagranges_equations_along_any_curve(name, evaluate):
         agree(s["p_dot"] - s["L_q"], s["M"] @ s["x"] + s["h"], *terms)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_energy_changes_by_power_and_by_explicit_time(name, evaluate):
-    """dH/dt = v . Q - dL/dt at fixed q and v, along the motion."""
+    """dH/dt = v . (Q + A^T lam) - dL/dt at fixed q and v, along the motion."""
     for s in evaluate(name):
-        power = s["v"] @ s["Q"]
-        terms = [norm(s["v"]) * x for x in (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["L_q"])]
+        power = s["v"] @ (s["Q"] + s["R"])
+        forces = (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["R"], s["L_q"])
+        terms = [norm(s["v"]) * x for x in forces]
         agree(s["H_dot"], power - s["L_t"], *terms, s["L_t"])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ALL)
 def test_energy_is_the_legendre_transform(name, evaluate):
     for s in evaluate(name):
         agree(s["H"], s["p"] @ s["v"] - s["L"], norm(s["p"]) * s["v"], s["L"])
@@ -196,13 +223,13 @@ def test_coriolis_force_is_the_quadratic_part_of_the_bias(name, evaluate):
         agree(s["C"] @ s["v"], even, *terms)
 
 
-@pytest.mark.parametrize("name", BOOK)
+@pytest.mark.parametrize("name", OF_BOOK)
 def test_momentum_is_mass_times_velocity(name, evaluate):
     for s in evaluate(name):
         agree(s["p"], s["M"] @ s["v"], norm(s["M"], 2) * s["v"])
 
 
-@pytest.mark.parametrize("name", BOOK)
+@pytest.mark.parametrize("name", OF_BOOK)
 def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
     for s in evaluate(name):
         # V itself is a sum that may cancel, as in 1 - cos: the 1 J stands for its terms.
@@ -210,7 +237,7 @@ def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
         agree(s["T"], s["v"] @ s["M"] @ s["v"] / 2, norm(s["M"], 2) * s["v"] @ s["v"])
 
 
-@pytest.mark.parametrize("name", BOOK)
+@pytest.mark.parametrize("name", OF_BOOK)
 def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evaluate):
     """h = M' v - d(T - V)/dq where p = M v and M is free of time."""
     for s in evaluate(name):
@@ -218,22 +245,33 @@ def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evalua
         agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["L_q"])
 
 
-def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate):
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param([name for name in CASES if name not in SLOW], id="plain"),
+        pytest.param(list(CASES), id="all", marks=pytest.mark.full),
+    ],
+)
+def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(names, evaluate):
     """None of them holds only because its terms vanish."""
     large = {
         key: {
             name
-            for name in CASES
+            for name in names
             if np.max(np.abs(np.asarray(evaluate(name).found.get(key, 0.0)))) > 1e-2
         }
-        for key in ("L_t", "C", "Q", "M_q", "h_rest", "L_q")
+        for key in ("L_t", "C", "Q", "R", "M_q", "h_rest", "L_q")
     }
     assert large["L_t"] == {"driven_pivot", "bead"}
     assert {"double_pendulum", "sleeve_pendulum", "chain", "bead"} <= large["C"] <= large["M_q"]
     assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= large["Q"]
-    free = {"disk_on_shaft", "hockey_puck", "hockey_puck_cord"}  # no potential, constant M
-    assert set(BOOK) - large["L_q"] == free
-    assert set(BOOK) - large["h_rest"] == free | {name for name in BOOK if "two_forces" in name}
+    assert large["R"] == CONSTRAINED & set(names)
+    book = set(BOOK) & set(names)
+    # No potential, and an M that is constant or, of the ball, about 0.02 kg m^2.
+    free = {"disk_on_shaft", "hockey_puck", "hockey_puck_cord", "rolling_ball_no_spin"} & book
+    without = {name for name in book if not np.any(evaluate(name).found["V"])}
+    assert free <= book - large["L_q"] <= without
+    assert free <= book - large["h_rest"] <= without
     params, _, _, v, *_ = random_states("charged")
     found = evaluate("charged").found
     assert np.min(norm(found["p"] - params["m"][:, None] * v, axis=1)) > 1e-2  # not M v

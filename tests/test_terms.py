@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _jaxprs import count, largest, names, operations
+from _jaxprs import count, largest, loop, names, operations
 from _mechanics import CHAIN_PARAMS, chain_lagrangian
 from _mechanics import chain as any_chain
 
@@ -217,11 +217,172 @@ def test_tables_are_searched_only_where_there_are_tables():
     assert "dynamic_slice" in with_table - free
 
 
+# ---- What depends on params alone ----------------------------------------------------------------
+
+INERTIA = {"a": jnp.array(1.3), "k": jnp.array(2.0)}
+HELD = jl.GeneralizedForce(lambda t, q, v, params: params["k"] * q, "spring")
+
+
+def coupled(t, q, v, params):
+    """Masses coupled by inertia and by nothing else, in a field g = k."""
+    M = params["a"] * jnp.eye(q.size) + 0.1
+    return 0.5 * v @ M @ v - params["k"] * jnp.sum(q)
+
+
+def hidden(t, q, v, params):
+    """The same with a T that is written with q, so that the structure must take M to vary."""
+    return coupled(t, q, v, params) + 0.0 * jnp.sum(q) * v @ v
+
+
+def free(t, q, v, params):
+    """The same without a field: h = 0."""
+    return coupled(t, q, v, params | {"k": 0.0})
+
+
+def of(lagrangian, n, forces=()):
+    return jl.System(lagrangian, {"x": (n,)}, forces=forces, lowering="array")
+
+
+def swung(lagrangian, n, params, t1=0.2):
+    """(q, v) at t1 and half-way, by fixed steps."""
+    system, q0 = of(lagrangian, n, (HELD,)), jnp.linspace(0.1, 1.0, n)
+    options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
+    motion = jl.simulate(system, q0, -q0, [0.0, t1 / 2, t1], params, **options)
+    return jnp.concatenate([motion.q[-1], motion.v[-1], motion.q[1]])
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
+    """Inside the loop of a whole solve there are solves and no factorisation."""
+
+    def factorisations(program):
+        if n > UNROLL_UP_TO:
+            return count(program, "cholesky")
+        return count(program, "div", without=("custom_linear_solve",)) // (n * (n - 1) // 2)
+
+    found = {}
+    for lagrangian in (coupled, hidden):
+        solve = partial(swung, lagrangian, n)
+        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, turns=1))
+        solves = count(inside, "custom_linear_solve")
+        assert solves > 0
+        assert names(inside) & FACTORISATIONS <= {"cholesky"}
+        found[lagrangian] = factorisations(inside)
+    assert found[coupled] == 0
+    assert found[hidden] > 0
+
+
+def test_the_factor_is_made_where_the_solve_is_prepared():
+    """Once per solve: M's columns and its elimination, and not one more evaluation of L for M."""
+    n, system = SMALL, of(coupled, SMALL)
+    q = v = jnp.linspace(0.1, 1.0, n)
+    prepared = system.terms.prepare(q, INERTIA, {})
+
+    def once(params):
+        return system.terms.prepare(q, params, {})
+
+    def each(prepared, q, v):
+        return system.terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+
+    def bias(params, q, v):
+        return system.bias(params, q, v)
+
+    assert count(operations(once, INERTIA), "div") == n * (n - 1) // 2
+    inside = operations(each, prepared, q, v)
+    products = count(inside, "dot_general", without=("custom_linear_solve",))
+    assert products == count(operations(bias, INERTIA, q, v), "dot_general")
+    assert count(inside, "div") == 2 * n
+
+
+def test_no_bias_is_computed_where_it_is_zero():
+    """A free body: no derivative of L is left in the loop, only the solve."""
+    n = SMALL
+    for lagrangian, left in ((free, set()), (coupled, {"dot_general", "mul"})):
+        terms = of(lagrangian, n).terms
+        q = v = jnp.linspace(0.1, 1.0, n)
+        prepared = terms.prepare(q, INERTIA, {})
+
+        def each(prepared, q, v, terms=terms):
+            return terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+
+        program = operations(each, prepared, q, v)
+        outside = [o for o in program if "custom_linear_solve" not in o.inside]
+        assert names(outside) & {"dot_general", "mul"} == left
+        assert bool(np.any(each(prepared, q, v))) == (lagrangian is coupled)
+
+
+DERIVATIVES = {
+    "fwd": jax.jacfwd,
+    "rev": jax.jacrev,
+    "fwd fwd": lambda f: jax.jacfwd(jax.jacfwd(f)),
+    "fwd rev": lambda f: jax.jacfwd(jax.jacrev(f)),
+    "rev rev": lambda f: jax.jacrev(jax.jacrev(f)),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("derivative", DERIVATIVES)
+def test_derivatives_go_through_the_factor(derivative):
+    """Those of a whole solve as where M is formed and factored at every state, to round-off."""
+    of_order = DERIVATIVES[derivative]
+    once, anew = (jax.jit(of_order(partial(swung, f, 2)))(INERTIA) for f in (coupled, hidden))
+    for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(anew), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * (1 + np.abs(b).max()))
+        assert np.any(b)
+
+
+@pytest.mark.parametrize("n", [3, UNROLL_UP_TO + 1])
+def test_derivatives_of_one_acceleration_go_through_the_factor(n):
+    """To third order, reverse and forward, batched, for both kinds of factor."""
+    q = jnp.linspace(0.1, 1.0, n)
+
+    def total(lagrangian, a):
+        params, system = INERTIA | {"a": a}, of(lagrangian, n, (HELD,))
+        prepared = system.terms.prepare(q, params, {})
+        return jnp.sum(system.terms.acceleration(jnp.zeros(()), q, q, params, {}, prepared) ** 2)
+
+    def orders(f):
+        first, second = jax.jacrev(f), jax.jacfwd(jax.jacrev(f))
+        return lambda a: [f(a), first(a), second(a), jax.jacfwd(second)(a)]
+
+    masses = jnp.linspace(1.3, 2.0, 4)
+    once, anew = (jax.jit(jax.vmap(orders(partial(total, f))))(masses) for f in (coupled, hidden))
+    for a, b in zip(once, anew, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+        assert np.all(b != 0)
+
+
+@pytest.mark.parametrize("n", [3, pytest.param(UNROLL_UP_TO + 1, marks=pytest.mark.full)])
+def test_a_constant_mass_matrix_without_inertia_ends_in_its_status(n):
+    """The factor carries its pivots' health."""
+    q0, params = jnp.linspace(0.1, 1.0, n), {"a": -0.05, "k": 1.0}
+    options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
+    motion = jl.simulate(of(coupled, n), q0, q0, [0.0, 0.1], params, **options)
+    assert motion.status == jl.Status.mass_singular
+    assert motion.message().startswith("mass_singular ('x[1]')")
+
+
+def test_a_lagrangian_may_hold_a_traced_value():
+    """Its structure and its program are those of this trace; a bias that is traced is not zero."""
+
+    def acceleration(lowering, c):
+        def lagrangian(t, q, v, params):
+            return 0.5 * v @ v - c * q[0]
+
+        system = jl.System(lagrangian, ("x",), lowering=lowering)
+        return system.acceleration(None, jnp.zeros(1), jnp.zeros(1))[0]
+
+    for lowering in ("auto", "array"):
+        for transform in (lambda f: f, jax.grad):
+            assert jax.jit(transform(partial(acceleration, lowering)))(2.0) in (-2.0, -1.0)
+
+
 # ---- The protocol --------------------------------------------------------------------------------
 
 
-def test_terms_without_constraints_have_no_rows():
-    system = ENTRIES["double_pendulum"].system
+@pytest.mark.parametrize("chosen", ["scalar", "array"])
+def test_terms_without_constraints_have_no_rows(chosen):
+    system = jl.System(ENTRIES["double_pendulum"].system.lagrangian, ("a", "b"), lowering=chosen)
     params = dict(ENTRIES["double_pendulum"].example.params)
     t, q, v = jnp.zeros(()), jnp.ones(2), jnp.ones(2)
     A, b = system.terms.rows(t, q, v, params)
@@ -229,14 +390,16 @@ def test_terms_without_constraints_have_no_rows():
     assert isinstance(system.terms, jl.Terms)
 
 
-def test_terms_are_those_of_the_public_methods():
+@pytest.mark.parametrize("chosen", ["scalar", "array"])
+def test_terms_are_those_of_the_public_methods(chosen):
     entry = ENTRIES["cart_pendulum"]
-    params = dict(entry.example.params)
+    declared, params = entry.system, dict(entry.example.params)
+    system = jl.System(declared.lagrangian, ("x", "a"), forces=declared.forces, lowering=chosen)
     t, q, v = jnp.array(0.7), jnp.array([0.2, 0.9]), jnp.array([-1.0, 2.0])
 
     @jax.jit
     def both():
-        terms, system = entry.system.terms, entry.system
+        terms = system.terms
         return [
             (terms.mass(t, q, v, params), system.mass_matrix(params, q, v, t)),
             (terms.bias(t, q, v, params), system.bias(params, q, v, t)),

@@ -1,9 +1,14 @@
 """The setting that makes XLA compile a solver loop to one native function."""
 
+import json
 import os
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
+import jaxlib
+import numpy as np
 import pytest
 
 from jaxlag import _xla
@@ -26,9 +31,13 @@ print(pendulum.explain(9.81))
 """
 
 
-def child(before="", first="", **environment):
-    code = SOLVE.format(before=before, first=first)
-    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAXLAG_XLA_FLAGS")}
+def child(before="", first="", code="", **environment):
+    code = code or SOLVE.format(before=before, first=first)
+    env = {
+        k: v
+        for k, v in os.environ.items()
+        if k not in ("XLA_FLAGS", _xla.SWITCH, _xla.ATTRIBUTE_SWITCH)
+    }
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=env | environment,
@@ -54,19 +63,113 @@ def test_existing_options_are_kept():
     assert done.stdout.splitlines()[1] == "True"
 
 
-@pytest.mark.skipif(not _xla.needed(), reason="this jax raised the bound itself")
-def test_switch_leaves_everything_alone():
-    done = child(JAXLAG_XLA_FLAGS="0")
+OLD = pytest.mark.skipif(not _xla.needed(), reason="this jax raised the bound itself")
+
+
+@OLD
+def test_switches_leave_everything_alone():
+    done = child(JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES="0")
     assert "entry loops left: 0" not in done.stdout
-    assert "JAXLAG_XLA_FLAGS=0" in done.stdout
+    assert "JAXLAG_XLA_FLAGS=0 and JAXLAG_XLA_ATTRIBUTES=0" in done.stdout
     assert "Warning" not in done.stderr
 
 
-@pytest.mark.skipif(not _xla.needed(), reason="this jax raised the bound itself")
+@OLD
 def test_compilation_before_import_is_said_once():
-    done = child(first="jax.jit(lambda x: x + 1)(1.0)")
+    done = child(first="jax.jit(lambda x: x + 1)(1.0)", JAXLAG_XLA_ATTRIBUTES="0")
     assert done.stderr.count("Solves will be several times slower") == 1
     assert "its loop setting came too late" in done.stdout
+
+
+EVERYTHING = """
+import json
+import jax, jax.numpy as jnp, numpy as np
+import jaxlag as jl
+jax.config.update("jax_enable_x64", True)
+def L(t, q, v, p):
+    c = jnp.cos(q[0] - q[1])
+    T = p["m"] * v[0] ** 2 + 0.5 * v[1] ** 2 + v[0] * v[1] * c
+    return T + 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+push = jl.GeneralizedForce(lambda t, q, v, p, inputs: jnp.stack([inputs["u"], 0 * q[0]]), "push")
+held = {"u": jl.ZeroOrderHold(jnp.linspace(0.0, 2.0, 9), jnp.sin(jnp.arange(9.0)))}
+free = jl.System(L, ("a", "b"))
+driven = jl.System(L, ("a", "b"), forces=(push,))
+def end(q0, inputs=None, count=3):
+    system = free if inputs is None else driven
+    ts = np.linspace(0.0, 1.5, count)
+    return jl.simulate(system, q0, [0.1, 0.2], ts, {"m": 1.0}, inputs=inputs, throw=False).q[-1]
+q0 = jnp.array([0.7, -0.4])
+batch = q0 + 0.01 * jnp.arange(19.0)[:, None]
+def policy(width):
+    W = np.eye(width)
+    def f(t, q, v, p):
+        return jnp.tanh(W @ jnp.concatenate([q, v, jnp.ones(width - 4)]))[0]
+    return {"u": jl.Feedback(f)}
+programs = [
+    lambda q: end(q), lambda q: end(q, held), lambda q: end(q, None, 200),
+    lambda q: jax.vmap(lambda q: end(q, None, 2))(batch),
+    lambda q: jax.vmap(lambda q: end(q, held))(batch),
+    jax.grad(lambda q: end(q)[0]), jax.jacfwd(end), jax.hessian(lambda q: end(q)[1]),
+    lambda q: jax.vmap(jax.grad(lambda q: end(q, held)[0]))(batch[:3]),
+    lambda q: jax.vmap(lambda q: end(q, policy(32), 2))(batch),
+    jax.jacfwd(lambda q: end(q, policy(32), 2)),
+]
+compiled = [jax.jit(f).lower(q0).compile() for f in programs]
+texts = [c.as_text() for c in compiled]
+print(json.dumps([np.asarray(c(q0)).tolist() for c in compiled]))
+print(['xla_cpu_small_call="true"' in text for text in texts])
+print(free.explain({"m": 1.0}).splitlines()[-1])
+"""
+
+
+@pytest.mark.full  # minutes, in two processes of its own
+@OLD
+def test_attributes_do_what_the_setting_does():
+    """Every transformation, in a process of its own, since they are internal to XLA."""
+    found = {}
+    for attributes in "01":
+        done = child(code=EVERYTHING, JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES=attributes)
+        numbers, used, said = done.stdout.splitlines()
+        found[attributes] = json.loads(numbers)
+        # XLA marks small loops of its own, such as the search in a table. The last two programs
+        # multiply by a matrix too large to be marked.
+        assert attributes == "0" or used == str([True] * 9 + [False] * 2)
+        assert ("by attributes of their calls" in said) == (attributes == "1")
+    for a, b in zip(found["0"], found["1"], strict=True):
+        # One rounding in a fused product moves a step: rtol = atol = 1e-9.
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+
+
+def test_attributes_are_for_versions_they_were_tested_on(monkeypatch):
+    monkeypatch.setattr(_xla, "in_force", lambda: False)
+    monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
+    assert _xla.by_attribute()
+    monkeypatch.setattr(_xla, "TESTED", ())
+    assert not _xla.by_attribute()
+    monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
+    monkeypatch.setenv(_xla.ATTRIBUTE_SWITCH, "0")
+    assert not _xla.by_attribute()
+
+
+def test_only_plain_operations_are_marked():
+    """What calls a library or the host, nested in a loop, is left to XLA as it is."""
+
+    def plain(function, x):
+        looped = lambda x: jax.lax.scan(lambda c, _: (function(c), None), x, None, 3)[0]  # noqa: E731
+        return _xla._plain(jax.make_jaxpr(looped)(x).jaxpr)
+
+    M = jnp.eye(3)
+    assert plain(lambda x: jnp.sin(x) + M[0] * x, M)
+    assert plain(lambda x: jax.lax.cond(x[0, 0] > 0, jnp.cos, jnp.tan, x), M)
+    assert not plain(lambda x: x @ x, M)
+    # A vmap makes a product of matrices of it, but not where the vector is a row of a method.
+    assert not plain(lambda x: jnp.eye(8) @ x, jnp.ones(8))
+    body = jax.make_jaxpr(lambda x: jnp.ones(8) @ x)(jnp.ones((8, 4))).jaxpr
+    assert _xla._plain(body, stages=8)
+    assert not _xla._plain(body, stages=10)
+    assert not plain(jnp.linalg.cholesky, M)
+    assert not plain(lambda x: jnp.linalg.solve(x, x), M)
+    assert not plain(lambda x: jax.pure_callback(np.sin, x, x), M)
 
 
 def test_merging():

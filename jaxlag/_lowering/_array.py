@@ -1,18 +1,56 @@
 """The array program: terms by automatic differentiation of L on whole arrays."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
+from jaxlag._constraints import (
+    AbstractConstraint,
+    Baumgarte,
+    position_or_zero,
+    position_rows,
+    velocity_rows,
+)
+from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import real_scalar
-from jaxlag._forces import AbstractForce, components
-from jaxlag._linalg import solve_mass
+from jaxlag._forces import AbstractForce, components, reads_lam
+from jaxlag._kkt import (
+    augmented,
+    factor_kkt,
+    independent_rows,
+    least_norm,
+    masked,
+    solve_kkt,
+    solve_reactions,
+)
+from jaxlag._linalg import MassFactor, factor_mass, solve_mass
+from jaxlag._lowering._rows import layout
+from jaxlag._lowering._structure import Structure, find_structure
+from jaxlag._quasi import QuasiVelocities
 from jaxlag._terms import Terms
+
+
+class Prepared(eqx.Module):
+    """What the array program computes once per solve, and what it leaves out.
+
+    Attributes:
+        mass: M where it depends on params alone, else None.
+        factor: its factor.
+        bias_zero: whether h = 0 in every state.
+        sense: -1 where time runs backwards.
+    """
+
+    mass: Float[Array, "n n"] | None
+    factor: MassFactor | None
+    bias_zero: bool = eqx.field(static=True)
+    sense: Array | float = 1.0
 
 
 class ArrayTerms(Terms):
@@ -20,10 +58,27 @@ class ArrayTerms(Terms):
 
     M takes n forward-over-reverse columns in one batch, h a single forward derivative of the
     reverse pass, so the number of evaluations of L in h does not grow with n.
+
+    Attributes:
+        lagrangian: L.
+        forces: applied forces.
+        constraints: constraints.
+        formulation: how accelerations are solved for under constraints.
+        baumgarte: stabilisation added to gamma.
+        regular: whether M is known to be positive definite by itself, which the scalar program
+            makes use of.
+        quasi: quasi-velocities, where the state is (q, u) with those that are not constrained.
+        in_u: L as a function of (t, q, u, params), where it was written so.
     """
 
     lagrangian: Callable = eqx.field(static=True)
     forces: tuple[AbstractForce, ...]
+    constraints: tuple[AbstractConstraint, ...] = ()
+    formulation: str = eqx.field(static=True, default="multipliers")
+    baumgarte: Baumgarte | None = eqx.field(static=True, default=None)
+    regular: bool = eqx.field(static=True, default=False)
+    quasi: QuasiVelocities | None = None
+    in_u: Callable | None = eqx.field(static=True, default=None)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -77,24 +132,93 @@ class ArrayTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
+        lam: Float[Array, " m"] | None = None,
     ) -> Float[Array, " n"]:
-        """Q, summed over the declared forces."""
+        """Q, summed over the declared forces; those that read lam only where it is given."""
         total = jnp.zeros_like(q)
         for force in self.forces:
-            total = total + components(force, t, q, v, params, inputs)
+            if not reads_lam(force):
+                total = total + components(force, t, q, v, params, inputs)
+        return total if lam is None else total + self.reactive(t, q, v, params, inputs, lam)
+
+    def reactive(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        lam: Float[Array, " m"],
+    ) -> Float[Array, " n"]:
+        """The sum of the forces that depend on multipliers."""
+        named = layout(self.constraints, params, q.shape[0], q.dtype).unflatten(lam)
+        total = jnp.zeros_like(q)
+        for force in filter(reads_lam, self.forces):
+            total = total + components(force, t, q, v, params, inputs, named)
         return total
+
+    def position(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, " k"]:
+        """phi(t, q) of the holonomic rows."""
+        return position_rows(self.constraints, t, q, params)
+
+    def velocity(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """A v + b."""
+        return velocity_rows(self.constraints, t, q, v, params)
 
     def rows(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """No rows: (0, n) and (0,)."""
-        return jnp.zeros((0, q.shape[0]), q.dtype), jnp.zeros((0,), q.dtype)
+        """A by one reverse derivative per row, b as what is left at rest."""
+
+        def along(v: Array) -> Array:
+            return self.velocity(t, q, v, params)
+
+        rest = jnp.zeros_like(v)
+        b, pull = jax.vjp(along, rest)
+        return jax.vmap(lambda e: pull(e)[0])(jnp.eye(b.shape[0], dtype=q.dtype)), b
 
     def gamma(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        sense: Array | float = 1.0,
     ) -> Float[Array, " m"]:
-        """No rows: shape (0,)."""
-        return jnp.zeros((0,), q.dtype)
+        """One derivative of A v + b along (t', q') = (1, v), and Baumgarte's terms if asked for.
+
+        Residuals are to decay where time runs backwards, too: alpha has the sense of time.
+        """
+
+        def along(t: Array, q: Array) -> Array:
+            return self.velocity(t, q, v, params)
+
+        residual, gamma = jax.jvp(along, (t, q), (jnp.ones_like(t), v))
+        if self.baumgarte is None:
+            return gamma
+        sense = jnp.asarray(sense, residual.dtype)
+        gamma = gamma + 2.0 * self.baumgarte.alpha * sense * residual
+        phi = position_or_zero(self.constraints, t, q, params)
+        return gamma + self.baumgarte.beta**2 * phi
+
+    def structure(self, params: Any, size: int, dtype: Any) -> Structure:
+        """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes).
+
+        Args:
+            params: as the Lagrangian takes them.
+            size: number n of coordinates.
+            dtype: of the state.
+        """
+        traced, static = _params.split(params)
+        avals = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced
+        )
+        keys = _params.Static(avals), _params.Static(static)
+        return _structure(self.lagrangian, *keys, size, jnp.dtype(dtype))
 
     def prepare(
         self,
@@ -102,8 +226,18 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
-    ) -> None:
-        """Nothing: M is formed at every state."""
+        kept: Bool[Array, " m"] | None = None,
+        sense: Array | float = 1.0,
+    ) -> Prepared:
+        """M and its factor where M depends on params alone."""
+        structure = self.structure(params, q.shape[0], q.dtype)
+        if not structure.mass_constant:
+            return Prepared(None, None, structure.bias_zero, sense)
+        anywhere = jnp.ones(q.shape, q.dtype)
+        M = self.mass(jnp.zeros((), jnp.result_type(float)), anywhere, anywhere, params)
+        # Derivatives with respect to params go through M, never through the elimination.
+        factor = None if self.constraints else factor_mass(jax.lax.stop_gradient(M))
+        return Prepared(M, factor, structure.bias_zero, sense)
 
     def acceleration(
         self,
@@ -113,10 +247,106 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, " n"]:
-        """Solve M a = Q - h; force code only where forces are declared."""
-        M = self.mass(t, q, v, params)
-        h = self.bias(t, q, v, params)
-        if not self.forces:
-            return solve_mass(M, -h)
-        return solve_mass(M, self.force(t, q, v, params, inputs) - h)
+        """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
+        prepared = self.prepare(q, params, inputs) if prepared is None else prepared
+        M, right = self._balance(t, q, v, params, inputs, prepared)
+        if not self.constraints:
+            return solve_mass(M, right, prepared.factor)
+        return self._solved(M, right, t, q, v, params, inputs, kept, prepared.sense)[0]
+
+    def reactions(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(a, lam), of least norm where rows depend on one another."""
+        M, right = self._balance(t, q, v, params, inputs, self.prepare(q, params, inputs))
+        if not self.constraints:
+            return solve_mass(M, right), jnp.zeros((0,), q.dtype)
+        A, _ = self.rows(t, q, v, params)
+        kept = None
+        if A.shape[0] > 1:
+            kept = independent_rows(*jax.lax.stop_gradient((M, A)))
+        a, lam = self._solved(M, right, t, q, v, params, inputs, kept)
+        return a, lam if kept is None else least_norm(A, lam, kept)
+
+    def _solved(
+        self,
+        M: Array,
+        right: Array,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        kept: Array | None,
+        sense: Array | float = 1.0,
+    ) -> tuple[Array, Array]:
+        """(a, lam) under constraints."""
+        (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
+        if not any(map(reads_lam, self.forces)):
+            return solve_kkt(M, A, right, gamma, kept, self.formulation)
+
+        def push(lam: Array) -> Array:
+            return self.reactive(t, q, v, params, inputs, lam)
+
+        slopes = jax.make_jaxpr(jax.jacfwd(push))(gamma).jaxpr
+        (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
+        return solve_reactions(M, A, right, push, gamma, kept, affine=not reached)
+
+    def correction(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+        chosen: Sequence[int] | None = None,
+    ) -> Float[Array, "n k"]:
+        """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero.
+
+        Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
+        """
+        M = self.mass(t, q, v, params) if getattr(prepared, "mass", None) is None else prepared.mass
+        A, b = self.rows(t, q, v, params)
+        if chosen is not None:
+            if not self.regular:
+                M, _ = augmented(M, masked(A, kept))
+            rows = np.array(chosen)
+            A, b, kept = A[rows], b[rows], None if kept is None else kept[rows]
+        factor = factor_kkt(*jax.lax.stop_gradient((M, A)), kept, self.formulation)
+
+        def column(c: Array) -> Array:
+            return -solve_kkt(M, A, jnp.zeros_like(q), c, kept, self.formulation, factor)[0]
+
+        return jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
+
+    def _balance(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], prepared: Any
+    ) -> tuple[Array, Array]:
+        """(M, Q - h)."""
+        M = self.mass(t, q, v, params) if prepared.mass is None else prepared.mass
+        right = jnp.zeros_like(q) if prepared.bias_zero else -self.bias(t, q, v, params)
+        if self.forces:
+            right = self.force(t, q, v, params, inputs) + right
+        return M, right
+
+
+@lru_cache(maxsize=256)
+def _structure(
+    lagrangian: Callable, avals: _params.Static, static: _params.Static, size: int, dtype: Any
+) -> Structure:
+    def with_params(function: Callable) -> Callable:
+        return lambda t, q, v, traced: function(t, q, v, _params.join(traced, static.tree))
+
+    terms = ArrayTerms(lagrangian, ())
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    q = jax.ShapeDtypeStruct((size,), dtype)
+    mass, bias, L = map(with_params, (terms.mass, terms.bias, lagrangian))
+    return find_structure(mass, bias, L, (t, q, q), avals.tree)

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from jaxlag._lowering._derive import Equations, Scene
 from jaxlag._lowering._diff import tangents
 from jaxlag._lowering._graph import Node, dependencies
+from jaxlag._lowering._scene import Equations, Scene
 from jaxlag._lowering._solve import blocks
 
 

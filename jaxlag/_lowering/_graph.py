@@ -9,6 +9,7 @@ x / x = 1 for every x, inf and NaN included, and sqrt(x)^2 = x. sqrt(x^2) stays 
 """
 
 from collections.abc import Container, Iterable, Sequence
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -16,6 +17,11 @@ import numpy as np
 
 Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
+
+
+FIXED = ("params", "kept", "sense")
+"""Names of the inputs that do not change during a solve: parameters, the rows solved with, and
+whether time runs forwards (+1) or backwards (-1)."""
 
 
 class Node:
@@ -27,14 +33,14 @@ class Node:
             call: (primitive, its parameters). custom: (Rule, index of the result). Others: None.
         args: the nodes that it is computed from, factors and terms included.
         id: its place in an order in which arguments come first.
-        fixed: whether it depends on params alone.
+        fixed: whether it depends on nothing that changes during a solve.
     """
 
     __slots__ = ("args", "data", "fixed", "id", "op")
 
     def __init__(self, op: str, data: Any, args: tuple["Node", ...], id: int) -> None:
         self.op, self.data, self.args, self.id = op, data, args, id
-        self.fixed: bool = data[0] == "params" if op == "input" else all(a.fixed for a in args)
+        self.fixed: bool = data[0] in FIXED if op == "input" else all(a.fixed for a in args)
 
     def __repr__(self) -> str:
         return f"<{self.op} {self.id}>"
@@ -78,6 +84,8 @@ _ACCURACY = {"accuracy": None}
 SQRT, SIN, COS = (named(name, **_ACCURACY) for name in ("sqrt", "sin", "cos"))
 ODD = {"sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "erf", "cbrt"}
 EVEN = {"cos", "cosh", "abs"}
+_AND = named("and")
+_ORDER = {"max": "ge", "min": "le"}
 
 
 class Graph:
@@ -237,7 +245,25 @@ class Graph:
         if len(args) == 1 and (name in ODD or name in EVEN) and _negative(args[0]):
             positive = self.call(primitive, self.scale(args[0], -1.0))
             return positive if name in EVEN else self.scale(positive, -1.0)
+        if len(args) == 2 and name == "eq":
+            a, b = args
+            for one, other in ((a, b), (b, a)):
+                if other.op == "call" and other.data.name in _ORDER:
+                    rest = _operands(other, other.data)
+                    if one in rest:
+                        return self._is_extreme(one, rest, named(_ORDER[other.data.name]))
         return self._node("call", primitive, args)
+
+    def _is_extreme(self, node: Node, others: Sequence[Node], order: Primitive) -> Node:
+        """Whether the node is the largest or smallest, by comparing it with every other.
+
+        So asks the derivative of max in JAX: x == max(x, y). XLA's CPU backend may compute x
+        twice, once with a fused multiply-add and once without, and x differs from itself then.
+        """
+        truths = [self.call(order, node, other) for other in others if other is not node]
+        if not truths:
+            return self.const(True)
+        return reduce(partial(self.call, _AND), truths)
 
     def sqrt(self, node: Node) -> Node:
         """Square root."""
@@ -292,6 +318,13 @@ def _negative(node: Node) -> bool:
     return node.op == "sum" and node.data[1][0][1] < 0
 
 
+def _operands(node: Node, primitive: Primitive) -> list[Node]:
+    """Everything that a nested maximum, or minimum, is taken of."""
+    if node.op == "call" and node.data == primitive:
+        return [x for arg in node.args for x in _operands(arg, primitive)]
+    return [node]
+
+
 def _power(base: float, exponent: int) -> float:
     with np.errstate(all="ignore"):
         return float(np.float64(base) ** exponent)
@@ -326,3 +359,32 @@ def dependencies(roots: Iterable[Node]) -> dict[Node, frozenset[tuple[str, int]]
         else:
             known[node] = frozenset().union(*(known[arg] for arg in node.args))
     return known
+
+
+def rebuilt(graph: Graph, node: Node, args: list[Node], values: dict[Node, Node]) -> Node:
+    """The node computed from other arguments."""
+    if node.op == "input":
+        return values.get(node, node)
+    if node.op == "const":
+        return node
+    if node.op == "sum":
+        constant, terms = node.data
+        return graph.sum(zip(args, (c for _, c in terms), strict=True), constant)
+    if node.op == "product":
+        return graph.product(zip(args, (e for _, e in node.data), strict=True))
+    if node.op == "call":
+        return graph.call(node.data, *args)
+    if node.op == "select":
+        return graph.select(*args)
+    if node.op == "custom":
+        rule, index = node.data
+        return graph.custom(rule, index, args)
+    return graph.stop(args[0]) if node.op == "stop" else graph.let(args[0])
+
+
+def substitute(graph: Graph, roots: Sequence[Node], values: dict[Node, Node]) -> list[Node]:
+    """The roots with inputs replaced."""
+    known: dict[Node, Node] = {}
+    for node in order(roots):
+        known[node] = rebuilt(graph, node, [known[arg] for arg in node.args], values)
+    return [known[root] for root in roots]

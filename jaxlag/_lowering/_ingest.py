@@ -14,6 +14,7 @@ import numpy as np
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jaxlag import _params
 from jaxlag._dependence import scan_sizes
 from jaxlag._lowering._elementwise import ELEMENTWISE, elementwise
 from jaxlag._lowering._graph import Graph, Node, named
@@ -89,6 +90,8 @@ def read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarra
     Raises:
         Unsupported: an operation that has no scalar form, with its place in the user's source.
     """
+    if not _params.concrete(*closed.consts):
+        raise Unsupported("a value traced by a transform comes from outside the arguments")
     try:
         return _read(graph, closed, *args)
     except Missing as missing:

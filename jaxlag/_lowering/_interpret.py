@@ -22,12 +22,13 @@ def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
     known.update(zip(jaxpr.invars, args, strict=True))
     for eqn in jaxpr.eqns:
         operands = [a.val if isinstance(a, Literal) else known[a] for a in eqn.invars]
-        results = _equation(eqn, [np.asarray(x) for x in operands])
+        results = equation(eqn, [np.asarray(x) for x in operands])
         known.update(zip(eqn.outvars, results, strict=True))
     return [np.asarray(a.val) if isinstance(a, Literal) else known[a] for a in jaxpr.outvars]
 
 
-def _equation(eqn: Any, operands: list) -> list:
+def equation(eqn: Any, operands: list) -> list:
+    """The results of one equation at given numpy arrays."""
     name = eqn.primitive.name
     for key in ("jaxpr", "call_jaxpr"):
         inner = eqn.params.get(key)
@@ -37,6 +38,8 @@ def _equation(eqn: Any, operands: list) -> list:
             return _run(inner, [], operands)
     if name in NUMPY:
         return [np.asarray(NUMPY[name](eqn, *operands))]
+    if name in _PARTS:
+        return _PARTS[name](eqn, *operands)
     kinds = [v.aval.dtype for v in eqn.invars]
     with jax.ensure_compile_time_eval():
         given = [x.astype(kind) for x, kind in zip(operands, kinds, strict=True)]
@@ -97,6 +100,24 @@ def _slice(eqn: Any, x: np.ndarray) -> Any:
 
 def _select(eqn: Any, which: np.ndarray, *cases: np.ndarray) -> Any:
     return np.choose(which.astype(int), np.broadcast_arrays(*cases))
+
+
+def _pad(eqn: Any, x: np.ndarray, filling: np.ndarray) -> list:
+    """Entries apart by `interior`, within `low` and `high`, which cut off where negative."""
+    config = eqn.params["padding_config"]
+    sizes = [max(n + (n - 1) * gap, 0) for n, (_, _, gap) in zip(x.shape, config, strict=True)]
+    apart = np.full(sizes, filling, x.dtype)
+    apart[tuple(slice(None, None, gap + 1) for _, _, gap in config)] = x
+    ends = [(low, high) for low, high, _ in config]
+    wide = np.pad(apart, np.maximum(ends, 0).reshape(-1, 2), constant_values=filling)
+    kept = [
+        slice(max(-low, 0), wide.shape[i] - max(-high, 0)) for i, (low, high) in enumerate(ends)
+    ]
+    return [wide[tuple(kept)]]
+
+
+def _split(eqn: Any, x: np.ndarray) -> list:
+    return np.split(x, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
 
 
 def _convert(eqn: Any, x: np.ndarray) -> Any:
@@ -173,3 +194,6 @@ NUMPY |= {
     "cumsum": _running(np.cumsum),
     "cumprod": _running(np.cumprod),
 }
+
+# What else derivatives are full of; not among NUMPY, the primitives that have a scalar form.
+_PARTS: dict[str, Callable] = {"pad": _pad, "split": _split}

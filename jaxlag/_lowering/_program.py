@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from jaxlag._lowering._graph import Graph, Node, node_id, order
+from jaxlag._lowering._graph import FIXED, Graph, Node, node_id, order, rebuilt
 
 
 class Line(NamedTuple):
@@ -111,8 +111,6 @@ class _Hoist:
         graph, args = self.graph, [self._done[arg] for arg in node.args]
         if node.op in ("const", "input") or node.fixed:
             return node
-        if node.op == "let":
-            return graph.let(args[0])
         if node.op == "sum":
             constant, terms = node.data
             fixed, varying = [], []
@@ -125,14 +123,7 @@ class _Hoist:
         if node.op == "product":
             factors = [(arg, e) for arg, (_, e) in zip(args, node.data, strict=True)]
             return self._gathered(factors, 1.0)
-        if node.op == "call":
-            return graph.call(node.data, *args)
-        if node.op == "select":
-            return graph.select(*args)
-        if node.op == "custom":
-            rule, index = node.data
-            return graph.custom(rule, index, args)
-        return graph.stop(args[0])
+        return rebuilt(graph, node, args, {})
 
     def _term(self, node: Node, coefficient: float) -> tuple[Node, float]:
         """A coefficient other than +-1 goes into the known factor of its product."""
@@ -194,7 +185,7 @@ class _Assembly:
         prelude = tuple(line for line in self.lines if self.known[line.to])
         body = tuple(line for line in self.lines if not self.known[line.to])
         made = {line.to for line in prelude}
-        made |= {slot for (name, _), slot in self.inputs.items() if name == "params"}
+        made |= {slot for (name, _), slot in self.inputs.items() if name in FIXED}
         read = [slot for line in body for slot in line.args] + list(results)
         carried = tuple(sorted({slot for slot in read if slot in made}))
         return Program(prelude, carried, body, results, self.inputs, self.numbers, self._truths())
@@ -316,7 +307,7 @@ class _Assembly:
         if found is None:
             found = len(self.known)
             self.slot[key] = found
-            fixed = data[0] == "params" if op == "input" else all(self.known[a] for a in args)
+            fixed = data[0] in FIXED if op == "input" else all(self.known[a] for a in args)
             self.known.append(fixed)
             if op == "input":
                 self.inputs[data] = found

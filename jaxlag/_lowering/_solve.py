@@ -7,6 +7,7 @@ import numpy as np
 from jaxlag._lowering._graph import Graph, Node, named
 
 GREATER = named("gt")
+_ABS = named("abs")
 
 
 def blocks(M: Sequence[Sequence[Node]], zero: Node) -> list[list[int]]:
@@ -46,56 +47,144 @@ def solve(graph: Graph, M: Sequence[Sequence[Node]], r: Sequence[Node], eps: flo
     coupling, the last two unknowns by Cramer's rule. A pivot must exceed 4 n eps M_ii, as in
     `jaxlag._linalg.factor_mass`.
     """
-    out: list[Node] = [graph.zero] * len(M)
-    for block in blocks(M, graph.zero):
-        for i, x in zip(block, _Elimination(graph, M, r, block, eps).solve(), strict=True):
-            out[i] = x
+    return bordered(graph, M, [], [(r, [])], eps)[0]
+
+
+def bordered(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
+    eps: float,
+    kept: Sequence[Node] | None = None,
+) -> list[list[Node]]:
+    """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0.
+
+    The same elimination of [M, A^T; A, 0] with the unknowns (x, -lam), whose pivots are positive
+    for coordinates and negative for rows: a row comes after the coordinates that it contains. Its
+    pivot must exceed eps^(2/3) times what the coordinates alone made it, as in
+    `jaxlag._kkt.factor_kkt`, or it is left out.
+
+    Args:
+        graph: of all nodes.
+        M: symmetric.
+        A: rows.
+        right: right-hand sides.
+        eps: of the numbers.
+        kept: for every row 1, or 0 where it is left out; None for all 1.
+    """
+    n, m = len(M), len(A)
+    whole = [[*M[i], *(row[i] for row in A)] for i in range(n)]
+    whole += [[*row, *([graph.zero] * m)] for row in A]
+    sides = [[*r, *(graph.scale(x, -1.0) for x in c)] for r, c in right]
+    out: list[list[Node]] = [[graph.zero] * n for _ in right]
+    for block in blocks(whole, graph.zero):
+        found = _Elimination(graph, whole, sides, block, n, eps, kept).solve()
+        for i, values in zip(block, found, strict=True):
+            if i < n:
+                for side, x in zip(out, values, strict=True):
+                    side[i] = x
     return out
 
 
+def solve_general(
+    graph: Graph, S: Sequence[Sequence[Node]], right: Sequence[Node], relative: float
+) -> list[Node]:
+    """The x with S x = right, as `jaxlag._kkt.solve_general`; NaN where a pivot is too small."""
+    m, zero = len(S), graph.zero
+    lines = [[*row, side] for row, side in zip(S, right, strict=True)]
+    for k in range(m):
+        # Nothing was taken off the first one.
+        least = graph.scale(graph.call(_ABS, S[k][k]), relative) if k else zero
+        fine = graph.call(GREATER, lines[k][k], least)
+        lines[k][k] = graph.let(graph.select(fine, lines[k][k], graph.const(np.nan)))
+        for i in range(k + 1, m):
+            if lines[i][k] is zero:
+                continue
+            ratio = graph.let(graph.div(lines[i][k], lines[k][k]))
+            for j in range(k + 1, m + 1):
+                taken = graph.mul(ratio, lines[k][j])
+                lines[i][j] = graph.let(graph.sub(lines[i][j], taken))
+    x: list[Node] = [zero] * m
+    for k in reversed(range(m)):
+        known = [(graph.mul(lines[k][j], x[j]), -1.0) for j in range(k + 1, m)]
+        x[k] = graph.let(graph.div(graph.sum([(lines[k][m], 1.0), *known]), lines[k][k]))
+    return x
+
+
 class _Elimination:
+    """Elimination of one block; unknowns from `coordinates` on are constraint rows."""
+
     def __init__(
         self,
         graph: Graph,
-        M: Sequence[Sequence[Node]],
-        r: Sequence[Node],
+        matrix: Sequence[Sequence[Node]],
+        right: Sequence[Sequence[Node]],
         block: list[int],
+        coordinates: int,
         eps: float,
+        kept: Sequence[Node] | None,
     ) -> None:
-        self.graph, self.block = graph, block
-        self.floor = 4 * len(M) * eps
-        self.entry = {(i, j): graph.let(M[i][j]) for i in block for j in block}
-        self.right = {i: graph.let(r[i]) for i in block}
+        self.graph, self.block, self.coordinates, self.kept = graph, block, coordinates, kept
+        self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
+        self.entry = {(i, j): graph.let(matrix[i][j]) for i in block for j in block}
+        self.right = {i: [graph.let(side[i]) for side in right] for i in block}
         self.diagonal = {i: self.entry[i, i] for i in block}
         self.touched: set[int] = set()
+        zero = graph.zero
+        self.contains = {
+            i: {j for j in block if j < coordinates and matrix[i][j] is not zero}
+            for i in block
+            if i >= coordinates
+        }
 
-    def solve(self) -> list[Node]:
+    def solve(self) -> list[list[Node]]:
         graph, left = self.graph, list(self.block)
         steps = []
-        while len(left) > 2:
-            k = min(left, key=lambda i: (self._coupling(i, left), i))
+        rows = bool(self.contains)
+        while len(left) > (1 if rows else 2):
+            k = min(self._ready(left), key=lambda i: (self._coupling(i, left), i))
             left.remove(k)
             steps.append((k, self._eliminate(k, left), self._pivot(k)))
-        found: dict[int, Node] = {}
+        found: dict[int, list[Node]] = {}
         if len(left) == 1:
             (i,) = left
-            found[i] = graph.div(self.right[i], self._pivot(i))
+            found[i] = self._over(self.right[i], self._pivot(i))
         else:
             self._cramer(left[0], left[1], found)
         for k, row, pivot in reversed(steps):
-            known = [(graph.mul(c, found[j]), -1.0) for j, c in row.items()]
-            found[k] = graph.div(graph.let(graph.sum([(self.right[k], 1.0), *known])), pivot)
-            found[k] = graph.let(found[k])
+            values = []
+            for s, right in enumerate(self.right[k]):
+                known = [(graph.mul(c, found[j][s]), -1.0) for j, c in row.items()]
+                values.append(graph.let(graph.sum([(right, 1.0), *known])))
+            found[k] = self._over(values, pivot)
         return [found[i] for i in self.block]
+
+    def _over(self, values: Sequence[Node], pivot: Node) -> list[Node]:
+        graph = self.graph
+        return [x if x is graph.zero else graph.let(graph.div(x, pivot)) for x in values]
+
+    def _ready(self, left: list[int]) -> list[int]:
+        """Coordinates, and rows whose coordinates are all eliminated."""
+        remaining = set(left)
+        return [i for i in left if remaining.isdisjoint(self.contains.get(i, ()))]
 
     def _coupling(self, i: int, left: list[int]) -> int:
         return sum(self.entry[i, j] is not self.graph.zero for j in left)
 
     def _pivot(self, i: int) -> Node:
-        """D_i, NaN where it is not positive to working precision."""
+        """D_i, NaN where it does not have its sign to working precision."""
         graph, pivot = self.graph, self.entry[i, i]
-        healthy = graph.call(GREATER, pivot, self._bound(i))
-        return graph.let(graph.select(healthy, pivot, graph.const(np.nan)))
+        nan = graph.const(np.nan)
+        if i < self.coordinates:
+            healthy = graph.call(GREATER, pivot, self._bound(i))
+            return graph.let(graph.select(healthy, pivot, nan))
+        bound = graph.scale(self.diagonal[i], self.row_floor)
+        pivot = graph.let(graph.select(graph.call(GREATER, bound, pivot), pivot, nan))
+        if self.kept is None:
+            return pivot
+        keep = graph.call(GREATER, self.kept[i - self.coordinates], graph.const(0.5))
+        return graph.let(graph.select(keep, pivot, graph.const(-np.inf)))
 
     def _bound(self, i: int) -> Node:
         """What cancellation may leave of a pivot that is zero; nothing was taken off the first."""
@@ -109,14 +198,20 @@ class _Elimination:
             ratio = graph.let(graph.div(c, pivot))
             for j, d in row.items():
                 if j >= i:
-                    reduced = graph.sub(self.entry[i, j], graph.mul(ratio, d))
-                    self.entry[i, j] = self.entry[j, i] = graph.let(reduced)
-            reduced = graph.sub(self.right[i], graph.mul(ratio, self.right[k]))
-            self.right[i] = graph.let(reduced)
+                    taken = graph.mul(ratio, d)
+                    reduced = graph.let(graph.sub(self.entry[i, j], taken))
+                    self.entry[i, j] = self.entry[j, i] = reduced
+                    if i == j and i >= self.coordinates > k:
+                        # What the coordinates make of a row's pivot, before other rows reduce it.
+                        self.diagonal[i] = graph.sub(self.diagonal[i], taken)
+            for s, right in enumerate(self.right[k]):
+                if right is not graph.zero:
+                    reduced = graph.sub(self.right[i][s], graph.mul(ratio, right))
+                    self.right[i][s] = graph.let(reduced)
             self.touched.add(i)
         return row
 
-    def _cramer(self, i: int, j: int, found: dict[int, Node]) -> None:
+    def _cramer(self, i: int, j: int, found: dict[int, list[Node]]) -> None:
         graph = self.graph
         a, b, c = self._pivot(i), self.entry[i, j], self.entry[j, j]
         determinant = graph.let(graph.sub(graph.mul(a, c), graph.power(b, 2)))
@@ -125,8 +220,9 @@ class _Elimination:
         bound = graph.scale(shares, self.floor)
         healthy = graph.call(GREATER, determinant, bound)
         determinant = graph.let(graph.select(healthy, determinant, graph.const(np.nan)))
-        r, s = self.right[i], self.right[j]
-        first = graph.sub(graph.mul(c, r), graph.mul(b, s))
-        second = graph.sub(graph.mul(a, s), graph.mul(b, r))
-        found[i] = graph.let(graph.div(graph.let(first), determinant))
-        found[j] = graph.let(graph.div(graph.let(second), determinant))
+        found[i], found[j] = [], []
+        for r, s in zip(self.right[i], self.right[j], strict=True):
+            first = graph.sub(graph.mul(c, r), graph.mul(b, s))
+            second = graph.sub(graph.mul(a, s), graph.mul(b, r))
+            found[i].append(graph.let(graph.div(graph.let(first), determinant)))
+            found[j].append(graph.let(graph.div(graph.let(second), determinant)))

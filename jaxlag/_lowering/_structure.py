@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxlag import _params
 from jaxlag._dependence import outputs_depend_on
 
 
@@ -62,10 +63,14 @@ def find_structure(
 
 
 def _vanishes(function: Any, state: tuple, params: Any) -> bool:
-    """Whether a function that depends on none of its arguments is zero: one value decides."""
+    """Whether a function that depends on none of its arguments is zero: one value decides.
+
+    Where it has none, as under a transform that traces what the function closes over, it is not.
+    """
     with jax.ensure_compile_time_eval():
         state, params = jax.tree.map(_ones, (state, params))
-        return not bool(jnp.any(function(*state, params)))
+        anything = jnp.any(function(*state, params))
+        return _params.concrete(anything) and not bool(anything)
 
 
 def _ones(like: jax.ShapeDtypeStruct) -> Any:

@@ -11,6 +11,11 @@ from jaxlag.solvers._unrolled import AbstractUnrolled
 class Dopri8(AbstractUnrolled):
     """Order 8 with an embedded method of order 7, 14 stages of which two steps share one.
 
+    Between steps `diffrax` interpolates with order 5: in the middle of a step of 0.8 s on a driven
+    pendulum 1.9e-7 off, where the step is 5.6e-9 off (output of order 7, as of DOP853: 7.4e-8 and
+    8.8e-9). `simulate` takes a step to each saved time instead, which is as accurate as any: 1e-11
+    there.
+
     Source: Prince, Dormand, High order embedded Runge-Kutta formulae, J. Comp. Appl. Math. 7
     (1981), with the coefficients of `diffrax.Dopri8`.
     """

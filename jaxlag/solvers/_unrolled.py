@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import jax
@@ -19,15 +19,26 @@ class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
 
     A stage is a sum of the stages before it with the zeros of the tableau left out, so that a
     step is straight-line code and a loop of steps over a small system one function without calls.
-    Where the terms have a method `elements`, stages work on the elements of y one by one, and y
-    is put together again at the end of the step.
+
+    Where the terms have an attribute `second_order` other than None, y is a tuple of scalars, the
+    elements of q and w with q' = w and w' = a(t, q, w), and a step is taken as
+
+        w_i = w + h sum_j a_ij a_j,    q_i = q + c_i h w + h^2 sum_j (A A)_ij a_j.
+
+    This is the same method (Nystrom's form), but stages meet only through accelerations. These
+    end in divisions, which XLA computes once; it would compute a velocity anew in every later
+    stage that reads it. `second_order` has the methods
+
+        split(y, args) -> (q, w),    join(q, w, args) -> y,    accelerations(t, q, w, args) -> a;
+
+    `split` takes rates (w, a) apart as well, and `join` puts them together.
 
     The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
     one of the next step.
 
     Steps, error estimates and interpolation are those of `stock`, up to the order of sums.
 
-    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1.
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1, II.14.
 
     Attributes:
         stock: the same method with a loop over stages.
@@ -53,8 +64,7 @@ class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
         """The first stage of the first step, where steps share one."""
-        tableau: Any = self.stock.tableau
-        return terms.vf(t0, y0, args) if tableau.fsal else None
+        return terms.vf(t0, y0, args) if _tableau(self.stock).fsal else None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         """dy/dt."""
@@ -64,7 +74,7 @@ class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], Any, diffrax.RESULTS]:
         """One step from t0 to t1: (y1, error estimate, stages, first stage of the next, result)."""
-        tableau: Any = self.stock.tableau
+        tableau = _tableau(self.stock)
         if not tableau.fsal:
             first = terms.vf(t0, y0, args)
         elif made_jump is False:
@@ -73,47 +83,134 @@ class AbstractUnrolled(diffrax.AbstractAdaptiveSolver):
             first = lax.cond(
                 made_jump, lambda _: terms.vf(t0, y0, args), lambda known: known, solver_state
             )
-        h = terms.contr(t0, t1)
-        by_element = getattr(terms, "elements", None)
-        split = by_element is not None
-        apart = _elements if split else jax.tree.leaves
-        y, k = apart(y0), [apart(first)]
-        structure = jax.tree.structure(y0)
-        for row, c in zip(tableau.a_lower, tableau.c, strict=True):
-            t = t1 if c == 1.0 else t0 + c * (t1 - t0)
-            stage = _advanced(y, h, row, k)
-            if by_element is not None:
-                k.append(list(by_element(t, stage, args)))
-            else:
-                k.append(jax.tree.leaves(terms.vf(t, jax.tree.unflatten(structure, stage), args)))
-        # Where the last row of the tableau is the weights, the last stage was taken at y1.
-        y1 = stage if tableau.fsal else _advanced(y, h, tableau.b_sol, k)
-        error = _advanced(None, h, tableau.b_error, k)
-
-        def whole(parts: Sequence[Array]) -> Any:
-            return jnp.stack(parts) if split else jax.tree.unflatten(structure, parts)
-
-        rates = [whole(stage) for stage in k]
+        second_order = getattr(terms, "second_order", None) is not None
+        stages = _second_order if second_order else _first_order
+        y1, error, increments, last = stages(tableau, terms, t0, t1, y0, first, args)
         # diffrax's interpolation takes the stages as increments.
-        stages = jax.tree.map(lambda *parts: h * jnp.stack(parts), *rates)
-        dense = {"y0": y0, "y1": whole(y1), "k": stages}
-        last = rates[-1] if tableau.fsal else None
-        return dense["y1"], whole(error), dense, last, diffrax.RESULTS.successful
+        k = jax.tree.map(lambda *parts: jnp.stack(parts), *increments)
+        return y1, error, {"y0": y0, "y1": y1, "k": k}, last, diffrax.RESULTS.successful
 
 
-def _elements(y: Array) -> list[Array]:
-    return [lax.squeeze(lax.slice_in_dim(y, i, i + 1), (0,)) for i in range(y.shape[0])]
+class _Tableau(NamedTuple):
+    """Coefficients of stages 2, 3, ..., and what Nystrom's form needs of their products."""
+
+    rows: list[np.ndarray]  # a_ij
+    squared: list[np.ndarray]  # (A A)_ij
+    c: list[float]
+    b: np.ndarray
+    b_squared: np.ndarray  # b A
+    e: np.ndarray
+    e_squared: np.ndarray  # e A
+    fsal: bool
 
 
-def _advanced(
-    y: Sequence[Array] | None, h: Array, weights: np.ndarray, k: Sequence[Sequence[Array]]
-) -> list[Array]:
-    """y + h sum_j weights_j k_j, element by element; without y the sum alone."""
+def _tableau(method: diffrax.AbstractERK) -> _Tableau:
+    tableau: Any = method.tableau
+    size = len(tableau.c) + 1
+    A = np.zeros((size, size))
+    for i, row in enumerate(tableau.a_lower, 1):
+        A[i, : len(row)] = row
+    b, e = np.asarray(tableau.b_sol, float), np.asarray(tableau.b_error, float)
+    squares = [_product(row, A) for row in A]
+    return _Tableau(
+        list(A[1:]),
+        squares[1:],
+        [float(c) for c in tableau.c],
+        b,
+        _product(b, A),
+        e,
+        _product(e, A),
+        bool(tableau.fsal),
+    )
+
+
+def _product(row: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """row A, with entries that are zero up to rounding set to zero."""
+    product = row @ A
+    rounding = 2 * len(row) * np.finfo(float).eps * (np.abs(row) @ np.abs(A))
+    return np.where(np.abs(product) <= rounding, 0.0, product)
+
+
+def _sums(weights: np.ndarray, k: Sequence[Sequence[Array]]) -> list[Array]:
+    """sum_j weights_j k_j, element by element."""
     used = [(float(w), stage) for w, stage in zip(weights, k, strict=False) if w != 0.0]
     out = []
     for i in range(len(k[0])):
         total = used[0][0] * used[0][1][i]
         for w, stage in used[1:]:
             total = total + w * stage[i]
-        out.append(h * total if y is None else y[i] + h * total)
+        out.append(total)
     return out
+
+
+def _added(x: Sequence[Array], change: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(a + b for a, b in zip(x, change, strict=True))
+
+
+def _first_order(
+    tableau: _Tableau, terms: Any, t0: Any, t1: Any, y0: Any, first: Any, args: Any
+) -> tuple[Any, Any, list[Any], Any]:
+    """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
+    structure, y = jax.tree.structure(y0), jax.tree.leaves(y0)
+    per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
+
+    def increments(rates: Any) -> list[Array]:
+        """They are read in every later stage: they end in divisions, which XLA computes once."""
+        return [x / per_step for x in jax.tree.leaves(rates)]
+
+    k, stage, last = [increments(first)], y, None
+    for row, c in zip(tableau.rows, tableau.c, strict=True):
+        t = t1 if c == 1.0 else t0 + c * (t1 - t0)
+        stage = _added(y, _sums(row, k))
+        last = terms.vf(t, jax.tree.unflatten(structure, stage), args)
+        k.append(increments(last))
+    if not tableau.fsal:
+        stage, last = _added(y, _sums(tableau.b, k)), None
+    whole = [jax.tree.unflatten(structure, x) for x in (stage, _sums(tableau.e, k), *k)]
+    return whole[0], whole[1], whole[2:], last
+
+
+def _second_order(
+    tableau: _Tableau, terms: Any, t0: Any, t1: Any, y0: Any, first: Any, args: Any
+) -> tuple[Any, Any, list[Any], Any]:
+    """The same in Nystrom's form."""
+    h, form = terms.contr(t0, t1), terms.second_order
+    q, w = form.split(y0, args)
+    a = [form.split(first, args)[1]]
+    rates = [first]
+    # The step's results are read in many places: they end in divisions, which XLA computes once.
+    per_step = lax.optimization_barrier(1.0 / h)
+
+    def moves(row: np.ndarray, squared: np.ndarray, c: float) -> tuple[list, list]:
+        """What q and w gain, over h."""
+        drift = [rate if c == 1.0 else c * rate for rate in w]
+        if np.any(squared):
+            turns = _sums(squared, a)
+            drift = [x + h * turn for x, turn in zip(drift, turns, strict=True)]
+        return drift, _sums(row, a)
+
+    def end() -> tuple[tuple, tuple]:
+        drift, kicks = moves(tableau.b, tableau.b_squared, 1.0)
+        return _added(q, [x / per_step for x in drift]), _added(w, [x / per_step for x in kicks])
+
+    for i, (row, squared, c) in enumerate(
+        zip(tableau.rows, tableau.squared, tableau.c, strict=True), 1
+    ):
+        t = t1 if c == 1.0 else t0 + c * (t1 - t0)
+        if tableau.fsal and i == len(tableau.rows):
+            at = end()
+        else:
+            drift, kicks = moves(row, squared, c)
+            at = _added(q, [h * x for x in drift]), _added(w, [h * x for x in kicks])
+        a.append(form.accelerations(t, *at, args))
+        rates.append(form.join(at[1], a[-1], args))
+    if not tableau.fsal:
+        at = end()
+    # The weights of the error estimate have the sum 0: w drops out.
+    error = (
+        tuple(h * x / per_step for x in _sums(tableau.e_squared, a)),
+        tuple(x / per_step for x in _sums(tableau.e, a)),
+    )
+    k = [jax.tree.map(lambda x: h * x, rate) for rate in rates]
+    last = rates[-1] if tableau.fsal else None
+    return form.join(*at, args), form.join(*error, args), k, last

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from systems._catalogue import find
 from systems._check import Motion
 from systems._entry import AbstractEntry
 
@@ -23,7 +24,7 @@ def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2
         "extras.p": (m * v)[:, None],
         "extras.p_dot": (-k * x)[:, None],
     }
-    return _file("mass_spring", ["x"], {"m": m, "k": k}, times, rows)
+    return _file(find("mass_spring"), {"m": m, "k": k}, times, rows)
 
 
 def recorded(entry: AbstractEntry, times, motion: Motion):
@@ -31,12 +32,13 @@ def recorded(entry: AbstractEntry, times, motion: Motion):
     rows = {name: np.asarray(values) for name, values in motion.rows.items()}
     if entry.kind == "static":
         rows = {name: values[0] for name, values in rows.items()}
-    params = dict(entry.example.params)
-    return _file(entry.name, list(entry.coordinates), params, times, rows, entry.kind)
+    params = {name: np.asarray(value).tolist() for name, value in entry.example.params.items()}
+    return _file(entry, params, times, rows)
 
 
-def _file(name, coordinates, params, times, rows, kind="trajectory"):
+def _file(entry: AbstractEntry, params, times, rows):
     """A file with one case, with the fields and groups of its kind."""
+    kind = entry.kind
     case = {
         "name": "base",
         "description": "made on the spot",
@@ -53,10 +55,10 @@ def _file(name, coordinates, params, times, rows, kind="trajectory"):
         (case[group] if group else case)[member] = values.tolist()
     return {
         "schema": "jaxlag-reference/1",
-        "system": name,
+        "system": entry.name,
         "kind": kind,
-        "coordinates": coordinates,
-        "quasi_velocities": [],
-        "constraints": [],
+        "coordinates": list(entry.file_coordinates),
+        "quasi_velocities": list(entry.quasi_velocities),
+        "constraints": list(entry.file_constraints),
         "cases": [case],
     }

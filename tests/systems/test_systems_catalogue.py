@@ -5,13 +5,14 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxlag as jl
 import systems
 from systems.__main__ import main
 from systems._catalogue import ENTRIES, UnknownSystem, find
-from systems._entry import Entry, Example
+from systems._entry import Chart, Entry, Example
 from systems._run import TOLERANCE, drifts, simulate_example
 
 JOBS = {"errata", "fit_pendulum"}
@@ -36,7 +37,7 @@ def test_the_docstring_says_what_the_system_is(name):
     doc = import_module(f"systems.{name}").__doc__
     assert 'Pila, "Introduction to Lagrangian Dynamics", ch. ' in doc
     assert "\nParameters" in doc
-    for word in (*entry.coordinates, *entry.parameter_units):
+    for word in (*entry.coordinates, *entry.quasi_velocities, *entry.parameter_units):
         assert re.search(rf"\b{word}\b", doc), word
     head, _ = doc.split("\n\nCoordinate")
     assert sum(line.startswith("    ") for line in head.splitlines()) >= 4  # the sketch
@@ -50,7 +51,10 @@ def test_the_book_place_is_that_of_the_docstring(name):
         assert figure in doc
 
 
-OF_EACH_KIND = ("central_motion", "double_pendulum_static_load", "carnival_ride")
+OF_EACH_KIND = (
+    *("central_motion", "atwood_multipliers", "double_pendulum_static_load"),
+    *("link_spring_mass_equilibrium", "carnival_ride", "chaplygin_sleigh", "heavy_symmetric_top"),
+)
 
 
 @pytest.mark.parametrize(
@@ -66,12 +70,30 @@ def test_the_example_runs(name, capsys):
     assert out.startswith(f"{name}: {ENTRIES[name].book}\n")
     if ENTRIES[name].kind != "prescribed":
         assert re.search(r"^status +ok at ", out, re.MULTILINE)
+    if ENTRIES[name].kind == "trajectory":
+        for row, unit in ENTRIES[name].multiplier_units.items():
+            (sizes,) = re.findall(rf"^{row} .*{unit}  (.* \d.*)$", out, re.MULTILINE)
+            assert all(float(size) < TOLERANCE for size in re.findall(r"\d\.\de-?\d+", sizes))
 
 
 def test_list_names_every_system_once(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(ENTRIES)
+
+
+def test_quasi_velocities_that_vanish_stand_among_the_constraints_alone(capsys):
+    assert main(["run", "chaplygin_sleigh"]) == 0
+    head, *others = capsys.readouterr().out.split("\n\n")[1].splitlines()
+    units = ("m", "m", "rad", "m/s", "rad/s", "J")
+    assert tuple(re.findall(r"\[(.*?)\]", head)[1:]) == units
+    assert re.findall(r"(\S+) \[", head) == ["t", "x", "y", "theta", "v", "omega", "V"]
+    assert len(others) == 7
+
+
+def test_a_parameter_may_be_an_array(capsys):
+    assert main(["run", "quadcopter_body_axes"]) == 0
+    assert "omega = (516, 512, 511, 515) rad/s" in capsys.readouterr().out
 
 
 def test_an_unknown_name_gets_its_neighbours(capsys):
@@ -102,16 +124,53 @@ def test_an_entry_speaks_of_one_system():
     assert declare().coordinates == ("x",)
     with pytest.raises(ValueError, match=r"free: coordinate_units must have one value for each"):
         declare(coordinate_units=("m", "rad"))
+    with pytest.raises(ValueError, match=r"free: quasi_units must have one value for each of no q"):
+        declare(quasi_units=("m/s",))
+    system = jl.System(
+        lambda t, q, u, params: params["m"] * u[0] ** 2,
+        coordinates=("x",),
+        quasi=jl.QuasiVelocities(lambda t, q, v, params: v, ("speed",)),
+        written_in="u",
+    )
+    assert declare(system=system, quasi_units=("m/s",)).quasi_velocities == ("speed",)
+    with pytest.raises(ValueError, match=r"free: quasi_units must have one value for each of spe"):
+        declare(system=system)
     with pytest.raises(ValueError, match=r"free: example.params must name the parameters k"):
         declare(parameter_units={"k": "N/m"})
+    with pytest.raises(ValueError, match=r"free: multiplier_units must name the constraints \(\)"):
+        declare(multiplier_units={"rod": "N"})
+    with pytest.raises(ValueError, match=r"free: chart.coordinates must be among x, in this order"):
+        declare(chart=Chart(coordinates=("x", "y"), configuration=lambda t, q, params: q))
+
+
+@pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry.chart])
+def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
+    entry = ENTRIES[name]
+    rng = np.random.default_rng(5)
+    params = dict(entry.example.params)
+    for _ in range(8):
+        own = rng.uniform(-1.5, 1.5, (2, len(entry.file_coordinates)))
+        q, v = entry.chart.state(0.7, *own, params)
+        np.testing.assert_array_equal(q[entry.file_columns], own[0])
+        np.testing.assert_array_equal(v[entry.file_columns], own[1])
+        positions, rates = entry.system.residuals(params, q, v, 0.7)
+        for residual in (*positions.values(), *rates.values()):
+            np.testing.assert_allclose(residual, 0.0, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 @pytest.mark.parametrize(
-    "name", ["cart_pendulum", "sleeve_pendulum_equilibrium", "two_link_robot_arm_inverse"]
+    "name",
+    [
+        *("cart_pendulum", "sleeve_pendulum_equilibrium", "two_link_robot_arm_inverse"),
+        *("atwood_multipliers", "link_spring_mass_equilibrium", "chaplygin_sleigh"),
+    ],
 )
 def test_plot_writes_a_figure(name, suffix, tmp_path, capsys):
-    """A motion, a state of rest, a prescribed motion."""
+    """A motion, a state of rest, a prescribed motion; the first two under constraints, too.
+
+    And a motion by quasi-velocities.
+    """
     path = tmp_path / f"figure{suffix}"
     assert main(["run", name, "--plot", str(path)]) == 0
     assert path.stat().st_size > 10_000

@@ -1,9 +1,10 @@
-"""Accelerations against the equations of motion that the book derives by hand.
+"""Accelerations and multipliers against the equations of motion derived by hand.
 
 Each function returns the book's mass matrix and the terms on the right-hand side, so that
-M a = sum(terms). The hand solution and the engine's both carry rounding of relative size
-eps cond(M) in the solve, and of a few eps in every term; with K = 32 roundings allowed, they
-agree to K eps cond(M) |M^-1| sum(|terms|).
+M a = sum(terms); under constraints M is bordered by their rows and the solution is (a, lam). The
+hand solution and the engine's both carry rounding of relative size eps cond(M) in the solve, and
+of a few eps in every term; with K = 32 roundings allowed, they agree to
+K eps cond(M) |M^-1| sum(|terms|).
 """
 
 from functools import partial
@@ -11,9 +12,13 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+from _consistent import onto_constraints
+from _hand_constrained import HAND_EQUATIONS as CONSTRAINED
 from _hand_equations2 import HAND_EQUATIONS as CHAPTER_2
 from _hand_equations3 import HAND_EQUATIONS as CHAPTER_3
+from _hand_equations4 import HAND_EQUATIONS as CHAPTER_4
 from numpy import cos, sin
+from numpy.linalg import norm
 
 from systems._catalogue import ENTRIES
 from systems._quantities import quantities
@@ -119,81 +124,116 @@ HAND_EQUATIONS = (
     }
     | CHAPTER_2
     | CHAPTER_3
+    | CHAPTER_4
+    | CONSTRAINED
 )
 
 
 def random_states(entry):
-    """(t, q, v, params) around the example: q within 0.4 m or rad, v within 3 per s."""
+    """(t, q, v, params) around the example: q within 0.4 m or rad, v within 3 per s.
+
+    Under constraints moved onto them.
+    """
     rng = np.random.default_rng(sum(map(ord, entry.name)))
     n = len(entry.coordinates)
+    moved = jax.jit(partial(onto_constraints, entry.system)) if entry.constraints else None
     for _ in range(STATES):
         params = {
             name: value * rng.uniform(0.7, 1.4) for name, value in entry.example.params.items()
         }
         q = np.asarray(entry.example.q0) + rng.uniform(-0.4, 0.4, n)
-        yield rng.uniform(0.0, 5.0), q, rng.uniform(-3.0, 3.0, n), params
+        t, v = rng.uniform(0.0, 5.0), rng.uniform(-3.0, 3.0, n)
+        if moved is not None:
+            q, v = moved(params, t, q, v)
+        yield t, np.asarray(q), np.asarray(v), params
 
 
 MOVING = [name for name, entry in ENTRIES.items() if entry.kind == "trajectory"]
 
 
+def evaluate(entry, params, t, q, v):
+    """Every quantity, dL/dq, Q, and dH/dt along the motion."""
+    rows = quantities(entry, params, t, q, v)
+
+    def energy(t, q, v):
+        return entry.system.energy(params, q, v, t)
+
+    return rows | {
+        "dL_dq": jax.grad(entry.system.lagrangian, argnums=1)(t, q, v, params),
+        "Q": entry.system.generalized_force(params, q, v, t),
+        "H_dot": jax.jvp(energy, (t, q, v), (1.0, v, rows["a"]))[1],
+    }
+
+
 @pytest.fixture(scope="module", params=MOVING)
-def evaluated(request):
+def evaluated(request, lowering):
     """An entry with its quantities at random states: (entry, [((t, q, v, params), rows), ...])."""
     entry = ENTRIES[request.param]
-    evaluate = jax.jit(partial(quantities, entry))
+    rows = jax.jit(partial(evaluate, entry))
     states = random_states(entry)
-    return entry, [((t, q, v, params), evaluate(params, t, q, v)) for t, q, v, params in states]
+    return entry, [((t, q, v, params), rows(params, t, q, v)) for t, q, v, params in states]
 
 
 def test_every_system_has_its_hand_equations():
     assert set(HAND_EQUATIONS) == set(MOVING)
 
 
+def test_random_states_are_on_the_constraints(evaluated):
+    entry, pairs = evaluated
+    for (t, q, v, params), _ in pairs if entry.constraints else []:
+        positions, rates = entry.system.residuals(params, q, v, t)
+        for rows, size in ((positions, 1 + norm(q)), (rates, 1 + norm(v))):
+            for residual in rows.values():
+                np.testing.assert_allclose(residual, 0.0, rtol=0, atol=K * EPS * size**2)
+
+
 def test_accelerations_are_those_of_the_book(evaluated):
+    """And the multipliers, where there are any."""
     entry, pairs = evaluated
     for (t, q, v, params), rows in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
         expected = np.linalg.solve(M, np.sum(terms, axis=0))
-        size = np.linalg.norm(np.linalg.inv(M), 2) * np.sum(np.linalg.norm(terms, axis=1))
+        size = norm(np.linalg.inv(M), 2) * np.sum(norm(terms, axis=1))
         tolerance = K * EPS * np.linalg.cond(M) * size
-        np.testing.assert_allclose(rows["a"], expected, rtol=0, atol=tolerance)
+        found = np.concatenate([rows["a"], rows.get("lambda", [])])
+        np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
 
 
 def test_momenta_change_by_lagrange_equations(evaluated):
-    """dp/dt along the motion, a derivative of p, is dL/dq + Q: two routes to one number.
+    """dp/dt along the motion, a derivative of p, is dL/dq + Q + A^T lam: two routes to one number.
 
     The route through a multiplies its error by M, hence the condition number.
     """
     entry, pairs = evaluated
-
-    @jax.jit
-    def lagrange(params, t, q, v):
-        dL_dq = jax.grad(entry.system.lagrangian, argnums=1)(t, q, v, params)
-        return dL_dq, entry.system.generalized_force(params, q, v, t)
-
     for (t, q, v, params), rows in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
-        size = 1 + np.sum(np.linalg.norm(terms, axis=1))
+        size = 1 + np.sum(norm(terms, axis=1))
         tolerance = K * EPS * np.linalg.cond(M) * size
-        expected = sum(lagrange(params, t, q, v))
+        expected = rows["dL_dq"] + rows["Q"] + rows.get("constraint_force", 0.0)
         np.testing.assert_allclose(rows["extras.p_dot"], expected, rtol=0, atol=tolerance)
 
 
 def test_energy_changes_by_the_power_of_the_forces(evaluated):
-    """dH/dt = v . Q, for no Lagrangian here contains the time."""
+    """dH/dt = v . (Q + A^T lam), for no Lagrangian here contains the time."""
     entry, pairs = evaluated
-
-    @jax.jit
-    def powers(params, t, q, v, a):
-        def energy(t, q, v):
-            return entry.system.energy(params, q, v, t)
-
-        _, H_dot = jax.jvp(energy, (t, q, v), (1.0, v, a))
-        return H_dot, v @ entry.system.generalized_force(params, q, v, t)
-
     for (t, q, v, params), rows in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
-        H_dot, power = powers(params, t, q, v, rows["a"])
-        size = np.linalg.norm(v) * (1 + np.sum(np.linalg.norm(terms, axis=1)))
-        np.testing.assert_allclose(H_dot, power, rtol=0, atol=K * EPS * np.linalg.cond(M) * size)
+        power = v @ (rows["Q"] + rows.get("constraint_force", 0.0))
+        size = norm(v) * (1 + np.sum(norm(terms, axis=1)))
+        tolerance = K * EPS * np.linalg.cond(M) * size
+        np.testing.assert_allclose(rows["H_dot"], power, rtol=0, atol=tolerance)
+
+
+MOVED = ("spherical_pendulum_varying", "particle_on_surface", "rolling_ball_turntable")
+"""Systems with constraints that move by themselves."""
+
+
+def test_constraints_at_rest_do_no_work(evaluated):
+    """v . A^T lam = 0 where no row contains the time; otherwise it is not."""
+    entry, pairs = evaluated
+    led = entry.name in MOVED
+    for (_, _, v, _), rows in pairs if entry.constraints else []:
+        force = rows["constraint_force"]
+        rounding = K * EPS * norm(v) * norm(force)
+        assert (abs(v @ force) > 1e6 * rounding) == led
+        assert led or abs(v @ force) <= rounding

@@ -3,6 +3,8 @@
 import re
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -51,7 +53,7 @@ def test_numbered_places_are_in_the_order_of_the_book(places):
     found = [re.match(r"(\d)\.(\d+)", place) for place in places]
     numbers = [tuple(map(int, match.groups())) for match in found if match]
     assert numbers == sorted(numbers)
-    chapters = [re.findall(r"[23]", place)[0] for place in places]
+    chapters = [re.findall(r"[1-4]", place)[0] for place in places]
     assert chapters == sorted(chapters)
 
 
@@ -91,7 +93,7 @@ def test_a_right_formula_without_a_value_is_not_confirmed(value):
 
 def test_a_formula_of_another_shape_than_the_engine_s_is_refused():
     with pytest.raises(
-        ValueError, match=r"2\.18.* what the engine does, shape \(\), but it .*\(1,"
+        ValueError, match=r"1\.15.* what the engine does, shape \(\), but it .*\(3,"
     ):
         examine(replace(ERRATA[0], right=lambda s: s.q))
 
@@ -107,3 +109,40 @@ def test_states_are_drawn_around_what_is_given():
         assert np.all(np.abs(s.v - [0.5, 0.0]) <= 0.2)
         assert np.all(s.a == 0)
         assert s.values("m") == (s.params["m"],)
+
+
+def tricycle_as_printed(q, rates):
+    """(v, v_Y, v_R, phi') of eqs. 4.72 to 4.74, wheelbase 1.2."""
+    x, y, theta, phi = rates
+    cT, sT, cF, sF = jnp.cos(q[2]), jnp.sin(q[2]), jnp.cos(q[3]), jnp.sin(q[3])
+    return jnp.stack([(x * cT + y * sT) / cF, y * cT - x * sT, 1.2 * theta * cT * cF - x * sF, phi])
+
+
+def tricycle_Theta(q):
+    return jax.jacfwd(tricycle_as_printed, argnums=1)(q, jnp.zeros(4)).T
+
+
+def test_rows_of_the_tricycle_need_no_approximation():
+    """4.92: rows 1 and 4 of beta^T (Theta' - eta) on the constraints."""
+    assert "4.92" in dict(TEXT_ONLY)
+    rng = np.random.default_rng(2)
+    for theta, phi, v, phi_rate in rng.uniform(-1.2, 1.2, (5, 4)):
+        q = jnp.array([0.3, -0.2, theta, phi])
+        along, turn = v * np.cos(phi), v * np.sin(phi) / 1.2
+        rates = jnp.array([along * np.cos(theta), along * np.sin(theta), turn, phi_rate])
+        speeds = tricycle_as_printed(q, rates)
+        np.testing.assert_allclose(speeds, [v, 0.0, 0.0, phi_rate], rtol=1e-14, atol=1e-15)
+        Theta_rate = jax.jvp(tricycle_Theta, (q,), (rates,))[1]
+        eta = jax.jacfwd(tricycle_as_printed)(q, rates).T
+        rows = np.linalg.solve(tricycle_Theta(q), Theta_rate - eta)[[0, 3]]
+        slope, cT = np.tan(phi), np.cos(theta)
+        exact = [[phi_rate * slope, 0, -phi_rate * cT, 0], [-v * slope, 0, v * cT, 0]]
+        np.testing.assert_allclose(rows, exact, rtol=1e-13, atol=1e-14)
+
+
+def test_matrix_of_the_tricycle_is_singular_across_the_x_axis():
+    """4.74: its determinant is that of theta' in v_R, l cos(theta)."""
+    assert "4.74" in dict(TEXT_ONLY)
+    for theta in (0.0, 0.7, 0.5 * np.pi, -0.5 * np.pi):
+        det = np.linalg.det(tricycle_Theta(jnp.array([0.3, -0.2, theta, 0.4])))
+        np.testing.assert_allclose(abs(det), 1.2 * np.cos(theta), atol=1e-15)

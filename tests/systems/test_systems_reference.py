@@ -6,8 +6,10 @@ import re
 
 import numpy as np
 import pytest
-from _files import harmonic
+from _files import harmonic, recorded
 
+from systems._catalogue import ENTRIES
+from systems._check import replay, replay_rest
 from systems._fields import InvalidReference
 from systems._reference import load, read
 
@@ -143,15 +145,11 @@ REFUSED = [
 ]
 
 
-def test_cases_have_names_of_their_own():
+def test_names_that_occur_again_are_numbered():
     raw = as_parsed(harmonic())
-    raw["cases"] *= 2
-    with pytest.raises(
-        InvalidReference, match="cases must have distinct names, but 2 were called 'base'"
-    ):
-        read(raw)
-    raw["cases"] = [raw["cases"][0], raw["cases"][1] | {"name": "other"}]
-    assert [case.name for case in read(raw).cases] == ["base", "other"]
+    raw["cases"] *= 3
+    raw["cases"][1] = raw["cases"][1] | {"name": "other"}
+    assert [case.name for case in read(raw).cases] == ["base", "other", "base (2)"]
 
 
 @pytest.mark.parametrize(("place", "value", "message"), REFUSED)
@@ -197,3 +195,161 @@ def test_a_missing_file_is_refused(tmp_path):
         load(tmp_path / "none.json")
     with pytest.raises(InvalidReference, match="it must be readable, but Is a directory"):
         load(tmp_path)
+
+
+# ---- Constraints ---------------------------------------------------------------------------------
+
+
+def of(name):
+    """A file of the entry's example with a single row, as parsed."""
+    entry = ENTRIES[name]
+    start = [x[entry.file_columns] for x in entry.start()] if entry.kind == "trajectory" else []
+    params = {name: np.asarray(x) for name, x in entry.example.params.items()}
+    times = np.zeros(1)
+    motion = replay(entry, params, times, *start) if start else replay_rest(entry, params)
+    return as_parsed(recorded(entry, times, motion))
+
+
+@pytest.fixture(scope="module")
+def files(lowering):
+    names = (
+        *("double_pendulum_cartesian", "falling_stick_friction", "link_spring_mass_equilibrium"),
+        *("chaplygin_sleigh", "heavy_symmetric_top"),
+    )
+    return {name: of(name) for name in names}
+
+
+def test_multipliers_and_reactions_stand_in_the_order_of_the_rows(files):
+    raw = files["double_pendulum_cartesian"]
+    assert raw["constraints"] == ["string1", "string2"]
+    (case,) = read(raw).cases
+    assert case.fields["lambda"].shape == (1, 2)
+    assert case.fields["constraint_force"].shape == (1, 4)
+
+
+def test_quasi_velocities_stand_in_their_order_those_that_vanish_included(files):
+    raw = files["chaplygin_sleigh"]
+    assert raw["quasi_velocities"] == ["v", "v_n", "omega"]
+    assert raw["constraints"] == ["v_n"]
+    (case,) = read(raw).cases
+    assert case.fields["u"].shape == (1, 3)
+    assert case.fields["lambda"].shape == (1, 1)
+    (case,) = read(files["heavy_symmetric_top"]).cases
+    assert case.fields["u"].shape == (1, 3)
+    assert "lambda" not in case.fields
+
+
+def test_a_file_may_be_written_in_independent_coordinates(files):
+    """It says nothing of constraints then, nor of what belongs to all coordinates."""
+    raw = files["falling_stick_friction"]
+    assert raw["coordinates"] == ["x_c", "theta"]
+    assert raw["constraints"] == []
+    (case,) = read(raw).cases
+    assert {name: rows.shape for name, rows in case.fields.items()} == {
+        **dict.fromkeys("qva", (1, 2)),
+        **dict.fromkeys(("energy.T", "energy.V", "energy.E"), (1,)),
+        **dict.fromkeys(("extras.N", "extras.friction", "extras.contact_point_velocity_x"), (1,)),
+    }
+
+
+def test_a_state_of_rest_may_name_its_coordinates(files):
+    raw = files["link_spring_mass_equilibrium"]
+    assert raw["coordinates"] == ["theta"]
+    for more in ({}, {"coordinates_redundant": ["x", "y", "theta"]}):
+        (case,) = read(raw | more).cases
+        names = {"x", "y", "theta", "lambda1", "lambda2", "spring_force", "d2V_dtheta2"}
+        assert set(case.fields) == names
+
+
+SLEIGH = "chaplygin_sleigh"
+STRINGS = "double_pendulum_cartesian"
+STICK = "falling_stick_friction"
+LINK = "link_spring_mass_equilibrium"
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "message"),
+    [
+        (
+            STRINGS,
+            ("constraints",),
+            ["one"],
+            "constraints must be a list of 2 texts, one for each of string1, string2, but it was",
+        ),
+        (STRINGS, ("constraints",), [1.0, 2.0], "constraints must be a list of 2 texts, one for"),
+        (STRINGS, (*CASE, "lambda"), None, "lambda must be a finite number, but it was None."),
+        (STRINGS, (*CASE, "lambda"), [[1.0]], "lambda must have shape (1, 2), one row for each of"),
+        (
+            STRINGS,
+            (*CASE, "constraint_force"),
+            [[1.0, 2.0]],
+            "constraint_force must have shape (1, 4), one row for each of 1 times, but it had",
+        ),
+        (
+            STRINGS,
+            ("coordinates_redundant",),
+            ["x1", "y1", "x2", "y2"],
+            "coordinates_redundant must be left out, for double_pendulum_cartesian has none, but",
+        ),
+        (
+            STICK,
+            ("coordinates",),
+            ["x_c", "y_c", "theta"],
+            "coordinates must be ['x_c', 'theta'], but it was ['x_c', 'y_c', 'theta'].",
+        ),
+        (
+            STICK,
+            ("constraints",),
+            ["ground"],
+            "constraints must be [], for falling_stick_friction has none in its files, but it was",
+        ),
+        (
+            STICK,
+            (*CASE, "lambda"),
+            [[1.0]],
+            "lambda must be null, for falling_stick_friction has no constraints in its files, but",
+        ),
+        (
+            STICK,
+            (*CASE, "extras", "H"),
+            [1.0],
+            "extras must hold known fields only (N, contact_point_velocity_x, friction), but it",
+        ),
+        (
+            LINK,
+            ("coordinates_redundant",),
+            ["x", "y"],
+            "coordinates_redundant must be ['x', 'y', 'theta'], but it was ['x', 'y'].",
+        ),
+        (
+            LINK,
+            (*CASE, "q"),
+            [0.7],
+            "must hold known fields only (name, params, d2V_dtheta2, lambda1, lambda2, ",
+        ),
+        (
+            SLEIGH,
+            ("quasi_velocities",),
+            ["v", "omega"],
+            "quasi_velocities must be ['v', 'v_n', 'omega'], but it was ['v', 'omega'].",
+        ),
+        (SLEIGH, ("quasi_velocities",), [], "quasi_velocities must be ['v', 'v_n', 'omega'], but"),
+        (SLEIGH, (*CASE, "u"), None, "u must be a finite number, but it was None."),
+        (
+            SLEIGH,
+            (*CASE, "u"),
+            [[1.0, 2.0]],
+            "u must have shape (1, 3), one row for each of 1 times, but it had (1, 2).",
+        ),
+        (LINK, (*CASE, "lambda2"), None, "lambda2[0] must be a finite number, but it was None."),
+    ],
+)
+def test_a_departure_under_constraints_is_refused_by_name(name, place, value, message, files):
+    raw = copy.deepcopy(files[name])
+    *parents, last = place
+    target = raw
+    for key in parents:
+        target = target[key]
+    target[last] = value
+    with pytest.raises(InvalidReference, match=re.escape(message)):
+        read(raw)

@@ -1,0 +1,89 @@
+"""Momenta and forces, as methods in canonical variables see a system."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag._dynamics import Dynamics
+from jaxlag._errors import real_scalar
+from jaxlag._inputs import evaluate
+from jaxlag._step import Arguments
+
+
+class Canonical(eqx.Module):
+    """p = dL/dv,   p' = dL/dq + Q + A^T lam,   phi(t, q) = 0, at times t of the user.
+
+    Rows that follow from others are left out: their multiplier is 0.
+
+    Attributes:
+        dynamics: of the system.
+        args: within a step.
+    """
+
+    dynamics: Dynamics
+    args: Arguments
+
+    def time(self, tau: Float[Array, ""]) -> Float[Array, ""]:
+        """The user's time."""
+        return self.dynamics.mirror(tau, self.args)
+
+    @property
+    def rows(self) -> int:
+        """Number of constraint rows."""
+        return self.dynamics.rows.size
+
+    def canonical(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """(p, dL/dq + Q)."""
+        params, values = self._given(t, q, v)
+        lagrangian = real_scalar("lagrangian", self.dynamics.system.lagrangian)
+        slope, p = jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
+        if not self.dynamics.system.forces:
+            return p, slope
+        return p, slope + self.dynamics.terms.force(t, q, v, params, values)
+
+    def position(
+        self, t: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
+    ) -> Float[Array, " m"]:
+        """phi, or lam of a row that is left out."""
+        params, _ = self.dynamics.given(self.args)
+        return self._of_rows(self.dynamics.terms.position(t, q, params), lam)
+
+    def velocity(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        lam: Float[Array, " m"],
+    ) -> Float[Array, " m"]:
+        """A v + b, or lam of a row that is left out."""
+        params, _ = self.dynamics.given(self.args)
+        return self._of_rows(self.dynamics.terms.velocity(t, q, v, params), lam)
+
+    def reaction(
+        self, t: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
+    ) -> Float[Array, " n"]:
+        """A^T lam."""
+        if not self.rows:
+            return jnp.zeros_like(q)
+        params, _ = self.dynamics.given(self.args)
+        lam = self._of_rows(lam, jnp.zeros_like(lam))
+        return jax.vjp(lambda q: self.dynamics.terms.position(t, q, params), q)[1](lam)[0]
+
+    def power(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
+    ) -> Float[Array, " k"]:
+        """The terms of dH/dt."""
+        assert self.dynamics.power is not None
+        return jnp.stack(list(self.dynamics.power(t, q, v, *self._given(t, q, v)).values()))
+
+    def _given(self, t: Array, q: Array, v: Array) -> tuple[Any, Any]:
+        params, inputs = self.dynamics.given(self.args)
+        return params, evaluate(inputs, t, q, v, params, self.args.intervals)
+
+    def _of_rows(self, kept: Array, other: Array) -> Array:
+        return kept if self.args.kept is None else jnp.where(self.args.kept, kept, other)

@@ -1,0 +1,189 @@
+"""Which numbers of params are to be found, and how the unknowns of an optimiser make them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlag._errors import bad
+from jaxlag._transforms import AbstractTransform, Free
+
+
+class Prior(eqx.Module):
+    """A Gaussian prior: the parameter is mean +- sigma.
+
+    Args:
+        mean: in the unit of the parameter; a number or the leaf's shape.
+        sigma: its standard deviation, likewise, positive.
+
+    Raises:
+        ValueError: a sigma that is not positive.
+    """
+
+    mean: np.ndarray
+    sigma: np.ndarray
+
+    def __init__(self, mean: Any, sigma: Any) -> None:
+        self.mean, self.sigma = np.asarray(mean, float), np.asarray(sigma, float)
+        if not np.all(self.sigma > 0):
+            raise bad("Prior: sigma", "be positive", f"it was {sigma}")
+
+
+def paths(params: Any) -> list[str]:
+    """Names of the leaves: "m", "link.mass", "links[0].mass"."""
+    found = jax.tree_util.tree_leaves_with_path(params)
+    return [_name(path) for path, _ in found]
+
+
+def _name(path: Any) -> str:
+    parts = ""
+    for key in path:
+        if isinstance(key, jax.tree_util.SequenceKey):
+            parts += f"[{key.idx}]"
+        else:
+            word = jax.tree_util.keystr((key,), simple=True)
+            parts += f".{word}" if parts else word
+    return parts or "params"
+
+
+class Leaf(NamedTuple):
+    """One leaf that is to be found.
+
+    Attributes:
+        name: its path in params.
+        index: among the leaves of params.
+        shape: its shape.
+        transform: from its unknowns.
+        first: of its unknowns, among all.
+        indices: of the numbers in it, as many as it has unknowns.
+    """
+
+    name: str
+    index: int
+    shape: tuple[int, ...]
+    transform: AbstractTransform
+    first: int
+    indices: tuple[tuple[int, ...], ...]
+
+
+class Unknowns(eqx.Module):
+    """The map z -> params: u = u0 + scale z, each leaf `transform.value(u)`, the others as given.
+
+    Attributes:
+        leaves: those that are to be found.
+        params0: all params.
+        u0: unconstrained numbers that make params0, (p,).
+        scale: (p,), by which z is multiplied.
+        reach: (p,), how far z may go in one step: logarithms are no longer linear beyond 1.
+        on_bound: names of leaves that started on a bound.
+    """
+
+    leaves: tuple[Leaf, ...] = eqx.field(static=True)
+    params0: Any
+    u0: np.ndarray
+    scale: np.ndarray
+    reach: np.ndarray
+    on_bound: tuple[str, ...] = eqx.field(static=True)
+
+    def params(self, z: Float[Array, " p"]) -> Any:
+        """All params at z."""
+        u = jnp.asarray(self.u0) + jnp.asarray(self.scale) * z
+        leaves, treedef = jax.tree.flatten(self.params0)
+        for leaf in self.leaves:
+            own = u[leaf.first : leaf.first + len(leaf.indices)]
+            leaves[leaf.index] = leaf.transform.value(own, leaf.shape)
+        return jax.tree.unflatten(treedef, leaves)
+
+    def numbers(self, z: Float[Array, " p"]) -> Float[Array, " e"]:
+        """The numbers that are to be found, in their own units: as many as there are unknowns."""
+        leaves = jax.tree.leaves(self.params(z))
+        own = [leaves[leaf.index][index] for leaf in self.leaves for index in leaf.indices]
+        return jnp.stack(own) if own else jnp.zeros(0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the numbers: "m", "I[0,0]"."""
+        return tuple(
+            leaf.name + (f"[{','.join(map(str, index))}]" if leaf.shape else "")
+            for leaf in self.leaves
+            for index in leaf.indices
+        )
+
+
+def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -> Unknowns:
+    """The unknowns of the leaves that `free` names, by their own name or by that of a branch.
+
+    Raises:
+        ValueError: a name of nothing, a leaf that holds no real numbers, or a transform of a leaf
+            that is not free.
+    """
+    if isinstance(free, str):
+        raise bad("free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},).")
+    names, values = paths(params0), jax.tree.leaves(params0)
+    chosen: dict[int, None] = {}
+    for name in free:
+        branch = f"{name}.", f"{name}["
+        below = [i for i, path in enumerate(names) if path == name or path.startswith(branch)]
+        if not below:
+            raise bad("free", f"name parameters among {names}", f"one was {name!r}")
+        chosen |= dict.fromkeys(below)
+    for name, transform in transforms.items():
+        if name not in [names[i] for i in chosen]:
+            free_names = [names[i] for i in chosen]
+            raise bad("transforms", f"be of free parameters {free_names}", f"one was of {name!r}")
+        if not isinstance(transform, AbstractTransform):
+            must = "be a transform such as jl.Positive()"
+            raise bad(f"transforms[{name!r}]", must, f"it was {transform!r}")
+    leaves, starts, scales, reaches, on_bound = [], [], [], [], []
+    k = 0
+    for i in sorted(chosen):
+        value = np.asarray(values[i])
+        if not np.issubdtype(value.dtype, np.floating):
+            must = "hold real numbers to be found"
+            raise bad(f"params0[{names[i]!r}]", must, f"it was {values[i]!r}", "Write 1.0 for 1.")
+        transform = transforms.get(names[i], Free())
+        u, bound = transform.start(names[i], value)
+        on_bound += [names[i]] * bound
+        indices = transform.entries(value.shape)
+        leaves.append(Leaf(names[i], i, value.shape, transform, k, indices))
+        starts.append(u)
+        # Unknowns of order one: numbers as multiples of what they start at, logarithms as they are.
+        plain = isinstance(transform, Free)
+        scales.append(np.where(u == 0, 1.0, np.abs(u)) if plain else np.ones(len(u)))
+        reaches.append(np.full(len(u), np.inf if plain else 1.0))
+        k += len(u)
+    parts = starts, scales, reaches
+    u0, scale, reach = (np.concatenate(x) if leaves else np.zeros(0) for x in parts)
+    params0 = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, params0)
+    return Unknowns(tuple(leaves), params0, u0, scale, reach, tuple(on_bound))
+
+
+def prior_rows(
+    free: Unknowns, priors: Mapping[str, Prior]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(which of the numbers, means, sigmas) that are known beforehand.
+
+    Raises:
+        ValueError: a prior of a parameter that is not free, or of another shape.
+    """
+    which, means, sigmas = [], [], []
+    by_name = {leaf.name: leaf for leaf in free.leaves}
+    for name, prior in priors.items():
+        if name not in by_name:
+            raise bad("priors", f"be of free parameters {list(by_name)}", f"one was of {name!r}")
+        leaf = by_name[name]
+        try:
+            mean, sigma = (np.broadcast_to(x, leaf.shape) for x in (prior.mean, prior.sigma))
+        except ValueError:
+            must = f"be numbers or of shape {leaf.shape}"
+            raise bad(f"priors[{name!r}]", must, f"its mean had {prior.mean.shape}") from None
+        which += range(leaf.first, leaf.first + len(leaf.indices))
+        means.append(np.array([mean[index] for index in leaf.indices]))
+        sigmas.append(np.array([sigma[index] for index in leaf.indices]))
+    if not which:
+        return np.zeros(0, int), np.zeros(0), np.zeros(0)
+    return np.array(which), np.concatenate(means), np.concatenate(sigmas)

@@ -1,0 +1,77 @@
+"""What a derivative keeps of the steps: the choice, its memory, its name."""
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+from jaxlag._errors import bad
+
+MODES = ("auto", "forward", "recorded", "checkpoints")
+# States that "auto" keeps: as many steps go backwards without any taken again, and what they
+# take fits into the caches of a processor for 16 lanes at once.
+ROOM = 512
+
+
+class GradientMode(IntEnum):
+    """How reverse derivatives go through the steps, stored as int32 in `stats["gradient"]`.
+
+    `none` is that of a motion of which no derivative is taken.
+    """
+
+    none = 0
+    forward = 1
+    recorded = 2
+    checkpoints = 3
+
+
+class Keep(NamedTuple):
+    """What is kept for derivatives.
+
+    Attributes:
+        mode: one of `MODES`.
+        room: for states on the way; 0 in forward mode.
+    """
+
+    mode: str
+    room: int
+
+
+def choose_gradient(
+    mode: str, memory: int | float | None, max_steps: int, state: int, itemsize: int
+) -> Keep:
+    """What to keep of `max_steps` steps.
+
+    Args:
+        mode: as asked for.
+        memory: bytes that one trajectory may keep; None for no bound.
+        max_steps: bound on the steps.
+        state: numbers in a state.
+        itemsize: bytes of a number.
+    """
+    least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
+    rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
+    needs = {
+        name: needed(room, max_steps, state, itemsize)
+        for name, room in sorted(rooms.items(), key=lambda item: -item[1])
+    }
+    if mode == "auto":
+        room = min(ROOM, rooms["recorded"])
+        if memory is None or needed(room, max_steps, state, itemsize) <= memory:
+            return Keep(mode, room)
+        fitting = [name for name, need in needs.items() if need <= memory]
+        if fitting:
+            return Keep(mode, rooms[fitting[0]])
+        must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
+        raise bad("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
+    if memory is not None and needs[mode] > memory:
+        fits = [f"{name!r} ({need} bytes)" for name, need in needs.items() if need <= memory]
+        fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
+        must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"
+        raise bad("gradient_memory", must, f"it was {memory}", fix)
+    return Keep(mode, rooms[mode])
+
+
+def needed(room: int, max_steps: int, state: int, itemsize: int) -> int:
+    """Bytes kept of one trajectory: times of all steps, states at points and between two."""
+    states = room + 1 + math.ceil(max_steps / room) if room else 0
+    return max_steps * 8 + states * state * itemsize

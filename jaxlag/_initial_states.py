@@ -1,0 +1,121 @@
+"""States that were measured, roughly: where a search for them starts."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlag._errors import bad
+from jaxlag._experiment import Experiment
+from jaxlag._simulate import simulate
+from jaxlag._system import System
+
+FEWEST = 5
+"""Rows through which a parabola is laid to find a value and a slope, at the least."""
+SHARE = 50
+"""A parabola spans this part of the rows of a recording."""
+
+
+def initial_states(
+    system: System,
+    experiment: Experiment,
+    rows: Sequence[int],
+    params: Any,
+    options: dict[str, Any],
+) -> np.ndarray:
+    """(q, v), or (q, u) of those that are not constrained, at some rows, (r, d).
+
+    Coordinates and rates as q0 and v0 along the recording say, or else as measured, rates from
+    slopes; what was not measured, by a simulation from q0 and v0 with the params of the guess.
+
+    Raises:
+        ValueError: a coordinate was not measured, and there is no q0 or v0 to simulate from.
+    """
+    q, v = (_along(system, experiment, rows, kind) for kind in ("q0", "v0"))
+    if np.isnan(q).any() or np.isnan(v).any():
+        motion = _simulated(system, experiment, params, options, q, v)
+        q = np.where(np.isnan(q), np.asarray(motion.q)[rows], q)
+        v = np.where(np.isnan(v), np.asarray(motion.v)[rows], v)
+    if system.quasi is None:
+        return np.concatenate([q, v], axis=1)
+    given = experiment.v0
+    if given is not None and given.shape[-1] == len(system.quasi.names) and given.ndim == 2:
+        u = given[rows]
+    else:
+        times = jnp.asarray(experiment.ts[list(rows)])
+        of = jax.vmap(lambda q, v, t: system.quasi_velocities(params, q, v, t))
+        u = np.asarray(of(jnp.asarray(q), jnp.asarray(v), times))
+    return np.concatenate([q, u[:, list(system.quasi.free)]], axis=1)
+
+
+def _along(system: System, experiment: Experiment, rows: Sequence[int], kind: str) -> np.ndarray:
+    """Coordinates ("q0") or velocities ("v0") at the rows; NaN where they are not known."""
+    given = experiment.q0 if kind == "q0" else experiment.v0
+    n = system.size
+    if given is not None and given.ndim == 2 and given.shape[1] == n:
+        return given[list(rows)]
+    found = np.full((len(rows), n), np.nan)
+    place = 0
+    for name, shape in system.coordinates.shapes.items():
+        width = int(np.prod(shape))
+        part = slice(place, place + width)
+        place += width
+        rate = experiment.channels.get(f"{name}'")
+        value = experiment.channels.get(name)
+        if kind == "v0" and rate is not None:
+            found[:, part] = [_parabola(experiment.ts, rate, row)[0] for row in rows]
+        elif value is not None:
+            which = 0 if kind == "q0" else 1
+            found[:, part] = [_parabola(experiment.ts, value, row)[which] for row in rows]
+    if given is not None and given.ndim == 1 and given.shape[0] == n and rows and rows[0] == 0:
+        found[0] = given
+    return found
+
+
+def _parabola(ts: np.ndarray, x: np.ndarray, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slope at a row, of parabolas through the nearest rows that were measured."""
+    known = np.flatnonzero(np.isfinite(x).all(axis=1))
+    count = min(len(known), max(FEWEST, len(ts) // SHARE))
+    near = known[np.argsort(np.abs(known - row), kind="stable")[:count]]
+    t = ts[near] - ts[row]
+    degree = min(2, len(near) - 1)
+    coefficients = np.polyfit(t, x[near], degree)
+    slope = coefficients[-2] if degree else np.zeros(x.shape[1])
+    return coefficients[-1], slope
+
+
+def _simulated(
+    system: System,
+    experiment: Experiment,
+    params: Any,
+    options: dict[str, Any],
+    q: np.ndarray,
+    v: np.ndarray,
+) -> Any:
+    labels = np.array(system.coordinates.labels)
+    q0 = experiment.q0 if experiment.q0 is not None else q[0]
+    v0 = experiment.v0 if experiment.v0 is not None else v[0]
+    q0, v0 = (x if x.ndim == 1 else x[0] for x in (q0, v0))
+    missing = np.isnan(q0)
+    if missing.any():
+        fix = f"Pass {experiment.name} a q0 and v0: where the search for them starts."
+        must = "be among the channels or in q0"
+        raise bad("coordinates", must, f"{labels[missing].tolist()} were not", fix)
+    start: dict[str, Any] = {"v0": v0}
+    if len(v0) != system.size:
+        start = {"u0": v0}
+    elif np.isnan(v0).any():
+        fix = f"Pass {experiment.name} a v0."
+        raise bad("velocities", "follow from the channels or v0", "some did not", fix)
+    ts, inputs = experiment.ts, experiment.inputs
+    return simulate(
+        system, q0, ts=ts, params=params, inputs=inputs, throw=False, **start, **options
+    )
+
+
+def typical(states: np.ndarray) -> np.ndarray:
+    """How far states range, (d,): their standard deviations, 1 where they do not."""
+    found = np.where(np.isfinite(states), states, 0.0).std(axis=0)
+    return np.where(found > 1e-6 * np.max(np.abs(states), axis=0, initial=0.0), found, 1.0)

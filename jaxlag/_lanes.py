@@ -1,0 +1,137 @@
+"""Many trajectories at once: what `jax.vmap` of a solve becomes.
+
+On CPU a loop over a few numbers at once is compiled to vector instructions, one over thousands
+to a traversal of memory for every operation. A vmapped solve is therefore run in chunks of
+trajectories, one chunk after another, each by one loop that ends with its last trajectory.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+from jaxtyping import PyTree
+
+LANES = 16
+
+
+def in_lanes(single: Callable, vmapped: Callable, *args: PyTree) -> PyTree:
+    """single(*args), and under `jax.vmap` chunks of `vmapped`.
+
+    No derivative is taken: that of the results is zero.
+
+    Args:
+        single: of arrays, returns arrays.
+        vmapped: the same function, in the form to be vmapped over up to LANES trajectories.
+        args: pytrees of arrays.
+    """
+
+    @jax.custom_jvp
+    def constant(args: tuple) -> PyTree:
+        return batched(args)
+
+    @constant.defjvp
+    def _(primals: tuple, _: tuple) -> tuple:
+        results = constant(*primals)
+        return results, jax.tree.map(zero_tangent, results)
+
+    @custom_vmap
+    def batched(args: tuple) -> PyTree:
+        return single(*args)
+
+    @batched.def_vmap
+    def _(size: int, mapped: list, args: tuple) -> tuple:
+        own, shared = eqx.partition(args, mapped[0])
+        results = _batch(vmapped, size)(own, shared)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return constant(args)
+
+
+def _batch(vmapped: Callable, size: int) -> Callable:
+    """(own, shared) -> results of `size` trajectories; own leaves have one row for each.
+
+    A further vmap makes more rows.
+    """
+
+    @custom_vmap
+    def rows(own: PyTree, shared: PyTree) -> PyTree:
+        def one(own: PyTree) -> PyTree:
+            return vmapped(*eqx.combine(own, shared))
+
+        return in_batches(one, own, size, LANES, even=False)
+
+    @rows.def_vmap
+    def _(outer: int, mapped: list, own: PyTree, shared: PyTree) -> tuple:
+        def flat(leaf: Any, is_mapped: bool) -> Any:
+            leaf = leaf if is_mapped else jnp.broadcast_to(leaf, (outer, *leaf.shape))
+            return leaf.reshape(outer * size, *leaf.shape[2:])
+
+        def spread(leaf: Any) -> Any:
+            return jnp.repeat(leaf, size, axis=0)
+
+        more, fewer = eqx.partition(shared, mapped[1])
+        own = eqx.combine(jax.tree.map(flat, own, mapped[0]), jax.tree.map(spread, more))
+        results = _batch(vmapped, outer * size)(own, fewer)
+        results = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), results)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return rows
+
+
+def in_batches(
+    function: Callable, rows: PyTree, count: int, at_once: int, even: bool = True
+) -> PyTree:
+    """The vmapped function over `count` rows, up to `at_once` at a time.
+
+    Args:
+        function: of one row.
+        rows: leaves (count, ...).
+        count: number of rows.
+        at_once: the largest batch.
+        even: whether batches may be smaller to be equal; else all have `at_once` rows. The last
+            row fills the last batch up.
+    """
+    if count <= at_once:
+        return jax.vmap(function)(rows)
+    batches = -(-count // at_once)
+    size = -(-count // batches) if even else at_once
+    filled = jnp.minimum(jnp.arange(batches * size), count - 1)
+    parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), rows)
+    results = lax.map(jax.vmap(function), parts)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], results)
+
+
+def lanes_first(tree: PyTree) -> PyTree:
+    """The same values, with the axis of a vmap in front.
+
+    JAX takes the results of a `custom_jvp` function and of its rule to have it in one place.
+    """
+
+    @jax.custom_jvp
+    def same(x: Any) -> Any:
+        return placed(x)
+
+    @same.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple:
+        return same(*primals), tangents[0]
+
+    @custom_vmap
+    def placed(x: Any) -> Any:
+        return x
+
+    @placed.def_vmap
+    def _(_: int, mapped: list, x: Any) -> tuple:
+        return x, mapped[0]
+
+    return jax.tree.map(same, tree)
+
+
+def zero_tangent(x: Any) -> Any:
+    """The tangent of a constant."""
+    if jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.zeros_like(x)
+    return jnp.zeros(x.shape, jax.dtypes.float0)

@@ -1,0 +1,96 @@
+"""Straight-line code as a function that XLA does not inline, with derivatives of the same kind.
+
+In a loop of steps every stage evaluates the accelerations, and backwards every stage evaluates
+their transposed derivative. Copied into the loop XLA's fusion would compute shared lines anew in
+each use. The derivatives start from the arguments again, but for sines and cosines: these are most
+of the work, and few numbers to keep.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array
+
+from jaxlag._linear import LinearMap, linear
+from jaxlag._lowering._program import Program
+from jaxlag._lowering._straight import Pairs, elements, is_trig, straight
+from jaxlag._xla import not_inlined
+
+Row = tuple[Array, Array]  # (what does not change during a solve, state and inputs)
+
+
+@lru_cache(maxsize=256)
+def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array], Array]:
+    """(what does not change, state and inputs) -> results, each in one row."""
+    slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
+
+    def both(row: Row, kept: Array | None = None) -> tuple[Array, Array]:
+        """Results, and the sines and cosines they are made from, which may be known."""
+        pairs: Pairs = {}
+        known: Pairs | None = None
+        if kept is not None:
+            x = elements(kept)
+            known = {slot: (x[2 * i], x[2 * i + 1]) for i, slot in enumerate(slots)}
+        given = elements(row[0]), elements(row[1])
+        found = jnp.stack(straight(program, dtype, *given, lanes, pairs, known))
+        trig = [x for slot in slots for x in pairs[slot]]
+        return found, jnp.stack(trig) if trig else jnp.zeros((0,), dtype)
+
+    def results(row: Row) -> Array:
+        return jnp.stack(straight(program, dtype, elements(row[0]), elements(row[1]), lanes))
+
+    @jax.custom_jvp
+    def call(carried: Array, given: Array) -> Array:
+        return apart((carried, given))
+
+    @partial(call.defjvp, symbolic_zeros=True)
+    def _(primals: Row, tangents: tuple) -> tuple:
+        found, kept = keeping(*primals)
+        return found, _derivative(of_results, (primals, kept), tangents, found)
+
+    @jax.custom_jvp
+    def keeping(carried: Array, given: Array) -> tuple[Array, Array]:
+        return both_apart((carried, given))
+
+    @partial(keeping.defjvp, symbolic_zeros=True)
+    def _(primals: Row, tangents: tuple) -> tuple:
+        found, kept = keeping(*primals)
+        return (found, kept), _derivative(of_both, (primals, kept), tangents, (found, kept))
+
+    apart, both_apart = not_inlined(results), not_inlined(both)
+    of_results, of_both = _maps(lambda row, kept: both(row, kept)[0]), _maps(both)
+    return call
+
+
+def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:
+    dot = tuple(None if isinstance(x, SymbolicZero) else x for x in tangents)
+    which = tuple(x is not None for x in dot)
+    if not any(which):
+        return jax.tree.map(jnp.zeros_like, like)
+    return linear(maps[which], at, dot)
+
+
+def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
+    """The derivative of function(row, kept) in the row, by which halves of it move."""
+
+    def pushed(at: tuple, dot: tuple) -> Any:
+        row, kept = at
+        filled = tuple(jnp.zeros_like(x) if d is None else d for x, d in zip(row, dot, strict=True))
+        return jax.jvp(lambda row: function(row, kept), (row,), (filled,))[1]
+
+    def pulled(which: tuple[bool, bool]) -> Callable:
+        def of(at: tuple, bar: Any) -> tuple:
+            row, kept = at
+            parts = jax.vjp(lambda row: function(row, kept), row)[1](bar)[0]
+            return tuple(x if moves else None for x, moves in zip(parts, which, strict=True))
+
+        return of
+
+    return {
+        which: LinearMap(not_inlined(pushed), not_inlined(pulled(which)), pushed, at_once=None)
+        for which in ((True, True), (False, True), (True, False))
+    }

@@ -1,0 +1,238 @@
+"""A scalar program against the array program, at random states and without compiling."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlag._forces import reads_lam
+from jaxlag._kkt import augmented
+from jaxlag._lowering._array import ArrayTerms
+from jaxlag._lowering._evaluate import evaluate
+from jaxlag._lowering._interpret import interpret
+from jaxlag._lowering._key import Key, traced
+from jaxlag._lowering._rows import layout_of
+from jaxlag._lowering._scene import Equations
+
+STATES = 8  # random states at which both programs are compared
+SLACK = 1e4  # of roundings, between two ways to compute one acceleration
+
+
+def compare(key: Key, equations: Equations, known: list | None) -> tuple[int, float]:
+    """(states compared, worst difference in units of SLACK roundings) of what a program gives.
+
+    At random states, with the known params or random ones; where they are known, at half as many
+    more with random ones, since what is known may be special: those do not count. States where the
+    array program is not finite, or ill-conditioned, are left out.
+    """
+    expected = _Plain(key) if key.quasi is None else _Quasi(key)
+    rng = np.random.default_rng(0)
+    n = key.size
+    speeds = n if key.quasi is None else len(key.quasi.free)
+    like, given = jax.tree.leaves(key.params.tree), jax.tree.leaves(key.inputs.tree)
+    compared, worst = 0, 0.0
+    for state in range(STATES + STATES // 2 if known else STATES):
+        t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
+        drawn = [rng.uniform(0.5, 1.5, leaf.shape) for leaf in like]
+        params = [np.asarray(x) for x in known] if known and state < STATES else drawn
+        inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
+        values: dict[tuple[str, int], Any] = {("t", 0): t, ("sense", 0): 1.0}
+        for name, rows in (("q", [q]), ("v", [v]), ("params", params), ("inputs", inputs)):
+            flat = np.concatenate([np.ravel(x) for x in rows]) if rows else []
+            values |= {(name, i): x for i, x in enumerate(flat)}
+        right = expected(t, q, v, params, inputs)
+        if right is None:
+            continue
+        values |= {("kept", k): float(x) for k, x in enumerate(right.kept)}
+        found = np.array([float(x) for x in evaluate(equations.accelerations, values)])
+        compared += state < STATES
+        off = float(np.max(np.abs(found - right.x) / right.allowed, initial=0.0))
+        if not np.isfinite(off):  # max() would pass nan over
+            return compared, np.inf
+        worst = max(worst, off)
+    return compared, worst
+
+
+class _Right(NamedTuple):
+    """What the array program gives, how far off a sound program may be, and the rows kept."""
+
+    x: np.ndarray
+    allowed: Any
+    kept: Any = ()
+
+
+def _solved(key: Key, M: Any, right: Any) -> tuple[Any, float] | None:
+    """(x with M x = right, how far off another way to it may be); None where that means little."""
+    if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
+        return None
+    if not np.linalg.cond(M) < 1e9:
+        return None
+    x = np.linalg.solve(M, right)
+    size = np.linalg.norm(right) + np.linalg.norm(M) * np.linalg.norm(x) + 1.0
+    eps = float(jnp.finfo(key.dtype).eps)
+    return x, float(SLACK * eps * size * np.linalg.norm(np.linalg.inv(M)))
+
+
+def _definite(M: Any) -> bool:
+    """Whether M is finite and clearly positive definite."""
+    if not np.all(np.isfinite(M)):
+        return False
+    return bool(np.min(np.linalg.eigvalsh(M), initial=1.0) > 1e-9 * np.linalg.norm(M))
+
+
+class _Plain:
+    """The accelerations a with M a + h = Q + A^T lam, A a + gamma = 0."""
+
+    def __init__(self, key: Key) -> None:
+        terms = ArrayTerms(key.lagrangian, key.forces, key.constraints, baumgarte=key.baumgarte)
+        self.key = key
+        self.mass, self.bias = (traced(key, f, False) for f in (terms.mass, terms.bias))
+        self.force = traced(key, terms.force, True) if key.forces else None
+        self.bound = []
+        if key.constraints:
+            self.bound = [traced(key, f, False) for f in (terms.rows, terms.gamma)]
+        self.felt = _slopes(key, terms) if any(map(reads_lam, key.forces)) else None
+
+    def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
+        n = self.key.size
+        (M,) = interpret(self.mass, t, q, v, *params)
+        (right,) = interpret(self.bias, t, q, v, *params)
+        right = -right
+        if self.force is not None:
+            (Q,) = interpret(self.force, t, q, v, *params, *inputs)
+            right = Q + right
+        if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
+            return None
+        kept: Any = ()
+        if self.bound:
+            (A, _), (gamma,) = (interpret(f, t, q, v, *params) for f in self.bound)
+            kept = _independent(A)
+            if not _definite(M if self.key.regular else _augmented(M, A[kept])):
+                return None
+            G = np.zeros((n, len(A)))
+            if self.felt is not None:
+                rest, G = interpret(self.felt, t, q, v, *params, *inputs, np.zeros(len(A)))
+                right = right + rest
+            M, right = _bordered(M, A[kept], right, gamma[kept], G[:, kept])
+            if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
+                return None
+        elif not _definite(M):
+            return None
+        found = _solved(self.key, M, right)
+        return None if found is None else _Right(found[0][:n], found[1], kept)
+
+
+class _Quasi:
+    """v and u' with B^T M B u' = B^T (Q - h - M s), v = B u + c and s = v' at u' = 0."""
+
+    def __init__(self, key: Key) -> None:
+        terms, quasi = ArrayTerms(key.lagrangian, key.forces), key.quasi
+        assert quasi is not None
+        self.key, self.quasi = key, quasi
+        self.mass, self.bias = (traced(key, f, False) for f in (terms.mass, terms.bias))
+        self.force = traced(key, terms.force, True) if key.forces else None
+        if quasi.kinematics is None:
+            self.slopes = traced(key, _slopes_of(quasi.of), False)
+            self.drift = traced(key, _drift_of(quasi.of, lambda t, q, v, params: v), False)
+        else:
+            V, speeds = quasi.velocities, quasi.size
+            self.slopes = traced(key, _slopes_of(V), False, speeds=speeds)
+            self.drift = traced(key, _drift_of(V, V), False, speeds=speeds)
+
+    def __call__(self, t: Any, q: Any, w: Any, params: list, inputs: list) -> _Right | None:
+        u = np.zeros(self.quasi.size)
+        u[self.quasi.free] = w
+        if self.quasi.kinematics is None:
+            theta, theta_0 = interpret(self.slopes, t, q, np.zeros(self.key.size), *params)
+            inverted = _solved(self.key, theta, u - theta_0)
+            if inverted is None:
+                return None
+            v, allowed = inverted
+            (turn,) = interpret(self.drift, t, q, v, *params)
+            B, s = np.linalg.inv(theta), np.linalg.solve(theta, -turn)
+        else:
+            B, c = interpret(self.slopes, t, q, np.zeros_like(u), *params)
+            v, (s,) = B @ u + c, interpret(self.drift, t, q, u, *params)
+            allowed = SLACK * float(jnp.finfo(self.key.dtype).eps) * (1.0 + np.linalg.norm(v))
+        B = B[:, self.quasi.free]
+        (M,) = interpret(self.mass, t, q, v, *params)
+        (h,) = interpret(self.bias, t, q, v, *params)
+        Q = interpret(self.force, t, q, v, *params, *inputs)[0] if self.force is not None else 0.0
+        reduced = B.T @ M @ B
+        if not _definite(reduced):
+            return None
+        found = _solved(self.key, reduced, B.T @ (Q - h - M @ s))
+        if found is None:
+            return None
+        # What is projected is larger than what is left of it, and B has errors of its own.
+        parts = np.linalg.norm(Q) + np.linalg.norm(h) + np.linalg.norm(M) * np.linalg.norm(s)
+        eps, size = float(jnp.finfo(self.key.dtype).eps), np.linalg.norm(B)
+        more = SLACK * eps * parts * size * np.linalg.norm(np.linalg.inv(reduced))
+        limits = [np.full(len(v), allowed), np.full(len(w), found[1] + more * (1.0 + size))]
+        return _Right(np.concatenate([v, found[0]]), np.concatenate(limits))
+
+
+def _slopes_of(function: Callable) -> Callable:
+    """(slopes in the third argument, value where it is zero) of an affine function of it."""
+
+    def slopes(t: Any, q: Any, x: Any, params: Any) -> Any:
+        return jax.jacfwd(lambda x: function(t, q, x, params))(x), function(t, q, 0.0 * x, params)
+
+    return slopes
+
+
+def _drift_of(function: Callable, velocity: Callable) -> Callable:
+    """The rate of a function of (t, q, x, params) along (1, velocity) at fixed x."""
+
+    def drift(t: Any, q: Any, x: Any, params: Any) -> Any:
+        along = jnp.ones_like(t), velocity(t, q, x, params)
+        return jax.jvp(lambda t, q: function(t, q, x, params), (t, q), along)[1]
+
+    return drift
+
+
+def _slopes(key: Key, terms: ArrayTerms) -> Any:
+    """The jaxpr of (Q_0, G) of the forces Q_0 + G lam."""
+
+    def affine(t: Any, q: Any, v: Any, params: Any, inputs: Any, lam: Any) -> Any:
+        def push(lam: Any) -> Any:
+            return terms.reactive(t, q, v, params, inputs, lam)
+
+        return push(lam), jax.jacfwd(push)(lam)
+
+    m = layout_of(key.constraints, key.params, key.static, key.size, key.dtype).size
+    return traced(key, affine, True, m)
+
+
+def _bordered(M: Any, A: Any, r: Any, c: Any, G: Any) -> tuple[Any, Any]:
+    """[M, A^T + G; A, 0] and (r, -c), for the unknowns (a, -lam)."""
+    none = np.zeros((len(A), len(A)))
+    return np.block([[M, A.T + G], [A, none]]), np.concatenate([r, -c])
+
+
+def _pressing(whole: Any, n: int) -> Any:
+    """[M + A^T A, -(A^T + G); A, 0], of a positive determinant where rows press as they should."""
+    whole = whole.copy()
+    A = whole[n:, :n]
+    whole[:n, :n] += A.T @ A
+    whole[:n, n:] *= -1.0
+    return whole
+
+
+def _augmented(M: Any, A: Any) -> np.ndarray:
+    """What the scalar program divides by where M may be singular, in numbers while tracing."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(augmented(jnp.asarray(M), jnp.asarray(A))[0])
+
+
+def _independent(A: Any) -> np.ndarray:
+    """A largest set of clearly independent rows."""
+    kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
+    for k, row in enumerate(A):
+        rest = row - (Y @ row) @ Y
+        size = np.linalg.norm(rest)
+        if size > 1e-3 * np.linalg.norm(row):
+            kept[k], Y = True, np.vstack([Y, rest / size])
+    return kept

@@ -1,0 +1,137 @@
+"""M and h from L on the graph, in several forms."""
+
+from collections.abc import Callable, Sequence
+
+from jaxlag._lowering._diff import gradient, tangents
+from jaxlag._lowering._expand import TooLong
+from jaxlag._lowering._graph import Graph, Node, dependencies, order, substitute
+from jaxlag._lowering._program import assemble
+from jaxlag._lowering._scene import Scene
+
+
+def attempt(make: Callable) -> list[Node] | None:
+    """What `make` returns, None where a polynomial grows too long."""
+    try:
+        return make()
+    except TooLong:
+        return None
+
+
+def mass_matrix(graph: Graph, L: Node, v: Sequence[Node]) -> list[list[Node]]:
+    """M_ij = d2L/dv_i dv_j, symmetric by construction."""
+    momentum = gradient(graph, L, v)
+    n = len(v)
+    M: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
+    for j, x in enumerate(v):
+        column = tangents(graph, momentum[j:], {x: graph.one})
+        for i in range(j, n):
+            M[i][j] = M[j][i] = column[i - j]
+    return M
+
+
+def momentum_form(scene: Scene, L: Node) -> list[Node]:
+    """h = (dp/dq) v + dp/dt - dL/dq by one derivative of p along the motion."""
+    graph = scene.graph
+    momentum = gradient(graph, L, scene.v)
+    seeds = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: graph.one}
+    rate = tangents(graph, momentum, seeds)
+    pull = gradient(graph, L, scene.q)
+    return [graph.sub(a, b) for a, b in zip(rate, pull, strict=True)]
+
+
+def christoffel_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
+    """h_i = sum_jk (dM_ij/dq_k - dM_jk/dq_i / 2) v_j v_k + the rest of L, for M free of v.
+
+    The rest, L - v.Mv/2, is linear in v: c . v + L_0, with c and L_0 read off at v = 0. With
+    time in M or c, dM/dt v + dc/dt join in.
+    """
+    graph, n = scene.graph, len(scene.q)
+    at_rest = dict.fromkeys(scene.v, graph.zero)
+    L_0 = substitute(graph, [L], at_rest)[0]
+    c = substitute(graph, gradient(graph, L, scene.v), at_rest)
+    flat = [M[i][j] for i in range(n) for j in range(i + 1)]
+
+    def full(packed: Sequence[Node]) -> list[list[Node]]:
+        rows: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
+        entries = iter(packed)
+        for i in range(n):
+            for j in range(i + 1):
+                rows[i][j] = rows[j][i] = next(entries)
+        return rows
+
+    slopes = [full(tangents(graph, flat, {q: graph.one})) for q in scene.q]  # [k][i][j]
+    M_t = full(tangents(graph, flat, {scene.t: graph.one}))
+    c_q = [tangents(graph, c, {q: graph.one}) for q in scene.q]  # [k][i]
+    c_t = tangents(graph, c, {scene.t: graph.one})
+    pull = gradient(graph, L_0, scene.q)
+    v, h = scene.v, []
+    for i in range(n):
+        terms: list[tuple[Node, float]] = [(pull[i], -1.0), (c_t[i], 1.0)]
+        for j in range(n):
+            symbol: list[tuple[Node, float]] = [(M_t[i][j], 1.0)]
+            symbol += [(c_q[j][i], 1.0), (c_q[i][j], -1.0)]
+            for k in range(j, n):
+                gamma = [(slopes[k][i][j], 1.0), (slopes[j][i][k], 1.0), (slopes[i][j][k], -1.0)]
+                weight = 0.5 if j == k else 1.0
+                both = graph.scale(graph.sum(gamma), weight)
+                terms.append((graph.product([(both, 1), (v[j], 1), (v[k], 1)]), 1.0))
+            terms.append((graph.mul(graph.sum(symbol), v[j]), 1.0))
+        h.append(graph.sum(terms))
+    return h
+
+
+def rate_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
+    """h = dM/dt v + dc/dt - dL/dq along the motion, for p = M v + c with M free of v."""
+    graph, n = scene.graph, len(scene.q)
+    at_rest = dict.fromkeys(scene.v, graph.zero)
+    c = substitute(graph, gradient(graph, L, scene.v), at_rest)
+    seeds = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: graph.one}
+    flat = [M[i][j] for i in range(n) for j in range(i + 1)]
+    rates = tangents(graph, [*flat, *c], seeds)
+    pull = gradient(graph, L, scene.q)
+    h = []
+    for i in range(n):
+        row = [rates[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(n)]
+        terms = [(graph.mul(rate, v), 1.0) for rate, v in zip(row, scene.v, strict=True)]
+        h.append(graph.sum([*terms, (rates[len(flat) + i], 1.0), (pull[i], -1.0)]))
+    return h
+
+
+def branches(L: Node, inputs: Sequence[Node]) -> bool:
+    """Whether L may be one function here and another there of any of the inputs.
+
+    Else M free of v is so everywhere, and p = M v + c with c = p at v = 0.
+    """
+    wanted = {node.data for node in inputs}
+    reached = dependencies([L])
+    return any(
+        (
+            node.op in ("select", "custom", "stop")
+            or (node.op == "call" and node.data.name in BROKEN)
+        )
+        and not wanted.isdisjoint(reached[node])
+        for node in order([L])
+    )
+
+
+# Functions with a corner or a jump.
+BROKEN = frozenset(
+    """abs max min sign floor ceil round rem clamp nextafter eq ne lt le gt ge and or not xor
+    is_finite""".split()  # noqa: SIM905
+)
+
+
+def varies(M: Sequence[Sequence[Node]], inputs: Sequence[Node]) -> bool:
+    """Whether any entry depends on any of the inputs."""
+    wanted = set(inputs)
+    return any(node in wanted for node in order(x for row in M for x in row))
+
+
+def nonzeros(graph: Graph, M: Sequence[Sequence[Node]]) -> int:
+    """Entries that are not structurally zero."""
+    return sum(x is not graph.zero for row in M for x in row)
+
+
+def cost(graph: Graph, M: Sequence[Sequence[Node]]) -> float:
+    """Cost of the entries by themselves."""
+    return assemble(graph, [x for row in M for x in row]).cost

@@ -1,0 +1,132 @@
+"""Straight-line code, line by line, as JAX operations on scalars."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from jaxlag._lowering._graph import FIXED
+from jaxlag._lowering._ingest import Rule
+from jaxlag._lowering._program import Line, Program
+from jaxlag._lowering._trig import recalled, sincos
+
+# Functions whose results are kept by a division by 1: XLA's CPU backend takes them for cheap and
+# would compute them anew for every acceleration, but never does so with a division. On scalars the
+# compiler finds most of the repetitions in short code itself.
+_KEPT = ("sin", "cos")
+KEEP_FROM = 120
+KEEP_FROM_IN_LANES = 14
+
+_BINARY = {"add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div}
+
+
+Pairs = dict[int, tuple[Array, Array]]
+
+
+def straight(
+    program: Program,
+    dtype: Any,
+    carried: Sequence[Array],
+    given: Sequence[Array],
+    lanes: bool,
+    pairs: Pairs | None = None,
+    known: Pairs | None = None,
+) -> tuple[Array, ...]:
+    """The results of the body.
+
+    `pairs` receives the sine and cosine of every argument of one, by slot; those that are known
+    are taken from `known`.
+    """
+    slots = numbers(program, dtype)
+    for slot, x in zip(program.carried, carried, strict=False):
+        slots[slot] = x != 0 if slot in program.truths else x
+    keep_from = KEEP_FROM_IN_LANES if lanes else KEEP_FROM
+    kept = len(program.body) > keep_from and jax.default_backend() == "cpu"
+    one = carried[-1] if kept and carried else None
+    read = [slot for (name, _), slot in program.inputs.items() if name not in FIXED]
+    slots |= dict(zip(read, given, strict=True))
+    run(program.body, slots, lanes, one, pairs, known)
+    return tuple(jnp.asarray(slots[slot], dtype) for slot in program.results)
+
+
+def run(
+    lines: Sequence[Line],
+    slots: dict[int, Any],
+    lanes: bool = False,
+    one: Array | None = None,
+    pairs: Pairs | None = None,
+    known: Pairs | None = None,
+) -> None:
+    """Line after line, each a new slot."""
+    ruled: dict[Any, Array] = {}
+    together = lanes or pairs is not None
+    pairs = {} if pairs is None else pairs
+    for line in lines:
+        args = [slots[a] for a in line.args]
+        if line.op == "custom":
+            rule, index = line.data
+            if (rule, line.args) not in ruled:
+                ruled[rule, line.args] = _by_rule(rule, args)
+            slots[line.to] = ruled[rule, line.args][index]
+        elif together and is_trig(line):
+            (argument,) = line.args
+            if argument not in pairs and known is not None:
+                pairs[argument] = recalled(*args, *known[argument])
+            elif argument not in pairs:
+                s, c = sincos(*args) if lanes else (jnp.sin(*args), jnp.cos(*args))
+                pairs[argument] = (s, c) if one is None else (s / one, c / one)
+            slots[line.to] = pairs[argument][line.data.name == "cos"]
+        elif one is not None and line.op == "call" and line.data.name in _KEPT:
+            slots[line.to] = lax.div(_line(line, args), one)
+        else:
+            slots[line.to] = _line(line, args)
+
+
+def is_trig(line: Line) -> bool:
+    """Whether this is a sine or a cosine."""
+    return line.op == "call" and line.data.name in _KEPT
+
+
+def _line(line: Line, args: list[Any]) -> Any:
+    op = line.op
+    if op in _BINARY:
+        return _BINARY[op](*args)
+    if op == "neg":
+        return lax.neg(args[0])
+    if op == "select":
+        return lax.select(*args)
+    if op == "stop":
+        return lax.stop_gradient(args[0])
+    return line.data(*args)
+
+
+def _by_rule(rule: Rule, args: Sequence[Array]) -> Array:
+    """All results of a function with a derivative rule of its own, in one row."""
+    operands, start = [], 0
+    for aval in rule.avals:
+        part = [jnp.asarray(x, aval.dtype) for x in args[start : start + aval.size]]
+        start += aval.size
+        operands.append(jnp.stack(part).reshape(aval.shape) if part else jnp.zeros(aval.shape))
+    return jnp.concatenate([jnp.ravel(x) for x in rule.call(*operands)])
+
+
+def numbers(program: Program, dtype: Any) -> dict[int, Any]:
+    return {
+        slot: np.asarray(value, np.bool_ if isinstance(value, bool) else dtype)
+        for slot, value in program.numbers.items()
+    }
+
+
+def elements(array: Array) -> list[Array]:
+    """All elements of an array in one row, by static slices."""
+    flat = jnp.reshape(array, (-1,))
+    return [lax.squeeze(lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])]
+
+
+def leaves(tree: Any) -> list[Array]:
+    """All elements of all arrays of a pytree."""
+    return [x for leaf in jax.tree.leaves(tree) for x in elements(jnp.asarray(leaf))]

@@ -1,0 +1,181 @@
+"""From the arguments of a solve to its problem: the equations, the start, the times, the scheme."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxlag import _params
+from jaxlag._arguments import check_declaration
+from jaxlag._assemble import assembled
+from jaxlag._constraints import Baumgarte
+from jaxlag._diagnosis import Start, start_consistent, start_finite, values_allowed
+from jaxlag._drive import Times
+from jaxlag._dynamics import Dynamics
+from jaxlag._gradient import Keep
+from jaxlag._inputs import all_knots, common_range
+from jaxlag._methods import WRITTEN_OUT
+from jaxlag._replay import Problem, Setup
+from jaxlag._requirements import check_requirements, splits
+from jaxlag._scheme import Scheme, with_stages
+from jaxlag._step import Arguments
+from jaxlag._system import System
+from jaxlag._term import term_of
+from jaxlag.solvers import AbstractPartitioned, AbstractUnrolled, Splitting
+
+
+class Plan(NamedTuple):
+    """What the compiled program is keyed by."""
+
+    system: System
+    params: _params.Static
+    inputs: _params.Static
+    scheme: _params.Static
+    direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
+    max_steps: int
+    save: tuple[str, ...]
+    sample: _params.Sample
+    formulation: str
+    stabilization: str | Baumgarte | None
+    assemble: bool
+    regular: bool
+    keep: Keep
+    auto: bool  # whether the method may be chosen by the structure of the system
+
+
+class Values(NamedTuple):
+    """What the compiled program takes."""
+
+    q0: Array
+    v0: Array | None  # one of v0 and u0
+    u0: Array | None
+    ts: Array
+    params: Any
+    inputs: Any
+    scheme: Any
+    rtol: Array
+    atol: Array
+    step: Array | None  # dt or dt0
+
+
+def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
+    """The problem that a plan and its values describe."""
+    power = None
+    if "work" in plan.save:
+        params = _params.join(values.params, plan.params.tree)
+        power = plan.system.power_terms(params, values.q0.dtype)
+    dynamics = Dynamics(
+        plan.system,
+        plan.params,
+        plan.inputs,
+        plan.direction,
+        power,
+        plan.sample,
+        formulation=plan.formulation,
+        stabilization=plan.stabilization,
+        regular=plan.regular,
+    )
+    args = dynamics.arguments(values.params, values.inputs, values.ts)
+    params, inputs = dynamics.given(args)
+    dynamics = replace(dynamics, rows=plan.system.rows(params, values.q0.dtype))
+    solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
+    if plan.auto and controller is None:
+        splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
+        solver = Splitting(8) if splitting else solver
+    check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
+
+    t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
+    if v0 is None:
+        v0 = plan.system.velocities(params, q0, u0, t0)
+    check_declaration(plan.system, params, inputs, t0, q0, v0)
+    if plan.assemble and dynamics.rows.size:
+        found = assembled(plan.system, q0, v0, params, t0)
+        q0, v0, u0 = found.q, found.v, None
+    w0 = v0
+    if dynamics.quasi is not None:
+        u0 = dynamics.quasi.of(t0, q0, v0, params) if u0 is None else u0
+        w0 = u0[dynamics.quasi.free]
+        # A lane whose kinematics are singular at the start lends no derivatives to the others.
+        sound = jnp.all(jnp.isfinite(dynamics.velocities(t0, q0, w0, params)))
+        q0, w0, still = still_unless(sound, (q0, w0, args.params))
+        args = args._replace(params=still)
+    y0 = dynamics.start(q0, w0)
+    start = dynamics.mirror(t0, args)
+    args = dynamics.prepare(start, y0, args)
+    consistent = start_consistent(dynamics, t0, q0, v0, params, args)
+    if dynamics.projects:
+        moved, _, _ = dynamics.project(start, y0, args, differentiable=True)
+        y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
+    if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
+        dynamics = replace(dynamics, stabilization=None)
+    settle = dynamics.settle if dynamics.settles else None
+    term = term_of(dynamics, start, y0, args)
+    scheme = Scheme(solver, controller, term, dynamics.within, settle, dynamics.projects)
+    if type(solver) in WRITTEN_OUT and scheme.by_element() is None:
+        assert isinstance(solver, AbstractUnrolled)
+        # Arrays in every stage: written out they compile and run in a multiple of the time.
+        scheme = replace(scheme, solver=with_stages(solver.stock, "lax"))
+    scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
+    times, in_range = _times(dynamics, args, inputs, values.ts)
+    speeds = values.u0 if values.v0 is None else values.v0
+    assert speeds is not None
+    given = jnp.concatenate([values.q0, speeds])
+    valid = values_allowed(given, times.saves, values.rtol, values.atol, values.step)
+    finite = start_finite(dynamics, times.start, y0, args)
+    pressed = dynamics.pressed(start, y0, args)
+    kinematic = dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None
+    begun = Start(valid, in_range, finite, consistent, pressed, kinematic)
+    setup = Setup(values.step, begun.allowed, scheme_traced)
+    problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps, plan.keep)
+    return dynamics, begun, problem
+
+
+def still_unless(moves: Array, tree: Any) -> Any:
+    """The same values, without derivatives where `moves` is False."""
+
+    def still(x: Any) -> Any:
+        inexact = eqx.is_inexact_array(x)
+        return jnp.where(moves, x, jax.lax.stop_gradient(x)) if inexact else x
+
+    return jax.tree.map(still, tree)
+
+
+def velocities_at(
+    dynamics: Dynamics, ts: Array, y: Array, args: Arguments, moved: Array
+) -> tuple[Array, Array]:
+    """(q, v) at every row of one motion; NaN where the motion did not get.
+
+    A motion that took no step, as its kinematics may be singular at the start, lends no
+    derivatives.
+    """
+    q, w = dynamics.parts(y)
+    if dynamics.quasi is None:
+        return q, w
+    reached = jnp.isfinite(q[:, :1])
+    # Rows not reached are NaN: look at the start instead, so that derivatives stay finite.
+    safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
+    ts, safe, args = still_unless(moved, (ts, safe, args))
+    v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)
+    return q, jnp.where(reached, v, jnp.nan)
+
+
+def _times(
+    dynamics: Dynamics, args: Arguments, inputs: Mapping[str, Any], ts: Array
+) -> tuple[Times, Array]:
+    """Anchors of the grid in tau, and whether the inputs are defined at the start."""
+
+    def mirror(time: Array) -> Array:
+        return dynamics.mirror(time.astype(ts.dtype), args)
+
+    saves, knots, span = mirror(ts), all_knots(inputs), common_range(inputs)
+    knots = None if knots is None else jnp.sort(mirror(knots))
+    if span is None:
+        return Times(saves[0], saves[-1], knots, saves), jnp.array(True)
+    ends = jnp.stack([mirror(time) for time in span])
+    first, last = jnp.min(ends), jnp.max(ends)
+    stop = jnp.where(saves[-1] <= last, saves[-1], last)
+    return Times(saves[0], stop, knots, saves), (first <= saves[0]) & (saves[0] <= last)

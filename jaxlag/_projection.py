@@ -1,0 +1,163 @@
+"""Projection of a state onto its constraints, by the metric of M and one factorisation."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int, PyTree
+
+MAX_TURNS = 12
+SWEEPS = 3
+TARGET = 8.0  # roundings of the state below which a correction is not worth a turn
+ACCEPTED = 0.6  # a state counts as consistent where its correction is below eps^this
+
+
+class Surface(NamedTuple):
+    """The constraints near a predicted state, as functions of vectors or of tuples of numbers.
+
+    Attributes:
+        position: q -> phi(t, q), None where no row has one.
+        velocity: (q, v) -> A v + b; None where velocities satisfy all rows by themselves.
+        shift: c -> M^-1 A^T (A M^-1 A^T)^-1 c over the rows of `position`, at the predicted state.
+        kick: the same over all rows; None as `velocity`.
+    """
+
+    position: Callable | None
+    velocity: Callable | None
+    shift: Callable
+    kick: Callable | None
+
+
+def of_arrays(surface: Surface) -> Surface:
+    """The same for vectors, from a surface for tuples of their elements."""
+
+    def on_arrays(function: Callable | None) -> Any:
+        if function is None:
+            return None
+
+        def of(*vectors: Array) -> Array:
+            return jnp.stack(function(*(tuple(x[i] for i in range(len(x))) for x in vectors)))
+
+        return of
+
+    return Surface(*map(on_arrays, surface))
+
+
+def project(
+    surface: Surface, q: PyTree, v: PyTree, frozen: Surface | None = None
+) -> tuple[PyTree, PyTree, Bool[Array, ""]]:
+    """The consistent (q, v) nearest to a predicted one, and whether it was found.
+
+    First q* = q - M^-1 A^T mu with phi(t, q*) = 0, then v* = v - M^-1 A^T nu with
+    A(t, q*) v* + b(t, q*) = 0; M and A at the predicted state, factored once. The order of a
+    solver is kept, since both moves are as large as its local error.
+
+    Args:
+        surface: the constraints.
+        q: predicted coordinates.
+        v: predicted velocities.
+        frozen: the same surface without derivatives, where derivatives are going to be taken.
+            They are those of the equations, whatever number of turns it took to solve them.
+
+    Source: Hairer, Wanner, Solving Ordinary Differential Equations II, sec. VII.2 (projection).
+    """
+    found = jnp.array(True)
+    if surface.position is not None:
+        still = None if frozen is None else _Equation(frozen.position, frozen.shift)
+        q, found = _solved(_Equation(surface.position, surface.shift), q, still)
+    if surface.velocity is None:
+        return q, v, found
+    at_q, still = _rates_at(surface, q), None
+    if frozen is not None:
+        still = _rates_at(frozen, jax.lax.stop_gradient(q))
+    v, also = _solved(at_q, v, still)
+    return q, v, found & also
+
+
+def turns_needed(surface: Surface, q: PyTree, v: PyTree) -> Int[Array, ""]:
+    """The larger of the numbers of turns that `project` takes for q and for v."""
+    count = jnp.zeros((), jnp.int32)
+    if surface.position is not None:
+        equation = _Equation(surface.position, surface.shift)
+        mu, _, count = _iterate(equation, q)
+        q = equation.at(q, mu)
+    if surface.velocity is None:
+        return count
+    return jnp.maximum(count, _iterate(_rates_at(surface, q), v)[2])
+
+
+def _rates_at(surface: Surface, q: PyTree) -> "_Equation":
+    velocity, kick = surface.velocity, surface.kick
+    assert velocity is not None
+    assert kick is not None
+    return _Equation(lambda v: velocity(q, v), kick)
+
+
+class _Equation(NamedTuple):
+    """residual(x) = 0 for x = start - correct(mu)."""
+
+    residual: Any
+    correct: Callable
+
+    def at(self, start: PyTree, mu: PyTree) -> PyTree:
+        return jax.tree.map(jnp.subtract, start, self.correct(mu))
+
+    def left(self, start: PyTree, mu: PyTree) -> PyTree:
+        return self.residual(self.at(start, mu))
+
+
+def _solved(
+    equation: _Equation, start: PyTree, frozen: _Equation | None
+) -> tuple[PyTree, Bool[Array, ""]]:
+    """(x, whether it is one): mu grows by what is left of the residual.
+
+    That shrinks per turn by a factor as small as the way from the predicted state. Where mu is
+    solved for, further turns are the identity with the derivative of the implicit function, to
+    that factor to the power of their number.
+    """
+    if frozen is None:
+        mu, size, _ = _iterate(equation, start)
+    else:
+        mu, size, _ = jax.lax.stop_gradient(_iterate(frozen, jax.lax.stop_gradient(start)))
+        for _ in range(SWEEPS):
+            mu = jax.tree.map(jnp.add, mu, equation.left(start, mu))
+    return equation.at(start, mu), size <= _eps(start) ** ACCEPTED
+
+
+def _iterate(equation: _Equation, start: PyTree) -> tuple[PyTree, Array, Array]:
+    """(mu at which nothing is left, up to rounding or after MAX_TURNS; what is left; turns).
+
+    The first turn, which is enough after most steps, is outside the loop.
+    """
+    target = TARGET * _eps(start)
+
+    def goes_on(state: Any) -> Array:
+        _, _, size, count = state
+        return (size > target) & (count < MAX_TURNS)
+
+    def turn(state: Any) -> Any:
+        mu, left, _, count = state
+        mu = jax.tree.map(jnp.add, mu, left)
+        left = equation.left(start, mu)
+        return mu, left, _size(equation.correct(left), start), count + 1
+
+    first = equation.residual(start)
+    left = equation.left(start, first)
+    size = _size(equation.correct(left), start)
+    begin = (first, left, size, jnp.ones((), jnp.int32))
+    mu, _, size, count = jax.lax.while_loop(goes_on, turn, begin)
+    return mu, size, count
+
+
+def _eps(x: PyTree) -> float:
+    return float(jnp.finfo(jnp.result_type(*jax.tree.leaves(x))).eps)
+
+
+def _size(change: PyTree, x: PyTree) -> Array:
+    """Largest |change_j| / (1 + |x_j|)."""
+    ratios = jax.tree.map(lambda d, x: jnp.max(jnp.abs(d) / (1.0 + jnp.abs(x))), change, x)
+    first, *rest = jax.tree.leaves(ratios)
+    for ratio in rest:
+        first = jnp.maximum(first, ratio)
+    return first

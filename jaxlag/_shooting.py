@@ -1,0 +1,353 @@
+"""Multiple shooting: motions of all segments as lanes of one batch, and the least squares of them.
+
+Unknown are params, by z, and the state where each segment starts, by x. Residuals are what a
+segment shows less what was measured, over sigma; and the end of each segment less the start of the
+next, over a sigma of their own, which goes to zero from stage to stage: early on, segments follow
+what was measured however wrong the params are; in the end they are one motion (Bock, Recent
+advances in parameter identification techniques for ODE, 1983).
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._channels import Reader, read
+from jaxlag._elimination import Rows, condense, eliminate, substitute
+from jaxlag._free import Unknowns
+from jaxlag._lanes import in_batches
+from jaxlag._segments import Segments
+from jaxlag._simulate import simulate
+from jaxlag._status import Status
+from jaxlag._system import System
+
+MOVED_AT_ONCE = 64
+"""Segments times directions of derivatives: vectors, and no more than a core's cache holds."""
+FAR = 10.0
+"""What a segment without a solution is off by, in multiples of how far its channels range."""
+
+
+class Guess(NamedTuple):
+    """What the optimiser moves: z (p,) of the params, x (k, d) of the states, all of order one."""
+
+    z: Float[Array, " p"]
+    x: Float[Array, "k d"]
+
+
+class Residuals(NamedTuple):
+    """What is to be small.
+
+    Attributes:
+        measured: (k, s m + d): of the channels, and of starts that are known roughly.
+        joined: (k, d), of ends and the starts that follow; None where none follow.
+        prior: (c,), of params that are known roughly.
+    """
+
+    measured: Float[Array, "k m"]
+    joined: Float[Array, "k d"] | None
+    prior: Float[Array, " c"]
+
+
+class Seen(NamedTuple):
+    """What segments did.
+
+    Attributes:
+        residuals: (k, s, m), over sigma, before the loss.
+        ends: (k, d), states where they end, m, rad, m/s, rad/s.
+        status: (k,).
+    """
+
+    residuals: Float[Array, "k s m"]
+    ends: Float[Array, "k d"]
+    status: Array
+
+
+class Shooting(eqx.Module):
+    """The problem.
+
+    Attributes:
+        system: what moves.
+        options: of `simulate`.
+        channels: what is measured.
+        loss: rho', by which residuals are made smaller; see `LOSSES`.
+        chained: whether any segment follows another.
+        free: from z to params.
+        segments: what was measured.
+        states: (d,), by which x is multiplied.
+        ranges: (m,), how far channels range.
+        prior: (which numbers, means, sigmas).
+    """
+
+    system: System = eqx.field(static=True)
+    options: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    channels: tuple[tuple[str, Reader], ...] = eqx.field(static=True)
+    loss: Callable[[Array], Array] = eqx.field(static=True)
+    chained: bool = eqx.field(static=True)
+    free: Unknowns
+    segments: Segments
+    states: Float[Array, " d"]
+    ranges: Float[Array, " m"]
+    prior: tuple[Array, Array, Array]
+
+    def start(self, x: Float[Array, " d"], segment: Segments) -> Float[Array, " d"]:
+        """The state (q, v) or (q, u) at the start of a segment."""
+        return segment.guess + jnp.where(segment.held == 0, 0.0, self.states * x)
+
+    def motion(self, params: Any, start: Float[Array, " d"], ts: Array, inputs: Any) -> Any:
+        """The motion from a state."""
+        n = self.system.size
+        quasi = self.system.quasi
+        if quasi is None:
+            rates = {"v0": start[n:]}
+        else:
+            full = jnp.zeros(len(quasi.names), start.dtype).at[jnp.array(quasi.free)].set(start[n:])
+            rates = {"u0": full}
+        return simulate(
+            self.system,
+            start[:n],
+            ts=ts,
+            params=params,
+            inputs=inputs,
+            throw=False,
+            **rates,
+            **dict(self.options),
+        )
+
+    def one(
+        self, z: Float[Array, " p"], x: Float[Array, " d"], segment: Segments
+    ) -> tuple[Array, Array, Array]:
+        """(residuals (s, m) before the loss, end less start, status) of one segment."""
+        start = self.start(x, segment)
+        motion = self.motion(self.free.params(z), start, segment.ts, segment.inputs)
+        ok = motion.status == Status.ok
+        shown = read(dict(self.channels), motion)
+        residuals = segment.weights * (shown - segment.values)
+        far = FAR * segment.weights * self.ranges
+        quasi = self.system.quasi
+        rates = motion.v[-1] if quasi is None else motion.u[-1, jnp.array(quasi.free)]
+        end = jnp.concatenate([motion.q[-1], rates])
+        residuals = jnp.where(ok, residuals, far)
+        end = jnp.where(ok, end, start + FAR * self.states)
+        # Rows beyond those that were measured hold nothing, not even NaN.
+        return jnp.where(segment.weights > 0, residuals, 0.0), end, motion.status
+
+    def linearized(self, guess: Guess) -> tuple[Any, Any]:
+        """((residuals, ends, status), their derivatives by z and by the segment's own x)."""
+
+        def both(z: Array, x: Array, segment: Segments) -> tuple[Any, Any]:
+            residuals, end, status = self.one(z, x, segment)
+            return (residuals, end), (residuals, end, status)
+
+        derivatives = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
+
+        def one(row: tuple[Array, Segments]) -> tuple[Any, Any]:
+            return derivatives(guess.z, *row)
+
+        count, d = guess.x.shape
+        at_once = max(1, MOVED_AT_ONCE // (guess.z.shape[0] + d))
+        by, values = in_batches(one, (guess.x, self.segments), count, at_once)
+        return values, by
+
+    def __call__(self, guess: Guess, join: Float[Array, ""]) -> tuple[Residuals, Any]:
+        """(residuals, what is seen of them), written as their own expansion about `guess`.
+
+        So a segment is differentiated by its own start only: in p + d directions, not p + k d.
+        """
+        here = jax.lax.stop_gradient(guess)
+        (residuals, ends, status), by = self.linearized(here)
+        (r_z, r_x), (e_z, e_x) = by
+        dz, dx = guess.z - here.z, guess.x - here.x
+        seen = Seen(residuals, ends, status)
+        residuals += r_z @ dz + jnp.einsum("ksmd,kd->ksm", r_x, dx)
+        ends += e_z @ dz + jnp.einsum("ked,kd->ke", e_x, dx)
+        segments = self.segments
+        known = jnp.isfinite(segments.held) & (segments.held > 0)
+        sigma = jnp.where(known, segments.held, 1.0)
+        starts = jnp.where(known, guess.x * self.states / sigma, 0.0)
+        rows = jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
+        which, mean, deviation = self.prior
+        prior = (self.free.numbers(guess.z)[which] - mean) / deviation
+        joined = None
+        if self.chained:
+            begins = jax.vmap(self.start)(guess.x, segments)
+            gap = (ends - jnp.roll(begins, -1, axis=0)) / (join * self.states)
+            joined = jnp.where(segments.follows[:, None], gap, 0.0)
+        return Residuals(rows, joined, prior), seen
+
+
+# Losses: residuals r are replaced by g(r), so that 1/2 g^2 is the loss.
+
+
+def squares(r: Array) -> Array:
+    """1/2 r^2."""
+    return r
+
+
+def soft_l1(r: Array) -> Array:
+    """(1 + r^2)^(1/2) - 1: as |r| for large r."""
+    return r * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + r * r)))
+
+
+def huber(r: Array) -> Array:
+    """1/2 r^2 up to |r| = 1.345, linear beyond."""
+    k = 1.345
+    large = jnp.abs(r) > k
+    safe = jnp.where(large, r, k)
+    return jnp.where(large, jnp.sign(r) * jnp.sqrt(2 * k * jnp.abs(safe) - k * k), r)
+
+
+def cauchy(r: Array) -> Array:
+    """1/2 log(1 + r^2)."""
+    small = r * r < 1e-12
+    x = jnp.where(small, 1.0, r * r)
+    return r * jnp.where(small, 1.0, jnp.sqrt(jnp.log1p(x) / x))
+
+
+LOSSES: Mapping[str, Callable[[Array], Array]] = {
+    "squares": squares,
+    "soft_l1": soft_l1,
+    "huber": huber,
+    "cauchy": cauchy,
+}
+
+
+# The optimiser: optimistix' Levenberg-Marquardt, its linear steps by elimination.
+
+
+def rows_of(
+    operator: lx.AbstractLinearOperator, residuals: Residuals, shooting: Shooting, join: Array
+) -> Rows:
+    """The linear problem: the operator's columns by z, and by the states of all segments at once.
+
+    A segment's measured rows hold its own state only. The rows that join it to the next hold
+    that one, too, with the known coefficient -1/join.
+    """
+    guess = operator.in_structure()
+    p, (k, d) = guess.z.shape[0], guess.x.shape
+    dtype = guess.x.dtype
+    nothing = Guess(jnp.zeros(p, dtype), jnp.zeros((k, d), dtype))
+    by_z = jax.vmap(lambda z: operator.mv(nothing._replace(z=z)))(jnp.eye(p, dtype=dtype))
+    same = jnp.broadcast_to(jnp.eye(d, dtype=dtype)[:, None], (d, k, d))
+    by_x = jax.vmap(lambda x: operator.mv(nothing._replace(x=x)))(same)
+
+    def columns(field: str, extra: Array | None = None) -> Array:
+        x, z = (jnp.moveaxis(getattr(by, field), 0, -1) for by in (by_x, by_z))
+        x = x if extra is None else x + extra
+        return jnp.concatenate([x, z, getattr(residuals, field)[..., None]], axis=-1)
+
+    prior = jnp.concatenate([by_z.prior.T, residuals.prior[:, None]], axis=1)
+    if residuals.joined is None:
+        return Rows(columns("measured"), None, None, prior)
+    moves = jnp.where(shooting.segments.held == 0, 0.0, 1.0)
+    after = jnp.where(shooting.segments.follows[:, None], jnp.roll(moves, -1, axis=0), 0.0) / join
+    return Rows(columns("measured"), columns("joined", jax.vmap(jnp.diag)(after)), after, prior)
+
+
+class _Condensed(eqx.Module):
+    rows: Rows
+
+
+class Eliminating(optx.AbstractDescent):
+    """Steps -(J^T J + 1 / step_size)^-1 J^T r by elimination of states, linear in segments."""
+
+    shooting: Shooting
+    join: Float[Array, ""]
+
+    def init(self, y: Guess, f_info_struct: Any) -> _Condensed:
+        """Of the right shapes."""
+        shapes = eqx.filter_eval_shape(self._condense, f_info_struct)
+        return _Condensed(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+
+    def _condense(self, f_info: Any) -> Rows:
+        return condense(rows_of(f_info.jac, f_info.residual, self.shooting, self.join))
+
+    def query(self, y: Guess, f_info: Any, state: _Condensed) -> _Condensed:
+        """Of new derivatives."""
+        return _Condensed(self._condense(f_info))
+
+    def step(self, step_size: Array, state: _Condensed) -> tuple[Guess, optx.RESULTS]:
+        """Of a step size."""
+        z, x = substitute(eliminate(state.rows, 1.0 / step_size))
+        beyond = jnp.max(jnp.abs(z) / self.shooting.free.reach, initial=1.0)
+        short = 1.0 / beyond
+        return Guess(-short * z, -short * x), optx.RESULTS.successful
+
+
+class Shooter(optx.AbstractGaussNewton):
+    """Levenberg-Marquardt by `Eliminating`."""
+
+    rtol: float
+    atol: float
+    norm: Callable[[Any], Array]
+    descent: Eliminating
+    search: optx.ClassicalTrustRegion
+    verbose: Callable[..., None]
+
+    def __init__(self, shooting: Shooting, join: Array, rtol: float, atol: float) -> None:
+        self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
+        self.descent = Eliminating(shooting, join)
+        self.search = optx.ClassicalTrustRegion()
+        self.verbose = _quiet
+
+
+def _quiet(**_: Any) -> None:
+    """Print nothing."""
+
+
+class Found(NamedTuple):
+    """Where the optimiser ended.
+
+    Attributes:
+        guess: the unknowns.
+        converged: whether it met its tolerance.
+        steps: how many it took, each a solve of all segments with derivatives.
+        cost: half the sum of squares.
+        rows: condensed, of the linear problem there.
+        seen: what segments do there.
+        starts: (k, d), states where they start, m, rad, m/s, rad/s.
+    """
+
+    guess: Guess
+    converged: Bool[Array, ""]
+    steps: Array
+    cost: Float[Array, ""]
+    rows: Rows
+    seen: Seen
+    starts: Float[Array, "k d"]
+
+
+@eqx.filter_jit
+def search(
+    shooting: Shooting, guess: Guess, join: Array, tolerance: float, max_steps: int
+) -> Found:
+    """Least squares from a guess, with gaps of `join` times the range of the states."""
+
+    def function(guess: Guess, args: tuple[Shooting, Array]) -> tuple[Residuals, Any]:
+        shooting, join = args
+        return shooting(guess, join)
+
+    solution = optx.least_squares(
+        function,
+        Shooter(shooting, join, tolerance, tolerance),
+        guess,
+        args=(shooting, join),
+        has_aux=True,
+        max_steps=max_steps,
+        throw=False,
+    )
+    # What the optimiser knows of the last point that it accepted; nothing is solved once more.
+    state = solution.state
+    return Found(
+        solution.value,
+        solution.result == optx.RESULTS.successful,
+        solution.stats["num_steps"],
+        0.5 * optx.two_norm(state.f_info.residual) ** 2,
+        state.descent_state.rows,
+        state.aux,
+        jax.vmap(shooting.start)(solution.value.x, shooting.segments),
+    )

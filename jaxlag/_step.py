@@ -1,0 +1,53 @@
+"""What a step is given besides time and state, and what is said about its end."""
+
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+
+class RowChoice(NamedTuple):
+    """Which constraint rows are solved with: a largest independent set at the start.
+
+    Attributes:
+        kept: these rows; the others follow from them as long as the rank does not change.
+        size: of every row at the start and beside.
+    """
+
+    kept: Bool[Array, " m"]
+    size: Float[Array, " m"]
+
+
+class Verdict(NamedTuple):
+    """What is to be said about the end of a step.
+
+    Attributes:
+        found: the projection was found.
+        closed: rows that were left out hold, too.
+        pressed: contacts press and slide as their friction takes them to.
+    """
+
+    found: Bool[Array, ""]
+    closed: Bool[Array, ""]
+    pressed: Bool[Array, ""]
+
+    @property
+    def good(self) -> Bool[Array, ""]:
+        """Whether all is well."""
+        return self.found & self.closed & self.pressed
+
+
+class Arguments(NamedTuple):
+    """What the vector field depends on besides time and state; all leaves are arrays."""
+
+    params: Any
+    inputs: Any
+    sigma: Float[Array, ""] | None  # direction of time where it is traced
+    intervals: Any  # table interval of every input, fixed throughout a step
+    prepared: Any  # what accelerations need of what depends on params alone
+    rows: RowChoice | None = None  # None where there is no choice: at most one row
+    senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
+
+    @property
+    def kept(self) -> Bool[Array, " m"] | None:
+        """Rows to solve with; None for all."""
+        return None if self.rows is None else self.rows.kept

@@ -1,0 +1,223 @@
+"""The derivative of the states on the way of a solve, as one linear map."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Bool, PyTree
+
+from jaxlag._drive import Outcome, Record, Times
+from jaxlag._lanes import LANES, in_batches
+from jaxlag._linear import LinearMap, linear
+from jaxlag._lowering import elements
+from jaxlag._scheme import Scheme, with_stages
+from jaxlag._walk import Change, Clock, Path, Walk, again, backwards, forwards
+
+
+class Setup(NamedTuple):
+    """What a solve needs and no derivative is taken of."""
+
+    first_step: Array | None
+    allowed: Bool[Array, ""]
+    scheme: Any  # traced half of the Scheme
+
+
+def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
+    """(start, arguments, times, scheme, bound on the steps) from the halves of a problem."""
+    static_problem, static_scheme, max_steps, _ = static
+    y0, args, times = eqx.combine(inexact, rest, static_problem)
+    return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
+
+
+def changes(tangents: Any, outcome: Outcome) -> Any:
+    """The directions of what moves, None for what does not.
+
+    A trajectory that took no step depends on nothing but its start: its derivatives, which may
+    not be finite, are kept out.
+    """
+    moved = outcome.accepted > 0
+
+    def change(dot: Any) -> Any:
+        return None if isinstance(dot, SymbolicZero) else jnp.where(moved, dot, 0.0)
+
+    return jax.tree.map(change, tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+
+
+def filled(change: Any, like: Any) -> Any:
+    """The directions with zeros for what does not move."""
+
+    def fill(x: Any, dot: Any) -> Any:
+        return jnp.zeros_like(x) if dot is None and x is not None else dot
+
+    return jax.tree.map(fill, like, change, is_leaf=lambda x: x is None)
+
+
+def changed(
+    inexact: Any,
+    rest: Any,
+    setup: Setup,
+    static: Any,
+    record: Record,
+    change: Any,
+    points: bool = False,
+) -> Walk:
+    """The derivative of the states on the way, at the points of the record too if asked for."""
+    y0_dot, args_dot, times_dot = change
+    dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
+    moving = tuple(i for i, dot in enumerate(dots) if dot is not None)
+    times, anchors_dot = eqx.combine(inexact, rest, static[0])[2], None
+    if jax.tree.leaves((times_dot.start, times_dot.stop, times_dot.knots)):
+        anchors_dot = jax.jvp(Times.anchors, (times,), (filled(times_dot, times),))[1]
+    x = Change(y0_dot, [dots[i] for i in moving], anchors_dot)
+    kind = _Kind(static, moving, y0_dot is not None, anchors_dot is not None, points)
+    return linear(_map(kind), (inexact, rest, setup, record), x)
+
+
+class _Kind(NamedTuple):
+    """What moves, and what is wanted to move with it."""
+
+    static: Any
+    moving: tuple[int, ...]
+    start: bool
+    times: bool
+    points: bool
+
+
+def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
+    """The variational equations as a linear map."""
+
+    def path(r: Any) -> tuple[Path, Any]:
+        inexact, rest, setup, record = r
+        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
+        return path_of(scheme, y0, args, times, record, kind.moving, scheme.by_element(lanes)), y0
+
+    def forward(r: Any, x: Change) -> Walk:
+        return forwards(path(r)[0], x, kind.points)
+
+    def backward(r: Any, y: Walk) -> Change:
+        way, y0 = path(r)
+        anchors = way.clock.times.anchors()
+        like = Change(y0 if kind.start else None, [], anchors if kind.times else None)
+        return backwards(way, like, y)
+
+    def by_directions(r: Any, y: Walk) -> Change:
+        """The same from `forward`, one direction of x after another."""
+        way, y0 = path(r)
+        anchors = way.clock.times.anchors()
+        like = Change(y0 if kind.start else None, way.moved(), anchors if kind.times else None)
+        return _transposed(partial(forward, r), like, y)
+
+    def plain(r: Any, x: Change) -> Walk:
+        inexact, rest, setup, record = r
+        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
+        way = path_of(scheme, y0, args, times, record, kind.moving)
+        like = jax.eval_shape(forward, r, x)
+
+        def motion(y0: Array, moved: list, anchors: Array) -> Walk:
+            walk = again(way, (y0, None), moved, anchors, kind.points)
+            return _in_form(walk, like)
+
+        given = (y0, way.moved(), times.anchors())
+        y0_dot = jnp.zeros_like(y0) if x.y0 is None else x.y0
+        anchors_dot = jnp.zeros_like(given[2]) if x.anchors is None else x.anchors
+        return jax.jvp(motion, given, (y0_dot, list(x.args), anchors_dot))[1]
+
+    in_lanes = None if lanes else _map(kind, lanes=True)
+    reverse = backward if kind.static[3].room else by_directions
+    return LinearMap(forward, reverse, plain, in_lanes=in_lanes)
+
+
+def _transposed(function: Callable, like: Any, y: Any) -> Any:
+    """A^T y of a linear function from its values in the directions of all numbers of x."""
+    leaves, tree = jax.tree.flatten(like)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: dtype.itemsize)
+
+    def split(row: Array) -> Any:
+        parts = jnp.split(row, ends[:-1])
+        pairs = zip(parts, leaves, strict=True)
+        shaped = [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in pairs]
+        return jax.tree.unflatten(tree, shaped)
+
+    def component(row: Array) -> Array:
+        pairs = zip(jax.tree.leaves(function(split(row))), jax.tree.leaves(y), strict=True)
+        parts = [jnp.sum(a * b).astype(widest) for a, b in pairs]
+        return jnp.sum(jnp.stack(parts))
+
+    count = int(ends[-1])
+    return split(in_batches(component, jnp.eye(count, dtype=widest), count, LANES))
+
+
+def _in_form(walk: Walk, like: Walk) -> Walk:
+    """A walk of arrays in the form of another one, whose states may be tuples of elements."""
+
+    def form(state: Any, like: Any) -> Any:
+        if like is None or not isinstance(like[0], tuple):
+            return state
+        return tuple(jnp.moveaxis(state[0], -1, 0)), None
+
+    return Walk(*(form(a, b) for a, b in zip(walk, like, strict=True)))
+
+
+def path_of(
+    scheme: Scheme,
+    y0: Array,
+    args: Any,
+    times: Times,
+    record: Record,
+    moving: tuple[int, ...],
+    fast: Scheme | None = None,
+) -> Path:
+    """The recorded motion, element by element if there is a form for that.
+
+    States between points are found by the form with loops over stages: with stages written out
+    it would take as long to compile as all else.
+    """
+    loops = in_loops(scheme)
+
+    def steps(scheme: Scheme) -> Callable:
+        def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
+            return one_step(scheme, args, t0, t1, state, jump, True)[0]
+
+        return step
+
+    def between(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
+        if not isinstance(state[0], tuple):
+            return steps(loops)(args, t0, t1, state, jump)
+        y, _ = steps(loops)(args, t0, t1, (jnp.stack(state[0]), None), jump)
+        return tuple(elements(y)), None
+
+    memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
+    start = (y0, memory) if fast is None else (tuple(elements(y0)), None)
+    leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
+    stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
+    clock = Clock(times, record)
+    return Path(steps(fast or loops), between, start, leaves, tree, moving, clock, stages)
+
+
+def in_loops(scheme: Scheme) -> Scheme:
+    """The form with loops over stages that JAX differentiates in any mode."""
+    return eqx.tree_at(lambda s: s.solver, scheme, with_stages(scheme.solver, "bounded"))
+
+
+def one_step(
+    scheme: Scheme,
+    args: Any,
+    t0: Array,
+    t1: Array,
+    state: PyTree,
+    jump: Array,
+    differentiable: bool,
+) -> tuple[PyTree, Bool[Array, ""]]:
+    """One step from (y, memory), and whether it was solved; without memory it starts afresh."""
+    y, memory = state
+    if not scheme.remembers:
+        memory, jump = scheme.begin(t0, t1, y, args), jnp.array(True)
+    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jump)
+    y, verdict = scheme.settled(t1, y, args, differentiable)
+    return (y, memory if scheme.remembers else None), solved & verdict.good

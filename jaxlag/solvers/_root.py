@@ -1,0 +1,104 @@
+"""Implicit equations of a step, solved to rounding."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.scipy.linalg import lu_factor, lu_solve
+
+MOST, EACH = 8, 12  # derivatives taken anew, iterations with each
+MEMORY = 3  # iterations in which increments halve while they fall
+
+
+def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tuple[Array, Array]:
+    """(z with residual(z) = 0, whether it was found), by Newton's method with the derivative kept.
+
+    Iterates until no component's increment falls any more: increments are roundings then, so that
+    no tolerance adds an error of one sign in every step. If they are not small beside z by
+    themselves, as near an equilibrium, where z is all rounding, the derivative is taken anew: where
+    it is what it was, the iteration contracts, and what does not fall is noise. Slow iterations go
+    on with the new derivative.
+
+    The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr, forward, reverse, and forward
+    over reverse to any order; reverse over reverse through a loop of steps JAX refuses.
+
+    Args:
+        residual: of z, shape (m,), as many components.
+        guess: near the solution. It is returned if nothing was found, nan where the residual is
+            not finite there.
+        rounded: what the first components of z, velocities, are roundings of; these are looked at.
+
+    Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.6 (iterations until
+    convergence, and their round-off).
+    """
+    function, given = jax.closure_convert(residual, guess)
+
+    @jax.custom_jvp
+    def solve(guess: Array, rounded: Array, given: list) -> tuple[Array, Array]:
+        return _solved(lambda z: function(z, *given), guess, rounded)
+
+    @solve.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple:
+        given = primals[2]
+        z, found = solve(*primals)
+        r_dot = jax.jvp(lambda given: function(z, *given), (given,), (tangents[2],))[1]
+        slope = jax.jacfwd(lambda z: function(z, *given))(z)
+        return (z, found), (-jnp.linalg.solve(slope, r_dot), jnp.zeros_like(found))
+
+    z, found = solve(guess, rounded, given)
+    return z, found > 0
+
+
+def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Array]:
+    """(z, 1.0 if found): a number, as a truth value has no derivative."""
+    count, eps = rounded.shape[0], jnp.finfo(guess.dtype).eps
+    no, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
+
+    def iterate(factor: Any, z: Array) -> tuple[Array, Array, Array]:
+        """(z, whether increments stopped falling, whether they are small)."""
+
+        def turn(carry: tuple) -> tuple:
+            z, least, _, _, k = carry
+            change = lu_solve(factor, residual(z))
+            z, size = z - change, jnp.abs(change[:count])
+            scale = jnp.abs(z[:count]) + rounded
+            new = jnp.minimum(least[-1], size)
+            stopped = (size <= 4 * eps * scale) | ~(new < 0.5 * least[0])
+            small = jnp.all(size <= eps**0.75 * scale)
+            return z, jnp.stack([*least[1:], new]), jnp.all(stopped), small, k + 1
+
+        def goes_on(carry: tuple) -> Array:
+            return ~carry[2] & (carry[4] < EACH)
+
+        unknown = jnp.full((MEMORY, count), jnp.inf, guess.dtype)
+        begin = (z, unknown, no, no, zero)
+        z, _, stopped, small, _ = jax.lax.while_loop(goes_on, turn, begin)
+        return z, stopped & jnp.all(jnp.isfinite(z)), small
+
+    def anew(carry: tuple) -> tuple:
+        z, slope, _, k = carry
+        new = jax.jacfwd(residual)(z)
+        factor = lu_factor(new)
+        unlike = _radius(jnp.eye(z.shape[0], dtype=z.dtype) - lu_solve(factor, slope))
+        z, stopped, small = iterate(factor, z)
+        return z, new, stopped & (small | (unlike < 0.5)), k + 1
+
+    def goes_on(carry: tuple) -> Array:
+        z, _, done, k = carry
+        return ~done & (k < MOST) & jnp.all(jnp.isfinite(z))
+
+    unknown = jnp.zeros((guess.shape[0], guess.shape[0]), guess.dtype)
+    z, _, done, _ = jax.lax.while_loop(goes_on, anew, (guess, unknown, no, zero))
+    there = jnp.all(jnp.isfinite(residual(guess)))
+    z = jnp.where(done, z, jnp.where(there, guess, jnp.nan))
+    return z, done.astype(z.dtype)
+
+
+def _radius(matrix: Array) -> Array:
+    """About the spectral radius, which units do not change."""
+    power = matrix
+    for _ in range(3):
+        power = power @ power
+    return jnp.sqrt(jnp.sum(power**2)) ** (1 / 8)

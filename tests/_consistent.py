@@ -1,0 +1,21 @@
+"""Random states moved onto constraints, by a way of its own."""
+
+import jax
+import jax.numpy as jnp
+
+
+def onto_constraints(system, params, t, q, v):
+    """(q, v) by steps of least norm: Newton's for the positions, then one for the velocities."""
+
+    def position(q):
+        return jnp.hstack([*system.residuals(params, q, v, t)[0].values(), jnp.zeros(0)])
+
+    def velocity(v):
+        return jnp.hstack([*system.residuals(params, q, v, t)[1].values()])
+
+    def nearer(_, q):
+        return q - jnp.linalg.pinv(jax.jacfwd(position)(q)) @ position(q)
+
+    q = jax.lax.fori_loop(0, 20, nearer, jnp.asarray(q))
+    v = v - jnp.linalg.pinv(jax.jacfwd(velocity)(v)) @ velocity(v)
+    return q, v

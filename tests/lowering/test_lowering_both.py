@@ -1,0 +1,44 @@
+"""The repetition of tests under both lowerings does switch programs, compiled ones included."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from _jaxprs import loop, names, operations
+
+import jaxlag as jl
+from jaxlag._lowering import ArrayTerms, ScalarTerms
+from systems._catalogue import ENTRIES
+
+DOUBLE = ENTRIES["double_pendulum"]
+PARAMS = dict(DOUBLE.example.params)
+
+
+@jax.jit
+def acceleration(q, v):
+    """Compiled at module level, as a test may have it."""
+    return DOUBLE.system.acceleration(PARAMS, q, v)
+
+
+@pytest.mark.parametrize("turn", [1, 2])
+def test_accelerations_are_compiled_from_the_lowering_in_use(lowering, turn):
+    """Read from what jit keeps: a program left over from the other lowering would show."""
+    q, v = jnp.array([1.0, 0.5]), jnp.array([0.2, -0.3])
+    acceleration(q, v)
+    on_arrays = lowering == "array"
+    assert ("custom_linear_solve" in names(operations(acceleration, q, v))) == on_arrays
+    assert ("tensor<2x2xf64>" in acceleration.lower(q, v).as_text()) == on_arrays  # M as a whole
+
+
+def test_solves_are_compiled_from_the_lowering_in_use(lowering):
+    def solve(q0):
+        return jl.simulate(DOUBLE.system, q0, [0.0, 0.0], [0.0, 0.1], PARAMS, throw=False).q
+
+    inside = loop(operations(solve, jnp.array([1.0, 0.5]), turns=1))
+    assert ("custom_linear_solve" in names(inside)) == (lowering == "array")
+
+
+def test_only_systems_left_at_auto_follow(lowering):
+    kinds = {"auto": ArrayTerms if lowering == "array" else ScalarTerms}
+    for chosen, kind in (kinds | {"scalar": ScalarTerms, "array": ArrayTerms}).items():
+        system = jl.System(DOUBLE.system.lagrangian, ("a", "b"), lowering=chosen)
+        assert type(system.terms) is kind

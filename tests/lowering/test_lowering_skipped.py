@@ -1,0 +1,492 @@
+"""What the equations of a system do not need is not in its program: read from jaxprs and HLO.
+
+One evaluation is the acceleration as the stages of a solve compute it, with all that depends on
+params alone prepared before. Everything is counted in JAX's own program, not in the lowering's.
+"""
+
+import re
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _jaxprs import count, loop, names, operations
+from problems import MOTIONS
+
+import jaxlag as jl
+from bench._scenes import SCENES
+from jaxlag._dynamics import Dynamics
+from jaxlag._lowering import ArrayTerms
+from systems._catalogue import ENTRIES
+
+SCALAR = {"add", "sub", "mul", "div", "neg", "sin", "cos", "sqrt", "tanh", "gt", "and", "select_n"}
+PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}
+STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
+# Divisions of a step itself: the new value of each of q and v, its error, and that over its
+# tolerance; 1/h; two in the factor by which h changes.
+STEP = (6, 3)  # for each coordinate, and once
+
+CEILINGS = {  # sines and cosines, divisions
+    "pendulum": (1, 0),
+    "double_pendulum": (4, 2),
+    "cart_pole": (2, 2),
+    "spherical_pendulum": (2, 1),
+    "elastic_pendulum": (2, 1),
+    "kepler": (0, 2),
+    "symmetric_top": (2, 2),
+    "top": (4, 4),
+    "rigid_body": (4, 4),
+    "aircraft": (6, 4 + 6),  # long programs also divide every sine, to keep it: see _emit.py
+    "chain_8": (16, 12 + 16),
+    # With forces:
+    "double_pendulum_rayleigh": (6, 2),
+    "cart_pendulum": (4, 2),
+    "mass_spring_dashpot": (1, 0),
+    "rotating_slender_rod": (3, 1),
+    "sleeve_pendulum": (3, 1),
+    "driven_pendulum": (1, 0),
+}
+
+
+CONSTRAINED = {  # the same, with multipliers eliminated
+    "spherical_pendulum_cartesian": (0, 1),
+    "double_pendulum_cartesian": (0, 2),
+    "atwood_multipliers": (0, 0),  # M, A and Q do not change: solved before the first step
+    "knife_edge_vehicle": (4, 3),
+    "falling_stick_friction": (2, 1),
+    "slider_crank": (4, 4),
+}
+
+
+QUASI = {  # the same in quasi-velocities: v and u', no rows; the inertia is constant or diagonal
+    "chaplygin_sleigh": (2, 0),
+    "knife_edge_incline": (2, 0),
+    "vertical_rolling_disk": (2, 0),
+    "nonholonomic_particle": (0, 1),
+    "rigid_body_roll_pitch_yaw": (4, 2),
+    "rolling_disk": (4, 2),
+    "rolling_ball_turntable": (4, 2),
+    "suslov": (4, 2),
+    "heavy_symmetric_top": (2, 1),
+}
+
+
+class Case(NamedTuple):
+    """A system at a state; `inputs` by name."""
+
+    system: jl.System
+    params: Any
+    q0: jax.Array
+    inputs: dict
+
+
+def case(name):
+    if name in SCENES:
+        scene = SCENES[name]
+        system = jl.System(scene.lagrangian, {"q": (len(scene.q0),)})
+        return Case(system, floats(scene.params), floats(scene.q0), {})
+    if name in MOTIONS:
+        motion = MOTIONS[name]
+        inputs = {} if motion.inputs is None else {"tau": jnp.array(0.3)}
+        return Case(motion.system, floats(motion.params), motion.q0, inputs)
+    entry = ENTRIES[name]
+    return Case(entry.system, floats(entry.example.params), floats(entry.example.q0), {})
+
+
+def floats(values):
+    if isinstance(values, tuple):
+        return jnp.array(values)
+    return {name: jnp.asarray(x, float) for name, x in values.items()}
+
+
+def prelude(case):
+    """The operations done once per solve."""
+    system, params, q, inputs = case
+    return operations(lambda params: system.terms.prepare(q, params, inputs), params)
+
+
+def evaluation(case, regular=False):
+    """The operations of one acceleration inside a solve; whether M is known to be regular."""
+    system, params, q, inputs = case
+    terms = system.terms
+    if regular:
+        terms = replace(terms, array=replace(terms.array, regular=True))
+    prepared = terms.prepare(q, params, inputs)
+
+    def acceleration(prepared, params, t, q, v, inputs):
+        return terms.acceleration(t, q, v, params, inputs, prepared)
+
+    return operations(acceleration, prepared, params, jnp.zeros(()), q, q, inputs)
+
+
+def solve(case):
+    """A solve as a function of (params, q0, v0), and such arguments."""
+    system, params, q0, inputs = case
+
+    def end(params, q0, v0):
+        ts = jnp.array([0.0, 1.0])
+        return jl.simulate(system, q0, v0, ts, params, inputs=inputs or None, throw=False).q[-1]
+
+    return end, (params, q0, 0.1 * q0)
+
+
+# ---- Ceilings ------------------------------------------------------------------------------------
+
+
+LONG = {"aircraft", "chain_8"}  # to derive
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.full) if n in LONG else n for n in CEILINGS]
+)
+def test_an_evaluation_stays_below_its_ceilings(name):
+    """Scalar arithmetic and nothing else: no product of arrays, no factorisation, no matrix."""
+    program = evaluation(case(name))
+    functions, divisions = CEILINGS[name]
+    assert count(program, "sin", "cos") <= functions
+    assert count(program, "div") <= divisions
+    assert names(program) <= SCALAR | PACKING
+    assert max(len(shape) for o in program for shape in o.shapes) <= 1
+
+
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
+    """Every row costs one division where M is known to be regular."""
+    whole = case(name)
+    start, known = (whole.q0, jnp.zeros_like(whole.q0)), dict(ENTRIES[name].example.params)
+    assert whole.system.mass_regular(known, 0.0, *start)
+    traced = []  # where the state is traced, it is looked at elsewhere
+    jax.eval_shape(lambda *z: traced.append(whole.system.mass_regular(known, 0.0, *z)), *start)
+    assert traced == [True]
+    program = evaluation(whole, regular=True)
+    functions, divisions = CONSTRAINED[name]
+    assert count(program, "sin", "cos") <= functions
+    assert count(program, "div") <= divisions
+    assert names(program) <= SCALAR | PACKING | {"ne"}  # the rows that are solved with
+    assert max(len(shape) for o in program for shape in o.shapes) <= 1
+
+
+@pytest.mark.parametrize("name", QUASI)
+def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
+    """No multipliers, no matrix, and no division but by what may vanish: cos(theta), 1 + y^2."""
+    system, params, q, _ = case(name)
+    array = replace(system.terms.array, quasi=system.quasi, in_u=system.in_u)
+    terms = replace(system.terms, array=array)
+    prepared = terms.prepare(q, params, {})
+    u = jnp.zeros(len(system.quasi.free))
+
+    def rates(prepared, params, t, q, u):
+        return terms.elements(t, tuple(q), tuple(u), q.dtype, params, {}, prepared)
+
+    program = operations(rates, prepared, params, jnp.zeros(()), q, u)
+    functions, divisions = QUASI[name]
+    assert count(program, "sin", "cos") <= functions
+    assert count(program, "div") <= divisions
+    assert names(program) <= SCALAR | PACKING | {"dynamic_slice", "broadcast_in_dim"}
+    assert max(len(shape) for o in program for shape in o.shapes) <= 1
+    with_multipliers = evaluation(case(name), regular=True)
+    arithmetic = ("add", "sub", "mul", "div", "neg", "sin", "cos")
+    assert count(program, *arithmetic) < count(with_multipliers, *arithmetic)
+
+
+@pytest.mark.parametrize("name", ["chaplygin_sleigh", "rolling_disk"])
+def test_a_step_in_quasi_velocities_has_no_constraint(name):
+    """Neither matrices nor Newton's loops; compiled, its loop calls no library."""
+    system, params, q0, _ = case(name)
+    u0 = jnp.linspace(0.1, 0.2, len(system.quasi.names))
+
+    def end(params, q0, u0):
+        motion = jl.simulate(
+            system, q0, u0=u0, ts=jnp.array([0.0, 1.0]), params=params, throw=False
+        )
+        return motion.q[-1]
+
+    step = loop(operations(end, params, q0, u0, turns=1))
+    matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "scan", "lu", "geqrf"}
+    assert names(step).isdisjoint(matrices)
+    assert not [o for o in step if o.inside.count("while") > 1]
+    assert count(step, "sin", "cos") <= STAGES * QUASI[name][0]
+    text = jax.jit(end).lower(params, q0, u0).compile().as_text()
+    assert {"dot", "custom-call"}.isdisjoint(instructions(in_loops(text)))
+
+
+def test_a_step_with_constraints_has_no_matrix():
+    """Neither in its stages nor in the projection; Newton's loops are the only ones within."""
+    end, start = solve(case("double_pendulum_cartesian"))
+    step = loop(operations(end, *start, turns=1))
+    matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "scan", "sort", "lu"}
+    assert names(step).isdisjoint(matrices)
+    assert all(o.shapes == ((),) for o in step if o.name == "dot_general")
+    newton = [o for o in step if o.inside.count("while") > 1]
+    assert newton
+    assert "cond" not in names(newton)
+
+
+@pytest.mark.parametrize("name", ["top", "cart_pendulum"])
+def test_a_step_evaluates_it_once_per_stage(name):
+    """The same numbers times the stages, and the step-size control, which has no matrix either."""
+    end, start = solve(case(name))
+    step = loop(operations(end, *start, turns=1))
+    functions, divisions = CEILINGS[name]
+    assert count(step, "sin", "cos") <= STAGES * functions
+    n = case(name).system.size
+    assert count(step, "div") <= STAGES * divisions + STEP[0] * n + STEP[1]
+    assert names(step).isdisjoint({"cholesky", "triangular_solve", "custom_linear_solve", "scan"})
+    assert count(step, "dot_general") == 2 * n  # the norm of the error, of vectors of one number
+    assert all(o.shapes == ((),) for o in step if o.name == "dot_general")
+
+
+def test_the_counts_see_what_arrays_cost():
+    """The counters themselves: the array program of the same system breaks every ceiling."""
+    system, *rest = case("top")
+    arrays = jl.System(system.lagrangian, {"q": (3,)}, lowering="array")
+    program = evaluation(Case(arrays, *rest))
+    assert {"dot_general", "custom_linear_solve"} <= names(program) - SCALAR - PACKING
+    assert count(program, "sin", "cos") > CEILINGS["top"][0]
+    assert max(len(shape) for o in program for shape in o.shapes) > 1
+
+
+# ---- The compiled program ------------------------------------------------------------------------
+
+CALLED = re.compile(
+    r"(?:body|condition|calls|to_apply|true_computation|false_computation)=%?([\w.\-]+)"
+)
+CALLED_TOGETHER = re.compile(r"(?:branch|called)_computations=\{([^}]*)\}")
+
+
+@cache
+def compiled(name):
+    """The optimised HLO of a whole solve."""
+    end, start = solve(case(name))
+    return jax.jit(end).lower(*start).compile().as_text()
+
+
+def in_loops(text):
+    """The lines of all computations that are reached from the body of a loop."""
+    lines, of = {}, None
+    for line in text.splitlines():
+        if line.endswith("{") and " = " not in line.split("->")[0]:
+            of = line.removeprefix("ENTRY ").split()[0].lstrip("%").split("(")[0]
+            lines[of] = []
+        elif of is not None:
+            lines[of].append(line)
+    reached = set()
+    waiting = re.findall(r"body=%?([\w.\-]+)", text)
+    while waiting:
+        name = waiting.pop()
+        if name in reached:
+            continue
+        reached.add(name)
+        for line in lines[name]:
+            waiting += CALLED.findall(line)
+            for group in CALLED_TOGETHER.findall(line):
+                waiting += [x.strip().lstrip("%") for x in group.split(",")]
+    return [line for name in reached for line in lines[name]]
+
+
+def instructions(lines):
+    """The operation of every line of HLO."""
+    return {m[1] for line in lines if (m := re.search(r"\s([a-z][a-z\-]*)\(", line))}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n
+        if n in ("pendulum", "top", "cart_pendulum", "double_pendulum_cartesian")
+        else pytest.param(n, marks=pytest.mark.full)
+        for n in (*CEILINGS, *CONSTRAINED)
+    ],
+)
+def test_no_library_is_called_and_no_product_of_arrays_is_left(name):
+    """No LAPACK in the whole solve, no dot in its loops."""
+    assert "custom-call" not in instructions(compiled(name).splitlines())
+    inside = instructions(in_loops(compiled(name)))
+    assert {"dot", "custom-call"}.isdisjoint(inside)
+    assert {"multiply", "add"} <= inside
+
+
+def test_the_reading_of_hlo_sees_products_and_libraries():
+    """The reader itself: a loop with both, on arrays too large to be unrolled."""
+
+    def turn(c):
+        return c[0] + 1, jnp.linalg.cholesky(c[1] @ c[1].T)
+
+    def run(A):
+        return jax.lax.while_loop(lambda c: c[0] < 3, turn, (0, A))[1]
+
+    text = jax.jit(run).lower(jnp.eye(40)).compile().as_text()
+    assert {"dot", "custom-call"} <= instructions(in_loops(text))
+
+
+# ---- A constant mass matrix ----------------------------------------------------------------------
+
+
+def coupled(t, q, v, params):
+    """Three masses on a line, geared together, each on a spring."""
+    M = jnp.diag(params["m"]) + params["J"] * jnp.ones((3, 3))
+    return 0.5 * v @ M @ v - 0.5 * params["k"] * (q @ q)
+
+
+def geared(k=3.0, m=(1.0, 1.5, 0.7), lagrangian=coupled, forces=()):
+    params = {"m": jnp.array(m), "J": jnp.array(0.4), "k": jnp.array(k)}
+    return Case(jl.System(lagrangian, {"x": (3,)}, forces=forces), params, jnp.arange(1.0, 4.0), {})
+
+
+@pytest.mark.parametrize("of", [geared, lambda: case("two_mass_three_springs")])
+def test_a_constant_mass_matrix_is_eliminated_before_the_loop(of):
+    """Divisions and the sign of the pivots are in the prelude; none is left inside."""
+    before, each = prelude(of()), evaluation(of())
+    assert count(before, "div") > 0
+    assert count(before, "gt") > 0
+    assert count(each, "div", "gt", "select_n") == 0
+    end, start = solve(of())
+    step = loop(operations(end, *start, turns=1))
+    assert count(step, "div") == STEP[0] * of().system.size + STEP[1]
+
+
+def test_what_depends_on_params_alone_is_computed_before_the_loop():
+    """Functions and powers of params, in L and in forces."""
+
+    def lagrangian(t, q, v, params):
+        slope = jnp.tan(params["angle"]) * jnp.exp(params["m"])
+        return 0.5 * params["m"] ** 3 * v[0] ** 2 - slope * jnp.cos(q[0])
+
+    def push(t, q, v, params):
+        return jnp.sinh(params["angle"]) * jnp.sin(q)
+
+    system = jl.System(lagrangian, ("x",), forces=(jl.GeneralizedForce(push, "push"),))
+    slanted = Case(system, floats({"m": 2.0, "angle": 0.3}), jnp.ones(1), {})
+    assert names(prelude(slanted)) >= {"tan", "exp", "sinh"}
+    each = evaluation(slanted)
+    assert names(each) <= SCALAR | PACKING
+    assert count(each, "sin", "cos") <= 2
+    assert count(each, "div") == 0
+
+
+# ---- What is not there ---------------------------------------------------------------------------
+
+
+def test_no_force_code_without_forces():
+    """Every force adds to the program; without any the params of forces need not exist."""
+
+    def drag(t, q, v, params):
+        return -params["c"] * jnp.tanh(v)
+
+    def wave(t, q, v, params):
+        return jnp.sin(params["w"] * t) * jnp.ones_like(q)
+
+    both = (jl.GeneralizedForce(drag, "drag"), jl.GeneralizedForce(wave, "wave"))
+    found = []
+    for forces in ((), both[:1], both):
+        pushed = geared(forces=forces)
+        pushed.params.update({name: jnp.array(0.5) for name in "cw"} if forces else {})
+        found.append(evaluation(pushed))
+    bare, dragged, waved = found
+    assert bare == evaluation(geared())
+    assert names(bare).isdisjoint({"tanh", "sin"})
+    assert (names(dragged) & {"tanh", "sin"}, names(waved) & {"tanh", "sin"}) == (
+        {"tanh"},
+        {"tanh", "sin"},
+    )
+    assert len(bare) < len(dragged) < len(waved)
+
+
+def test_no_table_is_searched_where_there_is_none():
+    """A solve whose input is a number has none of the searches and reads that tables need."""
+    searches = {"dynamic_slice", "gather", "scatter", "dynamic_update_slice"}
+    motion = MOTIONS["driven_pendulum"]
+
+    def step(inputs):
+        def end(q0):
+            return jl.simulate(
+                motion.system, q0, [0.0], [0.0, 1.0], motion.params, inputs=inputs, throw=False
+            ).q
+
+        return loop(operations(end, motion.q0, turns=1))
+
+    plain, table = step({"tau": jnp.array(0.3)}), step(motion.inputs)
+    assert names(plain).isdisjoint(searches)
+    assert names(table) & searches
+    assert len(plain) < len(table)
+
+
+def test_no_bias_is_computed_where_it_is_zero():
+    """Free bodies geared together: zeros, or NaN where M is singular, and no arithmetic."""
+
+    def free(t, q, v, params):
+        return coupled(t, q, v, params | {"k": 0.0})
+
+    assert names(evaluation(geared(lagrangian=free))).isdisjoint(SCALAR - {"select_n"})
+    assert "mul" in names(evaluation(geared()))
+
+
+def test_time_is_not_read_where_nothing_depends_on_it():
+    """The clock enters no operation of the evaluation."""
+
+    def reads_time(lagrangian):
+        system, params, q, _ = geared(lagrangian=lagrangian)
+        prepared = system.terms.prepare(q, params, {})
+
+        def acceleration(t):
+            return system.terms.acceleration(t, q, q, params, {}, prepared)
+
+        jaxpr = jax.make_jaxpr(acceleration)(jnp.zeros(())).jaxpr
+        return any(jaxpr.invars[0] is x for eqn in jaxpr.eqns for x in eqn.invars)
+
+    def rocked(t, q, v, params):
+        return coupled(t, q, v, params) + jnp.cos(t) * q[0]
+
+    def total_derivative(t, q, v, params):
+        """L + d/dt sin(t): other numbers, the same equations."""
+        return coupled(t, q, v, params) + jnp.cos(t)
+
+    assert not reads_time(coupled)
+    assert not reads_time(total_derivative)
+    assert reads_time(rocked)
+
+
+@pytest.mark.parametrize("chosen", ["scalar", "array"])
+def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
+    """Rows and gamma are never asked for; no array has the size of M with rows appended."""
+
+    def asked(*args):
+        raise AssertionError("constraint rows of a system without constraints")
+
+    for name in ("rows", "gamma", "position", "velocity", "correction", "reactions"):
+        monkeypatch.setattr(ArrayTerms, name, asked)
+    monkeypatch.setattr(Dynamics, "settle", asked)
+
+    def fresh(t, q, v, params):
+        return coupled(t, q, v, params)
+
+    _, *rest = geared()
+    system = jl.System(fresh, {"x": (3,)}, lowering=chosen)
+    found = evaluation(Case(system, *rest))
+    end, start = solve(Case(system, *rest))
+    assert jax.eval_shape(end, *start).shape == (3,)
+    assert max(np.prod(shape, dtype=int) for o in found for shape in o.shapes) <= 3 * 3
+
+
+# ---- Values of params ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "special",
+    [{"k": 0.0}, {"m": (1.0, 1.0, 1.0)}, {"k": 1.0, "m": (0.0, 1.0, 1.0)}, {"k": np.nan}],
+    ids=["no spring", "equal masses", "no mass", "nan"],
+)
+def test_values_of_params_do_not_change_the_program(special):
+    """One program, operation by operation, for L declared anew, so that no cache decides."""
+
+    def program(**values):
+        def fresh(t, q, v, params):
+            return coupled(t, q, v, params)
+
+        end, start = solve(geared(lagrangian=fresh, **values))
+        return operations(end, *start, turns=1)
+
+    assert program(**special) == program()

@@ -1,0 +1,52 @@
+"""Sine and cosine by polynomial, against the library's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlag._lowering._trig import sincos
+
+EPS = np.finfo(float).eps
+RNG = np.random.default_rng(0)
+NEAR = np.concatenate(
+    [k * np.pi / 2 + np.array([-1e-3, -1e-9, 0.0, 1e-9, 1e-3]) for k in range(-40, 41)]
+)
+
+
+@pytest.mark.parametrize(
+    "x", [RNG.uniform(-10, 10, 20000), RNG.uniform(-1e5, 1e5, 20000), NEAR, NEAR * 1e3]
+)
+def test_values_are_those_of_the_library(x):
+    """Within 2 eps of its size, near zeros as well."""
+    for found, expected in zip(jax.jit(sincos)(x), (np.sin(x), np.cos(x)), strict=True):
+        assert np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1e-12)) <= 2 * EPS
+
+
+@pytest.mark.parametrize("size", [1e8, 1e11, 1e13])
+def test_large_arguments_are_off_by_their_own_rounding(size):
+    x = jnp.asarray(size * RNG.uniform(1.0, 2.0, 2000))
+    s, c = sincos(x)
+    for found, exact in ((s, np.sin(x)), (c, np.cos(x))):
+        assert np.max(np.abs(found - exact)) <= 2 * EPS * 2 * size
+    np.testing.assert_allclose(np.square(s) + np.square(c), 1.0, rtol=4 * EPS)
+
+
+def test_odd_values():
+    s, c = sincos(jnp.array([0.0, -0.0, np.inf, -np.inf, np.nan]))
+    np.testing.assert_array_equal(s, [0.0, 0.0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(c, [1.0, 1.0, np.nan, np.nan, np.nan])
+    huge = jnp.array([1e16, -1e19, 1e60, 1e300])
+    assert np.max(np.abs(sincos(huge))) <= 1 + 2 * EPS
+    assert sincos(jnp.float32(0.3))[0].dtype == jnp.float32
+
+
+def test_derivatives_are_cosine_and_sine():
+    """Forward, reverse and second, without differentiating the polynomial."""
+    x = jnp.asarray(RNG.uniform(-10, 10, 100))
+    for first in (jax.jacfwd, jax.jacrev):
+        slopes = jax.vmap(first(sincos))(x)
+        np.testing.assert_allclose(slopes[0], np.cos(x), atol=2 * EPS)
+        np.testing.assert_allclose(slopes[1], -np.sin(x), atol=2 * EPS)
+        curvature = jax.vmap(first(first(lambda x: sincos(x)[0])))(x)
+        np.testing.assert_allclose(curvature, -np.sin(x), atol=2 * EPS)

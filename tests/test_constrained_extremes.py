@@ -1,0 +1,233 @@
+"""Constraints where numbers are extreme: far away, unequal masses, singular states, no inertia."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy import cos, sin
+
+import jaxlag as jl
+
+G = 9.81
+TIGHT = {"rtol": 1e-11, "atol": 1e-11, "throw": False}
+
+
+def free(t, q, v, params):
+    return 0.5 * v @ v
+
+
+# ---- Rows that were left out ---------------------------------------------------------------------
+
+
+def parting(t, q, params):
+    """Two rows that are one at y = 0 and part where y grows."""
+    return jnp.stack([q[0], q[0] + q[1] ** 3])
+
+
+@pytest.mark.parametrize("project", [True, False, jl.Baumgarte(5.0, 5.0)])
+def test_rows_that_part_are_told(project):
+    system = jl.System(free, ("x", "y"), constraints=(jl.Holonomic(parting, ("a", "b")),))
+    motion = jl.simulate(
+        system, [0.0, 0.0], [0.0, 1.0], [0.0, 1.0], project=project, method="tsit5", throw=False
+    )
+    assert motion.status == jl.Status.rank_change
+    assert motion.last_time < 0.05
+
+
+# ---- Time backwards ------------------------------------------------------------------------------
+
+
+def pendulum(t, q, v, params):
+    return 0.5 * v @ v - G * q[1]
+
+
+def rod(t, q, params):
+    return q @ q - 1.0
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_baumgarte_damps_backwards(traced):
+    """There and back: alpha has the sense of time."""
+    system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
+
+    def end(ts):
+        return jl.simulate(
+            system, [1.0, 0.0], [0.0, 0.0], ts, project=jl.Baumgarte(20.0, 20.0), **TIGHT
+        ).q[-1]
+
+    ahead, back = map(jax.jit(end) if traced else end, map(jnp.array, ([0.0, 2.0], [0.0, -2.0])))
+    np.testing.assert_allclose(back, ahead, atol=1e-8)  # it starts at rest
+    assert abs(rod(0.0, back, None)) < 1e-9
+
+
+# ---- Far from the origin -------------------------------------------------------------------------
+
+
+def chain(t, q, v, params):
+    return 0.25 * v @ v - 0.5 * G * (q[2] + q[5])
+
+
+def links(t, q, x0):
+    first, second = q[:3] - jnp.array([1.0, 0.0, 0.0]) * x0, q[3:] - q[:3]
+    return jnp.stack([first @ first - 1.0, second @ second - 1.0])
+
+
+def test_lengths_are_those_of_the_rows_not_of_the_frame():
+    """Two rods of 1 m that hang 100 km from the origin move as they do near it."""
+    system = jl.System(
+        chain, {"a": (3,), "b": (3,)}, constraints=(jl.Holonomic(links, ("upper", "lower")),)
+    )
+
+    def moved(x0, off=0.0):
+        q0 = [x0 + 1.0 + off, 0.0, 0.0, x0 + 2.0, 0.0, 0.0]
+        return jl.simulate(system, q0, [0.0] * 6, [0.0, 0.3], x0, throw=False)
+
+    near, far = moved(0.0), moved(1e5)
+    assert near.status == far.status == 0
+    np.testing.assert_allclose(far.q[-1, [2, 5]], near.q[-1, [2, 5]], rtol=1e-6)
+    assert moved(1e5, off=0.2).status == jl.Status.inconsistent_start
+
+
+# ---- Unequal masses ------------------------------------------------------------------------------
+
+
+def cart(t, q, v, params):
+    heavy, light = params["M"], params["m"]
+    return 0.5 * heavy * v[0] ** 2 + 0.5 * light * (v[1] ** 2 + v[2] ** 2) - light * G * q[2]
+
+
+def hanging(t, q, params):
+    return (q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0
+
+
+@pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
+def test_masses_may_be_as_unequal_as_they_like(formulation):
+    """Against one coordinate, params traced: M = 1e12 m."""
+    system = jl.System(cart, ("X", "x", "y"), constraints=(jl.Holonomic(hanging, "rod"),))
+    angle, heavy, light = 1.0, 1e11, 0.1
+    start = [0.0, sin(angle), -cos(angle)], [0.0, 0.0, 0.0]
+
+    @jax.jit
+    def run(params):
+        return jl.simulate(system, *start, [0.0, 1.0], params, formulation=formulation, **TIGHT)
+
+    motion = run({"M": heavy, "m": light})
+    assert motion.status == 0
+    single = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + G * jnp.cos(q[0]), ("angle",))
+    expected = jl.simulate(single, [angle], [0.0], [0.0, 1.0], **TIGHT).q[-1, 0]
+    np.testing.assert_allclose(motion.q[-1, 1], sin(expected), atol=1e-9)
+    even = run({"M": 1.0, "m": 1.0})
+    assert motion.stats["accepted"] < 3 * even.stats["accepted"]
+
+
+# ---- Almost dependent rows -----------------------------------------------------------------------
+
+
+def almost(t, q, angle):
+    return jnp.stack([q[0], q[0] * jnp.cos(angle) + q[1] * jnp.sin(angle)])
+
+
+@pytest.mark.parametrize("angle", [1e-2, 2e-4, 5e-5])
+def test_almost_dependent_rows_have_their_reactions(angle):
+    """Both hold x and y; digits are lost as sin(angle)^2 says."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - G * q[1] + q[0] - 3.0 * q[2],
+        ("x", "y", "z"),
+        constraints=(jl.Holonomic(almost, ("a", "b")),),
+    )
+    state = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    atol = 1e-14 / sin(angle) ** 2
+    np.testing.assert_allclose(system.acceleration(angle, *state), [0, 0, -3], atol=atol)
+    np.testing.assert_allclose(system.constraint_force(angle, *state), [-1, G, 0], atol=G * atol)
+    lam = system.multipliers(angle, *state)
+    np.testing.assert_allclose(lam["b"], G / sin(angle), rtol=1e-6)
+
+
+# ---- Singular inertia ----------------------------------------------------------------------------
+
+
+def polar(t, q, v, params):
+    return 0.5 * params * (v[0] ** 2 + (q[0] * v[1]) ** 2) - 0.5 * q[0] ** 2
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_start_where_a_coordinate_has_no_inertia(traced):
+    """A slot through the centre of polar coordinates: r = sin(t)."""
+    slot = jl.Holonomic(lambda t, q, params: q[1] - 0.3, "slot")
+    system = jl.System(polar, ("r", "phi"), constraints=(slot,))
+
+    def end(params):
+        return jl.simulate(system, [0.0, 0.3], [1.0, 0.0], [0.0, 1.0], params, **TIGHT).q[-1, 0]
+
+    found = (jax.jit(end) if traced else end)(1.0)
+    np.testing.assert_allclose(found, sin(1.0), atol=1e-10)
+
+
+def spring(t, q, v, params):
+    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
+
+
+def geared():
+    """x drives a wheel a by rolling, and a drives b by a gear; neither wheel has inertia."""
+    return jl.System(
+        spring,
+        ("x", "a", "b"),
+        constraints=(
+            jl.Holonomic(lambda t, q, params: q[1] + 2 * q[2], "gear"),
+            jl.Pfaffian(lambda t, q, v, params: v[0] - params * v[1], "roll"),
+        ),
+    )
+
+
+@pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
+def test_wheels_without_inertia(formulation):
+    """Held by a row of velocities beside one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
+    motion = jl.simulate(
+        geared(),
+        [0.3, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [0.0, 1.0],
+        0.5,
+        formulation=formulation,
+        **TIGHT,
+    )
+    x = 0.3 * cos(1.0)
+    np.testing.assert_allclose(motion.q[-1], [x, (x - 0.3) / 0.5, (0.3 - x)], atol=1e-10)
+
+
+def test_a_guess_for_wheels_without_inertia():
+    state = jl.assemble(geared(), [0.3, 0.1, 0.0], [0.2, 0.0, 0.0], 0.5)
+    np.testing.assert_allclose(state.q[1] + 2 * state.q[2], 0.0, atol=1e-15)
+    np.testing.assert_allclose(state.v[0], 0.5 * state.v[1], atol=1e-15)
+
+
+def test_all_of_a_heavy_state_may_be_held():
+    """Nothing is left to move, and nothing needs to."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * p * v @ v, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),)
+    )
+    hold = ("x", "y", "x'", "y'")
+    state = jl.assemble(system, [0.6, -0.8], [0.8, 0.6], 30.0, hold=hold)
+    np.testing.assert_array_equal(state.q, [0.6, -0.8])
+
+
+# ---- Starts that cannot be solved with -----------------------------------------------------------
+
+
+def test_a_row_that_vanishes_at_the_start_is_named():
+    """The user's state is kept, finite as it is."""
+    system = jl.System(
+        free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, params: q[0] ** 2, "flat"),)
+    )
+    motion = jl.simulate(system, [0.0, 1.0], [0.0, 1.0], [0.0, 1.0], throw=False)
+    assert motion.status == jl.Status.rank_change
+    assert "('flat')" in motion.message()
+    np.testing.assert_array_equal(motion.last_state[0], [0.0, 1.0])
+
+
+def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
+    system = jl.System(
+        free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, p: jnp.log(q[0]), "log"),)
+    )
+    motion = jl.simulate(system, [-1.0, 1.0], [0.0, 1.0], [0.0, 1.0], throw=False)
+    assert motion.status == jl.Status.nonfinite

@@ -1,0 +1,122 @@
+"""Derivatives that are wrong: modes against each other, and differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _checked import Q, check, file_of, here, line_of, places, right, rule_of
+from jax import lax
+
+import jaxlag as jl
+from jaxlag._derivative_check import _quotient, step
+from tests._user import unchecked  # noqa: F401
+
+
+@jax.custom_jvp
+def right_once(x):
+    return right(x)
+
+
+@right_once.defjvp
+def right_once_rule(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    return right_once(x), -1.001 * (2 * jnp.cos(x) - x * jnp.sin(x)) * -dx
+
+
+@pytest.mark.parametrize(
+    ("derivative", "order"),
+    [(right, None), (lambda x: 1.00001 * right(x), 1), (lambda x: -right(x), 1), (right_once, 2)],
+)
+def test_rules_of_the_users_own(derivative, order):
+    """The lowest order that is wrong, be it by one part in 10^5."""
+    function = rule_of(derivative)
+    report = check(lambda q, params: function(q[0]) + q[1])
+    assert report.ok == (order is None)
+    for finding in report.findings:
+        assert (finding.kind, finding.order, finding.function) == ("wrong", order, "lagrangian")
+        assert "difference quotient" in finding.hint
+    if order:
+        assert places(report) == here("custom_jvp_call", rule_of, "@jax.custom_jvp")
+        assert {"given", "random 1", "random 2", "random 3"} == {f.state for f in report.findings}
+
+
+def test_one_wrong_rule_among_several():
+    """None is singled out, but all are named."""
+    fine, wrong = rule_of(right), rule_of(lambda x: 2.0 * right(x))
+    (finding, *_) = check(lambda q, params: fine(q[0]) + right_once(q[1]) + wrong(q[1])).findings
+    assert (finding.kind, finding.order, finding.primitive) == ("wrong", 1, "")
+    for rule in (rule_of, right_once):
+        place = f"{file_of(rule)}:{line_of(rule, '@jax.custom_jvp')}"
+        assert place in finding.hint
+
+
+def test_a_rule_that_is_not_finite_is_named_where_it_is_used():
+    def potential(q, params):
+        return q[1] + root(q[0] ** 2)  # wrong
+
+    @jax.custom_jvp
+    def root(x):
+        return jnp.sqrt(x)
+
+    root.defjvp(lambda primals, tangents: (root(primals[0]), tangents[0] / (2 * root(primals[0]))))
+    report = check(potential)
+    assert places(report) == here("custom_jvp_call", potential, "# wrong")
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.001])
+def test_rules_for_reverse_derivatives_alone(factor):
+    @jax.custom_vjp
+    def function(x):
+        return jnp.sin(x)
+
+    function.defvjp(lambda x: (jnp.sin(x), x), lambda x, dy: (factor * jnp.cos(x) * dy,))
+    report = check(lambda q, params: function(q[0]))
+    assert report.ok == (factor == 1.0)
+    assert list(report.omitted) == ["lagrangian"]
+    assert {(f.kind, f.order, f.mode) for f in report.findings} <= {("wrong", 1, "reverse")}
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.001])
+def test_forward_and_reverse_derivatives_disagree(factor):
+    def solved(q, params):
+        def solve(matvec, b):
+            return b / 2.0
+
+        def transpose_solve(vecmat, b):
+            return factor * b / 2.0
+
+        return jnp.sum(lax.custom_linear_solve(lambda x: 2.0 * x, q**2, solve, transpose_solve))
+
+    report = check(solved)
+    assert report.ok == (factor == 1.0)
+    for finding in report.findings:
+        assert (finding.kind, finding.order, finding.mode) == ("wrong", 1, "reverse")
+        assert "forward" in finding.hint
+
+
+def test_kinks_and_jumps_are_no_findings():
+    """At the given state, on the kink; functions of different smoothness."""
+
+    def potential(q, params):
+        x, y = q[0] - 0.8, q[1] - 0.6
+        kinks = jnp.abs(x) + jnp.where(y > 0, y, 0.0) + jnp.maximum(x, 0.0) ** 2
+        return kinks + jnp.where(x > 0, x**3, x**2) + jl.math.norm(q - jnp.array(Q))
+
+    assert check(potential).ok
+
+
+def test_extrapolated_quotients():
+    """Exact for cubics; doubt covers a jump and a kink, and nearly nothing where f is smooth."""
+
+    def around(f, x):
+        h = step(np.finfo(float).eps)
+        return _quotient([f(x + s * h) for s in (0, 1, -1, 0.5, -0.5)], h)
+
+    value, doubt = around(lambda x: x**3 - 2 * x, 0.7)
+    assert value == pytest.approx(3 * 0.7**2 - 2, rel=1e-11)
+    assert doubt < 1e-4
+    value, doubt = around(lambda x: float(np.sign(x)), 0.0)  # of derivative 0 on either side
+    assert abs(value) < doubt
+    value, doubt = around(abs, 0.0)
+    assert abs(value - 1.0) <= doubt
+    assert abs(value + 1.0) <= doubt

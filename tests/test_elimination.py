@@ -1,0 +1,77 @@
+"""Elimination of states, against dense least squares."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlag._elimination import Rows, condense, eliminate, substitute
+
+EPS = np.finfo(float).eps
+SEGMENTS, ROWS, STATES, PARAMS, DAMPING = 7, 9, 4, 3, 0.3
+
+
+def problem(chained):
+    """(rows for elimination, the same as one dense matrix, its right-hand side)."""
+    rng = np.random.default_rng(0)
+    columns = STATES + PARAMS + 1
+    measured = rng.normal(size=(SEGMENTS, ROWS, columns))
+    joined = rng.normal(size=(SEGMENTS, STATES, columns))
+    following = np.full((SEGMENTS, STATES), 3.0)
+    for end in (2, SEGMENTS - 1):  # two experiments
+        joined[end] = following[end] = 0.0
+    prior = rng.normal(size=(2, PARAMS + 1))
+    size = PARAMS + SEGMENTS * STATES
+
+    def dense(k, rows):
+        full = np.zeros((len(rows), size))
+        full[:, :PARAMS] = rows[:, STATES:-1]
+        full[:, PARAMS + k * STATES : PARAMS + (k + 1) * STATES] = rows[:, :STATES]
+        return full
+
+    blocks, right = [], []
+    for k in range(SEGMENTS):
+        blocks.append(dense(k, measured[k]))
+        right.append(measured[k, :, -1])
+        if chained and following[k, 0]:
+            row = dense(k, joined[k])
+            row[:, PARAMS + (k + 1) * STATES : PARAMS + (k + 2) * STATES] = -np.diag(following[k])
+            blocks.append(row)
+            right.append(joined[k, :, -1])
+    blocks.append(np.eye(2, size) * 0.0)
+    blocks[-1][:, :PARAMS] = prior[:, :-1]
+    right.append(prior[:, -1])
+    chain = (jnp.asarray(joined), jnp.asarray(following)) if chained else (None, None)
+    rows = Rows(jnp.asarray(measured), *chain, jnp.asarray(prior))
+    return rows, np.concatenate(blocks), np.concatenate(right)
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_the_solution_is_that_of_the_dense_problem(chained):
+    rows, matrix, right = problem(chained)
+    left = eliminate(condense(rows), jnp.asarray(DAMPING))
+    p, x = substitute(left)
+    size = matrix.shape[1]
+    damped = np.concatenate([matrix, np.sqrt(DAMPING) * np.eye(size)])
+    expected = np.linalg.lstsq(damped, np.append(right, np.zeros(size)))[0]
+    found = np.concatenate([p, np.ravel(x)])
+    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_what_is_left_is_the_information_of_the_params(chained):
+    """R^T R is the Schur complement of the states in J^T J; the last number is the residual."""
+    rows, matrix, right = problem(chained)
+    left = eliminate(condense(rows), jnp.asarray(DAMPING))
+    size = matrix.shape[1]
+    damped = np.concatenate([matrix, np.sqrt(DAMPING) * np.eye(size)])
+    normal = damped.T @ damped
+    (own, mixed), (_, states) = (np.split(x, [PARAMS], 1) for x in np.split(normal, [PARAMS]))
+    factor = np.asarray(left.params)[:-1, :-1]
+    schur = own - mixed @ np.linalg.solve(states, mixed.T)
+    bound = 100 * EPS * np.linalg.norm(normal)
+    np.testing.assert_allclose(factor.T @ factor, schur, rtol=0, atol=bound)
+    full = np.append(right, np.zeros(size))
+    best = np.linalg.lstsq(damped, full)[0]
+    residual = np.linalg.norm(damped @ best - full)
+    np.testing.assert_allclose(abs(left.params[-1, -1]), residual, rtol=1e-12)

@@ -1,0 +1,289 @@
+"""Fits of motions whose parameters are known; every warning and error by name."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+NOISE = 2e-3
+TRUE = {"m": 1.0, "l": 0.7, "g": 9.81, "c": 0.05}
+TS = np.linspace(0.0, 3.0, 151)
+OPTIONS = {"method": "tsit5", "dt": 0.02}
+
+
+def lagrangian(t, q, v, p):
+    inertia = p["m"] * p["l"] ** 2
+    return 0.5 * inertia * v[0] ** 2 + p["m"] * p["g"] * p["l"] * jnp.cos(q[0])
+
+
+def drag(t, q, v, p):
+    return 0.5 * p["c"] * v[0] ** 2
+
+
+def motor(t, q, v, p, inputs):
+    return inputs["torque"][None]
+
+
+pendulum = jl.System(lagrangian, ("x",), forces=(jl.Rayleigh(drag, "air"),))
+driven = jl.System(
+    lagrangian, ("x",), forces=(jl.Rayleigh(drag, "air"), jl.GeneralizedForce(motor, "motor"))
+)
+
+
+def angles(ts=TS, q0=1.0, seed=0, noise=NOISE, **options):
+    """Measured angles of the true pendulum; the truth is far more accurate than they are."""
+    system = driven if options else pendulum
+    motion = jl.simulate(system, [q0], [0.0], ts, TRUE, rtol=1e-11, atol=1e-11, **options)
+    return np.asarray(motion["x"]) + noise * np.random.default_rng(seed).normal(size=len(ts))
+
+
+def experiment(**options):
+    return jl.Experiment(TS, {"x": angles()}, **options)
+
+
+def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
+    start = TRUE | {"l": 0.5, "c": 0.02} if params0 is None else params0
+    return jl.fit(system, data, start, free=free, **(OPTIONS | options))
+
+
+def within(found, names, deviations=3.5):
+    """Estimates within so many of their own standard deviations of the truth."""
+    for name in names:
+        assert found.std[name] < 0.05 * TRUE[name]
+        assert abs(found.params[name] - TRUE[name]) < deviations * found.std[name], name
+
+
+@pytest.mark.parametrize("segments", [1, 5])
+def test_parameters_start_and_noise_are_found(segments):
+    found = fit(experiment(), segments=segments)
+    assert found.converged
+    within(found, ("l", "c"))
+    np.testing.assert_allclose(found.starts[0], [1.0, 0.0], atol=5e-3)
+    # Of 151 samples the standard deviation is known to 6 %.
+    np.testing.assert_allclose(found.noise["x"], NOISE, rtol=0.2)
+    np.testing.assert_allclose(found.rms("x"), NOISE, rtol=0.2)
+    low, high = found.interval()["l"]
+    assert low < TRUE["l"] < high
+    assert found.gap < 1e-4
+    assert "95 % in" in str(found)
+
+
+def test_segments_find_what_one_motion_does():
+    """Joined ever more tightly they are one motion: the same estimates, within a hundredth of
+    their standard deviations."""
+    one, many = (fit(experiment(), segments=k, tolerance=1e-7) for k in (1, 5))
+    for name in ("l", "c"):
+        assert abs(one.params[name] - many.params[name]) < 1e-2 * one.std[name]
+        np.testing.assert_allclose(one.std[name], many.std[name], rtol=1e-2)
+
+
+def test_the_covariance_is_that_of_the_dense_derivatives():
+    """(J^T J)^-1 of params and starts, from central differences of simulations."""
+    data = experiment(sigma={"x": NOISE})
+    found = fit(data)
+
+    def residuals(x):
+        params = TRUE | {"l": x[0], "c": x[1]}
+        motion = jl.simulate(pendulum, x[2:3], x[3:4], TS, params, **OPTIONS)
+        return np.asarray(motion["x"]) / NOISE
+
+    x = np.concatenate([[found.params["l"], found.params["c"]], found.starts[0]])
+    h = 1e-5
+    columns = [(residuals(x + h * e) - residuals(x - h * e)) / (2 * h) for e in np.eye(4)]
+    jacobian = np.stack(columns, axis=1)
+    covariance = np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
+    order = [found.names.index(name) for name in ("l", "c")]
+    own = found.covariance[np.ix_(order, order)]
+    np.testing.assert_allclose(own, covariance, rtol=1e-5, atol=1e-6 * np.max(np.abs(own)))
+
+
+def test_several_experiments_with_gaps_and_other_rates():
+    """Padding and gaps count nothing: as a fit of the rows that are there."""
+    short = np.linspace(0.0, 1.0, 23)
+    y = angles()
+    with_gap = y.copy()
+    with_gap[40:70] = np.nan
+    second = {"x": angles(short, 0.6, seed=1)}
+    kept = np.isfinite(with_gap)
+    one = fit((jl.Experiment(TS, {"x": with_gap}), jl.Experiment(short, second)))
+    same = jl.Experiment(TS[kept], {"x": y[kept]}), jl.Experiment(short, second)
+    # Fixed steps do not depend on which rows are saved.
+    other = fit(same)
+    within(one, ("l", "c"))
+    np.testing.assert_allclose(one.values, other.values, rtol=1e-6)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-4)
+    assert np.isnan(one.residuals[0]["x"][40:70]).all()
+    assert np.isfinite(one.residuals[1]["x"]).all()
+
+
+def test_a_driven_motion_and_its_rate():
+    """Torque from a table, in segments; a measured rate and a channel of one's own."""
+    times = np.linspace(0.0, 3.0, 61)
+    torque = jl.Linear(times, 0.8 * np.sin(3.0 * times))
+    motion = jl.simulate(driven, [0.2], [0.0], TS, TRUE, inputs={"torque": torque})
+    rng = np.random.default_rng(3)
+    rate = np.asarray(motion.v[:, 0]) + 0.02 * rng.normal(size=len(TS))
+    height = -TRUE["l"] * np.cos(np.asarray(motion["x"])) + 1e-3 * rng.normal(size=len(TS))
+    data = jl.Experiment(
+        TS,
+        {"x'": rate, "height": height},
+        inputs={"torque": torque},
+        sigma={"x'": 0.02, "height": 1e-3},
+        q0=[0.15],
+        v0=[0.1],
+    )
+
+    def shown(motion):
+        return -motion.params["l"] * jnp.cos(motion["x"])
+
+    found = fit(
+        data,
+        ("l", "c", "m"),
+        TRUE | {"l": 0.6, "m": 1.3},
+        driven,
+        channels={"height": shown},
+        segments=3,
+    )
+    assert found.converged
+    within(found, ("l", "m"))
+
+
+def test_what_cannot_be_known_is_named():
+    """L is m times a function of l and g/l: a free swing tells g/l and c/(m l^2)."""
+    found = fit(experiment(), ("m", "l", "g"), TRUE | {"c": 0.05})
+    assert len(found.unidentifiable) == 1
+    assert np.isinf(found.std["g"])
+    assert any(text in found.determined for text in ("l/g", "g/l"))
+    ratio = found.params["g"] / found.params["l"]
+    np.testing.assert_allclose(ratio, TRUE["g"] / TRUE["l"], rtol=3e-3)
+
+
+def test_priors_decide_what_measurements_do_not():
+    prior = {"g": jl.Prior(9.81, 0.01)}
+    found = fit(experiment(), ("l", "g", "m"), TRUE | {"l": 0.6}, priors=prior)
+    assert not found.unidentifiable
+    np.testing.assert_allclose(found.std["g"], 0.01, rtol=1e-2)
+    within(found, ("l",))
+
+
+def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
+    plain = fit(experiment())
+    held = fit(experiment(), transforms={"l": jl.Positive(), "c": jl.Bounded(0.0, 1.0)})
+    np.testing.assert_allclose(held.values, plain.values, rtol=1e-4)
+    np.testing.assert_allclose(held.covariance, plain.covariance, rtol=1e-3)
+
+
+def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
+    exact = fit(experiment(q0=[1.0], v0=[0.0], start_sigma=0.0))
+    assert exact.starts[0].tolist() == [1.0, 0.0]
+    free = fit(experiment())
+    assert exact.std["l"] < free.std["l"]
+    rough = fit(experiment(q0=[1.1], v0=[0.0], start_sigma=1e-6))
+    np.testing.assert_allclose(rough.starts[0], [1.1, 0.0], atol=1e-4)
+
+
+@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
+def test_outliers_count_for_less(loss):
+    y = angles()
+    y[::10] += 0.3
+    data = jl.Experiment(TS, {"x": y}, sigma={"x": NOISE})
+    robust, plain = fit(data, loss=loss), fit(data)
+    off = [abs(found.params["l"] - TRUE["l"]) for found in (robust, plain)]
+    assert off[0] < 0.1 * off[1]
+
+
+def test_a_segment_that_fails_is_named_and_does_not_count():
+    """A spring that breaks at x = 2: beyond, the force is not a number."""
+
+    def force(t, q, v, p):
+        return -p["k"] * q + 1e-15 * jnp.sqrt(2.0 - q)
+
+    spring = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(jl.GeneralizedForce(force, "spring"),)
+    )
+    ts = np.linspace(0.0, 2.0, 41)
+    good = jl.Experiment(ts, {"x": np.cos(1.5 * ts)}, name="good")
+    broken = jl.Experiment(ts, {"x": 3.0 + 0.0 * ts + 1e-3 * ts}, name="broken")
+    with pytest.warns(UserWarning, match=r"segment of broken that starts at t = 0 s ended with"):
+        found = jl.fit(spring, (good, broken), {"k": 2.0}, free=("k",), **OPTIONS)
+    np.testing.assert_allclose(found.params["k"], 2.25, rtol=1e-6)
+    assert len(found.failed) == 1
+    assert np.isnan(found.residuals[1]["x"]).all()
+    alone = jl.fit(spring, good, {"k": 2.0}, free=("k",), **OPTIONS)
+    np.testing.assert_allclose(found.params["k"], alone.params["k"], rtol=1e-9)
+
+
+def test_warnings_name_what_they_are_about():
+    with pytest.warns(UserWarning, match=r"c starts on its bound"):
+        fit(experiment(), params0=TRUE | {"c": 0.0}, transforms={"c": jl.Bounded(0.0, 1.0)})
+    with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
+        found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0})
+    assert found.params["spare"] == 1.0
+    flat = jl.Experiment(TS, {"x": angles(), "x'": 0.0 * TS}, sigma={"x": NOISE, "x'": 1e3})
+    with pytest.warns(UserWarning, match=r"channel \"x'\" of experiment is constant"):
+        fit(flat)
+
+
+def test_no_warning_without_reason():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit(experiment())
+
+
+def test_windows_and_parts():
+    pieces = experiment().windows(1.0)
+    assert [len(piece.ts) for piece in pieces] == [50, 50, 50]
+    assert pieces[1].ts[0] == TS[50]
+    np.testing.assert_array_equal(pieces[2].channels["x"][:, 0], angles()[100:150])
+    found = fit(pieces)
+    within(found, ("l",))
+    assert len(found.starts) == 3
+
+
+NAN = np.full(len(TS), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("ts", "channels", "options", "message"),
+    [
+        (TS[::-1], {"x": TS}, {}, r"ts must increase strictly, but ts\[0\] = 3 and"),
+        (TS[:1], {"x": TS[:1]}, {}, r"one row of two times or more"),
+        (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one row per time, 151"),
+        (TS, {"x": NAN}, {}, r"channels\['x'\] must hold some numbers, but all were NaN"),
+        (TS, {}, {}, r"one channel or more"),
+        (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"sigma\['x'\] must be positive"),
+        (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
+        (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"q0 must be \(n,\) numbers at ts\[0\]"),
+        (TS, {"x": TS}, {"start_sigma": 0.0}, r"come with the start it is about"),
+    ],
+)
+def test_a_bad_experiment_is_named(ts, channels, options, message):
+    with pytest.raises(ValueError, match=message):
+        jl.Experiment(ts, channels, **options)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"free": ("k",)}, r"free must name parameters among \['c', 'g', 'l', 'm'\], but one was"),
+        ({"free": "l"}, r"Write free=\('l',\)"),
+        ({"segments": 0}, r"segments must be a positive integer"),
+        ({"segments": 100}, r"leave two rows or more to each"),
+        ({"loss": "abs"}, r"loss must be one of"),
+        ({"transforms": {"m": jl.Positive()}}, r"transforms must be of free parameters"),
+        ({"transforms": {"l": 3}}, r"transforms\['l'\] must be a transform"),
+        ({"priors": {"m": jl.Prior(1.0, 1.0)}}, r"priors must be of free parameters"),
+        ({"params0": TRUE | {"l": 1}}, r"hold real numbers to be found, but it was 1"),
+        ({"save": ("a",)}, r"save must be left to jl\.fit"),
+        ({"data": ()}, r"experiments must be a jl\.Experiment or a sequence"),
+        ({"data": jl.Experiment(TS, {"y": TS})}, r"be named as one of .*, but one was 'y'"),
+        ({"data": jl.Experiment(TS, {"energy": TS})}, r"be among the channels or in q0"),
+        ({"data": jl.Experiment(TS[:2], {"x": TS[:2]})}, r"at least as many numbers as there are"),
+    ],
+)
+def test_bad_arguments_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        fit(changes.pop("data", experiment()), **changes)

@@ -1,0 +1,144 @@
+"""Vmapped solves: chunks of lanes, against the same trajectories one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _jaxprs import operations
+
+import jaxlag as jl
+from jaxlag import _lanes
+from systems import double_pendulum
+
+EPS = np.finfo(float).eps
+PARAMS = {"m1": 1.0, "m2": 0.6, "h1": 0.9, "h2": 0.7, "g": 9.81}
+TS = np.linspace(0.0, 0.5, 4)
+
+
+def run(q0, params=PARAMS, system=double_pendulum.system, method="dopri8"):
+    """Fixed steps: no decision that rounding could turn."""
+    return jl.simulate(system, q0, [0.3, -0.4], TS, params, dt=0.01, method=method, throw=False)
+
+
+def starts(*shape):
+    return jnp.asarray(np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, 2)))
+
+
+@pytest.fixture(scope="module")
+def single(lowering):
+    return jax.jit(lambda q0, params: run(q0, params).q)
+
+
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.full), 5, 16, 37])
+def test_every_lane_is_its_own_solve(single, count):
+    """To 1e3 roundings: below, at and beyond one chunk, the last of them not full."""
+    q0 = starts(count)
+    batch = jax.jit(jax.vmap(lambda q0: run(q0).q))(q0)
+    assert batch.shape == (count, 4, 2)
+    for i in {0, count // 2, count - 1}:
+        np.testing.assert_allclose(batch[i], single(q0[i], PARAMS), rtol=0, atol=1e3 * EPS)
+
+
+def test_only_what_is_mapped_differs(single):
+    """A batch of params at one start."""
+    lengths = jnp.linspace(0.8, 1.2, 20)
+    batch = jax.jit(jax.vmap(lambda h1: run(jnp.array([0.5, 0.2]), PARAMS | {"h1": h1}).q))(lengths)
+    for i in (0, 19):
+        alone = single(jnp.array([0.5, 0.2]), PARAMS | {"h1": lengths[i]})
+        np.testing.assert_allclose(batch[i], alone, rtol=0, atol=1e3 * EPS)
+
+
+@pytest.mark.full
+def test_vmaps_of_vmaps_are_one_batch():
+    """Three by seven, the inner params shared by none, one or all of a row."""
+    q0, lengths = starts(3, 7), jnp.linspace(0.8, 1.2, 3)
+
+    def one(q0, h1):
+        return run(q0, PARAMS | {"h1": h1}).q
+
+    nested = jax.jit(jax.vmap(jax.vmap(one, (0, None))))(q0, lengths)
+    flat = jax.jit(jax.vmap(one))(q0.reshape(21, 2), jnp.repeat(lengths, 7))
+    np.testing.assert_allclose(nested.reshape(flat.shape), flat, rtol=0, atol=1e3 * EPS)
+    columns = jax.jit(jax.vmap(jax.vmap(one), (1, None), 1))(q0, lengths)
+    np.testing.assert_allclose(columns, nested, rtol=0, atol=1e3 * EPS)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
+def test_derivatives_pass_through(derivative, lowering):
+    """Forward and reverse, first and second order, of the batch as of its trajectories."""
+    if lowering == "array" and derivative is jax.hessian:
+        pytest.skip("chunks of second derivatives are those of scalar programs")
+    q0 = starts(3)
+
+    def last(q0):
+        return run(q0, method="tsit5").q[-1]
+
+    alone = jax.jit(derivative(last))
+    mapped = jax.jit(jax.vmap(derivative(last)))(q0)
+    inside = jax.jit(derivative(lambda q0: jax.vmap(last)(q0)))(q0)
+    scale = np.max(np.abs(mapped))
+    for i in range(3):
+        np.testing.assert_allclose(mapped[i], alone(q0[i]), rtol=0, atol=1e5 * EPS * scale)
+        own = inside[i][(slice(None), i) + ((slice(None), i) if inside.ndim == 6 else ())]
+        np.testing.assert_allclose(own, mapped[i], rtol=0, atol=1e5 * EPS * scale)
+
+
+def test_lanes_end_by_themselves():
+    """One lane that leaves the floats, in a chunk and in the filling of the last one."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v + 0.25 * params * jnp.sum(q**4)
+
+    system = jl.System(lagrangian, ("x", "y"))
+    ts, q0 = [0.0, 1.0, 2.0], jnp.array([0.5, 0.1])
+
+    def one(k):
+        return jl.simulate(system, q0, [0.1, 0.2], ts, k, throw=False)
+
+    stiffness = jnp.full(33, -1.0).at[jnp.array([3, 32])].set(200.0)
+    motion = jax.jit(jax.vmap(one))(stiffness)
+    alone = jax.jit(one)(-1.0)
+    bad = np.isin(np.arange(33), [3, 32])
+    assert (np.asarray(motion.status) != 0).tolist() == bad.tolist()
+    assert np.isnan(motion.q[bad, -1]).all()
+    np.testing.assert_allclose(motion.q[~bad], np.broadcast_to(alone.q, (31, 3, 2)), atol=1e-9)
+
+
+def test_chunks_are_what_is_compiled(lowering):
+    """37 trajectories: a loop over 3 chunks of rows of 16 numbers; on arrays one loop of 37."""
+    program = operations(jax.vmap(lambda q0: run(q0).q), starts(37), turns=1)
+    rows = {s for o in program if "while" in o.inside and o.name == "div" for s in o.shapes}
+    if lowering == "auto":
+        assert any(o.inside[-2:] and "scan" in o.inside and "while" in o.inside for o in program)
+        assert rows == {(_lanes.LANES,)}
+    else:
+        assert rows
+        assert all(shape[0] == 37 for shape in rows)
+
+
+def test_explain_says_which(lowering):
+    how = {"auto": "16 trajectories at a time", "array": "all trajectories"}[lowering]
+    assert f"batches       by jax.vmap: {how} in one loop" in double_pendulum.system.explain(PARAMS)
+    arrays = jl.System(double_pendulum.system.lagrangian, ("a", "b"), lowering="array")
+    assert "batches       by jax.vmap: all trajectories in one loop" in arrays.explain(PARAMS)
+
+
+def test_many_rows_of_a_costly_scene():
+    """XLA shares among cores an operation that costs much, but cannot in a native loop."""
+
+    def rubbing(t, q, v, params):
+        speeds = v[0], v[1] - v[0]
+        return 0.01 * sum(jnp.logaddexp(10.0 * x, -10.0 * x) for x in speeds)
+
+    forces = (jl.Rayleigh(rubbing, "hinges"),)
+    system = jl.System(double_pendulum.system.lagrangian, ("a", "b"), forces=forces)
+    ts = np.linspace(0.0, 1.0, 200)
+
+    def run(q0):
+        motion = jl.simulate(system, q0, [0.3, -0.4], ts, PARAMS, dt=0.02, throw=False)
+        return motion.q
+
+    q0 = starts(16)
+    together = jax.jit(jax.vmap(run))(q0)
+    np.testing.assert_allclose(together[3], jax.jit(run)(q0[3]), rtol=0, atol=1e3 * EPS)

@@ -1,0 +1,259 @@
+"""Motions under forces that depend on multipliers, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy import cos, sin
+
+import jaxlag as jl
+from jaxlag._kkt import solve_general as on_arrays
+from jaxlag._lowering._evaluate import evaluate
+from jaxlag._lowering._graph import Graph
+from jaxlag._lowering._solve import solve_general as on_graph
+from jaxlag._status import Status
+from systems import falling_stick_friction
+
+G = 9.81
+TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+
+
+# ---- A block on an incline -----------------------------------------------------------------------
+
+SLOPE, M = 0.4, 2.0
+
+
+def particle(t, q, v, params):
+    return 0.5 * M * v @ v - M * G * q[1]
+
+
+def plane(t, q, params):
+    """Height above the incline, along its normal: lam is the normal force."""
+    return cos(SLOPE) * q[1] - sin(SLOPE) * q[0]
+
+
+def uphill(t, q, v, params):
+    return cos(SLOPE) * v[0] + sin(SLOPE) * v[1]
+
+
+def drag(t, q, v, params, lam):
+    along = jnp.array([cos(SLOPE), sin(SLOPE)])
+    return -params * lam["plane"] * jnp.sign(uphill(t, q, v, params)) * along
+
+
+BLOCK = jl.System(
+    particle,
+    ("x", "y"),
+    forces=(jl.GeneralizedForce(drag, "drag", reaction=True, contact="plane", sliding=uphill),),
+    constraints=(jl.Holonomic(plane, "plane"),),
+)
+MU, SPEED = 0.3, 5.0
+STOP = SPEED / (G * (sin(SLOPE) + MU * cos(SLOPE)))
+
+
+def slid(mu, ts, speed=SPEED, **options):
+    v0 = speed * np.array([cos(SLOPE), sin(SLOPE)])
+    return jl.simulate(BLOCK, [0.0, 0.0], v0, ts, mu, **TIGHT, **options)
+
+
+def test_a_block_slides_as_coulomb_says():
+    ts = np.linspace(0.0, 0.9 * STOP, 4)
+    motion = slid(MU, ts)
+    deceleration = G * (sin(SLOPE) + MU * cos(SLOPE))
+    way = SPEED * ts - 0.5 * deceleration * ts**2
+    np.testing.assert_allclose(motion.q, np.outer(way, [cos(SLOPE), sin(SLOPE)]), atol=1e-13)
+    np.testing.assert_allclose(motion.lam["plane"], M * G * cos(SLOPE), rtol=1e-13)
+
+
+def test_the_way_depends_on_friction_as_it_should():
+    """d way/d mu = -g cos(slope) t^2/2."""
+    ts = np.array([0.0, 0.5 * STOP])
+
+    def height(mu):
+        return slid(mu, ts, throw=False).q[-1, 1]
+
+    expected = -0.5 * G * cos(SLOPE) * ts[-1] ** 2 * sin(SLOPE)
+    np.testing.assert_allclose(jax.grad(height)(MU), expected, rtol=1e-12)
+
+
+def test_a_motion_ends_where_sliding_does():
+    """Friction would push on: beyond, it is another system."""
+    motion = slid(MU, np.array([0.0, 2 * STOP]), throw=False)
+    assert motion.status == Status.no_reaction_solution
+    np.testing.assert_allclose(motion.last_time, STOP, rtol=1e-9)  # rejected steps close in on it
+    with pytest.raises(jl.SimulationError, match=r"(?s)plane.*contact lifts off, its sliding"):
+        slid(MU, np.array([0.0, 2 * STOP]))
+
+
+def test_a_start_that_slides_not():
+    """No sense of the friction is known."""
+    with pytest.raises(jl.SimulationError, match="contact lifts off, its sliding"):
+        slid(MU, np.array([0.0, 0.1]), speed=0.0)
+
+
+# ---- Off a cylinder ------------------------------------------------------------------------------
+
+
+def cylinder(t, q, params):
+    return jnp.sqrt(q @ q) - 1.0
+
+
+def nothing(t, q, v, params, lam):
+    return 0.0 * q * lam["cylinder"]
+
+
+def test_a_particle_leaves_a_cylinder():
+    """From rest near the top, where cos(angle from there) = 2/3 cos(the one at the start)."""
+    contact = jl.GeneralizedForce(nothing, "none", reaction=True, contact="cylinder")
+    system = jl.System(
+        particle, ("x", "y"), forces=(contact,), constraints=(jl.Holonomic(cylinder, "cylinder"),)
+    )
+    start = np.array([sin(0.1), cos(0.1)])
+    motion = jl.simulate(system, start, [0.0, 0.0], [0.0, 3.0], None, **TIGHT, throw=False)
+    assert motion.status == Status.no_reaction_solution
+    q, v = motion.last_state
+    np.testing.assert_allclose(q[1], 2 / 3 * cos(0.1), rtol=1e-9)
+    assert 0 <= system.multipliers(None, q, v)["cylinder"] < 1e-8 * M * G
+
+
+# ---- A sledge on two runners: two rows that share the friction -----------------------------------
+
+WIDE, HIGH, INERTIA = 0.5, 0.3, 0.4
+
+
+def sledge(t, q, v, params):
+    return 0.5 * (M * (v[0] ** 2 + v[1] ** 2) + INERTIA * v[2] ** 2) - M * G * q[1]
+
+
+def runners(t, q, params):
+    """Heights of the rear and the front runner."""
+    return q[1] - HIGH * jnp.cos(q[2]) + jnp.array([-WIDE, WIDE]) * jnp.sin(q[2])
+
+
+def rubbing(t, q, v, params, lam):
+    F = params * (lam["rear"] + lam["front"])
+    return jnp.stack([-F, jnp.zeros_like(F), -HIGH * F])
+
+
+def sledge_with(rows, names):
+    force = jl.GeneralizedForce(rubbing, "rubbing", reaction=True, contact="rear")
+    return jl.System(
+        sledge, ("x", "y", "theta"), forces=(force,), constraints=(jl.Holonomic(rows, names),)
+    )
+
+
+SLEDGE = sledge_with(runners, ("rear", "front"))
+REST = np.array([0.0, HIGH, 0.0])
+
+
+@pytest.mark.parametrize("mu", [0.2, 1.2])
+def test_a_sledge_brakes(mu):
+    """N_front - N_rear = mu m g h / w about the centre; beyond mu = w/h it tips over."""
+    v = np.array([3.0, 0.0, 0.0])
+    np.testing.assert_allclose(SLEDGE.acceleration(mu, REST, v), [-mu * G, 0, 0], atol=1e-13)
+    lam = SLEDGE.multipliers(mu, REST, v)
+    half, more = 0.5 * M * G, 0.5 * mu * M * G * HIGH / WIDE
+    np.testing.assert_allclose([lam["rear"], lam["front"]], [half - more, half + more], rtol=1e-13)
+    ts = np.array([0.0, 0.1, 0.2])
+    motion = jl.simulate(SLEDGE, REST, v, ts, mu, **TIGHT)
+    np.testing.assert_allclose(motion.q[:, 0], 3.0 * ts - 0.5 * mu * G * ts**2, rtol=1e-12)
+
+
+def test_a_sledge_tips_over():
+    with pytest.raises(jl.SimulationError, match=r"(?s)rear.*contact lifts off"):
+        jl.simulate(SLEDGE, REST, [3.0, 0.0, 0.0], [0.0, 0.1], 1.05 * WIDE / HIGH)
+
+
+# ---- No solution ---------------------------------------------------------------------------------
+
+
+def test_painleve():
+    """A stick that is pushed ahead by its lower end: (1/3 + cos^2)/(sin cos) <= mu has none."""
+    entry = falling_stick_friction.entry
+    params = dict(entry.example.params)
+    theta = np.arctan(2.0)  # where that is least, 4/3
+    q0 = [0.0, 0.5 * params["L"] * sin(theta), theta]
+    for mu in (1.33, 1.34):
+        v0, ts = [-1.0, 0.0, 0.0], [0.0, 1e-4]
+        motion = jl.simulate(entry.system, q0, v0, ts, params | {"mu": mu}, throw=False)
+        assert (motion.status == Status.no_reaction_solution) == (mu > 4 / 3)
+        a = entry.system.acceleration(params | {"mu": mu}, q0, v0)
+        assert np.all(np.isfinite(a)) == (mu < 4 / 3)
+
+
+# ---- The solve -----------------------------------------------------------------------------------
+
+
+def test_forces_that_are_not_affine_take_the_array_program():
+    """mu |lam|: the same motion, by Newton's method."""
+
+    def drag_of_size(t, q, v, params, lam):
+        return drag(t, q, v, params, {"plane": jnp.abs(lam["plane"])})
+
+    force = jl.GeneralizedForce(drag_of_size, "drag", reaction=True)
+    system = jl.System(
+        particle, ("x", "y"), forces=(force,), constraints=BLOCK.constraints, lowering="scalar"
+    )
+    v = SPEED * np.array([cos(SLOPE), sin(SLOPE)])
+    a = system.acceleration(MU, [0.0, 0.0], v)
+    expected = -G * (sin(SLOPE) + MU * cos(SLOPE))
+    np.testing.assert_allclose(a, expected * v / SPEED, rtol=1e-13)
+    assert "not affine in multipliers" in str(system.explain(MU))
+
+
+def test_two_sticks_do_not_excuse_one_another():
+    """Two uncoupled ones, pushed too hard each: the determinant of both is positive."""
+    one = falling_stick_friction.entry.system
+
+    def both(t, q, v, params):
+        return one.lagrangian(t, q[:3], v[:3], params) + one.lagrangian(t, q[3:], v[3:], params)
+
+    def contact(part):
+        return lambda t, q, params: q[part][1] - 0.5 * params["L"] * jnp.sin(q[part][2])
+
+    def friction(part, name):
+        def push(t, q, v, params, lam):
+            F = params["mu"] * lam[name]
+            mine = jnp.stack([F, 0.0 * F, 0.5 * params["L"] * jnp.sin(q[part][2]) * F])
+            return jnp.zeros_like(q).at[part].set(mine)
+
+        return jl.GeneralizedForce(push, f"friction of {name}", reaction=True)
+
+    parts = {"left": slice(0, 3), "right": slice(3, 6)}
+    system = jl.System(
+        both,
+        tuple(f"{name}{i}" for name in parts for i in range(3)),
+        forces=tuple(friction(part, name) for name, part in parts.items()),
+        constraints=tuple(jl.Holonomic(contact(part), name) for name, part in parts.items()),
+    )
+    params, theta = dict(falling_stick_friction.entry.example.params), np.arctan(2.0)
+    q, v = [0.0, 0.5 * params["L"] * sin(theta), theta] * 2, [-1.0, 0.0, 0.0] * 2
+    for mu in (1.3, 2.0):
+        a = system.acceleration(params | {"mu": mu}, q, v)
+        assert np.all(np.isfinite(a)) == (mu < 4 / 3)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4])
+def test_matrices_that_are_not_symmetric_are_eliminated(m):
+    """On the graph as on arrays; told where a leading minor is not positive."""
+    graph, rng = Graph(), np.random.default_rng(m)
+    S = [[graph.input("q", m * k + j) for j in range(m)] for k in range(m)]
+    right = [graph.input("v", k) for k in range(m)]
+    x = on_graph(graph, S, right, 1e-10)
+    signs = set()
+    for k in range(12):
+        matrix, side = rng.normal(size=(m, m)) + (k % 2) * 2.0 * np.eye(m), rng.normal(size=m)
+        values = {("q", i): value for i, value in enumerate(matrix.ravel())}
+        found = evaluate(x, values | {("v", i): value for i, value in enumerate(side)})
+        positive = all(np.linalg.det(matrix[:i, :i]) > 0 for i in range(1, m + 1))
+        also, fine = on_arrays(jnp.array(matrix), jnp.array(side), 1e-10)
+        assert fine == positive
+        signs.add(positive)
+        if not positive:
+            assert np.isnan(found[-1])
+            continue
+        expected = np.linalg.solve(matrix, side)
+        bound = 1e-13 * np.linalg.cond(matrix) * np.linalg.norm(expected)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+        np.testing.assert_allclose(also, expected, rtol=0, atol=bound)
+    assert signs == {True, False}

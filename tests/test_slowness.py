@@ -1,0 +1,161 @@
+"""Solution.explain: what held the steps short."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from systems._catalogue import ENTRIES
+
+
+def pendulum(t, q, v, params):
+    return 0.5 * v[0] ** 2 + params["g"] * jnp.cos(q[0])
+
+
+def bob(t, q, v, params):
+    return 0.5 * (v @ v) - params["g"] * q[1]
+
+
+def rod(t, q, params):
+    return q @ q - 1.0
+
+
+ANGLE = jl.System(pendulum, ("theta",))
+BOB = jl.System(bob, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
+TS = np.linspace(0.0, 2.0, 9)
+
+
+def line(text: str, head: str) -> str:
+    (found,) = [x[14:] for x in text.splitlines() if x[:14].rstrip() == head]
+    return found
+
+
+def test_a_motion_that_goes_well():
+    """At rest below, the rate is sqrt g: its period 2 pi / 3 and the steps in it are told."""
+    motion = jl.simulate(ANGLE, [1e-3], [0.0], TS, {"g": 9.0})
+    text = motion.explain()
+    h = 2.0 / int(motion.stats["accepted"])
+    assert line(text, "method") == "dopri8, rtol 1e-09, atol 1e-09, multipliers"
+    assert line(text, "rates") == (
+        f"fastest oscillation of period 2.09 s, {2 * np.pi / 3 / h:.3g} steps each"
+    )
+    assert line(text, "mass matrix") == "cond(M) up to 1 with its diagonal scaled to 1"
+    assert line(text, "advice").startswith("Accuracy sets the step")
+    assert "projection" not in text
+
+
+def test_the_projection_is_told():
+    text = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}).explain()
+    assert line(text, "projection") in ("up to 1 turn per step", "up to 2 turns per step")
+    left = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, project=False)
+    assert "projection" not in left.explain()
+    far = jl.simulate(
+        BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, method="tsit5", dt=0.6, throw=False
+    )
+    text = far.explain()  # a step of half the way round
+    turns = int(line(text, "projection").split()[2])
+    assert turns > 3
+    assert f"moved back onto the constraints in up to {turns} turns" in line(text, "advice")
+
+
+def test_a_force_that_jumps_is_advised_a_table():
+    def push(t, q, v, params, inputs):
+        return jnp.sign(jnp.sin(40.0 * t))[None]
+
+    system = jl.System(pendulum, ("theta",), forces=(jl.GeneralizedForce(push, name="push"),))
+    text = jl.simulate(system, [0.3], [0.0], TS, {"g": 9.0}).explain()
+    assert "Many steps were rejected" in line(text, "advice")
+
+
+def test_a_mass_matrix_near_singular_names_a_coordinate():
+    """Masses of 1e-10 in units of their own cost no digits; velocities that are nearly one do."""
+
+    def light(t, q, v, params):
+        return 0.5 * v[0] ** 2 + 0.5e-10 * v[1] ** 2 - 0.5 * q[0] ** 2 - 0.5e-10 * q[1] ** 2
+
+    motion = jl.simulate(jl.System(light, ("cart", "mote")), [1.0, 1.0], [0.0, 0.0], TS, {})
+    assert line(motion.explain(), "mass matrix") == "cond(M) up to 1 with its diagonal scaled to 1"
+
+    def alike(t, q, v, params):
+        both, apart = v[0] + v[1], v[0] - v[1]
+        return 0.5 * both**2 + 0.5e-10 * apart**2 - 0.5 * q[0] ** 2 - 0.5 * q[1] ** 2
+
+    motion = jl.simulate(jl.System(alike, ("a", "b")), [1e-3, 1e-3], [0.0, 0.0], TS, {})
+    text = motion.explain()
+    assert line(text, "mass matrix") == "cond(M) up to 1e+10 with its diagonal scaled to 1"
+    assert "M is nearly singular, as along 'a': accelerations keep about 6 digits" in text
+
+
+def test_a_link_without_mass_is_no_fault():
+    def lead(t, q, v, params):
+        return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
+
+    tie = jl.Holonomic(lambda t, q, p: q[0] - q[1], "tie")
+    system = jl.System(lead, ("x", "y"), constraints=(tie,))
+    text = jl.simulate(system, [1.0, 1.0], [0.0, 0.0], TS, {}).explain()
+    assert line(text, "mass matrix") == "no inertia of its own along 'y'"
+
+
+def test_growth_is_no_oscillation():
+    """Upright, the rates are +- sqrt g."""
+    text = jl.simulate(ANGLE, [np.pi - 1e-6], [0.0], TS, {"g": 9.0}).explain()
+    assert line(text, "rates").startswith("fastest growth e-fold in 0.333 s")
+
+
+def test_implicit_steps_follow_nothing():
+    def apart(t, q, v, params):
+        return 0.5 * (v @ v) - 0.5 * q[0] ** 2 - 0.5e8 * q[1] ** 2
+
+    motion = jl.simulate(
+        jl.System(apart, ("calm", "quick")), [1.0, 0.0], [0.0, 0.0], TS, {}, method="kvaerno5"
+    )
+    text = motion.explain()
+    assert line(text, "advice").startswith("Accuracy sets the step")
+    assert "error  " not in text
+
+
+def test_the_component_with_the_largest_error_is_named():
+    def apart(t, q, v, params):
+        return 0.5 * (v @ v) - 0.5 * q[0] ** 2 - 0.5e4 * q[1] ** 2
+
+    motion = jl.simulate(jl.System(apart, ("calm", "quick")), [1.0, 1.0], [0.0, 0.0], TS, {})
+    assert line(motion.explain(), "error").startswith(
+        "largest, beside its tolerance, in d(quick)/dt"
+    )
+
+
+def test_a_stopped_motion_is_told_how_far_it_came():
+    motion = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, max_steps=7, throw=False)
+    part = float(motion.last_time) / 2.0
+    advice = line(motion.explain(), "advice")
+    assert f"It got through {part:.1%} of ts: about {7 / part:.2g} steps would do" in advice
+
+
+def test_a_motion_without_a_step():
+    motion = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": np.nan}, throw=False)
+    assert line(motion.explain(), "steps") == "0 attempted, 0 rejected"
+
+
+def test_quasi_velocities_are_named():
+    entry = ENTRIES["chaplygin_sleigh"]
+    example = entry.example
+    motion = jl.simulate(
+        entry.system, example.q0, example.v0, [0.0, 1.0], dict(example.params), formulation="quasi"
+    )
+    quasi = entry.system.quasi
+    names = [*entry.coordinates, *(quasi.names[i] for i in quasi.free)]
+    told = line(motion.explain(), "error").split(" in ")[1].split(" (")[0]
+    assert told in names
+
+
+def test_only_single_motions_explain_themselves():
+    def solve(q0):
+        return jl.simulate(ANGLE, q0, [0.0], TS, {"g": 9.0})
+
+    batch = jax.vmap(solve)(jnp.array([[0.1], [0.2]]))
+    with pytest.raises(ValueError, match="explain must be asked of a single motion, but batch"):
+        batch.explain()
+    for transform in (jax.jit, jax.grad):
+        with pytest.raises(ValueError, match="outside jit and vmap"):
+            transform(lambda q0: len(solve(q0).explain()) * 1.0)(jnp.array([0.1]))
