@@ -82,6 +82,7 @@ def test_rheonomic_rows_at_an_instant():
     np.testing.assert_allclose(state.v, [3 * np.cos(0.6), 2.0], rtol=1e-14)
 
 
+@pytest.mark.full
 def test_rows_that_follow_from_others_are_named():
     def more(t, q, params):
         return jnp.append(rods(t, q, params), jnp.sum(rods(t, q, params)))
@@ -116,6 +117,7 @@ def test_derivative_is_that_of_the_implicit_function():
     assert np.linalg.norm(y) > 1
 
 
+@pytest.mark.full
 def test_batches():
     states = jax.vmap(lambda s: jl.assemble(cartesian, s * GUESS[0], GUESS[1], BOBS))(
         jnp.array([0.9, 1.0, 1.1])
@@ -128,6 +130,7 @@ def test_batches():
 # ---- What cannot be had --------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_what_is_held_in_the_way_is_named():
     """A crank angle that the four-bar cannot reach: the links are too short."""
     short = {"a": 0.4, "b": 0.5, "c": 0.4, "d": 1.0}
@@ -137,6 +140,7 @@ def test_what_is_held_in_the_way_is_named():
     assert "'pin[" in str(caught.value)
 
 
+@pytest.mark.full
 def test_more_rows_than_coordinates():
     """A point in the plane on three lines: fixed where they meet, else nowhere."""
 
@@ -160,6 +164,7 @@ def test_more_rows_than_coordinates():
         jl.simulate(system, [1.0, 2.0], [0.0, 0.0], [0.0, 1.0], 4.0)
 
 
+@pytest.mark.full
 def test_what_cannot_be_closed_with_nothing_held_is_told():
     apart = {"a": 0.1, "b": 0.1, "c": 0.1, "d": 1.0}
     with pytest.raises(jl.AssemblyError, match="contradictory_rows"):

@@ -60,6 +60,7 @@ def test_a_failing_lane_changes_no_other(lanes):
     assert np.isfinite(mended.q[BAD]).all()
 
 
+@pytest.mark.full
 def test_lanes_take_their_own_steps(lanes):
     """Adaptive: step counts differ from lane to lane; results agree to the tolerance."""
     params, q0, v0, torques = jax.tree.map(lambda x: x[:8], lanes)
@@ -76,6 +77,7 @@ def test_lanes_take_their_own_steps(lanes):
         np.testing.assert_allclose(batch.q[i], alone.q, rtol=0, atol=1e-7)
 
 
+@pytest.mark.full
 def test_gradient_of_a_batch_survives_a_failing_lane(lanes):
     lanes = jax.tree.map(lambda x: x[BAD - 2 : BAD + 2], lanes)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 
 from bench import __main__ as command
 from bench import (
@@ -58,7 +59,7 @@ def acceleration(motion, y):
     return q, v, jnp.asarray(motion.system.acceleration(motion.params, q, v))
 
 
-@pytest.mark.parametrize("name", SINGLE)
+@pytest.mark.parametrize("name", mostly_full(SINGLE, "heavy top"))
 def test_explicit_equations_are_those_of_the_system(name):
     """And so are all forms they are given to solvers in."""
     motion = motion_of(name)
@@ -251,7 +252,7 @@ def test_every_solver_of_ours_has_a_line():
     assert not any(isinstance(METHODS[name](), AbstractFixedStep) for name in lanes)
 
 
-@pytest.mark.parametrize("lanes", [False, True])
+@pytest.mark.parametrize("lanes", mostly_full([False, True], False))
 def test_lines_in_jax_get_to_the_end(lanes):
     motion = MOTIONS["16 double pendulums" if lanes else "double pendulum, regular"]()
     if lanes:

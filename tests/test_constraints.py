@@ -107,6 +107,7 @@ def test_names_and_residuals():
     np.testing.assert_array_equal(rows.of_all(jnp.array([3.0, 4.0])), [0, 3, 4])
 
 
+@pytest.mark.full
 def test_four_bar_multipliers_by_virtual_work():
     """Under a torque on the crank alone lam does no work: power balance through the loop."""
     q = jl.assemble(four_bar, [1.0, 0.4, -1.8], [0.5, 0, 0], FOUR_BAR, hold=("crank", "crank'"))

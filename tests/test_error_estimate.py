@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
+from _families import mostly_full
 
 import jaxlag as jl
 from systems.double_pendulum import entry
@@ -31,6 +32,7 @@ def exact():
     return jl.simulate(*PENDULUM, rtol=1e-13, atol=1e-14)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-7, 1e-9])
 def test_half_as_much_again_as_the_error(exact, tolerance):
     """By a method of higher order, whose own error is a few hundredths of it at the most."""
@@ -39,13 +41,18 @@ def test_half_as_much_again_as_the_error(exact, tolerance):
     assert np.all((found >= 1.3) & (found <= 1.7)), found  # measured 1.45 to 1.66
 
 
-@pytest.mark.parametrize(("method", "dt"), [("dopri8", 0.05), ("tsit5", 0.01), ("gauss4", 0.02)])
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("method", "dt"),
+    mostly_full([("tsit5", 0.01), ("dopri8", 0.05), ("gauss4", 0.02)], ("tsit5", 0.01)),
+)
 def test_with_fixed_steps(exact, method, dt):
     motion = jl.simulate(*PENDULUM, method=method, dt=dt, estimate_error=True)
     found = ratios(motion, exact, so_far=True)
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
+@pytest.mark.full
 def test_of_the_same_order_where_there_is_no_higher_one(exact):
     """Most are between 1 and 2; here the largest error so far is meant."""
     motion = jl.simulate(*PENDULUM, method="kvaerno5", rtol=1e-6, atol=1e-6, estimate_error=True)
@@ -53,6 +60,7 @@ def test_of_the_same_order_where_there_is_no_higher_one(exact):
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
+@pytest.mark.full
 def test_the_motion_itself_is_the_same():
     with_estimate = jl.simulate(*PENDULUM, estimate_error=True)
     without = jl.simulate(*PENDULUM)
@@ -62,6 +70,7 @@ def test_the_motion_itself_is_the_same():
     assert np.all(with_estimate.error[0][0] == 0.0)
 
 
+@pytest.mark.full
 def test_lanes_and_jit():
     system, q0, v0, ts, params = PENDULUM
     solve = jax.jit(

@@ -56,6 +56,7 @@ def within(found, names, deviations=3.5):
         assert abs(found.params[name] - TRUE[name]) < deviations * found.std[name], name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("segments", [1, 5])
 def test_parameters_start_and_noise_are_found(segments):
     found = fit(experiment(), segments=segments)
@@ -71,6 +72,7 @@ def test_parameters_start_and_noise_are_found(segments):
     assert "95 % in" in str(found)
 
 
+@pytest.mark.full
 def test_segments_find_what_one_motion_does():
     """Joined ever more tightly they are one motion: the same estimates, within a hundredth of
     their standard deviations."""
@@ -80,6 +82,7 @@ def test_segments_find_what_one_motion_does():
         np.testing.assert_allclose(one.std[name], many.std[name], rtol=1e-2)
 
 
+@pytest.mark.full
 def test_the_covariance_is_that_of_the_dense_derivatives():
     """(J^T J)^-1 of params and starts, from central differences of simulations."""
     data = experiment(sigma={"x": NOISE})
@@ -100,6 +103,7 @@ def test_the_covariance_is_that_of_the_dense_derivatives():
     np.testing.assert_allclose(own, covariance, rtol=1e-5, atol=1e-6 * np.max(np.abs(own)))
 
 
+@pytest.mark.full
 def test_several_experiments_with_gaps_and_other_rates():
     """Padding and gaps count nothing: as a fit of the rows that are there."""
     short = np.linspace(0.0, 1.0, 23)
@@ -119,6 +123,7 @@ def test_several_experiments_with_gaps_and_other_rates():
     assert np.isfinite(one.residuals[1]["x"]).all()
 
 
+@pytest.mark.full
 def test_a_driven_motion_and_its_rate():
     """Torque from a table, in segments; a measured rate and a channel of one's own."""
     times = np.linspace(0.0, 3.0, 61)
@@ -169,6 +174,7 @@ def test_priors_decide_what_measurements_do_not():
     within(found, ("l",))
 
 
+@pytest.mark.full
 def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
     plain = fit(experiment())
     held = fit(experiment(), transforms={"l": jl.Positive(), "c": jl.Bounded(0.0, 1.0)})
@@ -185,6 +191,7 @@ def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
     np.testing.assert_allclose(rough.starts[0], [1.1, 0.0], atol=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
 def test_outliers_count_for_less(loss):
     y = angles()
@@ -195,6 +202,7 @@ def test_outliers_count_for_less(loss):
     assert off[0] < 0.1 * off[1]
 
 
+@pytest.mark.full
 def test_a_segment_that_fails_is_named_and_does_not_count():
     """A spring that breaks at x = 2: beyond, the force is not a number."""
 
@@ -216,6 +224,7 @@ def test_a_segment_that_fails_is_named_and_does_not_count():
     np.testing.assert_allclose(found.params["k"], alone.params["k"], rtol=1e-9)
 
 
+@pytest.mark.full
 def test_warnings_name_what_they_are_about():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
         fit(experiment(), params0=TRUE | {"c": 0.0}, transforms={"c": jl.Bounded(0.0, 1.0)})
@@ -233,6 +242,7 @@ def test_no_warning_without_reason():
         fit(experiment())
 
 
+@pytest.mark.full
 def test_windows_and_parts():
     pieces = experiment().windows(1.0)
     assert [len(piece.ts) for piece in pieces] == [50, 50, 50]

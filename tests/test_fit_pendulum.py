@@ -49,6 +49,7 @@ def test_accelerations_are_the_equation_of_motion():
         np.testing.assert_allclose(driven, [(torque + u + 0.05) / 0.2], rtol=1e-13)
 
 
+@pytest.mark.full
 def test_fixed_steps_agree_with_small_tolerances():
     # Measured: 4.0e-5 rad; without Coulomb friction 7e-10.
     t = np.arange(100) / 100.0
@@ -59,6 +60,7 @@ def test_fixed_steps_agree_with_small_tolerances():
     np.testing.assert_allclose(fixed, exact, rtol=0, atol=5e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("model", "friction"),
     [("viscous", {}), ("+ Coulomb", {"f": 0.2}), ("+ quadratic", {"f": 0.2, "k": 0.02})],
@@ -92,6 +94,7 @@ def test_driven_pendulum_finds_its_inertia():
     assert rms(trials["+ Coulomb"].test) == pytest.approx(NOISE / MRAD, rel=0.08)
 
 
+@pytest.mark.full
 def test_standard_errors_are_honest():
     # Deviations over standard errors, squared: mean 1 if these are right. 60 recordings of 4
     # parameters: the mean scatters by about 0.1. Measured: 0.93, by parameter 0.86 to 1.02.
@@ -109,6 +112,7 @@ def test_standard_errors_are_honest():
     assert np.all(np.mean(squares, axis=0) < 1.9)
 
 
+@pytest.mark.full
 def test_samples_left_out_have_no_say():
     recording = synthetic(FREE | {"f": 0.2}, torque=False, noise=NOISE)
     windows, _ = cut(recording, 1.0)
@@ -121,6 +125,7 @@ def test_samples_left_out_have_no_say():
         assert one.errors[name] == pytest.approx(other.errors[name], rel=1e-6)
 
 
+@pytest.mark.full
 def test_derivatives_are_those_of_the_residuals():
     # Central differences of 1e-5 (units of a parameter's own term): truncation and rounding both
     # stay below 1e-6 of the largest derivative.
@@ -279,6 +284,7 @@ def test_bad_arguments_are_named(arguments, message, tmp_path, monkeypatch, caps
 # The command.
 
 
+@pytest.mark.full
 def test_without_a_file_it_fits_a_synthetic_pendulum(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert fit_pendulum.main([]) == 0
@@ -294,6 +300,7 @@ def test_without_a_file_it_fits_a_synthetic_pendulum(tmp_path, monkeypatch, caps
     assert (tmp_path / "fit-pendulum.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.full
 def test_without_matplotlib_the_figure_is_left_out(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(report, "can_plot", lambda: False)

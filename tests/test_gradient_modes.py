@@ -27,9 +27,9 @@ SPANS = {
 }
 LONG = ("double_pendulum_cartesian", "falling_stick_friction", "rigid_aircraft", "tricycle")
 """Those whose right-hand side is long: by tsit5, of which half as much is compiled."""
-PLAIN = ("double_pendulum",)
-NAMES = [n if n in PLAIN else pytest.param(n, marks=pytest.mark.full) for n in SPANS]
 MODES = ("recorded", "checkpoints", "forward")
+ALL_MODES = ("double_pendulum", "double_pendulum_cartesian", "tricycle")
+"""The others are differentiated backwards in one mode."""
 TIGHT = 1e-13
 
 
@@ -98,7 +98,8 @@ def forward(lowering):
     return of
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.full
+@pytest.mark.parametrize("name", SPANS)
 def test_all_modes_agree(forward, name):
     """Reverse in each mode against forward: <w, J dx> = <J^T w, dx>; at a tight tolerance, too.
 
@@ -106,7 +107,7 @@ def test_all_modes_agree(forward, name):
     are differences that round differently in every program.
     """
     this = case(name)
-    for mode in MODES:
+    for mode in MODES if name in ALL_MODES else MODES[:1]:
 
         def pulled(x, tolerance, mode=mode):
             _, pullback, kind = jax.vjp(lambda x: this.end(x, tolerance, mode), x, has_aux=True)
@@ -127,7 +128,8 @@ def test_all_modes_agree(forward, name):
             assert jl.GradientMode(int(kind)) in wanted
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.full
+@pytest.mark.parametrize("name", SPANS)
 def test_the_derivative_is_that_of_the_motion(forward, name):
     """Against differences of solves at a tight tolerance; as accurate as the solution is."""
     this = case(name)
@@ -151,6 +153,7 @@ def test_the_derivative_is_that_of_the_motion(forward, name):
     assert np.abs(loose_dot - dy).max() <= 10 * max(off, 1e-9) * np.abs(dy).max()
 
 
+@pytest.mark.full
 def test_points_are_thinned_out_on_long_motions():
     """3 states for 300 steps: the same gradient as from all of them."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
@@ -177,6 +180,7 @@ def test_points_are_thinned_out_on_long_motions():
     np.testing.assert_allclose(found["auto"], found["recorded"], rtol=1e-13)
 
 
+@pytest.mark.full
 def test_lanes_of_different_lengths(forward):
     """Lanes that were recorded together, and end at different steps, have their own gradients."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
@@ -329,7 +333,8 @@ def test_every_transform():
     np.testing.assert_allclose(third, by_differences, rtol=1e-5)  # h^2 times the fifth, over it
 
 
-@pytest.mark.parametrize("form", ["auto", pytest.param("array", marks=pytest.mark.full)])
+@pytest.mark.full
+@pytest.mark.parametrize("form", ["auto", "array"])
 def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
     """Error estimates see nothing there, and steps of any length would do for the motion.
 

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 from problems import MOTIONS, Motion
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
 from jaxlag import _replay, _simulate, _variations
 
-PLAIN = ("double_pendulum", "central_motion", "driven_pendulum")
-NAMES = [n if n in PLAIN else pytest.param(n, marks=pytest.mark.full) for n in MOTIONS]
+NAMES = mostly_full(MOTIONS, "driven_pendulum")
 
 
 def end(motion: Motion, **options):
@@ -154,7 +154,8 @@ def variational(motion: Motion, dx):
     return y[2 * n :]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.full
+@pytest.mark.parametrize("name", MOTIONS)
 def test_derivative_matches_variational_equations(name):
     """At tight tolerance the frozen grid's derivative is the motion's."""
     motion = MOTIONS[name]
@@ -171,6 +172,7 @@ def test_derivative_matches_variational_equations(name):
     np.testing.assert_allclose(dy[: 2 * n], expected, rtol=0, atol=2e-9 * np.abs(expected).max())
 
 
+@pytest.mark.full
 def test_dependence_on_times(derivatives):
     """dq/dt1 = v(t1), and moving the whole clock of an autonomous motion changes nothing."""
     state, x, _, (y, *_) = derivatives("double_pendulum")
@@ -184,6 +186,7 @@ def test_dependence_on_times(derivatives):
     assert np.abs(by_clock[:4]).max() < 1e-9 * np.abs(y).max()
 
 
+@pytest.mark.full
 def test_rows_move_with_their_own_time():
     """d x(ts[i]) / d ts[i] = v, on a mark of a fixed grid and on a knot as anywhere else."""
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
@@ -244,6 +247,7 @@ def test_every_kind_of_solver(method, dt):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.full
 def test_hessian_is_symmetric_and_right():
     """jacfwd of grad: symmetric to round-off, equal to differences of the gradient (fixed grid)."""
     motion = MOTIONS["central_motion"]
@@ -264,11 +268,12 @@ def test_hessian_is_symmetric_and_right():
     np.testing.assert_allclose(mixed, H, rtol=0, atol=1e-11 * np.abs(H).max())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "dt", "rtol"),
     [
         ("driven_pendulum", 0.02, 1e-12),
-        pytest.param("central_motion", None, 1e-8, marks=pytest.mark.full),
+        ("central_motion", None, 1e-8),
     ],
 )
 def test_vmap_of_grad_equals_loop_of_grad(name, dt, rtol):
@@ -290,6 +295,7 @@ def test_vmap_of_grad_equals_loop_of_grad(name, dt, rtol):
             np.testing.assert_allclose(a[i], b, rtol=rtol, atol=rtol)
 
 
+@pytest.mark.full
 def test_unreached_rows_keep_the_gradient_finite():
     """A lane that dies on the way has NaN rows, and a finite gradient in what it did reach."""
     system = jl.System(
@@ -312,6 +318,7 @@ def test_unreached_rows_keep_the_gradient_finite():
     np.testing.assert_array_equal(jax.grad(dead)(jnp.array([2.0])), [0.0])
 
 
+@pytest.mark.full
 def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
     """The comparisons above fail when the tangent rule is wrong in sign."""
     _, x, dx, (_, dy, _, _) = derivatives("central_motion")
@@ -329,6 +336,7 @@ def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
         )
 
 
+@pytest.mark.full
 def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
     """The comparison of forward with reverse fails when the transposed map is wrong in sign."""
     _, x, dx, (_, dy, weights, _) = derivatives("central_motion")

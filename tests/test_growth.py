@@ -67,6 +67,7 @@ def norm_of_exponential(t, rate=RATE):
     return np.sqrt(square / 2 + np.sqrt(square**2 / 4 - 1))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("params", "start", "span"),
     [
@@ -197,6 +198,7 @@ def hand_written(t, y):
     return [u, v, (M[2] * Q[0] - M[1] * Q[1]) / det, (M[0] * Q[1] - M[1] * Q[0]) / det]
 
 
+@pytest.mark.full
 def test_exponent_of_chaos_by_two_nearby_trajectories():
     """Benettin's way by scipy: the distance is set back to 1e-6 after each second."""
     start, span, distance = np.array([2.0, 2.0, 0.0, 0.0]), 160.0, 1e-6
@@ -222,6 +224,7 @@ def test_exponent_of_chaos_by_two_nearby_trajectories():
     assert 0 < growth.horizon < span
 
 
+@pytest.mark.full
 def test_product_of_parts_is_the_derivative_of_the_whole():
     """The variational equation against the derivative of one solve."""
     motion = regular()
@@ -242,6 +245,7 @@ def test_product_of_parts_is_the_derivative_of_the_whole():
     np.testing.assert_allclose(growth.log_norm[-1], np.log(norm), rtol=0, atol=1e-8)
 
 
+@pytest.mark.full
 def test_conservative_growth_is_symplectic():
     """Phi^T J Phi = J in (q, p), p = dL/dv."""
     motion = regular()
@@ -293,6 +297,7 @@ held = jl.System(bob, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
 angle = jl.System(bob_by_angle, ("theta",))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("X", [0.0, 0.3])
 def test_constrained_growth_is_that_of_the_angle(X):
     """Phi d(q, v)/d(theta, omega) = d(q, v)/d(theta, omega) Phi_angle; the pin at rest, and led."""
@@ -385,6 +390,7 @@ def test_rows_that_follow_from_others_change_nothing():
 # ---- Inputs --------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_table_is_read_on_both_sides_of_its_knots():
     """Against the derivative of one solve, save times on knots and between them."""
     q0, v0, params, _, inputs = MOTIONS["driven_pendulum"][1:]
@@ -404,6 +410,7 @@ def test_a_table_is_read_on_both_sides_of_its_knots():
 # ---- Batches, and what cannot be done ------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_batches_have_lanes_of_their_own():
     """As single motions; under vmap and jit; a lane that failed is NaN and says why."""
     ts = np.linspace(0.0, 10.0, 41)

@@ -69,6 +69,7 @@ def test_rows_are_instants():
     assert abs(fixed[3] - rows[3]) > 0.1
 
 
+@pytest.mark.full
 def test_a_simulated_motion_needs_nothing():
     """Inverse of forward dynamics along a whole motion, to rounding."""
     motion = MOTIONS["cart_pendulum"]

@@ -29,7 +29,8 @@ def single(lowering):
     return jax.jit(lambda q0, params: run(q0, params).q)
 
 
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.full), 5, 16, 37])
+@pytest.mark.full
+@pytest.mark.parametrize("count", [1, 5, 16, 37])
 def test_every_lane_is_its_own_solve(single, count):
     """To 1e3 roundings: below, at and beyond one chunk, the last of them not full."""
     q0 = starts(count)
@@ -39,6 +40,7 @@ def test_every_lane_is_its_own_solve(single, count):
         np.testing.assert_allclose(batch[i], single(q0[i], PARAMS), rtol=0, atol=1e3 * EPS)
 
 
+@pytest.mark.full
 def test_only_what_is_mapped_differs(single):
     """A batch of params at one start."""
     lengths = jnp.linspace(0.8, 1.2, 20)
@@ -124,6 +126,7 @@ def test_explain_says_which(lowering):
     assert "batches       by jax.vmap: all trajectories in one loop" in arrays.explain(PARAMS)
 
 
+@pytest.mark.full
 def test_many_rows_of_a_costly_scene():
     """XLA shares among cores an operation that costs much, but cannot in a native loop."""
 

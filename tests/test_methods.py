@@ -100,6 +100,7 @@ def test_motions_by_different_methods_are_of_one_form():
         jax.jit(lambda q: jl.simulate(PLAIN, q, [0.0], TS, {}).method)(jnp.ones(1))
 
 
+@pytest.mark.full
 def test_tolerances_in_large_units():
     """An orbit in metres for a day, to 0.1 mm: as order 8 has it."""
 
@@ -160,6 +161,7 @@ def test_stiffness_is_met_by_implicit_steps_where_explicit_ones_run_out():
     assert jax.jit(lambda: run_out())().status == jl.Status.max_steps
 
 
+@pytest.mark.full
 def test_an_oscillation_is_not_met_by_implicit_steps():
     motion = jl.simulate(
         OILED,

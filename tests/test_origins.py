@@ -17,6 +17,7 @@ from _checked import (
     scanned,
     turn,
 )
+from _families import mostly_full
 from jax import lax
 
 import jaxlag as jl
@@ -83,7 +84,9 @@ NOT_FINITE = {
 }
 
 
-@pytest.mark.parametrize("potential", NOT_FINITE, ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "potential", mostly_full(NOT_FINITE, *list(NOT_FINITE)[::2]), ids=lambda f: f.__name__
+)
 def test_where_a_derivative_is_born_that_is_not_finite(potential):
     """At zero alone; the operation and its line, not another of the same kind."""
     primitive, order, mode = NOT_FINITE[potential]
@@ -199,6 +202,7 @@ def test_hints_name_the_function_to_use():
     assert all(hasattr(jl.math, name) for name in named)
 
 
+@pytest.mark.full
 def test_what_the_hints_say_helps():
     def mended(q, params):
         x = q[0] ** 2

@@ -93,6 +93,7 @@ def test_explicit_time_has_a_term_of_its_own():
     assert motion.work == {}
 
 
+@pytest.mark.full
 def test_the_terms_keep_the_order_of_the_forces():
     """Explicit time last; through jit, vmap and `save`, which hand dicts back alphabetically."""
     forces = tuple(
@@ -175,6 +176,7 @@ def test_work_has_batches_and_derivatives():
     np.testing.assert_allclose(forward, central, rtol=0, atol=1e-5)  # tolerance 1e-9 over 2e-4
 
 
+@pytest.mark.full
 def test_work_done_backwards_is_given_back():
     system, q, v, params, _ = CASES["cart_pendulum"]
     ts = jnp.array([0.0, 0.4, 1.0])

@@ -11,6 +11,7 @@ from jaxlag import _projection
 from jaxlag._projection import Surface, project
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
     [("tsit5", 5, (60, 120)), ("bosh3", 3, (200, 400)), ("heun", 2, (400, 800))],

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 from _quasi_systems import NAMES, PARAMS, declared, in_u, in_v, of_u, random_states, skewed
 from _user import unchecked  # noqa: F401
 from numpy.linalg import cond, norm
@@ -16,7 +17,9 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 @pytest.mark.parametrize(
-    ("lagrangian", "written_in"), [(in_v, "v"), (in_u, "u"), (of_u, "u")], ids=["v", "same", "u"]
+    ("lagrangian", "written_in"),
+    mostly_full([(in_v, "v"), (in_u, "u"), (of_u, "u")], (in_v, "v"), (in_u, "u")),
+    ids=["v", "same", "u"],
 )
 def test_equations_are_those_of_lagrange(lagrangian, written_in):
     """a from u' and v = B u + c is a from M a + h = Q, at random states."""
@@ -32,12 +35,14 @@ def test_equations_are_those_of_lagrange(lagrangian, written_in):
         assert norm(a - right) <= 64 * EPS * kappa * (1.0 + norm(right))
 
 
-@pytest.mark.parametrize("lagrangian", [in_v, in_u, of_u], ids=["v", "same", "u"])
-@pytest.mark.parametrize("constrained", [("b",), ("a", "c")])
+@pytest.mark.parametrize(
+    "lagrangian", mostly_full([in_v, in_u, of_u], in_u), ids=["v", "same", "u"]
+)
+@pytest.mark.parametrize("constrained", mostly_full([["b"], ["a", "c"]], ["b"]))
 def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
     """a and lam of the quasi-velocity and of the multiplier equations, on the constraints."""
     written_in = "v" if lagrangian is in_v else "u"
-    system = declared(lagrangian, written_in, constrained)
+    system = declared(lagrangian, written_in, tuple(constrained))
     bound = [NAMES.index(name) for name in constrained]
     for t, q, v in random_states(3):
         u = np.array(system.quasi_velocities(PARAMS, q, v, t))
@@ -142,6 +147,7 @@ X = {
 }
 
 
+@pytest.mark.full
 def test_derivatives_forward_reverse_and_by_differences():
     """Fixed steps make the map smooth: central differences of it, and of the multiplier form."""
     system = on_springs()
@@ -173,6 +179,7 @@ def test_derivatives_by_both_formulations():
         np.testing.assert_allclose(a, b, atol=1e-8)
 
 
+@pytest.mark.full
 def test_lanes_equal_single_runs():
     system = on_springs()
 

@@ -52,6 +52,7 @@ def tumbling(**options):
     )
 
 
+@pytest.mark.full
 def test_a_free_top_in_quaternions_goes_through_gimbal_lock():
     """Against R' = R [w]x by scipy; its pitch passes within 1e-3 of 90 degrees, at large roll."""
     w0 = np.array([0.02, 1.0, 0.6])

@@ -27,6 +27,7 @@ EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
+@pytest.mark.full
 def test_singular_kinematics_are_named():
     """Pitch at 90 degrees: the third rate follows from the second; traced as well."""
     system = angles()
@@ -54,6 +55,7 @@ def swinging(t, q, v, params):
     return 0.5 * params["m"] * (1.0 + 0.1 * jnp.sin(q[1])) * (v @ v) - q[0] ** 2
 
 
+@pytest.mark.full
 def test_a_lane_with_singular_kinematics_spoils_no_derivative():
     quasi = jl.QuasiVelocities(leaning, ("a", "b"))
     system = jl.System(swinging, ("x", "y"), quasi=quasi)
@@ -208,6 +210,7 @@ def test_something_else_than_quasi_velocities_is_refused(unchecked):  # noqa: F8
         system_of("u")
 
 
+@pytest.mark.full
 def test_rows_beside_them_are_solved_for_with_multipliers():
     """Where quasi-velocities do not take care of a row, "auto" means multipliers."""
     motion = run(one(), constraints=(BLADE,), u0=np.zeros(3))

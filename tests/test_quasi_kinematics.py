@@ -14,6 +14,7 @@ EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
+@pytest.mark.full
 def test_tall_kinematics_are_a_square_choice_with_a_row_dropped():
     tall, square = sleighs()
     motions = [
@@ -49,6 +50,7 @@ def offset(t, q, v, params):
     return 0.65 * (x * x + y * y) + 0.1 * v[2] ** 2
 
 
+@pytest.mark.full
 def test_momenta_across_the_rows_are_not_lost():
     """L with the rows put in gives other equations, the same for one special value of params."""
     system = jl.System(offset, ("x", "y", "theta"), quasi=TALL, constraints=(BLADE,))

@@ -65,6 +65,7 @@ def test_a_block_slides_as_coulomb_says():
     np.testing.assert_allclose(motion.lam["plane"], M * G * cos(SLOPE), rtol=1e-13)
 
 
+@pytest.mark.full
 def test_the_way_depends_on_friction_as_it_should():
     """d way/d mu = -g cos(slope) t^2/2."""
     ts = np.array([0.0, 0.5 * STOP])
@@ -102,6 +103,7 @@ def nothing(t, q, v, params, lam):
     return 0.0 * q * lam["cylinder"]
 
 
+@pytest.mark.full
 def test_a_particle_leaves_a_cylinder():
     """From rest near the top, where cos(angle from there) = 2/3 cos(the one at the start)."""
     contact = jl.GeneralizedForce(nothing, "none", reaction=True, contact="cylinder")
@@ -146,6 +148,7 @@ SLEDGE = sledge_with(runners, ("rear", "front"))
 REST = np.array([0.0, HIGH, 0.0])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mu", [0.2, 1.2])
 def test_a_sledge_brakes(mu):
     """N_front - N_rear = mu m g h / w about the centre; beyond mu = w/h it tips over."""
@@ -159,6 +162,7 @@ def test_a_sledge_brakes(mu):
     np.testing.assert_allclose(motion.q[:, 0], 3.0 * ts - 0.5 * mu * G * ts**2, rtol=1e-12)
 
 
+@pytest.mark.full
 def test_a_sledge_tips_over():
     with pytest.raises(jl.SimulationError, match=r"(?s)rear.*contact lifts off"):
         jl.simulate(SLEDGE, REST, [3.0, 0.0, 0.0], [0.0, 0.1], 1.05 * WIDE / HIGH)

@@ -37,6 +37,7 @@ def test_small_oscillation_has_its_closed_form():
     np.testing.assert_allclose(motion.a[:, 0], -20.0 / 1.3 * motion["x"], rtol=1e-13)
 
 
+@pytest.mark.full
 def test_save_equals_on_demand():
     names = ("a", "p", "energy", "kinetic", "potential", "Q")
     plain, saved = run(), run(save=names)
@@ -203,8 +204,18 @@ def test_input_range():
             np.cos(1.0),
             marks=pytest.mark.full,
         ),
-        (jl.Function(lambda t, params: params * jnp.cos(t)), 3 - 2 * np.cos(1.0), 2 * np.cos(1.0)),
-        (jl.Feedback(lambda t, q, v, params: -q[0]), np.cos(1.0), -np.cos(1.0)),
+        pytest.param(
+            jl.Function(lambda t, params: params * jnp.cos(t)),
+            3 - 2 * np.cos(1.0),
+            2 * np.cos(1.0),
+            marks=pytest.mark.full,
+        ),
+        pytest.param(
+            jl.Feedback(lambda t, q, v, params: -q[0]),
+            np.cos(1.0),
+            -np.cos(1.0),
+            marks=pytest.mark.full,
+        ),
         (0.5, 1.25, 0.5),
     ],
 )
@@ -243,6 +254,7 @@ def test_wrapped_solver():
     np.testing.assert_allclose(motion.q, run().q, rtol=0, atol=1e-5)
 
 
+@pytest.mark.full
 def test_solution_after_vmap():
     starts = PENDULUM.q0 + jnp.linspace(0.0, 0.1, 3)[:, None]
     motions = jax.jit(jax.vmap(lambda q0: run(q0=q0)))(starts)

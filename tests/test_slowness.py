@@ -45,6 +45,7 @@ def test_a_motion_that_goes_well():
     assert "projection" not in text
 
 
+@pytest.mark.full
 def test_the_projection_is_told():
     text = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}).explain()
     assert line(text, "projection") in ("up to 1 turn per step", "up to 2 turns per step")
@@ -68,6 +69,7 @@ def test_a_force_that_jumps_is_advised_a_table():
     assert "Many steps were rejected" in line(text, "advice")
 
 
+@pytest.mark.full
 def test_a_mass_matrix_near_singular_names_a_coordinate():
     """Masses of 1e-10 in units of their own cost no digits; velocities that are nearly one do."""
 
@@ -87,6 +89,7 @@ def test_a_mass_matrix_near_singular_names_a_coordinate():
     assert "M is nearly singular, as along 'a': accelerations keep about 6 digits" in text
 
 
+@pytest.mark.full
 def test_a_link_without_mass_is_no_fault():
     def lead(t, q, v, params):
         return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
@@ -137,6 +140,7 @@ def test_a_motion_without_a_step():
     assert line(motion.explain(), "steps") == "0 attempted, 0 rejected"
 
 
+@pytest.mark.full
 def test_quasi_velocities_are_named():
     entry = ENTRIES["chaplygin_sleigh"]
     example = entry.example
@@ -149,6 +153,7 @@ def test_quasi_velocities_are_named():
     assert told in names
 
 
+@pytest.mark.full
 def test_only_single_motions_explain_themselves():
     def solve(q0):
         return jl.simulate(ANGLE, q0, [0.0], TS, {"g": 9.0})

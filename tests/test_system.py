@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _consistent import onto_constraints
+from _families import mostly_full
 from _mechanics import BEAD, GENERAL, RELATIVISTIC, Case, chain
 from numpy.linalg import norm
 
@@ -31,18 +32,13 @@ BOOK = {
 }
 CASES = BOOK | GENERAL
 CONSTRAINED = {name for name, case in BOOK.items() if case.system.constraints}
-SLOW = CONSTRAINED - {"knife_edge_vehicle", "spherical_pendulum_varying", "falling_stick_friction"}
-"""Looked at with -m full alone."""
-
-
-def every(names):
-    """These names, the slow ones marked as full."""
-    return [pytest.param(x, marks=pytest.mark.full) if x in SLOW else x for x in names]
-
-
-ALL = every(CASES)
-OF_BOOK = every(BOOK)
-QUADRATIC = every(name for name in CASES if name != "relativistic")
+PLAIN = (
+    *("cart_pendulum", "quadcopter", "falling_stick_friction", "knife_edge_vehicle"),
+    *GENERAL,
+)
+ALL = mostly_full(CASES, *PLAIN)
+OF_BOOK = mostly_full(BOOK, *PLAIN)
+QUADRATIC = mostly_full([name for name in CASES if name != "relativistic"], *PLAIN)
 
 
 def random_states(name):
@@ -245,19 +241,13 @@ def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evalua
         agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["L_q"])
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        pytest.param([name for name in CASES if name not in SLOW], id="plain"),
-        pytest.param(list(CASES), id="all", marks=pytest.mark.full),
-    ],
-)
-def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(names, evaluate):
+@pytest.mark.full
+def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate):
     """None of them holds only because its terms vanish."""
     large = {
         key: {
             name
-            for name in names
+            for name in CASES
             if np.max(np.abs(np.asarray(evaluate(name).found.get(key, 0.0)))) > 1e-2
         }
         for key in ("L_t", "C", "Q", "R", "M_q", "h_rest", "L_q")
@@ -265,10 +255,10 @@ def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(names, e
     assert large["L_t"] == {"driven_pivot", "bead"}
     assert {"double_pendulum", "sleeve_pendulum", "chain", "bead"} <= large["C"] <= large["M_q"]
     assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= large["Q"]
-    assert large["R"] == CONSTRAINED & set(names)
-    book = set(BOOK) & set(names)
+    assert large["R"] == CONSTRAINED
+    book = set(BOOK)
     # No potential, and an M that is constant or, of the ball, about 0.02 kg m^2.
-    free = {"disk_on_shaft", "hockey_puck", "hockey_puck_cord", "rolling_ball_no_spin"} & book
+    free = {"disk_on_shaft", "hockey_puck", "hockey_puck_cord", "rolling_ball_no_spin"}
     without = {name for name in book if not np.any(evaluate(name).found["V"])}
     assert free <= book - large["L_q"] <= without
     assert free <= book - large["h_rest"] <= without
@@ -531,6 +521,7 @@ def test_check_is_silent_where_all_is_well():
     assert case.system.check(case.params, case.q0, [0.1], t=0.3) is None
 
 
+@pytest.mark.full
 def test_a_long_chain_hangs_at_rest():
     """n = 12, the library solve: hanging straight and at rest it stays; M_ij = m l^2 (n - max)."""
     n, params, zero = 12, {"m": 0.4, "l": 0.3, "g": 9.81}, np.zeros(12)

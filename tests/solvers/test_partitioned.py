@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 
 import jaxlag as jl
 from systems.double_pendulum_cartesian import entry
@@ -72,13 +73,8 @@ def test_coefficients_in_closed_form():
     np.testing.assert_allclose(ah, expected, rtol=0, atol=2 * EPS)
 
 
-LONG = pytest.mark.full
-
-
-@pytest.mark.parametrize(
-    "method",
-    [pytest.param(name, marks=LONG if name in ("gauss2", "gauss6") else ()) for name in METHODS],
-)
+@pytest.mark.full
+@pytest.mark.parametrize("method", METHODS)
 def test_order_with_time_and_forces(method):
     """Forwards and backwards in time, with damping and a torque."""
     order = METHODS[method]
@@ -88,7 +84,8 @@ def test_order_with_time_and_forces(method):
         np.testing.assert_allclose(found[-1], order, atol=0.1 if order < 6 else 0.2)
 
 
-@pytest.mark.parametrize("method", [pytest.param("gauss4", marks=LONG), "variational4"])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["gauss4", "variational4"])
 def test_map_is_symplectic(method):
     """In (q, p), to 100 roundings of products of |S| a step."""
     defect, size = symplectic_defect(free, Q0, V0, PARAMS, method, 0.05, 10)
@@ -98,6 +95,7 @@ def test_map_is_symplectic(method):
         assert defect > 1e4 * EPS * size
 
 
+@pytest.mark.full
 def test_velocities_may_enter_by_more_than_squares():
     """A relativistic particle in a magnetic field, p = v / sqrt(1 - v^2) + A: order 4."""
 
@@ -133,7 +131,8 @@ def test_momentum_of_a_symmetry_is_kept(method):
 bars, BARS = entry.system, entry.example.params
 
 
-@pytest.mark.parametrize("method", [pytest.param("variational2", marks=LONG), "variational4"])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["variational2", "variational4"])
 def test_constraints_hold_inside_the_step(method):
     """Order, rows to rounding though nothing is projected, reversal."""
     q0, v0 = entry.start()
@@ -154,6 +153,7 @@ def test_constraints_hold_inside_the_step(method):
     np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-10)
 
 
+@pytest.mark.full
 def test_a_constraint_of_time():
     """A pendulum whose string is hauled in: order, and the energy that the hauling brings."""
 
@@ -175,6 +175,7 @@ def test_a_constraint_of_time():
     np.testing.assert_allclose(motion.work["string"][-1], change, rtol=1e-6)
 
 
+@pytest.mark.full
 def test_rest_is_kept():
     """Hanging at rest: roundings of the position are all the velocities there are."""
     q0 = jnp.stack([0.0, -BARS["h1"], 0.0, -BARS["h1"] - BARS["h2"]])
@@ -183,6 +184,7 @@ def test_rest_is_kept():
     np.testing.assert_allclose(motion.q, [q0] * 3, rtol=0, atol=1000 * EPS)
 
 
+@pytest.mark.full
 def test_a_row_twice_moves_as_once():
     def rod(t, q, p):
         return q @ q - 1.0
@@ -219,7 +221,8 @@ def test_work_closes_the_books_with_the_order_of_the_method():
     assert np.log2(abs(gap(40) / gap(80))) == pytest.approx(4, abs=0.2)
 
 
-@pytest.mark.parametrize("method", ["gauss4", pytest.param("variational4", marks=LONG)])
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["gauss4", "variational4"])
 def test_derivatives_are_those_of_the_steps(method):
     """Forward, reverse and differences; mixed second order by reverse over forward."""
 
@@ -235,7 +238,7 @@ def test_derivatives_are_those_of_the_steps(method):
     np.testing.assert_allclose(forward, jnp.stack(differences, 1), rtol=1e-8, atol=1e-8)
 
 
-@LONG
+@pytest.mark.full
 def test_derivatives_on_the_constraints():
     """Along starts on the constraints: forward, reverse and differences agree."""
     q0, v0 = (jnp.asarray(x) for x in entry.start())
@@ -257,6 +260,7 @@ def test_steps_that_are_not_solved_are_said():
     assert motion.last_time < 9.0
 
 
+@pytest.mark.full
 def test_lanes_are_single_motions():
     starts = jnp.array([[1.0, 0.5], [0.2, 0.1], [2.0, -1.0]])
 
@@ -277,7 +281,7 @@ def test_stages_that_there_are_not(kind, stages, least, unchecked):  # noqa: F81
         getattr(jl.solvers, kind)(stages)
 
 
-@pytest.mark.parametrize("method", ["gauss4", pytest.param("variational4", marks=LONG)])
+@pytest.mark.parametrize("method", mostly_full(["gauss4", "variational4"], "gauss4"))
 def test_a_preload_that_cancels_is_no_obstacle(method):
     """A hanging mass comes to rest: forces cancel, and increments are roundings of them alone."""
 
@@ -312,7 +316,7 @@ def test_a_force_that_is_not_finite_is_named():
     np.testing.assert_allclose(motion.last_time, 0.5, atol=1e-12)
 
 
-@LONG
+@pytest.mark.full
 def test_the_start_follows_the_constraint():
     """A derivative in the length of a rod, q0 and v0 given: as by projection, in every method."""
     rod = jl.Holonomic(lambda t, q, params: q @ q - params["l"] ** 2, "rod")
@@ -329,7 +333,7 @@ def test_the_start_follows_the_constraint():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)  # 1e-8 of the method, times 1/l
 
 
-@LONG
+@pytest.mark.full
 def test_second_derivatives_forward_over_reverse():
     def last(q):
         return jl.simulate(pendulum, [q], [0.0], [0.0, 0.4], {}, method="gauss4", dt=0.1).q[-1, 0]

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 
 import jaxlag as jl
 from tests.solvers._flows import EPS, end, slopes, symplectic_defect
@@ -33,7 +34,7 @@ force = jl.GeneralizedForce(swirl, "swirl")
 pushed = jl.System(lagrangian, ("x", "y"), forces=(force,))
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", mostly_full(ORDERS, 4))
 def test_order_with_time_and_forces(order):
     """Forwards and backwards in time; steps long enough for errors above 1e-12."""
     method, steps = f"splitting{order}", {2: 40, 4: 10, 6: 5, 8: 5}[order]
@@ -43,6 +44,7 @@ def test_order_with_time_and_forces(order):
         np.testing.assert_allclose(found[-1], order, atol=0.1 if order < 6 else 0.2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", ORDERS)
 def test_map_is_symplectic(order):
     """To 200 roundings of products of |S| over 20 steps; order 8 of Dormand and Prince is not."""
@@ -106,6 +108,7 @@ def test_arrays_take_the_same_steps():
     np.testing.assert_allclose(a, b, rtol=0, atol=30 * 24 * EPS)
 
 
+@pytest.mark.full
 def test_derivatives_are_those_of_the_steps():
     """Forward, reverse and differences, in the start and in params, single and in lanes."""
 

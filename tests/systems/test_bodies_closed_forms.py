@@ -85,6 +85,7 @@ LAGRANGE = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", LAGRANGE)
 def test_the_heavy_top_nutates_by_elliptic_functions(name):
     """cos(theta) by sn^2 between its turning points, and phi', psi' by the momenta."""

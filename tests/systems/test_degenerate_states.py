@@ -51,7 +51,15 @@ SINGULAR = {
 SYSTEMS = [name for name, entry in ENTRIES.items() if isinstance(entry, Entry)]
 
 
-@pytest.mark.parametrize(("name", "place"), SINGULAR)
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        pytest.param(*key, marks=pytest.mark.full)
+        if key[0] in ("rigid_aircraft", "quadcopter")
+        else key
+        for key in SINGULAR
+    ],
+)
 def test_a_singular_start_is_named(name, place):
     q0, v0, status = SINGULAR[name, place]
     entry = ENTRIES[name]

@@ -38,6 +38,7 @@ def sleigh(times, m, I, a, start, v0, omega0):  # noqa: E741
     return np.column_stack([x, y, theta(times), v, omega, lam])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("v0", "omega0"), [(-1.2, 0.3), (0.5, -1.5)])
 def test_the_sleigh_moves_by_hyperbolic_functions(v0, omega0):
     times, start = np.linspace(0.0, 6.0, 7), (1.0, -0.5, -0.2)
@@ -90,6 +91,7 @@ def suslov(times, I1, I2, I3, I13, I23, wx, wy):
     return np.column_stack([wx, wy, lam])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("wx", "wy"), [(0.8, -0.5), (-0.9, 0.1)])
 def test_the_suslov_body_turns_by_hyperbolic_functions(wx, wy):
     """On either way from one direction to its opposite; the angles stay off gimbal lock."""
@@ -205,6 +207,7 @@ def test_the_upright_disk_is_driven_along_a_spiral():
     close(motion.lam["s_y"], m * R * (spin * sin(phi) + roll * turn * cos(phi)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("v0", "turn", "phi0"), [(0.0, 1.5, 0.0), (1.3, -2.0, 0.7)])
 def test_the_knife_edge_does_not_slide_down_the_slope(v0, turn, phi0):
     """From rest x stays below g sin(alpha)/(2 phi'^2): a cycloid across the slope."""
@@ -226,6 +229,7 @@ def test_the_knife_edge_does_not_slide_down_the_slope(v0, turn, phi0):
         close(x, pull / (2 * turn**2) * sin(turn * times) ** 2, 1e-15)
 
 
+@pytest.mark.full
 def test_the_nonholonomic_particle_slows_by_its_constraint():
     """Not by the L into which the constraint is put: that has another motion."""
     m, start, (x_rate, y_rate) = 2.5, (1.0, -1.3, -0.5), (-0.7, 1.1)

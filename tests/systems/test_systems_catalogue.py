@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _families import mostly_full
 
 import jaxlag as jl
 import systems
@@ -51,19 +52,10 @@ def test_the_book_place_is_that_of_the_docstring(name):
         assert figure in doc
 
 
-OF_EACH_KIND = (
-    *("central_motion", "atwood_multipliers", "double_pendulum_static_load"),
-    *("link_spring_mass_equilibrium", "carnival_ride", "chaplygin_sleigh", "heavy_symmetric_top"),
-)
+OF_EACH_KIND = "cart_pendulum", "sleeve_pendulum_equilibrium", "carnival_ride"
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in OF_EACH_KIND else pytest.param(name, marks=pytest.mark.full)
-        for name in ENTRIES
-    ],
-)
+@pytest.mark.parametrize("name", mostly_full(ENTRIES, *OF_EACH_KIND))
 def test_the_example_runs(name, capsys):
     assert main(["run", name]) == 0
     out = capsys.readouterr().out
@@ -82,6 +74,7 @@ def test_list_names_every_system_once(capsys):
     assert [line.split()[0] for line in lines] == list(ENTRIES)
 
 
+@pytest.mark.full
 def test_quasi_velocities_that_vanish_stand_among_the_constraints_alone(capsys):
     assert main(["run", "chaplygin_sleigh"]) == 0
     head, *others = capsys.readouterr().out.split("\n\n")[1].splitlines()
@@ -91,6 +84,7 @@ def test_quasi_velocities_that_vanish_stand_among_the_constraints_alone(capsys):
     assert len(others) == 7
 
 
+@pytest.mark.full
 def test_a_parameter_may_be_an_array(capsys):
     assert main(["run", "quadcopter_body_axes"]) == 0
     assert "omega = (516, 512, 511, 515) rad/s" in capsys.readouterr().out
@@ -161,10 +155,10 @@ def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 @pytest.mark.parametrize(
     "name",
-    [
-        *("cart_pendulum", "sleeve_pendulum_equilibrium", "two_link_robot_arm_inverse"),
-        *("atwood_multipliers", "link_spring_mass_equilibrium", "chaplygin_sleigh"),
-    ],
+    mostly_full(
+        [*OF_EACH_KIND, "atwood_multipliers", "link_spring_mass_equilibrium", "chaplygin_sleigh"],
+        *OF_EACH_KIND,
+    ),
 )
 def test_plot_writes_a_figure(name, suffix, tmp_path, capsys):
     """A motion, a state of rest, a prescribed motion; the first two under constraints, too.

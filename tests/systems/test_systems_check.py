@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from _families import mostly_full
 from _files import harmonic, recorded
 from _paths import REFERENCE
 
@@ -41,21 +42,28 @@ def nudged(raw, path):
     return raw
 
 
-QUICK = (
-    *("atwood_multipliers", "knife_edge_vehicle", "link_spring_mass_equilibrium"),
-    *("chaplygin_sleigh", "heavy_symmetric_top"),
+PLAIN = "cart_pendulum", "atwood_multipliers", "chaplygin_sleigh"
+"""With a force of time, multipliers, quasi-velocities."""
+
+KINDS = (
+    *("spherical_pendulum_elastic", "falling_stick_friction", "heavy_symmetric_top"),
+    *("carnival_ride", "sleeve_pendulum_equilibrium", "link_spring_mass_equilibrium"),
 )
-"""Systems with constraints or quasi-velocities that are replayed in plain pytest."""
-
-EVERY = [
-    pytest.param(name, marks=pytest.mark.full)
-    if (entry.constraints or entry.quasi_velocities) and name not in QUICK
-    else name
-    for name, entry in ENTRIES.items()
-]
+"""One each with cyclic coordinates, reactions, L in u, a motion given, a state of rest or two."""
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.full
+def test_every_reference_file_passes(capsys):
+    files = sorted(REFERENCE.glob("*.json"))
+    if not files:
+        pytest.skip(f"no files in {REFERENCE}")
+    status = main(["check", *map(str, files)])
+    out = capsys.readouterr().out
+    assert status == 0, out
+    assert {line.split()[1] for line in out.splitlines()[:-1]} == {path.name for path in files}
+
+
+@pytest.mark.parametrize("name", PLAIN)
 def test_the_reference_file_is_reproduced(name):
     path = REFERENCE / f"{name}.json"
     if not path.exists():
@@ -79,7 +87,7 @@ def replayed(entry, times):
     return replay(entry, params, times, *(x[entry.file_columns] for x in entry.start()))
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", mostly_full([*PLAIN, *KINDS], *PLAIN))
 def test_every_wrong_number_is_found(name):
     """Each number of each compared field in turn, the first rows of derived fields included."""
     entry = ENTRIES[name]

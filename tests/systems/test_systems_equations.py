@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 from _consistent import onto_constraints
+from _families import mostly_full
 from _hand_constrained import HAND_EQUATIONS as CONSTRAINED
 from _hand_equations2 import HAND_EQUATIONS as CHAPTER_2
 from _hand_equations3 import HAND_EQUATIONS as CHAPTER_3
@@ -165,7 +166,13 @@ def evaluate(entry, params, t, q, v):
     }
 
 
-@pytest.fixture(scope="module", params=MOVING)
+PLAIN = (
+    *("central_motion", "cart_pendulum", "double_pendulum_rayleigh", "quadcopter"),
+    *("atwood_multipliers", "tricycle"),
+)
+
+
+@pytest.fixture(scope="module", params=mostly_full(MOVING, *PLAIN))
 def evaluated(request, lowering):
     """An entry with its quantities at random states: (entry, [((t, q, v, params), rows), ...])."""
     entry = ENTRIES[request.param]

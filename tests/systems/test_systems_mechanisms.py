@@ -53,6 +53,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", CLOSED)
 def test_the_motion_is_that_in_one_coordinate(name):
     """L of the crank alone; turns of the crank, q and v of all links, and the reactions."""
@@ -195,6 +196,7 @@ def loop_states(count):
         yield move(LOOP, 0.0, q, rng.uniform(-3.0, 3.0, LINKS))
 
 
+@pytest.mark.full
 def test_the_loop_accelerates_as_in_cartesian_coordinates():
     """And its pin is pulled as Newton's law for the links asks."""
 
@@ -214,6 +216,7 @@ def test_the_loop_accelerates_as_in_cartesian_coordinates():
         np.testing.assert_allclose(found, force, rtol=0, atol=1e-11 * np.max(np.abs(force)))
 
 
+@pytest.mark.full
 def test_the_loop_hangs_as_a_catenary_of_links():
     """tan(theta_k) = (k - (n + 1)/2) m g/H with the tension H; each pin bears half the weight."""
     guess = np.linspace(-0.9, 1.0, LINKS)

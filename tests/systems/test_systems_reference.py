@@ -219,6 +219,7 @@ def files(lowering):
     return {name: of(name) for name in names}
 
 
+@pytest.mark.full
 def test_multipliers_and_reactions_stand_in_the_order_of_the_rows(files):
     raw = files["double_pendulum_cartesian"]
     assert raw["constraints"] == ["string1", "string2"]

@@ -1,0 +1,12 @@
+"""Families of tests: a few members always, the others with -m full."""
+
+import pytest
+
+
+def mostly_full(values, *plain):
+    """Values to parametrise by; those that are not among `plain` are left to -m full."""
+
+    def left(x):
+        return pytest.param(*(x if isinstance(x, tuple) else (x,)), marks=pytest.mark.full)
+
+    return [x if x in plain else left(x) for x in values]

@@ -1,0 +1,62 @@
+"""The bounds on memory maps and memory: a run beyond them fails and says where, others do not."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CONFTEST = """
+from _footprint import Footprint
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(Footprint(most_maps={maps}, most_bytes={size}))
+"""
+TESTS = """
+import mmap
+
+
+def test_few():
+    pass
+
+
+def test_many():
+    global kept
+    kept = [mmap.mmap(-1, mmap.PAGESIZE) for _ in range(3000)]
+"""
+
+
+def run(folder, workers, maps=20_000, size=4e9):
+    """Exit status and output of the two tests above under these bounds."""
+    (folder / "conftest.py").write_text(CONFTEST.format(maps=maps, size=size))
+    (folder / "test_maps.py").write_text(TESTS)
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "PYTEST_ADDOPTS": ""}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", str(workers), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=folder)
+    return done.returncode, done.stdout
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="maps are not told here")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_too_many_maps_fail_the_run_and_name_the_test(tmp_path, workers):
+    status, output = run(tmp_path, workers, maps=2500)
+    assert status == 1
+    assert "2 passed" in output
+    (line,) = re.findall(r"^.*TOO MUCH.*$", output, re.MULTILINE)
+    assert re.search(r"3\d\d\d memory maps \(bound 2500, most after .*::test_many\)", line)
+
+
+def test_too_much_memory_fails_the_run(tmp_path):
+    status, output = run(tmp_path, 1, size=1e6)
+    assert status == 1
+    assert "GB (bound 0.0)  TOO MUCH" in output
+
+
+def test_every_worker_reports_and_a_run_within_the_bounds_passes(tmp_path):
+    status, output = run(tmp_path, 2)
+    assert status == 0
+    assert re.findall(r"^(gw\d): \d+ memory maps", output, re.MULTILINE) == ["gw0", "gw1"]
+    assert "TOO MUCH" not in output
