@@ -46,6 +46,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # derivatives is tested for every system in test_lowering_scalar.
 BOTH = {
     "test_batch": {"test_lanes_equal_single_runs"},
+    "test_gradients": {"test_forward_equals_reverse_under_both_lowerings"},
     "test_lanes": {"test_chunks_are_what_is_compiled"},
     "test_lowering_both": {
         "test_accelerations_are_compiled_from_the_lowering_in_use",

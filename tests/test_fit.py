@@ -1,10 +1,9 @@
 """Fits of motions whose parameters are known; every warning and error by name."""
 
-import warnings
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _silence import no_warning
 
 import jaxlag as jl
 
@@ -237,8 +236,7 @@ def test_warnings_name_what_they_are_about():
 
 
 def test_no_warning_without_reason():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warning():
         fit(experiment())
 
 

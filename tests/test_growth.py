@@ -1,12 +1,11 @@
 """Growth of perturbations: closed forms, two routes to one number, and what is said about it."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from _quasi_systems import sleighs
+from _silence import no_warning
 from _user import unchecked  # noqa: F401
 from mechanisms import (
     BOBS,
@@ -151,8 +150,7 @@ def test_a_motion_beyond_its_horizon_warns():
     with pytest.warns(UserWarning, match=r"From 6\.\d+ s after its start an error of 1e-09"):
         growth = jl.grad_growth(beyond)
     assert growth.horizon < 10.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warning():
         jl.grad_growth(linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 5.0, 41)))
         jax.jit(jl.grad_growth)(beyond)  # no values, no warning
     several = jax.vmap(lambda q: linear_motion(INVERTED, q, np.linspace(0.0, 10.0, 41)))

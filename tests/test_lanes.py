@@ -67,10 +67,8 @@ def test_vmaps_of_vmaps_are_one_batch():
 
 @pytest.mark.full
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
-def test_derivatives_pass_through(derivative, lowering):
+def test_derivatives_pass_through(derivative):
     """Forward and reverse, first and second order, of the batch as of its trajectories."""
-    if lowering == "array" and derivative is jax.hessian:
-        pytest.skip("chunks of second derivatives are those of scalar programs")
     q0 = starts(3)
 
     def last(q0):
@@ -119,9 +117,9 @@ def test_chunks_are_what_is_compiled(lowering):
         assert all(shape[0] == 37 for shape in rows)
 
 
-def test_explain_says_which(lowering):
-    how = {"auto": "16 trajectories at a time", "array": "all trajectories"}[lowering]
-    assert f"batches       by jax.vmap: {how} in one loop" in double_pendulum.system.explain(PARAMS)
+def test_explain_says_which():
+    line = "batches       by jax.vmap: 16 trajectories at a time in one loop"
+    assert line in double_pendulum.system.explain(PARAMS)
     arrays = jl.System(double_pendulum.system.lagrangian, ("a", "b"), lowering="array")
     assert "batches       by jax.vmap: all trajectories in one loop" in arrays.explain(PARAMS)
 
