@@ -33,8 +33,11 @@ class Footprint:
         self.reports = {}
 
     def pytest_runtest_logreport(self, report):
-        """A process that hands its tests to workers hears of theirs, too: its own count is low."""
-        if report.when == "teardown" and (count := maps()) > self.most:
+        """Before teardown, since after the last test of a module its programs are gone.
+
+        A process that hands its tests to workers hears of theirs, too: its own count is low.
+        """
+        if report.when == "call" and (count := maps()) > self.most:
             self.most, self.after = count, report.nodeid
 
     @pytest.hookimpl(optionalhook=True)

@@ -18,14 +18,23 @@ def pytest_configure(config):
 TESTS = """
 import mmap
 
+import pytest
+
 
 def test_few():
     pass
 
 
-def test_many():
-    global kept
-    kept = [mmap.mmap(-1, mmap.PAGESIZE) for _ in range(3000)]
+@pytest.fixture(scope="module")
+def kept():
+    kept = []
+    yield kept
+    for each in kept:
+        each.close()
+
+
+def test_many(kept):
+    kept += [mmap.mmap(-1, mmap.PAGESIZE) for _ in range(3000)]
 """
 
 
