@@ -99,7 +99,8 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
 
         def on_scalars(q: Parts, v: Parts) -> Parts:
             assert isinstance(terms, ScalarTerms)
-            return terms.elements(t, q, v, like.dtype, params, {}, prepared)
+            rates = terms.rates(t, jnp.stack(q), jnp.stack(v), params, {}, prepared)
+            return _elements(rates)
 
         def on_arrays(q: Parts, v: Parts) -> Parts:
             return [terms.acceleration(t, *q, *v, params, {}, prepared)]

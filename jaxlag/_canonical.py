@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from jaxlag._dynamics import Dynamics
 from jaxlag._errors import real_scalar
-from jaxlag._inputs import evaluate
 from jaxlag._step import Arguments
 
 
@@ -28,7 +27,11 @@ class Canonical(eqx.Module):
 
     def time(self, tau: Float[Array, ""]) -> Float[Array, ""]:
         """The user's time."""
-        return self.dynamics.mirror(tau, self.args)
+        return self.dynamics.clock(tau, self.args)
+
+    def span(self, tau0: Float[Array, ""], tau1: Float[Array, ""]) -> Float[Array, ""]:
+        """The user's time between two times, negative where it runs backwards."""
+        return self.dynamics.turned(tau1 - tau0, self.args)
 
     @property
     def rows(self) -> int:
@@ -82,8 +85,8 @@ class Canonical(eqx.Module):
         return jnp.stack(list(self.dynamics.power(t, q, v, *self._given(t, q, v)).values()))
 
     def _given(self, t: Array, q: Array, v: Array) -> tuple[Any, Any]:
-        params, inputs = self.dynamics.given(self.args)
-        return params, evaluate(inputs, t, q, v, params, self.args.intervals)
+        params, _ = self.dynamics.given(self.args)
+        return params, self.dynamics.inputs_at(t, q, v, self.args)
 
     def _of_rows(self, kept: Array, other: Array) -> Array:
         return kept if self.args.kept is None else jnp.where(self.args.kept, kept, other)

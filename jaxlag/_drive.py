@@ -1,95 +1,66 @@
 """The one loop: steps, step-size control, landing on knots, rows to save, record, status.
 
-Integration runs forwards in a time tau = sigma t, sigma = +1 or -1, so that nothing here knows
-about direction. Time, step, acceptance and status are elementwise and may carry a trailing lane
-shape that the state's leaves end in as well; a finished lane keeps its values while others go on.
+Integration runs forwards in a time tau = sigma (t - ts[0]), sigma = +1 or -1, so that nothing here
+knows about direction, and times are as fine as the span allows.
+
+A turn of the loop is a step, or it reaches a row: a row that lies inside the last step is reached
+by a step of its own from where that one started, which is at least as accurate, whatever the
+solver; its interpolant need not be. So the program holds one step.
 """
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._scheme import Scheme, resolution
+from jaxlag._record import Outcome, Record, Times
+from jaxlag._scheme import Scheme, all_finite, resolution
 from jaxlag._status import Status
 
 # The record is a whole number of chunks of this many turns.
 CHUNK = 64
 
 
-class Times(NamedTuple):
-    """What the grid of steps is anchored to, in tau.
+class _Place(NamedTuple):
+    """Where a step starts."""
 
-    `stop` is where integration ends: the last save time, or the end of an input's table before
-    it. `knots` are sorted.
-    """
-
-    start: Float[Array, "..."]
-    stop: Float[Array, "..."]
-    knots: Float[Array, " k"] | None
-    saves: Float[Array, "s ..."]
-
-    def anchors(self) -> Float[Array, "a ..."]:
-        """Start, stop and knots in one row; `Grid.anchor` indexes it."""
-        ends = jnp.stack([self.start, self.stop])
-        return ends if self.knots is None else jnp.concatenate([ends, self.knots])
+    t: Array
+    y: PyTree
+    memory: Any  # the solver's own state
+    jump: Array | None  # whether the field jumps there; None where nothing ever does
 
 
-class Record(NamedTuple):
-    """What a loop did, turn by turn: enough to go the same way again without step-size control.
+class _Rows(NamedTuple):
+    """Rows between the first and the last."""
 
-    Lanes share turns; a turn that takes a lane nowhere is one whose end is that of the last.
+    base: _Place  # where the last accepted step started
+    turn: Array  # that took it
+    next: Array  # index of the row that is due next
+    values: PyTree  # one more for what is not kept
+    turns: Array | None  # `Record.row_turn`
+    missed: Array
 
-    Attributes:
-        offsets: time after every turn, from its anchor, with which it moves.
-        anchors: which of `Times.anchors` that is. None without knots: the start, or where the
-            offset is infinite the stop, at which the turn ends.
-        jumps: whether the vector field jumps where the turn starts; None where it never does.
-        points: states before turn 0, `stride`, 2 `stride`, ...; None where nobody needs them.
-        stride: a power of 2.
-        turns: how many there were.
-        row_turn: row i is reached from the state before this turn; None where there are no rows
-            between the first and the last.
-    """
 
-    offsets: Float[Array, " N"]
-    anchors: Int[Array, " N"] | None
-    jumps: Bool[Array, " N"] | None
+class _Kept(NamedTuple):
+    """The record on the way."""
+
+    offsets: Array
+    anchors: Array | None
+    jumps: Array | None
     points: PyTree | None
-    stride: Int[Array, ""]
-    turns: Int[Array, ""]
-    row_turn: Int[Array, " s"] | None
-
-
-class Outcome(NamedTuple):
-    """Where a drive ended, and for each row the state from which one more step reaches it."""
-
-    status: Int[Array, "..."]
-    time: Float[Array, "..."]
-    state: PyTree
-    tried: Float[Array, "..."]  # end of the last attempted step
-    accepted: Int[Array, "..."]
-    attempted: Int[Array, "..."]
-    row_time: Float[Array, "s ..."] | None
-    row_state: PyTree | None  # (y, solver memory where the solver remembers)
-    reached: Bool[Array, "s ..."]  # rows that were reached
-    inside: Bool[Array, "s ..."]  # rows that take one more step to reach
-    record: Record | None
-    gradient: Int[Array, "..."]  # a GradientMode
+    stride: Array
 
 
 class _Carry(NamedTuple):
-    t: Array
-    y: PyTree
+    at: _Place
     h: Array
-    memory: Any  # the solver's own state
-    control_state: Any
-    jump: Array | None  # None where nothing ever jumps
+    control: Any  # the controller's own state
     mark: Array  # number of marks of the fixed grid passed
     anchor: Array
     status: Array
@@ -97,47 +68,32 @@ class _Carry(NamedTuple):
     tried: Array
     accepted: Array
     attempted: Array
-    rows: Array  # number of rows passed
-    row_time: Array | None
-    row_state: PyTree | None
-    row_turn: Array | None
     turn: Array  # shared by all lanes
-    offsets: Array | None
-    anchors: Array | None
-    jumps: Array | None
-    points: PyTree | None
-    stride: Array
+    rows: _Rows | None
+    kept: _Kept | None
+
+
+class _Loop(NamedTuple):
+    """What stays the same from turn to turn."""
+
+    scheme: Scheme
+    args: Any
+    times: Times
+    anchors: Array
+    dues: Array
+    dt: Array
+    max_steps: int
+    shared: bool
 
 
 def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
 
 
-def _all_finite(y: PyTree, lanes: int) -> Array:
-    def finite(leaf: Array) -> Array:
-        return jnp.all(jnp.isfinite(leaf), axis=tuple(range(leaf.ndim - lanes)))
-
-    flags = [finite(leaf) for leaf in jax.tree.leaves(y)]
-    return jnp.all(jnp.stack(flags), axis=0)
-
-
-def _write(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
-    """buffer[index] = row in every lane; an index past the end writes nothing."""
-
-    def write(b: Array, i: Array, r: Array) -> Array:
-        return b.at[i].set(r.astype(b.dtype), mode="drop")
-
-    def write_leaf(b: Array, r: Array) -> Array:
-        if index.ndim == 0:
-            return write(b, index, r)
-        return jax.vmap(write, in_axes=-1, out_axes=-1)(b, index, r)
-
-    return jax.tree.map(write_leaf, buffer, row)
-
-
-def _whole(scheme: Scheme, y: PyTree, memory: Any) -> PyTree:
-    """All that the next step depends on."""
-    return (y, memory if scheme.remembers else None)
+def _put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
+    """buffer[index] = row."""
+    put = partial(jax.lax.dynamic_update_index_in_dim, index=index, axis=0)
+    return jax.tree.map(lambda b, r: put(b, r.astype(b.dtype)), buffer, row)
 
 
 def _buffer(size: int, like: PyTree, fill: float | int) -> PyTree:
@@ -150,20 +106,20 @@ def drive(
     args: Any,
     times: Times,
     first_step: Array | None,
-    allowed: Bool[Array, "..."],
+    allowed: Bool[Array, ""],
     max_steps: int,
     record: bool,
     room: int = 0,
     native: Callable | None = None,
     shared: bool = True,
 ) -> Outcome:
-    """Integrate from `times.start` to `times.stop`.
+    """Integrate from tau = 0 to `times.stop`.
 
     Args:
         scheme: solver, controller, vector field.
         y0: state at the start.
         args: passed to the vector field, after `scheme.intervals`.
-        times: anchors and save times, in tau.
+        times: anchors and save times.
         first_step: the fixed step without a controller; else the first step, None for automatic.
         allowed: False where the trajectory must not start (status set by the caller).
         max_steps: bound on attempted steps.
@@ -171,93 +127,93 @@ def drive(
         room: for so many states on the way, an even number. When it is full every other one is
             dropped, and from then on half as many are kept.
         native: what calls the loop, with its start.
-        shared: whether this is going to be vmapped, so that a record has one row for each attempt
+        shared: whether this is going to be vmapped, so that a record has one row for each turn
             of any lane; else one for each accepted step.
     """
-    t0 = times.start
-    if times.saves.ndim == 1:  # shared by all lanes
-        saves = times.saves.reshape((-1,) + (1,) * t0.ndim)
-        times = times._replace(saves=jnp.broadcast_to(saves, times.saves.shape + t0.shape))
+    t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    keep_rows = count > 2
-    size = -(-max_steps // CHUNK) * CHUNK
-    room = (room if room < size else size) if record and not scheme.remembers else 0
-    memory = scheme.begin(t0, times.stop, y0, args)
+    size = -(-(max_steps + (count if shared else 0)) // CHUNK) * CHUNK
+    room = (room if room < max_steps else size) if record and not scheme.remembers else 0
     if scheme.controller is not None:
-        h, control_state = scheme.first_step(t0, times.stop, y0, args, first_step)
+        memory, h, control = scheme.start(t0, times.stop, y0, args, first_step)
         # The estimate is 0/0 where atol = 0 meets a component that is 0.
-        h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (times.stop - t0))
+        h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * times.stop)
         h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     else:
         assert first_step is not None
-        h, control_state = first_step, None
-    memory = jax.tree.map(lambda x: jnp.broadcast_to(x, jnp.shape(x) or t0.shape), memory)
-    whole = _whole(scheme, y0, memory)
-    zero = jnp.zeros(t0.shape, jnp.int32)
-    ok = zero + int(Status.ok)
+        memory, h, control = scheme.begin(t0, times.stop, y0, args), first_step, None
+    sound = scheme.is_sound(memory)
+    jumps = times.knots is not None or not scheme.standard
+    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None)
+    zero = jnp.zeros((), jnp.int32)
+    status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
+    rows = kept = None
+    if count > 2:
+        places = jnp.full((count - 1,), size, jnp.int32) if record else None
+        values = _buffer(count - 1, y0, jnp.nan)
+        rows = _Rows(start, zero, zero, values, places, jnp.array(False))
+    if record:
+        kept = _Kept(
+            offsets=_buffer(size, t0, 0.0),
+            anchors=None if times.knots is None else _buffer(size, zero, 0),
+            jumps=_buffer(size, zero > 0, 0) if jumps else None,
+            points=_buffer(room + 1, (y0, None), 0.0) if room else None,
+            stride=jnp.ones((), jnp.int32),
+        )
     carry = _Carry(
-        t=t0,
-        y=y0,
-        h=jnp.asarray(h, t0.dtype) + jnp.zeros_like(t0),
-        memory=memory,
-        control_state=control_state,
-        jump=jnp.zeros(t0.shape, bool) if _jumps(scheme, times) else None,
+        at=start,
+        h=jnp.asarray(h, t0.dtype),
+        control=control,
         mark=zero,
         anchor=zero,
-        status=ok,
-        done=~allowed | (times.stop <= t0),
+        status=status.astype(jnp.int32),
+        done=~(allowed & sound) | (times.stop <= 0),
         tried=t0,
         accepted=zero,
         attempted=zero,
-        rows=zero + 1,
-        row_time=_write(_buffer(count, t0, jnp.nan), zero, t0) if keep_rows else None,
-        row_state=_write(_buffer(count, whole, 0.0), zero, whole) if keep_rows else None,
-        row_turn=_buffer(count, zero, 0) if keep_rows and record else None,
-        turn=jnp.zeros((), jnp.int32),
-        offsets=_buffer(size, t0, 0.0) if record else None,
-        anchors=_buffer(size, zero, 0) if record and times.knots is not None else None,
-        jumps=_buffer(size, zero > 0, 0) if record and _jumps(scheme, times) else None,
-        # One more for what is not kept.
-        points=_buffer(room + 1, (y0, None), 0.0) if room else None,
-        stride=jnp.ones((), jnp.int32),
+        turn=zero,
+        rows=rows,
+        kept=kept,
     )
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
+    fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps, shared)
+    loop = _Loop(scheme, args, *fixed)
 
     def turn(dynamic: Any) -> Any:
-        c = _turn(scheme, args, times, h, max_steps, shared, eqx.combine(dynamic, static))
+        c = _turn(loop, eqx.combine(dynamic, static))
         return eqx.partition(c, eqx.is_array)[0]
 
     def goes_on(c: Any) -> Array:
-        return eqxi.unvmap_any(~c.done)
+        due = False if c.rows is None else loop.dues[c.rows.next] <= c.at.t
+        return eqxi.unvmap_any(~c.done | due)
 
-    def loop(dynamic: Any) -> Any:
+    def turns(dynamic: Any) -> Any:
         if room in (0, size):
             return jax.lax.while_loop(goes_on, turn, dynamic)
-        until_full = lambda c: goes_on(c) & (c.turn < room * c.stride)  # noqa: E731
+        until_full = lambda c: goes_on(c) & (c.turn < room * c.kept.stride)  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
         return jax.lax.while_loop(goes_on, lambda c: fill(_thinned(c, room)), dynamic)
 
-    final = loop(dynamic) if native is None else native(loop, dynamic)
-    c: _Carry = eqx.combine(final, static)
-    rows = _filled(c) if keep_rows else (None, None, None)
-    reached = (times.saves <= c.t) & allowed
-    reached = reached.at[0].set(True)
-    inside = jnp.zeros_like(reached)
-    if rows[0] is not None:
-        inside = reached & (times.saves - rows[0] > resolution(times.saves))
-    kept = None
-    if record:
-        assert c.offsets is not None
-        turns = jnp.broadcast_to(c.turn, t0.shape)
-        kept = Record(c.offsets, c.anchors, c.jumps, c.points, c.stride, turns, rows[2])
-    ends = (c.status, c.t, c.y, c.tried, c.accepted, c.attempted)
-    return Outcome(*ends, *rows[:2], reached, inside, kept, zero)
+    final = turns(dynamic) if native is None else native(turns, dynamic)
+    return _outcome(eqx.combine(final, static), times, y0, allowed)
 
 
-def _jumps(scheme: Scheme, times: Times) -> bool:
-    """Whether the vector field may jump during the integration."""
-    return times.knots is not None or not scheme.standard
+def _outcome(c: _Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
+    arrived = allowed & (times.saves[-1] <= c.at.t)
+    last = jax.tree.map(lambda y: jnp.where(arrived, y, jnp.nan), c.at.y)
+    parts = [jax.tree.map(lambda y: y[None], y0)]
+    if c.rows is not None:
+        parts.append(jax.tree.map(lambda x: x[:-1], c.rows.values))
+    parts.append(jax.tree.map(lambda y: y[None], last))
+    rows = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    record = None
+    if c.kept is not None:
+        row_turn = None if c.rows is None else c.rows.turns
+        record = Record(*c.kept, c.turn, row_turn)
+    ends = (c.status, c.at.t, c.at.y, c.tried, c.accepted, c.attempted)
+    missed = jnp.array(False) if c.rows is None else c.rows.missed
+    return Outcome(*ends, rows, missed, record, jnp.zeros((), jnp.int32))
 
 
 def _thinned(c: Any, room: int) -> Any:
@@ -266,142 +222,151 @@ def _thinned(c: Any, room: int) -> Any:
     def halved(leaf: Array) -> Array:
         return leaf.at[: room // 2].set(leaf[:room:2])
 
-    def thin(c: Any) -> Any:
-        return c._replace(points=jax.tree.map(halved, c.points), stride=2 * c.stride)
+    def thin(kept: Any) -> Any:
+        return kept._replace(points=jax.tree.map(halved, kept.points), stride=2 * kept.stride)
 
-    return jax.lax.cond(c.turn >= room * c.stride, thin, lambda c: c, c)
-
-
-def _put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
-    """buffer[index] = row in all lanes."""
-    put = partial(jax.lax.dynamic_update_index_in_dim, index=index, axis=0)
-    return jax.tree.map(lambda b, r: put(b, r.astype(b.dtype)), buffer, row)
+    full = c.turn >= room * c.kept.stride
+    return c._replace(kept=jax.lax.cond(full, thin, lambda kept: kept, c.kept))
 
 
-def _turn(
-    scheme: Scheme,
-    args: Any,
-    times: Times,
-    dt: Array,
-    max_steps: int,
-    shared: bool,
-    c: _Carry,
-) -> _Carry:
-    """One attempted step."""
+def _turn(loop: _Loop, c: _Carry) -> _Carry:
+    """One attempted step, or one that reaches a row."""
+    scheme, times, t = loop.scheme, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
-    goal = times.start + (c.mark + 1).astype(c.t.dtype) * dt if scheme.controller is None else None
-    goal = c.t + c.h if goal is None else goal
-    boundary, boundary_anchor = _next_boundary(times, c.t)
-    slack = jnp.maximum(1e-10 * (goal - c.t), resolution(boundary))
+    fixed = scheme.controller is None
+    goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + c.h
+    boundary, boundary_anchor = _next_boundary(times, t)
+    slack = jnp.maximum(1e-10 * (goal - t), resolution(boundary))
     lands = goal >= boundary - slack
     t1 = jnp.where(lands, boundary, goal)
 
-    jumped = False if c.jump is None else c.jump
-    y1, error, memory, solved = scheme.step(c.t, t1, c.y, args, c.memory, jumped)
-    finite = _all_finite(y1, c.t.ndim)
+    begin, to_row, due = c.at, jnp.array(False), None
+    if c.rows is not None:
+        due = loop.dues[c.rows.next]
+        to_row = due <= t
+        begin = _select(to_row, c.rows.base, c.at)
+        t1 = jnp.where(to_row, due, t1)
+    jumped = False if begin.jump is None else begin.jump
+    args = scheme.within(loop.args, begin.t)
+    y1, error, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
+    finite = all_finite(y1)
     settled, verdict = scheme.settled(t1, y1, args)
     good = finite & solved & verdict.good
-    if scheme.controller is None:
-        keep, h, control_state, jump, stuck = good, c.h, None, jnp.zeros_like(good), ~good
-    else:
-        order: Any = scheme.solver.error_order(scheme.term)
-        error = jax.tree.map(lambda e: jnp.where(good, e, jnp.inf), error)
-        keep, next0, next1, jump, control_state, _ = scheme.controller.adapt_step_size(
-            c.t, t1, c.y, y1, args, error, order, c.control_state
-        )
-        keep = keep & good
-        h = jnp.asarray(next1 - next0, c.t.dtype)
-        # A step cut short by a boundary says nothing against the length proposed before it.
-        h = jnp.where(keep & lands, jnp.maximum(h, c.h), h)
-        h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
-        span = times.stop - times.start
-        least = jnp.maximum(resolution(c.t), jnp.finfo(h.dtype).eps ** 2 * span)
-        stuck = ~keep & ~(h > least)
+    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, error, good, lands)
 
-    active = ~c.done
+    active = ~c.done & ~to_row
     take = active & keep
-    t = jnp.where(take, t1, c.t)
     attempted = c.attempted + active.astype(jnp.int32)
-    accepted = c.accepted + take.astype(jnp.int32)
-    arrived = t >= times.stop
-    y1 = settled
-    failure = jnp.full(t.shape, int(Status.step_below_resolution))
-    for sound, kind in (
+    arrived = take & (t1 >= times.stop)
+    failure = jnp.full((), int(Status.step_below_resolution))
+    for right, kind in (
         (verdict.pressed, Status.no_reaction_solution),
         (verdict.closed, Status.rank_change),
         (verdict.found, Status.projection_failed),
         (solved, Status.implicit_solve_failed),
         (finite, Status.nonfinite),
     ):
-        failure = jnp.where(sound, failure, int(kind))
-    exhausted = active & ~stuck & ~arrived & (attempted >= max_steps)
+        failure = jnp.where(right, failure, int(kind))
+    exhausted = active & ~stuck & ~arrived & (attempted >= loop.max_steps)
     status = jnp.where(active & stuck, failure, c.status)
     status = jnp.where(exhausted, int(Status.max_steps), status).astype(jnp.int32)
 
-    row_time, row_state, row_turn, rows = c.row_time, c.row_state, c.row_turn, c.rows
-    if row_time is not None:
-        size = times.saves.shape[0]
-        rows = jnp.where(take, jnp.sum(times.saves <= t, axis=0, dtype=jnp.int32), c.rows)
-        # Rows inside this step continue from its start; a row at its end is the end itself.
-        first = jnp.where(rows > c.rows, c.rows, size)
-        last_save = jnp.take_along_axis(times.saves, rows[None] - 1, axis=0)[0]
-        at_end = (rows > c.rows) & (t - last_save <= resolution(t))
-        if row_turn is not None:
-            # For derivatives the row must move with its own time, not with the end of the step.
-            at_end = jnp.zeros_like(at_end)
-        last = jnp.where(at_end, rows - 1, size)
-        row_time = _write(_write(row_time, first, c.t), last, t)
-        row_state = _write(row_state, first, _whole(scheme, c.y, c.memory))
-        row_state = _write(row_state, last, _whole(scheme, y1, memory))
-        if row_turn is not None:
-            row_turn = _write(row_turn, first, c.turn + jnp.zeros_like(c.accepted))
+    rows = c.rows
+    if rows is not None:
+        assert due is not None
+        if rows.turns is None:  # for derivatives a row must move with its own time
+            to_row = to_row | (take & (jnp.abs(due - t1) <= resolution(t1)))
+        slot = jnp.where(to_row, rows.next, times.saves.shape[0] - 2)
+        value = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), settled)
+        turns = rows.turns
+        if turns is not None:
+            # The slot after the last row is that of nothing: it stays beyond all turns.
+            beyond = turns[-1]
+            turns = _put(turns, slot, jnp.where(to_row, rows.turn, beyond))
+        rows = _Rows(
+            base=_select(take, c.at, rows.base),
+            turn=jnp.where(take, c.turn, rows.turn),
+            next=rows.next + to_row.astype(jnp.int32),
+            values=_put(rows.values, slot, value),
+            turns=turns,
+            missed=rows.missed | (to_row & ~good),
+        )
 
     passed = t1 >= goal - slack
-    own_anchor = jnp.zeros_like(c.anchor) if scheme.controller is None else c.anchor
+    own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
-    offsets, anchors, jumps, points = c.offsets, c.anchors, c.jumps, c.points
-    if offsets is not None:
-        if anchors is None:
-            offset = jnp.where(anchor == 1, jnp.inf, t - times.start)
-        else:
-            anchors = _put(anchors, c.turn, anchor)
-            offset = t - times.anchors()[anchor]
-        offsets = _put(offsets, c.turn, offset)
-        jumps = None if jumps is None else _put(jumps, c.turn, c.jump)
-    if points is not None:
-        spare = jax.tree.leaves(points)[0].shape[0] - 1
-        slot = jnp.where(c.turn % c.stride == 0, c.turn // c.stride, spare)
-        points = _put(points, slot, (c.y, None))
+    end = _Place(t1, settled, memory, None if c.at.jump is None else jump | lands)
+    at = _select(take, end, c.at)
+    kept = None if c.kept is None else _written(loop, c, c.kept, at.t, anchor)
     return _Carry(
-        t=t,
-        y=_select(take, y1, c.y),
+        at=at,
         h=jnp.where(active, h, c.h),
-        memory=_select(take, memory, c.memory),
-        control_state=_select(active, control_state, c.control_state),
-        jump=None if c.jump is None else jnp.where(take, jump | lands, c.jump),
+        control=_select(active, control, c.control),
         mark=c.mark + (take & passed).astype(jnp.int32),
         anchor=anchor,
         status=status,
         done=c.done | (active & (stuck | arrived | exhausted)),
         tried=jnp.where(active, t1, c.tried),
-        accepted=accepted,
+        accepted=c.accepted + take.astype(jnp.int32),
         attempted=attempted,
+        turn=c.turn + (1 if loop.shared else take.astype(jnp.int32)),
         rows=rows,
-        row_time=row_time,
-        row_state=row_state,
-        row_turn=row_turn,
-        turn=c.turn + 1 if shared else c.turn + take.astype(jnp.int32),
-        offsets=offsets,
-        anchors=anchors,
-        jumps=jumps,
-        points=points,
-        stride=c.stride,
+        kept=kept,
     )
+
+
+def _next_step(
+    loop: _Loop, c: _Carry, t1: Array, y1: PyTree, error: PyTree, good: Array, lands: Array
+) -> tuple[Array, Array, Any, Array, Array]:
+    """Whether to keep this step, and the next one.
+
+    Returns:
+        whether to keep it, length of the next, the controller's state, whether the field jumps,
+        whether there is no next one.
+    """
+    scheme, t, y = loop.scheme, c.at.t, c.at.y
+    if scheme.controller is None:
+        return good, c.h, None, jnp.zeros_like(good), ~good
+    order: Any = scheme.solver.error_order(scheme.term)
+    error = jax.tree.map(lambda e: jnp.where(good, e, jnp.inf), error)
+    proposal: Any = scheme.controller.adapt_step_size(
+        t, t1, y, y1, loop.args, error, order, c.control
+    )
+    keep, next0, next1, jump, control, result = proposal
+    keep = keep & good
+    h = jnp.asarray(next1 - next0, t.dtype)
+    # A step cut short by a boundary says nothing against the length proposed before it.
+    cut = keep & lands
+    h = jnp.where(cut, jnp.maximum(h, c.h), h)
+    if scheme.standard:
+        control = _select(cut, c.control, control)
+    h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
+    least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
+    refused = result != diffrax.RESULTS.successful
+    stuck = (~keep & ~(h > least)) | refused
+    return keep & ~refused, h, control, jnp.asarray(jump), stuck
+
+
+def _written(loop: _Loop, c: _Carry, kept: _Kept, t: Array, anchor: Array) -> _Kept:
+    """The record with this turn."""
+    anchors, jumps, points = kept.anchors, kept.jumps, kept.points
+    if anchors is None:
+        offset = jnp.where(anchor == 1, jnp.inf, t)
+    else:
+        anchors = _put(anchors, c.turn, anchor)
+        offset = t - loop.anchors[anchor]
+    offsets = _put(kept.offsets, c.turn, offset)
+    jumps = None if jumps is None else _put(jumps, c.turn, c.at.jump)
+    if points is not None:
+        spare = jax.tree.leaves(points)[0].shape[0] - 1
+        slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
+        points = _put(points, slot, (c.at.y, None))
+    return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)
 
 
 def _next_boundary(times: Times, t: Array) -> tuple[Array, Array]:
     """The first knot after t or the stop, whichever comes first, and its index as an anchor."""
-    stop_anchor = jnp.ones(t.shape, jnp.int32)
+    stop_anchor = jnp.ones((), jnp.int32)
     if times.knots is None:
         return times.stop, stop_anchor
     size = times.knots.shape[0]
@@ -409,16 +374,3 @@ def _next_boundary(times: Times, t: Array) -> tuple[Array, Array]:
     knot = times.knots[jnp.minimum(after, size - 1)]
     inside = (after < size) & (knot < times.stop)
     return jnp.where(inside, knot, times.stop), jnp.where(inside, 2 + after, stop_anchor)
-
-
-def _filled(c: _Carry) -> tuple[Array, PyTree, Array | None]:
-    """Row time, state and turn with every row not written taken from the last one written."""
-    assert c.row_time is not None
-    index = jnp.arange(c.row_time.shape[0], dtype=jnp.int32).reshape((-1,) + (1,) * c.t.ndim)
-    source = jax.lax.cummax(jnp.where(jnp.isnan(c.row_time), 0, index), axis=0)
-
-    def fill(leaf: Array) -> Array:
-        wide = source.reshape(source.shape[:1] + (1,) * (leaf.ndim - source.ndim) + c.t.shape)
-        return jnp.take_along_axis(leaf, wide, axis=0)
-
-    return fill(c.row_time), jax.tree.map(fill, c.row_state), jax.tree.map(fill, c.row_turn)

@@ -13,17 +13,22 @@ from jaxtyping import Array, Bool, Float
 from jaxlag import _params
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
 from jaxlag._forces import reads_lam
-from jaxlag._inputs import evaluate, locate, reads_state
+from jaxlag._inputs import (
+    all_knots,
+    at_interval,
+    counted_from,
+    evaluate,
+    reads_state,
+    tables,
+)
 from jaxlag._kkt import dependence_floor, independent_rows
-from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms, elements
+from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
-from jaxlag._projection import Surface, of_arrays, project
+from jaxlag._projection import Surface, project
 from jaxlag._quasi import QuasiVelocities
-from jaxlag._step import Arguments, RowChoice, Verdict
+from jaxlag._step import Arguments, Gaps, RowChoice, Verdict
 from jaxlag._system import System
 from jaxlag._terms import Terms
-
-Elements = tuple[Array, ...]
 
 
 class Dynamics(eqx.Module):
@@ -101,10 +106,26 @@ class Dynamics(eqx.Module):
 
     def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
         """Arguments outside any step, from the traced halves of params and inputs."""
-        if self.direction is not None:
-            return Arguments(params, inputs, None, None, None)
-        sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
-        return Arguments(params, inputs, sigma, None, None)
+        sigma = None
+        if self.direction is None:
+            sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
+        shifted = counted_from(ts[0], eqx.combine(inputs, self.inputs.tree))
+        args = Arguments(params, self._traced(shifted), sigma, ts[0], None, None)
+        knots = all_knots(shifted)
+        if knots is None:
+            return args
+        # They say which rows are read, and no derivative passes through that.
+        knots = jnp.sort(jax.lax.stop_gradient(self.turned(knots.astype(ts.dtype), args)))
+        lower, never = self.turned(knots, args), jnp.full((1,), -jnp.inf, ts.dtype)
+        lower = jnp.where(
+            self.turned(jnp.ones_like(ts[0]), args) > 0,
+            jnp.concatenate([never, lower]),
+            jnp.concatenate([lower, never]),
+        )
+        return args._replace(gaps=Gaps(knots, lower))
+
+    def _traced(self, inputs: Any) -> Any:
+        return eqx.filter(inputs, _params.is_array)
 
     def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
         """The arguments with all that accelerations need of what depends on params alone."""
@@ -114,7 +135,7 @@ class Dynamics(eqx.Module):
             speeds = [slide(t, q, v, params) for slide in self._sliding]
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
             args = args._replace(senses=jax.lax.stop_gradient(senses))
-        sense = self.mirror(jnp.ones_like(tau), args)
+        sense = self.turned(jnp.ones_like(tau), args)
         prepared = self.terms.prepare(q, params, values, self.sample, args.kept, sense)
         return args._replace(prepared=prepared)
 
@@ -122,7 +143,7 @@ class Dynamics(eqx.Module):
         """The rows to solve with; None where there are not several."""
         if self.rows.size < 2 or (self.quasi is not None and not self.projects):
             return None
-        t, q, v, params = _still((t, q, v, params))
+        t, q, v, params = still((t, q, v, params))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         # A row that vanishes, as at a dead point, is rounding; its size is how fast it grows.
         eps = float(jnp.finfo(q.dtype).eps)
@@ -135,45 +156,74 @@ class Dynamics(eqx.Module):
         size = jnp.where(there, norms, growth)
         return RowChoice(kept, jnp.where(size > 0, size, 1.0))
 
-    def mirror(self, time: Array, args: Arguments) -> Array:
-        """Tau from t, and t from tau; the sense of time from 1."""
+    def clock(self, tau: Array, args: Arguments) -> Array:
+        """The user's time t = t0 + sigma tau."""
+        return args.origin + self.turned(tau, args)
+
+    def tau(self, t: Array, args: Arguments) -> Array:
+        """Tau = sigma (t - t0)."""
+        return self.turned(t - args.origin, args)
+
+    def turned(self, x: Array, args: Arguments) -> Array:
+        """Sigma x."""
         if self.direction == 1:
-            return time
-        return -time if args.sigma is None else time * args.sigma
+            return x
+        return -x if args.sigma is None else x * args.sigma.astype(x.dtype)
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
-        """(params, inputs) as the user passed them."""
+        """(params, inputs) as the user passed them, times of tables from the start."""
         return (
             _params.join(args.params, self.params.tree),
             eqx.combine(args.inputs, self.inputs.tree),
         )
 
     def within(self, args: Arguments, tau: Float[Array, ""]) -> Arguments:
-        """Arguments for a step around tau: every table read in the interval that holds tau."""
+        """Arguments for a step that starts at tau: of every table the rows of one interval."""
+        return self.windows(args, tau)[0]
+
+    def windows(
+        self, args: Arguments, tau: Float[Array, ""]
+    ) -> tuple[Arguments, list[Array | None]]:
+        """The same, and for each leaf of the arguments where its rows start, None for all."""
         _, inputs = self.given(args)
-        return args._replace(intervals=locate(inputs, self.mirror(tau, args)))
+        starts: dict[str, Array] = {}
+        located = args
+        if args.gaps is not None and any(x.times.shape[0] > 2 for x in tables(inputs).values()):
+            gap = jnp.searchsorted(args.gaps.knots, tau, side="right")
+            inputs, starts = at_interval(inputs, args.gaps.lower[gap])
+            located = args._replace(inputs=self._traced(inputs))
+
+        def of(name: str, signal: Any) -> Any:
+            start = starts.get(name)
+            whole = signal is None or start is None
+            return jax.tree.map(lambda _: None if whole else start, signal)
+
+        nowhere = jax.tree.map(lambda _: None, args)
+        here = {name: of(name, signal) for name, signal in args.inputs.items()}
+        marks = nowhere._replace(inputs=here)
+        return located, jax.tree.leaves(marks, is_leaf=lambda x: x is None)
 
     def acceleration(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
         """Acceleration a, or w' of quasi-velocities, at (tau, y)."""
-        t, q, v, params, values = self._at(tau, y, args)
         if self.quasi is not None:
-            w = self.parts(y)[1]
-            return self._quasi_rates(t, q, w, params, values, args)[self.system.size :]
+            return self._quasi_rates(tau, y, args)[self.system.size :]
+        t, q, v, params, values = self._at(tau, y, args)
         return self.terms.acceleration(t, q, v, params, values, args.prepared, args.kept)
 
-    def _quasi_rates(
-        self, t: Array, q: Array, w: Array, params: Any, values: Any, args: Arguments
-    ) -> Array:
+    def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
-        terms = self.terms
+        terms, (q, w) = self.terms, self.parts(y)
         if isinstance(terms, ScalarTerms):
             if isinstance(args.prepared, ScalarPrepared):
-                state = elements(q), elements(w), q.dtype
-                return jnp.stack(terms.elements(t, *state, params, values, args.prepared))
+                args = self.within(args, tau)
+                t, (params, _) = self.clock(tau, args), self.given(args)
+                values = self._values(t, q, w, args)
+                return terms.rates(t, q, w, params, values, args.prepared)
             terms = terms.array
         assert isinstance(terms, ArrayTerms)
+        t, q, _, params, values = self._at(tau, y, args)
         moving = Moving(terms, t, q, w, params, values)
         return jnp.concatenate([moving.v, moving.accelerations()])
 
@@ -185,9 +235,14 @@ class Dynamics(eqx.Module):
         terms = self.terms
         return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
 
+    def state_of(self, t: Array, q: Array, v: Array, params: Any) -> Array:
+        """The state of a motion in terms of (q, v), no work done yet."""
+        w = v if self.quasi is None else self.quasi.of(t, q, v, params)[self.quasi.free]
+        return self.start(q, w)
+
     def state(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any]:
         """(t, q, v, params) at (tau, y)."""
-        t, (q, w), (params, _) = self.mirror(tau, args), self.parts(y), self.given(args)
+        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
         return t, q, self.velocities(t, q, w, params), params
 
     def velocities(self, t: Array, q: Array, w: Array, params: Any) -> Array:
@@ -200,19 +255,27 @@ class Dynamics(eqx.Module):
         """The same, by the scalar program where there is one."""
         if self.quasi is None or not isinstance(args.prepared, ScalarPrepared):
             return self.velocities(t, q, w, self.given(args)[0])
-        return self._by_program(t, elements(q), elements(w), args)
+        return self._by_program(t, q, w, args)
 
-    def _by_program(self, t: Array, q: Any, w: Any, args: Arguments) -> Array:
-        """Velocities from elements of a state of quasi-velocities, which no input changes."""
-        terms, (params, inputs), state = self.terms, self.given(args), jnp.stack(q)
+    def _by_program(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
+        """Velocities of a state of quasi-velocities, which no input changes."""
+        terms, (params, _) = self.terms, self.given(args)
         assert isinstance(terms, ScalarTerms)
-        values = evaluate(inputs, t, state, jnp.zeros_like(state), params, args.intervals)
-        v = terms.velocities(t, q, w, state.dtype, params, values, args.prepared)
-        return jnp.stack(v)
+        values = self.inputs_at(t, q, jnp.zeros_like(q), args)
+        return terms.velocities(t, q, w, params, values, args.prepared)
 
     def _at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
+        args = self.within(args, tau)
         t, q, v, params = self.state(tau, y, args)
-        return t, q, v, params, evaluate(self.given(args)[1], t, q, v, params, args.intervals)
+        return t, q, v, params, self.inputs_at(t, q, v, args, self.turned(tau, args))
+
+    def inputs_at(
+        self, t: Array, q: Array, v: Array, args: Arguments, since: Array | None = None
+    ) -> Any:
+        """Values of the inputs within a step."""
+        params, inputs = self.given(args)
+        since = t - args.origin if since is None else since
+        return evaluate(inputs, t, q, v, params, dict.fromkeys(inputs, 0), since)
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -224,27 +287,23 @@ class Dynamics(eqx.Module):
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " m"]:
         """dy/dtau."""
-        t, q, v, params, values = self._at(tau, y, args)
         if self.quasi is not None:
-            rates = [self._quasi_rates(t, q, self.parts(y)[1], params, values, args)]
+            rates = [self._quasi_rates(tau, y, args)]
         else:
-            rates = [v, self.terms.acceleration(t, q, v, params, values, args.prepared, args.kept)]
+            rates = [self.parts(y)[1], self.acceleration(tau, y, args)]
         if self.power is not None and self.power.names:
+            t, q, v, params, values = self._at(tau, y, args)
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
-        return self._turned((jnp.concatenate(rates),), args)[0]
+        return self.turned(jnp.concatenate(rates), args)
 
-    def surface(self, tau: Array, y: Any, args: Arguments) -> Surface:
-        """The constraints near a predicted state, an array or the tuple of its elements."""
-        t, (q, v), terms = self.mirror(tau, args), self.parts(y), self.terms
-        params, inputs = self.given(args)
+    def surface(self, tau: Array, y: Array, args: Arguments) -> Surface:
+        """The constraints near a predicted state."""
+        t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
+        params, _ = self.given(args)
         if isinstance(args.prepared, ScalarPrepared):
             assert isinstance(terms, ScalarTerms)
-            single = not isinstance(y, tuple)
-            if single:
-                q, v = tuple(elements(q)), tuple(elements(v))
-            values = self._values(inputs, t, q, v, params, args)
-            found = terms.surface(t, q, v, q[0].dtype, params, values, args.prepared)
-            return of_arrays(found) if single else found
+            values = self._values(t, q, v, args)
+            return terms.surface(t, q, v, params, values, args.prepared)
         v = self.velocities(t, q, v, params)
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
 
@@ -269,16 +328,15 @@ class Dynamics(eqx.Module):
             lambda c: K @ c,
         )
 
-    def _values(self, inputs: Any, t: Array, q: Any, w: Any, params: Any, args: Arguments) -> Any:
-        """Values of the inputs at elements of a state."""
-        state = jnp.stack(q)
+    def _values(self, t: Array, q: Array, w: Array, args: Arguments) -> Any:
+        """Values of the inputs at a state."""
         if self.quasi is None:
-            v = jnp.stack(w)
-        elif reads_state(inputs):
+            v = w
+        elif reads_state(self.given(args)[1]):
             v = self._by_program(t, q, w, args)
         else:
-            v = jnp.zeros_like(state)
-        return evaluate(inputs, t, state, v, params, args.intervals)
+            v = jnp.zeros_like(q)
+        return self.inputs_at(t, q, v, args)
 
     @property
     def _sliding(self) -> tuple[Any, ...]:
@@ -310,8 +368,8 @@ class Dynamics(eqx.Module):
         return self.projects or several or bool(self._contacts) or bool(self._sliding)
 
     def settle(
-        self, tau: Array, y: Any, args: Arguments, differentiable: bool = False
-    ) -> tuple[Any, Verdict]:
+        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
+    ) -> tuple[Array, Verdict]:
         """The state at the end of a step as it is kept, and what is to be said about it."""
         true = jnp.array(True)
         verdict = Verdict(true, true, true)
@@ -319,21 +377,20 @@ class Dynamics(eqx.Module):
             y, found, closed = self.project(tau, y, args, differentiable)
             verdict = Verdict(found, closed, true)
         elif args.rows is not None:
-            surface, (q, v) = self.surface(*_still((tau, y, args))), self.parts(_still(y))
+            surface, (q, v) = self.surface(*still((tau, y, args))), self.parts(still(y))
             verdict = Verdict(true, self._closed(surface, q, v, args), true)
         return y, verdict._replace(pressed=self.pressed(tau, y, args))
 
-    def pressed(self, tau: Array, y: Any, args: Arguments) -> Bool[Array, ""]:
+    def pressed(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
         """Whether contacts press and slide as their friction takes them to."""
         if not self._contacts and not self._sliding:
             return jnp.array(True)
-        tau, y, args = _still((tau, jnp.stack(y) if isinstance(y, tuple) else y, args))
+        tau, y, args = still((tau, y, args))
         t, q, v, params, values = self._at(tau, y, args)
         right, terms = [], self.terms
         if self._contacts:
             if isinstance(args.prepared, ScalarPrepared) and isinstance(terms, ScalarTerms):
-                state = tuple(elements(q)), tuple(elements(v)), q.dtype
-                lam = terms.multipliers(t, *state, params, values, args.prepared)
+                lam = terms.multipliers(t, q, v, params, values, args.prepared)
             else:
                 lam = terms.reactions(t, q, v, params, values)[1]
             right += [lam[row] >= 0 for row in self._contacts]
@@ -343,19 +400,18 @@ class Dynamics(eqx.Module):
         return jnp.all(jnp.stack(right))
 
     def project(
-        self, tau: Array, y: Any, args: Arguments, differentiable: bool = False
+        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
     ) -> tuple[Any, Bool[Array, ""], Bool[Array, ""]]:
         """(state on the constraints nearest to y, whether found, whether all rows hold there)."""
         frozen = None
         if differentiable:
-            frozen = self.surface(*_still((tau, y, args)))
+            frozen = self.surface(*still((tau, y, args)))
         surface, (q, v) = self.surface(tau, y, args), self.parts(y)
         q, v, found = project(surface, q, v, frozen)
         rest = self.system.size + self.speeds
-        whole = (*q, *v) if isinstance(y, tuple) else jnp.concatenate([q, v, y[rest:]])
-        return whole, found, self._closed(surface, q, v, args)
+        return jnp.concatenate([q, v, y[rest:]]), found, self._closed(surface, q, v, args)
 
-    def _closed(self, surface: Surface, q: Any, v: Any, args: Arguments) -> Bool[Array, ""]:
+    def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
         """Whether rows that were left out hold as well, to half the digits.
 
         Where nothing holds the others, these may drift as they do.
@@ -364,10 +420,10 @@ class Dynamics(eqx.Module):
             return jnp.array(True)
         kept, size = args.rows
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
-        floor = dependence_floor(jax.tree.leaves(q)[0].dtype)
+        floor = dependence_floor(q.dtype)
 
-        def holds(c: Any, x: Any, rows: list[int]) -> Array:
-            largest = jax.tree.reduce(jnp.maximum, jax.tree.map(lambda x: jnp.max(jnp.abs(x)), x))
+        def holds(c: Array, x: Array, rows: list[int]) -> Array:
+            largest = jnp.max(jnp.abs(x))
             off = [jnp.abs(c[i]) / size[row] for i, row in enumerate(rows)]
             drift = [jnp.where(kept[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
             allowed = floor * (1.0 + largest) + 100.0 * reduce(jnp.maximum, drift)
@@ -381,45 +437,9 @@ class Dynamics(eqx.Module):
             closed = closed & holds(surface.position(q), q, holonomic)
         return closed
 
-    def rates(self, tau: Array, y: Elements, args: Arguments) -> Elements:
-        """dy/dtau from y element by element, by the scalar program."""
-        if self.quasi is not None:
-            q, w = self.parts(y)
-            return self._turned(self._elements(self.mirror(tau, args), q, w, args), args)
-        q, w = self.split(y, args)
-        return self.join(w, self.accelerations(tau, q, w, args), args)
-
-    def split(self, y: Elements, args: Arguments) -> tuple[Elements, Elements]:
-        """(q, w) of y, w = dq/dtau = sigma v; (w, a) of dy/dtau."""
-        n = self.system.size
-        return y[:n], self._turned(y[n:], args)
-
-    def join(self, q: Elements, w: Elements, args: Arguments) -> Elements:
-        """The inverse of `split`."""
-        return (*q, *self._turned(w, args))
-
-    def accelerations(self, tau: Array, q: Elements, w: Elements, args: Arguments) -> Elements:
-        """d2q/dtau2 = a by the scalar program."""
-        return self._elements(self.mirror(tau, args), q, self._turned(w, args), args)
-
-    def _elements(self, t: Array, q: Elements, w: Elements, args: Arguments) -> Elements:
-        """What the scalar program gives."""
-        terms, (params, inputs) = self.terms, self.given(args)
-        assert isinstance(terms, ScalarTerms)
-        values = self._values(inputs, t, q, w, params, args)
-        return terms.elements(t, q, w, q[0].dtype, params, values, args.prepared)
-
-    def _turned(self, x: Elements, args: Arguments) -> Elements:
-        """Sigma x."""
-        if self.direction == 1:
-            return tuple(x)
-        return tuple(-a if args.sigma is None else a * args.sigma.astype(a.dtype) for a in x)
-
     def parts(self, y: Any) -> tuple[Any, Any]:
-        """(q, v), or (q, w), of y, (..., m) or the tuple of its elements."""
+        """(q, v), or (q, w), of y, (..., m)."""
         n, rest = self.system.size, self.system.size + self.speeds
-        if isinstance(y, tuple):
-            return y[:n], y[n:rest]
         return y[..., :n], y[..., n:rest]
 
     def start(self, q0: Float[Array, " n"], w0: Float[Array, " k"]) -> Float[Array, " m"]:
@@ -433,15 +453,16 @@ class Dynamics(eqx.Module):
         columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
 
-    def is_scalar(self, tau: Array, y: Array, args: Arguments) -> bool:
-        """Whether there is a scalar program for states and arguments like these."""
+    def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
+        """Lines of the scalar program for states and arguments like these, where there is one."""
         _, q, _, params, values = self._at(tau, y, args)
         terms = self.terms
         if not isinstance(terms, ScalarTerms) or self.power is not None:
-            return False
-        return terms.lowered(q, params, values).equations is not None
+            return None
+        equations = terms.lowered(q, params, values).equations
+        return None if equations is None else len(equations.program.body)
 
 
-def _still(tree: Any) -> Any:
-    """Without derivatives."""
+def still(tree: Any) -> Any:
+    """Without derivatives: a status has none, and differentiating its making would cost."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

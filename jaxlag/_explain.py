@@ -10,6 +10,8 @@ from jaxlag._constraints import Layout
 from jaxlag._lanes import LANES
 from jaxlag._linalg import UNROLL_UP_TO
 from jaxlag._lowering import Equations, Lowered, Program, Structure, find
+from jaxlag.solvers import Dopri8
+from jaxlag.solvers._explicit import WRITTEN_OUT, in_loop_over_stages
 
 if TYPE_CHECKING:
     from jaxlag._system import System
@@ -110,6 +112,7 @@ def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[st
         "mass solve    along the nonzeros of M"
         + (" and A" if system.constraints else "")
         + ", on scalars",
+        _steps(len(program.body)),
         _batches(),
     ]
 
@@ -121,6 +124,7 @@ def _in_quasi(lowered: Lowered, equations: Equations) -> list[str]:
         f"lowering      scalar program: {operations}",
         f"              equations {equations.form}; {lowered.reason}",
         "mass solve    along the nonzeros of B^T M B, on scalars",
+        _steps(len(equations.program.body)),
         _batches(),
     ]
 
@@ -131,6 +135,16 @@ def _operations(program: Program, what: str) -> str:
         f"{program.operations} operations for {what}, {functions} of them functions, "
         f"{program.count('div')} divisions; {len(program.prelude)} more once per solve"
     )
+
+
+def _steps(lines: int | None) -> str:
+    method = Dopri8()
+    if lines is None:
+        return "steps         in a loop over stages: compiled once"
+    size = f"{lines} lines of code times {method.stages} stages of order 8"
+    if in_loop_over_stages(lines, method.stages):
+        return f"steps         in a loop over stages: {size} are more than {WRITTEN_OUT}"
+    return f"steps         written out stage by stage: {size}, of up to {WRITTEN_OUT}"
 
 
 def _batches() -> str:
@@ -154,5 +168,6 @@ def _array(system: "System", structure: Structure, reason: str) -> list[str]:
         f"lowering      array program ({reason}): {', '.join(ways)}",
         f"mass solve    one factorisation {often}, "
         + ("unrolled" if n <= UNROLL_UP_TO else f"by library Cholesky (n > {UNROLL_UP_TO})"),
+        _steps(None),
         "batches       by jax.vmap: all trajectories in one loop",
     ]

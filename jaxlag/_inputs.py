@@ -1,18 +1,19 @@
 """Inputs: signals that forces read by name, from tables, functions of time or the state.
 
 Table inputs have knots where the signal or its slope jumps. The driver ends a step on every
-knot, and evaluates a table throughout one step in the one interval that holds the step's
-midpoint, so that no stage ever reads the wrong side of a jump.
+knot, and evaluates a table throughout one step in the one interval that the step lies in, so that
+no stage ever reads the wrong side of a jump. All that a step reads of a table is two rows.
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._errors import accepts, bad, require_arity, wants
 from jaxlag._params import concrete
@@ -35,10 +36,30 @@ class AbstractInput(eqx.Module):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        interval: Int[Array, ""] | None,
+        interval: Int[Array, ""] | int | None,
     ) -> Array:
         """The signal at (t, q, v), read from the given table interval."""
         raise NotImplementedError
+
+
+class AbstractTable(AbstractInput):
+    """A signal between times at which it is given.
+
+    Attributes:
+        times: shape (k,), s, strictly increasing.
+        values: shape (k, ...).
+    """
+
+    times: eqx.AbstractVar[Array]
+    values: eqx.AbstractVar[Array]
+
+    def knots(self) -> Float[Array, " k"] | None:
+        """The table's times."""
+        return self.times
+
+    def cut(self, times: Any, values: Any) -> "AbstractTable":
+        """The same signal from other rows."""
+        return eqx.tree_at(lambda s: (s.times, s.values), self, (times, values))
 
 
 def _inexact(x: Any) -> Array:
@@ -83,7 +104,7 @@ def _interval(times: Array, t: Array, last: int) -> Array:
     return jnp.clip(index, 0, last)
 
 
-class ZeroOrderHold(AbstractInput):
+class ZeroOrderHold(AbstractTable):
     """A table held constant between its times: u(t) = values[i] for times[i] <= t < times[i+1].
 
     Defined on [times[0], times[-1]]; the last value holds at the last time only. A simulation
@@ -103,10 +124,6 @@ class ZeroOrderHold(AbstractInput):
     def __init__(self, times: Any, values: Any) -> None:
         self.times, self.values = _table("ZeroOrderHold", times, values)
 
-    def knots(self) -> Float[Array, " k"] | None:
-        """The table's times."""
-        return self.times
-
     def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
         """Index i with times[i] <= t < times[i+1]."""
         return _interval(self.times, t, self.times.shape[0] - 1)
@@ -117,13 +134,13 @@ class ZeroOrderHold(AbstractInput):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        interval: Int[Array, ""] | None,
+        interval: Int[Array, ""] | int | None,
     ) -> Array:
         """values[interval]."""
         return self.values[interval]
 
 
-class Linear(AbstractInput):
+class Linear(AbstractTable):
     """A table interpolated linearly between its times; continuous, with kinks at the knots.
 
     Defined on [times[0], times[-1]]; a simulation that reaches beyond ends with
@@ -143,10 +160,6 @@ class Linear(AbstractInput):
     def __init__(self, times: Any, values: Any) -> None:
         self.times, self.values = _table("Linear", times, values)
 
-    def knots(self) -> Float[Array, " k"] | None:
-        """The table's times."""
-        return self.times
-
     def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
         """Index i with times[i] <= t < times[i+1]."""
         return _interval(self.times, t, self.times.shape[0] - 2)
@@ -157,7 +170,7 @@ class Linear(AbstractInput):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        interval: Int[Array, ""] | None,
+        interval: Int[Array, ""] | int | None,
     ) -> Array:
         """values[i] + (values[i+1] - values[i]) (t - times[i]) / (times[i+1] - times[i])."""
         assert interval is not None
@@ -191,7 +204,7 @@ class Function(AbstractInput):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        interval: Int[Array, ""] | None,
+        interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t) or f(t, params)."""
         return jnp.asarray(self.f(t, params) if self.takes_params else self.f(t))
@@ -219,7 +232,7 @@ class Feedback(AbstractInput):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        interval: Int[Array, ""] | None,
+        interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t, q, v, params)."""
         return jnp.asarray(self.f(t, q, v, params))
@@ -299,18 +312,67 @@ def evaluate(
     q: Float[Array, " n"],
     v: Float[Array, " n"],
     params: Any,
-    intervals: Mapping[str, Array | None] | None = None,
+    intervals: Mapping[str, Any] | None = None,
+    since: Float[Array, ""] | None = None,
 ) -> InputValues:
-    """Values of all inputs at (t, q, v); tables read at `intervals`, by default those at t."""
-    intervals = locate(inputs, t) if intervals is None else intervals
-    return InputValues(
-        {
-            name: signal.value(t, q, v, params, intervals[name])
-            if isinstance(signal, AbstractInput)
-            else signal
-            for name, signal in inputs.items()
-        }
-    )
+    """Values of all inputs at (t, q, v).
+
+    Args:
+        inputs: by name.
+        t: time.
+        q: coordinates.
+        v: velocities.
+        params: as the Lagrangian takes them.
+        intervals: in which tables are read; those at t by default.
+        since: the time of tables, where that is counted from another origin.
+    """
+    since = t if since is None else since
+    intervals = locate(inputs, since) if intervals is None else intervals
+
+    def value(name: str, signal: Any) -> Any:
+        if not isinstance(signal, AbstractInput):
+            return signal
+        clock = since if isinstance(signal, AbstractTable) else t
+        return signal.value(clock, q, v, params, intervals[name])
+
+    return InputValues({name: value(name, signal) for name, signal in inputs.items()})
+
+
+def tables(inputs: Mapping[str, Any]) -> dict[str, AbstractTable]:
+    """Those of the inputs that are tables."""
+    return {name: x for name, x in inputs.items() if isinstance(x, AbstractTable)}
+
+
+def counted_from(origin: Array, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """The inputs with the times of tables counted from another origin."""
+    shifted = {name: x.cut(x.times - origin, x.values) for name, x in tables(inputs).items()}
+    return {**inputs, **shifted}
+
+
+def at_interval(
+    inputs: Mapping[str, Any], since: Float[Array, ""]
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """The inputs with the two rows of each table around a time, and where these begin.
+
+    In them the interval is the first one.
+    """
+    starts = {}
+    cuts = dict(inputs)
+    for name, table in tables(inputs).items():
+        last = table.times.shape[0] - 2
+        starts[name] = start = _interval(table.times, since, last)
+        rows = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=2)
+        cuts[name] = table.cut(rows(table.times), rows(table.values))
+    return cuts, starts
+
+
+def in_order(inputs: Mapping[str, Any]) -> Bool[Array, ""]:
+    """Whether the times of all tables are finite and increase strictly."""
+    right = jnp.array(True)
+    for table in tables(inputs).values():
+        times = table.times
+        right = right & jnp.all(jnp.isfinite(times)) & jnp.all(times[1:] > times[:-1])
+    return right
 
 
 def reads_state(inputs: Mapping[str, Any]) -> bool:

@@ -50,7 +50,6 @@ METHODS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "variational2": partial(LobattoIIIAB, 2),
     "variational4": partial(LobattoIIIAB, 3),
 }
-WRITTEN_OUT = (Tsit5, Dopri5, Dopri8, Prince9)  # stage by stage
 LOOSE, TIGHT = 1e-3, 1e-12  # rtol from which order 5, and up to which order 9 is taken
 IMPLICIT = "kvaerno5"  # where explicit steps run out
 FINER = {"bosh3": "tsit5", "tsit5": "dopri8", "dopri5": "dopri8", "dopri8": "prince9"}

@@ -13,19 +13,19 @@ from jaxlag import _params
 from jaxlag._arguments import check_declaration
 from jaxlag._assemble import assembled
 from jaxlag._constraints import Baumgarte
-from jaxlag._diagnosis import Start, start_consistent, start_finite, values_allowed
-from jaxlag._drive import Times
 from jaxlag._dynamics import Dynamics
 from jaxlag._gradient import Keep
-from jaxlag._inputs import all_knots, common_range
-from jaxlag._methods import WRITTEN_OUT
+from jaxlag._inputs import all_knots, common_range, in_order
+from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
-from jaxlag._scheme import Scheme, with_stages
+from jaxlag._scheme import Scheme
+from jaxlag._start import Start, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
 from jaxlag._system import System
 from jaxlag._term import term_of
-from jaxlag.solvers import AbstractPartitioned, AbstractUnrolled, Splitting
+from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
+from jaxlag.solvers._explicit import in_loop_over_stages
 
 
 class Plan(NamedTuple):
@@ -104,7 +104,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         q0, w0, still = still_unless(sound, (q0, w0, args.params))
         args = args._replace(params=still)
     y0 = dynamics.start(q0, w0)
-    start = dynamics.mirror(t0, args)
+    start = jnp.zeros_like(args.origin)
     args = dynamics.prepare(start, y0, args)
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.projects:
@@ -114,21 +114,19 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         dynamics = replace(dynamics, stabilization=None)
     settle = dynamics.settle if dynamics.settles else None
     term = term_of(dynamics, start, y0, args)
-    scheme = Scheme(solver, controller, term, dynamics.within, settle, dynamics.projects)
-    if type(solver) in WRITTEN_OUT and scheme.by_element() is None:
-        assert isinstance(solver, AbstractUnrolled)
-        # Arrays in every stage: written out they compile and run in a multiple of the time.
-        scheme = replace(scheme, solver=with_stages(solver.stock, "lax"))
+    if isinstance(solver, AbstractExplicit) and solver.looped is None:
+        solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
+    scheme = Scheme(solver, controller, term, dynamics.windows, settle, dynamics.projects)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
     given = jnp.concatenate([values.q0, speeds])
     valid = values_allowed(given, times.saves, values.rtol, values.atol, values.step)
-    finite = start_finite(dynamics, times.start, y0, args)
+    valid = valid & in_order(inputs)
+    finite = start_finite(dynamics, start, y0, args)
     pressed = dynamics.pressed(start, y0, args)
-    kinematic = dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None
-    begun = Start(valid, in_range, finite, consistent, pressed, kinematic)
+    begun = Start(valid, in_range, finite, consistent, pressed)
     setup = Setup(values.step, begun.allowed, scheme_traced)
     problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps, plan.keep)
     return dynamics, begun, problem
@@ -168,14 +166,14 @@ def _times(
 ) -> tuple[Times, Array]:
     """Anchors of the grid in tau, and whether the inputs are defined at the start."""
 
-    def mirror(time: Array) -> Array:
-        return dynamics.mirror(time.astype(ts.dtype), args)
+    def tau(time: Array) -> Array:
+        return dynamics.turned(time.astype(ts.dtype), args)
 
-    saves, knots, span = mirror(ts), all_knots(inputs), common_range(inputs)
-    knots = None if knots is None else jnp.sort(mirror(knots))
+    saves, knots, span = tau(ts - ts[0]), all_knots(inputs), common_range(inputs)
+    knots = None if knots is None else jnp.sort(tau(knots))
     if span is None:
-        return Times(saves[0], saves[-1], knots, saves), jnp.array(True)
-    ends = jnp.stack([mirror(time) for time in span])
+        return Times(saves[-1], knots, saves), jnp.array(True)
+    ends = jnp.stack([tau(time) for time in span])
     first, last = jnp.min(ends), jnp.max(ends)
     stop = jnp.where(saves[-1] <= last, saves[-1], last)
-    return Times(saves[0], stop, knots, saves), (first <= saves[0]) & (saves[0] <= last)
+    return Times(stop, knots, saves), (first <= 0) & (last >= 0)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Bool, Int
 
 MAX_TURNS = 12
 SWEEPS = 3
@@ -14,7 +14,7 @@ ACCEPTED = 0.6  # a state counts as consistent where its correction is below eps
 
 
 class Surface(NamedTuple):
-    """The constraints near a predicted state, as functions of vectors or of tuples of numbers.
+    """The constraints near a predicted state, as functions of vectors.
 
     Attributes:
         position: q -> phi(t, q), None where no row has one.
@@ -29,24 +29,9 @@ class Surface(NamedTuple):
     kick: Callable | None
 
 
-def of_arrays(surface: Surface) -> Surface:
-    """The same for vectors, from a surface for tuples of their elements."""
-
-    def on_arrays(function: Callable | None) -> Any:
-        if function is None:
-            return None
-
-        def of(*vectors: Array) -> Array:
-            return jnp.stack(function(*(tuple(x[i] for i in range(len(x))) for x in vectors)))
-
-        return of
-
-    return Surface(*map(on_arrays, surface))
-
-
 def project(
-    surface: Surface, q: PyTree, v: PyTree, frozen: Surface | None = None
-) -> tuple[PyTree, PyTree, Bool[Array, ""]]:
+    surface: Surface, q: Array, v: Array, frozen: Surface | None = None
+) -> tuple[Array, Array, Bool[Array, ""]]:
     """The consistent (q, v) nearest to a predicted one, and whether it was found.
 
     First q* = q - M^-1 A^T mu with phi(t, q*) = 0, then v* = v - M^-1 A^T nu with
@@ -75,7 +60,7 @@ def project(
     return q, v, found & also
 
 
-def turns_needed(surface: Surface, q: PyTree, v: PyTree) -> Int[Array, ""]:
+def turns_needed(surface: Surface, q: Array, v: Array) -> Int[Array, ""]:
     """The larger of the numbers of turns that `project` takes for q and for v."""
     count = jnp.zeros((), jnp.int32)
     if surface.position is not None:
@@ -87,7 +72,7 @@ def turns_needed(surface: Surface, q: PyTree, v: PyTree) -> Int[Array, ""]:
     return jnp.maximum(count, _iterate(_rates_at(surface, q), v)[2])
 
 
-def _rates_at(surface: Surface, q: PyTree) -> "_Equation":
+def _rates_at(surface: Surface, q: Array) -> "_Equation":
     velocity, kick = surface.velocity, surface.kick
     assert velocity is not None
     assert kick is not None
@@ -100,16 +85,16 @@ class _Equation(NamedTuple):
     residual: Any
     correct: Callable
 
-    def at(self, start: PyTree, mu: PyTree) -> PyTree:
-        return jax.tree.map(jnp.subtract, start, self.correct(mu))
+    def at(self, start: Array, mu: Array) -> Array:
+        return start - self.correct(mu)
 
-    def left(self, start: PyTree, mu: PyTree) -> PyTree:
+    def left(self, start: Array, mu: Array) -> Array:
         return self.residual(self.at(start, mu))
 
 
 def _solved(
-    equation: _Equation, start: PyTree, frozen: _Equation | None
-) -> tuple[PyTree, Bool[Array, ""]]:
+    equation: _Equation, start: Array, frozen: _Equation | None
+) -> tuple[Array, Bool[Array, ""]]:
     """(x, whether it is one): mu grows by what is left of the residual.
 
     That shrinks per turn by a factor as small as the way from the predicted state. Where mu is
@@ -121,11 +106,11 @@ def _solved(
     else:
         mu, size, _ = jax.lax.stop_gradient(_iterate(frozen, jax.lax.stop_gradient(start)))
         for _ in range(SWEEPS):
-            mu = jax.tree.map(jnp.add, mu, equation.left(start, mu))
+            mu = mu + equation.left(start, mu)
     return equation.at(start, mu), size <= _eps(start) ** ACCEPTED
 
 
-def _iterate(equation: _Equation, start: PyTree) -> tuple[PyTree, Array, Array]:
+def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
     """(mu at which nothing is left, up to rounding or after MAX_TURNS; what is left; turns).
 
     The first turn, which is enough after most steps, is outside the loop.
@@ -138,7 +123,7 @@ def _iterate(equation: _Equation, start: PyTree) -> tuple[PyTree, Array, Array]:
 
     def turn(state: Any) -> Any:
         mu, left, _, count = state
-        mu = jax.tree.map(jnp.add, mu, left)
+        mu = mu + left
         left = equation.left(start, mu)
         return mu, left, _size(equation.correct(left), start), count + 1
 
@@ -150,14 +135,10 @@ def _iterate(equation: _Equation, start: PyTree) -> tuple[PyTree, Array, Array]:
     return mu, size, count
 
 
-def _eps(x: PyTree) -> float:
-    return float(jnp.finfo(jnp.result_type(*jax.tree.leaves(x))).eps)
+def _eps(x: Array) -> float:
+    return float(jnp.finfo(x.dtype).eps)
 
 
-def _size(change: PyTree, x: PyTree) -> Array:
+def _size(change: Array, x: Array) -> Array:
     """Largest |change_j| / (1 + |x_j|)."""
-    ratios = jax.tree.map(lambda d, x: jnp.max(jnp.abs(d) / (1.0 + jnp.abs(x))), change, x)
-    first, *rest = jax.tree.leaves(ratios)
-    for ratio in rest:
-        first = jnp.maximum(first, ratio)
-    return first
+    return jnp.max(jnp.abs(change) / (1.0 + jnp.abs(x)))

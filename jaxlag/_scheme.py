@@ -3,18 +3,18 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._step import Verdict
 from jaxlag._term import Term
-from jaxlag.solvers import AbstractFixedStep, AbstractUnrolled, Splitting
+from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
 
 
 class Scheme(eqx.Module):
@@ -23,7 +23,8 @@ class Scheme(eqx.Module):
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController | None
     term: diffrax.AbstractTerm
-    intervals: Callable = eqx.field(static=True)  # (args, tau) -> args of a step around tau
+    # (args, tau) -> (args of a step from tau, where rows of tables begin in them)
+    windows: Callable = eqx.field(static=True)
     # (tau, y, args, differentiable) -> (the end of a step as it is kept, Verdict)
     settle: Callable | None = eqx.field(static=True, default=None)
     moves: bool = eqx.field(static=True, default=False)  # whether `settle` moves the state
@@ -39,25 +40,31 @@ class Scheme(eqx.Module):
         """Whether steps are fixed or chosen by diffrax's own control, not a variant of it."""
         return self.controller is None or type(self.controller) is diffrax.PIDController
 
-    def by_element(self, lanes: bool = False, in_loop: bool = True) -> "Scheme | None":
-        """The form for states that are tuples of their elements, where there is one.
+    def on_scalars(self, lanes: bool = False, in_loop: bool = True) -> "Scheme | None":
+        """The form for loops that are one native function, where there is one.
 
         Args:
             lanes: whether it is going to be vmapped.
             in_loop: whether it is for a loop over one trajectory or a few lanes.
         """
-        term = self.term.by_element(lanes, in_loop) if isinstance(self.term, Term) else None
-        # Controllers and norms that the user brings may want the state as an array.
-        norm = getattr(self.controller, "norm", optimistix.rms_norm)
-        if term is None or not isinstance(self.solver, AbstractUnrolled | Splitting):
+        if not isinstance(self.term, Term) or self.term.lines is None:
             return None
-        if not (self.standard and norm is optimistix.rms_norm):
+        if not isinstance(self.solver, AbstractExplicit | Splitting):
             return None
-        dynamics: Any = term.elementwise
-        settle = None if self.settle is None else dynamics.settle
+        term = self.term.compiled_for(lanes, in_loop)
+        settle = None if self.settle is None else term.dynamics.settle
         return replace(self, term=term, settle=settle)
 
-    def for_derivatives(self, t0: Array, y: Array, args: Any) -> "Scheme":
+    def within(self, args: Any, tau: Array) -> Any:
+        """The arguments of a step from tau."""
+        return self.windows(args, tau)[0]
+
+    def is_sound(self, memory: Any) -> Bool[Array, ""]:
+        """Whether the first stage is finite, where that is what is carried from step to step."""
+        explicit = isinstance(self.solver, AbstractExplicit)
+        return all_finite(memory) if explicit and memory is not None else jnp.array(True)
+
+    def for_derivatives(self, y: Array, args: Any) -> "Scheme":
         """The scheme for a motion of which derivatives are taken.
 
         A motion that starts at rest or moves steadily, up to what error estimates do not see, takes
@@ -66,14 +73,14 @@ class Scheme(eqx.Module):
         their steps, and so do implicit methods, which need not follow what decays.
         """
         controller: Any = self.controller
-        explicit = isinstance(self.solver, AbstractUnrolled | diffrax.AbstractERK)
+        explicit = isinstance(self.solver, AbstractExplicit | diffrax.AbstractERK)
         bounded = type(controller) is diffrax.PIDController and controller.dtmax is None
         if not explicit or not bounded:
             return self
-        args = self.intervals(args, t0 + resolution(t0))
-        t0, y, args = jax.lax.stop_gradient((t0, y, args))
+        zero = jnp.zeros_like(args.origin)
+        y, args = jax.lax.stop_gradient((y, self.within(args, zero)))
 
-        f, J = linearized(lambda y: self.term.vf(t0, y, args), y)
+        f, J = linearized(lambda y: self.term.vf(zero, y, args), y)
         rate = _rate(J)
         allowed = _UNSEEN * (controller.atol + controller.rtol * jnp.abs(y))
         unseen = jnp.all(jnp.abs(J @ f) < rate**2 * allowed) & jnp.isfinite(rate)
@@ -81,23 +88,30 @@ class Scheme(eqx.Module):
         order = float(solver.error_order(self.term))
         eps = jnp.finfo(y.dtype).eps
         part = (jnp.maximum(controller.rtol, eps) * math.gamma(order + 1)) ** (1 / order)
-        longest = jnp.where(unseen, part / rate, jnp.inf).astype(t0.dtype)
+        longest = jnp.where(unseen, part / rate, jnp.inf).astype(zero.dtype)
         return replace(self, longest=longest)
 
     def begin(self, t0: Array, t1: Array, y: PyTree, args: Any) -> Any:
         """Solver state with nothing carried over from a step before."""
-        return self.solver.init(self.term, t0, t1, y, self.intervals(args, t0 + resolution(t0)))
+        return self.solver.init(self.term, t0, t1, y, self.within(args, t0))
+
+    def afresh(self, t0: Array, t1: Array, y: PyTree, args: Any) -> tuple[Any, Any]:
+        """(solver state, whether there was a jump) for a step that takes nothing over."""
+        if isinstance(self.solver, AbstractExplicit):
+            return None, True
+        return self.begin(t0, t1, y, args), jnp.array(True)
 
     def step(
         self, t0: Array, t1: Array, y: PyTree, args: Any, memory: Any, jump: Any
     ) -> tuple[PyTree, PyTree, Any, Bool[Array, "..."]]:
         """(y1, error estimate or None, solver state, whether implicit equations were solved)."""
-        args = self.intervals(args, t0 + 0.5 * (t1 - t0))
         if self.moves:
             # The state is not the one that the last step ended in: its last stage is of no use.
-            jump = jnp.array(True)
-            if isinstance(self.solver, AbstractUnrolled):
-                memory, jump = self.solver.init(self.term, t0, t1, y, args), False
+            jump = True if isinstance(self.solver, AbstractExplicit) else jnp.array(True)
+        if self.remembers and jump is not False:
+            # What was remembered is of the other side.
+            fresh = self.solver.init(self.term, t0, t1, y, args)
+            memory = jax.tree.map(partial(jnp.where, jump), fresh, memory)
         y1, error, _, memory, result = self.solver.step(self.term, t0, t1, y, args, memory, jump)
         return y1, error, memory, result == diffrax.RESULTS.successful
 
@@ -110,12 +124,33 @@ class Scheme(eqx.Module):
             return y, Verdict(true, true, true)
         return self.settle(t, y, args, differentiable)
 
-    def first_step(
+    def start(
+        self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
+    ) -> tuple[Any, Array, Any]:
+        """(solver state, length of the first adaptive step, the controller's state)."""
+        inside = self.within(args, t0)
+        controller: Any = self.controller
+        estimated = guess is None and type(controller) is diffrax.PIDController
+        if not estimated or not isinstance(self.solver, AbstractExplicit):
+            return self.begin(t0, t1, y, args), *self._first_step(t0, t1, y, inside, guess)
+        order = self.solver.error_order(self.term)
+
+        def field(t: Array, y: Array) -> Array:
+            return self.term.vf(t, y, inside)
+
+        slope, h = _slope_and_step(field, t0, y, controller, float(order))
+        at = jnp.asarray(t0, y.dtype)
+        _, state = controller.init(
+            self.term, at, t1.astype(y.dtype), y, h, inside, self.solver.func, order
+        )
+        # Where steps share no stage it is of no use, and the compiler drops it.
+        memory = slope if self.solver.shares_stages else None
+        return memory, h.astype(t0.dtype), state
+
+    def _first_step(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
     ) -> tuple[Array, Any]:
-        """Length of the first adaptive step, and the controller's state."""
         assert self.controller is not None
-        args = self.intervals(args, t0 + resolution(t0))
         order = self.solver.error_order(self.term)
         dtype = jnp.result_type(*jax.tree.leaves(y))
         if dtype == t0.dtype:
@@ -135,12 +170,49 @@ class Scheme(eqx.Module):
         return jnp.asarray(end, t0.dtype), state
 
 
+def _slope_and_step(
+    field: Callable, t0: Array, y0: Array, controller: Any, order: float
+) -> tuple[Array, Array]:
+    """(dy/dt at the start, length of the first step), in a loop that holds the field once.
+
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.4.
+    """
+    size = partial(_scaled_norm, controller, y0)
+
+    def turn(i: Array, carry: tuple) -> tuple:
+        f0, h, t, y = carry
+        f = field(t, y)
+        f0 = jnp.where(i == 0, f, f0)
+        d0, d1 = size(y0), size(f0)
+        tiny = (d0 < 1e-5) | (d1 < 1e-5)
+        trial = jnp.where(tiny, 1e-6, 0.01 * d0 / jnp.where(tiny, 1.0, d1))
+        steepest = jnp.maximum(d1, size(f - f0) / trial)
+        flat = steepest <= 1e-15
+        allowed = (0.01 / jnp.where(flat, 1.0, steepest)) ** (1 / order)
+        allowed = jnp.where(flat, jnp.maximum(1e-6, 1e-3 * trial), allowed)
+        h = jnp.minimum(100.0 * trial, allowed)
+        return f0, h, t0 + trial.astype(t0.dtype), y0 + trial * f0
+
+    begin = (jnp.zeros_like(y0), jnp.zeros((), y0.dtype), t0, y0)
+    f0, h, _, _ = jax.lax.fori_loop(0, 2, turn, begin)
+    return f0, h
+
+
+def _scaled_norm(controller: Any, y0: Array, x: Array) -> Array:
+    return controller.norm(x / (controller.atol + controller.rtol * jnp.abs(y0)))
+
+
 _UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of perturbations
+
+
+def all_finite(y: PyTree) -> Bool[Array, ""]:
+    """Whether all numbers of a state are finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]))
 
 
 def remembers(solver: diffrax.AbstractSolver) -> bool:
     """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
-    one_step = diffrax.AbstractRungeKutta | AbstractUnrolled | AbstractFixedStep
+    one_step = diffrax.AbstractRungeKutta | AbstractExplicit | AbstractFixedStep
     return not isinstance(solver, one_step)
 
 
@@ -169,13 +241,12 @@ def _rate(J: Array) -> Array:
 def with_stages(solver: Any, kind: str) -> Any:
     """A Runge-Kutta solver, wrapped or not, with its loop over stages of the given kind.
 
-    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying, where
-    stages written out would be compiled many times over.
+    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying.
     """
     if isinstance(solver, diffrax.HalfSolver):
         return eqx.tree_at(lambda s: s.solver, solver, with_stages(solver.solver, kind))
-    if isinstance(solver, AbstractUnrolled):
-        return solver if kind == "lax" else with_stages(solver.stock, kind)
+    if isinstance(solver, AbstractExplicit):
+        return solver if kind == "lax" else replace(solver, looped=True)
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

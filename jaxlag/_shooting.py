@@ -23,7 +23,6 @@ from jaxlag._free import Unknowns
 from jaxlag._lanes import in_batches
 from jaxlag._segments import Segments
 from jaxlag._simulate import simulate
-from jaxlag._status import Status
 from jaxlag._system import System
 
 MOVED_AT_ONCE = 64
@@ -124,7 +123,7 @@ class Shooting(eqx.Module):
         """(residuals (s, m) before the loss, end less start, status) of one segment."""
         start = self.start(x, segment)
         motion = self.motion(self.free.params(z), start, segment.ts, segment.inputs)
-        ok = motion.status == Status.ok
+        ok = motion.ok
         shown = read(dict(self.channels), motion)
         residuals = segment.weights * (shown - segment.values)
         far = FAR * segment.weights * self.ranges
@@ -134,7 +133,7 @@ class Shooting(eqx.Module):
         residuals = jnp.where(ok, residuals, far)
         end = jnp.where(ok, end, start + FAR * self.states)
         # Rows beyond those that were measured hold nothing, not even NaN.
-        return jnp.where(segment.weights > 0, residuals, 0.0), end, motion.status
+        return jnp.where(segment.weights > 0, residuals, 0.0), end, motion._ending.status
 
     def linearized(self, guess: Guess) -> tuple[Any, Any]:
         """((residuals, ends, status), their derivatives by z and by the segment's own x)."""

@@ -20,20 +20,19 @@ from jaxlag._arguments import (
     check_tolerances,
 )
 from jaxlag._constraints import Baumgarte
-from jaxlag._diagnosis import (
-    diagnose,
-    rows_hold,
-)
+from jaxlag._ending import ended
 from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
 from jaxlag._gradient import choose_gradient
 from jaxlag._inputs import check_inputs, check_range
 from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
+from jaxlag._patience import timed
 from jaxlag._pose import Plan, Values, pose, velocities_at
 from jaxlag._replay import solve
 from jaxlag._scheme import Scheme, remembers
 from jaxlag._slowness import is_stiff
 from jaxlag._solution import Solution, over_rows
+from jaxlag._start import rows_hold
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag.solvers import AbstractPartitioned
@@ -204,7 +203,7 @@ def simulate(
     )
     values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
-    motion = _simulate(plan, values)
+    motion = timed(_simulate, system, plan, values)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
         other = _simulate(*_with_method(plan, values, IMPLICIT, rtol, atol, step))
         if abs(other.last_time - ts[0]) > abs(motion.last_time - ts[0]):
@@ -218,7 +217,7 @@ def simulate(
         better = method if dt is not None else FINER.get(name_of(scheme[0]), method)
         beside = _simulate(*_with_method(room, values, better, *steps, fixed=dt is not None))
         motion = with_error(motion, beside, 1.0 if better is method else LEFT)
-    if throw and _params.concrete(motion.status):
+    if throw and _params.concrete(motion._ending.status):
         _raise_unless_ok(motion)
     return motion
 
@@ -241,28 +240,34 @@ def _with_method(
 
 def _ran_out(motion: Solution) -> bool:
     """Whether one motion, with values, took more steps than it may."""
-    single = np.ndim(motion.status) == 0 and _params.concrete(motion.status, motion.q)
-    return single and int(motion.status) == int(Status.max_steps)
+    status = motion._ending.status
+    single = np.ndim(status) == 0 and _params.concrete(status, motion.q)
+    return single and int(status) == int(Status.max_steps)
 
 
 @partial(jax.jit, static_argnums=0)
 def _simulate(plan: Plan, values: Values) -> Solution:
-    """The compiled program: pose, solve, diagnose, derive what `save` names."""
+    """The compiled program: pose, solve, derive what `save` names."""
     dynamics, start, problem = pose(plan, values)
     scheme: Scheme = eqx.combine(problem.setup.scheme, problem.scheme)
     name = name_of(scheme.solver)
     known = name in METHODS
     rows, outcome = solve(problem)
-    status, where = diagnose(dynamics, problem, outcome, start)
-    params, inputs = dynamics.given(problem.args)
+    ending = ended(dynamics, problem.times, problem.y0, problem.args, outcome, start)
+    params = _params.join(values.params, plan.params.tree)
+    inputs = eqx.combine(values.inputs, plan.inputs.tree)
     moved = outcome.accepted > 0
-    q, v = velocities_at(dynamics, values.ts, rows.saved, problem.args, moved)
+    last_time = dynamics.clock(rows.time, problem.args)
+    at = jnp.concatenate([values.ts, last_time[None].astype(values.ts.dtype)])
+    states = jnp.concatenate([rows.saved, rows.state[None]])
+    q, v = velocities_at(dynamics, at, states, problem.args, moved)
+    (q, last_q), (v, last_v) = ((x[:-1], x[-1]) for x in (q, v))
     hold, row = rows_hold(dynamics, values.ts, q, v, params)
-    broken = ~hold & (status == int(Status.ok))
-    status = jnp.where(broken, int(Status.contradictory_rows), status)
-    where = jnp.where(broken, row, where)
-    last_time = dynamics.mirror(rows.time, problem.args)
-    last = velocities_at(dynamics, last_time[None], rows.state[None], problem.args, moved)
+    broken = ~hold & (ending.status == int(Status.ok))
+    ending = ending._replace(
+        status=jnp.where(broken, int(Status.contradictory_rows), ending.status),
+        where=jnp.where(broken, row, ending.where),
+    )
     saved = {
         name: over_rows(name, plan.system, plan.formulation, values.ts, q, v, params, inputs)
         for name in plan.save
@@ -275,10 +280,8 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         ts=values.ts,
         q=q,
         v=v,
-        status=status,
         last_time=last_time,
-        last_state=(last[0][0], last[1][0]),
-        where=where,
+        last_state=(last_q, last_v),
         stats={
             "accepted": outcome.accepted,
             "rejected": outcome.attempted - outcome.accepted,
@@ -292,11 +295,14 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         formulation=plan.formulation,
         _method=jnp.asarray(list(METHODS).index(name) if known else -1, jnp.int32),
         _solver="" if known else name,
+        _ending=ending,
+        _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
         tolerances=None if scheme.controller is None else (values.rtol, values.atol),
     )
 
 
 def _raise_unless_ok(motion: Solution) -> None:
-    if np.ndim(motion.status) == 0 and int(motion.status) != int(Status.ok):
+    status = motion._ending.status
+    if np.ndim(status) == 0 and int(status) != int(Status.ok):
         raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

@@ -1,7 +1,6 @@
 """What held the steps of a motion short: `Solution.explain`."""
 
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
-from jaxlag._dynamics import Dynamics
+from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
 from jaxlag._projection import turns_needed
 from jaxlag._scheme import linearized
@@ -236,49 +235,21 @@ def _look(motion: "Solution", h: float, last: bool = False) -> Look:
         ts, q, v = end
     elif int(motion.status) != Status.ok:
         ts, q, v = (np.concatenate(pair) for pair in zip((ts, q, v), end, strict=True))
-    key = (
-        motion.system,
-        motion._params_static,
-        motion._inputs_static,
-        motion.formulation,
-        motion.stabilization,
-        1 if motion.ts[-1] >= motion.ts[0] else -1,
-    )
     tolerances = motion.tolerances or (jnp.ones(()), jnp.ones(()))
-    return _looks(key, (ts, q, v, h, motion._params_traced, motion._inputs_traced, tolerances))
+    given = motion._params_traced, motion._inputs_traced
+    return _looks(motion.scene, (ts, q, v, h, *given, tolerances))
 
 
 @partial(jax.jit, static_argnums=0)
-def _looks(key: Any, traced: Any) -> Look:
-    system, params_static, inputs_static, formulation, stabilization, direction = key
+def _looks(scene: Scene, traced: Any) -> Look:
     ts, q, v, h, params, inputs, (rtol, atol) = traced
-    dynamics = Dynamics(
-        system,
-        params_static,
-        inputs_static,
-        direction,
-        None,
-        _params.UNKNOWN,
-        formulation=formulation,
-        stabilization=stabilization,
-    )
-    args = dynamics.arguments(params, inputs, ts)
+    dynamics, args = dynamics_of(scene, ts, q[0], v[0], params, inputs)
     given, _ = dynamics.given(args)
-    dynamics = replace(dynamics, rows=system.rows(given, q.dtype))
-
-    def state(t: Array, q: Array, v: Array) -> Array:
-        w = v
-        if dynamics.quasi is not None:
-            w = dynamics.quasi.of(t, q, v, given)[dynamics.quasi.free]
-        return dynamics.start(q, w)
-
     solver = diffrax.Dopri8(scan_kind="lax")
-    begin = dynamics.mirror(ts[0], args)
-    args = dynamics.prepare(begin, state(ts[0], q[0], v[0]), args)
 
     def at(row: tuple[Array, Array, Array]) -> Look:
-        tau, y = dynamics.mirror(row[0], args), state(*row)
-        here = dynamics.within(args, tau + 0.5 * h)
+        tau, y = dynamics.tau(row[0], args), dynamics.state_of(*row, given)
+        here = dynamics.within(args, tau)
         term = term_of(dynamics, tau, y, here)
         _, rates = linearized(lambda y: dynamics(tau, y, here), y)
         memory = solver.init(term, tau, tau + h, y, here)

@@ -8,10 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._constraints import Baumgarte
+from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
 from jaxlag._methods import METHODS
 from jaxlag._power import in_order
@@ -82,11 +83,8 @@ class Solution(eqx.Module):
         ts: (s,), s.
         q: coordinates (s, n), m or rad.
         v: velocities (s, n), m/s or rad/s.
-        status: int32, see `Status`.
         last_time: last time reached, s.
         last_state: (q, v) there, each (n,).
-        where: index of the coordinate, or of the constraint row, that a failure concerns; -1 if
-            none.
         stats: counts of "accepted" and "rejected" steps; "gradient", a `GradientMode`: how reverse
             derivatives of this motion go through the steps.
         saved: quantities named in `save=`, by name.
@@ -102,10 +100,8 @@ class Solution(eqx.Module):
     ts: Float[Array, "*batch s"]
     q: Float[Array, "*batch s n"]
     v: Float[Array, "*batch s n"]
-    status: Int[Array, "*batch"]
     last_time: Float[Array, "*batch"]
     last_state: tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]
-    where: Int[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
     saved: dict[str, Any]
     _params_traced: Any
@@ -116,8 +112,43 @@ class Solution(eqx.Module):
     _method: Int[Array, "*batch"]  # in METHODS; -1 for another
     _solver: str = eqx.field(static=True)  # its name, then
     stabilization: str | Baumgarte | None = eqx.field(static=True)
+    _ending: Ending
+    _kinematic: bool = eqx.field(static=True)
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch"]] | None
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
+
+    @property
+    def status(self) -> Int[Array, "*batch"]:
+        """How the motion ended: int32, see `Status`.
+
+        Where one failed, the states around its end are looked at when this is asked for; inside
+        jit and vmap always.
+        """
+        return self._explained().status
+
+    @property
+    def ok(self) -> Bool[Array, "*batch"]:
+        """Whether the motion reached ts[-1]. Unlike the status it costs nothing inside jit."""
+        return self._ending.status == int(Status.ok)
+
+    @property
+    def where(self) -> Int[Array, "*batch"]:
+        """Index of the coordinate or constraint row that a failure concerns; -1 if none."""
+        return self._explained().where
+
+    @property
+    def scene(self) -> Scene:
+        """What moved, as compiled programs are keyed by it."""
+        keys = self._params_static, self._inputs_static, self.formulation, self.stabilization
+        return Scene(self.system, *keys, self._kinematic)
+
+    def _explained(self) -> Ending:
+        if not is_open(self._ending):
+            return self._ending
+        start = self.q[..., 0, :], self.v[..., 0, :]
+        at = self._ending, self.last_time, self.ts, *start
+        batch = self.ts.ndim - 1
+        return explained(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
 
     @property
     def method(self) -> str:

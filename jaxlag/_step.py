@@ -17,6 +17,19 @@ class RowChoice(NamedTuple):
     size: Float[Array, " m"]
 
 
+class Gaps(NamedTuple):
+    """The intervals between the knots of all tables.
+
+    Attributes:
+        knots: sorted, in tau.
+        lower: in the user's time from the start, the lower end of the gap before each knot and of
+            that after the last; -inf where there is none.
+    """
+
+    knots: Float[Array, " k"]
+    lower: Float[Array, " g"]
+
+
 class Verdict(NamedTuple):
     """What is to be said about the end of a step.
 
@@ -40,9 +53,10 @@ class Arguments(NamedTuple):
     """What the vector field depends on besides time and state; all leaves are arrays."""
 
     params: Any
-    inputs: Any
+    inputs: Any  # tables in time from the start; within a step two rows of each
     sigma: Float[Array, ""] | None  # direction of time where it is traced
-    intervals: Any  # table interval of every input, fixed throughout a step
+    origin: Float[Array, ""]  # the start, in the user's time
+    gaps: Gaps | None  # None without tables
     prepared: Any  # what accelerations need of what depends on params alone
     rows: RowChoice | None = None  # None where there is no choice: at most one row
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start

@@ -18,29 +18,19 @@ class Term(diffrax.ODETerm):
 
     Attributes:
         dynamics: what it is the vector field of.
-        scalar: the dynamics, where they have a scalar program.
+        lines: of the scalar program for the accelerations; None where there is none.
         dtype: of the state.
-        elementwise: the dynamics, where the state is the tuple of its elements.
     """
 
     dynamics: Dynamics
-    scalar: Dynamics | None
+    lines: int | None = eqx.field(static=True)
     dtype: Any = eqx.field(static=True)
-    elementwise: Dynamics | None = None
 
-    @property
-    def second_order(self) -> Dynamics | None:
-        """The dynamics, where they are q'' = a element by element."""
-        form = self.elementwise
-        return None if form is None or form.quasi is not None else form
-
-    def by_element(self, lanes: bool, in_loop: bool) -> "Term | None":
-        """The same for states that are tuples of their elements, vmapped or not."""
-        if self.scalar is None:
-            return None
-        dynamics = replace(self.scalar, lanes=lanes, in_loop=in_loop)
-        field: Any = dynamics.rates
-        return Term(field, dynamics, None, self.dtype, dynamics)
+    def compiled_for(self, lanes: bool, in_loop: bool) -> "Term":
+        """The same, written for where it is going to be evaluated, as told to `Dynamics`."""
+        dynamics = replace(self.dynamics, lanes=lanes, in_loop=in_loop)
+        field: Any = dynamics.__call__
+        return Term(field, dynamics, self.lines, self.dtype)
 
     @property
     def works(self) -> bool:
@@ -48,7 +38,7 @@ class Term(diffrax.ODETerm):
         return self.dynamics.power is not None and bool(self.dynamics.power.names)
 
     def sections(self, y: Any) -> tuple[Any, Any, Any]:
-        """(q, v, work) of a state or of its rates, an array or the tuple of its elements."""
+        """(q, v, work) of a state or of its rates."""
         n, rest = self.dynamics.system.size, self.dynamics.system.size + self.dynamics.speeds
         return y[:n], y[n:rest], y[rest:]
 
@@ -58,7 +48,7 @@ class Term(diffrax.ODETerm):
 
     def joined(self, q: Any, v: Any, work: Any) -> Any:
         """The inverse of `sections`."""
-        return (*q, *v, *work) if isinstance(q, tuple) else jnp.concatenate([q, v, work])
+        return jnp.concatenate([q, v, work])
 
     def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
         return (t1 - t0).astype(self.dtype)
@@ -69,5 +59,4 @@ def term_of(
 ) -> Term:
     """The vector field of `dynamics`, for states and arguments like these."""
     field: Any = dynamics.__call__
-    scalar = dynamics if dynamics.is_scalar(tau, y, args) else None
-    return Term(field, dynamics, scalar, y.dtype)
+    return Term(field, dynamics, dynamics.lines(tau, y, args), y.dtype)

@@ -11,10 +11,9 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._drive import Outcome, Record, Times
 from jaxlag._lanes import LANES, in_batches
 from jaxlag._linear import LinearMap, linear
-from jaxlag._lowering import elements
+from jaxlag._record import Outcome, Record, Times
 from jaxlag._scheme import Scheme, with_stages
 from jaxlag._walk import Change, Clock, Path, Walk, again, backwards, forwards
 
@@ -70,10 +69,11 @@ def changed(
     y0_dot, args_dot, times_dot = change
     dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
     moving = tuple(i for i, dot in enumerate(dots) if dot is not None)
-    times, anchors_dot = eqx.combine(inexact, rest, static[0])[2], None
-    if jax.tree.leaves((times_dot.start, times_dot.stop, times_dot.knots)):
-        anchors_dot = jax.jvp(Times.anchors, (times,), (filled(times_dot, times),))[1]
-    x = Change(y0_dot, [dots[i] for i in moving], anchors_dot)
+    times, anchors_dot, saves_dot = eqx.combine(inexact, rest, static[0])[2], None, None
+    if jax.tree.leaves(times_dot):
+        whole = filled(times_dot, times)
+        anchors_dot, saves_dot = jax.jvp(Times.anchors, (times,), (whole,))[1], whole.saves
+    x = Change(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
     kind = _Kind(static, moving, y0_dot is not None, anchors_dot is not None, points)
     return linear(_map(kind), (inexact, rest, setup, record), x)
 
@@ -94,38 +94,40 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
     def path(r: Any) -> tuple[Path, Any]:
         inexact, rest, setup, record = r
         y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
-        return path_of(scheme, y0, args, times, record, kind.moving, scheme.by_element(lanes)), y0
+        return path_of(scheme, y0, args, times, record, kind.moving, scheme.on_scalars(lanes)), y0
 
     def forward(r: Any, x: Change) -> Walk:
         return forwards(path(r)[0], x, kind.points)
 
-    def backward(r: Any, y: Walk) -> Change:
+    def like(r: Any) -> tuple[Path, Change]:
         way, y0 = path(r)
-        anchors = way.clock.times.anchors()
-        like = Change(y0 if kind.start else None, [], anchors if kind.times else None)
-        return backwards(way, like, y)
+        times = way.clock.times
+        moves = (times.anchors(), times.saves) if kind.times else (None, None)
+        return way, Change(y0 if kind.start else None, way.moved(), *moves)
+
+    def backward(r: Any, y: Walk) -> Change:
+        way, change = like(r)
+        return backwards(way, change, y)
 
     def by_directions(r: Any, y: Walk) -> Change:
         """The same from `forward`, one direction of x after another."""
-        way, y0 = path(r)
-        anchors = way.clock.times.anchors()
-        like = Change(y0 if kind.start else None, way.moved(), anchors if kind.times else None)
-        return _transposed(partial(forward, r), like, y)
+        return _transposed(partial(forward, r), like(r)[1], y)
 
     def plain(r: Any, x: Change) -> Walk:
         inexact, rest, setup, record = r
         y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
         way = path_of(scheme, y0, args, times, record, kind.moving)
-        like = jax.eval_shape(forward, r, x)
 
-        def motion(y0: Array, moved: list, anchors: Array) -> Walk:
-            walk = again(way, (y0, None), moved, anchors, kind.points)
-            return _in_form(walk, like)
+        def motion(y0: Array, moved: list, anchors: Array, saves: Array) -> Walk:
+            return again(way, (y0, None), moved, anchors, saves, kind.points)
 
-        given = (y0, way.moved(), times.anchors())
-        y0_dot = jnp.zeros_like(y0) if x.y0 is None else x.y0
-        anchors_dot = jnp.zeros_like(given[2]) if x.anchors is None else x.anchors
-        return jax.jvp(motion, given, (y0_dot, list(x.args), anchors_dot))[1]
+        given = (y0, way.moved(), times.anchors(), times.saves)
+        dots = (
+            jnp.zeros_like(at) if dot is None else dot
+            for at, dot in zip((y0, *given[2:]), (x.y0, x.anchors, x.saves), strict=True)
+        )
+        y0_dot, *times_dot = dots
+        return jax.jvp(motion, given, (y0_dot, list(x.args), *times_dot))[1]
 
     in_lanes = None if lanes else _map(kind, lanes=True)
     reverse = backward if kind.static[3].room else by_directions
@@ -153,17 +155,6 @@ def _transposed(function: Callable, like: Any, y: Any) -> Any:
     return split(in_batches(component, jnp.eye(count, dtype=widest), count, LANES))
 
 
-def _in_form(walk: Walk, like: Walk) -> Walk:
-    """A walk of arrays in the form of another one, whose states may be tuples of elements."""
-
-    def form(state: Any, like: Any) -> Any:
-        if like is None or not isinstance(like[0], tuple):
-            return state
-        return tuple(jnp.moveaxis(state[0], -1, 0)), None
-
-    return Walk(*(form(a, b) for a, b in zip(walk, like, strict=True)))
-
-
 def path_of(
     scheme: Scheme,
     y0: Array,
@@ -173,10 +164,10 @@ def path_of(
     moving: tuple[int, ...],
     fast: Scheme | None = None,
 ) -> Path:
-    """The recorded motion, element by element if there is a form for that.
+    """The recorded motion.
 
-    States between points are found by the form with loops over stages: with stages written out
-    it would take as long to compile as all else.
+    States between points are found by steps with loops over stages: written out they would take
+    as long to compile as all else.
     """
     loops = in_loops(scheme)
 
@@ -186,18 +177,15 @@ def path_of(
 
         return step
 
-    def between(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
-        if not isinstance(state[0], tuple):
-            return steps(loops)(args, t0, t1, state, jump)
-        y, _ = steps(loops)(args, t0, t1, (jnp.stack(state[0]), None), jump)
-        return tuple(elements(y)), None
-
-    memory = scheme.begin(times.start, times.stop, y0, args) if scheme.remembers else None
-    start = (y0, memory) if fast is None else (tuple(elements(y0)), None)
+    zero = jnp.zeros_like(times.stop)
+    memory = scheme.begin(zero, times.stop, y0, args) if scheme.remembers else None
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
     clock = Clock(times, record)
-    return Path(steps(fast or loops), between, start, leaves, tree, moving, clock, stages)
+    between = steps(loops if fast is None else in_loops(fast))
+    start = (y0, memory)
+    step = steps(fast or loops)
+    return Path(step, between, start, leaves, tree, moving, scheme.windows, clock, stages)
 
 
 def in_loops(scheme: Scheme) -> Scheme:
@@ -216,8 +204,10 @@ def one_step(
 ) -> tuple[PyTree, Bool[Array, ""]]:
     """One step from (y, memory), and whether it was solved; without memory it starts afresh."""
     y, memory = state
+    args = scheme.within(args, t0)
+    jumped: Any = jump
     if not scheme.remembers:
-        memory, jump = scheme.begin(t0, t1, y, args), jnp.array(True)
-    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jump)
+        memory, jumped = scheme.afresh(t0, t1, y, args)
+    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jumped)
     y, verdict = scheme.settled(t1, y, args, differentiable)
     return (y, memory if scheme.remembers else None), solved & verdict.good

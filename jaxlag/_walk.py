@@ -1,15 +1,14 @@
-"""Along a recorded motion again: its variational equations, forwards and backwards.
+"""Along a recorded motion and back: derivatives of states and rows, in loops that end where it did.
 
-The derivative of a solve is that of its steps y_k+1 = S(y_k, args, t_k, t_k+1) at the recorded
-times,
+With y_{k+1} = step(y_k, args, t_k, t_{k+1}) at recorded times the derivative is
 
-    dy_k+1 = dS/dy dy_k + dS/dargs dargs + dS/dt_k dt_k + dS/dt_k+1 dt_k+1,
+    dy_{k+1} = J_k dy_k + B_k dargs + c_k dt_k + e_k dt_{k+1},
 
-a linear map from (dy_0, dargs, danchors) to what is wanted of dy_0, dy_1, .... Forwards dy is
-carried beside y. Backwards the transposed steps are taken from the last to the first, at the
-recorded points, or at states found anew from them where points are further apart than a step.
-Neither depends on the step-size control, whose error estimates round differently in another
-program.
+and the same for a row, which is a step from y_k to its own time: a linear map from (dy_0, dargs,
+danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the rows. Forwards dy is carried
+beside y. Backwards the transposed steps are taken from the last to the first, at the recorded
+points, or at states found anew from them where points are further apart than a step. Neither
+depends on the step-size control, whose error estimates round differently in another program.
 
 Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.6 (variational
 equations); Griewank, Walther, Evaluating Derivatives, ch. 12 (checkpoints).
@@ -26,8 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag import _xla
-from jaxlag._drive import CHUNK, Record, Times
-from jaxlag._lowering import elements
+from jaxlag._drive import CHUNK
+from jaxlag._record import Record, Times
 
 
 class Walk(NamedTuple):
@@ -35,12 +34,14 @@ class Walk(NamedTuple):
 
     Attributes:
         last: state after the last step.
-        rows: states from which one more step reaches row i; None where nobody asks.
+        time: of it.
+        rows: the rows, (s, ...).
         points: states at the points of the record; None where nobody asks.
     """
 
     last: PyTree
-    rows: PyTree | None
+    time: Array
+    rows: PyTree
     points: PyTree | None
 
 
@@ -51,11 +52,13 @@ class Change(NamedTuple):
         y0: of the start, an array.
         args: of some leaves of the arguments.
         anchors: of `Times.anchors`.
+        saves: of `Times.saves`; moves where the anchors do.
     """
 
     y0: Array | None
     args: list[Array]
     anchors: Array | None
+    saves: Array | None
 
 
 class Clock(NamedTuple):
@@ -80,6 +83,11 @@ class Clock(NamedTuple):
         """Whether the vector field jumps where turn k starts."""
         return None if self.record.jumps is None else _at(self.record.jumps, k)
 
+    @property
+    def last(self) -> Array:
+        """The last turn."""
+        return self.record.turns - 1
+
 
 class Path(NamedTuple):
     """A recorded motion: what was given to the loop and what it kept.
@@ -91,6 +99,8 @@ class Path(NamedTuple):
         args: leaves of the arguments.
         tree: of the arguments.
         moving: indices of the leaves that may move.
+        windows: (args, t0) -> (args as a step from t0 reads them: of each table two rows; where
+            these rows start in the leaves that may move, None for those that are no tables).
         clock: times of the steps.
         stages: number of them in a step, 0 where it has none.
     """
@@ -101,36 +111,50 @@ class Path(NamedTuple):
     args: list
     tree: Any
     moving: tuple[int, ...]
+    windows: Callable
     clock: Clock
     stages: int
 
-    def with_args(self, moved: Sequence[Array]) -> Any:
+    def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
         """The arguments with other values of the leaves that may move."""
-        leaves = list(self.args)
+        leaves = list(self.args if leaves is None else leaves)
         for i, leaf in zip(self.moving, moved, strict=True):
             leaves[i] = leaf
         return jax.tree.unflatten(self.tree, leaves)
 
-    def ahead(
-        self, t: Array, end: Array, jump: Array | None, state: PyTree, moved: Sequence[Array]
-    ) -> PyTree:
+    def ahead(self, args: Any, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
         """The state one step on."""
-        jump = jnp.array(False) if jump is None else jump
-        return self.step(self.with_args(moved), t, end, state, jump)
+        return self.step(args, t, end, state, jnp.array(False) if jump is None else jump)
 
     def found(self, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
         """The same between points."""
-        jump = jnp.array(False) if jump is None else jump
-        return self.between(self.with_args(self.moved()), t, end, state, jump)
+        args = self.with_args(self.moved())
+        return self.between(args, t, end, state, jnp.array(False) if jump is None else jump)
 
     def moved(self) -> list[Array]:
         """The leaves of the arguments that may move."""
         return [self.args[i] for i in self.moving]
 
+    def local(self, t: Array) -> tuple[Callable, list[Array], list[Array | None]]:
+        """What a step from t reads of the arguments.
+
+        Returns:
+            moved -> arguments, what moves of them (of tables two rows), where these rows start.
+        """
+        args, starts = self.windows(self.with_args(self.moved()), t)
+        leaves = jax.tree.leaves(args, is_leaf=lambda x: x is None)
+        moved = [leaves[i] for i in self.moving]
+        return partial(self.with_args, leaves=leaves), moved, [starts[i] for i in self.moving]
+
 
 def _at(buffer: PyTree, k: Array) -> PyTree:
     index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
     return jax.tree.map(index, buffer)
+
+
+def _put(buffer: PyTree, k: Array, row: PyTree) -> PyTree:
+    put = partial(jax.lax.dynamic_update_index_in_dim, index=k, axis=0)
+    return jax.tree.map(put, buffer, row)
 
 
 def _pick(use: Array, new: PyTree, old: PyTree) -> PyTree:
@@ -141,85 +165,90 @@ def _add(a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(jnp.add, a, b)
 
 
-def _start(path: Path, change: Change) -> PyTree:
-    """dy_0 in the form of a state."""
-    if change.y0 is None:
-        return jax.tree.map(jnp.zeros_like, path.start)
-    return state_like(path.start, change.y0)
+def _zeros(state: PyTree, size: int) -> PyTree:
+    return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
 
 
-def state_like(state: PyTree, y: Array) -> PyTree:
-    """An array in the form of a state without memory."""
-    return (tuple(elements(y)) if isinstance(state[0], tuple) else y, None)
+def _joined(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -> PyTree:
+    """All rows, from those between the first and the last; zero where there was none."""
+
+    def of(a: Array, between: Array | None, b: Array) -> Array:
+        parts = [a[None], jnp.where(reached, b, 0.0)[None]]
+        if between is not None:
+            parts.insert(1, between[:-1])
+        return jnp.concatenate(parts)
+
+    if rows is None:
+        return jax.tree.map(lambda a, b: of(a, None, b), first, last)
+    return jax.tree.map(of, first, rows, last)
 
 
-class _Groups(NamedTuple):
-    """Rows that start at one turn, together."""
+def _reached(path: Path, anchors: Array) -> Array:
+    """Whether the last row was."""
+    clock = path.clock
+    return clock.time(clock.last, anchors) >= clock.times.saves[-1]
 
-    of: Array  # the group of each row
-    turn: Array  # of each group; -1 where there is none
 
-
-def _groups(row_turn: Array) -> _Groups:
-    new = jnp.concatenate([jnp.zeros((1,), bool), row_turn[1:] != row_turn[:-1]])
-    of = jnp.cumsum(new.astype(jnp.int32))
-    return _Groups(of, jnp.full(row_turn.shape, -1, jnp.int32).at[of].set(row_turn))
+def _turn_of_row(record: Record, r: Array) -> Array:
+    """The turn of row r between the first and the last; none beyond these."""
+    assert record.row_turn is not None
+    return jnp.where(r < 0, -1, _at(record.row_turn, r))
 
 
 def forwards(path: Path, change: Change, points: bool) -> Walk:
     """The derivative in one direction."""
     clock, record = path.clock, path.clock.record
-    anchors = clock.times.anchors()
-    groups = None if record.row_turn is None else _groups(record.row_turn)
-
-    def field(size: int) -> PyTree:
-        return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), path.start)
-
+    anchors, dues = clock.times.anchors(), clock.times.dues()
+    dues_dot = None
+    if change.saves is not None:
+        dues_dot = jnp.concatenate([change.saves[1:-1], jnp.zeros_like(change.saves[:1])])
+    start = path.start
+    dy0 = jax.tree.map(jnp.zeros_like, start) if change.y0 is None else (change.y0, None)
     count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
-    kept = (
-        None if groups is None else field(groups.turn.shape[0] + 1),
-        field(count) if points else None,
-    )
     zero = jnp.zeros((), jnp.int32)
-    begin = (zero, path.start, _start(path, change), zero, kept)
-
-    def keep(k: Array, p: Array, dy: PyTree, kept: tuple) -> tuple:
-        rows, points = kept
-        if groups is not None:
-            hit = groups.turn[jnp.minimum(p, groups.turn.shape[0] - 1)] == k
-            slot = jnp.where(hit, p, groups.turn.shape[0])
-            rows = jax.tree.map(lambda b, x: b.at[slot].set(x), rows, dy)
-            p = p + hit.astype(jnp.int32)
-        if points is not None:
-            slot = jnp.where(k % record.stride == 0, k // record.stride, count - 1)
-            put = partial(jax.lax.dynamic_update_index_in_dim, index=slot, axis=0)
-            points = jax.tree.map(put, points, dy)
-        return p, (rows, points)
+    rows = None if record.row_turn is None else _zeros(start, record.row_turn.shape[0])
+    begin = (zero, zero, start, dy0, rows, _zeros(start, count) if points else None)
 
     def turn(carry: tuple) -> tuple:
-        k, y, dy, p, kept = carry
-        p, kept = keep(k, p, dy, kept)
+        k, r, y, dy, rows, kept = carry
         t, end, jump = clock.time(k - 1, anchors), clock.time(k, anchors), clock.jump(k)
-        use = (k < record.turns) & (end > t)
-        if change.anchors is None:
-            step = lambda y, args: path.ahead(t, end, jump, y, args)  # noqa: E731
+        use, to_row = (k < record.turns) & (end > t), jnp.array(False)
+        if points:
+            slot = jnp.where(k % record.stride == 0, k // record.stride, count - 1)
+            kept = _put(kept, slot, dy)
+        end_dot = None if change.anchors is None else change.anchors[clock.anchor(k)]
+        if rows is not None:
+            here = _turn_of_row(record, r) == k
+            to_row = eqxi.unvmap_any(here)
+            end = jnp.where(here, dues[r], end)
+            if dues_dot is not None and end_dot is not None:
+                end_dot = jnp.where(here, dues_dot[r], end_dot)
+        if end_dot is None:
+            step = lambda y, moved: path.ahead(path.with_args(moved), t, end, jump, y)  # noqa: E731
             y1, dy1 = jax.jvp(step, (y, path.moved()), (dy, change.args))
         else:
-            step = lambda y, args, t, end: path.ahead(t, end, jump, y, args)  # noqa: E731
-            moves = change.anchors[clock.anchor(k - 1)], change.anchors[clock.anchor(k)]
+            assert change.anchors is not None
+            step = lambda y, moved, t, end: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y
+            )
+            moves = change.anchors[clock.anchor(k - 1)], end_dot
             y1, dy1 = jax.jvp(step, (y, path.moved(), t, end), (dy, change.args, *moves))
-        y, dy = _pick(use, (y1, dy1), (y, dy))
-        return k + 1, y, dy, p, kept
+        if rows is not None:
+            assert record.row_turn is not None
+            rows = _put(rows, jnp.where(here, r, record.row_turn.shape[0] - 1), dy1)
+            r = r + here.astype(jnp.int32)
+        y, dy = _pick(use & ~to_row, (y1, dy1), (y, dy))
+        return k + (~to_row).astype(jnp.int32), r, y, dy, rows, kept
 
     def goes_on(carry: tuple) -> Array:
         return eqxi.unvmap_any(carry[0] < record.turns)
 
     loop = partial(jax.lax.while_loop, goes_on, turn)
-    _, _, dy, _, kept = _xla.native(loop, begin, stages=path.stages)
-    rows_dot = None
-    if groups is not None:
-        rows_dot = jax.tree.map(lambda x: x[groups.of], kept[0])
-    return Walk(dy, rows_dot, kept[1])
+    _, _, _, dy, rows, kept = _xla.native(loop, begin, stages=path.stages)
+    time = jnp.zeros_like(clock.times.stop)
+    if change.anchors is not None:
+        time = change.anchors[clock.anchor(clock.last)]
+    return Walk(dy, time, _joined(dy0, rows, dy, _reached(path, anchors)), kept)
 
 
 def backwards(path: Path, change: Change, wanted: Walk) -> Change:
@@ -231,149 +260,236 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         wanted: cotangents.
     """
     clock, record = path.clock, path.clock.record
-    anchors = clock.times.anchors()
+    anchors, dues = clock.times.anchors(), clock.times.dues()
     assert record.points is not None
-    groups, row_bars = None, ()
-    if wanted.rows is not None:
-        assert record.row_turn is not None
-        groups = _groups(record.row_turn)
-        size = groups.turn.shape[0]
-
-        def gathered(ct: Array) -> Array:
-            return jnp.zeros((size, *ct.shape[1:]), ct.dtype).at[groups.of].add(ct)
-
-        row_bars = jax.tree.map(gathered, wanted.rows)
+    between = None if record.row_turn is None else jax.tree.map(lambda x: x[1:-1], wanted.rows)
+    moves = change.anchors is not None
     zero = jnp.zeros((), jnp.int32)
+    reached = _reached(path, anchors)
+    end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.rows)
     bars = (
         [jnp.zeros_like(x) for x in path.moved()],
-        None if change.anchors is None else jnp.zeros_like(change.anchors),
+        jnp.zeros_like(anchors).at[clock.anchor(clock.last)].add(wanted.time) if moves else None,
+        jnp.zeros_like(dues) if moves else None,
     )
 
-    def turn(k: Array, y: PyTree, carry: tuple) -> tuple:
-        """From the cotangent of the state after turn k to that of the state before it."""
-        bar, p, (args_bar, anchors_bar) = carry
+    def row_here(k: Array, fresh: Array, r: Array) -> Array:
+        """Whether a row that is left, r - 1, is reached from the state before turn k."""
+        if between is None:
+            return jnp.array(False)
+        return ~fresh & (_turn_of_row(record, r - 1) == k)
+
+    def turn(state_before: Callable, carry: tuple) -> tuple:
+        """From the cotangent of the state after turn k - 1 to that of the state before it.
+
+        `fresh` says that turn k has not been gone back yet, which it is not for the first one.
+        """
+        k, r, bar, (args_bar, anchors_bar, dues_bar) = carry
+        here = row_here(k, jnp.array(False), r)
+        to_row = eqxi.unvmap_any(here)
+        k = jnp.where(to_row, k, k - 1)
+        y = state_before(k)
         t, end, jump = clock.time(k - 1, anchors), clock.time(k, anchors), clock.jump(k)
         use = (k < record.turns) & (end > t)
-        if anchors_bar is None:
-            step = lambda y, args: path.ahead(t, end, jump, y, args)  # noqa: E731
-            before, args_more = jax.vjp(step, y, path.moved())[1](bar)
+        given = bar
+        if between is not None:
+            use = jnp.where(to_row, here, use)
+            end = jnp.where(here, dues[r - 1], end)
+            given = _pick(to_row, _at(between, r - 1), bar)
+        with_moved, moved, starts = path.local(t)
+        if not moves:
+            step = lambda y, moved: path.ahead(with_moved(moved), t, end, jump, y)  # noqa: E731
+            before, more = jax.vjp(step, y, moved)[1](given)
         else:
-            step = lambda y, args, t, end: path.ahead(t, end, jump, y, args)  # noqa: E731
-            pullback = jax.vjp(step, y, path.moved(), t, end)[1]
-            before, args_more, t_bar, end_bar = pullback(bar)
-            moved = anchors_bar.at[clock.anchor(k - 1)].add(t_bar)
-            moved = moved.at[clock.anchor(k)].add(end_bar)
-            anchors_bar = jnp.where(use, moved, anchors_bar)
-        bar = _pick(use, before, bar)
-        args_bar = _pick(use, _add(args_bar, args_more), args_bar)
-        if groups is not None:
-            hit = (p > 0) & (groups.turn[p] == k)
-            bar = _pick(hit, _add(bar, _at(row_bars, p)), bar)
-            p = p - hit.astype(jnp.int32)
+            step = lambda y, moved, t, end: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y
+            )
+            before, more, t_bar, end_bar = jax.vjp(step, y, moved, t, end)[1](given)
+            t_bar, end_bar = (jnp.where(use, x, 0.0) for x in (t_bar, end_bar))
+            at_row = jnp.where(here, end_bar, 0.0)
+            anchors_bar = anchors_bar.at[clock.anchor(k - 1)].add(t_bar)
+            anchors_bar = anchors_bar.at[clock.anchor(k)].add(end_bar - at_row)
+            if between is not None:
+                dues_bar = dues_bar.at[r - 1].add(at_row)
+        more = [jnp.where(use, x, 0.0) for x in more]
+        args_bar = [_added(*pair) for pair in zip(args_bar, more, starts, strict=True)]
+        if between is None:
+            bar = _pick(use, before, bar)
+        else:
+            summed = _add(bar, before)
+            bar = _pick(use, _pick(to_row, summed, before), bar)
+            r = r - here.astype(jnp.int32)
         if wanted.points is not None:
-            at_point = (k % record.stride == 0) & (k < record.turns)
+            at_point = ~to_row & (k % record.stride == 0) & (k < record.turns)
             bar = _pick(at_point, _add(bar, _at(wanted.points, k // record.stride)), bar)
-        return bar, p, (args_bar, anchors_bar)
+        return k, r, bar, (args_bar, anchors_bar, dues_bar)
+
+    def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
+        """All turns after the first, that one and its rows."""
+
+        def left(carry: tuple) -> Array:
+            k, r, *_ = carry
+            return (k > first) | eqxi.unvmap_any(row_here(k, jnp.array(False), r))
+
+        return jax.lax.while_loop(left, partial(turn, state_before), carry)
 
     # Lanes that were recorded together have one stride; all have points at those of the longest.
     stride = eqxi.unvmap_max(record.stride)
-
-    def single(carry: tuple) -> tuple:
-        k, inner = carry
-        return k - 1, turn(k, _at(record.points, k), inner)
-
     room = jax.tree.leaves(record.points)[0].shape[0] - 1
     longest = 2 ** ceil(log2(record.offsets.shape[0] / room))
 
     def segment(carry: tuple) -> tuple:
         """All turns since the last point before turn k."""
-        k, inner = carry
-        first = k // stride * stride
+        k = carry[0]
+        first = (k - 1) // stride * stride
         y = _at(record.points, first // record.stride)
-        states = jax.tree.map(lambda x: jnp.zeros((longest, *x.shape), x.dtype).at[0].set(x), y)
+        states = _put(_zeros(y, longest), zero, y)
 
         def ahead(carry: tuple) -> tuple:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
             use = (j < record.turns) & (end > t)
             y = _pick(use, path.found(t, end, clock.jump(j), y), y)
-            put = partial(jax.lax.dynamic_update_index_in_dim, index=j + 1 - first, axis=0)
-            return j + 1, y, jax.tree.map(put, states, y)
+            return j + 1, y, _put(states, j + 1 - first, y)
 
         begin = (first, y, states)
-        states = jax.lax.while_loop(lambda c: eqxi.unvmap_any(c[0] < k), ahead, begin)[2]
+        states = jax.lax.while_loop(lambda c: c[0] < k - 1, ahead, begin)[2]
+        return back(first, lambda j: _at(states, j - first), carry)
 
-        def back(carry: tuple) -> tuple:
-            j, inner = carry
-            return j - 1, turn(j, _at(states, j - first), inner)
-
-        return jax.lax.while_loop(lambda c: eqxi.unvmap_any(c[0] >= first), back, (k, inner))
+    def all_back(carry: tuple) -> tuple:
+        if longest == 1:
+            return back(zero, partial(_at, record.points), carry)
+        return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
 
     most = eqxi.unvmap_max(record.turns)  # shared by lanes
-    last = zero if groups is None else groups.of[-1]
-    begin = (most - 1, (wanted.last, last, bars))
-    body = single if longest == 1 else segment
-
-    def left(carry: tuple) -> Array:
-        return eqxi.unvmap_any(carry[0] >= 0)
-
-    ended = _xla.native(partial(jax.lax.while_loop, left, body), begin, stages=path.stages)
-    bar, _, (args_bar, anchors_bar) = ended[1]
-    if groups is not None:
-        bar = _add(bar, _at(row_bars, zero))
-    y0_bar = None
-    if change.y0 is not None:
-        y0_bar = jnp.stack(bar[0]) if isinstance(bar[0], tuple) else bar[0]
-    return Change(y0_bar, args_bar, anchors_bar)
+    rows_left = zero
+    if record.row_turn is not None:
+        rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
+    begin = (most, rows_left, _add(wanted.last, end_bar), bars)
+    ended = _xla.native(all_back, begin, stages=path.stages)
+    _, _, bar, (args_bar, anchors_bar, dues_bar) = ended
+    bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
+    saves_bar = None
+    if moves:
+        ends = jnp.zeros_like(clock.times.saves[:1])
+        saves_bar = jnp.concatenate([ends, dues_bar[:-1], ends])
+    return Change(None if change.y0 is None else bar[0], args_bar, anchors_bar, saves_bar)
 
 
-def again(path: Path, start: PyTree, moved: Sequence[Array], anchors: Array, points: bool) -> Walk:
+def _added(bar: Array, more: Array, start: Array | None) -> Array:
+    """The cotangent of a leaf with more of it, of two rows of a table at their place."""
+    if start is None:
+        return bar + more
+    rows = jax.lax.dynamic_slice_in_dim(bar, start, more.shape[0])
+    return jax.lax.dynamic_update_slice_in_dim(bar, rows + more, start, 0)
+
+
+class _Slots(NamedTuple):
+    """Steps and rows in one sequence, a row before the step that it lies in."""
+
+    begins: Array
+    ends: Array
+    used: Array
+    to_row: Array
+    jumps: Array | None
+
+
+def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Array | None]:
+    """The sequence, and the places of turns and of rows in it."""
+    clock, record = path.clock, path.clock.record
+    index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
+    ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
+    begins = jnp.concatenate([anchors[:1], ends[:-1]])
+    used = (index < record.turns) & (ends > begins)
+    if record.row_turn is None:
+        still = jnp.zeros_like(used)
+        return _Slots(begins, ends, used, still, record.jumps), index, None
+    turn = record.row_turn[:-1]
+    count = turn.shape[0]
+    reached = turn < record.turns
+    before = jnp.searchsorted(turn, index, side="right").astype(jnp.int32)
+    of_turn = index + before
+    of_row = jnp.where(reached, turn + jnp.arange(count, dtype=jnp.int32), 0)
+    size = -(-(index.shape[0] + count) // CHUNK) * CHUNK
+
+    def merged(steps: Array, rows: Array) -> Array:
+        place = jnp.where(reached, of_row, size)
+        out = jnp.zeros((size,), steps.dtype).at[of_turn].set(steps)
+        return out.at[place].set(rows, mode="drop")
+
+    safe = jnp.where(reached, turn, 0)
+    slots = _Slots(
+        merged(begins, begins[safe]),
+        merged(ends, saves[1:-1]),
+        merged(used, reached),
+        merged(jnp.zeros_like(used), reached),
+        None if record.jumps is None else merged(record.jumps, record.jumps[safe]),
+    )
+    return slots, of_turn, of_row
+
+
+def again(
+    path: Path,
+    start: PyTree,
+    moved: Sequence[Array],
+    anchors: Array,
+    saves: Array,
+    points: bool,
+) -> Walk:
     """The motion itself by a scan, which JAX differentiates in any mode and to any order.
 
     The scan skips whole chunks that no lane of a vmapped solve needs. Turns that are not wanted
     repeat the first step and drop its result, so that no derivative meets a state out of reach.
     """
     clock, record = path.clock, path.clock.record
-    index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
-    ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
-    begins = jnp.concatenate([anchors[:1], ends[:-1]])
-    used = (index < record.turns) & (ends > begins)
-    first = jnp.argmax(used)
-    begins, ends = jnp.where(used, begins, begins[first]), jnp.where(used, ends, ends[first])
+    slots, of_turn, of_row = _slots(path, anchors, saves)
+    first = jnp.argmax(slots.used)
+    begins = jnp.where(slots.used, slots.begins, slots.begins[first])
+    ends = jnp.where(slots.used, slots.ends, slots.ends[first])
+    slots = slots._replace(begins=begins, ends=ends)
 
     @partial(jax.checkpoint, prevent_cse=False)
     def step(t: Array, end: Array, y: PyTree, jump: Array | None) -> PyTree:
-        return path.ahead(t, end, jump, y, moved)
+        return path.ahead(path.with_args(moved), t, end, jump, y)
 
-    def one(y: PyTree, slot: tuple) -> tuple[PyTree, PyTree]:
-        t, end, use, jump = slot
-        new = _pick(use, step(t, end, _pick(use, y, start), jump), y)
-        return new, y
+    def one(y: PyTree, slot: _Slots) -> tuple[PyTree, tuple[PyTree, PyTree]]:
+        new = step(slot.begins, slot.ends, _pick(slot.used, y, start), slot.jumps)
+        return _pick(slot.used & ~slot.to_row, new, y), (y, new)
 
-    def chunk(y: PyTree, slots: Any) -> tuple[PyTree, PyTree]:
+    def chunk(y: PyTree, slots: _Slots) -> tuple[PyTree, PyTree]:
         def skip(y: PyTree) -> tuple[PyTree, PyTree]:
-            return y, jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), y)
+            same = jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), y)
+            return y, (same, same)
 
         def take(y: PyTree) -> tuple[PyTree, PyTree]:
             return jax.lax.scan(one, y, slots)
 
-        return jax.lax.cond(eqxi.unvmap_any(slots[2]), take, skip, y)
+        return jax.lax.cond(eqxi.unvmap_any(slots.used), take, skip, y)
 
-    slots = jax.tree.map(lambda x: x.reshape(-1, CHUNK), (begins, ends, used, record.jumps))
-    last, history = _xla.native(partial(jax.lax.scan, chunk), start, slots, stages=path.stages)
-    history = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), history)
-    row_states = point_states = None
-    if record.row_turn is not None:
-        row_states = jax.tree.map(lambda x: x[record.row_turn], history)
+    parts = jax.tree.map(lambda x: x.reshape(-1, CHUNK), slots)
+    last, found = _xla.native(partial(jax.lax.scan, chunk), start, parts, stages=path.stages)
+    befores, afters = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+    rows = point_states = None
+    if of_row is not None:
+        assert record.row_turn is not None
+        reached = record.row_turn[:-1] < record.turns
+
+        def gathered(x: Array) -> Array:
+            wide = reached.reshape(reached.shape + (1,) * (x.ndim - 1))
+            found = jnp.where(wide, x[of_row], 0.0)
+            return jnp.concatenate([found, jnp.zeros_like(x[:1])])
+
+        rows = jax.tree.map(gathered, afters)
     if points:
         count = jax.tree.leaves(record.points)[0].shape[0]
         at = jnp.arange(count, dtype=jnp.int32) * record.stride
         inside = (at < record.turns) & (at // record.stride < count - 1)
-        at = jnp.where(inside, at, 0)
+        at = of_turn[jnp.where(inside, at, 0)]
 
-        def gathered(x: Array) -> Array:
+        def kept(x: Array) -> Array:
             wide = inside.reshape(inside.shape + (1,) * (x.ndim - 1))
             return jnp.where(wide, x[at], 0.0)
 
-        point_states = jax.tree.map(gathered, history)
-    return Walk(last, row_states, point_states)
+        point_states = jax.tree.map(kept, befores)
+    time = clock.time(clock.last, anchors)
+    return Walk(last, time, _joined(start, rows, last, _reached(path, anchors)), point_states)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from functools import partial, singledispatch
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,8 +59,7 @@ class Deviation(NamedTuple):
         return f"{self.size:.1e} of {self.tolerance:.0e} in {self.field}, row {self.row}"
 
 
-@partial(jax.jit, static_argnums=0)
-def replay(entry: Entry, params: Mapping[str, Array], times: Array, q0: Array, v0: Array) -> Motion:
+def replay(entry: Entry, params: Mapping[str, Any], times: Any, q0: Any, v0: Any) -> Motion:
     """Simulate from (q0, v0) and evaluate every quantity of reference files at `times`.
 
     Args:
@@ -72,15 +71,21 @@ def replay(entry: Entry, params: Mapping[str, Array], times: Array, q0: Array, v
     """
     if entry.chart is not None:
         q0, v0 = entry.chart.state(times[0], q0, v0, params)
-    evaluate = jax.vmap(partial(file_quantities, entry, params))
     if len(times) == 1:
-        ok = jnp.int32(jl.Status.ok)
-        return Motion(evaluate(times, q0[None], v0[None]), ok, times[0])
+        rows = _quantities(entry, params, times, q0[None], v0[None])
+        return Motion(rows, jnp.int32(jl.Status.ok), times[0])
     motion = jl.simulate(
         entry.system, q0, v0, times, params, rtol=LOCAL_ERROR, atol=LOCAL_ERROR, throw=False
     )
-    rows = evaluate(times, motion.q, motion.v)
+    rows = _quantities(entry, params, times, motion.q, motion.v)
     return Motion(rows, motion.status, motion.last_time)
+
+
+@partial(jax.jit, static_argnums=0)
+def _quantities(
+    entry: Entry, params: Mapping[str, Array], times: Array, q: Array, v: Array
+) -> Mapping[str, Array]:
+    return jax.vmap(partial(file_quantities, entry, params))(times, q, v)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -155,6 +160,7 @@ def main(paths: Sequence[Path]) -> int:
             continue
         cases += len(reference.cases)
         failed += sum(not _report(path, reference.entry, case) for case in reference.cases)
+        jax.clear_caches()  # no file needs another's programs, and all of them take gigabytes
     verdicts = [f"{failed} out of tolerance" if failed else "all within tolerance"] * bool(cases)
     verdicts += [f"{refused} refused"] * bool(refused)
     print(f"files {len(paths)}, cases {cases}: {', '.join(verdicts)}")

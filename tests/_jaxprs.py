@@ -52,11 +52,16 @@ def _walk(jaxpr, times, inside, turns):
         if name == "while":
             assert turns is not None, "a while loop has no number of turns to count"
             repeats = turns
-        for inner in _executed(name, eqn.params):
+        for inner in _executed(name, eqn):
             yield from _walk(inner, times * repeats, (*inside, name), turns)
 
 
-def _executed(name, params):
+def _executed(name, eqn):
+    params = eqn.params
+    if name == "linear_map":  # holds its programs as functions
+        form, count = params["form"], params["count"]
+        like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+        return [jax.make_jaxpr(form.forward)(like[:count], like[count:]).jaxpr]
     if name == "custom_linear_solve":  # its products and its transpose serve derivatives only
         return [params["jaxprs"].solve.jaxpr]
     found = [leaf for value in params.values() for leaf in _leaves(value)]

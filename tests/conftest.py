@@ -20,7 +20,7 @@ if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
 
 import jax
 import pytest
-from _footprint import Footprint
+from _footprint import MAPS, Footprint, maps
 
 import jaxlag as jl  # before the first compilation: it sets XLA's bound on small loops
 from jaxlag._lowering import ArrayTerms
@@ -76,6 +76,14 @@ def drop():
     gc.collect()
     if trim is not None:
         trim(0)
+
+
+@pytest.fixture(autouse=True)
+def bounded():
+    """A module of many programs lets go of them on the way, half the bound of the guard left."""
+    yield
+    if maps() > MAPS / 2:
+        drop()
 
 
 @pytest.fixture(scope="module", autouse=True)

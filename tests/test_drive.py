@@ -291,7 +291,7 @@ def test_lanes_are_written_elementwise():
             eqx.tree_at(lambda s: s.scan_kind, diffrax.Tsit5(), "lax", is_leaf=lambda x: x is None),
             None,
             diffrax.ODETerm(field),
-            lambda args, t: args,
+            lambda args, t: (args, []),
         )
         saves = jnp.stack([start, 0.37 * stop, stop])
         times = _drive.Times(start, stop, None, saves)

@@ -115,7 +115,7 @@ def recorded(motion: Motion, x):
         inexact, rest, setup, static = _replay.halves(_simulate.pose(plan, values)[2])
         if outcome is None:
             return _replay._recorded(inexact, rest, setup, static)
-        rows, _ = _replay._replay(rest, setup, static, outcome, inexact)
+        rows = _replay._replay(rest, setup, static, outcome, inexact)
         n = motion.system.size
         return jnp.concatenate([rows.saved[-1], rows.saved[1, :n]])
 

@@ -33,11 +33,14 @@ def one_step(solver, h, y0=Y0, field=swing):
 
 PAIRS = [jl.solvers.Tsit5(), jl.solvers.Dopri5(), jl.solvers.Dopri8(), jl.solvers.Prince9()]
 NAMED = pytest.mark.parametrize("solver", PAIRS, ids=lambda solver: type(solver).__name__)
+LOOPED = pytest.mark.parametrize("looped", [False, True], ids=["written_out", "in_a_loop"])
 
 
+@LOOPED
 @NAMED
-def test_a_step_is_that_of_the_same_method_with_a_loop(solver):
+def test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped):
     """To roundings of the largest sum: y1, the error estimate, stages and the next first stage."""
+    solver = type(solver)(looped=looped)
     y1, error, dense, last, _ = one_step(solver, 0.2)
     y1_, error_, dense_, (_, last_), _ = one_step(solver.stock, 0.2)
     most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
@@ -124,9 +127,10 @@ def test_output_between_steps_of_order_9_is_of_order_8():
     np.testing.assert_allclose(output.evaluate(0.3 + h / 2), half, atol=8.7e-9)
 
 
-def test_states_may_be_pytrees():
+@LOOPED
+def test_states_may_be_pytrees(looped):
     y0 = {"angle": jnp.array(1.0), "rate": jnp.array(0.2)}
-    y1 = one_step(jl.solvers.Dopri8(), 0.2, y0, swing_by_parts)[0]
+    y1 = one_step(jl.solvers.Dopri8(looped), 0.2, y0, swing_by_parts)[0]
     flat = one_step(jl.solvers.Dopri8(), 0.2)[0]
     np.testing.assert_allclose([y1["angle"], y1["rate"]], flat, rtol=4 * EPS)
 
@@ -180,15 +184,38 @@ def test_it_is_a_solver_of_diffrax():
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-8)
 
 
+@LOOPED
 @pytest.mark.parametrize("made_jump", [False, True])
-def test_steps_share_a_stage_unless_the_field_jumped(made_jump):
-    solver, term = jl.solvers.Dopri8(), diffrax.ODETerm(swing)
+def test_steps_share_a_stage_unless_the_field_jumped(made_jump, looped):
+    """Whether that is known while tracing or not, and for each of several lanes."""
+    solver, term = jl.solvers.Dopri8(looped), diffrax.ODETerm(swing)
     _, _, _, last, _ = one_step(solver, 0.2)
     wrong = last + 1.0
-    step = jax.jit(
-        lambda jump: solver.step(
-            term, jnp.array(0.3), jnp.array(0.5), Y0, PUSH, wrong, made_jump=jump
-        )[0]
-    )
-    moved = np.abs(step(jnp.array(made_jump)) - one_step(solver, 0.2)[0]).max()
-    assert (moved < 32 * EPS) == made_jump
+
+    def step(jump):
+        ends = jnp.array(0.3), jnp.array(0.5)
+        return solver.step(term, *ends, Y0, PUSH, wrong, made_jump=jump)[0]
+
+    right = one_step(solver, 0.2)[0]
+    for found in (step(made_jump), jax.jit(step)(jnp.array(made_jump))):
+        assert (np.abs(found - right).max() < 32 * EPS) == made_jump
+    lanes = jax.jit(jax.vmap(step))(jnp.array([made_jump, not made_jump]))
+    moved = np.abs(lanes - right).max(axis=1)
+    np.testing.assert_array_equal(moved < 32 * EPS, [made_jump, not made_jump])
+
+
+def test_the_loop_over_stages_holds_the_field_once():
+    """Written out a step of order 8 holds it 13 times, besides the first stage of the first."""
+    term = diffrax.ODETerm(swing)
+
+    def copies(looped, made_jump):
+        solver = jl.solvers.Dopri8(looped)
+        ends = jnp.array(0.3), jnp.array(0.5)
+
+        def step(y0, first):
+            return solver.step(term, *ends, y0, PUSH, first, made_jump=made_jump)[0]
+
+        return str(jax.make_jaxpr(step)(Y0, Y0)).count("= sin ")
+
+    assert [copies(False, False), copies(False, True)] == [13, 14]
+    assert [copies(True, False), copies(True, True)] == [1, 1]

@@ -64,14 +64,13 @@ def body(
     program: Program,
     carried: Float[Array, " k"],
     t: Array,
-    q: Sequence[Array],
-    v: Sequence[Array],
+    q: Float[Array, " n"],
+    v: Float[Array, " w"],
     inputs: Mapping[str, Any],
-    dtype: Any,
     lanes: bool = False,
     in_loop: bool = False,
-) -> tuple[Array, ...]:
-    """The results at one state, given element by element.
+) -> Float[Array, " r"]:
+    """The results at one state.
 
     Args:
         program: straight-line code.
@@ -80,23 +79,22 @@ def body(
         q: coordinates.
         v: velocities.
         inputs: values of the inputs by name.
-        dtype: of the results.
         lanes: whether this is vmapped: sines and cosines of one argument by one polynomial.
         in_loop: whether this is in a loop over one trajectory or a few lanes.
     """
-    names = {name for name, _ in program.inputs}
+    names, dtype = {name for name, _ in program.inputs}, q.dtype
     flat = leaves(dict(inputs)) if "inputs" in names else []
-    values = {"t": [t], "q": q, "v": v, "inputs": flat}
+    values = {"t": [t], "q": elements(q), "v": elements(v), "inputs": flat}
     read = [key for key in program.inputs if key[0] not in FIXED]
     given = [values[name][index] for name, index in read]
     kinds = {jnp.result_type(x) for x in given} | {jnp.dtype(dtype)}
     kind = program, jnp.dtype(dtype), lanes
     short = len(program.body) <= (INLINE_IN_LOOP if in_loop else INLINE_UP_TO)
     if short or len(kinds) > 1 or jax.default_backend() != "cpu":
-        return _function(*kind)(carried, given)
+        return jnp.stack(_function(*kind)(carried, given))
     # One flat array in and one out.
     row = jnp.stack(given) if given else jnp.zeros((0,), dtype)
-    return tuple(elements(called(*kind)(carried, row)))
+    return called(*kind)(carried, row)
 
 
 @lru_cache(maxsize=256)

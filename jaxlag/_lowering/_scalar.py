@@ -1,10 +1,9 @@
 """The scalar program behind the terms: every element of every array its own scalar."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -103,107 +102,95 @@ class ScalarTerms(Terms):
             return self.array.acceleration(t, q, v, params, inputs, prepared, kept)
         if prepared is None:
             prepared = self.prepare(q, params, inputs, kept=kept)
-        state = (_emit.elements(q), _emit.elements(v))
-        return jnp.stack(self.elements(t, *state, q.dtype, params, inputs, prepared))
+        return self.rates(t, q, v, params, inputs, prepared)
 
-    def elements(
+    def rates(
         self,
         t: Array,
-        q: Sequence[Array],
-        v: Sequence[Array],
-        dtype: Any,
+        q: Array,
+        v: Array,
         params: Any,
         inputs: Mapping[str, Any],
         prepared: ScalarPrepared,
-    ) -> tuple[Array, ...]:
-        """The acceleration, element by element, from those of q and v; (v, u') from q and u."""
-        program = self._equations(q, dtype, params, inputs).program
-        mode = self.lanes, self.in_loop
-        return _emit.body(program, prepared.acceleration, t, q, v, inputs, dtype, *mode)
+    ) -> Array:
+        """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
+        program = self._equations(q, params, inputs).program
+        return self._run(program, prepared.acceleration, t, q, v, inputs)
 
     def velocities(
         self,
         t: Array,
-        q: Sequence[Array],
-        u: Sequence[Array],
-        dtype: Any,
+        q: Array,
+        u: Array,
         params: Any,
         inputs: Mapping[str, Any],
         prepared: ScalarPrepared,
-    ) -> tuple[Array, ...]:
-        """v, element by element, from the elements of q and of quasi-velocities u."""
-        code = self._equations(q, dtype, params, inputs).velocity
+    ) -> Array:
+        """v at (q, u) of quasi-velocities."""
+        code = self._equations(q, params, inputs).velocity
         assert code is not None
-        assert prepared.rates is not None
-        return _emit.body(code, prepared.rates, t, q, u, {}, dtype, self.lanes, self.in_loop)
+        return self._run(code, prepared.rates, t, q, u, {})
 
-    def _equations(
-        self, q: Sequence[Array], dtype: Any, params: Any, inputs: Mapping[str, Any]
-    ) -> Equations:
-        like = jax.ShapeDtypeStruct((len(q),), dtype)
-        equations = self.lowered(like, params, inputs).equations
+    def _run(
+        self,
+        program: Program,
+        carried: Array | None,
+        t: Array,
+        q: Array,
+        v: Array,
+        inputs: Mapping[str, Any],
+    ) -> Array:
+        assert carried is not None
+        return _emit.body(program, carried, t, q, v, inputs, self.lanes, self.in_loop)
+
+    def _equations(self, q: Array, params: Any, inputs: Mapping[str, Any]) -> Equations:
+        equations = self.lowered(q, params, inputs).equations
         assert equations is not None
         return equations
 
     def surface(
         self,
         t: Array,
-        q: Sequence[Array],
-        v: Sequence[Array],
-        dtype: Any,
+        q: Array,
+        v: Array,
         params: Any,
         inputs: Mapping[str, Any],
         prepared: ScalarPrepared,
     ) -> Surface:
-        """The constraints near the state (q, v), on elements; positions alone near a (q, u)."""
-        code = self._equations(q, dtype, params, inputs).surface
+        """The constraints near the state (q, v); positions alone near a (q, u)."""
+        code = self._equations(q, params, inputs).surface
         assert code is not None
 
-        def run(program: Program, carried: Any, q: Sequence[Array], v: Sequence[Array]) -> tuple:
-            mode = self.lanes, self.in_loop
-            return _emit.body(program, carried, t, q, v, {}, dtype, *mode)
-
         def columns(program: Program, carried: Any) -> Callable:
-            flat, n = run(program, carried, q, v), len(q)
+            K = self._run(program, carried, t, q, v, {}).reshape(-1, q.shape[0])
+            return lambda c: jnp.sum(c[:, None] * K, axis=0)
 
-            def apply(c: tuple) -> tuple:
-                used = [(flat[k * n : (k + 1) * n], x) for k, x in enumerate(c)]
-                return tuple(sum(column[i] * x for column, x in used) for i in range(n))
+        def position(q: Array) -> Array:
+            return self._run(code.position, prepared.position, t, q, v, {})
 
-            return apply
+        def velocity(q: Array, v: Array) -> Array:
+            return self._run(code.velocity, prepared.velocity, t, q, v, {})
 
         shift = columns(code.shift, prepared.shift)
         if self.array.quasi is not None:
-            return Surface(lambda q: run(code.position, prepared.position, q, v), None, shift, None)
+            return Surface(position, None, shift, None)
         kick = shift if code.kick is None else columns(code.kick, prepared.kick)
-        return Surface(
-            (lambda q: run(code.position, prepared.position, q, v))
-            if code.position.results
-            else None,
-            lambda q, v: run(code.velocity, prepared.velocity, q, v),
-            shift,
-            kick,
-        )
+        return Surface(position if code.position.results else None, velocity, shift, kick)
 
     def multipliers(
         self,
         t: Array,
-        q: Sequence[Array],
-        v: Sequence[Array],
-        dtype: Any,
+        q: Array,
+        v: Array,
         params: Any,
         inputs: Mapping[str, Any],
         prepared: ScalarPrepared,
-    ) -> tuple[Array, ...]:
-        """The multipliers that forces depend on, from the elements of q and v."""
-        surface, mode = (
-            self._equations(q, dtype, params, inputs).surface,
-            (self.lanes, self.in_loop),
-        )
+    ) -> Array:
+        """The multipliers that forces depend on, at (q, v)."""
+        surface = self._equations(q, params, inputs).surface
         assert surface is not None
         assert surface.lam is not None
-        assert prepared.lam is not None
-        return _emit.body(surface.lam, prepared.lam, t, q, v, inputs, dtype, *mode)
+        return self._run(surface.lam, prepared.lam, t, q, v, inputs)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any

@@ -2,6 +2,7 @@
 
 from jaxlag.solvers._dopri5 import Dopri5 as Dopri5
 from jaxlag.solvers._dopri8 import Dopri8 as Dopri8
+from jaxlag.solvers._explicit import AbstractExplicit as AbstractExplicit
 from jaxlag.solvers._fixed import AbstractFixedStep as AbstractFixedStep
 from jaxlag.solvers._partitioned import AbstractPartitioned as AbstractPartitioned
 from jaxlag.solvers._partitioned import GaussLegendre as GaussLegendre
@@ -9,4 +10,3 @@ from jaxlag.solvers._partitioned import LobattoIIIAB as LobattoIIIAB
 from jaxlag.solvers._prince9 import Prince9 as Prince9
 from jaxlag.solvers._splitting import Splitting as Splitting
 from jaxlag.solvers._tsit5 import Tsit5 as Tsit5
-from jaxlag.solvers._unrolled import AbstractUnrolled as AbstractUnrolled

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import diffrax
 
-from jaxlag.solvers._unrolled import AbstractUnrolled
+from jaxlag.solvers._explicit import AbstractExplicit
 
 
-class Dopri8(AbstractUnrolled):
+class Dopri8(AbstractExplicit):
     """Order 8 with an embedded method of order 7, 14 stages of which two steps share one.
 
     Between steps `diffrax` interpolates with order 5: in the middle of a step of 0.8 s on a driven

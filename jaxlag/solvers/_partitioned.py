@@ -51,7 +51,8 @@ class AbstractPartitioned(AbstractFixedStep):
     The terms have the methods `sections`, `joined` (as for `Splitting`) and `canonical(args)`, an
     object with
 
-        time(tau) -> t,    canonical(t, q, v) -> (p, F),    power(t, q, v) -> rates of work,
+        time(tau) -> t,    span(tau0, tau1) -> t1 - t0,    canonical(t, q, v) -> (p, F),
+        power(t, q, v) -> rates of work,
         rows -> their number,    reaction(t, q, lam) -> A^T lam,
         position(t, q, lam) -> phi,    velocity(t, q, v, lam) -> A v + b,
 
@@ -75,11 +76,11 @@ class AbstractPartitioned(AbstractFixedStep):
         pair, form, (q0, v0, work) = self.pair, terms.canonical(args), terms.sections(y0)
         b, a, ah = (jnp.asarray(x, q0.dtype) for x in pair[1:])
         begin, end = form.time(t0), form.time(t1)
-        h = (end - begin).astype(q0.dtype)
+        h = form.span(t0, t1).astype(q0.dtype)
         # A step of no length, which nobody asks for, would divide 0 by 0 in its derivative.
         h = jnp.where(h == 0, jnp.sqrt(jnp.finfo(h.dtype).eps), h)
         s, n, rows = self.stages, q0.shape[0], form.rows
-        ts = begin + jnp.asarray(pair.c, begin.dtype) * (end - begin)
+        ts = begin + jnp.asarray(pair.c, begin.dtype) * form.span(t0, t1)
         p0, _ = form.canonical(begin, q0, v0)
 
         def unpacked(z: Array) -> tuple[Array, Array]:

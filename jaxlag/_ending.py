@@ -1,0 +1,252 @@
+"""How a trajectory ended, and what that concerns."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxlag import _params
+from jaxlag._dynamics import Dynamics, still
+from jaxlag._forces import reads_lam
+from jaxlag._kkt import FORMULATIONS, augmented, factor_kkt, masked
+from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
+from jaxlag._quasi import SINE
+from jaxlag._record import Outcome, Times
+from jaxlag._start import Start, residuals
+from jaxlag._status import Status
+from jaxlag._step import Arguments
+
+
+class Ending(NamedTuple):
+    """How a trajectory ended, as far as the solve knows.
+
+    Attributes:
+        status: int32, see `Status`; `explained` may tell more.
+        where: index of the coordinate or constraint row that it concerns; -1 if none is known.
+        tried: end of the last attempted step, s.
+        state: the last good state.
+    """
+
+    status: Int[Array, "*batch"]
+    where: Int[Array, "*batch"]
+    tried: Float[Array, "*batch"]
+    state: Float[Array, "*batch m"]
+
+
+_OPEN = (
+    *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
+    *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
+    Status.implicit_solve_failed,
+)
+"""Outcomes of which `explained` may say more."""
+
+
+def ended(
+    dynamics: Dynamics, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
+) -> Ending:
+    """What a solve knows of its end, at the price of nothing."""
+    status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
+    status = jnp.where(begun.pressed, status, int(Status.no_reaction_solution))
+    kind = jnp.where(
+        begun.consistent.contradictory,
+        int(Status.contradictory_rows),
+        int(Status.inconsistent_start),
+    )
+    kind = jnp.where(begun.consistent.complete, kind, int(Status.kinematics_singular))
+    status = jnp.where(begun.consistent.ok, status, kind)
+    short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
+    status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
+    status = jnp.where(begun.valid, status, int(Status.bad_value))
+
+    faults, n = ~jnp.isfinite(still(y0)), dynamics.system.size
+    start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
+    # Of quasi-velocities it would be no coordinate.
+    start = jnp.where(start < n, start, start % n if dynamics.quasi is None else -1)
+    start = start.astype(jnp.int32)
+    where = jnp.where(status == int(Status.bad_value), start, -1)
+    if dynamics.rows.size:
+        fault = (status == int(Status.inconsistent_start)) | (
+            status == int(Status.contradictory_rows)
+        )
+        where = jnp.where(fault, begun.consistent.row, where)
+    tried = dynamics.clock(outcome.tried, args)
+    found = status.astype(jnp.int32), where.astype(jnp.int32), tried, outcome.state
+    return still(Ending(*found))
+
+
+def is_open(ending: Ending) -> bool:
+    """Whether `explained` may say more of one of these endings; True where they are traced."""
+    if not _params.concrete(ending.status):
+        return True
+    return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
+
+
+class Scene(NamedTuple):
+    """What a motion was of, to explain it by: the key of a compiled program."""
+
+    system: Any
+    params: _params.Static
+    inputs: _params.Static
+    formulation: str
+    stabilization: Any
+    kinematic: bool  # quasi-velocities enter, whose kinematics may be singular
+
+
+def dynamics_of(
+    scene: Scene, ts: Array, q0: Array, v0: Array, params: Any, inputs: Any
+) -> tuple[Dynamics, Arguments]:
+    """The equations of a motion from (q0, v0), and their arguments."""
+    dynamics = Dynamics(
+        scene.system,
+        scene.params,
+        scene.inputs,
+        None,
+        None,
+        _params.UNKNOWN,
+        formulation=scene.formulation,
+        stabilization=scene.stabilization,
+    )
+    args = dynamics.arguments(params, inputs, ts)
+    given, _ = dynamics.given(args)
+    dynamics = replace(dynamics, rows=dynamics.system.rows(given, q0.dtype))
+    start = dynamics.state_of(ts[0], q0, v0, given)
+    return dynamics, dynamics.prepare(jnp.zeros_like(args.origin), start, args)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def explained(scene: Scene, batch: int, given: Any) -> Ending:
+    """The endings with what is found when one looks at the states around them.
+
+    Args:
+        scene: what moved.
+        batch: number of batch axes.
+        given: (ending, last time, ts, q0, v0, traced halves of params and inputs).
+    """
+
+    def one(given: Any) -> Ending:
+        ending, time, ts, q0, v0, params, inputs = still(given)
+        # Kinematics that are singular at the start have no v0.
+        v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
+        dynamics, args = dynamics_of(scene, ts, q0, v0, params, inputs)
+        time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
+        return _explained(dynamics, ending, time, tried, start, q0, args, scene.kinematic)
+
+    for _ in range(batch):
+        one = jax.vmap(one)
+    return one(given)
+
+
+def _explained(
+    dynamics: Dynamics,
+    ending: Ending,
+    time: Array,
+    tried: Array,
+    start: Array,
+    q0: Array,
+    args: Arguments,
+    kinematic: bool,
+) -> Ending:
+    """What can be said by the state a failed step started from and the one it was heading for.
+
+    The latter, q + (t1 - t0) v, is asked where the former is sound.
+    """
+    status = ending.status
+    # Both states in one batch: the terms are traced and compiled once.
+    q, w = dynamics.parts(ending.state)
+    _, _, v, _ = dynamics.state(time, ending.state, args)
+    ahead = jnp.concatenate([q + (tried - time).astype(q.dtype) * v, w])
+    last = ending.state[: ahead.shape[0]]
+    taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
+    args = dynamics.within(args, time)
+    masses, worsts, rows = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
+    mass = jnp.where(masses[0] >= 0, masses[0], masses[1])
+    row = jnp.where(rows[0] >= 0, rows[0], rows[1])
+    worst = jnp.where(jnp.all(jnp.isfinite(ahead)), worsts[1], worsts[0])
+
+    unexplained = status == int(Status.nonfinite)
+    if dynamics.rows.size:
+        dependent = (unexplained | (status == int(Status.step_below_resolution))) & (row >= 0)
+        status = jnp.where(dependent, int(Status.rank_change), status)
+        if any(map(reads_lam, dynamics.system.forces)):
+            sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
+            status = jnp.where(unexplained & sound, int(Status.no_reaction_solution), status)
+    status = jnp.where(unexplained & (mass >= 0), int(Status.mass_singular), status)
+    turned = jnp.full((), -1, jnp.int32)
+    if kinematic:
+        turned = _turned(dynamics, time, q, start, q0, args)
+        failed = unexplained | (status == int(Status.step_below_resolution))
+        status = jnp.where(failed & (turned >= 0), int(Status.kinematics_singular), status)
+    concerns = {
+        Status.mass_singular: mass,
+        Status.nonfinite: worst,
+        Status.step_below_resolution: worst,
+        Status.implicit_solve_failed: worst,
+        Status.kinematics_singular: turned,
+    }
+    if dynamics.rows.size:
+        farthest = _farthest(dynamics, tried, states[1], args)
+        concerns |= {
+            Status.projection_failed: farthest,
+            Status.rank_change: jnp.where(row >= 0, row, farthest),
+            Status.no_reaction_solution: jnp.asarray(dynamics.contact_row),
+        }
+    where = ending.where
+    for kind, index in concerns.items():
+        where = jnp.where(status == int(kind), index.astype(jnp.int32), where)
+    return ending._replace(status=status.astype(jnp.int32), where=where)
+
+
+def _turned(
+    dynamics: Dynamics, tau: Array, q: Array, tau0: Array, q0: Array, args: Arguments
+) -> Int[Array, ""]:
+    """The quasi-velocity that follows from those before it, or came close to it; -1 for none."""
+    quasi, params = dynamics.system.quasi, dynamics.given(args)[0]
+    assert quasi is not None
+    eps = float(jnp.finfo(q.dtype).eps)
+
+    def sines(tau: Array, q: Array) -> Array:
+        return quasi.sines(dynamics.clock(tau, args), q, params, q.dtype)
+
+    now = sines(tau, q)
+    # A small angle of its own, as of v0 + 1e-5 v1 and v0, is no fault.
+    found = (now < jnp.minimum(eps**0.25, 0.01 * sines(tau0, q0))) | ~(now > SINE * eps)
+    found = found & jnp.all(jnp.isfinite(q))
+    return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+
+
+def _culprits(
+    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
+    """(coordinate without inertia, one of non-finite Q - h or else largest |a|, dependent row).
+
+    -1 where there is none.
+    """
+    M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
+    row = jnp.full((), -1, jnp.int32)
+    # A non-finite component spreads through the solve: look at the right-hand side first.
+    if dynamics.rows.size:
+        A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
+        if dynamics.quasi is None:
+            _, independent = factor_kkt(M, A, args.kept, FORMULATIONS[0]).healthy
+            row = jnp.where(jnp.all(independent), -1, jnp.argmin(independent)).astype(jnp.int32)
+        M, _ = augmented(M, masked(A, args.kept))
+    factor = factor_mass(M)
+    a = solve_mass(M, effort, factor)
+    suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
+    finite = jnp.isfinite(suspect)
+    worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
+    return first_unhealthy(M, factor), worst.astype(jnp.int32), row
+
+
+def _farthest(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:
+    """The constraint row with the largest residual, in units of its norm."""
+    at = dynamics.state(tau, y, args)
+    A, _ = dynamics.terms.rows(*at)
+    phi, rate = residuals(dynamics, *at)
+    size = jnp.abs(phi) + jnp.abs(rate)
+    unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+    return jnp.argmax(size / jnp.where(unit > 0, unit, 1.0)).astype(jnp.int32)

@@ -1,0 +1,215 @@
+"""Explicit Runge-Kutta steps, written out stage by stage or in a loop over their stages."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+# Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
+# tracing and compiling and milliseconds of a solve, written out | in a loop: pendulum (4 lines)
+# 0.7, 0.07 | 0.6, 0.12; double pendulum (28) 1.1, 0.19 | 0.7, 0.24; elastic one (40) 1.1, 0.16 |
+# 0.8, 0.24; 3 links (85) 1.5, 0.14 | 1.0, 0.22; quadcopter (117) 2.1, 0.22 | 1.4, 0.29; 4 links
+# (156) 2.1, 0.18 | 1.0, 0.23; 15 coordinates of 5 bodies (233) 4.0, 0.19 | 1.3, 0.20; aircraft
+# (335) 5.2, 0.34 | 3.0, 0.47; 6 links (375) 4.4, 0.36 | 1.2, 0.32.
+WRITTEN_OUT = 1600
+
+
+def in_loop_over_stages(lines: int | None, stages: int) -> bool:
+    """Whether a step is a loop over its stages: the program then holds dy/dt once.
+
+    Args:
+        lines: of straight-line code for dy/dt; None for a program on arrays.
+        stages: of the method.
+    """
+    return lines is None or lines * stages > WRITTEN_OUT
+
+
+class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
+    """An explicit Runge-Kutta method.
+
+    k_i = f(t + c_i h, y + h sum_{j<i} a_ij k_j), y1 = y + h sum_i b_i k_i; the error estimate is
+    h sum_i e_i k_i. The units are those of the problem; y is any pytree of arrays.
+
+    Written out, a stage is a sum of the stages before it with the zeros of the tableau left out,
+    so that a step is straight-line code and a loop of steps over a small system one function
+    without calls. In a loop over stages the program holds f once: it compiles in a fraction of
+    the time and runs as fast where f is long.
+
+    The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
+    one of the next step.
+
+    Steps, error estimates and interpolation are those of `stock`, up to the order of sums. With a
+    loop over stages, reverse derivatives need `made_jump` to be known while tracing.
+
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1, II.14.
+
+    Attributes:
+        looped: whether there is a loop over stages. None: as `simulate` finds it faster, and
+            written out elsewhere.
+    """
+
+    looped: bool | None = eqx.field(static=True, default=None)
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar[Callable]
+
+    @property
+    @abstractmethod
+    def stock(self) -> diffrax.AbstractERK:
+        """The same method as a class of diffrax."""
+
+    @property
+    def stages(self) -> int:
+        """Number of stages that a step evaluates."""
+        tableau = tableau_of(type(self))
+        return len(tableau.rows) + (0 if tableau.fsal else 1)
+
+    @property
+    def shares_stages(self) -> bool:
+        """Whether the last stage of a step is the first one of the next."""
+        return tableau_of(type(self)).fsal
+
+    def order(self, terms: Any) -> int:
+        """Order of the step."""
+        order = self.stock.order(terms)
+        assert order is not None
+        return int(order)
+
+    def error_order(self, terms: Any) -> Any:
+        """Order of the local error estimate."""
+        return self.stock.error_order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        """The first stage of the first step, where steps share one."""
+        return terms.vf(t0, y0, args) if tableau_of(type(self)).fsal else None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """dy/dt."""
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Any, Any, dict[str, Any], Any, diffrax.RESULTS]:
+        """One step from t0 to t1: (y1, error estimate, stages, first stage of the next, result).
+
+        Where `made_jump` is the constant True, `solver_state` is not read.
+        """
+        tableau = tableau_of(type(self))
+        fresh = True if not tableau.fsal else made_jump
+        stages = _in_loop if self.looped else _written_out
+        y1, error, k, last = stages(tableau, terms, t0, t1, y0, solver_state, fresh, args)
+        # diffrax's interpolation takes the stages as increments.
+        return y1, error, {"y0": y0, "y1": y1, "k": k}, last, diffrax.RESULTS.successful
+
+
+class Tableau(NamedTuple):
+    """Coefficients of stages 2, 3, ...; weights of the step and of its error estimate."""
+
+    rows: np.ndarray  # a_ij, (s - 1, s)
+    c: np.ndarray
+    b: np.ndarray
+    e: np.ndarray
+    fsal: bool
+
+
+@lru_cache
+def tableau_of(method: type[AbstractExplicit]) -> Tableau:
+    """The coefficients of a method."""
+    tableau: Any = method().stock.tableau
+    A = np.zeros((len(tableau.c), len(tableau.c) + 1))
+    for i, row in enumerate(tableau.a_lower):
+        A[i, : len(row)] = row
+    b, e = np.asarray(tableau.b_sol, float), np.asarray(tableau.b_error, float)
+    return Tableau(A, np.asarray(tableau.c, float), b, e, bool(tableau.fsal))
+
+
+def _added(y: Any, change: Any) -> Any:
+    return jax.tree.map(jnp.add, y, change)
+
+
+def _sum(weights: np.ndarray, k: Sequence[Any]) -> Any:
+    """sum_j weights_j k_j."""
+    used = [(float(w), stage) for w, stage in zip(weights, k, strict=False) if w != 0.0]
+
+    def total(*parts: Array) -> Array:
+        out = used[0][0] * parts[0]
+        for (w, _), part in zip(used[1:], parts[1:], strict=True):
+            out = out + w * part
+        return out
+
+    return jax.tree.map(total, *(stage for _, stage in used))
+
+
+def _written_out(
+    tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
+) -> tuple[Any, Any, Any, Any]:
+    """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
+    per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
+
+    def increments(rates: Any) -> Any:
+        """They are read in every later stage: they end in divisions, which XLA computes once."""
+        return jax.tree.map(lambda x: x / per_step, rates)
+
+    if fresh is True:
+        first = terms.vf(t0, y0, args)
+    elif fresh is False:
+        first = known
+    else:
+        first = lax.cond(fresh, lambda _: terms.vf(t0, y0, args), lambda k: k, known)
+    k, stage, last = [increments(first)], y0, None
+    for row, c in zip(tableau.rows, tableau.c, strict=True):
+        t = t1 if c == 1.0 else t0 + float(c) * (t1 - t0)
+        stage = _added(y0, _sum(row, k))
+        last = terms.vf(t, stage, args)
+        k.append(increments(last))
+    if not tableau.fsal:
+        stage, last = _added(y0, _sum(tableau.b, k)), None
+    return stage, _sum(tableau.e, k), jax.tree.map(lambda *x: jnp.stack(x), *k), last
+
+
+def _in_loop(
+    tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
+) -> tuple[Any, Any, Any, Any]:
+    """The same, with dy/dt once in the program."""
+    h, size = terms.contr(t0, t1), len(tableau.c) + 1
+    rows = np.concatenate([np.zeros((1, size)), tableau.rows])
+    nodes = np.concatenate([[0.0], tableau.c])
+    traced = not isinstance(fresh, bool)
+
+    def sums(weights: Array, k: Any) -> Any:
+        def total(x: Array) -> Array:
+            wide = weights.reshape((-1,) + (1,) * (x.ndim - 1)).astype(x.dtype)
+            return h * jnp.sum(wide * x, axis=0)
+
+        return jax.tree.map(total, k)
+
+    def stage(i: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        k, _ = carry
+        at = lambda x: lax.dynamic_index_in_dim(jnp.asarray(x), i, keepdims=False)  # noqa: E731
+        y = _added(y0, sums(at(rows), k))
+        rates = terms.vf(t0 + at(nodes).astype(t0.dtype) * (t1 - t0), y, args)
+        if traced:
+            rates = jax.tree.map(lambda x, k: jnp.where((i > 0) | fresh, x, k), rates, known)
+        put = lambda k, x: lax.dynamic_update_index_in_dim(k, x, i, 0)  # noqa: E731
+        return jax.tree.map(put, k, rates), y
+
+    k = jax.tree.map(lambda y: jnp.zeros((size, *y.shape), y.dtype), y0)
+    begin: Any = 0
+    if fresh is not True:
+        k = jax.tree.map(lambda k, x: k.at[0].set(x), k, known)
+        # One bound for all lanes.
+        begin = jnp.where(eqxi.unvmap_any(fresh), 0, 1) if traced else 1
+    k, last_stage = lax.fori_loop(begin, size, stage, (k, y0))
+    if tableau.fsal:
+        y1, last = last_stage, jax.tree.map(lambda x: x[-1], k)
+    else:
+        y1, last = _added(y0, sums(jnp.asarray(tableau.b), k)), None
+    return y1, sums(jnp.asarray(tableau.e), k), jax.tree.map(lambda x: h * x, k), last

@@ -1,0 +1,262 @@
+"""The loop at its edges: knots at the start, rows beside step ends, times far from zero."""
+
+from functools import partial
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _jaxprs import loop, operations
+
+import jaxlag as jl
+
+EPS = np.finfo(float).eps
+
+
+def _kinetic(t, q, v, params):
+    return 0.5 * v[0] ** 2 + 0.5 * params["k"] * q[0] ** 2
+
+
+mass = jl.System(
+    _kinetic,
+    ("x",),
+    forces=(jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"][None], "push"),),
+)
+"""x'' = k x + u(t)."""
+
+FREE = {"k": 0.0}
+KINDS = {"hold": jl.ZeroOrderHold, "line": jl.Linear}
+
+
+def moved(table, ts, start=(0.1, 0.2), params=FREE, **options):
+    return jl.simulate(
+        mass, [start[0]], [start[1]], ts, params, inputs={"u": table}, throw=False, **options
+    )
+
+
+def closed_form(kind, times, values, ts, start=(0.1, 0.2)):
+    """(x, x') of x'' = u at ts, the polynomials between the knots one after another."""
+
+    def to(t):
+        x, v, now = *start, float(ts[0])
+        sign = 1.0 if t >= now else -1.0
+        inner = sorted((k for k in times if min(now, t) < k < max(now, t)), reverse=sign < 0)
+        for end in [*inner, t]:
+            h, middle = end - now, 0.5 * (now + end)
+            i = int(np.clip(np.searchsorted(times, middle, side="right") - 1, 0, len(times) - 2))
+            u, slope = values[i], 0.0
+            if kind == "line":
+                slope = (values[i + 1] - values[i]) / (times[i + 1] - times[i])
+                u = values[i] + slope * (now - times[i])
+            x, v = x + v * h + u * h**2 / 2 + slope * h**3 / 6, v + u * h + slope * h**2 / 2
+            now = end
+        return x, v
+
+    return np.array([to(float(t)) for t in ts]).T
+
+
+TIMES = np.array([-1.0, -0.4, 0.0, 0.25, 1.0])
+VALUES = np.array([1.0, -2.0, 5.0, 3.0, -4.0])
+OPTIONS = [
+    pytest.param({}, id="adaptive"),
+    pytest.param({"dt": 0.3}, id="fixed"),
+    pytest.param({"method": "bosh3", "dt": 0.07}, id="bosh3", marks=pytest.mark.full),
+]
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_a_knot_at_the_start_is_read_from_the_side_of_the_step(kind, options, sense):
+    """From t = 0, which is a knot, to either side: plain, and under a gradient in the table.
+
+    x is linear in the values: its derivative is the motion from rest under one of them being 1.
+    Methods of order 3 and more are exact for it, up to some roundings of each of 15 steps.
+    """
+    ts = sense * np.array([0.0, 0.1, 0.25, 0.6, 1.0])
+
+    @jax.jit
+    def end(values):
+        motion = moved(KINDS[kind](jnp.array(TIMES), values), ts, **options)
+        return motion.q[-1, 0], (motion.q[:, 0], motion.v[:, 0])
+
+    expected = closed_form(kind, TIMES, VALUES, ts)
+    (_, again), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.array(VALUES))
+    for found in (end(jnp.array(VALUES))[1], again):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=64 * EPS)
+    units = [closed_form(kind, TIMES, unit, ts, (0.0, 0.0))[0, -1] for unit in np.eye(5)]
+    np.testing.assert_allclose(slope, units, rtol=0, atol=64 * EPS)
+    assert np.abs(units).max() > 0.01
+
+
+def test_a_step_cut_by_a_knot_leaves_the_control_alone():
+    """Below its least step a controller takes the next step as it comes: not after a short cut.
+
+    x'' = 100 x from rest at 1: cosh(10 t), 11013 at t = 1, with two knots 1e-7 apart.
+    """
+    table = jl.ZeroOrderHold([0.0, 0.5, 0.5 + 1e-7, 1.0], [0.0, 0.0, 0.0, 0.0])
+    control = diffrax.PIDController(rtol=1e-8, atol=1e-8, dtmin=1e-5)
+    ts = np.linspace(0.0, 1.0, 6)
+    method = (jl.solvers.Tsit5(), control)
+    motion = moved(table, ts, (1.0, 0.0), {"k": 100.0}, method=method)
+    assert motion.status == jl.Status.ok
+    np.testing.assert_allclose(motion.q[:, 0], np.cosh(10 * ts), rtol=1e-5)
+
+
+def test_a_controller_that_gives_up_is_heard():
+    """Errors too large for its least step, which it was told not to take all the same."""
+    control = diffrax.PIDController(rtol=1e-10, atol=1e-10, dtmin=0.3, force_dtmin=False)
+    table = jl.ZeroOrderHold([0.0, 1.0], [0.0, 0.0])
+    method = (jl.solvers.Tsit5(), control)
+    motion = moved(table, [0.0, 1.0], (1.0, 0.0), {"k": 100.0}, method=method)
+    assert motion.status == jl.Status.step_below_resolution
+    assert motion.last_time < 1.0
+    assert np.isnan(motion.q[-1, 0])
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, pytest.param({"dt": 0.125}, marks=pytest.mark.full)],
+    ids=["adaptive", "fixed"],
+)
+def test_a_row_moves_with_its_own_time(options, sense):
+    """Beside a knot and on it, where steps end: d x / d its time is x', by both modes."""
+    knot = 0.5
+    rows = [np.nextafter(knot, 0), knot, np.nextafter(knot, 1), knot + 4 * EPS, knot + 1e-9]
+    ts = jnp.array(sense * np.array([0.0, 0.2, *rows, 1.0]))
+    times = jnp.sort(sense * jnp.array([-1.0, 0.5, 1.0]))
+    table = jl.ZeroOrderHold(times, jnp.array([2.0, -7.0, 1.0]))
+
+    def x(ts):
+        return moved(table, ts, **options).q[:, 0]
+
+    v = moved(table, ts, **options).v[:, 0]
+    for jacobian in (jax.jacfwd(x), jax.jacrev(x)):
+        found = np.asarray(jax.jit(jacobian)(ts))
+        # x(ts[0]) is given; all rows but the first move with ts[0] as the table stands still.
+        np.testing.assert_allclose(np.diag(found)[1:], v[1:], rtol=0, atol=1e-12)
+        others = found - np.diag(np.diag(found))
+        np.testing.assert_allclose(others[:, 1:], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [diffrax.ReversibleHeun(), diffrax.LeapfrogMidpoint()])
+def test_rows_after_a_knot_see_the_jump(solver):
+    """Of solvers with memory, too: a row inside a step is as that step would have it.
+
+    The first row lies inside the step that starts at the knot, and is the end of one of a solve
+    whose last time it is.
+    """
+    table = jl.ZeroOrderHold([0.0, 0.5, 1.0], [0.0, 8.0, 0.0])
+    options = {"method": solver, "dt": 0.1}
+    rows = moved(table, [0.0, 0.53, 1.0], **options)
+    alone = moved(table, [0.0, 0.53], **options)
+    np.testing.assert_allclose(rows.q[1], alone.q[-1], rtol=0, atol=8 * EPS)
+    np.testing.assert_allclose(rows.v[1], alone.v[-1], rtol=0, atol=8 * EPS)
+    expected = closed_form("hold", np.array([0.0, 0.5, 1.0]), np.array([0.0, 8.0, 0.0]), [0, 0.53])
+    np.testing.assert_allclose(rows.v[1], expected[1, -1], rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    "times", [[0.0, 0.7, 0.3, 1.0], [0.0, 0.3, 0.3, 1.0], [0.0, np.nan, 0.3, 1.0]]
+)
+def test_traced_tables_out_of_order_are_bad_values(times):
+    """Where they have values, they raise; see test_inputs."""
+
+    @jax.jit
+    def status(times):
+        return moved(jl.Linear(times, jnp.ones(4)), [0.0, 1.0]).status
+
+    assert status(jnp.array([0.0, 0.3, 0.7, 1.0])) == jl.Status.ok
+    assert status(jnp.array(times)) == jl.Status.bad_value
+
+
+@pytest.mark.parametrize("options", [{}, {"dt": 0.01}], ids=["adaptive", "fixed"])
+def test_rows_far_from_the_origin_of_time_stay_apart(options):
+    """Seconds since 1970, rows some units in the last place (2.4e-7 s) apart: x = x0 + v (t - t0).
+
+    Bound: roundings of the span.
+    """
+    start = 1.7e9
+    steps = np.array([0.0, 5e-7, 1e-6, 3e-6, 1e-2, 1e-2 + 1e-6, 1.0])
+    ts = start + steps
+    table = jl.Linear([start, start + 0.5, start + 1.0], [0.0, 0.0, 0.0])
+    motion = moved(table, ts, **options)
+    np.testing.assert_allclose(motion.q[:, 0], 0.1 + 0.2 * (ts - ts[0]), rtol=0, atol=8 * EPS)
+    assert np.all(np.diff(motion.q[:, 0]) > 0)
+    np.testing.assert_array_equal(motion.last_time, ts[-1])
+
+
+def test_the_gradient_in_a_table_takes_the_same_for_each_step():
+    """Inside its loops nothing of the size of the table is computed, but written into."""
+    size = 777
+
+    def end(values):
+        table = jl.Linear(jnp.linspace(0.0, 1.0, size), values)
+        return moved(table, [0.0, 0.5, 1.0]).q[-1, 0]
+
+    program = loop(operations(jax.grad(end), jnp.zeros(size), turns=1))
+    written = {"dynamic_update_slice", "scatter-add", "while", "cond", "jit", "scan"}
+    large = {o.name for o in program if any(size <= x[0] <= size + 3 for x in o.shapes if x)}
+    assert large <= written
+    assert "dynamic_update_slice" in large
+
+
+# ---- Copies of the equations ---------------------------------------------------------------------
+
+
+def _odd(t, q, v, params):
+    """A force with one operation that nothing else contains."""
+    return jax.lax.erf_inv(0.1 * jnp.sin(q)) - q
+
+
+def copies(lowering, function_of, size=2):
+    """How often the program of `function_of(system)` contains the force."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v + 0.1 * jnp.sum(jnp.cos(q[:, None] - q)) * v[0] ** 2
+
+    system = jl.System(
+        lagrangian,
+        {"x": (size,)},
+        forces=(jl.GeneralizedForce(_odd, "odd"),),
+        lowering=lowering,
+    )
+    program = operations(*function_of(system), turns=1)
+    return len([o for o in program if o.name == "erf_inv"])
+
+
+def motion_of(system, save=(), rows=11):
+    n = system.size
+
+    def run(q0):
+        ts = jnp.linspace(0.0, 1.0, rows)
+        motion = jl.simulate(system, q0, jnp.ones(n), ts, save=save, throw=False)
+        return motion.q, motion.v, motion.ok, motion.saved
+
+    return run, jnp.full(n, 0.3)
+
+
+def gradient_of(system):
+    run, q0 = motion_of(system)
+    return jax.grad(lambda q0: jnp.sum(run(q0)[0] ** 2)), q0
+
+
+def test_a_program_holds_the_equations_once_in_its_loop_and_once_before():
+    """On arrays: the loop over stages; the first stage and the estimate of the first step."""
+    assert copies("array", motion_of) == 2
+    assert copies("array", partial(motion_of, save=("a", "energy"))) == 3
+
+
+def test_a_gradient_holds_them_once_in_each_of_its_loops():
+    """The recorded motion, states found again between points, the transposed step; before them
+    the first step, and how fast perturbations turn.
+    """
+    assert copies("array", gradient_of) == 5
+
+
+@pytest.mark.full
+def test_a_long_scalar_program_is_looped_over_as_well():
+    """Nine elements of the force, all in one copy of the acceleration."""
+    assert copies("scalar", motion_of, size=9) == 9 * 2

@@ -1,0 +1,45 @@
+"""What is said where compiling takes long."""
+
+import itertools
+import logging
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxlag as jl
+from jaxlag import _patience, _simulate
+
+PAIR = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * q @ q, ("x", "y"))
+
+
+def called(patch, seconds, system=PAIR, **options):
+    """A simulation whose every look at the clock is so many seconds after the last."""
+    clock = partial(next, itertools.count(0.0, seconds))
+    patch.setattr(_simulate, "timed", partial(_patience.timed, clock=clock))
+    return jl.simulate(system, [0.1, 0.2], [0.0, 0.0], [0.0, 1.0], {"k": 2.0}, **options)
+
+
+def test_a_long_compilation_is_said_once(monkeypatch, caplog):
+    caplog.set_level(logging.WARNING, logger="jaxlag")
+    called(monkeypatch, 4.0, dt=0.5)
+    assert not caplog.records
+    called(monkeypatch, 12.0, dt=0.5, method="heun")
+    (record,) = caplog.records
+    text = record.getMessage()
+    assert text.startswith("Compiling the motion of 2 coordinates (x, y) took 12 s")
+    assert "JAX_COMPILATION_CACHE_DIR" in text
+    assert "lowering='array'" in text
+    called(monkeypatch, 12.0, dt=0.25, method="heun")  # compiled already, however long it takes
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.full
+def test_nothing_is_said_inside_a_transform_nor_proposed_twice(monkeypatch, caplog):
+    caplog.set_level(logging.WARNING, logger="jaxlag")
+    jax.jit(lambda k: called(monkeypatch, 12.0, dt=k).q)(jnp.array(0.5))
+    assert not caplog.records
+    arrays = jl.System(PAIR.lagrangian, ("x", "y"), lowering="array")
+    called(monkeypatch, 12.0, arrays, dt=0.5)
+    assert "lowering" not in caplog.records[0].getMessage()
