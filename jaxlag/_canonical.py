@@ -13,7 +13,7 @@ from jaxlag._step import Arguments
 
 
 class Canonical(eqx.Module):
-    """p = dL/dv,   p' = dL/dq + Q + A^T lam,   phi(t, q) = 0, at times t of the user.
+    """p = dL/dv,   p' = dL/dq + Q + A^T lam,   phi(t, q) = 0, at times tau of the loop.
 
     Rows that follow from others are left out: their multiplier is 0.
 
@@ -25,10 +25,6 @@ class Canonical(eqx.Module):
     dynamics: Dynamics
     args: Arguments
 
-    def time(self, tau: Float[Array, ""]) -> Float[Array, ""]:
-        """The user's time."""
-        return self.dynamics.clock(tau, self.args)
-
     def span(self, tau0: Float[Array, ""], tau1: Float[Array, ""]) -> Float[Array, ""]:
         """The user's time between two times, negative where it runs backwards."""
         return self.dynamics.turned(tau1 - tau0, self.args)
@@ -39,10 +35,10 @@ class Canonical(eqx.Module):
         return self.dynamics.rows.size
 
     def canonical(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
+        self, tau: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """(p, dL/dq + Q)."""
-        params, values = self._given(t, q, v)
+        t, params, values = self._given(tau, q, v)
         lagrangian = real_scalar("lagrangian", self.dynamics.system.lagrangian)
         slope, p = jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
         if not self.dynamics.system.forces:
@@ -50,43 +46,46 @@ class Canonical(eqx.Module):
         return p, slope + self.dynamics.terms.force(t, q, v, params, values)
 
     def position(
-        self, t: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
+        self, tau: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
     ) -> Float[Array, " m"]:
         """phi, or lam of a row that is left out."""
-        params, _ = self.dynamics.given(self.args)
+        t, params = self._at(tau)
         return self._of_rows(self.dynamics.terms.position(t, q, params), lam)
 
     def velocity(
         self,
-        t: Float[Array, ""],
+        tau: Float[Array, ""],
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         lam: Float[Array, " m"],
     ) -> Float[Array, " m"]:
         """A v + b, or lam of a row that is left out."""
-        params, _ = self.dynamics.given(self.args)
+        t, params = self._at(tau)
         return self._of_rows(self.dynamics.terms.velocity(t, q, v, params), lam)
 
     def reaction(
-        self, t: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
+        self, tau: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
     ) -> Float[Array, " n"]:
         """A^T lam."""
         if not self.rows:
             return jnp.zeros_like(q)
-        params, _ = self.dynamics.given(self.args)
+        t, params = self._at(tau)
         lam = self._of_rows(lam, jnp.zeros_like(lam))
         return jax.vjp(lambda q: self.dynamics.terms.position(t, q, params), q)[1](lam)[0]
 
     def power(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
+        self, tau: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
     ) -> Float[Array, " k"]:
         """The terms of dH/dt."""
         assert self.dynamics.power is not None
-        return jnp.stack(list(self.dynamics.power(t, q, v, *self._given(t, q, v)).values()))
+        t, params, values = self._given(tau, q, v)
+        return jnp.stack(list(self.dynamics.power(t, q, v, params, values).values()))
 
-    def _given(self, t: Array, q: Array, v: Array) -> tuple[Any, Any]:
-        params, _ = self.dynamics.given(self.args)
-        return params, self.dynamics.inputs_at(t, q, v, self.args)
+    def _at(self, tau: Array) -> tuple[Array, Any]:
+        return self.dynamics.clock(tau, self.args), self.dynamics.given(self.args)[0]
+
+    def _given(self, tau: Array, q: Array, v: Array) -> tuple[Array, Any, Any]:
+        return *self._at(tau), self.dynamics.inputs_at(tau, q, v, self.args)
 
     def _of_rows(self, kept: Array, other: Array) -> Array:
         return kept if self.args.kept is None else jnp.where(self.args.kept, kept, other)

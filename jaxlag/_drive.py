@@ -68,7 +68,7 @@ class _Carry(NamedTuple):
     tried: Array
     accepted: Array
     attempted: Array
-    turn: Array  # shared by all lanes
+    turn: Array  # number of those in which any lane took a step
     rows: _Rows | None
     kept: _Kept | None
 
@@ -83,7 +83,6 @@ class _Loop(NamedTuple):
     dues: Array
     dt: Array
     max_steps: int
-    shared: bool
 
 
 def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
@@ -111,14 +110,13 @@ def drive(
     record: bool,
     room: int = 0,
     native: Callable | None = None,
-    shared: bool = True,
 ) -> Outcome:
     """Integrate from tau = 0 to `times.stop`.
 
     Args:
         scheme: solver, controller, vector field.
         y0: state at the start.
-        args: passed to the vector field, after `scheme.intervals`.
+        args: passed to the vector field, after `scheme.windows`.
         times: anchors and save times.
         first_step: the fixed step without a controller; else the first step, None for automatic.
         allowed: False where the trajectory must not start (status set by the caller).
@@ -127,22 +125,21 @@ def drive(
         room: for so many states on the way, an even number. When it is full every other one is
             dropped, and from then on half as many are kept.
         native: what calls the loop, with its start.
-        shared: whether this is going to be vmapped, so that a record has one row for each turn
-            of any lane; else one for each accepted step.
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    size = -(-(max_steps + (count if shared else 0)) // CHUNK) * CHUNK
+    # Turns in which any lane takes a step: at most those in which one attempts it or goes to rows.
+    size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
     room = (room if room < max_steps else size) if record and not scheme.remembers else 0
     if scheme.controller is not None:
-        memory, h, control = scheme.start(t0, times.stop, y0, args, first_step)
+        memory, sound, h, control = scheme.start(t0, times.stop, y0, args, first_step)
         # The estimate is 0/0 where atol = 0 meets a component that is 0.
         h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * times.stop)
         h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     else:
         assert first_step is not None
         memory, h, control = scheme.begin(t0, times.stop, y0, args), first_step, None
-    sound = scheme.is_sound(memory)
+        sound = scheme.is_sound(memory)
     jumps = times.knots is not None or not scheme.standard
     start = _Place(t0, y0, memory, jnp.array(False) if jumps else None)
     zero = jnp.zeros((), jnp.int32)
@@ -151,7 +148,7 @@ def drive(
     if count > 2:
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = _buffer(count - 1, y0, jnp.nan)
-        rows = _Rows(start, zero, zero, values, places, jnp.array(False))
+        rows = _Rows(start, zero, zero, values, places, zero)
     if record:
         kept = _Kept(
             offsets=_buffer(size, t0, 0.0),
@@ -177,7 +174,7 @@ def drive(
     )
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
-    fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps, shared)
+    fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps)
     loop = _Loop(scheme, args, *fixed)
 
     def turn(dynamic: Any) -> Any:
@@ -185,13 +182,12 @@ def drive(
         return eqx.partition(c, eqx.is_array)[0]
 
     def goes_on(c: Any) -> Array:
-        due = False if c.rows is None else loop.dues[c.rows.next] <= c.at.t
-        return eqxi.unvmap_any(~c.done | due)
+        return eqxi.unvmap_any(~c.done | _is_due(loop, c))
 
     def turns(dynamic: Any) -> Any:
         if room in (0, size):
             return jax.lax.while_loop(goes_on, turn, dynamic)
-        until_full = lambda c: goes_on(c) & (c.turn < room * c.kept.stride)  # noqa: E731
+        until_full = lambda c: goes_on(c) & ~eqxi.unvmap_any(_is_full(c, room))  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
         return jax.lax.while_loop(goes_on, lambda c: fill(_thinned(c, room)), dynamic)
 
@@ -212,8 +208,20 @@ def _outcome(c: _Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
         row_turn = None if c.rows is None else c.rows.turns
         record = Record(*c.kept, c.turn, row_turn)
     ends = (c.status, c.at.t, c.at.y, c.tried, c.accepted, c.attempted)
-    missed = jnp.array(False) if c.rows is None else c.rows.missed
+    missed = jnp.zeros((), jnp.int32) if c.rows is None else c.rows.missed
     return Outcome(*ends, rows, missed, record, jnp.zeros((), jnp.int32))
+
+
+def _is_due(loop: _Loop, c: Any) -> Array:
+    """Whether a row lies inside the last accepted step."""
+    if c.rows is None:
+        return jnp.array(False)
+    return (loop.dues[c.rows.next] <= c.at.t) & (c.accepted > 0)
+
+
+def _is_full(c: Any, room: int) -> Array:
+    """Whether there is no room for the point that the next step starts from."""
+    return (c.turn >= room * c.kept.stride) & ~c.done
 
 
 def _thinned(c: Any, room: int) -> Any:
@@ -225,8 +233,7 @@ def _thinned(c: Any, room: int) -> Any:
     def thin(kept: Any) -> Any:
         return kept._replace(points=jax.tree.map(halved, kept.points), stride=2 * kept.stride)
 
-    full = c.turn >= room * c.kept.stride
-    return c._replace(kept=jax.lax.cond(full, thin, lambda kept: kept, c.kept))
+    return c._replace(kept=jax.lax.cond(_is_full(c, room), thin, lambda kept: kept, c.kept))
 
 
 def _turn(loop: _Loop, c: _Carry) -> _Carry:
@@ -243,7 +250,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     begin, to_row, due = c.at, jnp.array(False), None
     if c.rows is not None:
         due = loop.dues[c.rows.next]
-        to_row = due <= t
+        to_row = _is_due(loop, c)
         begin = _select(to_row, c.rows.base, c.at)
         t1 = jnp.where(to_row, due, t1)
     jumped = False if begin.jump is None else begin.jump
@@ -289,7 +296,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
             next=rows.next + to_row.astype(jnp.int32),
             values=_put(rows.values, slot, value),
             turns=turns,
-            missed=rows.missed | (to_row & ~good),
+            missed=jnp.where(to_row & ~good, failure, rows.missed).astype(jnp.int32),
         )
 
     passed = t1 >= goal - slack
@@ -309,7 +316,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         tried=jnp.where(active, t1, c.tried),
         accepted=c.accepted + take.astype(jnp.int32),
         attempted=attempted,
-        turn=c.turn + (1 if loop.shared else take.astype(jnp.int32)),
+        turn=c.turn + eqxi.unvmap_any(take).astype(jnp.int32),
         rows=rows,
         kept=kept,
     )
@@ -339,12 +346,24 @@ def _next_step(
     cut = keep & lands
     h = jnp.where(cut, jnp.maximum(h, c.h), h)
     if scheme.standard:
-        control = _select(cut, c.control, control)
+        control = _uncut(scheme.controller, cut, h, c.control, control)
     h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
-    refused = result != diffrax.RESULTS.successful
+    refused = (result != diffrax.RESULTS.successful) & ~cut
     stuck = (~keep & ~(h > least)) | refused
     return keep & ~refused, h, control, jnp.asarray(jump), stuck
+
+
+def _uncut(controller: Any, cut: Array, h: Array, before: Any, after: Any) -> Any:
+    """The state of a PID control, which takes no notice of a step that was cut short.
+
+    Its last part says that the step proposed is the least there is, and to be kept as it comes.
+    """
+    control = _select(cut, before, after)
+    if controller.dtmin is None:
+        return control
+    *errors, at_least = control
+    return (*errors, at_least & (~cut | (h <= controller.dtmin)))
 
 
 def _written(loop: _Loop, c: _Carry, kept: _Kept, t: Array, anchor: Array) -> _Kept:

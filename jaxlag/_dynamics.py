@@ -1,7 +1,7 @@
 """The equations of motion in first-order form, as solvers see them."""
 
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -16,10 +16,8 @@ from jaxlag._forces import reads_lam
 from jaxlag._inputs import (
     all_knots,
     at_interval,
-    counted_from,
     evaluate,
     reads_state,
-    tables,
 )
 from jaxlag._kkt import dependence_floor, independent_rows
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
@@ -32,7 +30,9 @@ from jaxlag._terms import Terms
 
 
 class Dynamics(eqx.Module):
-    """dy/dtau = sigma (v, a), y = (q, v), tau = sigma t, M a + h = Q + A^T lam, A a + gamma = 0.
+    """dy/dtau = sigma (v, a), y = (q, v), M a + h = Q + A^T lam, A a + gamma = 0.
+
+    tau = sigma (t - t0) with t0 the start and sigma the direction of time.
 
     In the quasi-velocity formulation y = (q, w) and dy/dtau = sigma (v, w') with w the free
     quasi-velocities. Where work is asked for, y has one more component for each term of dH/dt.
@@ -109,20 +109,18 @@ class Dynamics(eqx.Module):
         sigma = None
         if self.direction is None:
             sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
-        shifted = counted_from(ts[0], eqx.combine(inputs, self.inputs.tree))
-        args = Arguments(params, self._traced(shifted), sigma, ts[0], None, None)
-        knots = all_knots(shifted)
+        args = Arguments(params, inputs, sigma, ts[0], ts[-1], None, None)
+        knots = all_knots(eqx.combine(inputs, self.inputs.tree))
         if knots is None:
             return args
         # They say which rows are read, and no derivative passes through that.
-        knots = jnp.sort(jax.lax.stop_gradient(self.turned(knots.astype(ts.dtype), args)))
-        lower, never = self.turned(knots, args), jnp.full((1,), -jnp.inf, ts.dtype)
-        lower = jnp.where(
-            self.turned(jnp.ones_like(ts[0]), args) > 0,
-            jnp.concatenate([never, lower]),
-            jnp.concatenate([lower, never]),
-        )
-        return args._replace(gaps=Gaps(knots, lower))
+        knots = jnp.sort(jax.lax.stop_gradient(knots.astype(ts.dtype)))
+        never = jnp.full((1,), -jnp.inf, ts.dtype)
+        ahead = Gaps(self.tau(knots, args), jnp.concatenate([never, knots]))
+        back = Gaps(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
+        onwards = self.turned(jnp.ones_like(ts[0]), args) > 0
+        gaps = jax.tree.map(partial(jnp.where, onwards), ahead, back)
+        return args._replace(gaps=still(gaps))
 
     def _traced(self, inputs: Any) -> Any:
         return eqx.filter(inputs, _params.is_array)
@@ -157,8 +155,11 @@ class Dynamics(eqx.Module):
         return RowChoice(kept, jnp.where(size > 0, size, 1.0))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
-        """The user's time t = t0 + sigma tau."""
-        return args.origin + self.turned(tau, args)
+        """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
+        t = args.origin + self.turned(tau, args)
+        if self.direction is not None:
+            return (jnp.minimum if self.direction == 1 else jnp.maximum)(t, args.end)
+        return jnp.clip(t, *(f(args.origin, args.end) for f in (jnp.minimum, jnp.maximum)))
 
     def tau(self, t: Array, args: Arguments) -> Array:
         """Tau = sigma (t - t0)."""
@@ -171,7 +172,7 @@ class Dynamics(eqx.Module):
         return -x if args.sigma is None else x * args.sigma.astype(x.dtype)
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
-        """(params, inputs) as the user passed them, times of tables from the start."""
+        """(params, inputs) as the user passed them; within a step of each table two rows."""
         return (
             _params.join(args.params, self.params.tree),
             eqx.combine(args.inputs, self.inputs.tree),
@@ -188,10 +189,11 @@ class Dynamics(eqx.Module):
         _, inputs = self.given(args)
         starts: dict[str, Array] = {}
         located = args
-        if args.gaps is not None and any(x.times.shape[0] > 2 for x in tables(inputs).values()):
+        if args.gaps is not None and args.gaps.knots.size:
             gap = jnp.searchsorted(args.gaps.knots, tau, side="right")
-            inputs, starts = at_interval(inputs, args.gaps.lower[gap])
-            located = args._replace(inputs=self._traced(inputs))
+            inputs, starts = at_interval(inputs, args.gaps.lower[gap], args.origin)
+            none = Gaps(args.gaps.knots[:0], args.gaps.lower[:0])
+            located = args._replace(inputs=self._traced(inputs), gaps=none)
 
         def of(name: str, signal: Any) -> Any:
             start = starts.get(name)
@@ -217,9 +219,8 @@ class Dynamics(eqx.Module):
         terms, (q, w) = self.terms, self.parts(y)
         if isinstance(terms, ScalarTerms):
             if isinstance(args.prepared, ScalarPrepared):
-                args = self.within(args, tau)
                 t, (params, _) = self.clock(tau, args), self.given(args)
-                values = self._values(t, q, w, args)
+                values = self._values(tau, q, w, args)
                 return terms.rates(t, q, w, params, values, args.prepared)
             terms = terms.array
         assert isinstance(terms, ArrayTerms)
@@ -261,21 +262,19 @@ class Dynamics(eqx.Module):
         """Velocities of a state of quasi-velocities, which no input changes."""
         terms, (params, _) = self.terms, self.given(args)
         assert isinstance(terms, ScalarTerms)
-        values = self.inputs_at(t, q, jnp.zeros_like(q), args)
+        values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
         return terms.velocities(t, q, w, params, values, args.prepared)
 
     def _at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
-        args = self.within(args, tau)
         t, q, v, params = self.state(tau, y, args)
-        return t, q, v, params, self.inputs_at(t, q, v, args, self.turned(tau, args))
+        return t, q, v, params, self.inputs_at(tau, q, v, args)
 
-    def inputs_at(
-        self, t: Array, q: Array, v: Array, args: Arguments, since: Array | None = None
-    ) -> Any:
-        """Values of the inputs within a step."""
-        params, inputs = self.given(args)
-        since = t - args.origin if since is None else since
-        return evaluate(inputs, t, q, v, params, dict.fromkeys(inputs, 0), since)
+    def inputs_at(self, tau: Array, q: Array, v: Array, args: Arguments) -> Any:
+        """Values of the inputs within a step; else in the interval that starts at tau."""
+        args = self.within(args, tau)
+        (params, inputs), since = self.given(args), self.turned(tau, args)
+        first = dict.fromkeys(inputs, 0)
+        return evaluate(inputs, self.clock(tau, args), q, v, params, first, since)
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -302,7 +301,7 @@ class Dynamics(eqx.Module):
         params, _ = self.given(args)
         if isinstance(args.prepared, ScalarPrepared):
             assert isinstance(terms, ScalarTerms)
-            values = self._values(t, q, v, args)
+            values = self._values(tau, q, v, args)
             return terms.surface(t, q, v, params, values, args.prepared)
         v = self.velocities(t, q, v, params)
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
@@ -328,15 +327,15 @@ class Dynamics(eqx.Module):
             lambda c: K @ c,
         )
 
-    def _values(self, t: Array, q: Array, w: Array, args: Arguments) -> Any:
+    def _values(self, tau: Array, q: Array, w: Array, args: Arguments) -> Any:
         """Values of the inputs at a state."""
         if self.quasi is None:
             v = w
         elif reads_state(self.given(args)[1]):
-            v = self._by_program(t, q, w, args)
+            v = self._by_program(self.clock(tau, args), q, w, args)
         else:
             v = jnp.zeros_like(q)
-        return self.inputs_at(t, q, v, args)
+        return self.inputs_at(tau, q, v, args)
 
     @property
     def _sliding(self) -> tuple[Any, ...]:

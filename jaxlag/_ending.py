@@ -97,9 +97,9 @@ class Scene(NamedTuple):
 
 
 def dynamics_of(
-    scene: Scene, ts: Array, q0: Array, v0: Array, params: Any, inputs: Any
+    scene: Scene, ts: Array, t: Array, q: Array, v: Array, params: Any, inputs: Any
 ) -> tuple[Dynamics, Arguments]:
-    """The equations of a motion from (q0, v0), and their arguments."""
+    """The equations of a motion over ts that passes (q, v) at t, and their arguments."""
     dynamics = Dynamics(
         scene.system,
         scene.params,
@@ -112,9 +112,9 @@ def dynamics_of(
     )
     args = dynamics.arguments(params, inputs, ts)
     given, _ = dynamics.given(args)
-    dynamics = replace(dynamics, rows=dynamics.system.rows(given, q0.dtype))
-    start = dynamics.state_of(ts[0], q0, v0, given)
-    return dynamics, dynamics.prepare(jnp.zeros_like(args.origin), start, args)
+    dynamics = replace(dynamics, rows=dynamics.system.rows(given, q.dtype))
+    y = dynamics.state_of(t, q, v, given)
+    return dynamics, dynamics.prepare(dynamics.tau(t, args), y, args)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -131,7 +131,7 @@ def explained(scene: Scene, batch: int, given: Any) -> Ending:
         ending, time, ts, q0, v0, params, inputs = still(given)
         # Kinematics that are singular at the start have no v0.
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
-        dynamics, args = dynamics_of(scene, ts, q0, v0, params, inputs)
+        dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)
         time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
         return _explained(dynamics, ending, time, tried, start, q0, args, scene.kinematic)
 

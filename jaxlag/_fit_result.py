@@ -146,11 +146,19 @@ def summarised(
         float(found.cost),
         tuple(
             f"the segment of {experiments[where.owner[k]].name} that starts at"
-            f" t = {problem.segments.ts[k, 0]:g} s ended with {Status(int(status[k])).name}"
-            for k in np.flatnonzero(status != Status.ok)
+            f" t = {problem.segments.ts[k, 0]:g} s ended with {_how_it_ended(problem, z, found, k)}"
+            for k in map(int, np.flatnonzero(status != Status.ok))
         ),
         experiments,
     )
+
+
+def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
+    """The status of a segment that failed, with all that can be said of it."""
+    segment = jax.tree.map(lambda x: x[k], problem.segments)
+    start = jnp.asarray(found.starts)[k]
+    motion = problem.motion(problem.free.params(z), start, segment.ts, segment.inputs)
+    return Status(int(motion.status)).name
 
 
 def _gaps(found: Found, problem: Shooting) -> np.ndarray:

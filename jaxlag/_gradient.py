@@ -37,7 +37,12 @@ class Keep(NamedTuple):
 
 
 def choose_gradient(
-    mode: str, memory: int | float | None, max_steps: int, state: int, itemsize: int
+    mode: str,
+    memory: int | float | None,
+    max_steps: int,
+    rows: int,
+    state: int,
+    itemsize: int,
 ) -> Keep:
     """What to keep of `max_steps` steps.
 
@@ -45,18 +50,20 @@ def choose_gradient(
         mode: as asked for.
         memory: bytes that one trajectory may keep; None for no bound.
         max_steps: bound on the steps.
+        rows: saved.
         state: numbers in a state.
         itemsize: bytes of a number.
     """
+    turns = max_steps + rows - 2  # at most, of lanes together
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
     needs = {
-        name: needed(room, max_steps, state, itemsize)
+        name: needed(turns if name == "recorded" else room, turns, state, itemsize)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])
     }
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
-        if memory is None or needed(room, max_steps, state, itemsize) <= memory:
+        if memory is None or needed(room, turns, state, itemsize) <= memory:
             return Keep(mode, room)
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
@@ -71,7 +78,7 @@ def choose_gradient(
     return Keep(mode, rooms[mode])
 
 
-def needed(room: int, max_steps: int, state: int, itemsize: int) -> int:
-    """Bytes kept of one trajectory: times of all steps, states at points and between two."""
-    states = room + 1 + math.ceil(max_steps / room) if room else 0
-    return max_steps * 8 + states * state * itemsize
+def needed(room: int, turns: int, state: int, itemsize: int) -> int:
+    """Bytes kept of one trajectory: times of all turns, states at points and between two."""
+    states = room + 1 + math.ceil(turns / room) if room else 0
+    return turns * 8 + states * state * itemsize

@@ -343,26 +343,20 @@ def tables(inputs: Mapping[str, Any]) -> dict[str, AbstractTable]:
     return {name: x for name, x in inputs.items() if isinstance(x, AbstractTable)}
 
 
-def counted_from(origin: Array, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """The inputs with the times of tables counted from another origin."""
-    shifted = {name: x.cut(x.times - origin, x.values) for name, x in tables(inputs).items()}
-    return {**inputs, **shifted}
-
-
 def at_interval(
-    inputs: Mapping[str, Any], since: Float[Array, ""]
+    inputs: Mapping[str, Any], t: Float[Array, ""], origin: Float[Array, ""]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """The inputs with the two rows of each table around a time, and where these begin.
 
-    In them the interval is the first one.
+    In them the interval is the first one, and time counts from `origin`.
     """
     starts = {}
     cuts = dict(inputs)
     for name, table in tables(inputs).items():
         last = table.times.shape[0] - 2
-        starts[name] = start = _interval(table.times, since, last)
+        starts[name] = start = _interval(table.times, t, last)
         rows = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=2)
-        cuts[name] = table.cut(rows(table.times), rows(table.values))
+        cuts[name] = table.cut(rows(table.times) - origin, rows(table.values))
     return cuts, starts
 
 

@@ -32,12 +32,13 @@ def timed(
         values: what it is called with.
         clock: seconds.
     """
-    if not _params.concrete(values):
+    compiled = getattr(program, "_cache_size", None)  # JAX's own count
+    if compiled is None or not _params.concrete(values):
         return program(key, values)
-    count, start = program._cache_size(), clock()
+    count, start = compiled(), clock()
     results = program(key, values)
     seconds = clock() - start
-    if seconds > LONG and program._cache_size() > count:
+    if seconds > LONG and compiled() > count:
         _logger.warning("%s", _words(system, seconds))
     return results
 

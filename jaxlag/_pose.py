@@ -122,7 +122,8 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
     given = jnp.concatenate([values.q0, speeds])
-    valid = values_allowed(given, times.saves, values.rtol, values.atol, values.step)
+    saves = dynamics.turned(values.ts, args)
+    valid = values_allowed(given, saves, values.rtol, values.atol, values.step)
     valid = valid & in_order(inputs)
     finite = start_finite(dynamics, start, y0, args)
     pressed = dynamics.pressed(start, y0, args)
@@ -167,9 +168,9 @@ def _times(
     """Anchors of the grid in tau, and whether the inputs are defined at the start."""
 
     def tau(time: Array) -> Array:
-        return dynamics.turned(time.astype(ts.dtype), args)
+        return dynamics.tau(time.astype(ts.dtype), args)
 
-    saves, knots, span = tau(ts - ts[0]), all_knots(inputs), common_range(inputs)
+    saves, knots, span = tau(ts), all_knots(inputs), common_range(inputs)
     knots = None if knots is None else jnp.sort(tau(knots))
     if span is None:
         return Times(saves[-1], knots, saves), jnp.array(True)

@@ -66,6 +66,6 @@ class Outcome(NamedTuple):
     accepted: Int[Array, ""]
     attempted: Int[Array, ""]
     rows: PyTree  # leaves (s, ...), NaN where not reached
-    missed: Bool[Array, ""]  # the step to one of them failed
+    missed: Int[Array, ""]  # how the step to one of them failed: a Status
     record: Record | None
     gradient: Int[Array, ""]  # a GradientMode

@@ -15,14 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxlag import _xla
+from jaxlag._again import again
 from jaxlag._drive import drive
 from jaxlag._gradient import GradientMode, Keep
 from jaxlag._lanes import in_lanes, lanes_first, zero_tangent
 from jaxlag._record import Outcome, Times
-from jaxlag._scheme import Scheme
 from jaxlag._status import Status
 from jaxlag._variations import Setup, changed, changes, filled, path_of, unpack
-from jaxlag._walk import again
 
 
 class Rows(NamedTuple):
@@ -52,7 +51,7 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
     @jax.custom_jvp
     def run(inexact: Any, rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
         outcome = _driven(inexact, rest, setup, static, record=False)
-        return lanes_first(_told(outcome, static[1]))
+        return lanes_first(_told(outcome))
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
@@ -63,10 +62,10 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
         if static[1].remembers:
             function = partial(_replay, rest, setup, static, outcome)
             rows, rows_dot = jax.jvp(function, (inexact,), (filled(change, inexact),))
-            told = _told(outcome, static[1])[1]
+            told = _told(outcome)[1]
         else:
             walk = changed(inexact, rest, setup, static, outcome.record, change)
-            rows, told = _told(outcome, static[1])
+            rows, told = _told(outcome)
             rows_dot = Rows(walk.rows[0], walk.last[0], walk.time)
         told = told._replace(gradient=_mode(outcome, static))
         rows, told = lanes_first((rows, told))
@@ -82,11 +81,10 @@ def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
     return inexact, rest, problem.setup, (static, problem.scheme, problem.max_steps, problem.keep)
 
 
-def _told(outcome: Outcome, scheme: Scheme) -> tuple[Rows, Outcome]:
+def _told(outcome: Outcome) -> tuple[Rows, Outcome]:
     """The rows, and what is said of a solve without what was kept on the way."""
-    lost = outcome.missed & (outcome.status == int(Status.ok))
-    fault = Status.projection_failed if scheme.moves else Status.implicit_solve_failed
-    status = jnp.where(lost, int(fault), outcome.status).astype(jnp.int32)
+    lost = (outcome.missed != int(Status.ok)) & (outcome.status == int(Status.ok))
+    status = jnp.where(lost, outcome.missed, outcome.status).astype(jnp.int32)
     rows = Rows(outcome.rows, outcome.state, outcome.time)
     return rows, outcome._replace(status=status, rows=None, record=None)
 
@@ -143,7 +141,7 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
         plain = fast is not None and not (lanes and times.saves.shape[0] > 2)
         rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room
         native = _xla.native if plain else None
-        return drive(fast or scheme, y0, args, times, *rest_of_it, native, lanes or fast is None)
+        return drive(fast or scheme, y0, args, times, *rest_of_it, native)
 
     scheme = unpack(inexact, rest, setup, static)[3]
     if scheme.on_scalars() is None or jax.default_backend() != "cpu":

@@ -126,26 +126,26 @@ class Scheme(eqx.Module):
 
     def start(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
-    ) -> tuple[Any, Array, Any]:
-        """(solver state, length of the first adaptive step, the controller's state)."""
+    ) -> tuple[Any, Array, Array, Any]:
+        """(solver state, whether it is finite, first adaptive step, the controller's state)."""
         inside = self.within(args, t0)
         controller: Any = self.controller
         estimated = guess is None and type(controller) is diffrax.PIDController
         if not estimated or not isinstance(self.solver, AbstractExplicit):
-            return self.begin(t0, t1, y, args), *self._first_step(t0, t1, y, inside, guess)
-        order = self.solver.error_order(self.term)
+            memory = self.begin(t0, t1, y, args)
+            return memory, self.is_sound(memory), *self._first_step(t0, t1, y, inside, guess)
+        order = controller.error_order or self.solver.error_order(self.term)
 
         def field(t: Array, y: Array) -> Array:
             return self.term.vf(t, y, inside)
 
         slope, h = _slope_and_step(field, t0, y, controller, float(order))
         at = jnp.asarray(t0, y.dtype)
-        _, state = controller.init(
+        end, state = controller.init(
             self.term, at, t1.astype(y.dtype), y, h, inside, self.solver.func, order
         )
-        # Where steps share no stage it is of no use, and the compiler drops it.
         memory = slope if self.solver.shares_stages else None
-        return memory, h.astype(t0.dtype), state
+        return memory, all_finite(slope), jnp.asarray(end - at, t0.dtype), state
 
     def _first_step(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None

@@ -70,7 +70,8 @@ def simulate(
     Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. Other values of q0, v0, ts,
     inputs, rtol, atol, dt, dt0 and of the traced params never recompile, unless a tolerance makes
     "auto" another method; another number of times, method, static or structure of params does, and
-    so does turning the direction of time round.
+    so does turning the direction of time round, and each transform. What takes more than 5 s is
+    said on the log "jaxlag".
 
     The derivative under every transform is that of the solution at the frozen sequence of
     accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
@@ -198,7 +199,9 @@ def simulate(
         stabilization=project if isinstance(project, Baumgarte) else _PROJECTION[project],
         assemble=assemble,
         regular=system.mass_regular(params, ts[0], q0, v0),
-        keep=choose_gradient(gradient, gradient_memory, max_steps, size, q0.dtype.itemsize),
+        keep=choose_gradient(
+            gradient, gradient_memory, max_steps, ts.shape[0], size, q0.dtype.itemsize
+        ),
         auto=method == "auto" and "work" not in save,
     )
     values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
@@ -257,7 +260,8 @@ def _simulate(plan: Plan, values: Values) -> Solution:
     params = _params.join(values.params, plan.params.tree)
     inputs = eqx.combine(values.inputs, plan.inputs.tree)
     moved = outcome.accepted > 0
-    last_time = dynamics.clock(rows.time, problem.args)
+    arrived = rows.time >= problem.times.saves[-1]
+    last_time = jnp.where(arrived, values.ts[-1], dynamics.clock(rows.time, problem.args))
     at = jnp.concatenate([values.ts, last_time[None].astype(values.ts.dtype)])
     states = jnp.concatenate([rows.saved, rows.state[None]])
     q, v = velocities_at(dynamics, at, states, problem.args, moved)

@@ -237,13 +237,13 @@ def _look(motion: "Solution", h: float, last: bool = False) -> Look:
         ts, q, v = (np.concatenate(pair) for pair in zip((ts, q, v), end, strict=True))
     tolerances = motion.tolerances or (jnp.ones(()), jnp.ones(()))
     given = motion._params_traced, motion._inputs_traced
-    return _looks(motion.scene, (ts, q, v, h, *given, tolerances))
+    return _looks(motion.scene, (motion.ts[jnp.array([0, -1])], ts, q, v, h, *given, tolerances))
 
 
 @partial(jax.jit, static_argnums=0)
 def _looks(scene: Scene, traced: Any) -> Look:
-    ts, q, v, h, params, inputs, (rtol, atol) = traced
-    dynamics, args = dynamics_of(scene, ts, q[0], v[0], params, inputs)
+    span, ts, q, v, h, params, inputs, (rtol, atol) = traced
+    dynamics, args = dynamics_of(scene, span, ts[0], q[0], v[0], params, inputs)
     given, _ = dynamics.given(args)
     solver = diffrax.Dopri8(scan_kind="lax")
 

@@ -21,9 +21,9 @@ class Gaps(NamedTuple):
     """The intervals between the knots of all tables.
 
     Attributes:
-        knots: sorted, in tau.
-        lower: in the user's time from the start, the lower end of the gap before each knot and of
-            that after the last; -inf where there is none.
+        knots: sorted, in tau; empty within a step.
+        lower: in the user's time, the lower end of the gap before each knot and of that after the
+            last; -inf where there is none.
     """
 
     knots: Float[Array, " k"]
@@ -53,9 +53,10 @@ class Arguments(NamedTuple):
     """What the vector field depends on besides time and state; all leaves are arrays."""
 
     params: Any
-    inputs: Any  # tables in time from the start; within a step two rows of each
+    inputs: Any  # within a step two rows of each table, in time from the start
     sigma: Float[Array, ""] | None  # direction of time where it is traced
     origin: Float[Array, ""]  # the start, in the user's time
+    end: Float[Array, ""]  # beyond which no time is read
     gaps: Gaps | None  # None without tables
     prepared: Any  # what accelerations need of what depends on params alone
     rows: RowChoice | None = None  # None where there is no choice: at most one row

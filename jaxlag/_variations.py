@@ -11,11 +11,13 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._again import again
 from jaxlag._lanes import LANES, in_batches
 from jaxlag._linear import LinearMap, linear
+from jaxlag._path import Change, Clock, Path, Walk
 from jaxlag._record import Outcome, Record, Times
 from jaxlag._scheme import Scheme, with_stages
-from jaxlag._walk import Change, Clock, Path, Walk, again, backwards, forwards
+from jaxlag._walk import backwards, forwards
 
 
 class Setup(NamedTuple):

@@ -3,7 +3,6 @@
 import itertools
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from problems import MOTIONS, driven, steps
 
 import jaxlag as jl
-from jaxlag import _drive, _scheme
 
 PENDULUM = MOTIONS["double_pendulum"]
 
@@ -276,46 +274,6 @@ def test_solver_with_memory_keeps_it_in_its_derivative():
             (value(PENDULUM.q0 + h * e) - value(PENDULUM.q0 - h * e)) / (2 * h) for e in np.eye(2)
         ]
         np.testing.assert_allclose(slope, expected, rtol=1e-8)
-
-
-@pytest.mark.full
-def test_lanes_are_written_elementwise():
-    """Four lanes in one loop, time and state with a trailing lane axis, equal four solves."""
-
-    def field(t, y, args):
-        q, v = y
-        return v, -args * jnp.sin(q) + 0.1 * jnp.cos(t)
-
-    def problem(start, stop, y0, stiffness):
-        scheme = _scheme.Scheme(
-            eqx.tree_at(lambda s: s.scan_kind, diffrax.Tsit5(), "lax", is_leaf=lambda x: x is None),
-            None,
-            diffrax.ODETerm(field),
-            lambda args, t: (args, []),
-        )
-        saves = jnp.stack([start, 0.37 * stop, stop])
-        times = _drive.Times(start, stop, None, saves)
-        allowed = jnp.ones(start.shape, bool)
-        return _drive.drive(scheme, y0, stiffness, times, jnp.array(0.05), allowed, 256, True)
-
-    stops = jnp.array([1.0, 2.0, 0.5, 3.0])
-    q, v = jnp.array([0.3, 1.0, -0.4, 2.0]), jnp.array([0.0, 0.1, 0.2, 0.3])
-    stiffness = jnp.array([1.0, 2.0, 3.0, 4.0])
-    lanes = problem(jnp.zeros(4), stops, (q, v), stiffness)
-    for i in range(4):
-        one = problem(jnp.array(0.0), stops[i], (q[i], v[i]), stiffness[i])
-        np.testing.assert_array_equal(lanes.status[i], one.status)
-        np.testing.assert_array_equal(lanes.accepted[i], one.accepted)
-        for a, b in zip(lanes.state, one.state, strict=True):
-            np.testing.assert_allclose(a[i], b, rtol=1e-14)
-        np.testing.assert_allclose(lanes.row_time[:, i], one.row_time, rtol=1e-15)
-        turns = int(one.record.turns)
-        offsets = lanes.record.offsets[:turns, i]
-        np.testing.assert_allclose(offsets, one.record.offsets[:turns], rtol=1e-15)
-        # While others go on it stays where it is.
-        np.testing.assert_array_equal(
-            lanes.record.offsets[turns : int(lanes.record.turns[i]), i], offsets[-1]
-        )
 
 
 def test_driven_system_matches_scipy():

@@ -188,6 +188,103 @@ def test_rows_far_from_the_origin_of_time_stay_apart(options):
     np.testing.assert_array_equal(motion.last_time, ts[-1])
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"gradient": "checkpoints", "max_steps": 256}, {"max_steps": 1024}],
+    ids=["checkpoints", "auto"],
+)
+def test_a_row_in_the_last_step_of_a_full_record(options):
+    """As many steps as there may be, all points taken: reverse is forward still."""
+    count, h = options["max_steps"], 1 / 128
+    ts = np.array([0.0, (count - 0.5) * h, count * h])
+
+    def x(k):
+        table = jl.Linear([0.0, 10.0], [0.3, 0.0])
+        motion = moved(table, ts, params={"k": k}, method="dopri5", dt=h, **options)
+        return motion.q[1, 0] + motion.q[2, 0], motion.stats["accepted"]
+
+    (forward, steps), (reverse, _) = (
+        jax.jit(of(x, has_aux=True))(-4.0) for of in (jax.jacfwd, jax.jacrev)
+    )
+    assert steps == count
+    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
+
+
+def test_times_that_differ_less_than_they_do_from_the_start():
+    """Two knots, and two rows, whose distance from ts[0] is the same number."""
+    pair = [0.5, np.nextafter(0.5, 1)]
+    assert pair[0] + 10.0 == pair[1] + 10.0
+    jump = jl.Linear([-10.0, *pair, 2.0], [0.0, 0.0, 1.0, 1.0])
+    motion = moved(jump, [-10.0, *pair, 1.0], dt=0.25)
+    assert motion.status == jl.Status.ok
+    x, v = 0.1 + 0.2 * 10.5, 0.2
+    np.testing.assert_allclose(motion.q[1:3, 0], x, rtol=8 * EPS)
+    np.testing.assert_allclose(motion.v[-1, 0], v + 0.5, rtol=8 * EPS)
+
+
+@pytest.mark.parametrize("options", [{}, {"dt": 0.1}], ids=["adaptive", "fixed"])
+@pytest.mark.parametrize("ts", [[-2.0, 0.6], [0.3, 0.1], [0.1, 0.7]])
+def test_no_time_beyond_the_last_is_read(ts, options):
+    """t0 + (t1 - t0) may be more than t1, where this force has no value."""
+    sense, end = np.sign(ts[1] - ts[0]), ts[1]
+    falling = jl.Function(lambda t: jnp.sqrt(sense * (end - t)))
+    for of in (lambda f: f, jax.jit):
+        motion = of(lambda ts: moved(falling, ts, **options))(jnp.array(ts))
+        assert motion.status == jl.Status.ok
+        assert motion.last_time == end
+
+
+@pytest.mark.parametrize("dtmin", [1e-3, 0.2])
+def test_a_short_step_to_a_knot_is_no_failure_of_the_control(dtmin):
+    """Neither is the short one to the last time."""
+    control = diffrax.PIDController(rtol=1e-8, atol=1e-8, dtmin=dtmin, force_dtmin=False)
+    table = jl.ZeroOrderHold([0.0, 0.5, 0.5 + 1e-5, 1.0], [1.0, 2.0, 3.0, 0.0])
+    motion = moved(table, [0.0, 0.9, 0.9 + 1e-5], method=(jl.solvers.Tsit5(), control))
+    assert motion.status == jl.Status.ok
+    times, values = (np.asarray(x) for x in (table.times, table.values))
+    expected = closed_form("hold", times, values, [0.0, 0.9 + 1e-5])[0, -1]
+    np.testing.assert_allclose(motion.q[-1, 0], expected, rtol=64 * EPS)
+
+
+def test_the_first_step_is_one_that_the_control_allows():
+    """Of at most 0.1 s: 10 steps to 1 s, as by the same method of diffrax."""
+    control = diffrax.PIDController(rtol=0.1, atol=0.1, dtmax=0.1)
+    table = jl.ZeroOrderHold([0.0, 1.0], [0.0, 0.0])
+    for solver in (jl.solvers.Tsit5(), diffrax.Tsit5()):
+        motion = moved(table, [0.0, 1.0], params={"k": -1.0}, method=(solver, control))
+        assert motion.stats["accepted"] == 10
+
+
+@pytest.mark.full
+def test_a_stiff_motion_backwards_in_time_is_recognised():
+    """x'' = -x + 1e4 x' from 0 to -10 s."""
+    damped = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
+        ("x",),
+        forces=(jl.GeneralizedForce(lambda t, q, v, p: 1e4 * v, "push"),),
+    )
+    motion = jl.simulate(damped, [1.0], [0.0], [0.0, -10.0], max_steps=300)
+    assert motion.method == "kvaerno5"
+    np.testing.assert_allclose(motion.q[-1, 0], np.exp(-10.0 / 1e4), rtol=1e-6)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["dopri5", "gauss4"])
+def test_tables_far_from_the_origin_are_read_to_the_last_digit(method):
+    """A slope of 1e9 N/s over a millisecond, seconds since 1901."""
+    start, length = 2.0**31, 2.0**-10
+    table = jl.Linear([start, start + length], [0.0, 1e6])
+    motion = moved(table, [start, start + length], method=method, dt=1e-6, max_steps=2000)
+    np.testing.assert_allclose(motion.v[-1, 0], 0.2 + 0.5e6 * length, rtol=1e-12)
+
+
+def test_a_motion_that_may_not_start_has_no_rows():
+    table = jl.ZeroOrderHold([-1.0, 1.0], [0.0, 0.0])
+    motion = jax.jit(lambda ts: moved(table, ts))(jnp.array([0.0, -0.5, 1.0]))
+    assert motion.status == jl.Status.bad_value
+    assert np.isnan(motion.q[1:]).all()
+
+
 def test_the_gradient_in_a_table_takes_the_same_for_each_step():
     """Inside its loops nothing of the size of the table is computed, but written into."""
     size = 777

@@ -230,12 +230,12 @@ def test_memory_decides():
     """The times of all steps take 8 bytes each; states what is left."""
     state, size, steps = 4, 8, 16384
     times = 8 * steps
-    assert choose_gradient("auto", None, steps, state, size).room == 512
-    room = choose_gradient("auto", times + 10_000, steps, state, size).room
+    assert choose_gradient("auto", None, steps, 2, state, size).room == 512
+    room = choose_gradient("auto", times + 10_000, steps, 2, state, size).room
     assert room == 128
     assert needed(room, steps, state, size) <= times + 10_000
-    assert choose_gradient("auto", times, steps, state, size).room == 0
-    assert choose_gradient("recorded", None, 1000, state, size).room >= 1000
+    assert choose_gradient("auto", times, steps, 2, state, size).room == 0
+    assert choose_gradient("recorded", None, 1000, 2, state, size).room >= 1000
 
 
 @pytest.mark.parametrize(

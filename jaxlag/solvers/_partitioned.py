@@ -51,10 +51,10 @@ class AbstractPartitioned(AbstractFixedStep):
     The terms have the methods `sections`, `joined` (as for `Splitting`) and `canonical(args)`, an
     object with
 
-        time(tau) -> t,    span(tau0, tau1) -> t1 - t0,    canonical(t, q, v) -> (p, F),
-        power(t, q, v) -> rates of work,
-        rows -> their number,    reaction(t, q, lam) -> A^T lam,
-        position(t, q, lam) -> phi,    velocity(t, q, v, lam) -> A v + b,
+        span(tau0, tau1) -> t1 - t0,    canonical(tau, q, v) -> (p, F),
+        power(tau, q, v) -> rates of work,    rows -> their number,
+        reaction(tau, q, lam) -> A^T lam,    position(tau, q, lam) -> phi,
+        velocity(tau, q, v, lam) -> A v + b,
 
     of which the last two are lam itself, and the first reads none, in rows that follow from others.
 
@@ -75,13 +75,12 @@ class AbstractPartitioned(AbstractFixedStep):
         """One step from t0 to t1; there is no error estimate."""
         pair, form, (q0, v0, work) = self.pair, terms.canonical(args), terms.sections(y0)
         b, a, ah = (jnp.asarray(x, q0.dtype) for x in pair[1:])
-        begin, end = form.time(t0), form.time(t1)
         h = form.span(t0, t1).astype(q0.dtype)
         # A step of no length, which nobody asks for, would divide 0 by 0 in its derivative.
         h = jnp.where(h == 0, jnp.sqrt(jnp.finfo(h.dtype).eps), h)
         s, n, rows = self.stages, q0.shape[0], form.rows
-        ts = begin + jnp.asarray(pair.c, begin.dtype) * form.span(t0, t1)
-        p0, _ = form.canonical(begin, q0, v0)
+        ts = t0 + jnp.asarray(pair.c, t0.dtype) * (t1 - t0)
+        p0, _ = form.canonical(t0, q0, v0)
 
         def unpacked(z: Array) -> tuple[Array, Array]:
             """Velocities and impulses h Lam of the stages; of the last one by what follows."""
@@ -114,11 +113,11 @@ class AbstractPartitioned(AbstractFixedStep):
 
         def last(z: Array) -> Array:
             v, lam = z[:n], z[n:]
-            motion = form.canonical(end, q1, v)[0] - p1
+            motion = form.canonical(t1, q1, v)[0] - p1
             if not rows:
                 return motion
-            motion = motion - form.reaction(end, q1, lam)
-            return jnp.concatenate([motion, form.velocity(end, q1, v, lam)])
+            motion = motion - form.reaction(t1, q1, lam)
+            return jnp.concatenate([motion, form.velocity(t1, q1, v, lam)])
 
         guess = jnp.concatenate([V[-1], jnp.zeros((rows,), q0.dtype)])
         rounded = jax.lax.stop_gradient(rounded + jnp.max(jnp.abs(V), axis=0))

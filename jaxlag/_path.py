@@ -1,0 +1,160 @@
+"""A recorded motion, as its derivatives are taken along it."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxlag._record import Record, Times
+
+
+class Walk(NamedTuple):
+    """What is wanted of a motion or of its derivative.
+
+    Attributes:
+        last: state after the last step.
+        time: of it.
+        rows: the rows, (s, ...).
+        points: states at the points of the record; None where nobody asks.
+    """
+
+    last: PyTree
+    time: Array
+    rows: PyTree
+    points: PyTree | None
+
+
+class Change(NamedTuple):
+    """A direction of what a motion depends on; None for what does not move.
+
+    Attributes:
+        y0: of the start, an array.
+        args: of some leaves of the arguments.
+        anchors: of `Times.anchors`.
+        saves: of `Times.saves`; moves where the anchors do.
+    """
+
+    y0: Array | None
+    args: list[Array]
+    anchors: Array | None
+    saves: Array | None
+
+
+class Clock(NamedTuple):
+    """When the turns of a recorded motion ended; time -1 is that of the start."""
+
+    times: Times
+    record: Record
+
+    def time(self, k: Array, anchors: Array) -> Array:
+        """Time after turn k."""
+        offset, anchor = at(self.record.offsets, k), self.anchor(k)
+        moved = anchors[anchor] + jnp.where(jnp.isinf(offset), 0.0, offset)
+        return jnp.where(k < 0, anchors[0], moved)
+
+    def anchor(self, k: Array) -> Array:
+        """The anchor that it moves with."""
+        if self.record.anchors is not None:
+            return jnp.where(k < 0, 0, at(self.record.anchors, k))
+        return ((k >= 0) & jnp.isinf(at(self.record.offsets, k))).astype(jnp.int32)
+
+    def jump(self, k: Array) -> Array | None:
+        """Whether the vector field jumps where turn k starts."""
+        return None if self.record.jumps is None else at(self.record.jumps, k)
+
+    @property
+    def last(self) -> Array:
+        """The last turn."""
+        return self.record.turns - 1
+
+
+class Path(NamedTuple):
+    """A recorded motion: what was given to the loop and what it kept.
+
+    Attributes:
+        step: (args, t0, t1, state, jump) -> state.
+        between: the same in a form that takes less to compile.
+        start: the state before the first step, as the step takes it.
+        args: leaves of the arguments.
+        tree: of the arguments.
+        moving: indices of the leaves that may move.
+        windows: (args, t0) -> (args as a step from t0 reads them: of each table two rows; where
+            these rows start in the leaves that may move, None for those that are no tables).
+        clock: times of the steps.
+        stages: number of them in a step, 0 where it has none.
+    """
+
+    step: Callable
+    between: Callable
+    start: PyTree
+    args: list
+    tree: Any
+    moving: tuple[int, ...]
+    windows: Callable
+    clock: Clock
+    stages: int
+
+    def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
+        """The arguments with other values of the leaves that may move."""
+        leaves = list(self.args if leaves is None else leaves)
+        for i, leaf in zip(self.moving, moved, strict=True):
+            leaves[i] = leaf
+        return jax.tree.unflatten(self.tree, leaves)
+
+    def ahead(self, args: Any, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
+        """The state one step on."""
+        return self.step(args, t, end, state, jnp.array(False) if jump is None else jump)
+
+    def found(self, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
+        """The same between points."""
+        args = self.with_args(self.moved())
+        return self.between(args, t, end, state, jnp.array(False) if jump is None else jump)
+
+    def moved(self) -> list[Array]:
+        """The leaves of the arguments that may move."""
+        return [self.args[i] for i in self.moving]
+
+    def local(self, t: Array) -> tuple[Callable, list[Array], list[Array | None]]:
+        """What a step from t reads of the arguments.
+
+        Returns:
+            moved -> arguments, what moves of them (of tables two rows), where these rows start.
+        """
+        args, starts = self.windows(self.with_args(self.moved()), t)
+        leaves = jax.tree.leaves(args, is_leaf=lambda x: x is None)
+        moved = [leaves[i] for i in self.moving]
+        return partial(self.with_args, leaves=leaves), moved, [starts[i] for i in self.moving]
+
+
+def at(buffer: PyTree, k: Array) -> PyTree:
+    """Row k of a buffer, the first one below 0."""
+    index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
+    return jax.tree.map(index, buffer)
+
+
+def pick(use: Array, new: PyTree, old: PyTree) -> PyTree:
+    """One of two states."""
+    return jax.tree.map(lambda a, b: jnp.where(use, a, b), new, old)
+
+
+def all_rows(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -> PyTree:
+    """All rows, from those between the first and the last; zero where there was none."""
+
+    def of(a: Array, between: Array | None, b: Array) -> Array:
+        parts = [a[None], jnp.where(reached, b, 0.0)[None]]
+        if between is not None:
+            parts.insert(1, between[:-1])
+        return jnp.concatenate(parts)
+
+    if rows is None:
+        return jax.tree.map(lambda a, b: of(a, None, b), first, last)
+    return jax.tree.map(of, first, rows, last)
+
+
+def arrived(path: Path, anchors: Array) -> Array:
+    """Whether the last row was reached."""
+    clock = path.clock
+    return clock.time(clock.last, anchors) >= clock.times.saves[-1]
