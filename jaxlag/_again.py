@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag import _xla
 from jaxlag._drive import CHUNK
 from jaxlag._path import Path, Walk, all_rows, arrived, pick
 
@@ -97,7 +96,7 @@ def again(
         return jax.lax.cond(eqxi.unvmap_any(slots.used), take, skip, y)
 
     parts = jax.tree.map(lambda x: x.reshape(-1, CHUNK), slots)
-    last, found = _xla.native(partial(jax.lax.scan, chunk), start, parts, stages=path.stages)
+    last, found = path.native(partial(jax.lax.scan, chunk), start, parts)
     befores, afters = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
     rows = point_states = None
     if of_row is not None:

@@ -96,7 +96,8 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
     def path(r: Any) -> tuple[Path, Any]:
         inexact, rest, setup, record = r
         y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
-        return path_of(scheme, y0, args, times, record, kind.moving, scheme.on_scalars(lanes)), y0
+        fast = scheme.on_scalars(lanes)
+        return path_of(scheme, y0, args, times, record, kind.moving, fast, lanes), y0
 
     def forward(r: Any, x: Change) -> Walk:
         return forwards(path(r)[0], x, kind.points)
@@ -165,6 +166,7 @@ def path_of(
     record: Record,
     moving: tuple[int, ...],
     fast: Scheme | None = None,
+    lanes: bool = False,
 ) -> Path:
     """The recorded motion.
 
@@ -187,7 +189,8 @@ def path_of(
     between = steps(loops if fast is None else in_loops(fast))
     start = (y0, memory)
     step = steps(fast or loops)
-    return Path(step, between, start, leaves, tree, moving, scheme.windows, clock, stages)
+    plain = not (lanes and record.row_turn is not None)
+    return Path(step, between, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
 
 
 def in_loops(scheme: Scheme) -> Scheme:

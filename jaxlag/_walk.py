@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag import _xla
 from jaxlag._path import Change, Path, Walk, all_rows, arrived, at, pick
 from jaxlag._record import Record
 
@@ -96,7 +95,7 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
         return eqxi.unvmap_any(carry[0] < record.turns)
 
     loop = partial(jax.lax.while_loop, goes_on, turn)
-    _, _, _, dy, rows, kept = _xla.native(loop, begin, stages=path.stages)
+    _, _, _, dy, rows, kept = path.native(loop, begin)
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
         time = change.anchors[clock.anchor(clock.last)]
@@ -216,7 +215,7 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     if record.row_turn is not None:
         rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
     begin = (most, rows_left, _add(wanted.last, end_bar), bars)
-    ended = _xla.native(all_back, begin, stages=path.stages)
+    ended = path.native(all_back, begin)
     _, _, bar, (args_bar, anchors_bar, dues_bar) = ended
     bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
     saves_bar = None
