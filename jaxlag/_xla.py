@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 BYTES = 10_000_000
@@ -90,12 +90,23 @@ def native(function: Callable, *args: Any, stages: int = 0) -> Any:
         args: what it is called with.
         stages: of a method whose weighted sums of stages are products with a vector.
     """
-    if not by_attribute() or not _plain(jax.make_jaxpr(function)(*args).jaxpr, stages):
+    if not by_attribute():
+        return function(*args)
+    flat, tree = jax.tree.flatten(args)
+    program, shape = jax.make_jaxpr(
+        lambda *flat: function(*jax.tree.unflatten(tree, flat)), return_shape=True
+    )(*flat)
+    if not _plain(program.jaxpr, stages):
         return function(*args)
     # A parameter whose value XLA knows at the call loses its uses inside, and the emitter of marked
-    # calls then looks for a buffer that is not there and ends the process.
-    args = jax.lax.optimization_barrier(args)
-    return not_inlined(function, ATTRIBUTES)(*args)
+    # calls then looks for a buffer that is not there and ends the process. What the function
+    # closes over becomes a parameter, too.
+    given = jax.lax.optimization_barrier((list(program.consts), flat))
+
+    def run(consts: list, flat: list) -> Any:
+        return jaxpr_as_fun(ClosedJaxpr(program.jaxpr, consts))(*flat)
+
+    return jax.tree.unflatten(jax.tree.structure(shape), not_inlined(run, ATTRIBUTES)(*given))
 
 
 def not_inlined(function: Callable, attributes: Any = None) -> Callable:
