@@ -8,7 +8,7 @@ import jax
 from jaxlag import _xla
 from jaxlag._constraints import Layout
 from jaxlag._lanes import LANES
-from jaxlag._linalg import UNROLL_UP_TO
+from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO
 from jaxlag._lowering import Equations, Lowered, Program, Structure, find
 from jaxlag.solvers import Dopri8
 from jaxlag.solvers._explicit import WRITTEN_OUT, in_loop_over_stages
@@ -158,16 +158,22 @@ def _batches() -> str:
 _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "select", "gt", "ge", "lt", "le", "eq", "ne")
 
 
+def _factorisation(n: int) -> str:
+    if n <= UNROLL_UP_TO:
+        return "unrolled"
+    if n <= LOOP_UP_TO:
+        return f"in a loop over rows (n > {UNROLL_UP_TO})"
+    return f"by library Cholesky (n > {LOOP_UP_TO})"
+
+
 def _array(system: "System", structure: Structure, reason: str) -> list[str]:
-    n = system.size
     often = "once per solve" if structure.mass_constant else "per evaluation"
     ways = ["M by batched forward-over-reverse columns"]
     if not structure.bias_zero:
         ways.append("h by one forward derivative of (dL/dq, dL/dv)")
     return [
         f"lowering      array program ({reason}): {', '.join(ways)}",
-        f"mass solve    one factorisation {often}, "
-        + ("unrolled" if n <= UNROLL_UP_TO else f"by library Cholesky (n > {UNROLL_UP_TO})"),
+        f"mass solve    one factorisation {often}, {_factorisation(system.size)}",
         _steps(None),
         "batches       by jax.vmap: all trajectories in one loop",
     ]

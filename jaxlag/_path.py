@@ -77,7 +77,6 @@ class Path(NamedTuple):
 
     Attributes:
         step: (args, t0, t1, state, jump) -> state.
-        between: the same in a form that takes less to compile.
         start: the state before the first step, as the step takes it.
         args: leaves of the arguments.
         tree: of the arguments.
@@ -91,7 +90,6 @@ class Path(NamedTuple):
     """
 
     step: Callable
-    between: Callable
     start: PyTree
     args: list
     tree: Any
@@ -117,9 +115,8 @@ class Path(NamedTuple):
         return self.step(args, t, end, state, jnp.array(False) if jump is None else jump)
 
     def found(self, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
-        """The same between points."""
-        args = self.with_args(self.moved())
-        return self.between(args, t, end, state, jnp.array(False) if jump is None else jump)
+        """The same with the arguments as they are."""
+        return self.ahead(self.with_args(self.moved()), t, end, jump, state)
 
     def moved(self) -> list[Array]:
         """The leaves of the arguments that may move."""

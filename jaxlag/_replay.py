@@ -21,7 +21,7 @@ from jaxlag._gradient import GradientMode, Keep
 from jaxlag._lanes import in_lanes, lanes_first, zero_tangent
 from jaxlag._record import Outcome, Times
 from jaxlag._status import Status
-from jaxlag._variations import Setup, changed, changes, filled, path_of, unpack
+from jaxlag._variations import Setup, changed, changes, filled, in_loops, path_of, unpack
 
 
 class Rows(NamedTuple):
@@ -137,6 +137,8 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
         if record:
             scheme = scheme.for_derivatives(y0, args)
         fast = scheme.on_scalars(lanes)
+        if record and lanes:  # written out, this half would take most of the time to compile
+            fast = None if fast is None else in_loops(fast)
         # Buffers that lanes write to at places of their own are no plain operations.
         plain = fast is not None and not (lanes and times.saves.shape[0] > 2)
         rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room

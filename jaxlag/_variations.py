@@ -168,29 +168,24 @@ def path_of(
     fast: Scheme | None = None,
     lanes: bool = False,
 ) -> Path:
-    """The recorded motion.
+    """The recorded motion, by steps with loops over stages.
 
-    States between points are found by steps with loops over stages: written out they would take
-    as long to compile as all else.
+    Written out, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
+    pendulum: a gradient 5.3 | 2.3 s, a Hessian 22 | 4.5 s, a gradient of lanes 15 | 4.5 s) and
+    run 0.9 to 1.4 times as fast.
     """
-    loops = in_loops(scheme)
+    looped = in_loops(scheme if fast is None else fast)
 
-    def steps(scheme: Scheme) -> Callable:
-        def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
-            return one_step(scheme, args, t0, t1, state, jump, True)[0]
-
-        return step
+    def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
+        return one_step(looped, args, t0, t1, state, jump, True)[0]
 
     zero = jnp.zeros_like(times.stop)
     memory = scheme.begin(zero, times.stop, y0, args) if scheme.remembers else None
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
-    clock = Clock(times, record)
-    between = steps(loops if fast is None else in_loops(fast))
-    start = (y0, memory)
-    step = steps(fast or loops)
+    clock, start = Clock(times, record), (y0, memory)
     plain = not (lanes and record.row_turn is not None)
-    return Path(step, between, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
+    return Path(step, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
 
 
 def in_loops(scheme: Scheme) -> Scheme:

@@ -1,4 +1,4 @@
-"""The solve with the mass matrix, by unrolled elimination up to n = 8 and by library above.
+"""The solve with the mass matrix: unrolled up to n = 8, by rows up to n = 16, by library above.
 
 Elimination without pivoting is backward stable on symmetric positive definite matrices: the
 computed x solves a system whose M and r differ by some n EPS of their norms.
@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.linalg import norm
 
-from jaxlag._linalg import UNROLL_UP_TO, factor_mass, first_unhealthy, solve_mass
+from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, first_unhealthy, solve_mass
 
 EPS = np.finfo(float).eps
-SIZES = range(1, 13)
-BOTH = (3, UNROLL_UP_TO + 2)  # one size for each way of solving
+SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 16, 17, 18)
+WAYS = (3, UNROLL_UP_TO + 2, LOOP_UP_TO + 2)  # one size for each way of solving
 
 
 @jax.jit
@@ -42,8 +42,8 @@ def backward_error(M, x, r):
     return norm(M @ x - r) / (norm(M, 2) * norm(x) + norm(r))
 
 
-def test_both_ways_of_solving_are_tested():
-    assert BOTH[0] <= UNROLL_UP_TO < BOTH[1] <= max(SIZES)
+def test_all_ways_of_solving_are_tested():
+    assert WAYS[0] <= UNROLL_UP_TO < WAYS[1] <= LOOP_UP_TO < WAYS[2] <= max(SIZES)
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -59,14 +59,14 @@ def test_solve_is_backward_stable(n):
 
 def test_solve_works_in_single_precision():
     rng = np.random.default_rng(0)
-    for n in BOTH:
+    for n in WAYS:
         M, r = (x.astype(np.float32) for x in (definite(rng, n, 100.0), rng.normal(size=n)))
         x = solve(M, r)
         assert x.dtype == jnp.float32
         assert backward_error(M, x, r) <= 10 * n * np.finfo(np.float32).eps
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_a_given_factor_serves_any_right_hand_side(n):
     rng = np.random.default_rng(n)
     M, R = definite(rng, n, 10.0), rng.normal(size=(3, n))
@@ -107,20 +107,24 @@ def test_the_coordinate_without_inertia_is_named(n):
         assert np.all(np.isnan(solve(M, np.ones(n))))
 
 
+def of_rank_less_one(rng, n):
+    """The last row is a combination of the others, which are well conditioned."""
+    M = np.zeros((n, n))
+    M[:-1, :-1] = definite(rng, n - 1, 4.0)
+    combination = rng.uniform(-1.0, 1.0, n - 1)
+    M[-1, :-1] = M[:-1, -1] = M[:-1, :-1] @ combination
+    M[-1, -1] = combination @ M[:-1, -1]
+    return M
+
+
 @pytest.mark.parametrize("n", SIZES[1:])
 def test_a_singular_matrix_is_found_through_its_rounding(n):
     """Of rank n - 1, the rest well conditioned: the last pivot is rounding, of either sign."""
     for seed in range(10):
-        rng = np.random.default_rng([n, seed])
-        M = np.zeros((n, n))
-        M[:-1, :-1] = definite(rng, n - 1, 4.0)
-        combination = rng.uniform(-1.0, 1.0, n - 1)  # the last row is one of the others
-        M[-1, :-1] = M[:-1, -1] = M[:-1, :-1] @ combination
-        M[-1, -1] = combination @ M[:-1, -1]
-        assert unhealthy(M) == n - 1
+        assert unhealthy(of_rank_less_one(np.random.default_rng([n, seed]), n)) == n - 1
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_a_bad_matrix_in_a_batch_harms_no_other(n):
     rng = np.random.default_rng(n)
     M = np.stack([definite(rng, n, 10.0), with_pivot(rng, n, 1, -1.0), definite(rng, n, 10.0)])
@@ -134,14 +138,14 @@ def test_a_bad_matrix_in_a_batch_harms_no_other(n):
 # ---- Units and mass ratios ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_units_of_the_coordinates_change_nothing(n):
     """M -> D M D, r -> D r gives x -> x/D: exactly, where D are powers of two, 1e-6 to 1e6."""
     rng = np.random.default_rng(n)
     M, r = definite(rng, n, 100.0), rng.normal(size=n)
     D = 2.0 ** np.round(np.linspace(-20, 20, n))[rng.permutation(n)]
     np.testing.assert_array_equal(solve(D[:, None] * M * D, D * r), solve(M, r) / D)
-    singular = with_pivot(rng, n, n - 1, 0.0)
+    singular = of_rank_less_one(rng, n)
     D = 10.0 ** np.linspace(-6, 6, n)[rng.permutation(n)]
     assert unhealthy(D[:, None] * M * D) == -1
     assert unhealthy(D[:, None] * singular * D) == n - 1
@@ -166,7 +170,7 @@ def curve(rng, n):
     return M, rng.normal(size=(3, n)), rng.normal(size=n)
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_derivatives_are_those_of_the_inverse(n):
     """x' = y(r' - M' x) and x'' = y(r'' - M'' x - 2 M' x') with y = M^-1, forward and reverse."""
     M, r, w = curve(np.random.default_rng(n), n)
@@ -199,7 +203,7 @@ def test_derivatives_are_those_of_the_inverse(n):
     np.testing.assert_allclose(second, [w @ expected2] * 4, rtol=0, atol=atol2)
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_second_derivatives_agree_with_differences(n):
     """Central differences of the first derivative, error h^2 + eps/h: 1e-10 at h = 1e-5."""
     M, r, w = curve(np.random.default_rng(n + 1), n)
@@ -220,7 +224,7 @@ def test_second_derivatives_agree_with_differences(n):
     assert abs(second) > 1e3 * atol
 
 
-@pytest.mark.parametrize("n", BOTH)
+@pytest.mark.parametrize("n", WAYS)
 def test_cotangents_are_the_outer_product(n):
     """Of w . x: lam = M^-1 w for r, and -lam x^T for M."""
     rng = np.random.default_rng(n)

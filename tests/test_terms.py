@@ -15,10 +15,10 @@ from _mechanics import CHAIN_PARAMS, chain_lagrangian
 from _mechanics import chain as any_chain
 
 import jaxlag as jl
-from jaxlag._linalg import UNROLL_UP_TO, factor_mass, solve_mass
+from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
 from systems._catalogue import ENTRIES
 
-SMALL, LARGE = 5, 12
+SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2
 chain = partial(any_chain, lowering="array")
 FACTORISATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
 MARK = 3  # entries of the marked array
@@ -60,7 +60,7 @@ def tangent(function):
 
 
 @pytest.mark.parametrize("derivative", [None, gradient, tangent])
-@pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, LARGE])
+@pytest.mark.parametrize("n", [LOOP_UP_TO + 1, LARGE])
 def test_large_systems_take_one_cholesky(n, derivative):
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
@@ -81,6 +81,17 @@ def test_small_systems_take_one_elimination(n, derivative):
     assert count(program, "div") - n * (n - 1) // 2 <= 2 * n * solves
 
 
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, MIDDLE])
+def test_middling_systems_take_one_elimination_by_rows(n, derivative):
+    """One row of divisions a turn of the elimination, one division a turn of each solve's loops."""
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert names(program) & FACTORISATIONS == set()
+    assert count(program, "div", without=("custom_linear_solve",)) == n
+    assert count(program, "div") == n + 2 * n * (2 if derivative else 1)
+
+
 def test_the_counts_see_a_second_factorisation():
     """The counter itself: the two forms that the tests above forbid."""
 
@@ -89,7 +100,7 @@ def test_the_counts_see_a_second_factorisation():
 
     for n in (SMALL, LARGE):
         program = operations(twice, jnp.eye(n), jnp.ones(n))
-        assert count(program, "cholesky") == (2 if n > UNROLL_UP_TO else 0)
+        assert count(program, "cholesky") == (2 if n > LOOP_UP_TO else 0)
         if n <= UNROLL_UP_TO:
             divisions = count(program, "div", without=("custom_linear_solve",))
             assert divisions == n * (n - 1)

@@ -195,5 +195,16 @@ NUMPY |= {
     "cumprod": _running(np.cumprod),
 }
 
+def _unstack(eqn: Any, x: np.ndarray) -> list:
+    return list(np.moveaxis(x, eqn.params["axis"], 0))
+
+
+def _iota(eqn: Any) -> list:
+    """Numbers from 0 along one axis."""
+    shape, axis = eqn.params["shape"], eqn.params["dimension"]
+    along = np.arange(shape[axis]).astype(eqn.params["dtype"])
+    return [np.broadcast_to(along.reshape((-1,) + (1,) * (len(shape) - axis - 1)), shape)]
+
+
 # What else derivatives are full of; not among NUMPY, the primitives that have a scalar form.
-_PARTS: dict[str, Callable] = {"pad": _pad, "split": _split}
+_PARTS: dict[str, Callable] = {"pad": _pad, "split": _split, "unstack": _unstack, "iota": _iota}
