@@ -196,7 +196,7 @@ NUMPY |= {
 }
 
 def _unstack(eqn: Any, x: np.ndarray) -> list:
-    return list(np.moveaxis(x, eqn.params["axis"], 0))
+    return [np.asarray(row) for row in np.moveaxis(x, eqn.params["axis"], 0)]
 
 
 def _iota(eqn: Any) -> list:
