@@ -43,7 +43,7 @@ class Beginning(NamedTuple):
     def start(self) -> np.ndarray:
         """y at t = 0."""
         w0 = self.v0 if self.turning is None else self.turning(self.q0, self.v0)
-        return np.concatenate([self.q0, w0])
+        return np.concatenate([self.q0, np.asarray(w0)])
 
     def by_hand(self) -> Callable[[Any, Array, Any], Array]:
         """dy/dt for diffrax."""
@@ -108,8 +108,8 @@ def hovering(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
     ]
 
 
-def _body_rates(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return np.concatenate([v[:3], np.asarray(jl.rotation.yaw_pitch_roll.body_rates(q[3:], v[3:]))])
+def _body_rates(q: Any, v: Any) -> Any:
+    return jnp.concatenate([v[:3], jl.rotation.yaw_pitch_roll.body_rates(q[3:], v[3:])])
 
 
 def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:

@@ -11,6 +11,7 @@ import jax
 
 BENCHMARKS = (
     "solve",
+    "first-result",
     "batch",
     "gradient",
     "lowering",

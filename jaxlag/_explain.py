@@ -1,6 +1,6 @@
 """The text of `System.explain`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -36,8 +36,7 @@ def explain(system: "System", structure: Structure, lowered: Lowered | None, row
         f"coordinates   {system.size}: {', '.join(system.coordinates.labels)}",
         f"lagrangian    depends on {_list(structure.lagrangian)}; "
         + ("explicit time" if structure.explicit_time else "no explicit time, so dL/dt is skipped"),
-        f"mass matrix   depends on {_list(structure.mass)}; "
-        + ("L is quadratic in v" if structure.quadratic else "L is not quadratic in v"),
+        f"mass matrix   depends on {_list(structure.mass)}",
         "bias          "
         + ("zero" if structure.bias_zero else f"depends on {_list(structure.bias)}"),
         f"forces        {', '.join(forces) if forces else 'none, so no force code is compiled'}",
@@ -93,8 +92,9 @@ def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[st
     if found.mass_constant:
         facts.append("M constant, factored once per solve")
     else:
-        inputs = sorted(labels[i] + ("'" if name == "v" else "") for name, i in found.mass_depends)
-        facts.append(f"M depends on {', '.join(inputs)}")
+        facts.append(f"M depends on {', '.join(_inputs(labels, found.mass_depends))}")
+    if found.quadratic:
+        facts.append("L quadratic in v")
     if system.size > 1 and len(found.mass_blocks) == system.size:
         facts.append("M diagonal")
     elif len(found.mass_blocks) > 1:
@@ -115,6 +115,12 @@ def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[st
         _steps(len(program.body)),
         _batches(),
     ]
+
+
+def _inputs(labels: Sequence[str], inputs: Iterable[tuple[str, int]]) -> list[str]:
+    """Names of inputs: t, x, x'."""
+    marks = {"q": "", "v": "'"}
+    return sorted("t" if name == "t" else f"{labels[i]}{marks[name]}" for name, i in inputs)
 
 
 def _in_quasi(lowered: Lowered, equations: Equations) -> list[str]:

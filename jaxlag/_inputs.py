@@ -315,7 +315,7 @@ def evaluate(
     intervals: Mapping[str, Any] | None = None,
     since: Float[Array, ""] | None = None,
 ) -> InputValues:
-    """Values of all inputs at (t, q, v).
+    """Values of all inputs at (t, q, v); integers are numbers like any other.
 
     Args:
         inputs: by name.
@@ -330,10 +330,11 @@ def evaluate(
     intervals = locate(inputs, since) if intervals is None else intervals
 
     def value(name: str, signal: Any) -> Any:
-        if not isinstance(signal, AbstractInput):
-            return signal
-        clock = since if isinstance(signal, AbstractTable) else t
-        return signal.value(clock, q, v, params, intervals[name])
+        if isinstance(signal, AbstractInput):
+            clock = since if isinstance(signal, AbstractTable) else t
+            signal = signal.value(clock, q, v, params, intervals[name])
+        whole = jnp.issubdtype(jnp.result_type(signal), jnp.integer)
+        return jnp.asarray(signal, q.dtype) if whole else signal
 
     return InputValues({name: value(name, signal) for name, signal in inputs.items()})
 

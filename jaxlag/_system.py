@@ -24,6 +24,7 @@ from jaxlag._lowering import (
     ArrayTerms,
     ScalarTerms,
     Structure,
+    check_indices,
     check_kinematics,
     layout,
 )
@@ -333,7 +334,8 @@ class System(AbstractReactions):
             p = terms.momentum(t, q, v, params)
             return p if values is None else p + terms.force(t, q, v, params, values)
 
-        jax.eval_shape(all_terms, t, q, v, traced)
+        closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
+        check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -12,9 +12,9 @@ from jaxlag._lowering._diff import gradient
 from jaxlag._lowering._expand import Expansion
 from jaxlag._lowering._forms import (
     attempt,
-    branches,
     christoffel_form,
     cost,
+    degree,
     mass_matrix,
     momentum_form,
     nonzeros,
@@ -66,12 +66,13 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
     short = attempt(lambda: expansion.simplified(bias))
     if short is not None:
         forms.append(("derivative of the momentum, expanded", short))
-    if not varies(mass, scene.v) and not branches(L, scene.v):
+    seen = [form for form in written if degree([form], scene.v) <= 2.0]
+    if seen and not varies(mass, scene.v):
         for words, form in (
             ("Christoffel symbols", christoffel_form),
             ("rates of M and c", rate_form),
         ):
-            best = form(scene, written[-1], mass)
+            best = form(scene, seen[-1], mass)
             forms.append((words, best))
             short = attempt(partial(expansion.simplified, best))
             if short is not None:

@@ -1,5 +1,6 @@
 """Operations element by element."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +26,7 @@ def _convert(graph: Graph, eqn: Any, x: Node) -> Node:
 
 def _pow(graph: Graph, eqn: Any, x: Node, y: Node) -> Node:
     exponent = y.constant
-    if exponent is not None and exponent == int(exponent):
+    if exponent is not None and math.isfinite(exponent) and exponent == int(exponent):
         return graph.power(x, int(exponent))
     if exponent == 0.5:
         return graph.sqrt(x)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from jaxlag._lowering._diff import tangents
+from jaxlag._lowering._forms import degree
 from jaxlag._lowering._graph import Node, dependencies
 from jaxlag._lowering._scene import Equations, Scene
 from jaxlag._lowering._solve import blocks
@@ -19,7 +19,8 @@ class Findings(NamedTuple):
         subsystems: coordinates coupled at all, forces included.
         bias_zero: whether h = 0.
         separable: whether L = T(v) - V(q) with a constant M.
-        linear: whether M is constant and Q - h of first degree in (q, v).
+        quadratic: whether L is a polynomial of degree 2 in v.
+        linear: whether M is constant and Q - h a polynomial of first degree in (q, v).
     """
 
     cyclic: tuple[int, ...]
@@ -28,6 +29,7 @@ class Findings(NamedTuple):
     subsystems: tuple[tuple[int, ...], ...]
     bias_zero: bool
     separable: bool
+    quadratic: bool
     linear: bool
 
     @property
@@ -47,6 +49,7 @@ def find(scene: Scene, equations: Equations) -> Findings:
     in_mass = _state(reached[x] for row in M for x in row)
     in_bias = _state(reached[x] for x in h)
     constant = not in_mass
+    quadratic = degree([equations.lagrangian], scene.v) <= 2.0
     in_L = reached[equations.lagrangian]
     return Findings(
         cyclic=tuple(i for i in range(n) if ("q", i) not in in_L),
@@ -54,8 +57,9 @@ def find(scene: Scene, equations: Equations) -> Findings:
         mass_blocks=tuple(map(tuple, blocks(M, graph.zero))),
         subsystems=_coupled(scene, M, effort, reached),
         bias_zero=all(x is graph.zero for x in h),
-        separable=constant and not any(name in ("v", "t") for name, _ in in_bias),
-        linear=constant and _first_degree(scene, effort),
+        separable=quadratic and constant and not any(name in ("v", "t") for name, _ in in_bias),
+        quadratic=quadratic,
+        linear=constant and degree(effort, [*scene.q, *scene.v]) <= 1.0,
     )
 
 
@@ -82,12 +86,3 @@ def _coupled(
     one = scene.graph.one
     pattern = [[one if linked[i][j] else zero for j in range(n)] for i in range(n)]
     return tuple(map(tuple, blocks(pattern, zero)))
-
-
-def _first_degree(scene: Scene, effort: Sequence[Node]) -> bool:
-    """Whether the slopes in q and v contain neither."""
-    for x in (*scene.q, *scene.v):
-        slopes = tangents(scene.graph, effort, {x: scene.graph.one})
-        if any(name in ("q", "v") for found in dependencies(slopes).values() for name, _ in found):
-            return False
-    return True

@@ -1,10 +1,11 @@
 """M and h from L on the graph, in several forms."""
 
+import math
 from collections.abc import Callable, Sequence
 
 from jaxlag._lowering._diff import gradient, tangents
 from jaxlag._lowering._expand import TooLong
-from jaxlag._lowering._graph import Graph, Node, dependencies, order, substitute
+from jaxlag._lowering._graph import Graph, Node, order, substitute
 from jaxlag._lowering._program import assemble
 from jaxlag._lowering._scene import Scene
 
@@ -40,7 +41,7 @@ def momentum_form(scene: Scene, L: Node) -> list[Node]:
 
 
 def christoffel_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
-    """h_i = sum_jk (dM_ij/dq_k - dM_jk/dq_i / 2) v_j v_k + the rest of L, for M free of v.
+    """h_i = sum_jk (dM_ij/dq_k - dM_jk/dq_i / 2) v_j v_k + the rest of L, for L quadratic in v.
 
     The rest, L - v.Mv/2, is linear in v: c . v + L_0, with c and L_0 read off at v = 0. With
     time in M or c, dM/dt v + dc/dt join in.
@@ -81,7 +82,7 @@ def christoffel_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list
 
 
 def rate_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
-    """h = dM/dt v + dc/dt - dL/dq along the motion, for p = M v + c with M free of v."""
+    """h = dM/dt v + dc/dt - dL/dq along the motion, for L quadratic in v: p = M v + c."""
     graph, n = scene.graph, len(scene.q)
     at_rest = dict.fromkeys(scene.v, graph.zero)
     c = substitute(graph, gradient(graph, L, scene.v), at_rest)
@@ -97,28 +98,27 @@ def rate_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
     return h
 
 
-def branches(L: Node, inputs: Sequence[Node]) -> bool:
-    """Whether L may be one function here and another there of any of the inputs.
+def degree(roots: Sequence[Node], variables: Sequence[Node]) -> float:
+    """Of polynomials in the variables with coefficients free of them; inf where it is none.
 
-    Else M free of v is so everywhere, and p = M v + c with c = p at v = 0.
+    What the graph shows: a function, a choice or a stopped derivative of a variable counts as
+    none, whatever becomes of it.
     """
-    wanted = {node.data for node in inputs}
-    reached = dependencies([L])
-    return any(
-        (
-            node.op in ("select", "custom", "stop")
-            or (node.op == "call" and node.data.name in BROKEN)
-        )
-        and not wanted.isdisjoint(reached[node])
-        for node in order([L])
-    )
-
-
-# Functions with a corner or a jump.
-BROKEN = frozenset(
-    """abs max min sign floor ceil round rem clamp nextafter eq ne lt le gt ge and or not xor
-    is_finite""".split()  # noqa: SIM905
-)
+    wanted, known = set(variables), dict[Node, float]()
+    for node in order(roots):
+        below = [known[arg] for arg in node.args]
+        if node in wanted:
+            known[node] = 1.0
+        elif not any(below):
+            known[node] = 0.0
+        elif node.op in ("sum", "let"):
+            known[node] = max(below)
+        elif node.op == "product":
+            powers = zip(below, (e for _, e in node.data), strict=True)
+            known[node] = sum(d * e if e > 0 else math.inf for d, e in powers if d)
+        else:
+            known[node] = math.inf
+    return max((known[root] for root in roots), default=0.0)
 
 
 def varies(M: Sequence[Sequence[Node]], inputs: Sequence[Node]) -> bool:

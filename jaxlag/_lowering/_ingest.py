@@ -18,8 +18,8 @@ from jaxlag import _params
 from jaxlag._dependence import scan_sizes
 from jaxlag._lowering._elementwise import ELEMENTWISE, elementwise
 from jaxlag._lowering._graph import Graph, Node, named
-from jaxlag._lowering._interpret import NUMPY
-from jaxlag._lowering._moves import MOVES, WHOLE, move
+from jaxlag._lowering._interpret import NUMPY, held
+from jaxlag._lowering._moves import MOVES, SHIFTS, WHOLE, move
 from jaxlag._lowering._nodes import Missing, broadcast, nodes
 
 LIMIT = 50_000  # nodes of a graph: far beyond what a scalar program is good for
@@ -98,16 +98,16 @@ def read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarra
         raise Unsupported(str(missing)) from None
 
 
-def _read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarray]:
-    return _run(graph, closed.jaxpr, [np.asarray(c) for c in closed.consts], list(args))
+def _read(graph: Graph, closed: ClosedJaxpr, *args: Any) -> list:
+    return _run(graph, closed.jaxpr, list(map(held, closed.consts)), list(args))
 
 
-def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list[np.ndarray]:
-    known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, consts, strict=True))
+def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list:
+    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
     known.update(zip(jaxpr.invars, args, strict=True))
 
-    def value(atom: Any) -> np.ndarray:
-        return np.asarray(atom.val) if isinstance(atom, Literal) else known[atom]
+    def value(atom: Any) -> Any:
+        return held(atom.val) if isinstance(atom, Literal) else known[atom]
 
     for eqn in jaxpr.eqns:
         operands = [value(atom) for atom in eqn.invars]
@@ -121,23 +121,23 @@ def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list[np.ndarra
             raise Unsupported(f"{missing} at {where}") from None
         if len(graph.nodes) > LIMIT:
             raise Unsupported(f"more than {LIMIT} scalar operations")
-        known.update(zip(eqn.outvars, results, strict=True))
+        for var, array in zip(eqn.outvars, results, strict=True):
+            # Nothing holds no nodes: it is known.
+            empty = array.dtype == object and array.size == 0
+            aval: Any = var.aval
+            known[var] = np.zeros(aval.shape, aval.dtype) if empty else array
     return [value(atom) for atom in jaxpr.outvars]
 
 
-def _equation(graph: Graph, eqn: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _equation(graph: Graph, eqn: Any, operands: list) -> list:
     name = eqn.primitive.name
+    if not any(array.dtype == object for array in operands) and name != "while":
+        return _known(eqn, operands)
     if name in _CALLS:
         return _call(graph, eqn, operands)
     if name in _CONTROL:
         return _CONTROL[name](graph, eqn, operands)
-    if not any(array.dtype == object for array in operands):
-        if eqn.primitive.multiple_results:
-            raise Missing(name)
-        if name in NUMPY:
-            return [np.asarray(NUMPY[name](eqn, *operands)).astype(eqn.outvars[0].aval.dtype)]
-        with jax.ensure_compile_time_eval():
-            return [np.asarray(eqn.primitive.bind(*operands, **eqn.params))]
+    _check_kinds(eqn, operands)
     if name in MOVES:
         return move(graph, eqn, operands)
     if name in WHOLE:
@@ -145,6 +145,35 @@ def _equation(graph: Graph, eqn: Any, operands: list[np.ndarray]) -> list[np.nda
     if name in ELEMENTWISE:
         return [elementwise(graph, eqn, operands)]
     raise Missing(name)
+
+
+def _known(eqn: Any, operands: list) -> list:
+    """What is known while tracing, computed by JAX, but for what numpy moves alike."""
+    name = eqn.primitive.name
+    if name in SHIFTS:
+        return [np.asarray(NUMPY[name](eqn, *operands))]
+    params = eqn.primitive.get_bind_params(eqn.params)
+    with jax.ensure_compile_time_eval():
+        found = eqn.primitive.bind(*operands, **params)
+    return [held(x) for x in (found if eqn.primitive.multiple_results else [found])]
+
+
+def _check_kinds(eqn: Any, operands: list) -> None:
+    """Numbers made from truth values are computed with as real ones: as far as that is the same."""
+    name = eqn.primitive.name
+    kinds = [v.aval.dtype for v, x in zip(eqn.invars, operands, strict=True) if x.dtype == object]
+    if name not in _OF_TRUTHS and any(kind == np.bool_ for kind in kinds):
+        raise Missing(f"{name} of truth values")
+    whole = [kind for kind in kinds if np.issubdtype(kind, np.integer)]
+    if whole and (name not in _OF_INTEGERS or any(kind.itemsize < 4 for kind in whole)):
+        raise Missing(f"{name} of integers")
+
+
+_OF_TRUTHS = {"and", "or", "xor", "not", "eq", "ne", "select_n", "convert_element_type"}
+_OF_TRUTHS |= {"reduce_and", "reduce_or", "argmax", "argmin", "stop_gradient", *MOVES}
+_OF_INTEGERS = {"add", "sub", "mul", "neg", "eq", "ne", "lt", "le", "gt", "ge", "max", "min"}
+_OF_INTEGERS |= {"select_n", "convert_element_type", "reduce_sum", "reduce_max", "reduce_min"}
+_OF_INTEGERS |= {"stop_gradient", "cumsum", "clamp", "argmax", "argmin", *MOVES}
 
 
 # ---- Calls and control flow ------------------------------------------------------------------
@@ -162,10 +191,8 @@ def _call(graph: Graph, eqn: Any, operands: list) -> list:
 
 def _custom_jvp(graph: Graph, eqn: Any, operands: list) -> list:
     rule = Rule(eqn)
-    if any(array.dtype != object for array in operands) and all(
-        array.dtype != object for array in operands
-    ):
-        return _read(graph, rule.body, *operands)
+    if not all(jax.numpy.issubdtype(aval.dtype, np.floating) for aval in rule.avals):
+        raise Missing("custom_jvp of what is no real number")
     args = rule.flat([nodes(graph, array) for array in operands])
     results, index = [], 0
     for shape in rule.shapes:

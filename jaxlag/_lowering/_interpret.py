@@ -4,6 +4,7 @@ NUMPY holds primitives as functions of (equation, operands).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,10 +12,17 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 
-def interpret(closed: ClosedJaxpr, *args: Any) -> list[np.ndarray]:
+def interpret(closed: ClosedJaxpr, *args: Any) -> list:
     """The results of a program at given arrays; overflows and the like give inf and nan."""
     with np.errstate(all="ignore"):
-        return _run(closed.jaxpr, [np.asarray(c) for c in closed.consts], list(args))
+        return _run(closed.jaxpr, list(map(held, closed.consts)), list(args))
+
+
+def held(value: Any) -> Any:
+    """A known value as numpy has it; random keys stay what they are."""
+    kind = getattr(value, "dtype", None)
+    extended = kind is not None and jax.dtypes.issubdtype(kind, jax.dtypes.extended)
+    return value if extended else np.asarray(value)
 
 
 def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
@@ -22,9 +30,9 @@ def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
     known.update(zip(jaxpr.invars, args, strict=True))
     for eqn in jaxpr.eqns:
         operands = [a.val if isinstance(a, Literal) else known[a] for a in eqn.invars]
-        results = equation(eqn, [np.asarray(x) for x in operands])
+        results = equation(eqn, list(map(held, operands)))
         known.update(zip(eqn.outvars, results, strict=True))
-    return [np.asarray(a.val) if isinstance(a, Literal) else known[a] for a in jaxpr.outvars]
+    return [held(a.val) if isinstance(a, Literal) else known[a] for a in jaxpr.outvars]
 
 
 def equation(eqn: Any, operands: list) -> list:
@@ -34,17 +42,23 @@ def equation(eqn: Any, operands: list) -> list:
         inner = eqn.params.get(key)
         if name in _CALLS and inner is not None:
             if isinstance(inner, ClosedJaxpr):
-                return _run(inner.jaxpr, [np.asarray(c) for c in inner.consts], operands)
+                return _run(inner.jaxpr, list(map(held, inner.consts)), operands)
             return _run(inner, [], operands)
     if name in NUMPY:
-        return [np.asarray(NUMPY[name](eqn, *operands))]
+        out = np.asarray(NUMPY[name](eqn, *operands))
+        kind = eqn.outvars[0].aval.dtype
+        # Integers keep their width, in which they wrap; real numbers are computed in double.
+        return [out.astype(kind) if np.issubdtype(kind, np.integer) else out]
     if name in _PARTS:
         return _PARTS[name](eqn, *operands)
     kinds = [v.aval.dtype for v in eqn.invars]
     with jax.ensure_compile_time_eval():
-        given = [x.astype(kind) for x, kind in zip(operands, kinds, strict=True)]
+        given = [
+            x.astype(kind) if isinstance(x, np.ndarray) else x
+            for x, kind in zip(operands, kinds, strict=True)
+        ]
         out = eqn.primitive.bind(*given, **eqn.params)
-    return [np.asarray(x) for x in out] if eqn.primitive.multiple_results else [np.asarray(out)]
+    return [held(x) for x in (out if eqn.primitive.multiple_results else [out])]
 
 
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
@@ -57,6 +71,12 @@ def _plain(function: Callable) -> Callable:
 
 def _axes(function: Callable) -> Callable:
     return lambda eqn, x: function(x, axis=tuple(eqn.params["axes"]))
+
+
+def _extreme(function: Callable, of_nothing: float, x: np.ndarray, axis: tuple) -> Any:
+    if x.size or not np.issubdtype(x.dtype, np.floating):
+        return function(x, axis=axis)
+    return function(x, axis=axis, initial=of_nothing)
 
 
 def _running(function: Callable) -> Callable:
@@ -127,6 +147,11 @@ def _convert(eqn: Any, x: np.ndarray) -> Any:
     return x if real else x.astype(new)
 
 
+def _whole(x: np.ndarray, y: np.ndarray) -> Any:
+    """The quotient of integers, cut off towards zero."""
+    return np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))
+
+
 def _integer_pow(eqn: Any, x: np.ndarray) -> Any:
     exponent = eqn.params["y"]
     return x ** (exponent if exponent >= 0 else float(exponent))
@@ -170,7 +195,7 @@ NUMPY: dict[str, Callable] = {
     }.items()
 }
 NUMPY |= {
-    "div": lambda e, x, y: x / y if np.issubdtype(x.dtype, np.floating) else x // y,
+    "div": lambda e, x, y: x / y if np.issubdtype(x.dtype, np.floating) else _whole(x, y),
     "pow": lambda e, x, y: np.power(x, y),
     "integer_pow": lambda e, x: (
         x ** (e.params["y"] if e.params["y"] >= 0 else float(e.params["y"]))
@@ -189,11 +214,12 @@ NUMPY |= {
     "dot_general": _dot,
     "reduce_sum": _axes(np.sum),
     "reduce_prod": _axes(np.prod),
-    "reduce_max": _axes(np.max),
-    "reduce_min": _axes(np.min),
+    "reduce_max": _axes(partial(_extreme, np.max, -np.inf)),
+    "reduce_min": _axes(partial(_extreme, np.min, np.inf)),
     "cumsum": _running(np.cumsum),
     "cumprod": _running(np.cumprod),
 }
+
 
 def _unstack(eqn: Any, x: np.ndarray) -> list:
     return [np.asarray(row) for row in np.moveaxis(x, eqn.params["axis"], 0)]

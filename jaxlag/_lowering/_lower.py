@@ -6,9 +6,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxlag import _params
-from jaxlag._lowering._compare import SLACK, STATES, compare
+from jaxlag._lowering._compare import compare
 from jaxlag._lowering._derive import derive
 from jaxlag._lowering._graph import Node, order
+from jaxlag._lowering._indices import OutOfRange
 from jaxlag._lowering._ingest import Unsupported
 from jaxlag._lowering._key import Key
 from jaxlag._lowering._read import read_scene
@@ -44,10 +45,23 @@ class Lowered(NamedTuple):
 def lower(key: Key, sample: _params.Sample) -> Lowered:
     """The scalar program for a key; compared with the array program before it is used.
 
+    Whatever fails on the way, there is the array program; what is wrong with the declaration
+    itself comes to light there.
+
     Args:
         key: what it is made for.
         sample: params to compare with where they are known, else random ones are used.
     """
+    try:
+        return _lowered(key, sample)
+    except OutOfRange:
+        raise
+    except Exception as error:
+        said = (str(error) or "no message").splitlines()[0]
+        return Lowered(None, f"no scalar program: {type(error).__name__}: {said}", None)
+
+
+def _lowered(key: Key, sample: _params.Sample) -> Lowered:
     try:
         scene = read_scene(key)
         if key.limit is not None and (units := _units(scene)) > UNITS:
@@ -59,12 +73,8 @@ def lower(key: Key, sample: _params.Sample) -> Lowered:
     if key.limit is not None and operations + once > key.limit:
         found = f"{operations} operations, {once} more once per solve: more than {key.limit}"
         return Lowered(None, found, scene)
-    compared, difference = compare(key, equations, sample.leaves)
-    if not difference <= 1.0:
-        found = f"differs from the array program by {SLACK * difference:.1e} roundings"
-        return Lowered(None, found, scene)
-    words = f"equal to the array program at {compared} of {STATES} random states"
-    return Lowered(equations, words, scene)
+    compared = compare(key, equations, sample.leaves)
+    return Lowered(equations if compared.sound else None, compared.words, scene)
 
 
 def _units(scene: Scene) -> int:

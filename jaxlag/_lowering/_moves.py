@@ -38,6 +38,10 @@ MOVES: dict[str, int | None] = {
 }
 
 
+# Those among them that the interpreter has in numpy; nothing else is shared with it.
+SHIFTS = frozenset(MOVES) & frozenset(NUMPY)
+
+
 def move(graph: Graph, eqn: Any, operands: list) -> list:
     """Run the primitive on positions in a row of all elements."""
     count = MOVES[eqn.primitive.name]
@@ -58,13 +62,13 @@ def _moved(graph: Graph, eqn: Any, operands: list, data: Sequence[int]) -> list:
             raise Missing(f"{eqn.primitive.name} with an index that depends on values")
         else:
             positions.append(array)
-    params = dict(eqn.params)
-    if "fill_value" in params:
-        params["fill_value"] = len(pool)
-    nowhere = graph.const(np.nan) if params.get("fill_value") is not None else None
+    params, nowhere = dict(eqn.params), None
+    if "fill_value" in params:  # of what lies outside; NaN unless it is stated
+        given, params["fill_value"] = params["fill_value"], len(pool)
+        nowhere = graph.const(np.nan if given is None else float(given))
     row = np.empty(len(pool) + 1, object)
     row[:] = [*pool, nowhere]
-    if eqn.primitive.name in NUMPY:
+    if eqn.primitive.name in SHIFTS:  # in numpy: JAX would compile each
         moved = [NUMPY[eqn.primitive.name](eqn, *positions)]
     else:
         with jax.ensure_compile_time_eval():
@@ -153,7 +157,8 @@ def _reduce(combine: Callable) -> Callable:
         axes = tuple(eqn.params["axes"])
         kept = [i for i in range(array.ndim) if i not in axes]
         shape = tuple(array.shape[i] for i in kept)
-        rows = array.transpose(*kept, *axes).reshape(int(np.prod(shape)), -1)
+        size = int(np.prod([array.shape[i] for i in axes]))
+        rows = array.transpose(*kept, *axes).reshape(int(np.prod(shape)), size)
         return take(
             [combine(graph, list(row)) for row in rows], np.arange(len(rows)).reshape(shape)
         )

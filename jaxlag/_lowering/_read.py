@@ -13,6 +13,7 @@ from jaxlag._forces import reads_lam
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._constrained import Constrained
 from jaxlag._lowering._graph import Graph, Node
+from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
 from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._rows import layout_of
@@ -41,7 +42,9 @@ def read_scene(key: Key) -> Scene:
         kinematics = _kinematics(key, graph, state, params)
         at = state if key.in_u is None else [*state[:2], _array(list(kinematics.u), (-1,))]
     lagrangian = real_scalar("lagrangian", key.in_u or key.lagrangian)
-    (L,) = read(graph, traced(key, lagrangian, False, speeds=at[2].size), *at, *params)
+    of_L = traced(key, lagrangian, False, speeds=at[2].size)
+    check_indices(of_L, [None, "q", "v" if key.in_u is None else "u", *(None for _ in params)])
+    (L,) = read(graph, of_L, *at, *params)
     force = None
     if key.forces:
         terms = ArrayTerms(key.lagrangian, key.forces)

@@ -97,12 +97,18 @@ class ScalarTerms(Terms):
         prepared: Any = None,
         kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, " n"]:
-        """Acceleration a; NaN where M is not positive definite."""
+        """Acceleration a; NaN, whole, where M is not positive definite.
+
+        In a solve, where `prepared` is known, of blocks of M that nothing couples the others keep
+        their values: the step fails by the one that is NaN.
+        """
         if self.lowered(q, params, inputs).equations is None:
             return self.array.acceleration(t, q, v, params, inputs, prepared, kept)
-        if prepared is None:
-            prepared = self.prepare(q, params, inputs, kept=kept)
-        return self.rates(t, q, v, params, inputs, prepared)
+        if prepared is not None:
+            return self.rates(t, q, v, params, inputs, prepared)
+        own: Any = self.prepare(q, params, inputs, kept=kept)
+        a = self.rates(t, q, v, params, inputs, own)
+        return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
     def rates(
         self,

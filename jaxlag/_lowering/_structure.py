@@ -24,7 +24,7 @@ class Structure(NamedTuple):
 
     @property
     def quadratic(self) -> bool:
-        """Whether M is free of v, so that L is quadratic in v."""
+        """Whether M is free of v."""
         return "v" not in self.mass
 
     @property
