@@ -58,7 +58,7 @@ def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any]) -> None:
         if not isinstance(first, Literal) and first in vectors:
             _check(eqn, vectors[first], values[1:])
         inner = eqn.params.get("jaxpr")
-        if isinstance(inner, ClosedJaxpr) and len(inner.jaxpr.invars) == len(eqn.invars):
+        if eqn.primitive.name in ("jit", "pjit", "checkpoint") and isinstance(inner, ClosedJaxpr):
             inside = list(zip(inner.jaxpr.invars, eqn.invars, values, strict=True))
             _walk(
                 inner.jaxpr,
