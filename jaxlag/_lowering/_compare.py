@@ -68,7 +68,7 @@ def compare(key: Key, equations: Equations, known: list | None) -> Comparison:
         t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
         params = [rng.uniform(0.5, 1.5, leaf.shape) for leaf in like]
         if own and known is not None:
-            params = [np.asarray(x) for x in known]
+            params = [np.asarray(x, np.float64) for x in known]
         inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
         values: dict[tuple[str, int], Any] = {("t", 0): t, ("sense", 0): 1.0}
         for name, rows in (("q", [q]), ("v", [v]), ("params", params), ("inputs", inputs)):

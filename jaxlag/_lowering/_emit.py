@@ -48,7 +48,7 @@ def prelude(
             values = {"kept": kept, "sense": sense}
             flat = leaves(_params.split(params)[0] if given == "params" else values[given])
             slots |= {slot: jnp.asarray(flat[index], dtype) for index, slot in wanted.items()}
-    run(program.prelude, slots)
+    run(program.prelude, slots, program.whole)
     row = [jnp.asarray(slots[slot], dtype) for slot in program.carried]
     return jnp.stack([*row, _one(row)]) if row else jnp.zeros((0,), dtype)
 

@@ -1,19 +1,21 @@
 """Simplification: expressions as polynomials in atoms, and back as products of few factors.
 
-An atom is an input, a call of a function of simplified arguments, or the reciprocal of a
-simplified sum. sin^2 is written 1 - cos^2, so that equal polynomials in sines and cosines have
-one form and what cancels is gone; where it is shorter, sin^2 comes back.
+An atom is an input, a call of a function of simplified arguments, the reciprocal of a simplified
+sum, or a sum that is left as it is written. Only velocities, sines and cosines are multiplied out:
+a difference of coordinates or of parameters keeps digits that its terms, multiplied, would lose.
+Of sines and cosines m sin^2 + m cos^2 = m is used, and m - m cos^2 = m sin^2, never the reverse.
 """
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
-from jaxlag._lowering._graph import COS, SIN, SQRT, Graph, Node, order
+from jaxlag._lowering._graph import COS, POWERS, SIN, SQRT, Graph, Node, order, scaled
 
 Monomial = tuple[tuple[int, int], ...]  # (id of an atom, exponent), ascending
 Polynomial = dict[Monomial, float]
 
 CAP = 2000  # terms of a polynomial
+SPEEDS = ("v", "speed", "bound")
 
 
 class TooLong(Exception):
@@ -33,6 +35,7 @@ class Expansion:
         self._cosine: dict[int, int] = {}
         self._sine: dict[int, int] = {}
         self._radicand: dict[int, Node] = {}
+        self._left: set[int] = set()  # sums that are left as they are
 
     def simplified(self, roots: Iterable[Node]) -> list[Node]:
         """The roots as short sums of products."""
@@ -54,7 +57,7 @@ class Expansion:
             total: Polynomial = {(): constant} if constant != 0.0 else {}
             for term, coefficient in terms:
                 _add(total, self._known[term], coefficient)
-            return self._capped(_nonzero(total))
+            return self._capped(self._guarded(node, self._paired(_nonzero(total))))
         if node.op == "product":
             out: Polynomial = {(): 1.0}
             for base, exponent in node.data:
@@ -64,6 +67,8 @@ class Expansion:
 
     def _raised(self, base: Node, exponent: int) -> Polynomial:
         factor = self._known[base]
+        if abs(exponent) > POWERS and scaled(built := self.build(factor)):
+            return {((built.id, exponent),): 1.0}
         if exponent < 0:
             if len(factor) == 1:
                 ((monomial, coefficient),) = factor.items()
@@ -123,16 +128,81 @@ class Expansion:
         for left, x in a.items():
             for right, y in b.items():
                 self._collect(out, _merged(left, right), x * y)
-        return self._capped(_nonzero(out))
+        return self._capped(self._paired(_nonzero(out)))
+
+    def _guarded(self, node: Node, polynomial: Polynomial) -> Polynomial:
+        """Sums of different coordinates, or of parameters alone, as one atom for each velocity."""
+        if len(polynomial) < 2:
+            return polynomial
+        if node.fixed:
+            return self._as_atom(self.build(polynomial))
+        groups: dict[Monomial, Polynomial] = defaultdict(dict)
+        for monomial, coefficient in polynomial.items():
+            speeds = tuple(f for f in monomial if self._is(f[0]) == "speed")
+            groups[speeds][tuple(f for f in monomial if self._is(f[0]) != "speed")] = coefficient
+        out: Polynomial = {}
+        for speeds, group in groups.items():
+            kept = {tuple(f for f in m if self._is(f[0]) == "kept") for m in group}
+            if len(kept) > 1:
+                group = self._as_atom(self.build(group))
+            for monomial, coefficient in group.items():
+                out[_merged(monomial, speeds)] = coefficient
+        return out
+
+    def _as_atom(self, node: Node) -> Polynomial:
+        number, atom = _split(node)
+        if atom is None:
+            return {(): number} if number else {}
+        if atom.op == "product":
+            return {tuple(sorted((base.id, e) for base, e in atom.data)): number}
+        self._known.setdefault(atom, {((atom.id, 1),): 1.0})
+        return {((atom.id, 1),): number}
+
+    def _is(self, atom: int) -> str:
+        """What an atom is: "speed", "kept" as it is written, or one that is multiplied out."""
+        node = self.graph.nodes[atom]
+        if node.fixed or atom in self._cosine or atom in self._sine:
+            return "plain"
+        if node.op == "input" and node.data[0] in SPEEDS:
+            return "speed"
+        return "kept"
+
+    def _paired(self, polynomial: Polynomial) -> Polynomial:
+        """With m sin^2 + m cos^2 = m."""
+        waiting = list(polynomial)
+        while waiting:
+            monomial = waiting.pop()
+            for atom, exponent in monomial:
+                other = self._cosine.get(atom, self._sine.get(atom))
+                if exponent < 2 or other is None or monomial not in polynomial:
+                    continue
+                rest = _merged(monomial, ((atom, -2),))
+                partner = _merged(rest, ((other, 2),))
+                if polynomial.get(partner) == polynomial[monomial]:
+                    polynomial = dict(polynomial)
+                    total = polynomial.get(rest, 0.0) + polynomial.pop(partner)
+                    del polynomial[monomial]
+                    polynomial.pop(rest, None)
+                    if total != 0.0:
+                        polynomial[rest] = total
+                        waiting.append(rest)
+                        waiting.extend(self._near(rest, polynomial))
+        return polynomial
+
+    def _near(self, monomial: Monomial, polynomial: Polynomial) -> list[Monomial]:
+        """Those that the monomial may pair with."""
+        out = []
+        for atom, exponent in monomial:
+            other = self._cosine.get(atom, self._sine.get(atom))
+            if exponent >= 2 and other is not None:
+                partner = _merged(_merged(monomial, ((atom, -2),)), ((other, 2),))
+                if partner in polynomial:
+                    out.append(partner)
+        return out
 
     def _collect(self, out: Polynomial, monomial: Monomial, coefficient: float) -> None:
-        """Add a monomial, with sin^2 = 1 - cos^2 and sqrt(x)^2 = x applied."""
+        """Add a monomial, with sqrt(x)^2 = x applied."""
         for k, (atom, exponent) in enumerate(monomial):
-            if exponent >= 2 and atom in self._cosine:
-                rest = _merged(monomial[:k] + monomial[k + 1 :], ((atom, exponent - 2),))
-                self._collect(out, rest, coefficient)
-                self._collect(out, _merged(rest, ((self._cosine[atom], 2),)), -coefficient)
-                return
             if exponent >= 2 and atom in self._radicand:
                 rest = _merged(monomial[:k] + monomial[k + 1 :], ((atom, exponent - 2),))
                 inner = self.polynomial(self._radicand[atom])
@@ -171,20 +241,21 @@ class Expansion:
         return self._factored(terms)
 
     def _with_sines(self, groups: Mapping[Monomial, Polynomial]) -> dict[Monomial, Polynomial]:
-        """m - m cos^2 as m sin^2, wherever that removes a term."""
+        """m - m cos^2 as m sin^2, and the like with both interchanged: it removes a term."""
         groups = dict(groups)
         again = True
         while again:
             again = False
             for monomial in list(groups):
                 for atom, exponent in monomial:
-                    if exponent < 2 or atom not in self._sine or monomial not in groups:
+                    other = self._cosine.get(atom, self._sine.get(atom))
+                    if exponent < 2 or other is None or monomial not in groups:
                         continue
                     plain = _merged(monomial, ((atom, -2),))
                     if plain in groups and _opposite(groups[plain], groups[monomial]):
                         coefficient = groups.pop(plain)
                         del groups[monomial]
-                        squared = _merged(plain, ((self._sine[atom], 2),))
+                        squared = _merged(plain, ((other, 2),))
                         total = dict(groups.get(squared, {}))
                         _add(total, coefficient, 1.0)
                         groups[squared] = _nonzero(total)

@@ -24,6 +24,11 @@ FIXED = ("params", "kept", "sense")
 whether time runs forwards (+1) or backwards (-1)."""
 
 
+POWERS = 2
+"""Powers beyond are taken of a product with numbers or parameters as a whole: (q / a)^32 stays in
+the range of numbers where q^32 / a^32 does not."""
+
+
 class Node:
     """One scalar of a graph.
 
@@ -207,6 +212,9 @@ class Graph:
             return 1.0
         if node.op == "const":
             return _power(float(node.data), exponent)
+        if abs(exponent) > POWERS and scaled(node):
+            powers[node] = powers.get(node, 0) + exponent
+            return 1.0
         if node.op == "product":
             for base, inner in node.data:
                 powers[base] = powers.get(base, 0) + inner * exponent
@@ -288,6 +296,14 @@ class Graph:
     def let(self, node: Node) -> Node:
         """The node as one atom that no sum or product opens."""
         return node if node.op in ("const", "input", "let") else self._node("let", None, (node,))
+
+
+def scaled(node: Node) -> bool:
+    """Whether a node is something times a number or a parameter."""
+    if node.op == "sum":
+        constant, terms = node.data
+        return abs(terms[0][1]) != 1.0 or constant not in (0.0, 1.0, -1.0)
+    return node.op == "product" and any(base.fixed for base, _ in node.data)
 
 
 def _by_id(item: tuple[Node, Any]) -> int:

@@ -7,7 +7,16 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from jaxlag._lowering._graph import FIXED, Graph, Node, node_id, order, rebuilt
+from jaxlag._lowering._graph import (
+    FIXED,
+    POWERS,
+    Graph,
+    Node,
+    node_id,
+    order,
+    rebuilt,
+    scaled,
+)
 
 
 class Line(NamedTuple):
@@ -30,6 +39,7 @@ class Program(NamedTuple):
         inputs: (name, index) -> slot of the inputs that are read.
         numbers: slot -> value of the constants.
         truths: slots that hold truth values.
+        whole: slots of what is raised to a high power as a whole.
     """
 
     prelude: tuple[Line, ...]
@@ -39,6 +49,7 @@ class Program(NamedTuple):
     inputs: Mapping[tuple[str, int], int]
     numbers: Mapping[int, float | bool]
     truths: frozenset[int]
+    whole: frozenset[int]
 
     def __hash__(self) -> int:
         return id(self)
@@ -163,6 +174,7 @@ class _Assembly:
         self.sums: dict[Node, list[tuple[Any, float]]] = {}
         self.over: dict[Node, list[Any]] = {}
         self.under: dict[Node, list[Any]] = {}
+        self.whole: set[Node] = set()
         self._ranks: dict[Any, int] = {}
 
     @staticmethod
@@ -188,7 +200,9 @@ class _Assembly:
         made |= {slot for (name, _), slot in self.inputs.items() if name in FIXED}
         read = [slot for line in body for slot in line.args] + list(results)
         carried = tuple(sorted({slot for slot in read if slot in made}))
-        return Program(prelude, carried, body, results, self.inputs, self.numbers, self._truths())
+        whole = frozenset(self.slot[base] for base in self.whole if base in self.slot)
+        slots = self.inputs, self.numbers, self._truths(), whole
+        return Program(prelude, carried, body, results, *slots)
 
     def _truths(self) -> frozenset[int]:
         truths = {line.to for line in self.lines if getattr(line.data, "name", None) in _TRUTHS}
@@ -214,6 +228,8 @@ class _Assembly:
                 under: list[Any] = []
                 for base, exponent in node.data:
                     base = _open(base)
+                    if abs(exponent) > POWERS and scaled(base):
+                        self.whole.add(base)
                     if exponent > 0:
                         over += [base] * exponent
                     elif below[base] > 1 and node not in ends:

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxlag._lowering._graph import Graph, Node, named
 
+DOUBLE = 1e-12  # eps of double precision lies below, that of single precision above
 GREATER = named("gt")
 _ABS = named("abs")
 
@@ -44,8 +45,8 @@ def solve(graph: Graph, M: Sequence[Sequence[Node]], r: Sequence[Node], eps: flo
     """The a with M a = r, each ending in a division; NaN where M is not positive definite.
 
     L D L^T (Golub, Van Loan, Matrix Computations, sec. 4.1) of every block in order of least
-    coupling, the last two unknowns by Cramer's rule. A pivot must exceed 4 n eps M_ii, as in
-    `jaxlag._linalg.factor_mass`.
+    coupling; in double precision the last two unknowns by Cramer's rule. A pivot must exceed
+    4 n eps M_ii, as in `jaxlag._linalg.factor_mass`.
     """
     return bordered(graph, M, [], [(r, [])], eps)[0]
 
@@ -127,6 +128,8 @@ class _Elimination:
     ) -> None:
         self.graph, self.block, self.coordinates, self.kept = graph, block, coordinates, kept
         self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
+        # Products of two entries of M leave the range of single precision in common units.
+        self.cramer = eps < DOUBLE
         self.entry = {(i, j): graph.let(matrix[i][j]) for i in block for j in block}
         self.right = {i: [graph.let(side[i]) for side in right] for i in block}
         self.diagonal = {i: self.entry[i, i] for i in block}
@@ -142,7 +145,7 @@ class _Elimination:
         graph, left = self.graph, list(self.block)
         steps = []
         rows = bool(self.contains)
-        while len(left) > (1 if rows else 2):
+        while len(left) > (2 if self.cramer and not rows else 1):
             k = min(self._ready(left), key=lambda i: (self._coupling(i, left), i))
             left.remove(k)
             steps.append((k, self._eliminate(k, left), self._pivot(k)))

@@ -49,19 +49,23 @@ def straight(
     one = carried[-1] if kept and carried else None
     read = [slot for (name, _), slot in program.inputs.items() if name not in FIXED]
     slots |= dict(zip(read, given, strict=True))
-    run(program.body, slots, lanes, one, pairs, known)
+    run(program.body, slots, program.whole, lanes, one, pairs, known)
     return tuple(jnp.asarray(slots[slot], dtype) for slot in program.results)
 
 
 def run(
     lines: Sequence[Line],
     slots: dict[int, Any],
+    whole: frozenset[int] = frozenset(),
     lanes: bool = False,
     one: Array | None = None,
     pairs: Pairs | None = None,
     known: Pairs | None = None,
 ) -> None:
-    """Line after line, each a new slot."""
+    """Line after line, each a new slot.
+
+    XLA would move constants out of powers of what is `whole`, and out of the range of numbers.
+    """
     ruled: dict[Any, Array] = {}
     together = lanes or pairs is not None
     pairs = {} if pairs is None else pairs
@@ -84,6 +88,8 @@ def run(
             slots[line.to] = lax.div(_line(line, args), one)
         else:
             slots[line.to] = _line(line, args)
+        if line.to in whole:
+            slots[line.to] = lax.optimization_barrier(slots[line.to])
 
 
 def is_trig(line: Line) -> bool:
@@ -91,8 +97,23 @@ def is_trig(line: Line) -> bool:
     return line.op == "call" and line.data.name in _KEPT
 
 
+@jax.custom_jvp
+def _quotient(x: Array, y: Array) -> Array:
+    """x / y, whose derivative (dx - x/y dy) / y forms no square of y, as that of JAX does."""
+    return x / y
+
+
+@_quotient.defjvp
+def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (_, y), (dx, dy) = primals, tangents
+    z = _quotient(*primals)
+    return z, _quotient(dx - z * dy, y)
+
+
 def _line(line: Line, args: list[Any]) -> Any:
     op = line.op
+    if op == "div" and args[1].dtype == jnp.float32:
+        return _quotient(jnp.asarray(args[0], args[1].dtype), args[1])
     if op in _BINARY:
         return _BINARY[op](*args)
     if op == "neg":
