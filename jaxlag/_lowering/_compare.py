@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.linalg import norm
 
 from jaxlag._forces import reads_lam
 from jaxlag._kkt import augmented
@@ -14,7 +15,7 @@ from jaxlag._lowering._evaluate import evaluate
 from jaxlag._lowering._interpret import interpret
 from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._rows import layout_of
-from jaxlag._lowering._scene import Equations
+from jaxlag._lowering._scene import Equations, Scene
 
 STATES = 8  # random states at which both programs are compared
 LEAST = 6  # of them that must have been comparable
@@ -50,12 +51,13 @@ class Comparison(NamedTuple):
         return bool(self.difference <= 1.0) and self.states >= LEAST
 
 
-def compare(key: Key, equations: Equations, known: list | None) -> Comparison:
+def compare(key: Key, scene: Scene, equations: Equations, known: list | None) -> Comparison:
     """A program beside the array program, with the known params and with random ones.
 
     What is known may be special, and random params may be none that a system has: both are drawn
-    with, until there are states enough. States where the array program is ill-conditioned are
-    left out; where it has no value the other must have none.
+    with, until there are states enough. Where M is not positive definite, M, h and Q are compared
+    in place of the acceleration, where the system has no constraints; else such states are left
+    out. Where the array program has no value the other must have none.
     """
     expected = _Plain(key) if key.quasi is None else _Quasi(key)
     rng = np.random.default_rng(0)
@@ -78,7 +80,11 @@ def compare(key: Key, equations: Equations, known: list | None) -> Comparison:
         if right is None:
             return None
         values |= {("kept", k): float(x) for k, x in enumerate(right.kept)}
-        found = np.array([float(x) for x in evaluate(equations.accelerations, values)])
+        roots = equations.accelerations
+        if right.parts:
+            roots = [*(x for row in equations.mass for x in row), *equations.bias]
+            roots += scene.force or []
+        found = np.array([float(x) for x in evaluate(roots, values)])
         if not right.defined:
             return np.inf if np.all(np.isfinite(found)) else None
         off = float(np.max(np.abs(found - right.x) / right.allowed, initial=0.0))
@@ -99,12 +105,21 @@ def compare(key: Key, equations: Equations, known: list | None) -> Comparison:
 
 
 class _Right(NamedTuple):
-    """What the array program gives, how far off a sound program may be, and the rows kept."""
+    """What the array program gives.
+
+    Attributes:
+        x: the acceleration, or M, h and Q.
+        allowed: how far off a sound program may be.
+        kept: rows that are solved with.
+        defined: whether there is a value.
+        parts: whether x is M, h and Q.
+    """
 
     x: np.ndarray
     allowed: Any
     kept: Any = ()
     defined: bool = True
+    parts: bool = False
 
 
 _NONE = _Right(np.zeros(0), 0.0, defined=False)
@@ -145,8 +160,9 @@ class _Plain:
     def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
         n = self.key.size
         (M,) = interpret(self.mass, t, q, v, *params)
-        (right,) = interpret(self.bias, t, q, v, *params)
-        right = -right
+        (h,) = interpret(self.bias, t, q, v, *params)
+        Q = np.zeros(0)
+        right = -h
         if self.force is not None:
             (Q,) = interpret(self.force, t, q, v, *params, *inputs)
             right = Q + right
@@ -166,7 +182,10 @@ class _Plain:
             if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
                 return None
         elif not _definite(M):
-            return None
+            # Terms of h that cancel are of the size of M v v.
+            size = 1.0 + norm(M) * (1.0 + norm(v) ** 2) + norm(h) + norm(Q)
+            parts = np.concatenate([np.ravel(M), h, Q])
+            return _Right(parts, SLACK * float(jnp.finfo(self.key.dtype).eps) * size, parts=True)
         found = _solved(self.key, M, right)
         return None if found is None else _Right(found[0][:n], found[1], kept)
 

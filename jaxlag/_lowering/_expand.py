@@ -35,7 +35,6 @@ class Expansion:
         self._cosine: dict[int, int] = {}
         self._sine: dict[int, int] = {}
         self._radicand: dict[int, Node] = {}
-        self._left: set[int] = set()  # sums that are left as they are
 
     def simplified(self, roots: Iterable[Node]) -> list[Node]:
         """The roots as short sums of products."""

@@ -73,7 +73,7 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
     if key.limit is not None and operations + once > key.limit:
         found = f"{operations} operations, {once} more once per solve: more than {key.limit}"
         return Lowered(None, found, scene)
-    compared = compare(key, equations, sample.leaves)
+    compared = compare(key, scene, equations, sample.leaves)
     return Lowered(equations if compared.sound else None, compared.words, scene)
 
 

@@ -313,10 +313,10 @@ def test_params_at_hand_are_compared_with():
 
         return jl.System(lagrangian, declared.coordinates.shapes)
 
-    assert "equal to the array program at 8 random states" in fresh().explain(params)
+    assert "equal to the array program at 12 random states" in fresh().explain(params)
     simulated = fresh()
     jl.simulate(simulated, q0, np.zeros(3), [0.0, 0.1], params)
-    assert "equal to the array program at 8 random states" in simulated.explain(params)
+    assert "equal to the array program at 12 random states" in simulated.explain(params)
 
 
 @pytest.mark.full
