@@ -148,8 +148,8 @@ def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
     return [turn, spin, (M22 * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det]
 
 
-def _chain(n: int) -> Beginning:
-    scene = links(n)
+def chain_on_arrays(n: int) -> Callable[[Any, Array, Any], Array]:
+    """dy/dt of `bench._scenes.links(n)`, as a hand would write it for JAX."""
     later = np.maximum.outer(np.arange(n), np.arange(n))
 
     def field(t: Any, y: Array, p: Any) -> Array:
@@ -161,9 +161,14 @@ def _chain(n: int) -> Beginning:
         a = jnp.linalg.solve(A * jnp.cos(between), -(A * jnp.sin(between)) @ v**2 - pull)
         return jnp.concatenate([v, a])
 
+    return field
+
+
+def _chain(n: int) -> Beginning:
+    scene = links(n)
     system = jl.System(scene.lagrangian, [f"q{i}" for i in range(n)])
-    q0, v0 = np.array(scene.q0), np.zeros(n)
-    return Beginning(system, scene.params, q0, v0, 1.0, _timeless(_explicit.chain), field)
+    q0, v0, rates = np.array(scene.q0), np.zeros(n), _timeless(_explicit.chain)
+    return Beginning(system, scene.params, q0, v0, 1.0, rates, chain_on_arrays(n))
 
 
 BODIES, AXES = 5, 3

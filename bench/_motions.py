@@ -19,6 +19,7 @@ import jaxlag as jl
 from bench import _explicit
 from bench._double_pendulum import PARAMS as PENDULUM
 from bench._explicit import PLAIN, Rates
+from bench._first_scenes import chain_on_arrays
 from bench._scenes import G, elastic_pendulum, links
 from systems import (
     _attitude,
@@ -228,17 +229,6 @@ def _elastic() -> Motion:
 
 def _chain() -> Motion:
     scene = links(8)
-
-    def field(t: Any, y: Array, p: Any) -> Array:
-        q, v = y[:8], y[8:]
-        carried = jnp.cumsum(p["m"][::-1])[::-1]
-        later = np.maximum.outer(np.arange(8), np.arange(8))
-        A = jnp.outer(p["l"], p["l"]) * carried[later]
-        between = q[:, None] - q[None, :]
-        pull = carried * p["g"] * p["l"] * jnp.sin(q)
-        a = jnp.linalg.solve(A * jnp.cos(between), -(A * jnp.sin(between)) @ v**2 - pull)
-        return jnp.concatenate([v, a])
-
     return Motion(
         system=jl.System(scene.lagrangian, [f"q{i}" for i in range(8)]),
         params=scene.params,
@@ -247,7 +237,7 @@ def _chain() -> Motion:
         t1=5.0,
         rates=_explicit.chain,
         lagrangian=scene.lagrangian,
-        field=field,
+        field=chain_on_arrays(8),
     )
 
 

@@ -132,16 +132,16 @@ def _solved(key: Key, M: Any, right: Any) -> tuple[Any, float] | None:
     if not np.linalg.cond(M) < 1e9:
         return None
     x = np.linalg.solve(M, right)
-    size = np.linalg.norm(right) + np.linalg.norm(M) * np.linalg.norm(x) + 1.0
+    size = norm(right) + norm(M) * norm(x) + 1.0
     eps = float(jnp.finfo(key.dtype).eps)
-    return x, float(SLACK * eps * size * np.linalg.norm(np.linalg.inv(M)))
+    return x, float(SLACK * eps * size * norm(np.linalg.inv(M)))
 
 
 def _definite(M: Any) -> bool:
     """Whether M is finite and clearly positive definite."""
     if not np.all(np.isfinite(M)):
         return False
-    return bool(np.min(np.linalg.eigvalsh(M), initial=1.0) > 1e-9 * np.linalg.norm(M))
+    return bool(np.min(np.linalg.eigvalsh(M), initial=1.0) > 1e-9 * norm(M))
 
 
 class _Plain:
@@ -221,7 +221,7 @@ class _Quasi:
         else:
             B, c = interpret(self.slopes, t, q, np.zeros_like(u), *params)
             v, (s,) = B @ u + c, interpret(self.drift, t, q, u, *params)
-            allowed = SLACK * float(jnp.finfo(self.key.dtype).eps) * (1.0 + np.linalg.norm(v))
+            allowed = SLACK * float(jnp.finfo(self.key.dtype).eps) * (1.0 + norm(v))
         B = B[:, self.quasi.free]
         (M,) = interpret(self.mass, t, q, v, *params)
         (h,) = interpret(self.bias, t, q, v, *params)
@@ -233,9 +233,9 @@ class _Quasi:
         if found is None:
             return None
         # What is projected is larger than what is left of it, and B has errors of its own.
-        parts = np.linalg.norm(Q) + np.linalg.norm(h) + np.linalg.norm(M) * np.linalg.norm(s)
-        eps, size = float(jnp.finfo(self.key.dtype).eps), np.linalg.norm(B)
-        more = SLACK * eps * parts * size * np.linalg.norm(np.linalg.inv(reduced))
+        parts = norm(Q) + norm(h) + norm(M) * norm(s)
+        eps, size = float(jnp.finfo(self.key.dtype).eps), norm(B)
+        more = SLACK * eps * parts * size * norm(np.linalg.inv(reduced))
         limits = [np.full(len(v), allowed), np.full(len(w), found[1] + more * (1.0 + size))]
         return _Right(np.concatenate([v, found[0]]), np.concatenate(limits))
 
@@ -298,7 +298,7 @@ def _independent(A: Any) -> np.ndarray:
     kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
     for k, row in enumerate(A):
         rest = row - (Y @ row) @ Y
-        size = np.linalg.norm(rest)
-        if size > 1e-3 * np.linalg.norm(row):
+        size = norm(rest)
+        if size > 1e-3 * norm(row):
             kept[k], Y = True, np.vstack([Y, rest / size])
     return kept

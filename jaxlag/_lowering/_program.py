@@ -7,16 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from jaxlag._lowering._graph import (
-    FIXED,
-    POWERS,
-    Graph,
-    Node,
-    node_id,
-    order,
-    rebuilt,
-    scaled,
-)
+from jaxlag._lowering._graph import FIXED, POWERS, Graph, Node, node_id, order, rebuilt, scaled
 
 
 class Line(NamedTuple):
