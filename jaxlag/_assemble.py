@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
+from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._errors import AssemblyError, bad
 from jaxlag._kkt import augmented, dependence_floor, independent_rows, solve_kkt
@@ -152,7 +153,7 @@ def assemble(
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
-    traced, static = _params.split(params)
+    traced, static = _params.split(closing(system, params, q, {}))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held
     found = _run(key, (q, v, traced, t, diagonal))

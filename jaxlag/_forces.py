@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._captured import captured
 from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import accepts, bad, real_scalar, require_arity, wants
 
@@ -118,8 +119,8 @@ class GeneralizedForce(AbstractForce):
             raise bad(f"{argument}: contact", "be the name of a constraint", f"it was {contact!r}")
         if sliding is not None:
             require_arity(f"{argument}: sliding", sliding, ("t", "q", "v", "params"))
-        self.Q, self.name, self.reaction = Q, name, reaction
-        self.contact, self.sliding = contact, sliding
+        self.Q, self.name, self.reaction = captured(Q), name, reaction
+        self.contact, self.sliding = contact, None if sliding is None else captured(sliding)
 
     def __call__(
         self,
@@ -166,7 +167,7 @@ class PointForce(AbstractForce):
         _require_name("PointForce", name)
         require_arity(f"force {name!r}: position", position, ("t", "q", "params"))
         self.takes_inputs = _takes_inputs(f"force {name!r}: force", force)
-        self.position, self.force, self.name = position, force, name
+        self.position, self.force, self.name = captured(position), captured(force), name
 
     def __call__(
         self,
@@ -224,7 +225,8 @@ class Couple(AbstractForce):
         arguments = ("t", "q", "v", "params")
         require_arity(f"couple {name!r}: angular_velocity", angular_velocity, arguments)
         self.takes_inputs = _takes_inputs(f"couple {name!r}: torque", torque)
-        self.angular_velocity, self.torque, self.name = angular_velocity, torque, name
+        self.angular_velocity, self.torque = captured(angular_velocity), captured(torque)
+        self.name = name
 
     def __call__(
         self,
@@ -290,7 +292,7 @@ class Rayleigh(AbstractForce):
     def __init__(self, R: Callable, name: str = "rayleigh") -> None:
         _require_name("Rayleigh", name)
         require_arity(f"Rayleigh {name!r}: R", R, ("t", "q", "v", "params"))
-        self.R, self.name = R, name
+        self.R, self.name = captured(R), name
 
     def __call__(
         self,

@@ -5,7 +5,7 @@ knot, and evaluates a table throughout one step in the one interval that the ste
 no stage ever reads the wrong side of a jump. All that a step reads of a table is two rows.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlag._captured import plain
 from jaxlag._errors import accepts, bad, require_arity, wants
+from jaxlag._input_values import InputValues
 from jaxlag._params import concrete
 
 
@@ -207,7 +209,7 @@ class Function(AbstractInput):
         interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t) or f(t, params)."""
-        return jnp.asarray(self.f(t, params) if self.takes_params else self.f(t))
+        return jnp.asarray(self.f(t, plain(params)) if self.takes_params else self.f(t))
 
 
 class Feedback(AbstractInput):
@@ -235,41 +237,7 @@ class Feedback(AbstractInput):
         interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t, q, v, params)."""
-        return jnp.asarray(self.f(t, q, v, params))
-
-
-class InputValues(Mapping[str, Any]):
-    """Values of the inputs by name; remembers which names were read."""
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self._values = dict(values)
-        self.read: set[str] = set()
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._values:
-            raise bad(
-                "inputs",
-                f"have an entry {name!r}, which a force reads",
-                f"its names were {sorted(self)}",
-                "Pass inputs={...} with this name.",
-            )
-        self.read.add(name)
-        return self._values[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._values
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """The value, or `default` where there is no such input."""
-        if name not in self:
-            return default
-        return self[name]
+        return jnp.asarray(self.f(t, q, v, plain(params)))
 
 
 def check_inputs(inputs: Any) -> dict[str, Any]:

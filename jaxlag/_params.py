@@ -66,6 +66,13 @@ def join(traced: Any, static: Any) -> Any:
     return eqx.combine(traced, thawed)
 
 
+def shapes(traced: Any) -> Any:
+    """Traced params without their values: shapes, dtypes, and which of them give way to others."""
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=bool(x.weak_type)), traced
+    )
+
+
 class Static:
     """A pytree without traced leaves, hashable, to key compiled programs by."""
 

@@ -14,7 +14,8 @@ from jaxlag._constraints import AbstractConstraint, Layout
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, real_scalar
 from jaxlag._forces import AbstractForce
-from jaxlag._inputs import InputValues, check_inputs, check_range, evaluate
+from jaxlag._input_values import InputValues
+from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._lowering import ArrayTerms, Structure
 from jaxlag._power import Power
 from jaxlag._quasi import QuasiVelocities

@@ -11,6 +11,7 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxlag._captured import captured
 from jaxlag._constraints import Pfaffian
 from jaxlag._errors import bad, require_arity
 from jaxlag._vectors import real
@@ -68,7 +69,8 @@ class QuasiVelocities(eqx.Module):
         if kinematics is not None:
             form = ("t", "q", "u", "params")
             require_arity("QuasiVelocities: kinematics", kinematics, form)
-        self.U, self.kinematics = U, kinematics
+        self.U = None if U is None else captured(U)
+        self.kinematics = None if kinematics is None else captured(kinematics)
         self.names = _names("names", names)
         self.constrained = _names("constrained", constrained)
         if not self.names:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxlag import _params
 from jaxlag._errors import bad
 from jaxlag._forces import reads_lam
-from jaxlag._inputs import InputValues
+from jaxlag._input_values import InputValues
 from jaxlag._lowering import ArrayTerms, Moving
 from jaxlag._quantities import AbstractQuantities
 

@@ -19,6 +19,8 @@ from jaxlag._arguments import (
     check_times,
     check_tolerances,
 )
+from jaxlag._captured import functions_of
+from jaxlag._closing import closing
 from jaxlag._constraints import Baumgarte
 from jaxlag._ending import ended
 from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
@@ -173,6 +175,7 @@ def simulate(
     rtol, atol = check_tolerances(method, rtol, atol, q0.dtype)
     step = check_step(dt, dt0)
     formulation = check_formulation(system, formulation, project, params, q0.dtype)
+    params = closing(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     scheme = choose(method, dt is None, rtol, atol)
@@ -206,6 +209,8 @@ def simulate(
     )
     values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
+    for function in functions_of(system):
+        function.warn()
     motion = timed(_simulate, system, plan, values)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
         other = _simulate(*_with_method(plan, values, IMPLICIT, rtol, atol, step))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
+from jaxlag._captured import plain
 from jaxlag._constraints import Baumgarte
 from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
@@ -162,6 +163,10 @@ class Solution(eqx.Module):
     @property
     def params(self) -> Any:
         """The params of this motion, numbers as arrays."""
+        return plain(self._given)
+
+    @property
+    def _given(self) -> Any:
         return _params.join(self._params_traced, self._params_static.tree)
 
     @property
@@ -275,7 +280,7 @@ class Solution(eqx.Module):
             if index < 0:
                 more = " The quasi-velocities are fewer than the freedoms that constraints leave."
         if status in CONCERNS_ROW:
-            rows = self.system.rows(self.params, self.q.dtype)
+            rows = self.system.rows(self._given, self.q.dtype)
             labels = rows.labels
             if status is Status.contradictory_rows:
                 more = rows.contradiction(self.system.size)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
@@ -231,7 +232,7 @@ def equilibrium(
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
-    traced, static = _params.split(params)
+    traced, static = _params.split(closing(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
     found = _search(key, (q0, t, tol, traced, inputs_traced))

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag import _params
+from jaxlag._captured import as_written, captured
 from jaxlag._constraints import AbstractConstraint, Layout, check_constraints
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, require_arity
@@ -54,7 +55,10 @@ class System(AbstractReactions):
     Methods that take a state are called as (params, q, v, t): `params` any pytree, q and v of
     shape (n,) in SI units (m or rad, and per s), t in s. They compose with jit, vmap and every
     derivative of JAX. A system hashes by the identity of its functions: declare it once, not
-    in a loop, or every declaration compiles anew.
+    in a loop, or every declaration compiles anew. Every function is traced once for each kind of
+    arguments (shapes, dtypes, static params), and what it reads from globals and closures holds as
+    it was then, for motions, energies and accelerations alike; where a number, an array or a
+    function that it read is another one later, a warning names it.
 
     Args:
         lagrangian: scalar function `L(t, q, v, params)`, in J. Either this, or both of
@@ -145,10 +149,11 @@ class System(AbstractReactions):
             assert potential is not None
             require_arity("kinetic", kinetic, form)
             require_arity("potential", potential, ("t", "q", "params"))
+            kinetic, potential = captured(kinetic), captured(potential)
             whole: Callable = _Difference(kinetic, potential)
         else:
             require_arity("lagrangian", lagrangian, form)
-            whole = lagrangian
+            whole = captured(lagrangian)
         self.in_u = None
         if written_in == "u":
             assert quasi is not None
@@ -271,7 +276,7 @@ class System(AbstractReactions):
         t, q, v, params = self._state(params, q, v, t)
         values = self._inputs_at(inputs, t, q, v, params)
         self.check_traceable(params, q.dtype, values)
-        L = self.lagrangian(t, q, v, params)
+        L = as_written(self.lagrangian)(t, q, v, params)
         if not bool(jnp.isfinite(L)):
             raise bad("lagrangian", "be finite at the given state", f"it was {L}")
         M = self.terms.mass(t, q, v, params)

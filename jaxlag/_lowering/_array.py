@@ -214,9 +214,7 @@ class ArrayTerms(Terms):
             dtype: of the state.
         """
         traced, static = _params.split(params)
-        avals = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced
-        )
+        avals = _params.shapes(traced)
         keys = _params.Static(avals), _params.Static(static)
         return _structure(self.lagrangian, *keys, size, jnp.dtype(dtype))
 

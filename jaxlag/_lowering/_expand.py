@@ -15,11 +15,12 @@ Monomial = tuple[tuple[int, int], ...]  # (id of an atom, exponent), ascending
 Polynomial = dict[Monomial, float]
 
 CAP = 2000  # terms of a polynomial
+WORK = 200_000  # terms met in all, about half a second; the largest system of use takes 35,000
 SPEEDS = ("v", "speed", "bound")
 
 
 class TooLong(Exception):
-    """A polynomial of more than `CAP` terms."""
+    """A polynomial of more than `CAP` terms, or more than `WORK` of them in all."""
 
 
 class Expansion:
@@ -30,7 +31,7 @@ class Expansion:
     """
 
     def __init__(self, graph: Graph, cap: int = CAP) -> None:
-        self.graph, self.cap = graph, cap
+        self.graph, self.cap, self.work = graph, cap, 0
         self._known: dict[Node, Polynomial] = {}
         self._cosine: dict[int, int] = {}
         self._sine: dict[int, int] = {}
@@ -121,8 +122,7 @@ class Expansion:
             self._known.setdefault(below, {((below.id, 1),): 1.0})
 
     def _times(self, a: Polynomial, b: Polynomial) -> Polynomial:
-        if len(a) * len(b) > 100 * self.cap:
-            raise TooLong
+        self._spend(len(a) * len(b))
         out: Polynomial = defaultdict(float)
         for left, x in a.items():
             for right, y in b.items():
@@ -210,6 +210,11 @@ class Expansion:
                 return
         out[monomial] = out.get(monomial, 0.0) + coefficient
 
+    def _spend(self, terms: int) -> None:
+        self.work += terms
+        if self.work > WORK:
+            raise TooLong
+
     def _capped(self, polynomial: Polynomial) -> Polynomial:
         if len(polynomial) > self.cap:
             raise TooLong
@@ -266,6 +271,7 @@ class Expansion:
         graph = self.graph
         done: list[tuple[Node, float]] = []
         while terms:
+            self._spend(len(terms))
             counts: dict[tuple[int, bool], int] = defaultdict(int)
             for _, powers in terms:
                 for atom, exponent in powers.items():

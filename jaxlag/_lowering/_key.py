@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxlag import _params
 from jaxlag._constraints import Baumgarte
-from jaxlag._inputs import InputValues
+from jaxlag._input_values import InputValues
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._quasi import QuasiVelocities
 

@@ -66,6 +66,8 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
         scene = read_scene(key)
         if key.limit is not None and (units := _units(scene)) > UNITS:
             return Lowered(None, f"{units} functions of weighted sums, more than {UNITS}", scene)
+        if key.limit is not None and (written := _written(scene)) > 2 * key.limit:
+            return Lowered(None, f"{written} operations in L and Q alone", scene)
         equations = derive(scene, float(jnp.finfo(key.dtype).eps), key.limit)
     except Unsupported as unsupported:
         return Lowered(None, str(unsupported), None)
@@ -75,6 +77,12 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
         return Lowered(None, found, scene)
     compared = compare(key, scene, equations, sample.leaves)
     return Lowered(equations if compared.sound else None, compared.words, scene)
+
+
+def _written(scene: Scene) -> int:
+    """Operations on what varies in L and Q, as they are written."""
+    roots = [scene.lagrangian, *(scene.force or ())]
+    return sum(max(len(node.args) - 1, 1) for node in order(roots) if not node.fixed)
 
 
 def _units(scene: Scene) -> int:

@@ -5,6 +5,7 @@ What depends on params alone makes the prelude, computed once per solve; the res
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 from jaxlag._lowering._graph import FIXED, POWERS, Graph, Node, node_id, order, rebuilt, scaled
@@ -232,30 +233,43 @@ class _Assembly:
     def _share_sums(self) -> None:
         """Pairs x + k y that several sums contain, the most frequent first."""
         groups = {node: list(terms) for node, terms in self.sums.items()}
-        places: dict[Any, set[Node]] = defaultdict(set)
+        occurs = Counter(token for terms in groups.values() for token, _ in terms)
+        places: dict[Any, set[Node]] = {}
+        ages: dict[Any, int] = {}
+        queue: list[tuple[int, int, Any]] = []  # (- of how many sums at least, age, pair)
 
         def pairs(terms: list[tuple[Any, float]]) -> Iterable[tuple[Any, ...]]:
-            for i, (x, a) in enumerate(terms):
-                for y, b in terms[i + 1 :]:
+            shared = [(x, a) for x, a in terms if occurs[x] > 1]
+            for i, (x, a) in enumerate(shared):
+                for y, b in shared[i + 1 :]:
                     yield self._pair(x, a, y, b)[0]
 
-        for node, terms in groups.items():
-            for key in pairs(terms):
-                places[key].add(node)
-        while True:
-            best = max(places, key=lambda key: len(places[key]), default=None)
-            if best is None or len(places[best]) < 2:
-                break
-            users = places.pop(best)
-            for node in users:
-                terms = groups[node]
-                for key in pairs(terms):
-                    if key != best:
-                        places[key].discard(node)
-                rest, chosen = _without(terms, best)
-                groups[node] = [*rest, (best, chosen)]
+        def enter(node: Node) -> None:
+            for key in pairs(groups[node]):
+                users = places.setdefault(key, set())
+                users.add(node)
+                age = ages.setdefault(key, len(ages))
+                if len(users) > 1:
+                    heappush(queue, (-len(users), age, key))
+
+        for node in groups:
+            enter(node)
+        while queue:
+            count, age, best = heappop(queue)
+            found = len(places[best])
+            if found != -count:
+                if found > 1:
+                    heappush(queue, (-found, age, best))
+                continue
+            users = places[best]
+            places[best] = set()
+            occurs[best] = found
+            for node in sorted(users, key=node_id):
                 for key in pairs(groups[node]):
-                    places[key].add(node)
+                    places[key].discard(node)
+                rest, chosen = _without(groups[node], best)
+                groups[node] = [*rest, (best, chosen)]
+                enter(node)
         self.sums = groups
 
     def _share_factors(self, groups: dict[Node, list[Any]]) -> None:

@@ -1,0 +1,298 @@
+"""Declared functions are traced once: what they read from outside, and what they close over."""
+
+import pickle
+import warnings
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._captured import captured
+
+TS = jnp.array([0.0, 0.5, 1.0])
+GRAVITY = 2.0
+
+
+def fall(system, ts=TS):
+    """Where it is at the end, its energy and its acceleration there."""
+    motion = jl.simulate(system, [0.0], [0.0], ts, {})
+    return motion.q[-1, 0], motion.energy, system.acceleration({}, motion.q[-1], motion.v[-1])[0]
+
+
+def changed(name, before, now):
+    return pytest.warns(UserWarning, match=f"^{name}, which .* was {before} .* and is {now} now")
+
+
+def test_a_global_holds_as_it_was_when_it_was_traced(monkeypatch):
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v - GRAVITY * q[0]
+
+    system = jl.System(lagrangian, ("x",))
+    first = fall(system)
+    np.testing.assert_allclose(first[0], -1.0, rtol=1e-9)
+    monkeypatch.setitem(globals(), "GRAVITY", 5.0)
+    for again in (system, jl.System(lagrangian, ("x",))):
+        with changed("GRAVITY", "2.0", "5.0"):
+            assert fall(again)[0] == first[0]
+    with changed("GRAVITY", "2.0", "5.0"):
+        where, energy, acceleration = fall(system, jnp.array([0.0, 1.0]))  # another program
+    np.testing.assert_allclose(where, -1.0, rtol=1e-9)
+    np.testing.assert_allclose(energy, 0.0, atol=1e-12)
+    assert acceleration == -2.0
+
+
+def test_a_function_defined_anew_reads_anew(monkeypatch):
+    def declare():
+        return jl.System(lambda t, q, v, params: 0.5 * v @ v - GRAVITY * q[0], ("x",))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fall(declare())[2] == -2.0
+        monkeypatch.setitem(globals(), "GRAVITY", 5.0)
+        assert fall(declare())[2] == -5.0
+
+
+def _array_in_place():
+    k = np.array([2.0])
+
+    def change():
+        k[0] = 5.0
+
+    return lambda t, q, v, params: 0.5 * v @ v - k @ q, change, "k"
+
+
+def _array_in_a_compiled_helper():
+    k = np.array([2.0])
+
+    @jax.jit
+    def potential(q):
+        return jnp.asarray(k) @ q
+
+    def change():
+        k[0] = 5.0
+
+    return lambda t, q, v, params: 0.5 * v @ v - potential(q), change, "k"
+
+
+def _number_of_numpy_in_place():
+    k = np.array(2.0)
+
+    def change():
+        k[...] = 5.0
+
+    return lambda t, q, v, params: 0.5 * v @ v - k * q[0], change, "k"
+
+
+def _helper():
+    def potential(q):
+        return 2.0 * q[0]
+
+    def change():
+        nonlocal potential
+        potential = jnp.sum
+
+    return lambda t, q, v, params: 0.5 * v @ v - potential(q), change, "potential"
+
+
+def _dict():
+    given = {"g": [2.0]}
+
+    def change():
+        given["g"][0] = 5.0
+
+    return lambda t, q, v, params: 0.5 * v @ v - given["g"][0] * q[0], change, "given"
+
+
+def _attribute():
+    given = SimpleNamespace(g=2.0, other=object())
+
+    def change():
+        given.g = 5.0
+
+    return lambda t, q, v, params: 0.5 * v @ v - given.g * q[0], change, r"given\.g"
+
+
+def _method():
+    class Body:
+        g = 2.0
+
+        def __init__(self):
+            self.g = 2.0
+
+        def lagrangian(self, t, q, v, params):
+            return 0.5 * v @ v - self.g * q[0]
+
+    body = Body()
+
+    def change():
+        body.g = 5.0
+
+    return body.lagrangian, change, r"self\.g"
+
+
+OUTSIDE = [
+    _array_in_place,
+    _array_in_a_compiled_helper,
+    _number_of_numpy_in_place,
+    _helper,
+    _dict,
+    _attribute,
+    _method,
+]
+
+
+@pytest.mark.parametrize("declared", OUTSIDE)
+def test_what_changes_outside_is_named_and_changes_nothing(declared):
+    lagrangian, change, name = declared()
+    system = jl.System(lagrangian, ("x",))
+    at = {}, [0.0], [0.0]
+    assert system.acceleration(*at) == -2.0
+    change()
+    with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
+        again = system.acceleration(*at), system.energy({}, [1.0], [0.0])
+    assert again == (-2.0, 2.0)
+
+
+def test_forces_constraints_and_quasi_velocities_are_traced_once():
+    given = {"force": 2.0, "row": 1.0, "turn": 3.0}
+    push = jl.GeneralizedForce(lambda t, q, v, params: given["force"] * jnp.ones(2), "push")
+    row = jl.Pfaffian(lambda t, q, v, params: v[1] - given["row"] * v[0], "row")
+    quasi = jl.QuasiVelocities(
+        lambda t, q, v, params: jnp.stack([given["turn"] * v[0], v[1] - v[0]]), ("u", "w")
+    )
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v,
+        ("x", "y"),
+        forces=(push,),
+        constraints=(row,),
+        quasi=quasi,
+    )
+
+    def numbers():
+        lam = system.multipliers({}, [0.0, 0.0], [1.0, 1.0])["row"]
+        u = system.quasi_velocities({}, [0.0, 0.0], [1.0, 1.0])
+        force = system.generalized_force({}, [0.0, 0.0], [1.0, 1.0])
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves((lam, u, force))])
+
+    before = numbers()
+    given |= {"force": 7.0, "row": 4.0, "turn": 5.0}
+    with pytest.warns(UserWarning, match="^given, which"):
+        np.testing.assert_array_equal(numbers(), before)
+
+
+def test_nothing_is_said_of_what_stays():
+    k, table = np.array([2.0]), {"a": [1.0, np.nan]}
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v - k @ q * table["a"][0]
+
+    system = jl.System(lagrangian, ("x",))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            assert system.acceleration({}, [0.0], [0.0]) == -2.0
+            k = k.copy()  # another array of the same numbers
+
+
+def test_the_function_is_called_once_for_each_kind_of_arguments():
+    calls = 0
+
+    def lagrangian(t, q, v, params):
+        nonlocal calls
+        calls += 1
+        return 0.5 * params["m"] * v @ v - params["n"] * q[0]
+
+    system = jl.System(lagrangian, ("x",))
+    params = {"m": jnp.array(1.0), "n": 2}
+    motion = jl.simulate(system, [0.0], [0.0], TS, params)
+    assert calls == 1
+    motion.energy, motion.a, system.explain(params), system.acceleration(params, [0.0], [1.0])
+    jl.simulate(system, [0.0], [0.0], TS[:2], params)
+    assert calls == 1
+    system.energy(params | {"n": 3}, [0.0], [1.0])
+    assert calls == 2
+    system.check(params, [0.0], [1.0])  # on numbers, for functions that look at them
+    assert calls == 3
+
+
+def test_a_function_of_a_system_is_taken_as_it_is():
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",))
+    again = jl.System(system.lagrangian, ("x",))
+    assert again == system
+    assert again.lagrangian is system.lagrangian
+    assert captured(system.lagrangian.function) is system.lagrangian
+    x = jnp.array([1.0])
+    assert system.lagrangian(0.0, x, x, params=None) == 0.5
+
+
+def _module_level(t, q, v, params):
+    return 0.5 * v @ v
+
+
+def test_a_system_of_named_functions_is_pickled():
+    system = jl.System(_module_level, ("x",))
+    assert pickle.loads(pickle.dumps(system)) == system
+
+
+# ---- Traced values in closures ----------------------------------------------------------------
+
+
+def swing(k):
+    """The end of a motion whose Lagrangian, force and input close over k."""
+    drag = jl.GeneralizedForce(
+        lambda t, q, v, params, inputs: (inputs["u"] - 0.1 * k) * v + 0.0 * params["one"], "drag"
+    )
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v - 0.5 * k * params["one"] * q @ q,
+        ("x",),
+        forces=(drag,),
+    )
+    inputs = {"u": jl.Function(lambda t: 0.0 * t)}
+    motion = jl.simulate(system, [1.0], [0.0], TS, {"one": 1.0}, inputs=inputs)
+    assert set(motion.params) == {"one"}
+    return motion.q[-1, 0] + motion.energy[-1]
+
+
+def by_params(k):
+    drag = jl.GeneralizedForce(lambda t, q, v, params: -0.1 * params["k"] * v, "drag")
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v - 0.5 * params["k"] * q @ q, ("x",), forces=(drag,)
+    )
+    motion = jl.simulate(system, [1.0], [0.0], TS, {"k": k})
+    return motion.q[-1, 0] + motion.energy[-1]
+
+
+TRANSFORMS = {
+    "jit": jax.jit,
+    "vmap": lambda f: lambda k: jax.vmap(f)(k * jnp.arange(1.0, 3.0)),
+    "grad": jax.grad,
+    "jit of grad": lambda f: jax.jit(jax.grad(f)),
+    "grad of jit": lambda f: jax.grad(jax.jit(f)),
+    "jvp": lambda f: lambda k: jax.jvp(f, (k,), (1.0,))[1],
+}
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_closing_over_traced_values_is_the_same_as_params(transform):
+    by_closure, expected = (TRANSFORMS[transform](f)(2.0) for f in (swing, by_params))
+    np.testing.assert_allclose(by_closure, expected, rtol=1e-9)
+
+
+def test_a_state_of_rest_moves_with_what_its_system_closes_over():
+    def rest(k):
+        system = jl.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * k * (q[0] - k) ** 2, ("x",))
+        return jl.equilibrium(system, [0.1], {}).q[0]
+
+    np.testing.assert_allclose(jax.grad(rest)(2.0), 1.0, rtol=1e-9)
+
+
+def test_an_assembled_state_moves_with_what_its_system_closes_over():
+    def height(length):
+        rod = jl.Holonomic(lambda t, q, params: q @ q - length**2, "rod")
+        system = jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), constraints=(rod,))
+        return jl.assemble(system, [0.6, 0.8], [0.0, 0.0], {}).q[1]
+
+    np.testing.assert_allclose(jax.grad(height)(1.0), 0.8, rtol=1e-9)
