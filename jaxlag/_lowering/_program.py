@@ -5,10 +5,10 @@ What depends on params alone makes the prelude, computed once per solve; the res
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
-from jaxlag._lowering._graph import FIXED, POWERS, Graph, Node, node_id, order, rebuilt, scaled
+from jaxlag._lowering._graph import FIXED, POWERS, Graph, Node, order, rebuilt, scaled
+from jaxlag._lowering._shared import Shared
 
 
 class Line(NamedTuple):
@@ -167,7 +167,6 @@ class _Assembly:
         self.over: dict[Node, list[Any]] = {}
         self.under: dict[Node, list[Any]] = {}
         self.whole: set[Node] = set()
-        self._ranks: dict[Any, int] = {}
 
     @staticmethod
     def _reachable(roots: Iterable[Node]) -> list[Node]:
@@ -182,9 +181,10 @@ class _Assembly:
 
     def program(self) -> Program:
         self._operands()
-        self._share_sums()
-        self._share_factors(self.over)
-        self._share_factors(self.under)
+        shared = Shared(len(self.graph.nodes))
+        self.sums = shared.sums(self.sums)
+        shared.factors(self.over)
+        shared.factors(self.under)
         results = tuple(self._at(root) for root in self.roots)
         prelude = tuple(line for line in self.lines if self.known[line.to])
         body = tuple(line for line in self.lines if not self.known[line.to])
@@ -229,96 +229,6 @@ class _Assembly:
                     else:
                         under += [base] * -exponent
                 self.over[node], self.under[node] = over, under
-
-    def _share_sums(self) -> None:
-        """Pairs x + k y that several sums contain, the most frequent first."""
-        groups = {node: list(terms) for node, terms in self.sums.items()}
-        occurs = Counter(token for terms in groups.values() for token, _ in terms)
-        places: dict[Any, set[Node]] = {}
-        ages: dict[Any, int] = {}
-        queue: list[tuple[int, int, Any]] = []  # (- of how many sums at least, age, pair)
-
-        def pairs(terms: list[tuple[Any, float]]) -> Iterable[tuple[Any, ...]]:
-            shared = [(x, a) for x, a in terms if occurs[x] > 1]
-            for i, (x, a) in enumerate(shared):
-                for y, b in shared[i + 1 :]:
-                    yield self._pair(x, a, y, b)[0]
-
-        def enter(node: Node) -> None:
-            for key in pairs(groups[node]):
-                users = places.setdefault(key, set())
-                users.add(node)
-                age = ages.setdefault(key, len(ages))
-                if len(users) > 1:
-                    heappush(queue, (-len(users), age, key))
-
-        for node in groups:
-            enter(node)
-        while queue:
-            count, age, best = heappop(queue)
-            found = len(places[best])
-            if found != -count:
-                if found > 1:
-                    heappush(queue, (-found, age, best))
-                continue
-            users = places[best]
-            places[best] = set()
-            occurs[best] = found
-            for node in sorted(users, key=node_id):
-                for key in pairs(groups[node]):
-                    places[key].discard(node)
-                rest, chosen = _without(groups[node], best)
-                groups[node] = [*rest, (best, chosen)]
-                enter(node)
-        self.sums = groups
-
-    def _share_factors(self, groups: dict[Node, list[Any]]) -> None:
-        """Products x y that several products contain, or one contains twice."""
-        counts: Counter[Any] = Counter()
-        places: dict[Any, set[Node]] = defaultdict(set)
-
-        def enter(node: Node, sign: int) -> None:
-            for pair, times in self._factor_pairs(groups[node]):
-                counts[pair] += sign * times
-                (places[pair].add if sign > 0 else places[pair].discard)(node)
-
-        for node in groups:
-            enter(node, 1)
-        while counts:
-            best, count = max(counts.items(), key=_count)
-            if count < 2:
-                return
-            self._rank(best)
-            for node in sorted(places[best], key=node_id):
-                enter(node, -1)
-                groups[node] = _with_pair(groups[node], best)
-                enter(node, 1)
-            del counts[best], places[best]
-
-    def _factor_pairs(self, factors: list[Any]) -> list[tuple[Any, int]]:
-        """Pairs of factors, each as often as disjoint pairs of it fit."""
-        if len(factors) < 2:
-            return []
-        powers = Counter(factors)
-        tokens = sorted(powers, key=self._rank)
-        out: list[tuple[Any, int]] = []
-        for i, x in enumerate(tokens):
-            if powers[x] > 1:
-                out.append((("times", x, x), powers[x] // 2))
-            out += [(("times", x, y), min(powers[x], powers[y])) for y in tokens[i + 1 :]]
-        return out
-
-    def _rank(self, token: Any) -> int:
-        """Place in an order of tokens: nodes by id, then what is shared by age."""
-        if isinstance(token, Node):
-            return token.id
-        return self._ranks.setdefault(token, len(self.graph.nodes) + len(self._ranks))
-
-    def _pair(self, x: Any, a: float, y: Any, b: float) -> tuple[tuple[Any, ...], float]:
-        """a x + b y as (("plus", first, second, ratio), factor)."""
-        if self._rank(x) > self._rank(y):
-            x, a, y, b = y, b, x, a
-        return ("plus", x, y, b / a), a
 
     # ---- Lines -------------------------------------------------------------------------------
 
@@ -431,27 +341,3 @@ class _Assembly:
         for slot in less:
             out = self._emit("sub", [out, slot])
         return out
-
-
-def _count(item: tuple[Any, int]) -> int:
-    return item[1]
-
-
-def _without(
-    terms: list[tuple[Any, float]], pair: tuple[Any, ...]
-) -> tuple[list[tuple[Any, float]], float]:
-    """The terms without the pair, and the factor it had."""
-    _, x, y, _ = pair
-    factor = next(c for t, c in terms if t == x)
-    return [(t, c) for t, c in terms if t not in (x, y)], factor
-
-
-def _with_pair(factors: list[Any], pair: tuple[Any, ...]) -> list[Any]:
-    _, x, y = pair
-    powers = Counter(factors)
-    times = powers[x] // 2 if x == y else min(powers[x], powers[y])
-    if not times:
-        return factors
-    powers.subtract([x, y] * times)
-    powers[pair] += times
-    return list(powers.elements())
