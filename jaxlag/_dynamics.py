@@ -1,30 +1,30 @@
 """The equations of motion in first-order form, as solvers see them."""
 
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
-from jaxlag._forces import reads_lam
+from jaxlag._forces import sliding
 from jaxlag._inputs import (
     all_knots,
     at_interval,
     evaluate,
     reads_state,
 )
-from jaxlag._kkt import dependence_floor, independent_rows
+from jaxlag._kkt import independent_rows
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
-from jaxlag._projection import Surface, project
+from jaxlag._projection import Surface
 from jaxlag._quasi import QuasiVelocities
-from jaxlag._step import Arguments, Gaps, RowChoice, Verdict
+from jaxlag._step import Arguments, Gaps, RowChoice
 from jaxlag._system import System
 from jaxlag._terms import Terms
 
@@ -127,10 +127,10 @@ class Dynamics(eqx.Module):
 
     def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
         """The arguments with all that accelerations need of what depends on params alone."""
-        t, q, v, params, values = self._at(tau, y, args)
+        t, q, v, params, values = self.at(tau, y, args)
         args = args._replace(rows=self._choice(t, q, v, params))
-        if self._sliding:
-            speeds = [slide(t, q, v, params) for slide in self._sliding]
+        if slides := sliding(self.system.forces):
+            speeds = [slide(t, q, v, params) for slide in slides]
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
             args = args._replace(senses=jax.lax.stop_gradient(senses))
         sense = self.turned(jnp.ones_like(tau), args)
@@ -211,7 +211,7 @@ class Dynamics(eqx.Module):
         """Acceleration a, or w' of quasi-velocities, at (tau, y)."""
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
-        t, q, v, params, values = self._at(tau, y, args)
+        t, q, v, params, values = self.at(tau, y, args)
         return self.terms.acceleration(t, q, v, params, values, args.prepared, args.kept)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
@@ -224,7 +224,7 @@ class Dynamics(eqx.Module):
                 return terms.rates(t, q, w, params, values, args.prepared)
             terms = terms.array
         assert isinstance(terms, ArrayTerms)
-        t, q, _, params, values = self._at(tau, y, args)
+        t, q, _, params, values = self.at(tau, y, args)
         moving = Moving(terms, t, q, w, params, values)
         return jnp.concatenate([moving.v, moving.accelerations()])
 
@@ -232,7 +232,7 @@ class Dynamics(eqx.Module):
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
         """Q - h at (tau, y): what M a is equal to."""
-        t, q, v, params, values = self._at(tau, y, args)
+        t, q, v, params, values = self.at(tau, y, args)
         terms = self.terms
         return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
 
@@ -265,7 +265,8 @@ class Dynamics(eqx.Module):
         values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
         return terms.velocities(t, q, w, params, values, args.prepared)
 
-    def _at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
+    def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
+        """(t, q, v, params, values of the inputs) at (tau, y)."""
         t, q, v, params = self.state(tau, y, args)
         return t, q, v, params, self.inputs_at(tau, q, v, args)
 
@@ -291,7 +292,7 @@ class Dynamics(eqx.Module):
         else:
             rates = [self.parts(y)[1], self.acceleration(tau, y, args)]
         if self.power is not None and self.power.names:
-            t, q, v, params, values = self._at(tau, y, args)
+            t, q, v, params, values = self.at(tau, y, args)
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
         return self.turned(jnp.concatenate(rates), args)
 
@@ -337,105 +338,6 @@ class Dynamics(eqx.Module):
             v = jnp.zeros_like(q)
         return self.inputs_at(tau, q, v, args)
 
-    @property
-    def _sliding(self) -> tuple[Any, ...]:
-        """Velocities of contact points that must not change their sign."""
-        return tuple(f.sliding for f in filter(reads_lam, self.system.forces) if f.sliding)
-
-    @property
-    def _contacts(self) -> list[int]:
-        """Rows whose multipliers must not become negative."""
-        names = {f.contact for f in filter(reads_lam, self.system.forces)}
-        rows, start = [], 0
-        for name, shape in self.rows.shapes:
-            stop = start + int(np.prod(shape))
-            rows += range(start, stop) if name in names else ()
-            start = stop
-        return rows
-
-    @property
-    def contact_row(self) -> int:
-        """The first row that friction depends on, as far as it is declared; else row 0."""
-        return self._contacts[0] if self._contacts else 0
-
-    @property
-    def settles(self) -> bool:
-        """Whether a step's end is moved, or looked at beyond its being finite."""
-        if self.quasi is not None:
-            return self.projects
-        several = self.rows.size > 1  # some of which may have been left out
-        return self.projects or several or bool(self._contacts) or bool(self._sliding)
-
-    def settle(
-        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
-    ) -> tuple[Array, Verdict]:
-        """The state at the end of a step as it is kept, and what is to be said about it."""
-        true = jnp.array(True)
-        verdict = Verdict(true, true, true)
-        if self.projects:
-            y, found, closed = self.project(tau, y, args, differentiable)
-            verdict = Verdict(found, closed, true)
-        elif args.rows is not None:
-            surface, (q, v) = self.surface(*still((tau, y, args))), self.parts(still(y))
-            verdict = Verdict(true, self._closed(surface, q, v, args), true)
-        return y, verdict._replace(pressed=self.pressed(tau, y, args))
-
-    def pressed(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
-        """Whether contacts press and slide as their friction takes them to."""
-        if not self._contacts and not self._sliding:
-            return jnp.array(True)
-        tau, y, args = still((tau, y, args))
-        t, q, v, params, values = self._at(tau, y, args)
-        right, terms = [], self.terms
-        if self._contacts:
-            if isinstance(args.prepared, ScalarPrepared) and isinstance(terms, ScalarTerms):
-                lam = terms.multipliers(t, q, v, params, values, args.prepared)
-            else:
-                lam = terms.reactions(t, q, v, params, values)[1]
-            right += [lam[row] >= 0 for row in self._contacts]
-        for k, slide in enumerate(self._sliding):
-            assert args.senses is not None
-            right.append(slide(t, q, v, params) * args.senses[k] > 0)
-        return jnp.all(jnp.stack(right))
-
-    def project(
-        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
-    ) -> tuple[Any, Bool[Array, ""], Bool[Array, ""]]:
-        """(state on the constraints nearest to y, whether found, whether all rows hold there)."""
-        frozen = None
-        if differentiable:
-            frozen = self.surface(*still((tau, y, args)))
-        surface, (q, v) = self.surface(tau, y, args), self.parts(y)
-        q, v, found = project(surface, q, v, frozen)
-        rest = self.system.size + self.speeds
-        return jnp.concatenate([q, v, y[rest:]]), found, self._closed(surface, q, v, args)
-
-    def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
-        """Whether rows that were left out hold as well, to half the digits.
-
-        Where nothing holds the others, these may drift as they do.
-        """
-        if args.rows is None:
-            return jnp.array(True)
-        kept, size = args.rows
-        holonomic = np.flatnonzero(self.rows.holonomic).tolist()
-        floor = dependence_floor(q.dtype)
-
-        def holds(c: Array, x: Array, rows: list[int]) -> Array:
-            largest = jnp.max(jnp.abs(x))
-            off = [jnp.abs(c[i]) / size[row] for i, row in enumerate(rows)]
-            drift = [jnp.where(kept[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
-            allowed = floor * (1.0 + largest) + 100.0 * reduce(jnp.maximum, drift)
-            found = [kept[row] | (x <= allowed) for row, x in zip(rows, off, strict=True)]
-            return jnp.all(jnp.stack(found))
-
-        closed = jnp.array(True)
-        if surface.velocity is not None:
-            closed = holds(surface.velocity(q, v), v, list(range(self.rows.size)))
-        if surface.position is not None:
-            closed = closed & holds(surface.position(q), q, holonomic)
-        return closed
-
     def parts(self, y: Any) -> tuple[Any, Any]:
         """(q, v), or (q, w), of y, (..., m)."""
         n, rest = self.system.size, self.system.size + self.speeds
@@ -454,7 +356,7 @@ class Dynamics(eqx.Module):
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Lines of the scalar program for states and arguments like these, where there is one."""
-        _, q, _, params, values = self._at(tau, y, args)
+        _, q, _, params, values = self.at(tau, y, args)
         terms = self.terms
         if not isinstance(terms, ScalarTerms) or self.power is not None:
             return None

@@ -16,6 +16,7 @@ from jaxlag._kkt import FORMULATIONS, augmented, factor_kkt, masked
 from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
 from jaxlag._quasi import SINE
 from jaxlag._record import Outcome, Times
+from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals
 from jaxlag._status import Status
 from jaxlag._step import Arguments
@@ -192,7 +193,7 @@ def _explained(
         concerns |= {
             Status.projection_failed: farthest,
             Status.rank_change: jnp.where(row >= 0, row, farthest),
-            Status.no_reaction_solution: jnp.asarray(dynamics.contact_row),
+            Status.no_reaction_solution: jnp.asarray(Settling(dynamics).contact_row),
         }
     where = ending.where
     for kind, index in concerns.items():

@@ -1,6 +1,6 @@
 """Applied generalized forces, each with a name."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeGuard
 
 import equinox as eqx
@@ -331,6 +331,11 @@ def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
 def reads_lam(force: AbstractForce) -> TypeGuard[GeneralizedForce]:
     """Whether a force depends on the multipliers of constraints."""
     return isinstance(force, GeneralizedForce) and force.reaction
+
+
+def sliding(forces: Iterable[AbstractForce]) -> tuple[Callable, ...]:
+    """Velocities of contact points, functions of (t, q, v, params), that must keep their sign."""
+    return tuple(f.sliding for f in forces if reads_lam(f) and f.sliding is not None)
 
 
 def components(

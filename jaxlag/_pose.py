@@ -20,6 +20,7 @@ from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
 from jaxlag._scheme import Scheme
+from jaxlag._settling import Settling
 from jaxlag._start import Start, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
 from jaxlag._system import System
@@ -108,11 +109,12 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     args = dynamics.prepare(start, y0, args)
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.projects:
-        moved, _, _ = dynamics.project(start, y0, args, differentiable=True)
+        moved, _, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
     if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
         dynamics = replace(dynamics, stabilization=None)
-    settle = dynamics.settle if dynamics.settles else None
+    settling = Settling(dynamics)
+    settle = settling if settling.settles else None
     term = term_of(dynamics, start, y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
@@ -126,7 +128,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     valid = values_allowed(given, saves, values.rtol, values.atol, values.step)
     valid = valid & in_order(inputs)
     finite = start_finite(dynamics, start, y0, args)
-    pressed = dynamics.pressed(start, y0, args)
+    pressed = settling.pressed(start, y0, args)
     begun = Start(valid, in_range, finite, consistent, pressed)
     setup = Setup(values.step, begun.allowed, scheme_traced)
     problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps, plan.keep)

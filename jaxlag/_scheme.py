@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._settling import Settling
 from jaxlag._step import Verdict
 from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
@@ -52,7 +53,7 @@ class Scheme(eqx.Module):
         if not isinstance(self.solver, AbstractExplicit | Splitting):
             return None
         term = self.term.compiled_for(lanes, in_loop)
-        settle = None if self.settle is None else term.dynamics.settle
+        settle = None if self.settle is None else Settling(term.dynamics)
         return replace(self, term=term, settle=settle)
 
     def within(self, args: Any, tau: Array) -> Any:
