@@ -153,7 +153,7 @@ def assemble(
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
-    traced, static = _params.split(closing(system, params, q, {}))
+    traced, static = _params.split(closing(system, params, q, None))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held
     found = _run(key, (q, v, traced, t, diagonal))

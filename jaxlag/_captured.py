@@ -5,7 +5,7 @@ of it: the motion, its energy, its derivatives.
 """
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from functools import update_wrapper
 from inspect import signature
@@ -15,12 +15,13 @@ from weakref import WeakValueDictionary
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag import _params
+from jaxlag._closed import Closed, plain
 from jaxlag._input_values import InputValues
 from jaxlag._outside import Outside, changes, outside
+from jaxlag._owned import owned
 
 
 class _Program(NamedTuple):
@@ -37,37 +38,6 @@ class _Program(NamedTuple):
     form: Any
     static: Any
     inputs: frozenset[str]
-
-
-@jax.tree_util.register_pytree_node_class
-class Closed:
-    """Params, and beside them the traced values that the declaration closes over.
-
-    In this way they are arguments of every program, as params are, and have derivatives.
-
-    Attributes:
-        params: as the user gave them.
-        values: what stands for the tracers in the functions' closures.
-        tracers: which is for which, by their identity.
-    """
-
-    def __init__(self, params: Any, values: Any, tracers: tuple[int, ...]) -> None:
-        self.params, self.values, self.tracers = params, values, tracers
-
-    def tree_flatten(self) -> tuple[tuple[Any, Any], tuple[int, ...]]:
-        """As JAX asks for it."""
-        return (self.params, self.values), self.tracers
-
-    @classmethod
-    def tree_unflatten(cls, tracers: tuple[int, ...], parts: Any) -> "Closed":
-        """As JAX asks for it."""
-        params, values = parts
-        return cls(params, values, tracers)
-
-
-def plain(params: Any) -> Any:
-    """Params as the user gave them."""
-    return params.params if isinstance(params, Closed) else params
 
 
 class Captured:
@@ -101,31 +71,48 @@ class Captured:
         """What the function returns."""
         if keywords:
             arguments = signature(self.function).bind(*arguments, **keywords).args
-        named = {i: x for i, x in enumerate(arguments) if isinstance(x, InputValues)}
-        given = {}
-        for x in arguments:
-            given |= dict(zip(x.tracers, x.values, strict=True)) if isinstance(x, Closed) else {}
-        arguments = tuple(x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments)
-        traced, rest = _params.split(arguments)
+        closed = [x for x in arguments if isinstance(x, Closed)]
+        return self.beside(closed[0] if closed else None, *arguments)
+
+    def beside(self, params: Any, *arguments: Any) -> Any:
+        """The same; what stands for traced values of its closure comes with the params."""
+        named = tuple(i for i, x in enumerate(arguments) if isinstance(x, InputValues))
+        given = [x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments]
+        traced, rest = _params.split(given)
         leaves, tree = jax.tree.flatten(traced)
         if len({x.dtype for x in leaves}) == 1:  # numbers of Python's have nothing to give way to
             leaves = [jnp.asarray(x, x.dtype) for x in leaves]
         static = _params.Static(rest)
-        kind = (tree, static, tuple(_params.shapes(leaves)), tuple(named), _config())
-        program = self._programs.get(kind)
+        try:
+            kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
+            program = self._programs.get(kind)
+        except TypeError:  # a leaf without hash: no compiled program knows such params either
+            return self.function(*map(plain, arguments))
         if program is None:
-            program = self._traced(tree, static, leaves, tuple(named))
-            if _params.concrete(*program.code.consts):
-                program = self._programs.setdefault(kind, program)
+            program = self._trace(kind, leaves)
         else:
             self.warn()
-        for values in named.values():
-            values.read |= program.inputs
+        for i in named:
+            arguments[i].read |= program.inputs
         code = program.code
-        if given:
-            code = ClosedJaxpr(code.jaxpr, [given.get(id(x), x) for x in code.consts])
+        if isinstance(params, Closed):
+            instead = params.by_tracer
+            code = ClosedJaxpr(code.jaxpr, [instead.get(id(x), x) for x in code.consts])
         found = map(jnp.asarray, jaxpr_as_fun(code)(*leaves))
         return eqx.combine(jax.tree.unflatten(program.form, found), program.static)
+
+    def _trace(self, kind: Any, leaves: list) -> _Program:
+        """The program for a new kind of arguments; kept, unless it closes over traced values."""
+        read = outside(self.function) if self._outside is None else {}
+        tree, static, _, named, _ = kind
+        program = self._traced(tree, static, leaves, named)
+        if not _params.concrete(*program.code.consts):
+            return program
+        if self._outside is None:
+            # What the function changes itself is no business of its results: counters, records.
+            own = {name for name, _, _ in changes(read)}
+            self._outside = {name: x for name, x in read.items() if name not in own}
+        return self._programs.setdefault(kind, program)
 
     def _traced(
         self, tree: Any, static: _params.Static, leaves: list, named: tuple[int, ...]
@@ -146,13 +133,8 @@ class Captured:
             found, form = jax.tree.flatten(dynamic)
             return found
 
-        before = outside(self.function)
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
-        if self._outside is None:
-            # What the function changes itself is no business of its results: counters, records.
-            own = {name for name, _, _ in changes(before)}
-            self._outside = {name: read for name, read in before.items() if name not in own}
-        return _Program(_own(code), form, static_part, frozenset(read))
+        return _Program(owned(code), form, static_part, frozenset(read))
 
     @property
     def known(self) -> bool:
@@ -170,6 +152,7 @@ class Captured:
             warnings.warn(message, UserWarning, stacklevel=1)
 
 
+# Not a setting: the object for a function, as long as anybody holds it.
 _ALIVE: WeakValueDictionary[Callable, Captured] = WeakValueDictionary()
 
 
@@ -183,6 +166,11 @@ def captured(function: Callable) -> Captured:
         return Captured(function)
 
 
+def once(function: Any) -> Any:
+    """The same of a plain function; a module, whose arrays are traced, as it is."""
+    return function if isinstance(function, eqx.Module) else captured(function)
+
+
 def as_written(function: Any) -> Any:
     """The function of the user's itself, which sees numbers where it is given numbers."""
     if isinstance(function, Captured):
@@ -194,56 +182,15 @@ def as_written(function: Any) -> Any:
 
 
 def functions_of(declared: Any) -> Iterator[Captured]:
-    """All the functions in a declaration."""
+    """All the functions in a declaration, or in inputs."""
     if isinstance(declared, Captured):
         yield declared
-    elif isinstance(declared, tuple):
-        for part in declared:
+    elif isinstance(declared, tuple | Mapping):
+        for part in declared.values() if isinstance(declared, Mapping) else declared:
             yield from functions_of(part)
     elif isinstance(declared, eqx.Module):
         for part in vars(declared).values():
             yield from functions_of(part)
-
-
-def _own(code: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program, with its own copy of every constant: those of numpy can be changed."""
-    consts = [x if not _params.concrete(x) else _copied(x) for x in code.consts]
-    return ClosedJaxpr(_own_inside(code.jaxpr), consts)
-
-
-def _own_inside(jaxpr: Any) -> Any:
-    eqns = []
-    for eqn in jaxpr.eqns:
-        inner = {key: _own_param(value) for key, value in eqn.params.items()}
-        atoms = list(map(_own_atom, eqn.invars))
-        eqns.append(eqn.replace(invars=atoms, params=inner))
-    return jaxpr.replace(eqns=eqns)
-
-
-def _own_atom(atom: Any) -> Any:
-    if not isinstance(atom, Literal) or not isinstance(atom.val, np.ndarray):
-        return atom
-    return Literal(atom.val.copy(), atom.aval)
-
-
-def _own_param(value: Any) -> Any:
-    if isinstance(value, ClosedJaxpr):
-        return _own(value)
-    if isinstance(value, Jaxpr):
-        return _own_inside(value)
-    if isinstance(value, tuple) and any(isinstance(x, ClosedJaxpr) for x in value):
-        inner = map(_own_param, value)
-        return tuple(inner) if type(value) is tuple else type(value)(*inner)
-    return value
-
-
-def _copied(x: Any) -> Any:
-    if isinstance(x, np.ndarray):
-        return x.copy()
-    if isinstance(x, jax.Array) and not jnp.issubdtype(x.dtype, jax.dtypes.extended):
-        with jax.ensure_compile_time_eval():
-            return jnp.array(x, copy=True)  # it may be a view of an array of numpy's
-    return x
 
 
 def _config() -> tuple:

@@ -8,38 +8,43 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag import _params
-from jaxlag._captured import Closed, functions_of
+from jaxlag._captured import functions_of
+from jaxlag._closed import Closed
+from jaxlag._errors import real_scalar
+from jaxlag._forces import sliding
 from jaxlag._inputs import evaluate
 from jaxlag._lowering import ArrayTerms
 from jaxlag._system import System
 
 
-def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any]) -> Any:
+def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> Any:
     """Params, and beside them whatever traced values the declared functions close over.
 
     A Lagrangian written inside a function that is being differentiated may read its arguments:
-    derivatives in them are those in params.
+    derivatives in them are those in params. Without inputs the forces are left out.
     """
-    if all(function.known for function in functions_of(system)):
+    declared = (system.lagrangian, system.constraints, system.quasi)
+    if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
         return params
-    try:
-        consts = _consts(system, params, q, inputs)
-    except Exception:  # it is said where the functions are used
-        return params
-    tracers = [x for x in consts if not _params.concrete(x)]
+    tracers = [x for x in _consts(system, params, q, inputs) if not _params.concrete(x)]
     return Closed(params, tracers, tuple(map(id, tracers))) if tracers else params
 
 
-def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any]) -> list[Any]:
+def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
+    """The constants of a program that calls every function of the declaration."""
     traced, static = _params.split(params)
     terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
         params = _params.join(traced, static)
-        L = system.lagrangian(t, q, v, params)
+        L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
+        u = None if system.quasi is None else system.quasi.of(t, q, v, params)
         rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
+        if inputs is None:
+            return L, u, rows
+        slides = [slide(t, q, v, params) for slide in sliding(system.forces)]
         values = evaluate(inputs, t, q, v, params)
-        return L, rows, terms.force(t, q, v, params, values, jnp.zeros_like(rows[1]))
+        return L, u, rows, slides, terms.force(t, q, v, params, values, jnp.zeros_like(rows[1]))
 
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.make_jaxpr(everything)(t, q, q, traced).consts

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._captured import captured
+from jaxlag._captured import captured, once
 from jaxlag._errors import bad, require_arity
 from jaxlag._forces import EXPLICIT_TIME, AbstractForce, reads_lam
 
@@ -114,9 +114,7 @@ class Pfaffian(AbstractConstraint):
     def __init__(self, residual: Callable, names: str | Sequence[str]) -> None:
         self.names = _names("Pfaffian", names)
         require_arity(f"constraint {names!r}: residual", residual, ("t", "q", "v", "params"))
-        # That of quasi-velocities is made of functions that are traced once already.
-        own = isinstance(residual, eqx.Module)
-        self.residual = cast(Callable, residual) if own else captured(residual)
+        self.residual = once(residual)
 
     def velocity(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any

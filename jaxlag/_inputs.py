@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._captured import plain
+from jaxlag._captured import Captured, once
+from jaxlag._closed import plain
 from jaxlag._errors import accepts, bad, require_arity, wants
 from jaxlag._input_values import InputValues
 from jaxlag._params import concrete
@@ -182,6 +183,12 @@ class Linear(AbstractTable):
         return first + (last - first) * fraction
 
 
+def _called(f: Callable, params: Any, *arguments: Any) -> Any:
+    if isinstance(f, Captured):
+        return f.beside(params, *arguments)
+    return f(*map(plain, arguments))
+
+
 class Function(AbstractInput):
     """A signal u(t) given by a smooth function of time, or of time and params.
 
@@ -198,7 +205,7 @@ class Function(AbstractInput):
     def __init__(self, f: Callable) -> None:
         self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
         require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
-        self.f = f
+        self.f = once(f)
 
     def value(
         self,
@@ -209,7 +216,8 @@ class Function(AbstractInput):
         interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t) or f(t, params)."""
-        return jnp.asarray(self.f(t, plain(params)) if self.takes_params else self.f(t))
+        more = (params,) if self.takes_params else ()
+        return jnp.asarray(_called(self.f, params, t, *more))
 
 
 class Feedback(AbstractInput):
@@ -226,7 +234,7 @@ class Feedback(AbstractInput):
 
     def __init__(self, f: Callable) -> None:
         require_arity("Feedback: f", f, ("t", "q", "v", "params"))
-        self.f = f
+        self.f = once(f)
 
     def value(
         self,
@@ -237,7 +245,7 @@ class Feedback(AbstractInput):
         interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t, q, v, params)."""
-        return jnp.asarray(self.f(t, q, v, plain(params)))
+        return jnp.asarray(_called(self.f, params, t, q, v, params))
 
 
 def check_inputs(inputs: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dis import get_instructions
 from functools import partial
+from inspect import unwrap
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, NamedTuple
 
@@ -57,8 +58,7 @@ def _read(function: Any, found: Outside, met: set[int], depth: int) -> None:
         codes = list(_codes(function.__func__.__code__))
         _attributes("self", partial(getattr, function, "__self__"), codes, found)
         function = function.__func__
-    while hasattr(function, "__wrapped__"):  # by jit and the like
-        function = function.__wrapped__
+    function = _unwrapped(function)
     if not isinstance(function, FunctionType) or id(function) in met or depth == 0:
         return
     met.add(id(function))
@@ -75,7 +75,7 @@ def _read(function: Any, found: Outside, met: set[int], depth: int) -> None:
         if name in stored:  # counters and the like
             continue
         value = look()
-        if isinstance(value, _FUNCTIONS) or hasattr(value, "__wrapped__"):
+        if isinstance(_unwrapped(value), _FUNCTIONS):
             if getattr(value, "__module__", None) != function.__module__:
                 continue  # of a library
             found.setdefault(name, Read(look, value))
@@ -86,6 +86,14 @@ def _read(function: Any, found: Outside, met: set[int], depth: int) -> None:
             found.setdefault(name, Read(look, _value(value)))
         else:
             _attributes(name, look, codes, found)
+
+
+def _unwrapped(x: Any) -> Any:
+    """The function inside jit and the like."""
+    try:
+        return unwrap(x)
+    except ValueError:  # whatever has every attribute
+        return x
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
@@ -118,11 +126,7 @@ def _attributes(owner: str, look: Callable[[], Any], codes: list, found: Outside
 
 def _value(x: Any) -> Any:
     """A number, an array or a container of them as it is now; None for anything else."""
-    if (
-        x is _GONE
-        or isinstance(x, (*_FUNCTIONS, *_NUMBERS, jax.Array))
-        or hasattr(x, "__wrapped__")
-    ):
+    if x is _GONE or isinstance(x, (*_NUMBERS, jax.Array)) or isinstance(_unwrapped(x), _FUNCTIONS):
         return x
     if isinstance(x, np.ndarray):
         return x.copy() if 0 < x.size <= ELEMENTS and x.dtype != object else None
@@ -143,7 +147,7 @@ def _same(before: Any, now: Any) -> bool:
         pairs = zip(before[1], now[1], strict=False)
         return before[0] == now[0] and all(_same(x, y) for x, y in pairs)
     if isinstance(before, Tracer) or isinstance(now, Tracer):
-        return True  # of two calls of one function under a transform
+        return False
     kinds = (np.ndarray, jax.Array, *_NUMBERS)
     if not isinstance(before, kinds) or not isinstance(now, kinds):
         return False
@@ -158,6 +162,8 @@ def _words(value: Any) -> str:
         return "gone"
     if isinstance(value, tuple):
         value = jax.tree.unflatten(*value)
+    if isinstance(value, Tracer):
+        return "a traced value"
     if isinstance(value, _FUNCTIONS):
         return f"{value.__qualname__} at {id(value):#x}"
     text = repr(value)

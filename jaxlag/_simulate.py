@@ -209,7 +209,7 @@ def simulate(
     )
     values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
     _xla.warn_if_late()
-    for function in functions_of(system):
+    for function in functions_of((system, inputs)):
         function.warn()
     motion = timed(_simulate, system, plan, values)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
-from jaxlag._captured import plain
+from jaxlag._closed import plain
 from jaxlag._constraints import Baumgarte
 from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad

@@ -2,15 +2,19 @@
 
 import pickle
 import warnings
+from functools import partial
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 import jaxlag as jl
+from jaxlag import _closing
 from jaxlag._captured import captured
+from jaxlag._owned import owned
 
 TS = jnp.array([0.0, 0.5, 1.0])
 GRAVITY = 2.0
@@ -237,27 +241,86 @@ def test_a_system_of_named_functions_is_pickled():
     assert pickle.loads(pickle.dumps(system)) == system
 
 
+def test_params_that_have_no_hash_are_params_still():
+    """No compiled program is keyed by them; energies need none."""
+    system = jl.System(lambda t, q, v, p: 0.5 * len(p["names"]) * v @ v, ("x",))
+    assert system.energy({"names": {"a", "b"}}, [0.0], [1.0]) == 1.0
+
+
+def test_an_input_is_traced_once():
+    given = {"u": 2.0}
+    push = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * jnp.ones(1), "push")
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(push,))
+    inputs = {"u": jl.Function(lambda t: given["u"])}
+
+    def forces(ts):
+        return jl.simulate(system, [0.0], [0.0], ts, {}, inputs=inputs).Q
+
+    before = forces(TS)
+    given["u"] = 5.0
+    with pytest.warns(UserWarning, match="^given, which .* was {'u': 2.0} .* is {'u': 5.0} now"):
+        np.testing.assert_array_equal(forces(TS[:2]), before[:2])
+
+
+@pytest.mark.parametrize("formulation", ["multipliers", "quasi"])
+def test_nothing_is_traced_twice_for_the_sake_of_closures(monkeypatch, formulation):
+    """Not even where a declared function has no part in the motion."""
+    quasi = jl.QuasiVelocities(lambda t, q, v, params: 2.0 * v, ("u",))
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), quasi=quasi)
+    run = partial(jl.simulate, system, [0.0], [1.0], TS, {}, formulation=formulation)
+    run()
+    monkeypatch.setattr(_closing, "_consts", None)
+    run()
+
+
+def test_constants_are_owned_and_what_has_none_is_shared():
+    k = np.array([1.0, 2.0])
+
+    @jax.jit
+    def without(x):
+        return jnp.sin(x)
+
+    @jax.jit
+    def with_array(x):
+        return x @ jnp.asarray(k)
+
+    code = jax.make_jaxpr(lambda x: without(x) @ x + with_array(x))(jnp.ones(2))
+    mine = owned(code)
+    before, after = (
+        {eqn.params["name"]: eqn.params["jaxpr"] for eqn in c.jaxpr.eqns if "jaxpr" in eqn.params}
+        for c in (code, mine)
+    )
+    assert after["without"] is before["without"]
+    expected = jaxpr_as_fun(mine)(jnp.ones(2))[0]
+    k[:] = 7.0
+    assert jaxpr_as_fun(mine)(jnp.ones(2))[0] == expected
+
+
 # ---- Traced values in closures ----------------------------------------------------------------
 
 
 def swing(k):
     """The end of a motion whose Lagrangian, force and input close over k."""
     drag = jl.GeneralizedForce(
-        lambda t, q, v, params, inputs: (inputs["u"] - 0.1 * k) * v + 0.0 * params["one"], "drag"
+        lambda t, q, v, params, inputs: (inputs["u"] - 0.1 * k) * v + inputs["w"] * params["one"],
+        "drag",
     )
     system = jl.System(
         lambda t, q, v, params: 0.5 * v @ v - 0.5 * k * params["one"] * q @ q,
         ("x",),
         forces=(drag,),
     )
-    inputs = {"u": jl.Function(lambda t: 0.0 * t)}
+    inputs = {
+        "u": jl.Function(lambda t: k * t),
+        "w": jl.Feedback(lambda t, q, v, params: -k * params["one"] * q),
+    }
     motion = jl.simulate(system, [1.0], [0.0], TS, {"one": 1.0}, inputs=inputs)
     assert set(motion.params) == {"one"}
     return motion.q[-1, 0] + motion.energy[-1]
 
 
 def by_params(k):
-    drag = jl.GeneralizedForce(lambda t, q, v, params: -0.1 * params["k"] * v, "drag")
+    drag = jl.GeneralizedForce(lambda t, q, v, params: params["k"] * ((t - 0.1) * v - q), "drag")
     system = jl.System(
         lambda t, q, v, params: 0.5 * v @ v - 0.5 * params["k"] * q @ q, ("x",), forces=(drag,)
     )
@@ -296,3 +359,34 @@ def test_an_assembled_state_moves_with_what_its_system_closes_over():
         return jl.assemble(system, [0.6, 0.8], [0.0, 0.0], {}).q[1]
 
     np.testing.assert_allclose(jax.grad(height)(1.0), 0.8, rtol=1e-9)
+
+
+def test_forces_of_a_motion_move_with_what_its_system_closes_over():
+    def pull(m):
+        system = jl.System(lambda t, q, v, p: 0.5 * m * v @ v, ("x",))
+        return jl.inverse_dynamics(system, [0.0], [0.0], [3.0], {})[0]
+
+    np.testing.assert_allclose(jax.jit(jax.grad(pull))(2.0), 3.0, rtol=1e-12)
+
+
+def test_what_becomes_traced_after_it_was_traced_is_named():
+    k = 2.0
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v - 0.5 * k * q @ q, ("x",))
+
+    def end(x):
+        nonlocal k
+        k = x
+        return jl.simulate(system, [1.0], [0.0], TS, {}).q[-1, 0]
+
+    end(2.0)
+    with pytest.warns(UserWarning, match="^k, which .* was 2.0 .* and is a traced value now"):
+        assert jax.grad(end)(3.0) == 0.0
+
+
+def test_a_driven_system_is_assembled_without_its_inputs():
+    rod = jl.Holonomic(lambda t, q, params: q @ q - 1.0, "rod")
+    push = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * q, "push")
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), forces=(push,), constraints=(rod,)
+    )
+    np.testing.assert_allclose(jl.assemble(system, [1.2, 1.6], [0.0, 0.0], {}).q, [0.6, 0.8])
