@@ -19,8 +19,8 @@ from problems import MOTIONS
 
 import jaxlag as jl
 from bench._scenes import SCENES
-from jaxlag._dynamics import Dynamics
 from jaxlag._lowering import ArrayTerms
+from jaxlag._settling import Settling
 from systems._catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sin", "cos", "sqrt", "tanh", "gt", "and", "select_n"}
@@ -455,7 +455,7 @@ def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
 
     for name in ("rows", "gamma", "position", "velocity", "correction", "reactions"):
         monkeypatch.setattr(ArrayTerms, name, asked)
-    monkeypatch.setattr(Dynamics, "settle", asked)
+    monkeypatch.setattr(Settling, "__call__", asked)
 
     def fresh(t, q, v, params):
         return coupled(t, q, v, params)
