@@ -22,9 +22,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--system", action="append", help="of work-precision: this system alone (repeatable)"
     )
+    parser.add_argument("--seconds", type=float, help="of fuzz: how long to try")
+    parser.add_argument("--first", type=int, help="of fuzz: the first seed")
     parser.add_argument("--python", help="of work-precision: an interpreter with another jax")
     arguments = parser.parse_args(argv)
-    options = {name: vars(arguments)[name] for name in ("system", "python")}
+    options = {name: vars(arguments)[name] for name in ("system", "python", "seconds", "first")}
     options = {name: value for name, value in options.items() if value}
     if arguments.name == "list":
         for name in BENCHMARKS:

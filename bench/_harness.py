@@ -19,6 +19,7 @@ BENCHMARKS = (
     "stability",
     "accuracy",
     "work-precision",
+    "fuzz",
 )
 
 RUNS_PER_TURN = 3

@@ -125,7 +125,7 @@ def _line(line: Line, args: list[Any]) -> Any:
     return line.data(*args)
 
 
-def _by_rule(rule: Rule, args: Sequence[Array]) -> Array:
+def _by_rule(rule: Rule, args: Sequence[Any]) -> Array:
     """All results of a function with a derivative rule of its own, in one row."""
     operands, start = [], 0
     for aval in rule.avals:
