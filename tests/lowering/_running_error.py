@@ -9,6 +9,7 @@ import operator
 from typing import NamedTuple
 
 import mpmath
+import numpy as np
 
 from jaxlag._lowering._graph import order
 
@@ -98,3 +99,41 @@ def _same(node, args, inputs):
 _OPS = {"const": _const, "input": _input, "sum": _sum, "product": _product, "call": _call}
 _OPS |= {"select": _select}
 _OPS |= {"let": _same, "stop": _same}
+
+
+def rounded(roots, inputs, dtype):
+    """The roots in the arithmetic of a dtype, overflow and all."""
+    known = {}
+    with np.errstate(all="ignore"):
+        for node in order(roots):
+            known[node] = _round(node, [known[arg] for arg in node.args], inputs, dtype)
+    return np.array([known[root] for root in roots])
+
+
+def _round(node, args, inputs, dtype):
+    if node.op in ("const", "input"):
+        value = node.data if node.op == "const" else inputs[node.data]
+        return value if isinstance(value, bool) else dtype(value)
+    if node.op == "sum":
+        constant, terms = node.data
+        total = dtype(constant)
+        for x, (_, c) in zip(args, terms, strict=True):
+            total = total + dtype(c) * x
+        return total
+    if node.op == "product":
+        over, under = dtype(1), dtype(1)
+        for x, (_, e) in zip(args, node.data, strict=True):
+            for _ in range(abs(e)):  # as the program does it, one factor after the other
+                over, under = (over * x, under) if e > 0 else (over, under * x)
+        return over / under
+    if node.op == "select":
+        return args[1] if args[0] else args[2]
+    if node.op in ("let", "stop"):
+        return args[0]
+    name = node.data.name
+    if name in _TRUTHS:
+        return bool(_TRUTHS[name](*args))
+    return dtype(getattr(np, _NUMPY.get(name, name))(*args))
+
+
+_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2"}
