@@ -7,6 +7,7 @@ import pytest
 
 from bench import fuzz
 from bench._random_systems import ONE, TWO, Drawn, draw, smaller, text
+from bench._rounding import evaluated
 from jaxlag._lowering import ScalarTerms
 
 SEEDS = range(40)
@@ -70,18 +71,35 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
     assert find["kind"].startswith("seed 7: ")
     assert find["systems"] > 1.0
     # Made smaller as far as it differs: of the force nothing is left.
-    assert find["lagrangian"].startswith("1.0 * (0.5 * (2.0 * v[0] ** 2) - (")
-    assert find["force"] == []
+    assert find["declared"].startswith("L = 1.0 * (0.5 * (2.0 * v[0] ** 2) - (")
+    assert "; Q = []; params = {'a': [0.1, " in find["declared"]
     assert [target.met for target in report.targets] == [False, True]
 
 
 @pytest.mark.parametrize(
     ("off", "least", "most"),
-    [(0.0, 0.0, 0.0), (1e-15, 0.0, 0.1), (1e-9, 1e2, 1e5), (np.nan, np.inf, np.inf)],
+    [(0.0, 0.0, 0.0), (1e-15, 0.0, 0.1), (1e-9, 1e3, 1e6), (np.nan, np.inf, np.inf)],
 )
-def test_differences_are_measured_by_what_nudges_change(off, least, most):
+def test_differences_are_measured_by_what_roundings_change(off, least, most):
     right = np.array([[[1.0, 2.0]], [[1.0 + 1e-15, 2.0]]])
-    found = right + off
-    assert least <= fuzz._off(right, found, 2.0**-53, fuzz.SLACK) <= most
+    found = right[0] + off
+    assert least <= fuzz._off(right, found, right[0], 2.0**-52) <= most
     # Where the array program has no value, anything is right.
-    assert fuzz._off(np.full_like(right, np.nan), found, 2.0**-53, fuzz.SLACK) == 0.0
+    assert fuzz._off(np.full_like(right, np.nan), found, right[0], 2.0**-52) == 0.0
+
+
+def test_roundings_show_the_digits_that_a_result_has():
+    """(1 + x) - 1 has the digits that 1 + x has; what is only moved has all."""
+
+    def cancels(x):
+        return jax.jit(lambda x: (1.0 + x) - 1.0)(x), -jnp.stack([x, x])[::-1]
+
+    traced = jax.make_jaxpr(cancels)(1e-6)
+    plain, moved = evaluated(traced, [jnp.asarray(1e-6)])
+    assert (plain, *moved) == ((1.0 + 1e-6) - 1.0, -1e-6, -1e-6)
+    rng = np.random.default_rng(0)
+    eps = 2.0**-52
+    several = [evaluated(traced, [jnp.asarray(1e-6)], eps, rng) for _ in range(20)]
+    off = [float(abs(x[0] - 1e-6)) for x in several]
+    assert 0.3 * eps < max(off) <= 1.7 * eps  # eps / 2 rounds once more
+    assert all((x[1] == -1e-6).all() for x in several)
