@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 from bench import fuzz
 from bench._random_systems import ONE, TWO, Drawn, draw, smaller, text
-from bench._rounding import evaluated
+from bench._rounding import CALLS, NUMPY, evaluated
 from jaxlag._lowering import ScalarTerms
 
 SEEDS = range(40)
@@ -103,3 +104,88 @@ def test_roundings_show_the_digits_that_a_result_has():
     off = [float(abs(x[0] - 1e-6)) for x in several]
     assert 0.3 * eps < max(off) <= 1.7 * eps  # eps / 2 rounds once more
     assert all((x[1] == -1e-6).all() for x in several)
+
+
+X = np.array([[0.3, -1.7, 0.0], [2.5, -0.4, 1.1]])
+WHOLE = np.array([[3, -2, 0], [-5, 2, 7]], np.int32)
+
+
+def _moves(x):
+    y = lax.pad(x, x[0, 0], ((1, 0, 2), (0, 2, 0)))
+    z = lax.pad(x, x[0, 0], ((-1, 0, 0), (0, -2, 1)))
+    parts = [*lax.split(x, (1, 2), axis=1), jnp.concatenate([x, x[:, ::-1]], 1), x[:, ::2]]
+    rows = [jnp.stack([x, 2 * x], 1), *jnp.unstack(x, axis=1), x.T, x.reshape(3, 2), x[1, 2]]
+    kept = [lax.stop_gradient(x), jnp.copy(x), lax.broadcast_in_dim(x[0], (2, 3, 4), (1,))]
+    return y, z, parts, rows, kept
+
+
+def _numbers(x, k):
+    signs = [-x, jnp.abs(x), jnp.sign(x), x % 2, jnp.maximum(x, k), jnp.minimum(x, k)]
+    truths = [x > k, x >= k, x < k, x <= k, x == k, x != k, (x > k) & (x < 1), ~(x > k) | (x == 0)]
+    sums = [x.sum(0), x.max(1), x.min(0), x @ k.T, jnp.einsum("ij,ij->i", x, k)]
+    return signs, truths, sums, [x + k, x - k, x * k, x // k, jnp.where(x > k, x, k)]
+
+
+def _functions(x):
+    s = jnp.abs(x) + 0.1
+    plain = [f(x) for f in (jnp.sin, jnp.cos, jnp.tanh, jnp.exp, jnp.expm1, jnp.floor)]
+    positive = [f(s) for f in (jnp.sqrt, lax.rsqrt, jnp.log, jnp.log1p)]
+    powers = [x**3, s**-3, jnp.square(x), x / s, jnp.arctan2(x, s)]
+    return plain, positive, powers, x.astype(jnp.float32), x.astype(int), WHOLE.astype(float) * x
+
+
+def _loops(x):
+    def step(carry, row):
+        return 0.5 * carry + row, carry * row
+
+    once = lax.scan(step, x[0], x)
+    back = lax.scan(step, x[0], x, reverse=True)
+    branch = lax.cond(x[0, 0] > 0.0, jnp.sin, jnp.cos, x)
+    grown = jax.grad(lambda x: lax.fori_loop(0, 3, lambda i, y: jnp.sin(y + i), x).sum())(x)
+    key = jax.random.key(3)
+    return once, back, branch, grown, jax.random.normal(jax.random.split(key)[0], (3,))
+
+
+def _primitives(jaxpr):
+    for eqn in jaxpr.eqns:
+        yield eqn.primitive.name
+        if eqn.primitive.name in CALLS:
+            yield from _primitives(eqn.params[CALLS[eqn.primitive.name]].jaxpr)
+
+
+CALLED = [
+    (_moves, X),
+    (_numbers, X, X[::-1].copy()),
+    (_numbers, WHOLE, WHOLE[::-1] + (WHOLE[::-1] == 0)),
+    (_functions, X),
+    (_loops, X),
+    (lambda x: jax.linearize(jnp.sin, x)[1](x) + lax.iota(float, 3), X[0]),
+]
+
+
+@pytest.mark.parametrize("case", CALLED, ids=lambda case: case[0].__name__.strip("_"))
+def test_operations_are_those_of_jax(case):
+    f, *args = case
+    traced = jax.make_jaxpr(f)(*args)
+    found = evaluated(traced, args)
+    right = jax.tree.leaves(f(*map(jnp.asarray, args)))
+    for x, y in zip(found, map(np.asarray, right), strict=True):
+        assert x.dtype == y.dtype
+        assert x.shape == y.shape
+        if x.dtype.kind == "f":
+            np.testing.assert_array_max_ulp(x, y, 4)
+        else:
+            np.testing.assert_array_equal(x, y)
+
+
+def test_every_operation_is_tried():
+    tried = {name for f, *args in CALLED for name in _primitives(jax.make_jaxpr(f)(*args).jaxpr)}
+    tried |= {"add_any"}  # of sums that derivatives make
+    assert set(NUMPY) <= tried
+
+
+def test_roundings_reach_the_inside_of_loops():
+    traced = jax.make_jaxpr(lambda x: lax.scan(lambda c, _: (c * x, None), x, None, 3)[0])(1.1)
+    rng = np.random.default_rng(0)
+    off = [float(evaluated(traced, [np.float64(1.1)], 1e-3, rng)[0]) / 1.1**4 - 1 for _ in range(9)]
+    assert 1e-3 < max(map(abs, off)) < 3e-3  # of three operations, more than one rounding
