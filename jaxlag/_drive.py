@@ -9,7 +9,6 @@ solver; its interpolant need not be. So the program holds one step.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._put import put
 from jaxlag._record import Outcome, Record, Times
 from jaxlag._scheme import Scheme, all_finite, resolution
 from jaxlag._status import Status
@@ -87,12 +87,6 @@ class _Loop(NamedTuple):
 
 def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
-
-
-def _put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
-    """buffer[index] = row."""
-    put = partial(jax.lax.dynamic_update_index_in_dim, index=index, axis=0)
-    return jax.tree.map(lambda b, r: put(b, r.astype(b.dtype)), buffer, row)
 
 
 def _buffer(size: int, like: PyTree, fill: float | int) -> PyTree:
@@ -289,12 +283,12 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         if turns is not None:
             # The slot after the last row is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
-            turns = _put(turns, slot, jnp.where(to_row, rows.turn, beyond))
+            turns = put(turns, slot, jnp.where(to_row, rows.turn, beyond))
         rows = _Rows(
             base=_select(take, c.at, rows.base),
             turn=jnp.where(take, c.turn, rows.turn),
             next=rows.next + to_row.astype(jnp.int32),
-            values=_put(rows.values, slot, value),
+            values=put(rows.values, slot, value),
             turns=turns,
             missed=jnp.where(to_row & ~good, failure, rows.missed).astype(jnp.int32),
         )
@@ -372,14 +366,14 @@ def _written(loop: _Loop, c: _Carry, kept: _Kept, t: Array, anchor: Array) -> _K
     if anchors is None:
         offset = jnp.where(anchor == 1, jnp.inf, t)
     else:
-        anchors = _put(anchors, c.turn, anchor)
+        anchors = put(anchors, c.turn, anchor)
         offset = t - loop.anchors[anchor]
-    offsets = _put(kept.offsets, c.turn, offset)
-    jumps = None if jumps is None else _put(jumps, c.turn, c.at.jump)
+    offsets = put(kept.offsets, c.turn, offset)
+    jumps = None if jumps is None else put(jumps, c.turn, c.at.jump)
     if points is not None:
         spare = jax.tree.leaves(points)[0].shape[0] - 1
         slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
-        points = _put(points, slot, (c.at.y, None))
+        points = put(points, slot, (c.at.y, None))
     return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)
 
 

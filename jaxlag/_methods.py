@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
+from jaxtyping import Array
 
 from jaxlag import _params
 from jaxlag._errors import bad
@@ -106,10 +107,15 @@ def choose(
         )
     if adaptive and controller is None:
         safety = SAFETY.get(type(solver), 0.9)
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, safety=safety)
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, safety=safety, norm=_rms)
     if isinstance(method, str) and hasattr(solver, "root_finder"):
         return _with_chord(solver, rtol, atol), controller
     return _with_tolerances(solver, controller, rtol, atol), controller
+
+
+def _rms(x: Array) -> Array:
+    """Root mean square; by a product of x with itself a loop is no function of plain operations."""
+    return jnp.sqrt(jnp.mean(x**2))
 
 
 def automatic(tolerance: Any) -> str:

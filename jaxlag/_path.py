@@ -85,8 +85,6 @@ class Path(NamedTuple):
             these rows start in the leaves that may move, None for those that are no tables).
         clock: times of the steps.
         stages: number of them in a step, 0 where it has none.
-        plain: whether loops along it are of plain operations alone, which lanes that read and
-            write rows at places of their own are not.
     """
 
     step: Callable
@@ -97,11 +95,10 @@ class Path(NamedTuple):
     windows: Callable
     clock: Clock
     stages: int
-    plain: bool
 
     def native(self, loop: Callable, *args: Any) -> Any:
         """loop(*args), compiled to one native function where that can be done."""
-        return _xla.native(loop, *args, stages=self.stages) if self.plain else loop(*args)
+        return _xla.native(loop, *args, stages=self.stages)
 
     def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
         """The arguments with other values of the leaves that may move."""

@@ -139,10 +139,8 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
         fast = scheme.on_scalars(lanes)
         if record and lanes:  # written out, this half would take most of the time to compile
             fast = None if fast is None else in_loops(fast)
-        # Buffers that lanes write to at places of their own are no plain operations.
-        plain = fast is not None and not (lanes and times.saves.shape[0] > 2)
         rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room
-        native = _xla.native if plain else None
+        native = None if fast is None else _xla.native
         return drive(fast or scheme, y0, args, times, *rest_of_it, native)
 
     scheme = unpack(inexact, rest, setup, static)[3]

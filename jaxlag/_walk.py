@@ -24,12 +24,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag._path import Change, Path, Walk, all_rows, arrived, at, pick
+from jaxlag._put import put
 from jaxlag._record import Record
-
-
-def _put(buffer: PyTree, k: Array, row: PyTree) -> PyTree:
-    put = partial(jax.lax.dynamic_update_index_in_dim, index=k, axis=0)
-    return jax.tree.map(put, buffer, row)
 
 
 def _add(a: PyTree, b: PyTree) -> PyTree:
@@ -66,7 +62,7 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
         use, to_row = (k < record.turns) & (end > t), jnp.array(False)
         if points:
             slot = jnp.where(k % record.stride == 0, k // record.stride, count - 1)
-            kept = _put(kept, slot, dy)
+            kept = put(kept, slot, dy)
         end_dot = None if change.anchors is None else change.anchors[clock.anchor(k)]
         if rows is not None:
             here = _turn_of_row(record, r) == k
@@ -86,7 +82,7 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
             y1, dy1 = jax.jvp(step, (y, path.moved(), t, end), (dy, change.args, *moves))
         if rows is not None:
             assert record.row_turn is not None
-            rows = _put(rows, jnp.where(here, r, record.row_turn.shape[0] - 1), dy1)
+            rows = put(rows, jnp.where(here, r, record.row_turn.shape[0] - 1), dy1)
             r = r + here.astype(jnp.int32)
         y, dy = pick(use & ~to_row, (y1, dy1), (y, dy))
         return k + (~to_row).astype(jnp.int32), r, y, dy, rows, kept
@@ -120,7 +116,9 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.rows)
     bars = (
         [jnp.zeros_like(x) for x in path.moved()],
-        jnp.zeros_like(anchors).at[clock.anchor(clock.last)].add(wanted.time) if moves else None,
+        _added_at(jnp.zeros_like(anchors), clock.anchor(clock.last), wanted.time)
+        if moves
+        else None,
         jnp.zeros_like(dues) if moves else None,
     )
 
@@ -156,10 +154,10 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             before, more, t_bar, end_bar = jax.vjp(step, y, moved, t, end)[1](given)
             t_bar, end_bar = (jnp.where(use, x, 0.0) for x in (t_bar, end_bar))
             at_row = jnp.where(here, end_bar, 0.0)
-            anchors_bar = anchors_bar.at[clock.anchor(k - 1)].add(t_bar)
-            anchors_bar = anchors_bar.at[clock.anchor(k)].add(end_bar - at_row)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(k - 1), t_bar)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(k), end_bar - at_row)
             if between is not None:
-                dues_bar = dues_bar.at[r - 1].add(at_row)
+                dues_bar = _added_at(dues_bar, r - 1, at_row)
         more = [jnp.where(use, x, 0.0) for x in more]
         args_bar = [_added(*pair) for pair in zip(args_bar, more, starts, strict=True)]
         if between is None:
@@ -192,14 +190,14 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         k = carry[0]
         first = (k - 1) // stride * stride
         y = at(record.points, first // record.stride)
-        states = _put(_zeros(y, longest), zero, y)
+        states = put(_zeros(y, longest), zero, y)
 
         def ahead(carry: tuple) -> tuple:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
             use = (j < record.turns) & (end > t)
             y = pick(use, path.found(t, end, clock.jump(j), y), y)
-            return j + 1, y, _put(states, j + 1 - first, y)
+            return j + 1, y, put(states, j + 1 - first, y)
 
         begin = (first, y, states)
         states = jax.lax.while_loop(lambda c: c[0] < k - 1, ahead, begin)[2]
@@ -229,5 +227,11 @@ def _added(bar: Array, more: Array, start: Array | None) -> Array:
     """The cotangent of a leaf with more of it, of two rows of a table at their place."""
     if start is None:
         return bar + more
-    rows = jax.lax.dynamic_slice_in_dim(bar, start, more.shape[0])
-    return jax.lax.dynamic_update_slice_in_dim(bar, rows + more, start, 0)
+    for k in range(more.shape[0]):
+        bar = _added_at(bar, start + k, more[k])
+    return bar
+
+
+def _added_at(bar: Array, index: Array, more: Array) -> Array:
+    """One entry with more of it."""
+    return put(bar, index, at(bar, index) + more)

@@ -98,15 +98,17 @@ def native(function: Callable, *args: Any, stages: int = 0) -> Any:
     )(*flat)
     if not _plain(program.jaxpr, stages):
         return function(*args)
-    # A parameter whose value XLA knows at the call loses its uses inside, and the emitter of marked
-    # calls then looks for a buffer that is not there and ends the process. What the function
-    # closes over becomes a parameter, too.
+    # A parameter that has lost its uses inside, being known at the call or of no consequence, ends
+    # the process: the emitter of marked calls looks for a buffer that is not there. So what the
+    # function closes over becomes a parameter, none is known, and of each a number is returned.
     given = jax.lax.optimization_barrier((list(program.consts), flat))
 
     def run(consts: list, flat: list) -> Any:
-        return jaxpr_as_fun(ClosedJaxpr(program.jaxpr, consts))(*flat)
+        used = [x.reshape(-1)[:1] for x in map(jnp.asarray, (*consts, *flat))]
+        return jaxpr_as_fun(ClosedJaxpr(program.jaxpr, consts))(*flat), used
 
-    return jax.tree.unflatten(jax.tree.structure(shape), not_inlined(run, ATTRIBUTES)(*given))
+    results, _ = not_inlined(run, ATTRIBUTES)(*given)
+    return jax.tree.unflatten(jax.tree.structure(shape), results)
 
 
 def not_inlined(function: Callable, attributes: Any = None) -> Callable:

@@ -8,6 +8,7 @@ from _jaxprs import operations
 
 import jaxlag as jl
 from jaxlag import _lanes
+from jaxlag._put import put
 from systems import double_pendulum
 
 EPS = np.finfo(float).eps
@@ -113,9 +114,39 @@ def test_chunks_are_what_is_compiled(lowering):
         assert any(o.inside[-2:] and "scan" in o.inside and "while" in o.inside for o in program)
         assert rows
         assert all(shape[0] == _lanes.LANES for shape in rows)
+        # Rows are written by each lane at a place of its own.
+        assert not [o for o in program if "while" in o.inside and "scatter" in o.name]
     else:
         assert rows
         assert all(shape[0] == 37 for shape in rows)
+
+
+@pytest.mark.parametrize("lanes", [3, _lanes.LANES + 1])
+@pytest.mark.parametrize("dtype", [float, np.int32])
+def test_rows_are_put_where_each_lane_says(lanes, dtype):
+    rng = np.random.default_rng(0)
+    buffer = jnp.asarray(rng.integers(0, 9, (lanes, 5, 2)), dtype)
+    row = jnp.asarray(rng.integers(0, 9, (lanes, 2)))
+    index = jnp.asarray(rng.integers(0, 5, lanes), jnp.int32)
+    right = np.array(buffer)
+    right[np.arange(lanes), index] = row
+    each = jax.vmap(put)
+    np.testing.assert_array_equal(jax.jit(each)(buffer, index, row), right)
+    same = np.array(buffer)
+    same[:, 2] = row[0]
+    several = jax.vmap(put, (0, None, None))(buffer, jnp.asarray(2), row[0])
+    np.testing.assert_array_equal(several, same)
+    assert several.dtype == dtype
+    # Directions inside of trajectories, and the other way round.
+    once, twice = jax.vmap(put, (0, None, 0)), jnp.stack([buffer, 2 * buffer], 1)
+    found = jax.jit(jax.vmap(once))(twice, index, jnp.stack([row, 2 * row], 1))
+    np.testing.assert_array_equal(found, np.stack([right, 2 * right], 1))
+    found = jax.jit(jax.vmap(each, (1, None, 1)))(twice, index, jnp.stack([row, 2 * row], 1))
+    np.testing.assert_array_equal(found, np.stack([right, 2 * right]))
+    if dtype is float:  # linear in the buffer and the row
+        row = row.astype(dtype)
+        dots = jax.jvp(lambda b, r: each(b, index, r), (buffer, row), (-buffer, -row))
+        np.testing.assert_array_equal(dots[1], -right)
 
 
 def test_explain_says_which():

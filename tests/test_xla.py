@@ -98,6 +98,10 @@ def end(q0, inputs=None, count=3):
     system = free if inputs is None else driven
     ts = np.linspace(0.0, 1.5, count)
     return jl.simulate(system, q0, [0.1, 0.2], ts, {"m": 1.0}, inputs=inputs, throw=False).q[-1]
+def moved(stop):
+    ts = jnp.linspace(0.0, stop, 40)
+    inputs = {"u": jl.ZeroOrderHold(jnp.linspace(0.0, stop, 9), jnp.sin(jnp.arange(9.0)))}
+    return jl.simulate(driven, q0, [0.1, 0.2], ts, {"m": 1.0}, inputs=inputs).q.sum()
 q0 = jnp.array([0.7, -0.4])
 batch = q0 + 0.01 * jnp.arange(19.0)[:, None]
 def policy(width):
@@ -109,8 +113,11 @@ programs = [
     lambda q: end(q), lambda q: end(q, held), lambda q: end(q, None, 200),
     lambda q: jax.vmap(lambda q: end(q, None, 2))(batch),
     lambda q: jax.vmap(lambda q: end(q, held))(batch),
+    lambda q: jax.vmap(lambda q: end(q, None, 101))(batch),
     jax.grad(lambda q: end(q)[0]), jax.jacfwd(end), jax.hessian(lambda q: end(q)[1]),
     lambda q: jax.vmap(jax.grad(lambda q: end(q, held)[0]))(batch[:3]),
+    lambda q: jax.vmap(jax.grad(moved))(jnp.linspace(1.0, 1.5, 19)),
+    lambda q: jax.vmap(jax.jacfwd(moved))(jnp.linspace(1.0, 1.5, 19)),
     lambda q: jax.vmap(lambda q: end(q, policy(32), 2))(batch),
     jax.jacfwd(lambda q: end(q, policy(32), 2)),
 ]
@@ -131,9 +138,9 @@ def test_attributes_do_what_the_setting_does():
         done = child(code=EVERYTHING, JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES=attributes)
         numbers, used, said = done.stdout.splitlines()
         found[attributes] = json.loads(numbers)
-        # XLA marks small loops of its own, such as the search in a table. The fourth program takes
-        # the norm of the errors of lanes by a product, the last two multiply by a large matrix.
-        marked = [True] * 3 + [False] + [True] * 5 + [False] * 2
+        # XLA marks small loops of its own, such as the search in a table. The last two programs
+        # multiply by a large matrix.
+        marked = [True] * 12 + [False] * 2
         assert attributes == "0" or used == str(marked)
         assert ("by attributes of their calls" in said) == (attributes == "1")
     for a, b in zip(found["0"], found["1"], strict=True):
