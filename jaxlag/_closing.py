@@ -32,11 +32,11 @@ def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
     """The constants of a program that calls every function of the declaration."""
-    traced, static = _params.split(params)
+    traced, static = _params.split((params, inputs))
     terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
-        params = _params.join(traced, static)
+        params, inputs = _params.join(traced, static)
         L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
         u = None if system.quasi is None else system.quasi.of(t, q, v, params)
         rows = terms.position(t, q, params), terms.velocity(t, q, v, params)

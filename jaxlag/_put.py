@@ -23,7 +23,7 @@ def put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
 
 @jax.custom_jvp
 def _put(buffer: Array, row: Array, index: Array) -> Array:
-    return _places(0)(buffer[None], row[None], index[None])[0]
+    return _place(buffer, row, index)
 
 
 @_put.defjvp
@@ -35,39 +35,69 @@ def _(primals: tuple, tangents: tuple) -> tuple:
     return result, _put(buffer_dot, row_dot, index)
 
 
+def _write(buffer: Array, row: Array, *index: Array | None) -> Array:
+    """buffer[index] = row; None for all of an axis."""
+    axes = [axis for axis, k in enumerate(index) if k is not None]
+    start = [0 if k is None else k for k in (*index, *[None] * (buffer.ndim - len(index)))]
+    start = [jnp.asarray(k, jnp.int32) for k in start]
+    return lax.dynamic_update_slice(buffer, jnp.expand_dims(row, axes), start)
+
+
+@custom_vmap
+def _place(buffer: Array, row: Array, index: Array) -> Array:
+    return _write(buffer, row, index)
+
+
+@_place.def_vmap
+def _(size: int, mapped: list, buffer: Array, row: Array, index: Array) -> tuple[Array, bool]:
+    buffer, row = _each(size, mapped, buffer, row)
+    if mapped[2]:
+        return _places(0)(buffer, row, index), True
+    return _places(1)(buffer[None], row[None], index[None])[0], True
+
+
+def _each(size: int, mapped: list, *arrays: Array) -> list[Array]:
+    """The arrays with a row for each of `size`."""
+    pairs = zip(arrays, mapped, strict=False)
+    return [x if has else jnp.broadcast_to(x, (size, *x.shape)) for x, has in pairs]
+
+
 def _places(shared: int) -> Callable:
     """(buffers, rows, indices) -> buffers with a row each.
 
     Args:
         shared: number of axes after the first one over which buffers and rows share an index.
     """
+    whole = [None] * shared
 
-    def write(k: Array | int, buffers: Array, rows: Array, indices: Array) -> Array:
-        start = [k, *[0] * shared, indices[k], *[0] * (rows.ndim - 1 - shared)]
-        row = jnp.expand_dims(rows[k], (0, 1 + shared))
-        return lax.dynamic_update_slice(buffers, row, [jnp.asarray(i, jnp.int32) for i in start])
+    def one(buffer: Array, row: Array, index: Array) -> Array:
+        return _write(buffer, row, *whole, index)
 
     @custom_vmap
     def place(buffers: Array, rows: Array, indices: Array) -> Array:
         count = indices.shape[0]
         if count == 1:
-            return write(0, buffers, rows, indices)
-        if count <= LANES and jax.default_backend() == "cpu":
-            return lax.fori_loop(0, count, lambda k, b: write(k, b, rows, indices), buffers)
-        return jax.vmap(lambda *one: write(0, *(x[None] for x in one))[0])(buffers, rows, indices)
+            return one(buffers[0], rows[0], indices[0])[None]
+        if count > LANES or jax.default_backend() != "cpu":
+            return jax.vmap(one)(buffers, rows, indices)
+
+        def write(k: Array, buffers: Array) -> Array:
+            return _write(buffers, rows[k], k, *whole, indices[k])
+
+        return lax.fori_loop(0, count, write, buffers)
 
     @place.def_vmap
     def _(size: int, mapped: list, *args: Array) -> tuple[Array, bool]:
-        def batch(x: Array, is_mapped: bool) -> Array:
-            return x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
-
-        (buffers, rows, indices), count = args, args[2].shape[-1]
-        buffers, rows = batch(buffers, mapped[0]), batch(rows, mapped[1])
+        buffers, rows, indices = args
+        count = indices.shape[-1]
+        buffers, rows = _each(size, mapped, buffers, rows)
         if count == 1 and not mapped[2]:  # (size, 1, ...) is (1, size, ...) in memory
             swapped = (jnp.swapaxes(x, 0, 1) for x in (buffers, rows))
             return jnp.swapaxes(_places(shared + 1)(*swapped, indices), 0, 1), True
-        each = buffers, rows, batch(indices, mapped[2])
-        flat = (x.reshape(size * count, *x.shape[2:]) for x in each)
+        flat = (
+            x.reshape(size * count, *x.shape[2:])
+            for x in (buffers, rows, *_each(size, mapped[2:], indices))
+        )
         return _places(shared)(*flat).reshape(buffers.shape), True
 
     return place

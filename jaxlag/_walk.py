@@ -54,44 +54,58 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
     count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
     zero = jnp.zeros((), jnp.int32)
     rows = None if record.row_turn is None else _zeros(start, record.row_turn.shape[0])
-    begin = (zero, zero, start, dy0, rows, _zeros(start, count) if points else None)
+    # Rows are reached from the state before the last step, with dy there.
+    base = None if rows is None else (start, dy0)
+    begin = (zero, zero, start, dy0, base, rows, _zeros(start, count) if points else None)
 
     def turn(carry: tuple) -> tuple:
-        k, r, y, dy, rows, kept = carry
-        t, end, jump = clock.time(k - 1, anchors), clock.time(k, anchors), clock.jump(k)
-        use, to_row = (k < record.turns) & (end > t), jnp.array(False)
+        """One step, or a row where a lane takes none or must not go on without."""
+        k, r, y, dy, base, rows, kept = carry
+        t, end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, to_row, row, i = (k < record.turns) & (end > t), jnp.array(False), jnp.array(False), k
         if points:
-            slot = jnp.where(k % record.stride == 0, k // record.stride, count - 1)
-            kept = put(kept, slot, dy)
-        end_dot = None if change.anchors is None else change.anchors[clock.anchor(k)]
+            at_point = (k < record.turns) & (k % record.stride == 0)
+            kept = put(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
+        begin = (y, dy)
         if rows is not None:
-            here = _turn_of_row(record, r) == k
-            to_row = eqxi.unvmap_any(here)
-            end = jnp.where(here, dues[r], end)
-            if dues_dot is not None and end_dot is not None:
-                end_dot = jnp.where(here, dues_dot[r], end_dot)
+            j = _turn_of_row(record, r)
+            left = (j < k) & (j < record.turns)
+            to_row = eqxi.unvmap_any(left & use)
+            use, row = use & ~to_row, left & (~use | to_row)
+            i, begin = jnp.where(row, j, k), pick(row, base, begin)
+            t, end = clock.time(i - 1, anchors), jnp.where(row, dues[r], clock.time(i, anchors))
+        jump, end_dot = clock.jump(i), None
+        if change.anchors is not None:
+            end_dot = change.anchors[clock.anchor(i)]
+            if rows is not None:
+                assert dues_dot is not None
+                end_dot = jnp.where(row, dues_dot[r], end_dot)
         if end_dot is None:
             step = lambda y, moved: path.ahead(path.with_args(moved), t, end, jump, y)  # noqa: E731
-            y1, dy1 = jax.jvp(step, (y, path.moved()), (dy, change.args))
+            y1, dy1 = jax.jvp(step, (begin[0], path.moved()), (begin[1], change.args))
         else:
             assert change.anchors is not None
             step = lambda y, moved, t, end: path.ahead(  # noqa: E731
                 path.with_args(moved), t, end, jump, y
             )
-            moves = change.anchors[clock.anchor(k - 1)], end_dot
-            y1, dy1 = jax.jvp(step, (y, path.moved(), t, end), (dy, change.args, *moves))
+            at_, moves = (begin[0], path.moved(), t, end), change.anchors[clock.anchor(i - 1)]
+            y1, dy1 = jax.jvp(step, at_, (begin[1], change.args, moves, end_dot))
         if rows is not None:
             assert record.row_turn is not None
-            rows = put(rows, jnp.where(here, r, record.row_turn.shape[0] - 1), dy1)
-            r = r + here.astype(jnp.int32)
-        y, dy = pick(use & ~to_row, (y1, dy1), (y, dy))
-        return k + (~to_row).astype(jnp.int32), r, y, dy, rows, kept
+            rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
+            r, base = r + row.astype(jnp.int32), pick(use, (y, dy), base)
+        y, dy = pick(use, (y1, dy1), (y, dy))
+        return k + (~to_row).astype(jnp.int32), r, y, dy, base, rows, kept
 
     def goes_on(carry: tuple) -> Array:
-        return eqxi.unvmap_any(carry[0] < record.turns)
+        k, r, *_ = carry
+        left = k < record.turns
+        if rows is not None:
+            left = left | (_turn_of_row(record, r) < record.turns)
+        return eqxi.unvmap_any(left)
 
     loop = partial(jax.lax.while_loop, goes_on, turn)
-    _, _, _, dy, rows, kept = path.native(loop, begin)
+    *_, dy, _, rows, kept = path.native(loop, begin)
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
         time = change.anchors[clock.anchor(clock.last)]
@@ -122,27 +136,29 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         jnp.zeros_like(dues) if moves else None,
     )
 
-    def row_here(k: Array, r: Array) -> Array:
-        """Whether a row that is left, r - 1, is reached from the state before turn k."""
-        return jnp.array(False) if between is None else _turn_of_row(record, r - 1) == k
+    def row_left(r: Array) -> Array:
+        """The turn of the last row that is left."""
+        return jnp.array(-1) if between is None else _turn_of_row(record, r - 1)
 
-    def turn(state_before: Callable, carry: tuple) -> tuple:
-        """One turn back: a row reached from the state before turn k, or else turn k - 1.
+    def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
+        """One turn back: turn k - 1, or rows reached from the state before turn k.
 
-        The cotangent is that of the state before turn k.
+        The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
+        a row reached from the state before its last step; `ahead` is what that adds there.
         """
-        k, r, bar, (args_bar, anchors_bar, dues_bar) = carry
-        here = row_here(k, r)
+        k, r, bar, ahead, (args_bar, anchors_bar, dues_bar) = carry
+        j, now = row_left(r), clock.time(k - 1, anchors)
+        here = j == k
         to_row = eqxi.unvmap_any(here)
         k = jnp.where(to_row, k, k - 1)
-        y = state_before(k)
-        t, end, jump = clock.time(k - 1, anchors), clock.time(k, anchors), clock.jump(k)
-        use = (k < record.turns) & (end > t)
-        given = bar
+        t, end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, row, i, given = (k < record.turns) & (end > t) & ~to_row, here, k, bar
         if between is not None:
-            use = jnp.where(to_row, here, use)
-            end = jnp.where(here, dues[r - 1], end)
-            given = pick(to_row, at(between, r - 1), bar)
+            row = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
+            i = jnp.where(row, j, k)
+            t, end = clock.time(i - 1, anchors), jnp.where(row, dues[r - 1], end)
+            given = pick(row, at(between, r - 1), bar)
+        y, jump, takes = state_before(i), clock.jump(i), use | row
         with_moved, moved, starts = path.local(t)
         if not moves:
             step = lambda y, moved: path.ahead(with_moved(moved), t, end, jump, y)  # noqa: E731
@@ -152,33 +168,35 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
                 with_moved(moved), t, end, jump, y
             )
             before, more, t_bar, end_bar = jax.vjp(step, y, moved, t, end)[1](given)
-            t_bar, end_bar = (jnp.where(use, x, 0.0) for x in (t_bar, end_bar))
-            at_row = jnp.where(here, end_bar, 0.0)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(k - 1), t_bar)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(k), end_bar - at_row)
+            t_bar, end_bar = (jnp.where(takes, x, 0.0) for x in (t_bar, end_bar))
+            at_row = jnp.where(row, end_bar, 0.0)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i), end_bar - at_row)
             if between is not None:
                 dues_bar = _added_at(dues_bar, r - 1, at_row)
-        more = [jnp.where(use, x, 0.0) for x in more]
+        more = [jnp.where(takes, x, 0.0) for x in more]
         args_bar = [_added(*pair) for pair in zip(args_bar, more, starts, strict=True)]
         if between is None:
             bar = pick(use, before, bar)
         else:
-            summed = _add(bar, before)
-            bar = pick(use, pick(to_row, summed, before), bar)
-            r = r - here.astype(jnp.int32)
+            zeros = jax.tree.map(jnp.zeros_like, bar)
+            summed = _add(before, pick(here, bar, ahead))
+            bar = pick(use | here, summed, bar)
+            ahead = pick(use, zeros, pick(row & ~here, summed, ahead))
+            r = r - row.astype(jnp.int32)
         if wanted.points is not None:
             at_point = ~to_row & (k % record.stride == 0) & (k < record.turns)
             bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
-        return k, r, bar, (args_bar, anchors_bar, dues_bar)
+        return k, r, bar, ahead, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
         """All turns after the first, that one and its rows."""
 
         def left(carry: tuple) -> Array:
             k, r, *_ = carry
-            return (k > first) | eqxi.unvmap_any(row_here(k, r))
+            return (k > first) | eqxi.unvmap_any(row_left(r) == k)
 
-        return jax.lax.while_loop(left, partial(turn, state_before), carry)
+        return jax.lax.while_loop(left, partial(turn, first, state_before), carry)
 
     # Lanes that were recorded together have one stride; all have points at those of the longest.
     stride = eqxi.unvmap_max(record.stride)
@@ -186,9 +204,9 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     longest = 2 ** ceil(log2(record.offsets.shape[0] / room))
 
     def segment(carry: tuple) -> tuple:
-        """All turns since the last point before turn k."""
+        """All turns since the last point before turn k; all there are, where each has a point."""
         k = carry[0]
-        first = (k - 1) // stride * stride
+        first = jnp.where(stride == 1, 0, (k - 1) // stride * stride)
         y = at(record.points, first // record.stride)
         states = put(_zeros(y, longest), zero, y)
 
@@ -200,8 +218,13 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             return j + 1, y, put(states, j + 1 - first, y)
 
         begin = (first, y, states)
-        states = jax.lax.while_loop(lambda c: c[0] < k - 1, ahead, begin)[2]
-        return back(first, lambda j: at(states, j - first), carry)
+        missing = lambda c: (stride > 1) & (c[0] < k - 1)  # noqa: E731
+        states = jax.lax.while_loop(missing, ahead, begin)[2]
+
+        def state_before(j: Array) -> PyTree:
+            return pick(stride == 1, at(record.points, j), at(states, j - first))
+
+        return back(first, state_before, carry)
 
     def all_back(carry: tuple) -> tuple:
         if longest == 1:
@@ -212,9 +235,10 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     rows_left = zero
     if record.row_turn is not None:
         rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
-    begin = (most, rows_left, _add(wanted.last, end_bar), bars)
-    ended = path.native(all_back, begin)
-    _, _, bar, (args_bar, anchors_bar, dues_bar) = ended
+    bar = _add(wanted.last, end_bar)
+    ahead = None if between is None else jax.tree.map(jnp.zeros_like, bar)
+    ended = path.native(all_back, (most, rows_left, bar, ahead, bars))
+    _, _, bar, _, (args_bar, anchors_bar, dues_bar) = ended
     bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
     saves_bar = None
     if moves:

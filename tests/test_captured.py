@@ -369,6 +369,19 @@ def test_forces_of_a_motion_move_with_what_its_system_closes_over():
     np.testing.assert_allclose(jax.jit(jax.grad(pull))(2.0), 3.0, rtol=1e-12)
 
 
+def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
+    """Of the values of a table derivatives write what a step reads, which is seen of inputs."""
+    force = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * v, "push")
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(force,))
+
+    def check(times, values):
+        inputs = {"u": jl.Linear(times, values)}
+        assert _closing.closing(system, {}, jnp.zeros(1), inputs) == {}
+        return jl.simulate(system, [0.0], [1.0], TS, {}, inputs=inputs).q[-1, 0]
+
+    jax.make_jaxpr(jax.grad(check, (0, 1)))(jnp.array([0.0, 2.0]), jnp.array([1.0, 3.0]))
+
+
 def test_what_becomes_traced_after_it_was_traced_is_named():
     k = 2.0
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v - 0.5 * k * q @ q, ("x",))

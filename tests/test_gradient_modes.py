@@ -181,23 +181,34 @@ def test_points_are_thinned_out_on_long_motions():
 
 
 @pytest.mark.full
-def test_lanes_of_different_lengths(forward):
-    """Lanes that were recorded together, and end at different steps, have their own gradients."""
+@pytest.mark.parametrize("mode", ["recorded", "checkpoints", "forward"])
+def test_lanes_that_reach_rows_in_different_turns(mode):
+    """Some with several rows in a step, some with one in several; all with their own gradients."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
+    rng = np.random.default_rng(0)
+    parts, weights = np.sort(rng.uniform(0.0, 1.0, 30)), rng.uniform(-1.0, 1.0, 31)
+    parts[0], parts[17] = 0.0, parts[16] + 1e-9
 
-    def angle(q0, end):
+    def loss(q0, end):
         motion = jl.simulate(
-            pendulum, q0, [0.3], jnp.stack([0.0, 0.4 * end, end]), 9.81, dt=0.02,
-            gradient="checkpoints", max_steps=256,
+            pendulum, q0, [0.3], end * jnp.append(parts, 1.0), 9.81, dt=0.02,
+            gradient=mode, max_steps=256,
         )  # fmt: skip
-        return motion.q[-1, 0] + motion.q[1, 0]
+        return motion.q[:, 0] @ weights
 
-    gradient = jax.jit(jax.grad(angle, argnums=(0, 1)))
+    gradient = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
     starts, ends = jnp.linspace(0.5, 1.5, 5)[:, None], jnp.array([0.5, 1.0, 4.0, 2.0, 0.03])
-    batch = jax.jit(jax.vmap(jax.grad(angle, argnums=(0, 1))))(starts, ends)
+    batch = jax.jit(jax.vmap(jax.value_and_grad(loss, argnums=(0, 1))))(starts, ends)
     for i in range(5):
-        for a, b in zip(batch, gradient(starts[i], ends[i]), strict=True):
-            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-13)
+        alone = jax.tree.leaves(gradient(starts[i], ends[i]))
+        for a, b in zip(jax.tree.leaves(batch), alone, strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
+    # Against differences, which round by 1e-16 / 1e-5.
+    for j, h in enumerate((1e-5, 1e-5)):
+        shift = [0.0, 0.0]
+        shift[j] = h
+        up, down = (gradient(starts[3] + s * shift[0], ends[3] + s * shift[1])[0] for s in (1, -1))
+        np.testing.assert_allclose(batch[1][j][3].sum(), (up - down) / (2 * h), rtol=1e-6)
 
 
 def test_gradients_are_traced_once():

@@ -237,8 +237,7 @@ def test_a_step_evaluates_it_once_per_stage(name):
     assert count(step, "sin", "cos") <= STAGES * functions
     assert count(step, "div") <= STAGES * divisions + STEP
     assert names(step).isdisjoint({"cholesky", "triangular_solve", "custom_linear_solve", "scan"})
-    assert count(step, "dot_general") == 1  # the norm of the error
-    assert all(o.shapes == ((),) for o in step if o.name == "dot_general")
+    assert count(step, "dot_general") == 0
 
 
 def test_the_counts_see_what_arrays_cost():
