@@ -56,7 +56,7 @@ class Captured:
         self.function = function
         self._programs: dict[Any, _Program] = {}
         self._outside: Outside | None = None
-        update_wrapper(self, function)
+        update_wrapper(self, function, updated=())  # an object's own attributes are its own
 
     def __hash__(self) -> int:
         return hash(self.function)

@@ -137,7 +137,9 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
 
 def _batched(form: LinearMap, size: int, mapped: tuple[bool, ...]) -> LinearMap:
     """The map for `size` rows of x, y and the leaves of r that are mapped."""
-    form = form.in_lanes if any(mapped) and form.in_lanes is not None else form
+    in_lanes = form.in_lanes
+    if any(mapped) and in_lanes is not None:
+        form, in_lanes = in_lanes, None
 
     def rows(function: Callable | None, at_once: int) -> Any:
         if function is None:
@@ -162,7 +164,7 @@ def _batched(form: LinearMap, size: int, mapped: tuple[bool, ...]) -> LinearMap:
         rows(form.backward, at_once),
         rows(form.plain, size),
         rows(form.plain_backward, size),
-        None,
+        None if in_lanes is None else _batched(in_lanes, size, mapped),
         form.at_once,
     )
 

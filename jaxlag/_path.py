@@ -85,6 +85,9 @@ class Path(NamedTuple):
             these rows start in the leaves that may move, None for those that are no tables).
         clock: times of the steps.
         stages: number of them in a step, 0 where it has none.
+        plain: whether loops along it are of plain operations alone, which lanes that read rows at
+            places of their own are not: what such an operation costs is taken for that of reading
+            the whole buffer, and it is shared among cores.
     """
 
     step: Callable
@@ -95,10 +98,11 @@ class Path(NamedTuple):
     windows: Callable
     clock: Clock
     stages: int
+    plain: bool
 
     def native(self, loop: Callable, *args: Any) -> Any:
         """loop(*args), compiled to one native function where that can be done."""
-        return _xla.native(loop, *args, stages=self.stages)
+        return _xla.native(loop, *args, stages=self.stages) if self.plain else loop(*args)
 
     def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
         """The arguments with other values of the leaves that may move."""

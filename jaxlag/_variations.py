@@ -97,7 +97,7 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
         inexact, rest, setup, record = r
         y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
         fast = scheme.on_scalars(lanes)
-        return path_of(scheme, y0, args, times, record, kind.moving, fast), y0
+        return path_of(scheme, y0, args, times, record, kind.moving, fast, lanes), y0
 
     def forward(r: Any, x: Change) -> Walk:
         return forwards(path(r)[0], x, kind.points)
@@ -166,6 +166,7 @@ def path_of(
     record: Record,
     moving: tuple[int, ...],
     fast: Scheme | None = None,
+    lanes: bool = False,
 ) -> Path:
     """The recorded motion, by steps with loops over stages.
 
@@ -183,7 +184,8 @@ def path_of(
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
     clock, start = Clock(times, record), (y0, memory)
-    return Path(step, start, leaves, tree, moving, scheme.windows, clock, stages)
+    plain = not (lanes and record.row_turn is not None)
+    return Path(step, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
 
 
 def in_loops(scheme: Scheme) -> Scheme:

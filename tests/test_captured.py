@@ -236,6 +236,28 @@ def _module_level(t, q, v, params):
     return 0.5 * v @ v
 
 
+def test_an_object_keeps_its_attributes_to_itself():
+    """Of whatever names: they are not those of what stands for it."""
+
+    class Spring:
+        def __init__(self):
+            self.function, self._programs, self._outside = (lambda *_: 1.0), None, None
+
+        def __call__(self, t, q, v, params):
+            return 0.5 * v @ v - 2.0 * q @ q
+
+    system = jl.System(Spring(), ("x",))
+    np.testing.assert_allclose(system.acceleration({}, [0.5], [0.0]), [-2.0], rtol=1e-15)
+    kinetic = lambda t, q, u, params: 0.5 * u @ u  # noqa: E731
+    potential = lambda t, q, params: jnp.zeros(())  # noqa: E731
+    quasi = jl.QuasiVelocities(lambda t, q, v, params: 3.0 * v, ("u",))
+    inner = jl.System(
+        coordinates=("x",), kinetic=kinetic, potential=potential, quasi=quasi, written_in="u"
+    )
+    outer = jl.System(inner.lagrangian, ("x",))  # an L of v that is made of one of u
+    np.testing.assert_allclose(outer.mass_matrix({}, [0.5]), [[9.0]], rtol=1e-15)
+
+
 def test_a_system_of_named_functions_is_pickled():
     system = jl.System(_module_level, ("x",))
     assert pickle.loads(pickle.dumps(system)) == system
