@@ -66,13 +66,13 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
         if points:
             at_point = (k < record.turns) & (k % record.stride == 0)
             kept = put(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
-        begin = (y, dy)
+        before = (y, dy)
         if rows is not None:
             j = _turn_of_row(record, r)
             left = (j < k) & (j < record.turns)
             to_row = eqxi.unvmap_any(left & use)
             use, row = use & ~to_row, left & (~use | to_row)
-            i, begin = jnp.where(row, j, k), pick(row, base, begin)
+            i, before = jnp.where(row, j, k), pick(row, base, before)
             t, end = clock.time(i - 1, anchors), jnp.where(row, dues[r], clock.time(i, anchors))
         jump, end_dot = clock.jump(i), None
         if change.anchors is not None:
@@ -82,14 +82,15 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
                 end_dot = jnp.where(row, dues_dot[r], end_dot)
         if end_dot is None:
             step = lambda y, moved: path.ahead(path.with_args(moved), t, end, jump, y)  # noqa: E731
-            y1, dy1 = jax.jvp(step, (begin[0], path.moved()), (begin[1], change.args))
+            y1, dy1 = jax.jvp(step, (before[0], path.moved()), (before[1], change.args))
         else:
             assert change.anchors is not None
             step = lambda y, moved, t, end: path.ahead(  # noqa: E731
                 path.with_args(moved), t, end, jump, y
             )
-            at_, moves = (begin[0], path.moved(), t, end), change.anchors[clock.anchor(i - 1)]
-            y1, dy1 = jax.jvp(step, at_, (begin[1], change.args, moves, end_dot))
+            t_dot = change.anchors[clock.anchor(i - 1)]
+            given = (before[0], path.moved(), t, end)
+            y1, dy1 = jax.jvp(step, given, (before[1], change.args, t_dot, end_dot))
         if rows is not None:
             assert record.row_turn is not None
             rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
@@ -144,9 +145,9 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         """One turn back: turn k - 1, or rows reached from the state before turn k.
 
         The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
-        a row reached from the state before its last step; `ahead` is what that adds there.
+        a row reached from the state before its last step; `owed` is what that adds there.
         """
-        k, r, bar, ahead, (args_bar, anchors_bar, dues_bar) = carry
+        k, r, bar, owed, (args_bar, anchors_bar, dues_bar) = carry
         j, now = row_left(r), clock.time(k - 1, anchors)
         here = j == k
         to_row = eqxi.unvmap_any(here)
@@ -180,14 +181,14 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             bar = pick(use, before, bar)
         else:
             zeros = jax.tree.map(jnp.zeros_like, bar)
-            summed = _add(before, pick(here, bar, ahead))
+            summed = _add(before, pick(here, bar, owed))
             bar = pick(use | here, summed, bar)
-            ahead = pick(use, zeros, pick(row & ~here, summed, ahead))
+            owed = pick(use, zeros, pick(row & ~here, summed, owed))
             r = r - row.astype(jnp.int32)
         if wanted.points is not None:
             at_point = ~to_row & (k % record.stride == 0) & (k < record.turns)
             bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
-        return k, r, bar, ahead, (args_bar, anchors_bar, dues_bar)
+        return k, r, bar, owed, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
         """All turns after the first, that one and its rows."""
@@ -236,8 +237,8 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     if record.row_turn is not None:
         rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
     bar = _add(wanted.last, end_bar)
-    ahead = None if between is None else jax.tree.map(jnp.zeros_like, bar)
-    ended = path.native(all_back, (most, rows_left, bar, ahead, bars))
+    owed = None if between is None else jax.tree.map(jnp.zeros_like, bar)
+    ended = path.native(all_back, (most, rows_left, bar, owed, bars))
     _, _, bar, _, (args_bar, anchors_bar, dues_bar) = ended
     bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
     saves_bar = None
