@@ -13,9 +13,13 @@ from jaxlag import solvers as solvers  # noqa: E402
 from jaxlag import testing as testing  # noqa: E402
 from jaxlag._assemble import Assembly as Assembly  # noqa: E402
 from jaxlag._assemble import assemble as assemble  # noqa: E402
+from jaxlag._comparison import Candidate as Candidate  # noqa: E402
+from jaxlag._comparison import Comparison as Comparison  # noqa: E402
+from jaxlag._comparison import compare as compare  # noqa: E402
 from jaxlag._constraints import Baumgarte as Baumgarte  # noqa: E402
 from jaxlag._constraints import Holonomic as Holonomic  # noqa: E402
 from jaxlag._constraints import Pfaffian as Pfaffian  # noqa: E402
+from jaxlag._descent import Descent as Descent  # noqa: E402
 from jaxlag._errors import AssemblyError as AssemblyError  # noqa: E402
 from jaxlag._errors import EquilibriumError as EquilibriumError  # noqa: E402
 from jaxlag._errors import SimulationError as SimulationError  # noqa: E402
@@ -36,6 +40,8 @@ from jaxlag._inputs import Linear as Linear  # noqa: E402
 from jaxlag._inputs import ZeroOrderHold as ZeroOrderHold  # noqa: E402
 from jaxlag._inverse import inverse_dynamics as inverse_dynamics  # noqa: E402
 from jaxlag._inverse import prescribed_motion as prescribed_motion  # noqa: E402
+from jaxlag._prediction import Prediction as Prediction  # noqa: E402
+from jaxlag._prediction import predict as predict  # noqa: E402
 from jaxlag._quasi import QuasiVelocities as QuasiVelocities  # noqa: E402
 from jaxlag._simulate import simulate as simulate  # noqa: E402
 from jaxlag._solution import Solution as Solution  # noqa: E402

@@ -5,25 +5,35 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxlag._channels import Reader, readers
+from jaxlag._channels import Reader
+from jaxlag._descent import Descent, descend
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._fit_result import FitResult, summarised
-from jaxlag._free import Prior, Unknowns, prior_rows, unknowns
-from jaxlag._initial_states import initial_states, typical
-from jaxlag._segments import Layout, layout, pack
-from jaxlag._shooting import LOSSES, Found, Guess, Shooting, search, squares
+from jaxlag._free import NO_PRIOR, Prior, Unknowns, prior_rows, unknowns
+from jaxlag._losses import LOSSES, squares
+from jaxlag._problem import (
+    check_options,
+    estimated_noise,
+    experiments_of,
+    pose,
+    readers_of,
+    with_noise,
+)
+from jaxlag._segments import Layout, layout
+from jaxlag._shooting import Found, Guess, Shooting, judged, search
 from jaxlag._system import System
 
 GAPS = (1e-1, 1e-2, 1e-3, 1e-5)
 """Standard deviations of the gaps between segments, stage by stage, over the states' ranges."""
+LARGEST_COVARIANCE = 200
+"""Numbers, beyond which a covariance costs more than the descent that found them."""
 NOISE_ROUNDS = 3
 """How often noise that was not given is estimated, and the fit repeated with it."""
-STATES_FOR_RANGE = 32
 
 
 def fit(
@@ -37,6 +47,7 @@ def fit(
     transforms: Mapping[str, Any] | None = None,
     priors: Mapping[str, Prior] | None = None,
     loss: str = "squares",
+    optimiser: Any = None,
     tolerance: float = 1e-6,
     max_steps: int = 100,
     **options: Any,
@@ -68,8 +79,11 @@ def fit(
         priors: name -> `Prior` of a free leaf, in its own unit.
         loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less (of residuals over
             sigma, so state sigma).
+        optimiser: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
+            There may then be more of them than measurements; no covariance is computed of more than
+            200.
         tolerance: relative and absolute, of unknowns and residuals, both of order one.
-        max_steps: of the optimiser, in each stage.
+        max_steps: of Levenberg and Marquardt's method, in each stage.
         options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
 
     Raises:
@@ -97,76 +111,55 @@ def fit(
         >>> print(f"{found.params['k']:.2f} {found.converged}")
         4.00 True
     """
-    experiments = _experiments(experiments)
-    _check(system, segments, loss, options)
+    experiments = experiments_of(experiments)
+    _check(system, segments, loss, optimiser)
+    check_options(options, "jl.fit")
     unknown = unknowns(params0, free, dict(transforms or {}))
-    names = tuple(dict.fromkeys(name for each in experiments for name in each.channels))
-    rows = _row_names(system, params0)
-    shown = readers(system, names, channels or {}, rows)
+    own = dict(channels or {})
+    shown = readers_of(system, experiments, own, params0)
     where = layout(experiments, segments)
     prior = prior_rows(unknown, dict(priors or {}))
-    _count(experiments, unknown, len(prior[0]), len(experiments) * 2 * system.size)
-    if system.constraints:
-        options = {"assemble": True} | options
+    if optimiser is None:
+        _count(experiments, len(unknown.u0), len(prior[0]), 2 * system.size)
     _warn_before(experiments, unknown)
-    problem, noise = _problem(
-        system, experiments, where, unknown, shown, prior, loss, dict(options)
-    )
-    found = _stages(problem, tolerance, max_steps)
-    for _ in range(NOISE_ROUNDS if noise else 0):
-        changed = _noise(found, problem, where, noise)
-        settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
-        noise, problem = changed, _with_noise(problem, where, changed)
-        join = jnp.asarray(GAPS[-1] if problem.chained else 1.0)
-        found = search(problem, found.guess, join, tolerance, max_steps)
-        if settled:
-            break
-    result = summarised(problem, found, experiments, where, noise)
+    problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
+    costs = np.zeros(0)
+    if optimiser is None:
+        found = _stages(problem, tolerance, max_steps)
+        problem, noise, found = _with_its_noise(problem, noise, found, where, tolerance, max_steps)
+    else:
+        guess, costs = _downhill(problem, optimiser, max_steps)
+        if noise:
+            seen = _judged(problem, guess, optimiser, costs, linear=False)
+            noise = estimated_noise(seen, problem, where, noise)
+            problem = with_noise(problem, where, noise)
+        linear = len(unknown.u0) <= LARGEST_COVARIANCE
+        found = _judged(problem, guess, optimiser, costs, linear)
+    result = summarised(problem, found, experiments, where, noise, own, costs)
     _warn_after(result)
     return result
 
 
-def _experiments(given: Any) -> tuple[Experiment, ...]:
-    found = (given,) if isinstance(given, Experiment) else tuple(given)
-    if not found or not all(isinstance(x, Experiment) for x in found):
-        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
-    return found
-
-
-def _check(system: Any, segments: Any, loss: Any, options: Mapping[str, Any]) -> None:
+def _check(system: Any, segments: Any, loss: Any, optimiser: Any) -> None:
     if not isinstance(system, System):
         raise bad("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(segments, int | np.integer) or segments < 1:
         raise bad("segments", "be a positive integer", f"it was {segments!r}")
+    if optimiser is not None and not isinstance(optimiser, Descent):
+        fix = "Write jl.Descent(optax.adam(1e-3))."
+        raise bad("optimiser", "be None or a jl.Descent", f"it was {optimiser!r}", fix)
     if loss not in LOSSES:
         raise bad("loss", f"be one of {list(LOSSES)}", f"it was {loss!r}")
-    for name in ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error"):
-        if name in options:
-            raise bad(name, "be left to jl.fit", "it was given")
 
 
-def _row_names(system: System, params: Any) -> tuple[str, ...]:
-    if not system.constraints:
-        return ()
-    return tuple(system.rows(params, jnp.dtype(float)).labels)
-
-
-def _count(experiments: Sequence[Experiment], free: Unknowns, priors: int, states: int) -> None:
+def _count(experiments: Sequence[Experiment], params: int, priors: int, start: int) -> None:
     """Raise where there is less to be known from than is to be known."""
     numbers = sum(int(np.isfinite(x).sum()) for each in experiments for x in each.channels.values())
-    if numbers + priors < len(free.u0) + states:
-        must = f"hold at least as many numbers as there are unknowns, {len(free.u0) + states}"
+    unknown = params + start * sum(each.start_sigma is None for each in experiments)
+    if numbers + priors < unknown:
+        must = f"hold at least as many numbers as there are unknowns, {unknown}"
         was = f"they held {numbers}"
         raise bad("experiments", must, was, "Measure more, or free fewer parameters.")
-
-
-def _unstated(experiments: Sequence[Experiment]) -> set[str]:
-    """Channels whose noise one experiment or more does not state."""
-    without = {name for each in experiments for name in each.channels if name not in each.sigma}
-    for name in without & {name for each in experiments for name in each.sigma}:
-        was = f"that of {name!r} was given in some"
-        raise bad("sigma", "be given in all experiments that measure a channel, or in none", was)
-    return without
 
 
 def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
@@ -178,48 +171,6 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
             if np.all(np.nanmax(x, axis=0) == np.nanmin(x, axis=0)):
                 text = f"channel {name!r} of {each.name} is constant: it may be disconnected."
                 warnings.warn(text, stacklevel=3)
-
-
-def _problem(
-    system: System,
-    experiments: Sequence[Experiment],
-    where: Layout,
-    free: Unknowns,
-    shown: Mapping[str, Reader],
-    prior: tuple[np.ndarray, np.ndarray, np.ndarray],
-    loss: str,
-    options: dict[str, Any],
-) -> tuple[Shooting, dict[str, float]]:
-    """The problem, and the noise assumed of channels whose noise is not stated."""
-    ranges = {
-        name: np.concatenate([x.channels[name] for x in experiments if name in x.channels])
-        for name in where.columns
-    }
-    ranges = {name: np.nanstd(x, axis=0) for name, x in ranges.items()}
-    ranges = {name: np.where(x > 0, x, 1.0) for name, x in ranges.items()}
-    noise = {name: 1e-2 * float(np.max(ranges[name])) for name in _unstated(experiments)}
-    guesses, spread = [], []
-    params = free.params0
-    for i, each in enumerate(experiments):
-        rows = where.first[where.owner == i].tolist()
-        some = np.linspace(0, len(each.ts) - 1, STATES_FOR_RANGE).astype(int).tolist()
-        states = initial_states(system, each, rows + some, params, options)
-        guesses.append(states[: len(rows)])
-        spread.append(states[len(rows) :])
-    segments = pack(system, experiments, where, noise, np.concatenate(guesses))
-    problem = Shooting(
-        system,
-        tuple(sorted(options.items())),
-        tuple(shown.items()),
-        LOSSES[loss],
-        bool(np.any(segments.follows)),
-        free,
-        segments,
-        jnp.asarray(typical(np.concatenate(spread))),
-        jnp.asarray(np.concatenate([ranges[name] for name in where.columns])),
-        (jnp.asarray(prior[0]), jnp.asarray(prior[1]), jnp.asarray(prior[2])),
-    )
-    return problem, noise
 
 
 def _stages(problem: Shooting, tolerance: float, max_steps: int) -> Found:
@@ -240,36 +191,57 @@ def _stages(problem: Shooting, tolerance: float, max_steps: int) -> Found:
     return found
 
 
-def _noise(
-    found: Found, problem: Shooting, where: Layout, noise: Mapping[str, float]
-) -> dict[str, float]:
-    """Standard deviations of the channels' residuals, m, rad or what they are measured in."""
-    measured = np.asarray(problem.segments.weights) > 0
-    unknowns = len(problem.free.u0) + np.count_nonzero(~problem.segments.follows) * len(
-        problem.states
-    )
-    share = 1.0 - unknowns / np.count_nonzero(measured)
-    ok = (np.asarray(found.seen.status) == 0)[:, None, None]
-    changed = {}
-    for name, sigma in noise.items():
-        part = where.columns[name]
-        used = (measured & ok)[:, :, part]
-        sum_of_squares = np.sum(
-            np.where(used, np.asarray(found.seen.residuals)[:, :, part] ** 2, 0.0)
-        )
-        mean = sum_of_squares / max(1.0, share * np.count_nonzero(used))
-        # Measurements without noise: what is left then is the solver's.
-        changed[name] = sigma * max(float(np.sqrt(mean)), 1e-9)
-    return changed
+def _with_its_noise(
+    problem: Shooting,
+    noise: dict[str, float],
+    found: Found,
+    where: Layout,
+    tolerance: float,
+    max_steps: int,
+) -> tuple[Shooting, dict[str, float], Found]:
+    """The problem, weighed by the noise that its residuals show, and what is found then."""
+    join = jnp.asarray(GAPS[-1] if problem.chained else 1.0)
+    for _ in range(NOISE_ROUNDS if noise else 0):
+        changed = estimated_noise(found, problem, where, noise)
+        settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
+        noise, problem = changed, with_noise(problem, where, changed)
+        found = search(problem, found.guess, join, tolerance, max_steps)
+        if settled:
+            break
+    return problem, noise, found
 
 
-def _with_noise(problem: Shooting, where: Layout, noise: Mapping[str, float]) -> Shooting:
-    """The problem with other weights of these channels."""
-    weights = problem.segments.weights
-    for name, sigma in noise.items():
-        part = where.columns[name]
-        weights = weights.at[:, :, part].set(jnp.where(weights[:, :, part] > 0, 1 / sigma, 0.0))
-    return eqx.tree_at(lambda p: p.segments.weights, problem, weights)
+def _downhill(
+    problem: Shooting, descent: Descent, max_steps: int
+) -> tuple[Guess, Float[np.ndarray, " epochs"]]:
+    """(where a descent ends, its costs); starts by least squares before it and after it."""
+    z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
+    x = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
+    guess, costs = descend(problem, Guess(z, x), descent)
+    return Guess(guess.z, _starts(problem, guess.z, guess.x, join, max_steps)), np.asarray(costs)
+
+
+def _join(problem: Shooting, descent: Descent) -> Float[Array, ""]:
+    return jnp.asarray(descent.gap if problem.chained else 1.0)
+
+
+def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_steps: int) -> Array:
+    """Starts by least squares, params as they are at z."""
+    held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
+    return search(held, Guess(jnp.zeros(0), x), join, 1e-4, max_steps).guess.x
+
+
+def _judged(
+    problem: Shooting,
+    guess: Guess,
+    descent: Descent,
+    costs: Float[np.ndarray, " epochs"],
+    linear: bool,
+) -> Found:
+    """All that is known where a descent ended, with derivatives or without."""
+    cost, rows, seen, starts = judged(problem, guess, _join(problem, descent), linear)
+    fell = bool(np.all(np.isfinite(costs)) and costs[-1] <= costs[0])
+    return Found(guess, jnp.asarray(fell), jnp.asarray(len(costs)), cost, rows, seen, starts)
 
 
 def _warn_after(result: FitResult) -> None:

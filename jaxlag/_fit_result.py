@@ -1,8 +1,8 @@
 """What a fit found: estimates, how well they are known, and how well they predict."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from statistics import NormalDist
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -10,15 +10,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlag._elimination import eliminate
+from jaxlag._channels import Reader
+from jaxlag._elimination import Rows, eliminate
+from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._identifiability import Spectrum
+from jaxlag._prediction import Prediction, predict, residuals_of, root_mean_square
 from jaxlag._segments import Layout
 from jaxlag._shooting import Found, Shooting
 from jaxlag._status import Status
+from jaxlag._system import System
 
+SHOWN = 40
+"""Estimates in a result's text."""
 FAINT = 1e-20
 """Damping, in squares of unknowns of order one, that keeps starts regular that are not observed."""
+
+
+class Model(NamedTuple):
+    """What moves, what is measured of it, and by which options it is simulated."""
+
+    system: System
+    channels: tuple[tuple[str, Reader], ...]
+    options: tuple[tuple[str, Any], ...]
 
 
 @final
@@ -31,10 +45,10 @@ class FitResult(eqx.Module):
         values: their estimates, in their own units.
         covariance: of `values`, (e, e), from the derivatives at the estimates (Cramer-Rao); inf
             for numbers that take part in what is not determined. It holds for noise that is
-            independent from sample to sample.
+            independent from sample to sample. NaN after a `Descent` of more than 200 numbers.
         singular_values: of the weighted derivatives by relative changes of `values`, states
             eliminated, falling: a relative change of eps along the i-th direction moves the
-            weighted residuals by eps times the i-th.
+            weighted residuals by eps times the i-th. None where there is no covariance.
         unidentifiable: null directions, in words: which numbers change together without a trace.
         determined: what is known of those: "g/l".
         unused: numbers that nothing measured depends on.
@@ -43,10 +57,13 @@ class FitResult(eqx.Module):
             NaN where nothing was measured or the segment failed.
         starts: of each experiment, (q, v) or (q, u) at its first time.
         gap: largest gap between segments, over the range of the states.
-        converged: whether the optimiser met its tolerance.
-        steps: how many it took in the last stage.
+        converged: whether the optimiser met its tolerance; of a `Descent`, whether costs are finite
+            and lower than at first.
+        steps: how many it took in the last stage; of a `Descent`, epochs.
         cost: half the weighted sum of squares.
         failed: segments without a solution, each with its status.
+        costs: of a `Descent`, mean cost of the steps of each epoch; else empty.
+        experiments: what was measured.
     """
 
     params: Any
@@ -65,7 +82,40 @@ class FitResult(eqx.Module):
     steps: int
     cost: float
     failed: tuple[str, ...]
+    costs: Float[np.ndarray, " epochs"]
     experiments: tuple[Experiment, ...]
+    _model: "Model" = eqx.field(static=True)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels."""
+        return tuple(dict.fromkeys(name for each in self.residuals for name in each))
+
+    def predict(self, experiments: Any, settle: float | int | None = None) -> Prediction:
+        """How well the estimates predict other experiments: `jl.predict` with them."""
+        model = self._model
+        return predict(
+            model.system,
+            experiments,
+            self.params,
+            settle=settle,
+            channels=dict(model.channels),
+            noise=self.noise,
+            **dict(model.options),
+        )
+
+    def plot(self) -> Any:
+        """A figure of measurements and motions, residuals beneath.
+
+        One column for every experiment, of more than four those from the best to the worst; needs
+        matplotlib, from the extra "plot".
+
+        Returns:
+            A `matplotlib.figure.Figure`.
+        """
+        from jaxlag._fit_plot import plotted
+
+        return plotted(self.experiments, self.residuals)
 
     @property
     def std(self) -> dict[str, float]:
@@ -82,28 +132,28 @@ class FitResult(eqx.Module):
 
     def rms(self, channel: str) -> Float[np.ndarray, " k"]:
         """Root mean square of a channel's residuals over all experiments, in its own unit."""
-        return root_mean_square(self.residuals, channel)
+        if channel not in self.channels:
+            raise bad("channel", f"be one of {list(self.channels)}", f"it was {channel!r}")
+        return root_mean_square([each[channel] for each in self.residuals if channel in each])
 
     def __str__(self) -> str:
         lines = []
-        for name, value in zip(self.names, self.values.tolist(), strict=True):
-            low, high = self.interval()[name]
+        interval = self.interval()
+        for name, value in list(zip(self.names, self.values.tolist(), strict=True))[:SHOWN]:
+            low, high = interval[name]
             known = f"95 % in [{low:.6g}, {high:.6g}]" if np.isfinite(low) else "not determined"
+            known = known if self.singular_values.size else "(no covariance)"
             lines.append(f"{name:<12} {value:.6g}   {known}")
+        lines += [f"and {len(self.names) - SHOWN} more"] * (len(self.names) > SHOWN)
         lines += [f"unknown: {text}" for text in self.unidentifiable]
         lines += [f"known: {text}" for text in self.determined]
-        channels = dict.fromkeys(name for each in self.residuals for name in each)
-        for name in channels:
+        for name in self.channels:
             lines.append(f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name)))
         lines += list(self.failed)
-        lines.append(f"{'converged' if self.converged else 'not converged'} in {self.steps} steps")
+        steps = "epochs" if self.costs.size else "steps"
+        ended = "converged" if self.converged else "not converged"
+        lines.append(f"{ended} in {self.steps} {steps}")
         return "\n".join(lines)
-
-
-def root_mean_square(residuals: Sequence[dict[str, np.ndarray]], channel: str) -> np.ndarray:
-    """Over all rows that have a number."""
-    rows = np.concatenate([each[channel] for each in residuals if channel in each])
-    return np.sqrt(np.nanmean(rows**2, axis=0))
 
 
 def summarised(
@@ -112,31 +162,34 @@ def summarised(
     experiments: tuple[Experiment, ...],
     where: Layout,
     noise: dict[str, float],
+    own: Mapping[str, Reader],
+    costs: Float[np.ndarray, " epochs"],
 ) -> FitResult:
-    """The result of a search."""
+    """The result of a search.
+
+    Args:
+        problem: the least squares.
+        found: where the search ended.
+        experiments: what was measured.
+        where: their segments.
+        noise: that was estimated.
+        own: channels of the caller.
+        costs: of the epochs of a descent.
+    """
     z = found.guess.z
     values = np.asarray(problem.free.numbers(z))
-    by_z = np.asarray(jax.jacfwd(problem.free.numbers)(z))
-    factor = np.asarray(eliminate(_without_failed(found, problem), jnp.asarray(FAINT)).params)
-    factor = factor[:-1, :-1]
-    by_value = np.linalg.solve(by_z.T, factor.T).T
-    names = problem.free.names
-    # A column of round-off: nothing depends on it, whatever it is divided by.
-    sizes = np.linalg.norm(by_value * np.where(values == 0, 1.0, values), axis=0)
-    least = 1e-9 * max(sizes, default=0.0)
-    unused = tuple(n for n, x in zip(names, sizes, strict=True) if x <= least)
-    spectrum = Spectrum(names, values, by_value)
     firsts = np.flatnonzero(where.first == 0)
     status = np.asarray(found.seen.status)
+    known = _uncertainty(problem, found, values)
     return FitResult(
-        jax.tree.map(np.asarray, problem.free.params(z)),
-        names,
+        jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, problem.free.params(z)),
+        problem.free.names,
         values,
-        spectrum.covariance(),
-        spectrum.singular_values,
-        spectrum.unidentifiable,
-        spectrum.determined,
-        unused,
+        known.covariance,
+        known.singular_values,
+        known.unidentifiable,
+        known.determined,
+        known.unused,
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
         tuple(np.asarray(found.starts)[firsts]),
@@ -149,7 +202,42 @@ def summarised(
             f" t = {problem.segments.ts[k, 0]:g} s ended with {_how_it_ended(problem, z, found, k)}"
             for k in map(int, np.flatnonzero(status != Status.ok))
         ),
+        costs,
         experiments,
+        Model(problem.system, tuple(own.items()), problem.options),
+    )
+
+
+class _Uncertainty(NamedTuple):
+    """How well estimates are known: attributes of a `FitResult`."""
+
+    covariance: np.ndarray
+    singular_values: np.ndarray
+    unidentifiable: tuple[str, ...]
+    determined: tuple[str, ...]
+    unused: tuple[str, ...]
+
+
+def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncertainty:
+    names = problem.free.names
+    if found.rows is None:
+        unknown = np.full((len(names), len(names)), np.nan)
+        return _Uncertainty(unknown, np.zeros(0), (), (), ())
+    by_z = np.asarray(jax.jacfwd(problem.free.numbers)(found.guess.z))
+    factor = np.asarray(eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT)).params)
+    factor = factor[:-1, :-1]
+    by_value = np.linalg.solve(by_z.T, factor.T).T
+    # A column of round-off: nothing depends on it, whatever it is divided by.
+    sizes = np.linalg.norm(by_value * np.where(values == 0, 1.0, values), axis=0)
+    least = 1e-9 * max(sizes, default=0.0)
+    unused = tuple(n for n, x in zip(names, sizes, strict=True) if x <= least)
+    spectrum = Spectrum(names, values, by_value)
+    return _Uncertainty(
+        spectrum.covariance(),
+        spectrum.singular_values,
+        spectrum.unidentifiable,
+        spectrum.determined,
+        unused,
     )
 
 
@@ -167,30 +255,9 @@ def _gaps(found: Found, problem: Shooting) -> np.ndarray:
     return np.where(problem.segments.follows[:, None], apart, 0.0)
 
 
-def _without_failed(found: Found, problem: Shooting) -> Any:
+def _without_failed(rows: Rows, found: Found) -> Rows:
     """The linear problem without rows of segments that failed."""
     ok = (found.seen.status == Status.ok)[:, None, None]
-    rows = found.rows
     joined = None if rows.joined is None else jnp.where(ok, rows.joined, 0.0)
     following = None if rows.next is None else jnp.where(ok[:, :, 0], rows.next, 0.0)
     return rows._replace(measured=jnp.where(ok, rows.measured, 0.0), joined=joined, next=following)
-
-
-def residuals_of(
-    problem: Shooting,
-    weighted: np.ndarray,
-    status: np.ndarray,
-    experiments: Sequence[Experiment],
-    where: Layout,
-) -> tuple[dict[str, np.ndarray], ...]:
-    """Of each experiment by channel, in the channels' units."""
-    weights = np.asarray(problem.segments.weights)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        raw = np.where(weights > 0, weighted / weights, np.nan)
-    raw[status != Status.ok] = np.nan
-    found = []
-    for i, each in enumerate(experiments):
-        own = np.flatnonzero(where.owner == i)
-        rows = np.concatenate([raw[k, where.places[k]] for k in own])
-        found.append({name: rows[:, where.columns[name]] for name in each.channels})
-    return tuple(found)

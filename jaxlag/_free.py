@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 from jaxlag._errors import bad
 from jaxlag._transforms import AbstractTransform, Free
 
+NO_PRIOR = np.zeros(0, int), np.zeros(0), np.zeros(0)
+"""Of which numbers, means, standard deviations: nothing is known beforehand."""
+
 
 class Prior(eqx.Module):
     """A Gaussian prior: the parameter is mean +- sigma.
@@ -69,6 +72,11 @@ class Leaf(NamedTuple):
     first: int
     indices: tuple[tuple[int, ...], ...]
 
+    @property
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """The indices, axis by axis."""
+        return tuple(np.array(self.indices, int).reshape(len(self.indices), len(self.shape)).T)
+
 
 class Unknowns(eqx.Module):
     """The map z -> params: u = u0 + scale z, each leaf `transform.value(u)`, the others as given.
@@ -98,11 +106,16 @@ class Unknowns(eqx.Module):
             leaves[leaf.index] = leaf.transform.value(own, leaf.shape)
         return jax.tree.unflatten(treedef, leaves)
 
+    def held(self, z: Float[Array, " p"]) -> "Unknowns":
+        """No unknowns, and the params at z."""
+        nothing = np.zeros(0)
+        return Unknowns((), self.params(z), nothing, nothing, nothing, ())
+
     def numbers(self, z: Float[Array, " p"]) -> Float[Array, " e"]:
         """The numbers that are to be found, in their own units: as many as there are unknowns."""
         leaves = jax.tree.leaves(self.params(z))
-        own = [leaves[leaf.index][index] for leaf in self.leaves for index in leaf.indices]
-        return jnp.stack(own) if own else jnp.zeros(0)
+        own = [leaves[leaf.index][leaf.columns].ravel() for leaf in self.leaves]
+        return jnp.concatenate(own) if own else jnp.zeros(0)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,6 +130,8 @@ class Unknowns(eqx.Module):
 def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -> Unknowns:
     """The unknowns of the leaves that `free` names, by their own name or by that of a branch.
 
+    Of a branch, such as a network, only leaves that hold real numbers are meant.
+
     Raises:
         ValueError: a name of nothing, a leaf that holds no real numbers, or a transform of a leaf
             that is not free.
@@ -130,7 +145,11 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         below = [i for i, path in enumerate(names) if path == name or path.startswith(branch)]
         if not below:
             raise bad("free", f"name parameters among {names}", f"one was {name!r}")
-        chosen |= dict.fromkeys(below)
+        real = [i for i in below if _is_real(values[i])]
+        if not real:
+            must, was = "hold real numbers to be found", f"it was {values[below[0]]!r}"
+            raise bad(f"params0[{name!r}]", must, was, "Write 1.0 for 1.")
+        chosen |= dict.fromkeys(real)
     for name, transform in transforms.items():
         if name not in [names[i] for i in chosen]:
             free_names = [names[i] for i in chosen]
@@ -142,24 +161,27 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
     k = 0
     for i in sorted(chosen):
         value = np.asarray(values[i])
-        if not np.issubdtype(value.dtype, np.floating):
-            must = "hold real numbers to be found"
-            raise bad(f"params0[{names[i]!r}]", must, f"it was {values[i]!r}", "Write 1.0 for 1.")
         transform = transforms.get(names[i], Free())
         u, bound = transform.start(names[i], value)
         on_bound += [names[i]] * bound
         indices = transform.entries(value.shape)
         leaves.append(Leaf(names[i], i, value.shape, transform, k, indices))
         starts.append(u)
-        # Unknowns of order one: numbers as multiples of what they start at, logarithms as they are.
+        # Unknowns of order one: as multiples of the size that a leaf starts at, logarithms as they
+        # are.
         plain = isinstance(transform, Free)
-        scales.append(np.where(u == 0, 1.0, np.abs(u)) if plain else np.ones(len(u)))
+        size = float(np.sqrt(np.mean(u**2))) if plain and u.size else 1.0
+        scales.append(np.full(len(u), size or 1.0))
         reaches.append(np.full(len(u), np.inf if plain else 1.0))
         k += len(u)
     parts = starts, scales, reaches
     u0, scale, reach = (np.concatenate(x) if leaves else np.zeros(0) for x in parts)
     params0 = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, params0)
     return Unknowns(tuple(leaves), params0, u0, scale, reach, tuple(on_bound))
+
+
+def _is_real(leaf: Any) -> bool:
+    return eqx.is_array_like(leaf) and np.issubdtype(np.asarray(leaf).dtype, np.floating)
 
 
 def prior_rows(
@@ -185,5 +207,5 @@ def prior_rows(
         means.append(np.array([mean[index] for index in leaf.indices]))
         sigmas.append(np.array([sigma[index] for index in leaf.indices]))
     if not which:
-        return np.zeros(0, int), np.zeros(0), np.zeros(0)
+        return NO_PRIOR
     return np.array(which), np.concatenate(means), np.concatenate(sigmas)

@@ -102,7 +102,7 @@ def in_batches(
     filled = jnp.minimum(jnp.arange(batches * size), count - 1)
     parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), rows)
     results = lax.map(jax.vmap(function), parts)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], results)
+    return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
 
 
 def lanes_first(tree: PyTree) -> PyTree:

@@ -7,13 +7,14 @@ what was measured however wrong the params are; in the end they are one motion (
 advances in parameter identification techniques for ODE, 1983).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
@@ -27,6 +28,8 @@ from jaxlag._system import System
 
 MOVED_AT_ONCE = 64
 """Segments times directions of derivatives: vectors, and no more than a core's cache holds."""
+AT_ONCE = 16
+"""Motions without derivatives that run side by side."""
 FAR = 10.0
 """What a segment without a solution is off by, in multiples of how far its channels range."""
 
@@ -73,7 +76,7 @@ class Shooting(eqx.Module):
         system: what moves.
         options: of `simulate`.
         channels: what is measured.
-        loss: rho', by which residuals are made smaller; see `LOSSES`.
+        loss: by which residuals are made smaller; one of `LOSSES`.
         chained: whether any segment follows another.
         free: from z to params.
         segments: what was measured.
@@ -91,7 +94,7 @@ class Shooting(eqx.Module):
     segments: Segments
     states: Float[Array, " d"]
     ranges: Float[Array, " m"]
-    prior: tuple[Array, Array, Array]
+    prior: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     def start(self, x: Float[Array, " d"], segment: Segments) -> Float[Array, " d"]:
         """The state (q, v) or (q, u) at the start of a segment."""
@@ -164,55 +167,46 @@ class Shooting(eqx.Module):
         seen = Seen(residuals, ends, status)
         residuals += r_z @ dz + jnp.einsum("ksmd,kd->ksm", r_x, dx)
         ends += e_z @ dz + jnp.einsum("ked,kd->ke", e_x, dx)
-        segments = self.segments
-        known = jnp.isfinite(segments.held) & (segments.held > 0)
-        sigma = jnp.where(known, segments.held, 1.0)
-        starts = jnp.where(known, guess.x * self.states / sigma, 0.0)
-        rows = jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
-        which, mean, deviation = self.prior
-        prior = (self.free.numbers(guess.z)[which] - mean) / deviation
+        return self.compared(guess, residuals, ends, join), seen
+
+    def compared(
+        self,
+        guess: Guess,
+        residuals: Float[Array, "k s m"],
+        ends: Float[Array, "k d"],
+        join: Float[Array, ""],
+    ) -> Residuals:
+        """All that is to be small, of what segments do."""
         joined = None
         if self.chained:
-            begins = jax.vmap(self.start)(guess.x, segments)
-            gap = (ends - jnp.roll(begins, -1, axis=0)) / (join * self.states)
-            joined = jnp.where(segments.follows[:, None], gap, 0.0)
-        return Residuals(rows, joined, prior), seen
+            begins = jax.vmap(self.start)(guess.x, self.segments)
+            joined = self.gaps(self.segments, ends, jnp.roll(begins, -1, axis=0), join)
+        rows = self.weighed(guess.x, self.segments, residuals)
+        return Residuals(rows, joined, self.known(guess.z))
 
+    def weighed(
+        self, x: Float[Array, "k d"], segments: Segments, residuals: Float[Array, "k s m"]
+    ) -> Float[Array, "k r"]:
+        """Rows of what was measured by the loss, and of starts that are known roughly."""
+        known = jnp.isfinite(segments.held) & (segments.held > 0)
+        sigma = jnp.where(known, segments.held, 1.0)
+        starts = jnp.where(known, x * self.states / sigma, 0.0)
+        return jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
 
-# Losses: residuals r are replaced by g(r), so that 1/2 g^2 is the loss.
+    def gaps(
+        self,
+        segments: Segments,
+        ends: Float[Array, "k d"],
+        begins: Float[Array, "k d"],
+        join: Float[Array, ""],
+    ) -> Float[Array, "k d"]:
+        """Ends less the starts that follow, over `join` times the range of the states."""
+        return jnp.where(segments.follows[:, None], (ends - begins) / (join * self.states), 0.0)
 
-
-def squares(r: Array) -> Array:
-    """1/2 r^2."""
-    return r
-
-
-def soft_l1(r: Array) -> Array:
-    """(1 + r^2)^(1/2) - 1: as |r| for large r."""
-    return r * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + r * r)))
-
-
-def huber(r: Array) -> Array:
-    """1/2 r^2 up to |r| = 1.345, linear beyond."""
-    k = 1.345
-    large = jnp.abs(r) > k
-    safe = jnp.where(large, r, k)
-    return jnp.where(large, jnp.sign(r) * jnp.sqrt(2 * k * jnp.abs(safe) - k * k), r)
-
-
-def cauchy(r: Array) -> Array:
-    """1/2 log(1 + r^2)."""
-    small = r * r < 1e-12
-    x = jnp.where(small, 1.0, r * r)
-    return r * jnp.where(small, 1.0, jnp.sqrt(jnp.log1p(x) / x))
-
-
-LOSSES: Mapping[str, Callable[[Array], Array]] = {
-    "squares": squares,
-    "soft_l1": soft_l1,
-    "huber": huber,
-    "cauchy": cauchy,
-}
+    def known(self, z: Float[Array, " p"]) -> Float[Array, " c"]:
+        """Params less what is known of them beforehand, over its standard deviation."""
+        which, mean, deviation = self.prior
+        return (self.free.numbers(z)[jnp.asarray(which)] - mean) / deviation
 
 
 # The optimiser: optimistix' Levenberg-Marquardt, its linear steps by elimination.
@@ -304,9 +298,9 @@ class Found(NamedTuple):
     Attributes:
         guess: the unknowns.
         converged: whether it met its tolerance.
-        steps: how many it took, each a solve of all segments with derivatives.
+        steps: how many it took; of least squares each is a solve of all segments with derivatives.
         cost: half the sum of squares.
-        rows: condensed, of the linear problem there.
+        rows: condensed, of the linear problem there; None where nobody asked.
         seen: what segments do there.
         starts: (k, d), states where they start, m, rad, m/s, rad/s.
     """
@@ -315,7 +309,7 @@ class Found(NamedTuple):
     converged: Bool[Array, ""]
     steps: Array
     cost: Float[Array, ""]
-    rows: Rows
+    rows: Rows | None
     seen: Seen
     starts: Float[Array, "k d"]
 
@@ -350,3 +344,37 @@ def search(
         state.aux,
         jax.vmap(shooting.start)(solution.value.x, shooting.segments),
     )
+
+
+@eqx.filter_jit
+def moved(shooting: Shooting, guess: Guess) -> Seen:
+    """What segments do, without derivatives."""
+
+    def one(row: tuple[Array, Segments]) -> tuple[Array, Array, Array]:
+        return shooting.one(guess.z, *row)
+
+    count = guess.x.shape[0]
+    return Seen(*in_batches(one, (guess.x, shooting.segments), count, AT_ONCE))
+
+
+@eqx.filter_jit
+def judged(
+    shooting: Shooting, guess: Guess, join: Array, linear: bool
+) -> tuple[Float[Array, ""], Rows | None, Seen, Float[Array, "k d"]]:
+    """(cost, the linear problem condensed, what segments do, where they start) at a guess.
+
+    Args:
+        shooting: the problem.
+        guess: where.
+        join: of the gaps.
+        linear: whether to take derivatives; without them there is no linear problem.
+    """
+    starts = jax.vmap(shooting.start)(guess.x, shooting.segments)
+    if linear:
+        residuals, by, seen = jax.linearize(lambda x: shooting(x, join), guess, has_aux=True)
+        operator = lx.FunctionLinearOperator(by, jax.eval_shape(lambda: guess))
+        rows = condense(rows_of(operator, residuals, shooting, join))
+    else:
+        rows, seen = None, moved(shooting, guess)
+        residuals = shooting.compared(guess, seen.residuals, seen.ends, join)
+    return 0.5 * optx.two_norm(residuals) ** 2, rows, seen, starts

@@ -192,6 +192,19 @@ class System(AbstractReactions):
             return array
         return ScalarTerms(array, OPERATIONS if self.lowering == "auto" else None)
 
+    def with_forces(self, *forces: AbstractForce) -> "System":
+        """The same system under further forces.
+
+        Raises:
+            ValueError: a force that is none, a name that is taken.
+        """
+        both = check_forces((*self.forces, *forces))
+        check_constraints(self.constraints, both)
+        if self.quasi is not None:
+            taken = dict.fromkeys((force.name for force in both), "a force")
+            check_quasi(self.quasi, self.size, taken)
+        return eqx.tree_at(lambda s: s.forces, self, both, is_leaf=lambda x: x is self.forces)
+
     @property
     def size(self) -> int:
         """Number n of scalar coordinates."""

@@ -3,44 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _measured import NOISE, OPTIONS, TRUE, TS, angles, driven, experiment, pendulum
 from _silence import no_warning
 
 import jaxlag as jl
-
-NOISE = 2e-3
-TRUE = {"m": 1.0, "l": 0.7, "g": 9.81, "c": 0.05}
-TS = np.linspace(0.0, 3.0, 151)
-OPTIONS = {"method": "tsit5", "dt": 0.02}
-
-
-def lagrangian(t, q, v, p):
-    inertia = p["m"] * p["l"] ** 2
-    return 0.5 * inertia * v[0] ** 2 + p["m"] * p["g"] * p["l"] * jnp.cos(q[0])
-
-
-def drag(t, q, v, p):
-    return 0.5 * p["c"] * v[0] ** 2
-
-
-def motor(t, q, v, p, inputs):
-    return inputs["torque"][None]
-
-
-pendulum = jl.System(lagrangian, ("x",), forces=(jl.Rayleigh(drag, "air"),))
-driven = jl.System(
-    lagrangian, ("x",), forces=(jl.Rayleigh(drag, "air"), jl.GeneralizedForce(motor, "motor"))
-)
-
-
-def angles(ts=TS, q0=1.0, seed=0, noise=NOISE, **options):
-    """Measured angles of the true pendulum; the truth is far more accurate than they are."""
-    system = driven if options else pendulum
-    motion = jl.simulate(system, [q0], [0.0], ts, TRUE, rtol=1e-11, atol=1e-11, **options)
-    return np.asarray(motion["x"]) + noise * np.random.default_rng(seed).normal(size=len(ts))
-
-
-def experiment(**options):
-    return jl.Experiment(TS, {"x": angles()}, **options)
 
 
 def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
@@ -281,6 +247,8 @@ def test_a_bad_experiment_is_named(ts, channels, options, message):
         ({"segments": 0}, r"segments must be a positive integer"),
         ({"segments": 100}, r"leave two rows or more to each"),
         ({"loss": "abs"}, r"loss must be one of"),
+        ({"optimiser": "adam"}, r"optimiser must be None or a jl\.Descent, .*optax"),
+        ({"rtol": np.float64(1e-6)}, r"rtol must be a Python number.*Write float"),
         ({"transforms": {"m": jl.Positive()}}, r"transforms must be of free parameters"),
         ({"transforms": {"l": 3}}, r"transforms\['l'\] must be a transform"),
         ({"priors": {"m": jl.Prior(1.0, 1.0)}}, r"priors must be of free parameters"),

@@ -1,0 +1,191 @@
+"""Predictions: motions from starts that the first measurements tell, against the later ones."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxlag._channels import Reader
+from jaxlag._errors import bad
+from jaxlag._experiment import Experiment
+from jaxlag._free import NO_PRIOR, unknowns
+from jaxlag._losses import squares
+from jaxlag._problem import check_options, experiments_of, pose, readers_of
+from jaxlag._segments import Layout, layout
+from jaxlag._shooting import Guess, Shooting, moved, search
+from jaxlag._status import Status
+from jaxlag._system import System
+
+
+@final
+class Prediction(eqx.Module):
+    """What was predicted of experiments, beside what was measured.
+
+    Attributes:
+        residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
+            NaN where nothing was measured or the motion failed.
+        predicted: of each experiment, (s,): rows that the start was not fitted to; all of them
+            where it was fitted to all.
+        starts: of each experiment, (q, v) or (q, u) at its first time.
+        failed: experiments whose motion failed, each with its status.
+        experiments: what was measured.
+    """
+
+    residuals: tuple[dict[str, np.ndarray], ...]
+    predicted: tuple[np.ndarray, ...]
+    starts: tuple[np.ndarray, ...]
+    failed: tuple[str, ...]
+    experiments: tuple[Experiment, ...]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels."""
+        return tuple(dict.fromkeys(name for each in self.residuals for name in each))
+
+    def rms(self, channel: str) -> Float[np.ndarray, " k"]:
+        """Root mean square of a channel over all rows that were predicted, in its own unit."""
+        if channel not in self.channels:
+            raise bad("channel", f"be one of {list(self.channels)}", f"it was {channel!r}")
+        own = zip(self.residuals, self.predicted, strict=True)
+        return root_mean_square([each[channel][rows] for each, rows in own if channel in each])
+
+    def plot(self) -> Any:
+        """A figure as `FitResult.plot`, a dotted line where predictions begin."""
+        from jaxlag._fit_plot import plotted
+
+        return plotted(self.experiments, self.residuals, self.predicted)
+
+    def __str__(self) -> str:
+        lines = [
+            f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name))
+            for name in self.channels
+        ]
+        return "\n".join([*lines, *self.failed])
+
+
+def root_mean_square(parts: Sequence[np.ndarray]) -> Float[np.ndarray, " k"]:
+    """Over all rows that have a number, of parts (s, k)."""
+    rows = np.concatenate(parts)
+    count = np.count_nonzero(np.isfinite(rows), axis=0)
+    total = np.nansum(rows**2, axis=0)
+    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def predict(
+    system: System,
+    experiments: Any,
+    params: Any,
+    *,
+    settle: float | int | None = None,
+    channels: Mapping[str, Reader] | None = None,
+    noise: Mapping[str, float] | None = None,
+    tolerance: float = 1e-6,
+    max_steps: int = 100,
+    **options: Any,
+) -> Prediction:
+    """How well params predict experiments, of which none need have been used to find them.
+
+    The start of each experiment is fitted to its first `settle` seconds, params as they are; the
+    motion from there is compared with all that was measured.
+
+    Args:
+        system: what moves.
+        experiments: one `Experiment` or more.
+        params: all params.
+        settle: s, from the first time of each experiment; None fits its start to all of it.
+        channels: as for `jl.fit`.
+        noise: channel -> standard deviation, where the experiments state none: by which channels
+            are weighed when starts are fitted.
+        tolerance: of the starts, over how far states range.
+        max_steps: of the optimiser.
+        options: of `jl.simulate`.
+
+    Raises:
+        ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
+            measurements than a start has numbers.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2
+        >>> spring = jl.System(lagrangian, coordinates=("x",))
+        >>> ts = np.linspace(0.0, 3.0, 31)
+        >>> data = jl.Experiment(ts, {"x": 0.3 * np.cos(2.0 * ts)})
+        >>> good, bad = (jl.predict(spring, data, {"k": k}, settle=0.5) for k in (4.0, 4.4))
+        >>> print(f"{good.rms('x')[0]:.3f} {bad.rms('x')[0]:.3f}")
+        0.000 0.031
+    """
+    experiments = experiments_of(experiments)
+    check_options(options, "jl.predict")
+    early = tuple(_first(system, each, settle) for each in experiments)
+    fixed = unknowns(params, (), {})
+    shown = readers_of(system, experiments, dict(channels or {}), params)
+
+    def posed(these: tuple[Experiment, ...]) -> tuple[Shooting, Layout]:
+        where = layout(these, 1)
+        problem, _ = pose(system, these, where, fixed, shown, NO_PRIOR, squares, options, noise)
+        return problem, where
+
+    problem, _ = posed(early)
+    nowhere = Guess(jnp.zeros(0), jnp.zeros(problem.segments.guess.shape))
+    found = search(problem, nowhere, jnp.asarray(1.0), tolerance, max_steps)
+    whole, where = posed(experiments)
+    whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
+    seen = moved(whole, Guess(nowhere.z, jnp.zeros(whole.segments.guess.shape)))
+    status = np.asarray(seen.status)
+    rows = tuple(
+        np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)
+        for each, first in zip(experiments, early, strict=True)
+    )
+    return Prediction(
+        residuals_of(whole, np.asarray(seen.residuals), status, experiments, where),
+        rows,
+        tuple(np.asarray(found.starts)),
+        tuple(
+            f"the motion of {experiments[k].name} ended with {Status(int(status[k])).name}"
+            for k in map(int, np.flatnonzero(status != Status.ok))
+        ),
+        experiments,
+    )
+
+
+def _first(system: System, experiment: Experiment, settle: float | int | None) -> Experiment:
+    """The rows that a start is fitted to."""
+    if settle is None:
+        return experiment
+    if not settle > 0:
+        raise bad("settle", "be a positive number of seconds, or None", f"it was {settle!r}")
+    rows = int(np.searchsorted(experiment.ts, experiment.ts[0] + settle, side="right"))
+    if rows >= len(experiment.ts):
+        was = f"it was {settle:g} s of {experiment.ts[-1] - experiment.ts[0]:g} s"
+        raise bad("settle", f"leave rows of {experiment.name} to be predicted", was)
+    known = experiment.start_sigma is not None
+    numbers = sum(int(np.isfinite(x[:rows]).sum()) for x in experiment.channels.values())
+    if rows < 2 or (not known and numbers < 2 * system.size):
+        must = f"hold {2 * system.size} numbers or more of {experiment.name}, as many as a start"
+        raise bad("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
+    return experiment.part(slice(0, rows))
+
+
+def residuals_of(
+    problem: Shooting,
+    weighted: np.ndarray,
+    status: np.ndarray,
+    experiments: Sequence[Experiment],
+    where: Layout,
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Of each experiment by channel, in the channels' units; NaN where a segment failed."""
+    weights = np.asarray(problem.segments.weights)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        raw = np.where(weights > 0, weighted / weights, np.nan)
+    raw[status != Status.ok] = np.nan
+    found = []
+    for i, each in enumerate(experiments):
+        own = np.flatnonzero(where.owner == i)
+        rows = np.concatenate([raw[k, where.places[k]] for k in own])
+        found.append({name: rows[:, where.columns[name]] for name in each.channels})
+    return tuple(found)

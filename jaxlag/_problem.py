@@ -1,0 +1,151 @@
+"""The least squares of a fit: experiments cut into segments, their noise, where a search starts."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._channels import Reader, readers
+from jaxlag._errors import bad
+from jaxlag._experiment import Experiment
+from jaxlag._free import Unknowns
+from jaxlag._initial_states import initial_states, typical
+from jaxlag._segments import Layout, pack
+from jaxlag._shooting import Found, Shooting
+from jaxlag._system import System
+
+OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
+"""Arguments of `simulate` that a fit gives itself."""
+STATES_FOR_RANGE = 32
+"""States of each experiment, by whose spread those of the problem are measured."""
+ASSUMED_NOISE = 1e-2
+"""Of what a channel ranges over, where neither a sigma nor an estimate is at hand."""
+
+
+def experiments_of(given: Any) -> tuple[Experiment, ...]:
+    """What was given as one experiment or several, as a tuple."""
+    found = (given,) if isinstance(given, Experiment) else tuple(given)
+    if not found or not all(isinstance(x, Experiment) for x in found):
+        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
+    return found
+
+
+def check_options(options: Mapping[str, Any], by: str) -> None:
+    """Raise where an option of `jl.simulate` is one that the caller decides, or no static one."""
+    for name, value in options.items():
+        if name in OURS:
+            raise bad(name, f"be left to {by}", "it was given")
+        if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
+            must = "be a Python number, a name or an object without arrays"
+            raise bad(name, must, f"it was {value!r}", "Write float(...).")
+
+
+def readers_of(
+    system: System, experiments: Sequence[Experiment], own: Mapping[str, Reader], params: Any
+) -> dict[str, Reader]:
+    """name -> function of a motion, of every channel that was measured."""
+    names = tuple(dict.fromkeys(name for each in experiments for name in each.channels))
+    rows = tuple(system.rows(params, jnp.dtype(float)).labels) if system.constraints else ()
+    return readers(system, names, own, rows)
+
+
+def _unstated(experiments: Sequence[Experiment]) -> set[str]:
+    """Channels whose noise one experiment or more does not state."""
+    without = {name for each in experiments for name in each.channels if name not in each.sigma}
+    for name in without & {name for each in experiments for name in each.sigma}:
+        was = f"that of {name!r} was given in some"
+        raise bad("sigma", "be given in all experiments that measure a channel, or in none", was)
+    return without
+
+
+def pose(
+    system: System,
+    experiments: Sequence[Experiment],
+    where: Layout,
+    free: Unknowns,
+    shown: Mapping[str, Reader],
+    prior: tuple[np.ndarray, np.ndarray, np.ndarray],
+    loss: Callable[[Array], Array],
+    options: Mapping[str, Any],
+    known_noise: Mapping[str, float] | None = None,
+) -> tuple[Shooting, dict[str, float]]:
+    """The problem, and the noise assumed of channels whose noise is not stated.
+
+    Args:
+        system: what moves.
+        experiments: what was measured.
+        where: their segments.
+        free: what is to be found beside the starts of segments.
+        shown: name -> what a motion shows of a channel.
+        prior: (which numbers, means, sigmas).
+        loss: one of `LOSSES`.
+        options: of `simulate`.
+        known_noise: of channels, from an earlier fit.
+    """
+    if system.constraints:
+        options = {"assemble": True} | dict(options)
+    ranges = {
+        name: np.concatenate([x.channels[name] for x in experiments if name in x.channels])
+        for name in where.columns
+    }
+    ranges = {name: np.nanstd(x, axis=0) for name, x in ranges.items()}
+    ranges = {name: np.where(x > 0, x, 1.0) for name, x in ranges.items()}
+    noise = {name: ASSUMED_NOISE * float(np.max(ranges[name])) for name in _unstated(experiments)}
+    noise |= {name: x for name, x in (known_noise or {}).items() if name in noise}
+    guesses, spread = [], []
+    params = free.params0
+    for i, each in enumerate(experiments):
+        rows = where.first[where.owner == i].tolist()
+        some = np.linspace(0, len(each.ts) - 1, STATES_FOR_RANGE).astype(int).tolist()
+        states = initial_states(system, each, rows + some, params, dict(options))
+        guesses.append(states[: len(rows)])
+        spread.append(states[len(rows) :])
+    segments = pack(system, experiments, where, noise, np.concatenate(guesses))
+    problem = Shooting(
+        system,
+        tuple(sorted(options.items())),
+        tuple(shown.items()),
+        loss,
+        bool(np.any(segments.follows)),
+        free,
+        segments,
+        jnp.asarray(typical(np.concatenate(spread))),
+        jnp.asarray(np.concatenate([ranges[name] for name in where.columns])),
+        prior,
+    )
+    return problem, noise
+
+
+def estimated_noise(
+    found: Found, problem: Shooting, where: Layout, noise: Mapping[str, float]
+) -> dict[str, float]:
+    """Standard deviations of the channels' residuals, m, rad or what they are measured in."""
+    measured = np.asarray(problem.segments.weights) > 0
+    unknowns = len(problem.free.u0) + np.count_nonzero(~problem.segments.follows) * len(
+        problem.states
+    )
+    share = 1.0 - unknowns / np.count_nonzero(measured)
+    ok = (np.asarray(found.seen.status) == 0)[:, None, None]
+    changed = {}
+    for name, sigma in noise.items():
+        part = where.columns[name]
+        used = (measured & ok)[:, :, part]
+        sum_of_squares = np.sum(
+            np.where(used, np.asarray(found.seen.residuals)[:, :, part] ** 2, 0.0)
+        )
+        mean = sum_of_squares / max(1.0, share * np.count_nonzero(used))
+        # Measurements without noise: what is left then is the solver's.
+        changed[name] = sigma * max(float(np.sqrt(mean)), 1e-9)
+    return changed
+
+
+def with_noise(problem: Shooting, where: Layout, noise: Mapping[str, float]) -> Shooting:
+    """The problem with other weights of these channels."""
+    weights = problem.segments.weights
+    for name, sigma in noise.items():
+        part = where.columns[name]
+        weights = weights.at[:, :, part].set(jnp.where(weights[:, :, part] > 0, 1 / sigma, 0.0))
+    return eqx.tree_at(lambda p: p.segments.weights, problem, weights)

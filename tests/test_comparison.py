@@ -1,0 +1,91 @@
+"""Candidate forces ranked by what they predict."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _measured import OPTIONS, TRUE, TS, angles
+
+import jaxlag as jl
+
+
+def lagrangian(t, q, v, p):
+    return 0.5 * (p["l"] * v[0]) ** 2 + p["g"] * p["l"] * jnp.cos(q[0])
+
+
+bare = jl.System(lagrangian, ("x",))
+viscous = jl.Candidate(
+    jl.Rayleigh(lambda t, q, v, p: 0.5 * p["c"] * v[0] ** 2, "viscous"), params0={"c": 0.02}
+)
+cubic = jl.Candidate(
+    jl.Rayleigh(lambda t, q, v, p: 0.25 * p["k"] * v[0] ** 4, "cubic"), params0={"k": 0.001}
+)
+START = {"l": 0.65, "g": 9.81}
+
+
+def measured(q0, seed):
+    return jl.Experiment(TS, {"x": angles(q0=q0, seed=seed)}, name=f"from {q0}")
+
+
+def compare(candidates, **options):
+    return jl.compare(
+        bare,
+        measured(1.0, 0),
+        START,
+        candidates,
+        held_out=measured(0.4, 1),
+        **({"free": ("l",)} | OPTIONS | options),
+    )
+
+
+@pytest.mark.full
+def test_the_term_that_acts_ranks_first():
+    found = compare({"cubic": cubic, "viscous": viscous}, settle=0.5)
+    assert [model.name for model in found.models] == ["viscous", "cubic", "none"]
+    best = found.best
+    assert best is found["viscous"]
+    assert abs(best.fit.params["c"] - TRUE["c"]) < 3.5 * best.fit.std["c"]
+    assert found["none"].error > 3 * best.error
+    lines = str(found).splitlines()
+    assert lines[0].split() == ["model", "params", "error", "rms", "of", "x"]
+    assert lines[1].startswith("viscous  2 ")
+
+
+@pytest.mark.full
+def test_combinations_and_what_is_useless():
+    """Both terms predict no better than the one that acts, within the noise."""
+    found = compare({"cubic": cubic, "viscous": viscous}, most=2)
+    both = found["cubic + viscous"]
+    assert len(found.models) == 4
+    assert set(both.fit.names) == {"l", "c", "k"}
+    np.testing.assert_allclose(both.error, found["viscous"].error, rtol=0.05)
+    with pytest.raises(ValueError, match=r"model must be one of .*'cubic \+ viscous'"):
+        found["dry"]
+
+
+def test_forces_are_added_to_a_system():
+    more = bare.with_forces(*viscous.forces)
+    params = {"l": 0.5, "g": 0.0, "c": 0.3}
+    q, v = jnp.array([0.2]), jnp.array([1.5])
+    np.testing.assert_allclose(more.acceleration(params, q, v), [-0.3 * 1.5 / 0.25], rtol=1e-14)
+    assert bare.forces == ()
+    with pytest.raises(ValueError, match="distinct names"):
+        more.with_forces(*viscous.forces)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "options", "message"),
+    [
+        ({}, {}, r"candidates must be a dict of jl\.Candidate by name, but it was \{\}"),
+        ({"a": 3}, {}, r"candidates\['a'\] must be a jl\.Candidate, but it was 3"),
+        ({"a": viscous, "b": viscous}, {}, r"names of its own, but candidate 'a' has 'c', too"),
+        ({"a": viscous}, {"most": 2}, r"most must be an integer from 1 to the 1 candidates"),
+    ],
+)
+def test_bad_arguments_are_named(candidates, options, message):
+    with pytest.raises(ValueError, match=message):
+        compare(candidates, **options)
+
+
+def test_a_candidate_without_a_force_is_named():
+    with pytest.raises(ValueError, match=r"forces must be one force or more.*Write jl\.Candidate"):
+        jl.Candidate(params0={"k": 1.0})

@@ -1,0 +1,108 @@
+"""Fits by gradients of few segments at a time."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from _measured import NOISE, OPTIONS, TRUE, angles, experiment, pendulum
+
+import jaxlag as jl
+from jaxlag._descent import cost_of
+from jaxlag._free import NO_PRIOR, unknowns
+from jaxlag._losses import squares
+from jaxlag._problem import pose, readers_of
+from jaxlag._segments import layout
+from jaxlag._shooting import Guess
+
+
+@pytest.mark.full
+def test_a_descent_finds_what_least_squares_finds():
+    pieces = experiment(sigma={"x": NOISE}).windows(1.0)
+    start = TRUE | {"l": 0.68, "c": 0.08}
+    descent = jl.Descent(optax.adam(3e-3), epochs=400, batch=2)
+    down = jl.fit(pendulum, pieces, start, free=("l", "c"), optimiser=descent, **OPTIONS)
+    squares = jl.fit(pendulum, pieces, start, free=("l", "c"), **OPTIONS)
+    assert down.converged
+    assert down.costs.shape == (400,)
+    assert down.costs[-1] < down.costs[0]
+    for name in ("l", "c"):
+        assert abs(down.params[name] - squares.params[name]) < 0.3 * squares.std[name]
+        np.testing.assert_allclose(down.std[name], squares.std[name], rtol=0.05)
+    assert down.cost < 1.02 * squares.cost
+
+
+@pytest.mark.parametrize("segments", [1, 5])
+def test_the_cost_is_guessed_without_bias(segments):
+    """The mean over all parts of equal size is the cost of the least squares, gaps included."""
+    data = experiment(sigma={"x": NOISE})
+    data = (data, jl.Experiment(data.ts, {"x": angles(seed=1)}, sigma={"x": NOISE}))
+    free = unknowns(TRUE, ("l",), {})
+    where = layout(data, segments)
+    shown = readers_of(pendulum, data, {}, TRUE)
+    problem, _ = pose(pendulum, data, where, free, shown, NO_PRIOR, squares, OPTIONS)
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(0.01 * rng.normal(size=problem.segments.guess.shape))
+    guess = Guess(jnp.asarray([0.02]), x)
+    join = jnp.asarray(1e-2)
+    residuals, _ = problem(guess, join)
+    whole = 0.5 * sum(float(jnp.sum(r**2)) for r in jax.tree.leaves(residuals))
+    order = rng.permutation(len(x)).reshape(2, -1)
+    parts = [float(cost_of(guess, problem, jnp.asarray(which), join)) for which in order]
+    # Solved in other batches: equal to rounding of terms of 1e-16 * (angle/NOISE)^2 * rows.
+    np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-9)
+
+
+@pytest.mark.full
+def test_a_network_in_the_potential_is_found():
+    """A spring that hardens, fitted as a linear one and a network: it predicts what the linear one
+    does not, and the energy is that of a conservative system."""
+
+    def true(t, q, v, params):
+        return 0.5 * v[0] ** 2 - 2.0 * q[0] ** 2 - 1.5 * q[0] ** 4
+
+    def physics(t, q, v, params):
+        return 0.5 * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2
+
+    def both(t, q, v, params):
+        return physics(t, q, v, params) - params["net"](q)
+
+    ts = np.linspace(0.0, 2.0, 81)
+    rng = np.random.default_rng(0)
+
+    def measured(q0):
+        motion = jl.simulate(jl.System(true, ("x",)), [q0], [0.0], ts, {})
+        noisy = np.asarray(motion["x"]) + 1e-3 * rng.normal(size=len(ts))
+        return jl.Experiment(ts, {"x": noisy}, sigma={"x": 1e-3}, name=f"from {q0}")
+
+    training, held_out = [measured(q0) for q0 in (0.3, 0.6, 1.0)], measured(0.8)
+    network = eqx.nn.MLP(1, "scalar", 8, 1, jnp.tanh, key=jax.random.key(0))
+    plain = jl.fit(jl.System(physics, ("x",)), training, {"k": 4.0}, free=("k",))
+    found = jl.fit(
+        jl.System(both, ("x",)),
+        training,
+        {"k": plain.params["k"], "net": network},
+        free=("net",),
+        optimiser=jl.Descent(optax.lbfgs(memory_size=20), epochs=150, batch=3),
+    )
+    assert len(found.names) == 8 + 8 + 8 + 1
+    worse, better = (x.predict(held_out, settle=0.3).rms("x")[0] for x in (plain, found))
+    assert better < 0.2 * worse
+    motion = jl.simulate(jl.System(both, ("x",)), [0.8], [0.0], ts, found.params, rtol=1e-10)
+    energy = np.asarray(motion.energy)
+    np.testing.assert_allclose(energy, energy[0], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        (("adam",), {}, r"optimiser must have init and update.*'adam'.*Try optax\.adam"),
+        ((optax.sgd(1.0),), {"epochs": 0}, r"epochs must be a positive integer, but it was 0"),
+        ((optax.sgd(1.0),), {"batch": 1.5}, r"batch must be a positive integer, but it was 1\.5"),
+        ((optax.sgd(1.0),), {"gap": 0.0}, r"gap must be positive, but it was 0"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, options, message):
+    with pytest.raises(ValueError, match=message):
+        jl.Descent(*arguments, **options)

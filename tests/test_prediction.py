@@ -1,0 +1,80 @@
+"""Predictions of recordings that were not fitted, from starts that were."""
+
+import numpy as np
+import pytest
+from _measured import NOISE, OPTIONS, TRUE, TS, angles, experiment, pendulum
+
+import jaxlag as jl
+
+
+def predict(data, params=TRUE, **options):
+    return jl.predict(pendulum, data, params, **(OPTIONS | options))
+
+
+def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
+    """Starts fitted to the first half second of two recordings of unequal length."""
+    short = jl.Experiment(TS[:100], {"x": angles(TS[:100], seed=1)}, name="short")
+    found = predict((experiment(), short), settle=0.5)
+    # 26 samples tell the start to about NOISE/2, which the motion keeps.
+    assert 0.8 * NOISE < found.rms("x")[0] < 1.6 * NOISE
+    np.testing.assert_allclose(found.starts[0], [1.0, 0.0], atol=8e-3)
+    assert [rows.sum() for rows in found.predicted] == [151 - 26, 100 - 26]
+    assert found.residuals[1]["x"].shape == (100, 1)
+    wrong = predict((experiment(), short), TRUE | {"l": 0.8}, settle=0.5)
+    assert wrong.rms("x")[0] > 20 * NOISE
+    assert "rms of x: " in str(found)
+
+
+@pytest.mark.full
+def test_a_start_fitted_to_all_rows():
+    """It is that of least squares: as small as any of the starts nearby."""
+    found = predict(experiment())
+    assert found.predicted[0].all()
+
+    def size(start):
+        motion = jl.simulate(pendulum, start[:1], start[1:], TS, TRUE, **OPTIONS)
+        return np.sum((np.asarray(motion["x"]) - angles()) ** 2)
+
+    start = np.asarray(found.starts[0])
+    np.testing.assert_allclose(np.sqrt(size(start) / len(TS)), found.rms("x")[0], rtol=1e-9)
+    h = 1e-4
+    slopes = [(size(start + h * e) - size(start - h * e)) / (2 * h) for e in np.eye(2)]
+    # Curvature 2 sum x_start^2 is about 2 * 75: the slope is that of an error of 1e-6.
+    np.testing.assert_allclose(slopes, 0.0, atol=1e-6 * 2 * 75)
+
+
+@pytest.mark.full
+def test_a_fit_predicts_as_its_params_do():
+    found = jl.fit(pendulum, experiment(), TRUE | {"l": 0.6, "c": 0.1}, free=("l", "c"), **OPTIONS)
+    other = jl.Experiment(TS, {"x": angles(seed=5, q0=0.6)}, name="other")
+    own = found.predict(other, settle=1.0)
+    again = predict(other, found.params, settle=1.0, noise=found.noise)
+    np.testing.assert_array_equal(own.residuals[0]["x"], again.residuals[0]["x"])
+    assert own.rms("x")[0] < 1.5 * NOISE
+
+
+def test_figures_show_what_was_measured(tmp_path):
+    many = [experiment(name=f"run {k}") for k in range(6)]
+    found = predict(many, settle=0.5)
+    figure = found.plot()
+    assert len(figure.axes) == 2 * 4
+    dots = figure.axes[0].lines[1]
+    assert set(dots.get_ydata()) <= set(many[0].channels["x"][:, 0])
+    line = figure.axes[0].lines[0]
+    motion = many[0].channels["x"] + found.residuals[0]["x"]
+    np.testing.assert_array_equal(line.get_ydata(), motion[:, 0])
+    figure.savefig(tmp_path / "figure.png")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"settle": 0.0}, r"settle must be a positive number of seconds, or None, but it was 0"),
+        ({"settle": 5.0}, r"settle must leave rows of experiment to be predicted.*5 s of 3 s"),
+        ({"settle": 1e-3}, r"settle must hold 2 numbers or more.*hold 1.*Make it longer"),
+        ({"save": ("a",)}, r"save must be left to jl\.predict"),
+    ],
+)
+def test_bad_arguments_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        predict(experiment(), **options)
