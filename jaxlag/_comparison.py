@@ -58,7 +58,8 @@ class Ranked(NamedTuple):
     Attributes:
         name: of its terms, "none" or "viscous + Coulomb".
         error: root mean square over all channels of what it mispredicts, each over how far that
-            channel ranges in the data held out; inf where a motion failed.
+            channel ranges in the data held out; inf where a motion failed, or the search for a
+            start.
         fit: to the experiments.
         prediction: of those held out.
     """
@@ -150,7 +151,7 @@ def compare(
     Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.2.
     """
     experiments, held_out = experiments_of(experiments), experiments_of(held_out)
-    _check(system, params0, candidates, most)
+    _check(system, params0, candidates, most, free)
     models = []
     for count in range(most + 1):
         for names in combinations(candidates, count):
@@ -175,7 +176,9 @@ def compare(
     return Comparison(tuple(sorted(models, key=lambda model: model.error)))
 
 
-def _check(system: Any, params0: Any, candidates: Any, most: Any) -> None:
+def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
+    if isinstance(free, str):
+        raise bad("free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},).")
     if not isinstance(system, System):
         raise bad("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(params0, Mapping):
@@ -198,12 +201,15 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any) -> None:
 
 
 def _error(predicted: Prediction, experiments: Sequence[Experiment]) -> float:
-    """Of all channels, each over how far it ranges; inf where a motion failed."""
-    if predicted.failed:
+    """Of all channels, each over how far it ranges; inf where a motion or a start failed."""
+    if predicted.failed or not predicted.converged:
         return float("inf")
     shares = []
     for name in predicted.channels:
         rows = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
         ranges = np.nanstd(rows, axis=0)
         shares.append(predicted.rms(name) / np.where(ranges > 0, ranges, 1.0))
-    return float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
+    # A channel may have no number in the rows that were predicted.
+    known = np.concatenate(shares)
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")

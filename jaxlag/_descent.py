@@ -64,8 +64,11 @@ class Descent(eqx.Module):
 @eqx.filter_jit
 def descend(
     shooting: Shooting, guess: Guess, descent: Descent
-) -> tuple[Guess, Float[Array, " epochs"]]:
-    """(where the descent ends, mean cost of the steps of each epoch)."""
+) -> tuple[Guess, Float[Array, " epochs"], Int[Array, ""]]:
+    """(where the descent ends, mean cost of the steps of each epoch, unsound steps).
+
+    Unsound are steps some of whose derivatives were not finite; they move nothing by those.
+    """
     # An extra: whoever has one of its optimisers has it.
     from optax import with_extra_args_support
 
@@ -75,29 +78,30 @@ def descend(
     steps = count // batch
     join = jnp.asarray(descent.gap)
 
-    def step(carry: tuple[Guess, Any], which: Int[Array, " b"]) -> tuple[Any, Array]:
+    def step(carry: tuple[Guess, Any], which: Int[Array, " b"]) -> tuple[Any, tuple[Array, Array]]:
         guess, state = carry
 
         def value(guess: Guess) -> Array:
             return cost_of(guess, shooting, which, join)
 
         cost, slope = jax.value_and_grad(value)(guess)
-        # A step from numbers that are not finite would be the last one.
+        sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in slope]))
         slope = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), slope)
         # Optimisers count their steps in integers and mix them with floats.
         with jax.numpy_dtype_promotion("standard"):
             # Line searches ask for the last three.
             updates, state = update(slope, state, guess, value=cost, grad=slope, value_fn=value)
-        return (eqx.apply_updates(guess, updates), state), cost
+        return (eqx.apply_updates(guess, updates), state), (cost, ~sound)
 
-    def epoch(carry: tuple[Guess, Any], key: Array) -> tuple[Any, Array]:
+    def epoch(carry: tuple[Guess, Any], key: Array) -> tuple[Any, tuple[Array, Array]]:
         order = jax.random.permutation(key, count)[: steps * batch]
-        carry, costs = jax.lax.scan(step, carry, order.reshape(steps, batch))
-        return carry, jnp.mean(costs)
+        carry, (costs, unsound) = jax.lax.scan(step, carry, order.reshape(steps, batch))
+        return carry, (jnp.mean(costs), jnp.sum(unsound))
 
     keys = jax.random.split(jax.random.key(descent.seed), descent.epochs)
-    (guess, _), costs = jax.lax.scan(epoch, (guess, descent.optimiser.init(guess)), keys)
-    return guess, costs
+    begin = guess, descent.optimiser.init(guess)
+    (guess, _), (costs, unsound) = jax.lax.scan(epoch, begin, keys)
+    return guess, costs, jnp.sum(unsound)
 
 
 def cost_of(

@@ -17,9 +17,9 @@ from jaxlag._fit_result import FitResult, summarised
 from jaxlag._free import NO_PRIOR, Prior, Unknowns, prior_rows, unknowns
 from jaxlag._losses import LOSSES, squares
 from jaxlag._problem import (
-    check_options,
     estimated_noise,
     experiments_of,
+    plain_options,
     pose,
     readers_of,
     with_noise,
@@ -113,7 +113,7 @@ def fit(
     """
     experiments = experiments_of(experiments)
     _check(system, segments, loss, optimiser)
-    check_options(options, "jl.fit")
+    options = plain_options(options, "jl.fit")
     unknown = unknowns(params0, free, dict(transforms or {}))
     own = dict(channels or {})
     shown = readers_of(system, experiments, own, params0)
@@ -217,7 +217,10 @@ def _downhill(
     """(where a descent ends, its costs); starts by least squares before it and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
     x = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
-    guess, costs = descend(problem, Guess(z, x), descent)
+    guess, costs, unsound = descend(problem, Guess(z, x), descent)
+    if int(unsound):
+        text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
+        warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
     return Guess(guess.z, _starts(problem, guess.z, guess.x, join, max_steps)), np.asarray(costs)
 
 
@@ -247,7 +250,17 @@ def _judged(
 def _warn_after(result: FitResult) -> None:
     if not result.converged:
         text = f"The search did not converge in {result.steps} steps: raise max_steps, take more "
-        warnings.warn(text + "segments, or start closer.", stacklevel=3)
+        text += "segments, or start closer."
+        if result.costs.size:
+            text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
+            text += f"{result.costs[-1]:.3g}: take a lower learning rate."
+        warnings.warn(text, stacklevel=3)
+    few = len(result.names) <= LARGEST_COVARIANCE
+    if few and np.isnan(result.singular_values).any():
+        text = (
+            "Derivatives at the estimates are not finite: there is no covariance, and they may be"
+        )
+        warnings.warn(f"{text} wrong. Look for a square root or a norm at zero.", stacklevel=3)
     for name in result.unused:
         warnings.warn(f"nothing measured depends on {name}: it keeps its value.", stacklevel=3)
     for text in result.failed:

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
-from jaxlag._prediction import root_mean_square
+from jaxlag._prediction import channels_of, rms_of
 
 MOST = 4
 """Experiments in a figure."""
@@ -37,12 +37,11 @@ def plotted(
         raise bad(
             "plot()", "find matplotlib", "it is not installed", 'pip install "jaxlag[plot]"'
         ) from error
-    sizes = [_size(each) for each in residuals]
-    order = np.argsort(sizes, kind="stable")
-    shown = order[np.unique(np.linspace(0, len(order) - 1, MOST).round().astype(int))]
-    if len(order) <= MOST:
-        shown = np.arange(len(order))
-    channels = list(dict.fromkeys(name for each in residuals for name in each))
+    shown = np.arange(len(residuals))
+    if len(shown) > MOST:
+        best_first = np.argsort([_size(each) for each in residuals], kind="stable")
+        shown = best_first[np.linspace(0, len(shown) - 1, MOST).round().astype(int)]
+    channels = channels_of(residuals)
     figure = Figure(
         figsize=(1.2 + 3.2 * len(shown), 0.6 + 3.0 * len(channels)), dpi=120, layout="constrained"
     )
@@ -53,8 +52,8 @@ def plotted(
         sharex="col",
         height_ratios=[3, 2] * len(channels),
     )
-    if len(shown) < len(order):
-        figure.suptitle(f"from the best to the worst of {len(order)} experiments", fontsize=11)
+    if len(shown) < len(residuals):
+        figure.suptitle(f"from the best to the worst of {len(residuals)} experiments", fontsize=11)
     for column, i in zip(axes.T, map(int, shown), strict=True):
         each = experiments[i]
         column[0].set_title(each.name, fontsize=9)
@@ -90,4 +89,4 @@ def _channel(
 
 def _size(residuals: Mapping[str, np.ndarray]) -> float:
     """By which experiments are ordered: the worst channel's root mean square; NaN comes last."""
-    return float(np.max([np.max(root_mean_square([x])) for x in residuals.values()]))
+    return float(np.max([np.max(rms_of([residuals], name)) for name in residuals]))

@@ -12,10 +12,9 @@ from jaxtyping import Float
 
 from jaxlag._channels import Reader
 from jaxlag._elimination import Rows, eliminate
-from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._identifiability import Spectrum
-from jaxlag._prediction import Prediction, predict, residuals_of, root_mean_square
+from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
 from jaxlag._segments import Layout
 from jaxlag._shooting import Found, Shooting
 from jaxlag._status import Status
@@ -45,10 +44,11 @@ class FitResult(eqx.Module):
         values: their estimates, in their own units.
         covariance: of `values`, (e, e), from the derivatives at the estimates (Cramer-Rao); inf
             for numbers that take part in what is not determined. It holds for noise that is
-            independent from sample to sample. NaN after a `Descent` of more than 200 numbers.
+            independent from sample to sample. NaN after a `Descent` of more than 200 numbers, and
+            where derivatives at the estimates are not finite.
         singular_values: of the weighted derivatives by relative changes of `values`, states
             eliminated, falling: a relative change of eps along the i-th direction moves the
-            weighted residuals by eps times the i-th. None where there is no covariance.
+            weighted residuals by eps times the i-th. NaN where there is no covariance.
         unidentifiable: null directions, in words: which numbers change together without a trace.
         determined: what is known of those: "g/l".
         unused: numbers that nothing measured depends on.
@@ -89,7 +89,7 @@ class FitResult(eqx.Module):
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels."""
-        return tuple(dict.fromkeys(name for each in self.residuals for name in each))
+        return channels_of(self.residuals)
 
     def predict(self, experiments: Any, settle: float | int | None = None) -> Prediction:
         """How well the estimates predict other experiments: `jl.predict` with them."""
@@ -132,9 +132,7 @@ class FitResult(eqx.Module):
 
     def rms(self, channel: str) -> Float[np.ndarray, " k"]:
         """Root mean square of a channel's residuals over all experiments, in its own unit."""
-        if channel not in self.channels:
-            raise bad("channel", f"be one of {list(self.channels)}", f"it was {channel!r}")
-        return root_mean_square([each[channel] for each in self.residuals if channel in each])
+        return rms_of(self.residuals, channel)
 
     def __str__(self) -> str:
         lines = []
@@ -142,7 +140,7 @@ class FitResult(eqx.Module):
         for name, value in list(zip(self.names, self.values.tolist(), strict=True))[:SHOWN]:
             low, high = interval[name]
             known = f"95 % in [{low:.6g}, {high:.6g}]" if np.isfinite(low) else "not determined"
-            known = known if self.singular_values.size else "(no covariance)"
+            known = "no covariance" if np.isnan(low) else known
             lines.append(f"{name:<12} {value:.6g}   {known}")
         lines += [f"and {len(self.names) - SHOWN} more"] * (len(self.names) > SHOWN)
         lines += [f"unknown: {text}" for text in self.unidentifiable]
@@ -220,12 +218,15 @@ class _Uncertainty(NamedTuple):
 
 def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncertainty:
     names = problem.free.names
+    unknown = np.full((len(names), len(names)), np.nan)
+    nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), ())
     if found.rows is None:
-        unknown = np.full((len(names), len(names)), np.nan)
-        return _Uncertainty(unknown, np.zeros(0), (), (), ())
+        return nothing
     by_z = np.asarray(jax.jacfwd(problem.free.numbers)(found.guess.z))
     factor = np.asarray(eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT)).params)
     factor = factor[:-1, :-1]
+    if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
+        return nothing
     by_value = np.linalg.solve(by_z.T, factor.T).T
     # A column of round-off: nothing depends on it, whatever it is divided by.
     sizes = np.linalg.norm(by_value * np.where(values == 0, 1.0, values), axis=0)

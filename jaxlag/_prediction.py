@@ -1,5 +1,6 @@
 """Predictions: motions from starts that the first measurements tell, against the later ones."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
@@ -13,7 +14,7 @@ from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._free import NO_PRIOR, unknowns
 from jaxlag._losses import squares
-from jaxlag._problem import check_options, experiments_of, pose, readers_of
+from jaxlag._problem import experiments_of, plain_options, pose, readers_of
 from jaxlag._segments import Layout, layout
 from jaxlag._shooting import Guess, Shooting, moved, search
 from jaxlag._status import Status
@@ -31,6 +32,7 @@ class Prediction(eqx.Module):
             where it was fitted to all.
         starts: of each experiment, (q, v) or (q, u) at its first time.
         failed: experiments whose motion failed, each with its status.
+        converged: whether the search for starts met its tolerance.
         experiments: what was measured.
     """
 
@@ -38,19 +40,19 @@ class Prediction(eqx.Module):
     predicted: tuple[np.ndarray, ...]
     starts: tuple[np.ndarray, ...]
     failed: tuple[str, ...]
+    converged: bool
     experiments: tuple[Experiment, ...]
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels."""
-        return tuple(dict.fromkeys(name for each in self.residuals for name in each))
+        return channels_of(self.residuals)
 
     def rms(self, channel: str) -> Float[np.ndarray, " k"]:
         """Root mean square of a channel over all rows that were predicted, in its own unit."""
-        if channel not in self.channels:
-            raise bad("channel", f"be one of {list(self.channels)}", f"it was {channel!r}")
         own = zip(self.residuals, self.predicted, strict=True)
-        return root_mean_square([each[channel][rows] for each, rows in own if channel in each])
+        parts = [{name: x[rows] for name, x in each.items()} for each, rows in own]
+        return rms_of(parts, channel)
 
     def plot(self) -> Any:
         """A figure as `FitResult.plot`, a dotted line where predictions begin."""
@@ -66,9 +68,21 @@ class Prediction(eqx.Module):
         return "\n".join([*lines, *self.failed])
 
 
-def root_mean_square(parts: Sequence[np.ndarray]) -> Float[np.ndarray, " k"]:
-    """Over all rows that have a number, of parts (s, k)."""
-    rows = np.concatenate(parts)
+def channels_of(residuals: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, ...]:
+    """Names of all channels."""
+    return tuple(dict.fromkeys(name for each in residuals for name in each))
+
+
+def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float[np.ndarray, " k"]:
+    """Root mean square of a channel over all rows that have a number; NaN where none has.
+
+    Raises:
+        ValueError: a channel that nobody measured.
+    """
+    known = channels_of(residuals)
+    if channel not in known:
+        raise bad("channel", f"be one of {list(known)}", f"it was {channel!r}")
+    rows = np.concatenate([each[channel] for each in residuals if channel in each])
     count = np.count_nonzero(np.isfinite(rows), axis=0)
     total = np.nansum(rows**2, axis=0)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
@@ -107,6 +121,9 @@ def predict(
         ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
             measurements than a start has numbers.
 
+    Warns:
+        where the search for the starts did not converge.
+
     Example:
         >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
         >>> jax.config.update("jax_enable_x64", True)
@@ -120,7 +137,7 @@ def predict(
         0.000 0.031
     """
     experiments = experiments_of(experiments)
-    check_options(options, "jl.predict")
+    options = plain_options(options, "jl.predict")
     early = tuple(_first(system, each, settle) for each in experiments)
     fixed = unknowns(params, (), {})
     shown = readers_of(system, experiments, dict(channels or {}), params)
@@ -133,6 +150,9 @@ def predict(
     problem, _ = posed(early)
     nowhere = Guess(jnp.zeros(0), jnp.zeros(problem.segments.guess.shape))
     found = search(problem, nowhere, jnp.asarray(1.0), tolerance, max_steps)
+    if not found.converged:
+        text = f"The search for starts did not converge in {int(found.steps)} steps: raise "
+        warnings.warn(text + "max_steps, or make settle longer.", stacklevel=2)
     whole, where = posed(experiments)
     whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
     seen = moved(whole, Guess(nowhere.z, jnp.zeros(whole.segments.guess.shape)))
@@ -149,6 +169,7 @@ def predict(
             f"the motion of {experiments[k].name} ended with {Status(int(status[k])).name}"
             for k in map(int, np.flatnonzero(status != Status.ok))
         ),
+        bool(found.converged),
         experiments,
     )
 

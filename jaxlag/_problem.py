@@ -33,14 +33,23 @@ def experiments_of(given: Any) -> tuple[Experiment, ...]:
     return found
 
 
-def check_options(options: Mapping[str, Any], by: str) -> None:
-    """Raise where an option of `jl.simulate` is one that the caller decides, or no static one."""
+def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
+    """Options of `jl.simulate` by which compiled programs are keyed, numbers as Python's.
+
+    Raises:
+        ValueError: one that the caller decides, or that holds an array.
+    """
+    found = {}
     for name, value in options.items():
         if name in OURS:
             raise bad(name, f"be left to {by}", "it was given")
         if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
-            must = "be a Python number, a name or an object without arrays"
-            raise bad(name, must, f"it was {value!r}", "Write float(...).")
+            if np.ndim(value):
+                must, was = "be one number, a name or an object without arrays", f"it was {value!r}"
+                raise bad(name, must, was)
+            value = value.item()
+        found[name] = value
+    return found
 
 
 def readers_of(
@@ -128,6 +137,8 @@ def estimated_noise(
         problem.states
     )
     share = 1.0 - unknowns / np.count_nonzero(measured)
+    if share <= 0:  # nothing is left to judge by, as with a network: as if none had been fitted
+        share = 1.0
     ok = (np.asarray(found.seen.status) == 0)[:, None, None]
     changed = {}
     for name, sigma in noise.items():

@@ -376,5 +376,5 @@ def judged(
         rows = condense(rows_of(operator, residuals, shooting, join))
     else:
         rows, seen = None, moved(shooting, guess)
-        residuals = shooting.compared(guess, seen.residuals, seen.ends, join)
+    residuals = shooting.compared(guess, seen.residuals, seen.ends, join)
     return 0.5 * optx.two_norm(residuals) ** 2, rows, seen, starts

@@ -68,6 +68,8 @@ def test_forces_are_added_to_a_system():
     q, v = jnp.array([0.2]), jnp.array([1.5])
     np.testing.assert_allclose(more.acceleration(params, q, v), [-0.3 * 1.5 / 0.25], rtol=1e-14)
     assert bare.forces == ()
+    assert more.constraints == ()
+    assert more.lagrangian is bare.lagrangian
     with pytest.raises(ValueError, match="distinct names"):
         more.with_forces(*viscous.forces)
 
@@ -78,6 +80,7 @@ def test_forces_are_added_to_a_system():
         ({}, {}, r"candidates must be a dict of jl\.Candidate by name, but it was \{\}"),
         ({"a": 3}, {}, r"candidates\['a'\] must be a jl\.Candidate, but it was 3"),
         ({"a": viscous, "b": viscous}, {}, r"names of its own, but candidate 'a' has 'c', too"),
+        ({"a": viscous}, {"free": "l"}, r"free must be a sequence of names.*Write free=\('l',\)"),
         ({"a": viscous}, {"most": 2}, r"most must be an integer from 1 to the 1 candidates"),
     ],
 )

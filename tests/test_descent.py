@@ -7,6 +7,7 @@ import numpy as np
 import optax
 import pytest
 from _measured import NOISE, OPTIONS, TRUE, angles, experiment, pendulum
+from _silence import no_warning
 
 import jaxlag as jl
 from jaxlag._descent import cost_of
@@ -92,6 +93,64 @@ def test_a_network_in_the_potential_is_found():
     motion = jl.simulate(jl.System(both, ("x",)), [0.8], [0.0], ts, found.params, rtol=1e-10)
     energy = np.asarray(motion.energy)
     np.testing.assert_allclose(energy, energy[0], atol=1e-7)
+
+
+@pytest.mark.full
+def test_a_segment_that_fails_moves_nothing():
+    """A spring that breaks at x = 2, where one recording begins."""
+
+    def force(t, q, v, p):
+        return -p["k"] * q + 1e-15 * jnp.sqrt(2.0 - q)
+
+    spring = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(jl.GeneralizedForce(force, "spring"),)
+    )
+    ts = np.linspace(0.0, 2.0, 41)
+    good = jl.Experiment(ts, {"x": np.cos(1.5 * ts)}, name="good")
+    broken = jl.Experiment(ts, {"x": 3.0 + 1e-3 * ts}, name="broken")
+    descent = jl.Descent(optax.adam(1e-2), epochs=300, batch=1)
+    with pytest.warns(UserWarning, match="segment of broken that starts at t = 0 s ended with"):
+        found = jl.fit(
+            spring, (good, broken), {"k": 2.0}, free=("k",), optimiser=descent, **OPTIONS
+        )
+    np.testing.assert_allclose(found.params["k"], 2.25, rtol=1e-5)
+
+
+@pytest.mark.full
+def test_derivatives_that_are_not_finite_are_counted():
+    """sqrt(k) has none at k = 0."""
+    spring = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(p["k"]) * q @ q, ("x",))
+    ts = np.linspace(0.0, 1.0, 21)
+    data = jl.Experiment(ts, {"x": np.cos(1.5 * ts)})
+    descent = jl.Descent(optax.adam(1e-2), epochs=3)
+    no_covariance = r"Derivatives at the estimates are not finite: there is no covariance"
+    with (
+        pytest.warns(UserWarning, match=r"3 steps of the descent met derivatives that are not"),
+        pytest.warns(UserWarning, match=no_covariance),
+    ):
+        found = jl.fit(spring, data, {"k": 0.0}, free=("k",), optimiser=descent, **OPTIONS)
+    assert np.isnan(found.covariance).all()
+    assert np.isfinite(found.cost)
+    with pytest.warns(UserWarning, match=no_covariance):
+        jl.fit(spring, data, {"k": 0.0}, free=("k",), **OPTIONS)
+
+
+@pytest.mark.full
+def test_of_more_than_200_numbers_no_covariance_is_computed():
+    def lagrangian(t, q, v, p):
+        return 0.5 * v[0] ** 2 - 2.0 * q[0] ** 2 - p["net"](q)
+
+    network = eqx.nn.MLP(1, "scalar", 16, 2, jnp.tanh, key=jax.random.key(0))
+    ts = np.linspace(0.0, 1.0, 21)
+    data = jl.Experiment(ts, {"x": np.cos(2.0 * ts)})
+    descent = jl.Descent(optax.adam(1e-3), epochs=5)
+    system = jl.System(lagrangian, ("x",))
+    with no_warning():
+        found = jl.fit(system, data, {"net": network}, free=("net",), optimiser=descent, **OPTIONS)
+    assert len(found.names) == 2 * 16 + 16 * 17 + 17
+    assert np.isnan(found.covariance).all()
+    assert "no covariance" in str(found)
+    assert f"and {len(found.names) - 40} more" in str(found)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,9 @@ def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
     wrong = predict((experiment(), short), TRUE | {"l": 0.8}, settle=0.5)
     assert wrong.rms("x")[0] > 20 * NOISE
     assert "rms of x: " in str(found)
+    assert found.converged
+    with pytest.raises(ValueError, match=r"channel must be one of \['x'\], but it was 'y'"):
+        found.rms("y")
 
 
 @pytest.mark.full
@@ -51,6 +54,12 @@ def test_a_fit_predicts_as_its_params_do():
     again = predict(other, found.params, settle=1.0, noise=found.noise)
     np.testing.assert_array_equal(own.residuals[0]["x"], again.residuals[0]["x"])
     assert own.rms("x")[0] < 1.5 * NOISE
+
+
+def test_a_search_that_did_not_converge_is_said():
+    with pytest.warns(UserWarning, match=r"search for starts did not converge in 1 steps: raise"):
+        found = predict(experiment(), settle=0.5, max_steps=1)
+    assert not found.converged
 
 
 def test_figures_show_what_was_measured(tmp_path):

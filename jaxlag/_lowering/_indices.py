@@ -17,7 +17,9 @@ class OutOfRange(ValueError):
     """An index beyond the coordinates."""
 
 
-def check_indices(closed: ClosedJaxpr, watched: Sequence[str | None]) -> None:
+def check_indices(
+    closed: ClosedJaxpr, watched: Sequence[str | None], of: str = "lagrangian and forces"
+) -> None:
     """Raise where a fixed index reaches beyond a vector of coordinates or velocities.
 
     Indices with a stated mode (`jnp.take(..., mode="clip")`) mean what they do, and those that
@@ -26,13 +28,14 @@ def check_indices(closed: ClosedJaxpr, watched: Sequence[str | None]) -> None:
     Args:
         closed: a traced function.
         watched: names of its arguments that are such vectors; None for others.
+        of: what errors call the function.
 
     Raises:
         OutOfRange: an index is out of range.
     """
     pairs = zip(closed.jaxpr.invars, watched, strict=True)
     vectors = {var: name for var, name in pairs if name is not None}
-    _walk(closed.jaxpr, vectors, _fixed(closed))
+    _walk(closed.jaxpr, vectors, _fixed(closed), of)
 
 
 def _fixed(closed: ClosedJaxpr) -> dict[Any, Any]:
@@ -48,7 +51,7 @@ def _small(x: Any) -> bool:
     return whole and x.size <= 1000
 
 
-def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any]) -> None:
+def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any], of: str) -> None:
     def value(atom: Any) -> Any:
         return np.asarray(atom.val) if isinstance(atom, Literal) else known.get(atom)
 
@@ -56,7 +59,7 @@ def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any]) -> None:
         values = [value(atom) for atom in eqn.invars]
         first = eqn.invars[0] if eqn.invars else None
         if not isinstance(first, Literal) and first in vectors:
-            _check(eqn, vectors[first], values[1:])
+            _check(eqn, vectors[first], values[1:], of)
         inner = eqn.params.get("jaxpr")
         if eqn.primitive.name in ("jit", "pjit", "checkpoint") and isinstance(inner, ClosedJaxpr):
             inside = list(zip(inner.jaxpr.invars, eqn.invars, values, strict=True))
@@ -68,13 +71,14 @@ def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any]) -> None:
                     if not isinstance(atom, Literal) and atom in vectors
                 },
                 {var: x for var, _, x in inside if x is not None} | _fixed(inner),
+                of,
             )
         elif eqn.primitive.name in NUMPY and all(x is not None for x in values):
             results = equation(eqn, [np.asarray(x) for x in values])
             known |= {v: x for v, x in zip(eqn.outvars, results, strict=True) if _small(x)}
 
 
-def _check(eqn: Any, name: str, indices: list[Any]) -> None:
+def _check(eqn: Any, name: str, indices: list[Any], of: str) -> None:
     (size,) = eqn.invars[0].aval.shape
     kind, params = eqn.primitive.name, eqn.params
     if kind == "dynamic_slice" or (
@@ -91,7 +95,7 @@ def _check(eqn: Any, name: str, indices: list[Any]) -> None:
         taken = off[0] if off[0] >= 0 else off[0] - size
         raise OutOfRange(
             complaint(
-                "lagrangian and forces",
+                of,
                 f"take indices from {-size} to {size - 1} of {name}, which has {size} entries",
                 f"{name}[{taken}] was taken" + (f" at {where}" if where else ""),
                 "JAX would read the nearest entry; jnp.take(..., mode='clip') asks for that.",

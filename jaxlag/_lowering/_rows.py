@@ -17,6 +17,7 @@ from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import bad
 from jaxlag._lowering._diff import gradient
 from jaxlag._lowering._graph import Graph, Node, order, substitute
+from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
 from jaxlag._lowering._nodes import nodes
 from jaxlag._quasi import QuasiVelocities
@@ -59,8 +60,10 @@ def layout_of(
         t = jax.ShapeDtypeStruct((), jnp.result_type(float))
         q = jax.ShapeDtypeStruct((n,), dtype)
         (count,) = jax.eval_shape(of_v, t, q, q, like.tree).shape
+        written = jax.make_jaxpr(raw)(t, q, q, like.tree)
+        check_indices(written, _watched(like, "v"), f"constraint {constraint.names!r}")
         if isinstance(constraint.names, str):
-            shape = jax.eval_shape(raw, t, q, q, like.tree).shape
+            (shape,) = (x.shape for x in written.out_avals)
             shapes.append((constraint.names, shape))
             labels += [
                 f"{constraint.names}[{i}]" if shape else constraint.names for i in range(count)
@@ -71,6 +74,11 @@ def layout_of(
         holonomic += [constraint.holonomic] * count
         driven += _examine(constraint, labels[-count:], like, static, n, dtype)
     return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven))
+
+
+def _watched(like: _params.Static, speeds: str) -> list[str | None]:
+    """Names of the vectors among (t, q, speeds, params)."""
+    return [None, "q", speeds, *(None for _ in jax.tree.leaves(like.tree))]
 
 
 def _examine(
@@ -120,6 +128,15 @@ def check_kinematics(quasi: QuasiVelocities, params: Any, n: int, dtype: Any) ->
 def _checked(
     quasi: QuasiVelocities, like: _params.Static, static: _params.Static, n: int, dtype: Any
 ) -> None:
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    q, u = (jax.ShapeDtypeStruct((k,), dtype) for k in (n, quasi.size))
+    function, at, speeds = (quasi.velocities, u, "u") if quasi.U is None else (quasi.of, q, "v")
+
+    def written(t: Array, q: Array, x: Array, traced: Any) -> Array:
+        return function(t, q, x, _params.join(traced, static.tree))
+
+    closed = jax.make_jaxpr(written)(t, q, at, like.tree)
+    check_indices(closed, _watched(like, speeds), "QuasiVelocities")
     if quasi.U is None:
         rows = examine(quasi.velocities, None, like, static, n, dtype, quasi.size)
         bent = [str(i) for i, row in enumerate(rows) if not row.affine]

@@ -37,3 +37,35 @@ def test_a_stated_mode_means_what_it_says(how):
     read = lambda q: jnp.take(q, jnp.array([0, 5]), **how) @ q  # noqa: E731
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - read(q), ("x", "y"))
     assert jl.simulate(system, [1.0, 0.5], [0.0, 0.0], [0.0, 0.1]).ok
+
+
+def kinetic(t, q, v, p):
+    return 0.5 * v @ v
+
+
+@pytest.mark.parametrize(
+    ("declared", "match"),
+    [
+        (
+            {"constraints": (jl.Holonomic(lambda t, q, p: q[0] + q[2] - 1.0, "rail"),)},
+            r"constraint 'rail' must take indices from -2 to 1 of q.* but q\[2\] was taken",
+        ),
+        (
+            {"constraints": (jl.Pfaffian(lambda t, q, v, p: v[0] - v[-3], ("blade",)),)},
+            r"constraint \('blade',\) must take indices from -2 to 1 of v.* but v\[-3\] was taken",
+        ),
+        (
+            {"quasi": jl.QuasiVelocities(lambda t, q, v, p: v * q[4], ("a", "b"))},
+            r"QuasiVelocities must take indices from -2 to 1 of q.* but q\[4\] was taken",
+        ),
+        (
+            {"quasi": jl.QuasiVelocities(kinematics=lambda t, q, u, p: u * u[3], names=("a", "b"))},
+            r"QuasiVelocities must take indices from -2 to 1 of u.* but u\[3\] was taken",
+        ),
+    ],
+    ids=["holonomic", "pfaffian", "U", "kinematics"],
+)
+def test_an_index_beyond_is_refused_in_rows_and_kinematics(declared, match):
+    system = jl.System(kinetic, ("x", "y"), **declared)
+    with pytest.raises(ValueError, match=match):
+        system.rows(None, jnp.float64)
