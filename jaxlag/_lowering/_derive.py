@@ -34,7 +34,7 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
     """The cheapest of the forms that exist.
 
     Raises:
-        Unsupported: the solve alone takes more operations than the limit.
+        Unsupported: the solve or the mass matrix alone takes more operations than the limit.
     """
     graph, L = scene.graph, scene.lagrangian
     if limit is not None:
@@ -57,6 +57,10 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
             n = len(scene.q)
             masses.append([short[i * n : (i + 1) * n] for i in range(n)])
     mass = min(masses, key=lambda M: (nonzeros(graph, M), cost(graph, M)))
+    if limit is not None:
+        alone = assemble(graph, [x for row in mass for x in row]).operations
+        if alone > limit:  # no need to look for the bias
+            raise Unsupported(f"{alone} operations in the mass matrix alone, more than {limit}")
 
     forms: list[tuple[str, list[Node]]] = []
     for form, words in zip(written, ("L as written", "L simplified"), strict=False):

@@ -12,6 +12,8 @@ from jaxlag._lowering._graph import Node, node_id
 
 Term = tuple[Any, float]  # (token, coefficient)
 
+LONGEST = 32  # factors of a product that is looked through
+
 
 class Shared:
     """Finds pairs, and puts tokens in an order: nodes by id, then pairs by age.
@@ -70,40 +72,63 @@ class Shared:
         return groups
 
     def factors(self, groups: dict[Node, list[Any]]) -> None:
-        """In place: products x y that several products contain, or one contains twice."""
-        counts: Counter[Any] = Counter()
+        """In place: products x y that several products contain, or one contains twice.
+
+        The most frequent pair comes first, of equally frequent ones the one met first. Products of
+        more than LONGEST factors stay as they are: their pairs would take seconds to count.
+        """
+        powers = {
+            node: Counter(factors) for node, factors in groups.items() if len(factors) <= LONGEST
+        }
+        counts: dict[Any, int] = {}
+        ages: dict[Any, int] = {}
         places: dict[Any, set[Node]] = defaultdict(set)
+        queue: list[tuple[int, int, Any]] = []  # (- of how often, age, pair), some out of date
 
-        def enter(node: Node, sign: int) -> None:
-            for pair, times in self._factor_pairs(groups[node]):
-                counts[pair] += sign * times
-                (places[pair].add if sign > 0 else places[pair].discard)(node)
-
-        for node in groups:
-            enter(node, 1)
-        while counts:
-            best, count = max(counts.items(), key=_count)
-            if count < 2:
+        def change(node: Node, pair: tuple[Any, ...], old: int, new: int) -> None:
+            if old == new:
                 return
-            self._rank(best)
-            for node in sorted(places[best], key=node_id):
-                enter(node, -1)
-                groups[node] = _with_pair(groups[node], best)
-                enter(node, 1)
-            del counts[best], places[best]
+            counts[pair] = counts.get(pair, 0) + new - old
+            age = ages.setdefault(pair, len(ages))
+            (places[pair].add if new else places[pair].discard)(node)
+            if counts[pair] > 1:
+                heappush(queue, (-counts[pair], age, pair))
 
-    def _factor_pairs(self, factors: list[Any]) -> list[tuple[Any, int]]:
+        for node, own in powers.items():
+            for pair, times in self._factor_pairs(own):
+                change(node, pair, 0, times)
+        while queue:
+            count, _, best = heappop(queue)
+            if counts[best] != -count:  # entered again when it became another one
+                continue
+            self._rank(best)
+            _, x, y = best
+            for node in sorted(places[best], key=node_id):
+                own = powers[node]
+                old = dict(own)
+                times = _times(old, x, y)
+                own.subtract([x, y] * times)
+                own[best] += times
+                powers[node] = own = +own
+                rank = {token: self._rank(token) for token in (*old, best)}
+                touched = (x, best) if x == y else (x, y, best)
+                for z in sorted(rank, key=rank.__getitem__):
+                    for w in touched:
+                        if z in touched and rank[w] < rank[z]:
+                            continue  # met from the other side
+                        first, second = (z, w) if rank[z] <= rank[w] else (w, z)
+                        then, now = (_times(each, first, second) for each in (old, own))
+                        change(node, ("times", first, second), then, now)
+        for node, own in powers.items():
+            groups[node] = list(own.elements())
+
+    def _factor_pairs(self, powers: Mapping[Any, int]) -> Iterable[tuple[Any, int]]:
         """Pairs of factors, each as often as disjoint pairs of it fit."""
-        if len(factors) < 2:
-            return []
-        powers = Counter(factors)
         tokens = sorted(powers, key=self._rank)
-        out: list[tuple[Any, int]] = []
         for i, x in enumerate(tokens):
-            if powers[x] > 1:
-                out.append((("times", x, x), powers[x] // 2))
-            out += [(("times", x, y), min(powers[x], powers[y])) for y in tokens[i + 1 :]]
-        return out
+            for y in tokens[i:]:
+                if times := _times(powers, x, y):
+                    yield ("times", x, y), times
 
     def _rank(self, token: Any) -> int:
         """Place in an order of tokens: nodes by id, then what is shared by age."""
@@ -118,8 +143,11 @@ class Shared:
         return ("plus", x, y, b / a), a
 
 
-def _count(item: tuple[Any, int]) -> int:
-    return item[1]
+def _times(powers: Mapping[Any, int], x: Any, y: Any) -> int:
+    """How many disjoint pairs x y there are."""
+    if x == y:
+        return powers.get(x, 0) // 2
+    return min(powers.get(x, 0), powers.get(y, 0))
 
 
 def _without(terms: list[Term], pair: tuple[Any, ...]) -> tuple[list[Term], float]:
@@ -127,14 +155,3 @@ def _without(terms: list[Term], pair: tuple[Any, ...]) -> tuple[list[Term], floa
     _, x, y, _ = pair
     factor = next(c for t, c in terms if t == x)
     return [(t, c) for t, c in terms if t not in (x, y)], factor
-
-
-def _with_pair(factors: list[Any], pair: tuple[Any, ...]) -> list[Any]:
-    _, x, y = pair
-    powers = Counter(factors)
-    times = powers[x] // 2 if x == y else min(powers[x], powers[y])
-    if not times:
-        return factors
-    powers.subtract([x, y] * times)
-    powers[pair] += times
-    return list(powers.elements())

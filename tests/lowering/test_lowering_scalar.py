@@ -1,5 +1,6 @@
 """The scalar program against the array program: values, derivatives, structure, what is skipped."""
 
+import re
 from functools import cache, partial
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _families import mostly_full
+from _lowered import lowered as derived
 from numpy.linalg import cond, norm
 
 import jaxlag as jl
@@ -417,3 +419,35 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop():
     assert program.count("div", "gt", "select") == 0
     assert any(line.op == "div" for line in program.prelude)
     assert not any(name == "inputs" for name, _ in program.inputs)
+
+
+def sines_of_differences(t, q, v, p):
+    return 0.5 * v @ v - jnp.prod(jnp.sin(q[:, None] - q + 1.0))
+
+
+def inertia_by_products(t, q, v, p):
+    once = 2.0 * jnp.eye(6) + jnp.outer(jnp.sin(q), jnp.cos(q))
+    whole = once @ once @ once @ once @ once
+    return 0.5 * v @ whole.T @ whole @ v
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "n", "reason"),
+    [
+        (sines_of_differences, 10, r"1775 operations, 0 more once per solve: more than 1500"),
+        (inertia_by_products, 6, r"\d+ operations in the mass matrix alone, more than 1500"),
+    ],
+    ids=["long products", "mass"],
+)
+def test_what_would_take_long_to_derive_is_a_named_fallback(lagrangian, n, reason):
+    """Of 90 factors in each of 90 products all pairs were counted again and again: 88 s."""
+    system = jl.System(lagrangian, tuple(f"q{i}" for i in range(n)))
+    found = derived(system)
+    assert found.equations is None
+    assert re.fullmatch(reason, found.reason)
+
+
+def test_factors_of_products_are_shared():
+    """Of 20 factors, each product lacks one: 18 multiplications for each by itself, 4 together."""
+    system = jl.System(sines_of_differences, ("a", "b", "c", "d", "e"))
+    assert derived(system).equations.program.operations == 185
