@@ -95,7 +95,11 @@ def check_formulation(
         raise bad("formulation", must, f"it was {formulation!r}", why)
     if formulation != "auto":
         return formulation
-    return "quasi" if "quasi" in known else FORMULATIONS[0]
+    if quasi is None or "quasi" not in known:
+        return FORMULATIONS[0]
+    # Kinematics that leave more freedoms than the rows do not satisfy these by themselves.
+    fitting = len(quasi.free) + system.rows(params, dtype).size <= system.size
+    return "quasi" if fitting or quasi.kinematics is None else FORMULATIONS[0]
 
 
 def check_start(

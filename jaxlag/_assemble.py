@@ -14,7 +14,7 @@ from jaxlag import _params
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._errors import AssemblyError, bad
-from jaxlag._kkt import augmented, dependence_floor, independent_rows, solve_kkt
+from jaxlag._kkt import augmented, dependence_floor, independent_rows, row_sizes, solve_kkt
 from jaxlag._linalg import factor_mass
 from jaxlag._lowering import ArrayTerms
 from jaxlag._status import Status
@@ -202,17 +202,20 @@ def _assembled(
     if any(rows.holonomic):
         q = _nearest(phi, metric(q, fixed), q, ~fixed)
 
-    A, _ = terms.rows(t, q, v, params)
-    of_free = jnp.where(rates_fixed, 0.0, A)
-    W = metric(q, rates_fixed)
+    def all_rows(q: Array) -> Array:
+        return terms.rows(t, q, v, params)[0]
+
+    def of_free(q: Array) -> Array:
+        return jnp.where(rates_fixed, 0.0, all_rows(q))
+
+    A, W = all_rows(q), metric(q, rates_fixed)
     if rows.size:
-        kept = independent_rows(*jax.lax.stop_gradient((W, of_free)), rows.holonomic)
+        kept = _independent(of_free, W, q, rows.velocity)
         residual = terms.velocity(t, q, v, params)
-        v = v + solve_kkt(W, of_free, jnp.zeros_like(v), residual, kept)[0]
+        v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
-    size = jnp.sqrt(jnp.sum(A**2, axis=1))
-    size = jnp.where(size > 0, size, 1.0)
+    size = row_sizes(all_rows, q, A)[1]
     floor = float(jnp.finfo(q.dtype).eps) ** 0.7
     off = jnp.maximum(
         jnp.abs(rows.of_all(position)) / size / (1.0 + jnp.max(jnp.abs(q))),
@@ -223,8 +226,8 @@ def _assembled(
     failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))
     independent = jnp.zeros((0,), bool)
     if rows.size:
-        M = jax.lax.stop_gradient(metric(q, np.zeros_like(fixed)))
-        independent = independent_rows(M, jax.lax.stop_gradient(A), rows.holonomic)
+        M = metric(q, np.zeros_like(fixed))
+        independent = _independent(all_rows, M, q, rows.velocity)
     worst = jnp.argmax(off) if rows.size else 0
     return Assembly(
         system,
@@ -237,6 +240,24 @@ def _assembled(
         where=jnp.where(ok, -1, worst).astype(jnp.int32),
         _rows=rows,
     )
+
+
+def _independent(
+    rows: Callable,
+    W: Array,
+    q: Array,
+    turn: Sequence[int] | None = None,
+    floor: float | None = None,
+) -> Bool[Array, " m"]:
+    """A largest set of independent rows at q, rounding left out."""
+    W, q = jax.lax.stop_gradient((W, q))
+
+    def still(q: Array) -> Array:
+        return jax.lax.stop_gradient(rows(q))
+
+    A = still(q)
+    there, _ = row_sizes(still, q, A)
+    return independent_rows(W, A, turn, floor, there)
 
 
 def _inertia(terms: ArrayTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
@@ -268,7 +289,7 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
     frozen = jax.lax.stop_gradient((W, start))
     still = partial(_still, phi)
     q, lam = jax.lax.stop_gradient(_search(still, rows, *frozen))
-    kept = independent_rows(frozen[0], jax.lax.stop_gradient(rows(q)))
+    kept = _independent(rows, W, q)
     lam = jnp.where(kept, lam, 0.0)
     n = start.shape[0]
 
@@ -296,7 +317,8 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
 
     def turn(s: _Search) -> _Search:
         A, c = jax.lax.stop_gradient(rows(s.q)), phi(s.q)
-        kept = independent_rows(W, A, floor=max(NEAR_DEPENDENCE, dependence_floor(start.dtype)))
+        floor = max(NEAR_DEPENDENCE, dependence_floor(start.dtype))
+        kept = _independent(rows, W, s.q, floor=floor)
         step, lam = solve_kkt(W, A, W @ (start - s.q), c, kept)
         # Down the exact penalty |q - start|^2 / 2 + nu |phi|_1, for nu larger than every |lam|.
         nu = 2.0 * jnp.max(jnp.abs(lam)) + jnp.finfo(start.dtype).tiny
@@ -340,7 +362,7 @@ def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
     def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
         q, _ = state
         A, c = jax.lax.stop_gradient(rows(q)), phi(q)
-        further = q + solve_kkt(W, A, jnp.zeros_like(q), c, independent_rows(W, A))[0]
+        further = q + solve_kkt(W, A, jnp.zeros_like(q), c, _independent(rows, W, q))[0]
         better = jnp.max(jnp.abs(phi(further))) < 0.9 * jnp.max(jnp.abs(c))
         return jnp.where(better, further, q), better
 

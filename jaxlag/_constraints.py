@@ -183,9 +183,7 @@ def _rows(constraint: AbstractConstraint, function: str, value: Any, dtype: Any)
     return jnp.ravel(value).astype(dtype)
 
 
-def check_constraints(
-    constraints: Any, forces: tuple[AbstractForce, ...]
-) -> tuple[AbstractConstraint, ...]:
+def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     """Constraints as a tuple; raises unless each is one of the classes here, names distinct."""
     if isinstance(constraints, AbstractConstraint):
         fix = "Write constraints=(constraint,)."
@@ -201,11 +199,20 @@ def check_constraints(
                 'Write jl.Holonomic(phi, "name") or jl.Pfaffian(residual, "name").',
             )
         names += constraint.all_names
-    taken = {force.name for force in forces}
     for name in names:
         if names.count(name) > 1:
             was = f"{name!r} occurs {names.count(name)} times"
             raise bad("constraints", "have distinct names", was)
+    return constraints
+
+
+def check_reactions(
+    constraints: tuple[AbstractConstraint, ...], forces: tuple[AbstractForce, ...]
+) -> None:
+    """Raise unless rows and forces bear names of their own, and forces read rows that exist."""
+    names = [name for constraint in constraints for name in constraint.all_names]
+    taken = {force.name for force in forces}
+    for name in names:
         if name in taken:
             was = f"{name!r} is the name of a force, too"
             raise bad("constraints", "have names that no force bears", was)
@@ -216,7 +223,6 @@ def check_constraints(
         if force.contact is not None and force.contact not in names:
             was = f"it was {force.contact!r}"
             raise bad(f"force {force.name!r}: contact", f"be among {names}", was)
-    return constraints
 
 
 class Layout(NamedTuple):
@@ -238,6 +244,16 @@ class Layout(NamedTuple):
     def size(self) -> int:
         """Number m of rows."""
         return len(self.labels)
+
+    @property
+    def velocity(self) -> tuple[bool, ...]:
+        """For every row, whether it has no position residual."""
+        return tuple(not holonomic for holonomic in self.holonomic)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """For every row the name that it bears or belongs to."""
+        return tuple(name for name, shape in self.shapes for _ in range(int(np.prod(shape))))
 
     def contradiction(self, coordinates: int) -> str:
         """What may be said about rows that contradict one another."""

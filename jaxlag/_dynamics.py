@@ -12,14 +12,14 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
-from jaxlag._forces import sliding
+from jaxlag._forces import reads_lam, sliding
 from jaxlag._inputs import (
     all_knots,
     at_interval,
     evaluate,
     reads_state,
 )
-from jaxlag._kkt import independent_rows
+from jaxlag._kkt import independent_rows, row_sizes
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
@@ -77,6 +77,14 @@ class Dynamics(eqx.Module):
         return self._solved(terms)
 
     @property
+    def _array(self) -> ArrayTerms:
+        """The array program."""
+        terms = self.terms
+        array = terms.array if isinstance(terms, ScalarTerms) else terms
+        assert isinstance(array, ArrayTerms)
+        return array
+
+    @property
     def quasi(self) -> QuasiVelocities | None:
         """The quasi-velocities that the state is made of, if any."""
         return self.system.quasi if self.formulation == "quasi" else None
@@ -128,31 +136,31 @@ class Dynamics(eqx.Module):
     def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
         """The arguments with all that accelerations need of what depends on params alone."""
         t, q, v, params, values = self.at(tau, y, args)
-        args = args._replace(rows=self._choice(t, q, v, params))
+        args = args._replace(rows=self._choice(t, q, v, params, values))
         if slides := sliding(self.system.forces):
             speeds = [slide(t, q, v, params) for slide in slides]
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
             args = args._replace(senses=jax.lax.stop_gradient(senses))
         sense = self.turned(jnp.ones_like(tau), args)
-        prepared = self.terms.prepare(q, params, values, self.sample, args.kept, sense)
+        rows = args.kept, args.reacting
+        prepared = self.terms.prepare(q, params, values, self.sample, *rows, sense)
         return args._replace(prepared=prepared)
 
-    def _choice(self, t: Array, q: Array, v: Array, params: Any) -> RowChoice | None:
+    def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
         """The rows to solve with; None where there are not several."""
         if self.rows.size < 2 or (self.quasi is not None and not self.projects):
             return None
-        t, q, v, params = still((t, q, v, params))
+        t, q, v, params, values = still((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
-        # A row that vanishes, as at a dead point, is rounding; its size is how fast it grows.
-        eps = float(jnp.finfo(q.dtype).eps)
-        small = eps**0.25
-        signs = jnp.asarray((-1.0) ** np.arange(q.shape[0]), q.dtype)
-        beside, _ = self.terms.rows(t, q + small * signs * (1.0 + jnp.abs(q)), v, params)
-        norms, growth = (jnp.sqrt(jnp.sum(x**2, axis=1)) for x in (A, (beside - A) / small))
-        there = norms > 1e3 * eps * growth
-        kept = independent_rows(M, A, self.rows.holonomic, there=there)
-        size = jnp.where(there, norms, growth)
-        return RowChoice(kept, jnp.where(size > 0, size, 1.0))
+        there, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
+        velocity = np.array(self.rows.velocity)
+        unread = np.ones(self.rows.size, bool)
+        if any(map(reads_lam, self.system.forces)):
+            unread = ~np.array(self._array.rows_read(t, q, v, params, values))
+        kept = independent_rows(M, A, 2 * velocity + unread, there=there)
+        if not np.any(velocity & ~unread):  # then those that are read come first already
+            return RowChoice(kept, size, kept)
+        return RowChoice(kept, size, independent_rows(M, A, unread, there=there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
@@ -212,7 +220,7 @@ class Dynamics(eqx.Module):
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
         t, q, v, params, values = self.at(tau, y, args)
-        return self.terms.acceleration(t, q, v, params, values, args.prepared, args.kept)
+        return self.terms.acceleration(t, q, v, params, values, args.prepared, args.reacting)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
@@ -308,9 +316,7 @@ class Dynamics(eqx.Module):
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> Array:
-            array = terms.array if isinstance(terms, ScalarTerms) else terms
-            assert isinstance(array, ArrayTerms)
-            return array.correction(t, q, v, params, args.prepared, args.kept, chosen)
+            return self._array.correction(t, q, v, params, args.prepared, args.kept, chosen)
 
         def position(q: Array) -> Array:
             return terms.position(t, q, params)

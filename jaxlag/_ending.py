@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxlag import _params
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import FORMULATIONS, augmented, factor_kkt, masked
+from jaxlag._kkt import FORMULATIONS, augmented, factor_kkt, masked, row_sizes
 from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
 from jaxlag._quasi import SINE
 from jaxlag._record import Outcome, Times
@@ -163,14 +163,19 @@ def _explained(
     last = ending.state[: ahead.shape[0]]
     taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
     args = dynamics.within(args, time)
-    masses, worsts, rows = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
+    masses, worsts = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
     mass = jnp.where(masses[0] >= 0, masses[0], masses[1])
-    row = jnp.where(rows[0] >= 0, rows[0], rows[1])
+    row = jnp.full((), -1, jnp.int32)
+    if dynamics.rows.size and dynamics.quasi is None:
+        begin = jnp.concatenate([q0, w])
+        row = _dependent(dynamics, jnp.append(taus, start), jnp.vstack([states, begin]), args)
     worst = jnp.where(jnp.all(jnp.isfinite(ahead)), worsts[1], worsts[0])
 
     unexplained = status == int(Status.nonfinite)
     if dynamics.rows.size:
-        dependent = (unexplained | (status == int(Status.step_below_resolution))) & (row >= 0)
+        short = status == int(Status.step_below_resolution)
+        lost = status == int(Status.projection_failed)
+        dependent = (unexplained | short | lost) & (row >= 0)
         status = jnp.where(dependent, int(Status.rank_change), status)
         if any(map(reads_lam, dynamics.system.forces)):
             sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
@@ -221,26 +226,55 @@ def _turned(
 
 def _culprits(
     dynamics: Dynamics, tau: Array, y: Array, args: Arguments
-) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """(coordinate without inertia, one of non-finite Q - h or else largest |a|, dependent row).
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """(coordinate without inertia, one of non-finite Q - h or else largest |a|).
 
     -1 where there is none.
     """
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
-    row = jnp.full((), -1, jnp.int32)
     # A non-finite component spreads through the solve: look at the right-hand side first.
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
-        if dynamics.quasi is None:
-            _, independent = factor_kkt(M, A, args.kept, FORMULATIONS[0]).healthy
-            row = jnp.where(jnp.all(independent), -1, jnp.argmin(independent)).astype(jnp.int32)
         M, _ = augmented(M, masked(A, args.kept))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
     suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
     finite = jnp.isfinite(suspect)
     worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
-    return first_unhealthy(M, factor), worst.astype(jnp.int32), row
+    return first_unhealthy(M, factor), worst.astype(jnp.int32)
+
+
+def _dependent(dynamics: Dynamics, taus: Array, states: Array, args: Arguments) -> Int[Array, ""]:
+    """The row that vanishes, or follows from those before it, or came close to that; -1 for none.
+
+    Args:
+        dynamics: what moves.
+        taus: of a last good state, of one ahead of it, and of the start.
+        states: these three.
+        args: arguments.
+    """
+
+    def squares(tau: Array, y: Array) -> tuple[Array, Array]:
+        """(squared distances of rows from those before them, whether they count as such)."""
+        t, q, v, params = dynamics.state(tau, y, args)
+
+        def rows(q: Array) -> Array:
+            return masked(dynamics.terms.rows(t, q, v, params)[0], args.kept)
+
+        A, M = rows(q), dynamics.mass(tau, y, args)
+        there, _ = row_sizes(rows, q, A)
+        factor = factor_kkt(M, A, args.kept, FORMULATIONS[0])
+        fine = factor.healthy[1] & there
+        return factor.schur.pivots, fine if args.kept is None else fine | ~args.kept
+
+    pivots, fine = jax.vmap(squares)(taus, states)
+    eps = float(jnp.finfo(states.dtype).eps)
+    # A small angle of its own, between rods that almost lie in line, is no fault.
+    near = pivots[:2] < eps**0.5 * pivots[2]
+    found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
+    if args.kept is not None:
+        found = found & args.kept
+    return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
 
 
 def _farthest(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:

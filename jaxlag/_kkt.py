@@ -4,11 +4,12 @@ M may be singular, but is positive definite on the tangent space A x = 0. Rows t
 others are left out by a mask `kept`; their lam is 0.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._linalg import MassFactor, eliminate, factor_mass, solve_mass
@@ -24,6 +25,11 @@ def dependence_floor(dtype: jnp.dtype) -> float:
 def rank_floor(dtype: jnp.dtype) -> float:
     """The same in flight, where rows that were independent at the start no longer are: eps^2/3."""
     return float(jnp.finfo(dtype).eps) ** (2 / 3)
+
+
+def closed_to(dtype: jnp.dtype) -> float:
+    """Residual over row and state up to which rows that were left out hold: eps^3/4."""
+    return float(jnp.finfo(dtype).eps) ** 0.75
 
 
 class Multipliers(NamedTuple):
@@ -332,10 +338,56 @@ def _iterated(newton: Callable, lam: Array) -> Array:
     return jax.lax.while_loop(goes_on, turn, begin)[0]
 
 
+def row_sizes(
+    rows: Callable[[Array], Array], q: Float[Array, " n"], A: Float[Array, "m n"]
+) -> tuple[Bool[Array, " m"], Float[Array, " m"]]:
+    """(whether rows are more than rounding, their lengths, or how fast they grow where not).
+
+    At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever.
+
+    Args:
+        rows: A as a function of q.
+        q: coordinates.
+        A: rows(q).
+    """
+    eps = float(jnp.finfo(q.dtype).eps)
+    small = eps**0.25
+    signs = jnp.asarray((-1.0) ** np.arange(q.shape[0]), q.dtype)
+    beside = rows(q + small * signs * (1.0 + jnp.abs(q)))
+    norms, growth = (jnp.sqrt(jnp.sum(x**2, axis=1)) for x in (A, (beside - A) / small))
+    there = norms > 1e3 * eps * growth
+    size = jnp.where(there, norms, growth)
+    return there, jnp.where(size > 0, size, 1.0)
+
+
+def rows_hold(
+    A: Float[Array, "m n"],
+    x: Float[Array, " n"],
+    c: Float[Array, " m"],
+    size: Float[Array, " m"],
+    v: Float[Array, " n"],
+) -> Bool[Array, ""]:
+    """Whether A x + c = 0 for all rows, those that were left out included.
+
+    Up to what the angle may be below which a row counts as dependent.
+
+    Args:
+        A: rows.
+        x: an acceleration that some of them have been solved for.
+        c: gamma.
+        size: of the rows, see `row_sizes`.
+        v: velocities, whose squares make gamma.
+    """
+    eps = float(jnp.finfo(A.dtype).eps)
+    scale = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(c) / size)
+    allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * (1.0 + jnp.sum(v**2))
+    return jnp.all(jnp.abs(A @ x + c) <= allowed * size)
+
+
 def independent_rows(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],
-    first: tuple[bool, ...] = (),
+    turn: Sequence[int] | np.ndarray | None = None,
     floor: float | None = None,
     there: Bool[Array, " m"] | None = None,
 ) -> Bool[Array, " m"]:
@@ -348,7 +400,8 @@ def independent_rows(
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
-        first: for every row, whether it is to be taken before those where this is False.
+        turn: for every row, when it is to be taken: before all rows of a higher number; None for
+            all at once.
         floor: least pivot; by default `rank_floor`.
         there: rows that are not taken for zero; by default those that are not.
 
@@ -359,6 +412,8 @@ def independent_rows(
     floor = rank_floor(A.dtype) if floor is None else floor
     nonzero = norms > 0
     usable = nonzero if there is None else nonzero & there
+    if m == 1:
+        return usable
     A = A / jnp.where(usable, norms, 1.0)[:, None]
     mass = factor_mass(augmented(M, A)[0])
     S = A @ jax.vmap(lambda row: eliminate(mass, row))(A).T
@@ -366,13 +421,13 @@ def independent_rows(
     usable = usable & (pivots > 0)
     scale = jax.lax.rsqrt(jnp.where(usable, pivots, 1.0))
     S = scale[:, None] * S * scale
-    early = jnp.asarray(first or (True,) * m)
+    turns = np.zeros(m, int) if turn is None else np.asarray(turn, int)
 
     def choose(_: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
         S, kept = state
         left = jnp.where(kept | ~usable, -1.0, jnp.diagonal(S))
-        some = jnp.any(early & (left > floor))
-        left = jnp.where(some & ~early, -1.0, left)
+        now = jnp.min(jnp.where(left > floor, turns, np.max(turns, initial=0)))
+        left = jnp.where(turns > now, -1.0, left)
         k = jnp.argmax(left > 0.999 * jnp.max(left))  # the first of nearly equal ones
         take = left[k] > floor
         reduced = S - jnp.outer(S[:, k], S[k]) / jnp.where(take, S[k, k], 1.0)
@@ -388,8 +443,8 @@ def least_norm(
 
     |A_k lam_k| is the generalized force of row k alone, so that the choice does not depend on
     how a residual is scaled. With C the rows in terms of those that are kept, A = C A_kept,
-    lam = C (C^T C)^-1 lam_kept: the same where none is left out. Derivatives are those at constant
-    rank of A.
+    lam = C (C^T C)^-1 lam_kept: the same where none is left out. Rows that do not follow from
+    those that are kept have none. Derivatives are those at constant rank of A.
 
     Args:
         A: rows.
@@ -399,6 +454,8 @@ def least_norm(
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
     m, n = A.shape
+    if m == 1:
+        return lam
     if kept is None:
         kept = independent_rows(jnp.eye(n, dtype=A.dtype), jax.lax.stop_gradient(A))
     norms = jnp.sqrt(jnp.sum(A**2, axis=1))
@@ -407,8 +464,35 @@ def least_norm(
     gram, one = unit @ unit.T, jnp.eye(m, dtype=A.dtype)
     among = jnp.where(jnp.outer(kept, kept), gram, one)
     C = jnp.linalg.solve(among, jnp.where(kept[:, None], gram, 0.0)).T
+    apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
+    C = jnp.where((apart <= rank_floor(A.dtype))[:, None], C, 0.0)
     C = jnp.where(kept[:, None], jnp.where(kept, one, 0.0), C)
     # What all rows do, by those that are kept: with C^T, for lam may be on any of them.
     of_kept = C.T @ (norms * lam)
     square = C.T @ C + jnp.where(kept, 0.0, one)
     return (C @ jnp.linalg.solve(square, of_kept)) / norms
+
+
+def as_read(
+    A: Float[Array, "m n"],
+    lam: Float[Array, " m"],
+    kept: Bool[Array, " m"] | None,
+    read: tuple[bool, ...],
+) -> Float[Array, " m"]:
+    """The multipliers as forces see them that read some of them: of least norm among those rows.
+
+    So two rows for one contact share its reaction, a row that nothing reads takes none of it, and
+    whatever else depends on these is of least norm among itself.
+
+    Args:
+        A: rows.
+        lam: multipliers with that A^T lam, 0 where rows are not kept.
+        kept: a largest set of independent rows, first of those that are read; None for all.
+        read: for every row, whether a force reads its multiplier.
+    """
+    if kept is None:
+        return lam
+    for group in (np.flatnonzero(read), np.flatnonzero(np.logical_not(read))):
+        if len(group) > 1:
+            lam = lam.at[group].set(least_norm(A[group], lam[group], kept[group]))
+    return lam

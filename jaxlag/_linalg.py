@@ -27,6 +27,16 @@ class MassFactor(NamedTuple):
     cholesky: Float[Array, "n n"] | None
     healthy: Bool[Array, " n"]
 
+    @property
+    def pivots(self) -> Float[Array, " n"]:
+        """The diagonal of D."""
+        if self.upper is None:
+            assert self.cholesky is not None
+            return jnp.diagonal(self.cholesky) ** 2
+        if isinstance(self.upper, jax.Array):
+            return jnp.diagonal(self.upper)
+        return jnp.stack([row[0] for row in self.upper])
+
 
 def factor_mass(M: Float[Array, "n n"], relative: float | None = None) -> MassFactor:
     """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.

@@ -21,7 +21,7 @@ from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
 from jaxlag._scheme import Scheme
 from jaxlag._settling import Settling
-from jaxlag._start import Start, start_consistent, start_finite, values_allowed
+from jaxlag._start import Start, residuals, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
 from jaxlag._system import System
 from jaxlag._term import term_of
@@ -100,14 +100,20 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     if dynamics.quasi is not None:
         u0 = dynamics.quasi.of(t0, q0, v0, params) if u0 is None else u0
         w0 = u0[dynamics.quasi.free]
-        # A lane whose kinematics are singular at the start lends no derivatives to the others.
-        sound = jnp.all(jnp.isfinite(dynamics.velocities(t0, q0, w0, params)))
+    if dynamics.quasi is not None or dynamics.rows.size:
+        # A lane that has no start, or none that is consistent, or whose kinematics are singular
+        # there, lends no derivatives to the others.
+        known = (q0, dynamics.velocities(t0, q0, w0, params))
+        known = (*known, *residuals(dynamics, t0, q0, v0, params))
+        sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
         q0, w0, still = still_unless(sound, (q0, w0, args.params))
         args = args._replace(params=still)
     y0 = dynamics.start(q0, w0)
     start = jnp.zeros_like(args.origin)
     args = dynamics.prepare(start, y0, args)
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
+    if dynamics.rows.size:
+        y0, args = still_unless(consistent.ok, (y0, args))
     if dynamics.projects:
         moved, _, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)

@@ -149,7 +149,8 @@ class AbstractQuantities(eqx.Module):
         u = quasi.vector("u", u)
         t, q, _, params = self._state(params, q, None, t)
         q, u = common(q, u)
-        return quasi.velocities(t, q, u, params)
+        v = quasi.velocities(t, q, u, params)
+        return jnp.where(quasi.regular(t, q, params), v, jnp.nan)
 
     def _with_quasi(self, method: str) -> QuasiVelocities:
         if self.quasi is None:

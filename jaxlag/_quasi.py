@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlag._captured import captured
 from jaxlag._constraints import Pfaffian
 from jaxlag._errors import bad, require_arity
+from jaxlag._kkt import row_sizes
 from jaxlag._vectors import real
 
 # Least sine of the angle between a row of dU/dv and those before it, in roundings.
@@ -171,18 +172,34 @@ class QuasiVelocities(eqx.Module):
     ) -> Float[Array, " k"]:
         """Sine of the angle between every quasi-velocity and those before it; 0 if it follows.
 
+        Or if it vanishes up to rounding, as cos(pitch) yaw' does at a pitch of 90 degrees.
+
         Args:
             t: time, s.
             q: coordinates, shape (n,).
             params: as U takes them.
             dtype: of velocities.
         """
-        if self.U is None:
-            columns = self._affine(t, q, dtype, params)[0]
-        else:
+
+        def rows(q: Array) -> Array:
+            if self.U is None:
+                return self._affine(t, q, dtype, params)[0].T
             rest = jnp.zeros(q.shape, dtype)
-            columns = jax.jacfwd(lambda v: self.of(t, q, v, params))(rest).T
-        return jnp.nan_to_num(_sines(columns), nan=0.0)
+            return jax.jacfwd(lambda v: self.of(t, q, v, params))(rest)
+
+        here = rows(q)
+        there, _ = row_sizes(rows, q, here)
+        return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
+
+    def regular(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Bool[Array, ""]:
+        """Whether v follows from u there, and u from v.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            params: as U takes them.
+        """
+        return jnp.all(self.sines(t, q, params, q.dtype) > SINE * float(jnp.finfo(q.dtype).eps))
 
     def vector(self, argument: str, u: Any) -> Float[Array, " k"]:
         """All quasi-velocities from k numbers, or a dict by name; constrained ones may be left out.

@@ -228,8 +228,12 @@ def _quasi_reactions(
     )
     w = quasi.of(t, q, v, params)[quasi.free]
     moving = Moving(terms, t, q, w, params, InputValues(values))
-    if not system.constraints:
+    if system.constraints:
+        a, lam = moving.reactions()
+        force = lam @ terms.rows(t, q, v, params)[0]
+    else:
         a = moving.velocity_rate(moving.accelerations())
-        return a, jnp.zeros((0,), q.dtype), jnp.zeros_like(q)
-    a, lam = moving.reactions()
-    return a, lam, lam @ terms.rows(t, q, v, params)[0]
+        lam, force = jnp.zeros((0,), q.dtype), jnp.zeros_like(q)
+    regular = quasi.regular(t, q, params)
+    a, lam, force = (jnp.where(regular, x, jnp.nan) for x in (a, lam, force))
+    return a, lam, force

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam, sliding
-from jaxlag._kkt import dependence_floor
+from jaxlag._kkt import closed_to
 from jaxlag._lowering import ScalarPrepared, ScalarTerms
 from jaxlag._projection import Surface, project
 from jaxlag._step import Arguments, Verdict
@@ -100,15 +100,15 @@ class Settling(eqx.Module):
         return jnp.concatenate([q, v, y[rest:]]), found, self._closed(surface, q, v, args)
 
     def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
-        """Whether rows that were left out hold as well, to half the digits.
+        """Whether rows that were left out hold as well.
 
         Where nothing holds the others, these may drift as they do.
         """
         if args.rows is None:
             return jnp.array(True)
-        kept, size = args.rows
+        kept, size = args.rows.kept, args.rows.size
         holonomic = np.flatnonzero(self.dynamics.rows.holonomic).tolist()
-        floor = dependence_floor(q.dtype)
+        floor = closed_to(q.dtype)
 
         def holds(c: Array, x: Array, rows: list[int]) -> Array:
             largest = jnp.max(jnp.abs(x))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jaxlag._dynamics import Dynamics, still
-from jaxlag._kkt import dependence_floor, independent_rows
+from jaxlag._kkt import closed_to, dependence_floor, independent_rows
 from jaxlag._step import Arguments
 
 
@@ -76,6 +76,17 @@ def residuals(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> 
 def start_consistent(
     dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
 ) -> Consistency:
+    """Whether a state satisfies the constraints, and its quasi-velocities stand for velocities."""
+    found = _rows_consistent(dynamics, t, q, v, params, args)
+    if dynamics.quasi is None:
+        return found
+    regular = dynamics.quasi.regular(*still((t, q, params)))
+    return found._replace(ok=found.ok & regular, complete=found.complete & regular)
+
+
+def _rows_consistent(
+    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
+) -> Consistency:
     """Whether residuals are below sqrt(eps) of the state, and no row contradicts the others.
 
     A row contradicts where it is left open by solving for the independent ones: phi, A v + b, or
@@ -107,15 +118,17 @@ def start_consistent(
 
     off, bad = jnp.zeros_like(unit), jnp.zeros_like(unit)
     for c, x in ((phi, q), (rate, v)):
-        size = jnp.abs(c) / unit / (floor * (1.0 + jnp.max(jnp.abs(x))))
-        off = jnp.maximum(off, size)
+        size = jnp.abs(c) / unit / (1.0 + jnp.max(jnp.abs(x)))
+        off = jnp.maximum(off, size / floor)
         # A contradiction is not just what the linearised rows leave open.
-        bad = jnp.maximum(bad, jnp.where(left(c) > 0.1 * jnp.max(jnp.abs(c) / unit), size, 0.0))
+        ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
+        bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
     gamma = terms.gamma(t, q, v, params)
     turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
     bent = left(gamma) / (floor * jnp.where(turn > 0, turn, 1.0))
-    return _consistency(off, jnp.where(near, bent, bad), near, phi, rate)
+    bad = jnp.where(near, jnp.maximum(bent, bad), bad)
+    return _consistency(off, bad, near, phi, rate)
 
 
 def _fitting(

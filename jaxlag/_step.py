@@ -9,12 +9,15 @@ class RowChoice(NamedTuple):
     """Which constraint rows are solved with: a largest independent set at the start.
 
     Attributes:
-        kept: these rows; the others follow from them as long as the rank does not change.
+        kept: these rows, holonomic ones first; the others follow from them as long as the rank does
+            not change.
         size: of every row at the start and beside.
+        reacting: such a set with as many as possible of the rows whose multipliers forces read.
     """
 
     kept: Bool[Array, " m"]
     size: Float[Array, " m"]
+    reacting: Bool[Array, " m"]
 
 
 class Gaps(NamedTuple):
@@ -64,5 +67,10 @@ class Arguments(NamedTuple):
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:
-        """Rows to solve with; None for all."""
+        """Rows to project by; None for all."""
         return None if self.rows is None else self.rows.kept
+
+    @property
+    def reacting(self) -> Bool[Array, " m"] | None:
+        """Rows to solve accelerations with; None for all."""
+        return None if self.rows is None else self.rows.reacting

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from jaxlag import _params
 from jaxlag._captured import as_written, captured
-from jaxlag._constraints import AbstractConstraint, Layout, check_constraints
+from jaxlag._constraints import AbstractConstraint, Layout, check_constraints, check_reactions
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, require_arity
 from jaxlag._explain import explain
@@ -121,10 +121,11 @@ class System(AbstractReactions):
             )
         self.coordinates = Coordinates(coordinates)
         self.forces = check_forces(forces)
-        rows = check_constraints(constraints, self.forces)
+        rows = check_constraints(constraints)
         if quasi is not None:
             check_quasi(quasi, self.coordinates.size, self._taken(rows))
-            rows = check_constraints((*quasi.rows, *rows), self.forces)
+            rows = check_constraints((*quasi.rows, *rows))
+        check_reactions(rows, self.forces)
         self.constraints, self.quasi = rows, quasi
         if written_in not in ("v", "u"):
             raise bad("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
@@ -199,7 +200,7 @@ class System(AbstractReactions):
             ValueError: a force that is none, a name that is taken.
         """
         both = check_forces((*self.forces, *forces))
-        check_constraints(self.constraints, both)
+        check_reactions(self.constraints, both)
         if self.quasi is not None:
             taken = dict.fromkeys((force.name for force in both), "a force")
             check_quasi(self.quasi, self.size, taken)
@@ -222,10 +223,14 @@ class System(AbstractReactions):
         """Whether M is positive definite for these params without the help of constraints.
 
         Looked at in the given state, where it is known, and in one other, as the mass of a link is
-        zero everywhere or nowhere; False where the params have no values, since they are traced.
-        Of use to a system with constraints alone.
+        zero everywhere or nowhere; False where the params have no values, since they are traced,
+        or the state has none and M depends on it, as in polar coordinates at r = 0. Of use to a
+        system with constraints alone.
         """
         if not self.constraints or not _params.concrete(params):
+            return False
+        given = (t, q) if v is None else (t, q, v)
+        if not _params.concrete(given) and self.structure(params, q.dtype).mass & {"t", "q", "v"}:
             return False
         states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.size)))]
         v = jnp.zeros_like(q) if v is None else v

@@ -91,12 +91,14 @@ class Terms(eqx.Module):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
+        reacting: Bool[Array, " m"] | None = None,
         sense: Array | float = 1.0,
     ) -> Any:
         """What accelerations need of what depends on params alone, to be computed once per solve.
 
         Of q and the inputs' values only shapes and dtypes matter; `sample` holds values of the
-        params where these are traced, `kept` the rows that are going to be solved with.
+        params where these are traced, `kept` the rows that states are going to be projected by,
+        `reacting` those that accelerations are going to be solved with.
         """
 
     @abstractmethod

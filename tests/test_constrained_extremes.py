@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _families import mostly_full
+from mechanisms import FOUR_BAR, four_bar
 from numpy import cos, sin
 
 import jaxlag as jl
@@ -33,6 +34,21 @@ def test_rows_that_part_are_told(project):
     )
     assert motion.status == jl.Status.rank_change
     assert motion.last_time < 0.05
+
+
+@pytest.mark.parametrize("gap", mostly_full([1e-6, 1e-9, 1e-11, 1e-13], 1e-9, 1e-13))
+def test_a_small_contradiction_is_one(gap):
+    """Two lengths of one rod; what is below rounding is none."""
+    rods = (jl.Holonomic(rod, "rod"), jl.Holonomic(lambda t, q, p: rod(t, q, p) - p, "other"))
+    system = jl.System(pendulum, ("x", "y"), constraints=rods)
+    motion = jl.simulate(
+        system, [1.0, 0.0], [0.0, 0.0], [0.0, 1.0], gap, dt=0.1, method="tsit5", throw=False
+    )
+    if gap < 1e-12:
+        assert motion.status == jl.Status.ok
+    else:
+        assert motion.status == jl.Status.contradictory_rows
+        assert "('other')" in motion.message()
 
 
 # ---- Time backwards ------------------------------------------------------------------------------
@@ -167,6 +183,24 @@ def test_a_start_where_a_coordinate_has_no_inertia(traced):
     np.testing.assert_allclose(found, sin(1.0), atol=1e-10)
 
 
+def test_whether_a_coordinate_has_inertia_is_asked_of_traced_states_too():
+    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the centre as well."""
+    turn = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2),
+        ("r", "phi"),
+        constraints=(turn,),
+    )
+
+    def end(r):
+        start = jnp.stack([r, 0.0]), jnp.array([1.0, 2.0])
+        return jl.simulate(system, *start, jnp.array([0.0, 1.0]), method="tsit5", **TIGHT).q[-1, 0]
+
+    r = jnp.array([0.0, 0.3])
+    expected = np.cosh(2.0) * r + 0.5 * np.sinh(2.0)
+    np.testing.assert_allclose(jax.vmap(end)(r), expected, rtol=1e-9)
+
+
 def spring(t, q, v, params):
     return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
 
@@ -215,6 +249,34 @@ def test_all_of_a_heavy_state_may_be_held():
     np.testing.assert_array_equal(state.q, [0.6, -0.8])
 
 
+# ---- Loops that lie flat, where a row is sin(pi) -----------------------------------------------
+
+
+PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
+
+
+@pytest.mark.parametrize("crank", [0.0, np.pi])
+def test_what_rounding_leaves_of_a_row_is_no_row(crank):
+    """Of the pin only y holds; forces along x are not found in 1e-16 of a row."""
+    params, q, v = PARALLELOGRAM, [crank, 0.0, crank + np.pi], [0.3, 0.2, -0.7]
+    found = jl.assemble(four_bar, q, v, params)
+    assert int(found.rank) == 1
+    A = np.array([0.5 * cos(crank), 1.0, 0.5 * cos(crank + np.pi)])
+    M = four_bar.mass_matrix(params, q)
+    way = np.linalg.solve(M, A)
+    np.testing.assert_allclose(found.v, v - way * (A @ v) / (A @ way), atol=1e-12)
+    rest = four_bar.multipliers(params, q, np.zeros(3))["pin"]
+    h = four_bar.bias(params, q, np.zeros(3))
+    expected = way @ h / (A @ way)
+    np.testing.assert_allclose(rest, [0.0, expected], rtol=1e-12, atol=1e-12)
+
+
+def test_no_acceleration_satisfies_rows_that_contradict():
+    """Turning through the flat place the links would have to leave the pin."""
+    a = four_bar.acceleration(PARALLELOGRAM, [0.0, 0.0, np.pi], [1.0, -0.5, 0.0])
+    assert np.all(np.isnan(a))
+
+
 # ---- Starts that cannot be solved with -----------------------------------------------------------
 
 
@@ -235,3 +297,30 @@ def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
     )
     motion = jl.simulate(system, [-1.0, 1.0], [0.0, 1.0], [0.0, 1.0], throw=False)
     assert motion.status == jl.Status.nonfinite
+
+
+def test_a_lane_without_a_start_spoils_no_derivative():
+    """Neither one that is not a number nor one off the constraint, in what all lanes share."""
+    system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
+
+    def height(angle, length, g):
+        q = length * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+        motion = jl.simulate(
+            system, q, g * jnp.zeros(2), jnp.array([0.0, 0.3]), method="tsit5", dt=0.1, throw=False
+        )
+        return motion.status, jnp.where(motion.ok, motion.q[-1, 1], 0.0)
+
+    def total(angles, lengths, g):
+        status, heights = jax.vmap(height, (0, 0, None))(angles, lengths, g)
+        return jnp.sum(heights), status
+
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2), has_aux=True))
+    angles, lengths = jnp.array([0.3, jnp.nan, 0.7, 1.2]), jnp.array([1.0, 1.0, 1.5, 1.0])
+    found, status = slopes(angles, lengths, 1.0)
+    assert [jl.Status(int(kind)).name for kind in status] == [
+        *("ok", "bad_value", "inconsistent_start", "ok")
+    ]
+    alone, _ = slopes(angles[::3], lengths[::3], 1.0)
+    assert np.all(np.isfinite(alone[0]))
+    np.testing.assert_allclose(found[0][::3], alone[0], rtol=1e-12)
+    np.testing.assert_array_equal(found[2], alone[2])

@@ -15,6 +15,8 @@ from mechanisms import (
     bobs,
     cartesian,
     double_pendulum,
+    four_bar,
+    four_bar_start,
     led_pendulum,
     led_start,
     minimal,
@@ -314,6 +316,26 @@ def test_a_start_at_a_dead_point():
     assert between.status in (jl.Status.rank_change, jl.Status.contradictory_rows)
     assert between.last_time < 0.01
     assert "('y')" in between.message()
+
+
+@pytest.mark.full
+def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
+    """Fast, by null spaces, and at the change point of a four-bar, where two branches meet."""
+    equal = {**SLIDER, "r": 1.0}
+    q0, v0 = slider_start(0.5, 10.0, equal)
+    options = {"throw": False, "rtol": 1e-9, "atol": 1e-9}
+    found = jl.simulate(
+        slider_crank, q0, v0, np.linspace(0, 3, 31), equal, formulation="null_space", **options
+    )
+    assert found.status in (jl.Status.ok, jl.Status.rank_change)
+    params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}  # a + d = b + c
+    start = jl.assemble(
+        four_bar, four_bar_start(1.0, params), [5.0, 0.0, 0.0], params, hold=("crank'",)
+    )
+    found = jl.simulate(four_bar, start.q, start.v, [0.0, 3.0], params, **options)
+    assert found.status == jl.Status.rank_change
+    assert "('pin[0]')" in found.message()
+    np.testing.assert_allclose(found.last_state[0], [np.pi, 0.0, 0.0], atol=1e-6)
 
 
 # ---- Links without mass --------------------------------------------------------------------------

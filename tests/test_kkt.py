@@ -83,7 +83,7 @@ def test_which_rows_are_left_out():
     """The first of equal ones stays; rows marked to come first do so whatever their place."""
     M, rows = jnp.eye(3), jnp.array([[1.0, 0, 0], [2.0, 0, 0], [0, 1.0, 0]])
     assert independent_rows(M, rows).tolist() == [True, False, True]
-    assert independent_rows(M, rows, (False, True, False)).tolist() == [False, True, True]
+    assert independent_rows(M, rows, (1, 0, 1)).tolist() == [False, True, True]
     assert independent_rows(M, jnp.zeros((2, 3))).tolist() == [False, False]
 
 

@@ -22,7 +22,6 @@ def test_notebook_is_stored_without_outputs(path):
             assert cell.execution_count is None
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path):
     notebook = nbformat.read(path, as_version=4)

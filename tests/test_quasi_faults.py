@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 from _quasi_systems import (
     BLADE,
     NAMES,
@@ -15,7 +16,9 @@ from _quasi_systems import (
     push,
     sideways,
     skewed,
+    sleigh,
     sleigh_rates,
+    sleighs,
 )
 from _user import unchecked  # noqa: F401
 
@@ -53,6 +56,20 @@ def leaning(t, q, v, params):
 
 def swinging(t, q, v, params):
     return 0.5 * params["m"] * (1.0 + 0.1 * jnp.sin(q[1])) * (v @ v) - q[0] ** 2
+
+
+@pytest.mark.parametrize(
+    "pitch", mostly_full([0.5 * np.pi, -0.5 * np.pi, 1.5 * np.pi], 0.5 * np.pi)
+)
+def test_a_rate_that_rounding_leaves_is_none(pitch):
+    """Without roll the third rate is 6e-17 yaw' and nothing else."""
+    system, q, v = angles(), [0.0, pitch, 0.0], [0.1, 0.2, 0.3]
+    for start in ({"u0": v}, {"v0": v}):
+        motion = jl.simulate(system, q, ts=[0.0, 0.1], throw=False, **start)
+        assert motion.status == Status.kinematics_singular
+        assert "'wz'" in motion.message()
+    assert np.all(np.isnan(system.velocities({}, q, v)))
+    assert np.all(np.isnan(system.quasi_reactions({}, q, v)["a"]))
 
 
 @pytest.mark.full
@@ -216,6 +233,45 @@ def test_rows_beside_them_are_solved_for_with_multipliers():
     motion = run(one(), constraints=(BLADE,), u0=np.zeros(3))
     assert motion.formulation == "multipliers"
     np.testing.assert_allclose(motion.u[0], 0.0, atol=8 * EPS)
+
+
+def braked(t, q, v, params, lam):
+    return -0.2 * lam["b"] * v
+
+
+def test_a_force_may_read_what_holds_a_quasi_velocity():
+    """Solved for with multipliers then; the quasi-velocity formulation knows none."""
+    force = jl.GeneralizedForce(braked, "brake", reaction=True)
+    quasi = one(constrained=("b",))
+    system = system_of(quasi, forces=(force,))
+    start = {"u0": {"a": 0.4, "c": -0.3}, "ts": [0.0, 0.2], "params": PARAMS, "dt": 0.1}
+    motion = jl.simulate(system, np.zeros(3), method="tsit5", **start)
+    assert motion.formulation == "multipliers"
+    np.testing.assert_allclose(motion["b"], 0.0, atol=64 * EPS)
+    a, force = motion.a[-1], system.constraint_force(PARAMS, motion.q[-1], motion.v[-1], 0.2)
+    push = braked(0.2, motion.q[-1], motion.v[-1], PARAMS, {"b": motion.lam["b"][-1]})
+    M, h = (f(PARAMS, motion.q[-1], motion.v[-1], 0.2) for f in (system.mass_matrix, system.bias))
+    np.testing.assert_allclose(M @ a + h, push + force, atol=1e-13)
+    with pytest.raises(ValueError, match=r"need formulation='multipliers'"):
+        jl.simulate(system, np.zeros(3), formulation="quasi", **start)
+
+
+def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
+    """Three speeds for three coordinates, one of which the blade's row forbids."""
+
+    def rates(t, q, u, params):
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        return jnp.stack([c * u[0] - s * u[2], s * u[0] + c * u[2], u[1]])
+
+    body = jl.QuasiVelocities(kinematics=rates, names=("ahead", "turn", "aside"))
+    start = {"ts": [0.0, 1.0], "dt": 0.1, "method": "tsit5"}
+    q = [0.0, 0.0, 0.3]
+    system = jl.System(sleigh, ("x", "y", "theta"), quasi=body, constraints=(BLADE,))
+    motion = jl.simulate(system, q, u0=[1.0, 0.4, 0.0], **start)
+    assert motion.formulation == "multipliers"
+    tall, _ = sleighs()
+    other = jl.simulate(tall, q, u0=[1.0, 0.4], formulation="multipliers", **start)
+    np.testing.assert_allclose(motion.q, other.q, atol=1e-14)
 
 
 def test_what_is_found_is_said():

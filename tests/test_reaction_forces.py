@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from _families import mostly_full
 from numpy import cos, sin
 
 import jaxlag as jl
@@ -183,6 +184,129 @@ def test_painleve():
         assert (motion.status == Status.no_reaction_solution) == (mu > 4 / 3)
         a = entry.system.acceleration(params | {"mu": mu}, q0, v0)
         assert np.all(np.isfinite(a)) == (mu < 4 / 3)
+
+
+# ---- Rows that depend on one another ------------------------------------------------------------
+
+
+def doubled(t, q, params):
+    return 2.0 * plane(t, q, params)
+
+
+def rate(t, q, v, params):
+    return cos(SLOPE) * v[1] - sin(SLOPE) * v[0]
+
+
+def sliding_on(rows, read, lowering="auto"):
+    """The block on contacts of these names, with friction on those that are read."""
+
+    def drag(t, q, v, params, lam):
+        along = jnp.array([cos(SLOPE), sin(SLOPE)])
+        pressed = sum(share * lam[name] for name, share in read.items())
+        return -params * pressed * jnp.sign(uphill(t, q, v, params)) * along
+
+    force = jl.GeneralizedForce(drag, "drag", reaction=True)
+    return jl.System(particle, ("x", "y"), forces=(force,), constraints=rows, lowering=lowering)
+
+
+PLANE = jl.Holonomic(plane, "plane")
+AGAIN = jl.Holonomic(plane, "again")
+RATE = jl.Pfaffian(rate, "rate")
+TWICE = jl.Holonomic(doubled, "twice")
+CONTACTS = {
+    "first": ((PLANE, AGAIN), {"plane": 1.0}, {"plane": 1.0, "again": 0.0}),
+    "second": ((AGAIN, PLANE), {"plane": 1.0}, {"plane": 1.0, "again": 0.0}),
+    "both": ((PLANE, AGAIN), {"plane": 1.0, "again": 1.0}, {"plane": 0.5, "again": 0.5}),
+    "doubled": ((PLANE, TWICE), {"twice": 2.0}, {"plane": 0.0, "twice": 0.5}),
+    "with doubled": (
+        (PLANE, TWICE),
+        {"plane": 1.0, "twice": 2.0},
+        {"plane": 0.5, "twice": 0.25},
+    ),
+    "rate": ((PLANE, RATE), {"rate": 1.0}, {"plane": 0.0, "rate": 1.0}),
+    "three": (
+        (PLANE, AGAIN, RATE),
+        {"again": 1.0, "rate": 1.0},
+        {"plane": 0.0, "again": 0.5, "rate": 0.5},
+    ),
+}
+
+
+@pytest.mark.parametrize("lowering", ["scalar", "array"])
+@pytest.mark.parametrize("kind", mostly_full(list(CONTACTS), "both", "rate"))
+def test_a_contact_that_is_declared_twice_drags_once(kind, lowering):
+    """Whichever row the friction reads; what it reads is what is told, and the books are kept."""
+    rows, read, shares = CONTACTS[kind]
+    system = sliding_on(rows, read, lowering)
+    ts, along = np.linspace(0.0, 0.9 * STOP, 3), np.array([cos(SLOPE), sin(SLOPE)])
+    start = [0.0, 0.0], SPEED * along
+    normal, deceleration = M * G * cos(SLOPE), G * (sin(SLOPE) + MU * cos(SLOPE))
+    motion = jl.simulate(system, *start, ts, MU, save=("work",), **TIGHT)
+    way = SPEED * ts - 0.5 * deceleration * ts**2
+    np.testing.assert_allclose(motion.q, np.outer(way, along), atol=1e-12)
+    for name, share in shares.items():
+        np.testing.assert_allclose(motion.lam[name], share * normal, rtol=1e-12, atol=1e-12)
+    done = sum(motion.work.values())[-1]
+    np.testing.assert_allclose(motion.energy[-1] - motion.energy[0], done, rtol=1e-12)
+    a = system.acceleration(MU, *start)
+    np.testing.assert_allclose(a, -deceleration * along, rtol=1e-12)
+    push = system.generalized_force(MU, *start)
+    np.testing.assert_allclose(push, -MU * normal * along, rtol=1e-12)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("lowering", ["scalar", "array"])
+def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
+    """d way/d mu, as of one contact."""
+    system = sliding_on(*CONTACTS["both"][:2], lowering)
+    ts, along = np.array([0.0, 0.5 * STOP]), np.array([cos(SLOPE), sin(SLOPE)])
+
+    def height(mu):
+        return jl.simulate(system, [0.0, 0.0], SPEED * along, ts, mu, **TIGHT, throw=False).q[-1, 1]
+
+    expected = -0.5 * G * cos(SLOPE) * ts[-1] ** 2 * sin(SLOPE)
+    np.testing.assert_allclose(jax.grad(height)(MU), expected, rtol=1e-11)
+    np.testing.assert_allclose(jax.jacfwd(height)(MU), expected, rtol=1e-11)
+
+
+def table(t, q, v, params):
+    """A table of mass 1 that slides upright; q: x, y, z of its mass centre, roll, pitch."""
+    return 0.5 * (v @ v) - G * q[2]
+
+
+FEET = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+
+
+def feet(t, q, params):
+    """Heights of the feet, for small angles; params: (friction, where the mass centre is)."""
+    arms = FEET - params[1]
+    return q[2] + arms[:, 1] * q[3] - arms[:, 0] * q[4]
+
+
+def feet_drag(t, q, v, params, lam):
+    return jnp.zeros(5).at[0].set(-params[0] * jnp.sum(lam["feet"]) * jnp.sign(v[0]))
+
+
+@pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
+def test_four_feet_share_as_equals(lowering):
+    """Of three alone one might have to pull; of least norm all four press."""
+    force = jl.GeneralizedForce(feet_drag, "drag", reaction=True, contact="feet")
+    system = jl.System(
+        table,
+        ("x", "y", "z", "roll", "pitch"),
+        forces=(force,),
+        constraints=(jl.Holonomic(feet, "feet"),),
+        lowering=lowering,
+    )
+    params = 0.3, np.array([0.2, -0.1])
+    motion = jl.simulate(
+        system, np.zeros(5), [2.0, 0, 0, 0, 0], [0.0, 0.5], params, dt=0.05, method="tsit5"
+    )
+    np.testing.assert_allclose(motion["x"][-1], 1.0 - 0.5 * 0.3 * G * 0.25, rtol=1e-13)
+    balance = np.vstack([np.ones(4), (FEET - params[1]).T])
+    sizes = np.sqrt(1.0 + np.sum((FEET - params[1]) ** 2, axis=1))
+    expected = np.linalg.pinv(balance / sizes) @ [G, 0.0, 0.0] / sizes
+    np.testing.assert_allclose(motion.lam["feet"][-1], expected, rtol=1e-12)
 
 
 # ---- The solve -----------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The array program: terms by automatic differentiation of L on whole arrays."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -22,11 +22,14 @@ from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import real_scalar
 from jaxlag._forces import AbstractForce, components, reads_lam
 from jaxlag._kkt import (
+    as_read,
     augmented,
     factor_kkt,
     independent_rows,
     least_norm,
     masked,
+    row_sizes,
+    rows_hold,
     solve_kkt,
     solve_reactions,
 )
@@ -152,10 +155,30 @@ class ArrayTerms(Terms):
     ) -> Float[Array, " n"]:
         """The sum of the forces that depend on multipliers."""
         named = layout(self.constraints, params, q.shape[0], q.dtype).unflatten(lam)
+        return self._reactive(t, q, v, params, inputs, named)
+
+    def _reactive(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Any, named: Mapping[str, Array]
+    ) -> Array:
         total = jnp.zeros_like(q)
         for force in filter(reads_lam, self.forces):
             total = total + components(force, t, q, v, params, inputs, named)
         return total
+
+    def rows_read(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any]
+    ) -> tuple[bool, ...]:
+        """For every row, whether a force depends on the multipliers of its name."""
+        rows = layout(self.constraints, params, q.shape[0], q.dtype)
+        named = rows.unflatten(jnp.zeros((rows.size,), q.dtype))
+
+        def push(parts: list[Array]) -> Array:
+            return self._reactive(t, q, v, params, inputs, dict(zip(named, parts, strict=True)))
+
+        program = jax.make_jaxpr(push)(list(named.values())).jaxpr
+        (reached,) = outputs_depend_on(program, [frozenset({name}) for name in named])
+        reached |= {force.contact for force in self.forces if reads_lam(force) and force.contact}
+        return tuple(name in reached for name in rows.names)
 
     def position(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
@@ -225,6 +248,7 @@ class ArrayTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
+        reacting: Bool[Array, " m"] | None = None,
         sense: Array | float = 1.0,
     ) -> Prepared:
         """M and its factor where M depends on params alone."""
@@ -262,16 +286,20 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam), of least norm where rows depend on one another."""
+        """(a, lam), of least norm where rows depend on one another; NaN where rows contradict."""
         M, right = self._balance(t, q, v, params, inputs, self.prepare(q, params, inputs))
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
-        kept = None
-        if A.shape[0] > 1:
-            kept = independent_rows(*jax.lax.stop_gradient((M, A)))
+        felt = any(map(reads_lam, self.forces))
+        unread = np.logical_not(self.rows_read(t, q, v, params, inputs)) if felt else None
+        still = jax.lax.stop_gradient
+        there, size = row_sizes(lambda q: still(self.rows(t, q, v, params)[0]), *still((q, A)))
+        kept = independent_rows(*still((M, A)), unread, there=there)
         a, lam = self._solved(M, right, t, q, v, params, inputs, kept)
-        return a, lam if kept is None else least_norm(A, lam, kept)
+        lam = lam if felt else least_norm(A, lam, kept)
+        fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
+        return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
     def _solved(
         self,
@@ -285,7 +313,7 @@ class ArrayTerms(Terms):
         kept: Array | None,
         sense: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """(a, lam) under constraints."""
+        """(a, lam) under constraints; lam as forces read it where some do."""
         (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
         if not any(map(reads_lam, self.forces)):
             return solve_kkt(M, A, right, gamma, kept, self.formulation)
@@ -295,7 +323,10 @@ class ArrayTerms(Terms):
 
         slopes = jax.make_jaxpr(jax.jacfwd(push))(gamma).jaxpr
         (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
-        return solve_reactions(M, A, right, push, gamma, kept, affine=not reached)
+        seen = partial(as_read, A, kept=kept, read=self.rows_read(t, q, v, params, inputs))
+        felt = lambda lam: push(seen(lam))  # noqa: E731
+        a, lam = solve_reactions(M, A, right, felt, gamma, kept, affine=not reached)
+        return a, seen(lam)
 
     def correction(
         self,

@@ -1,6 +1,6 @@
 """A scalar program against the array program, at random states and without compiling."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,11 +9,12 @@ import numpy as np
 from numpy.linalg import norm
 
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import augmented
+from jaxlag._kkt import as_read, augmented
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._evaluate import evaluate
 from jaxlag._lowering._interpret import interpret
 from jaxlag._lowering._key import Key, traced
+from jaxlag._lowering._read import rows_read
 from jaxlag._lowering._rows import layout_of
 from jaxlag._lowering._scene import Equations, Scene
 
@@ -170,7 +171,9 @@ class _Plain:
         self.bound = []
         if key.constraints:
             self.bound = [traced(key, f, False) for f in (terms.rows, terms.gamma)]
-        self.felt = _slopes(key, terms) if any(map(reads_lam, key.forces)) else None
+        self.felt, self.read = None, ()
+        if any(map(reads_lam, key.forces)):
+            self.felt, self.read = _slopes(key, terms), rows_read(key, terms)
 
     def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
         n = self.key.size
@@ -186,13 +189,14 @@ class _Plain:
         kept: Any = ()
         if self.bound:
             (A, _), (gamma,) = (interpret(f, t, q, v, *params) for f in self.bound)
-            kept = _independent(A)
+            kept = _independent(A, self.read)
             if not _definite(M if self.key.regular else _augmented(M, A[kept])):
                 return None
             G = np.zeros((n, len(A)))
             if self.felt is not None:
                 rest, G = interpret(self.felt, t, q, v, *params, *inputs, np.zeros(len(A)))
                 right = right + rest
+                G = G if np.all(kept) else G @ _as_read(A, kept, self.read)
             M, right = _bordered(M, A[kept], right, gamma[kept], G[:, kept])
             if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
                 return None
@@ -308,12 +312,19 @@ def _augmented(M: Any, A: Any) -> np.ndarray:
         return np.asarray(augmented(jnp.asarray(M), jnp.asarray(A))[0])
 
 
-def _independent(A: Any) -> np.ndarray:
-    """A largest set of clearly independent rows."""
+def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
+    """What takes multipliers of the rows kept to those that forces see, in numbers."""
+    with jax.ensure_compile_time_eval():
+        columns = [as_read(jnp.asarray(A), e, jnp.asarray(kept), read) for e in jnp.eye(len(A))]
+        return np.asarray(jnp.stack(columns, axis=1))
+
+
+def _independent(A: Any, read: Sequence[bool]) -> np.ndarray:
+    """A largest set of clearly independent rows, first of those that are read."""
     kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
-    for k, row in enumerate(A):
-        rest = row - (Y @ row) @ Y
+    for k in sorted(range(len(A)), key=lambda k: bool(read) and not read[k]):
+        rest = A[k] - (Y @ A[k]) @ Y
         size = norm(rest)
-        if size > 1e-3 * norm(row):
+        if size > 1e-3 * norm(A[k]):
             kept[k], Y = True, np.vstack([Y, rest / size])
     return kept

@@ -24,6 +24,7 @@ class Constrained(NamedTuple):
         regular: whether M is known to be positive definite by itself.
         reaction: the forces that depend on multipliers; None without.
         lam: the multipliers that they depend on.
+        read: for every row, whether it is one of these.
     """
 
     velocity: Sequence[Node]
@@ -35,6 +36,7 @@ class Constrained(NamedTuple):
     regular: bool
     reaction: Sequence[Node] | None = None
     lam: Sequence[Node] = ()
+    read: Sequence[bool] = ()
 
 
 class Rows(NamedTuple):
@@ -115,6 +117,7 @@ def solve_with_reactions(
     found: Reaction,
     eps: float,
     kept: Sequence[Node] | None,
+    read: Sequence[bool],
     regular: bool,
 ) -> tuple[list[Node], list[Node]]:
     """(a, lam) with M a = r + Q_0 + (A^T + G) lam, A a + gamma = 0.
@@ -124,6 +127,10 @@ def solve_with_reactions(
     """
     m = len(rows.A)
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
+    seen = None if kept is None else _as_read(graph, A, kept, read, eps)
+    if seen is not None:
+        of_rows = zip(*seen, strict=True)
+        G = [[_weighted(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
     if kept is not None:
         A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
         G = [[graph.mul(kept[k], x) for x in column] for k, column in enumerate(G)]
@@ -150,7 +157,70 @@ def solve_with_reactions(
     for i, x in enumerate(free):
         pushed = [(graph.mul(lam[k], spread[k][i]), 1.0) for k in range(m)]
         a.append(graph.let(graph.sum([(x, 1.0), *pushed])))
-    return a, lam
+    return a, lam if seen is None else [_weighted(graph, row, lam) for row in seen]
+
+
+def _weighted(graph: Graph, weights: Sequence[Node], x: Sequence[Node]) -> Node:
+    """The sum of weights times x."""
+    terms = [(graph.mul(w, y), 1.0) for w, y in zip(weights, x, strict=True)]
+    return graph.let(graph.sum(terms))
+
+
+def _as_read(
+    graph: Graph,
+    A: Sequence[Sequence[Node]],
+    kept: Sequence[Node],
+    read: Sequence[bool],
+    eps: float,
+) -> list[list[Node]] | None:
+    """What takes multipliers of the rows kept to those that forces see; None where it is 1.
+
+    As `jaxlag._kkt.as_read` for the rows that are read: C (C^T C)^-1 C^T between rows of unit
+    length, C the rows in terms of those that are kept.
+    """
+    m, chosen = len(A), [k for k, is_read in enumerate(read) if is_read]
+    if len(chosen) < 2:
+        return None
+    zero, one = graph.zero, graph.one
+
+    def solved(S: list[list[Node]], columns: list[list[Node]]) -> list[list[Node]]:
+        return bordered(graph, S, [], [(column, []) for column in columns], eps)
+
+    def product(x: Sequence[Sequence[Node]], y: Sequence[Sequence[Node]]) -> list[list[Node]]:
+        """x y^T."""
+        return [[_weighted(graph, a, b) for b in y] for a in x]
+
+    squares = [_weighted(graph, A[k], A[k]) for k in chosen]
+    there = [graph.call(GREATER, x, zero) for x in squares]
+    sizes = [
+        graph.let(graph.sqrt(graph.let(graph.select(*pair, one))))
+        for pair in zip(there, squares, strict=True)
+    ]
+    unit = [
+        [graph.let(graph.div(x, size)) for x in A[k]] for k, size in zip(chosen, sizes, strict=True)
+    ]
+    gram, flags = product(unit, unit), [kept[k] for k in chosen]
+    places = range(len(chosen))
+    among = [
+        [one if i == j else graph.mul(flags[i], flags[j], gram[i][j]) for j in places]
+        for i in places
+    ]
+    C = solved(among, [[graph.mul(flags[j], gram[i][j]) for j in places] for i in places])
+    for i, flag in enumerate(flags):
+        keep = graph.call(GREATER, flag, graph.const(0.5))
+        itself = [one if i == j else zero for j in places]
+        C[i] = [graph.select(keep, x, y) for x, y in zip(itself, C[i], strict=True)]
+    columns = list(zip(*C, strict=True))
+    square = product(columns, columns)
+    for j, flag in enumerate(flags):
+        square[j][j] = graph.sum([(square[j][j], 1.0), (flag, -1.0)], 1.0)
+    least = product(C, solved(square, C))
+    seen = [[one if i == j else zero for j in range(m)] for i in range(m)]
+    for i, k in enumerate(chosen):
+        for j, other in enumerate(chosen):
+            ratio = graph.div(graph.mul(least[i][j], sizes[j]), sizes[i])
+            seen[k][other] = graph.let(ratio)
+    return seen
 
 
 def _less(terms: list[tuple[Node, float]]) -> list[tuple[Node, float]]:

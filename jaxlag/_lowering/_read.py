@@ -94,8 +94,9 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
     own = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
     kept = [graph.input("kept", k) for k in own] if len(every) > 1 else None
     holonomic = [every[k] for k in own]
-    lam, reaction = [graph.input("lam", k) for k in range(m)], None
+    lam, reaction, read_by_forces = [graph.input("lam", k) for k in range(m)], None, ()
     if any(map(reads_lam, key.forces)):
+        read_by_forces = rows_read(key, terms)
         code = traced(key, terms.reactive, True, m)
         (Q,) = read(graph, code, *state, *params, *inputs, _array(lam, (m,)))
         reaction = [_node(graph, x) for x in Q]
@@ -112,7 +113,20 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         key.regular,
         reaction,
         lam,
+        read_by_forces,
     )
+
+
+def rows_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
+    """For every row, whether forces read its multiplier."""
+    found: list[tuple[bool, ...]] = []
+
+    def look(t: Any, q: Any, v: Any, params: Any, inputs: Any) -> Any:
+        found.append(terms.rows_read(t, q, v, params, inputs))
+        return t
+
+    traced(key, look, True)
+    return found[0]
 
 
 def _node(graph: Graph, x: Any) -> Node:

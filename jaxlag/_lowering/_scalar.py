@@ -71,21 +71,25 @@ class ScalarTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
+        reacting: Bool[Array, " m"] | None = None,
         sense: Array | float = 1.0,
     ) -> ScalarPrepared | Prepared:
         """All that accelerations and projections need of what depends on params alone."""
         equations = self.lowered(q, params, inputs, sample).equations
         if equations is None:
-            return self.array.prepare(q, params, inputs, sample, kept, sense)
-        first = _emit.prelude(equations.program, params, q.dtype, kept, sense)
-        others = [
-            None if code is None else _emit.prelude(code, params, q.dtype, kept, sense)
-            for code in equations.surface or ()
-        ]
-        rates = None
-        if equations.velocity is not None:
-            rates = _emit.prelude(equations.velocity, params, q.dtype, kept, sense)
-        return ScalarPrepared(first, *others)._replace(rates=rates)
+            return self.array.prepare(q, params, inputs, sample, kept, reacting, sense)
+
+        def before(code: Program | None, kept: Array | None) -> Array | None:
+            return None if code is None else _emit.prelude(code, params, q.dtype, kept, sense)
+
+        first = before(equations.program, reacting)
+        assert first is not None
+        rates = before(equations.velocity, kept)
+        if equations.surface is None:
+            return ScalarPrepared(first, rates=rates)
+        *moving, lam = equations.surface
+        others = [before(code, kept) for code in moving]
+        return ScalarPrepared(first, *others, lam=before(lam, reacting), rates=rates)
 
     def acceleration(
         self,
@@ -106,7 +110,7 @@ class ScalarTerms(Terms):
             return self.array.acceleration(t, q, v, params, inputs, prepared, kept)
         if prepared is not None:
             return self.rates(t, q, v, params, inputs, prepared)
-        own: Any = self.prepare(q, params, inputs, kept=kept)
+        own: Any = self.prepare(q, params, inputs, kept=kept, reacting=kept)
         a = self.rates(t, q, v, params, inputs, own)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
