@@ -40,6 +40,7 @@ from jaxlag._inputs import Linear as Linear  # noqa: E402
 from jaxlag._inputs import ZeroOrderHold as ZeroOrderHold  # noqa: E402
 from jaxlag._inverse import inverse_dynamics as inverse_dynamics  # noqa: E402
 from jaxlag._inverse import prescribed_motion as prescribed_motion  # noqa: E402
+from jaxlag._named import named as named  # noqa: E402
 from jaxlag._prediction import Prediction as Prediction  # noqa: E402
 from jaxlag._prediction import predict as predict  # noqa: E402
 from jaxlag._quasi import QuasiVelocities as QuasiVelocities  # noqa: E402

@@ -133,9 +133,13 @@ def check_start(
 def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
     """An array of this dtype; a numpy one where x is concrete, which costs no dispatch."""
     try:
-        return np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
+        given = np.asarray(x) if concrete(x) else jnp.asarray(x)
+        kinds = (jnp.floating, jnp.integer)
+        if any(jnp.issubdtype(given.dtype, kind) for kind in kinds):
+            return given.astype(dtype)
     except (TypeError, ValueError) as error:
         raise bad(argument, must, f"it was {x!r}") from error
+    raise bad(argument, must, f"it was {x!r}", "Only real numbers will do.")
 
 
 def check_times(ts: Any) -> tuple[Any, int | None]:
@@ -180,20 +184,28 @@ def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
             )
 
 
-def check_tolerances(method: Any, rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
+def check_tolerances(
+    system: System, method: Any, rtol: Any, atol: Any, dtype: Any
+) -> tuple[Any, Any]:
     """(rtol, atol) of the default controller, or of the one that `method` brings."""
     if isinstance(method, tuple):
         rtol, atol = (getattr(method[-1], name, None) for name in ("rtol", "atol"))
+        if np.ndim(atol):  # of every component of the state, which the controller knows
+            atol = jnp.max(jnp.asarray(atol))
+    elif isinstance(atol, Mapping):
+        atol = system.coordinates.flatten(atol, "atol")
     defaults = default_tolerances(dtype)
     rtol = _number("rtol", "be a number", defaults[0] if rtol is None else rtol, dtype)
     atol = _number("atol", "be a number", defaults[1] if atol is None else atol, dtype)
     for name, x in (("rtol", rtol), ("atol", atol)):
-        if x.ndim != 0:
-            raise bad(name, "be a number", f"its shape was {x.shape}")
-        if concrete(x) and not (np.isfinite(x) and x >= 0):
+        if x.ndim != 0 and (name == "rtol" or x.shape != (system.size,)):
+            or_each = f", or one for each of {system.size} coordinates" * (name == "atol")
+            must = f"be a number{or_each}"
+            raise bad(name, must, f"its shape was {x.shape}")
+        if concrete(x) and not np.all(np.isfinite(x) & (x >= 0)):
             raise bad(name, "be finite and not negative", f"it was {x}")
     if concrete(rtol, atol):
-        if rtol == 0 and atol == 0:
+        if rtol == 0 and np.any(atol == 0):
             raise bad("rtol and atol", "not both be zero", "both were")
         least = 10 * jnp.finfo(dtype).eps
         if 0 < rtol < least:
@@ -212,12 +224,22 @@ def check_tolerances(method: Any, rtol: Any, atol: Any, dtype: Any) -> tuple[Any
     return rtol, atol
 
 
+def check_longest(dt: Any, dt_max: Any) -> Any:
+    """The bound on adaptive steps, None for none."""
+    if dt is not None and dt_max is not None:
+        raise bad("dt_max", "be left out with fixed steps", "dt was given too")
+    return None if dt_max is None else _positive("dt_max", dt_max)
+
+
 def check_step(dt: Any, dt0: Any) -> Any:
+    """The fixed step, or the first one; None where neither is given."""
     if dt is not None and dt0 is not None:
         raise bad("dt and dt0", "be given one at a time", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
-    if step is None:
-        return None
+    return None if step is None else _positive(name, step)
+
+
+def _positive(name: str, step: Any) -> Any:
     step = _number(name, "be a number", step, jnp.result_type(float))
     if step.ndim != 0:
         raise bad(name, "be a number", f"its shape was {step.shape}")

@@ -14,7 +14,14 @@ from jaxlag import _params
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._errors import AssemblyError, bad
-from jaxlag._kkt import augmented, dependence_floor, independent_rows, row_sizes, solve_kkt
+from jaxlag._kkt import (
+    augmented,
+    closed_to,
+    dependence_floor,
+    independent_rows,
+    row_sizes,
+    solve_kkt,
+)
 from jaxlag._linalg import factor_mass
 from jaxlag._lowering import ArrayTerms
 from jaxlag._status import Status
@@ -153,6 +160,7 @@ def assemble(
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
+    _params.check(params)
     traced, static = _params.split(closing(system, params, q, None))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held
@@ -215,8 +223,8 @@ def _assembled(
         v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
-    size = row_sizes(all_rows, q, A)[1]
-    floor = float(jnp.finfo(q.dtype).eps) ** 0.7
+    size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))[1]
+    floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
     off = jnp.maximum(
         jnp.abs(rows.of_all(position)) / size / (1.0 + jnp.max(jnp.abs(q))),
         jnp.abs(velocity) / size / (1.0 + jnp.max(jnp.abs(v))),
@@ -251,12 +259,8 @@ def _independent(
 ) -> Bool[Array, " m"]:
     """A largest set of independent rows at q, rounding left out."""
     W, q = jax.lax.stop_gradient((W, q))
-
-    def still(q: Array) -> Array:
-        return jax.lax.stop_gradient(rows(q))
-
-    A = still(q)
-    there, _ = row_sizes(still, q, A)
+    A = jax.lax.stop_gradient(rows(q))
+    there, _ = row_sizes(rows, q, A)
     return independent_rows(W, A, turn, floor, there)
 
 

@@ -4,13 +4,15 @@ What it reads from globals and closures is read then, and holds for everything t
 of it: the motion, its energy, its derivatives.
 """
 
+import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from functools import update_wrapper
-from inspect import signature
+from inspect import signature, unwrap
+from types import CodeType
 from typing import Any, NamedTuple
-from weakref import WeakValueDictionary
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import equinox as eqx
 import jax
@@ -19,7 +21,9 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag import _params
 from jaxlag._closed import Closed, plain
+from jaxlag._errors import bad
 from jaxlag._input_values import InputValues
+from jaxlag._mishaps import said
 from jaxlag._outside import Outside, changes, outside
 from jaxlag._owned import owned
 
@@ -56,6 +60,7 @@ class Captured:
         self.function = function
         self._programs: dict[Any, _Program] = {}
         self._outside: Outside | None = None
+        self._told: set[str] = set()  # paths of Python ints that were warned about
         update_wrapper(self, function, updated=())  # an object's own attributes are its own
 
     def __hash__(self) -> int:
@@ -87,7 +92,7 @@ class Captured:
             kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
             program = self._programs.get(kind)
         except TypeError:  # a leaf without hash: no compiled program knows such params either
-            return self.function(*map(plain, arguments))
+            return _called(self.function, [plain(x) for x in arguments])
         if program is None:
             program = self._trace(kind, leaves)
         else:
@@ -108,6 +113,9 @@ class Captured:
         program = self._traced(tree, static, leaves, named)
         if not _params.concrete(*program.code.consts):
             return program
+        if not self._programs:
+            _count(self.function)
+        self._warn_of_counts(kind)
         if self._outside is None:
             # What the function changes itself is no business of its results: counters, records.
             own = {name for name, _, _ in changes(read)}
@@ -124,7 +132,7 @@ class Captured:
             arguments = list(_params.join(jax.tree.unflatten(tree, leaves), static.tree))
             for i in named:
                 arguments[i] = InputValues(arguments[i])
-            value = self.function(*arguments)
+            value = _called(self.function, arguments)
             for i in named:
                 read.update(arguments[i].read)
             dynamic, rest = eqx.partition(value, _params.is_array)
@@ -135,6 +143,34 @@ class Captured:
 
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
         return _Program(owned(code), form, static_part, frozenset(read))
+
+    def _warn_of_counts(self, kind: Any) -> None:
+        """Say where ints of Python's are given as if they were numbers: each value compiles anew.
+
+        That is so at the third value of one and the same leaf.
+        """
+        tree, static, *rest = kind
+        given, _ = jax.tree_util.tree_flatten_with_path(static.tree)
+        others = [
+            jax.tree.leaves(other.tree)
+            for form, other, *more in self._programs
+            if form == tree and other.treedef == static.treedef and more == rest
+        ]
+        for i, (path, leaf) in enumerate(given):
+            if type(leaf) is not int:
+                continue
+            values = {leaf, *(leaves[i] for leaves in others if type(leaves[i]) is int)}
+            name = _leaf(path)
+            if len(values) < MANY_VALUES or name in self._told:
+                continue
+            self._told.add(name)
+            warnings.warn(
+                f"{name} of {_named(self.function)} is the Python int {leaf}, the "
+                f"{len(values)}th value that it has: ints count as part of the program, which "
+                f"compiles anew for each of them. Write {float(leaf)} where it is a number.",
+                UserWarning,
+                stacklevel=1,
+            )
 
     @property
     def known(self) -> bool:
@@ -152,18 +188,66 @@ class Captured:
             warnings.warn(message, UserWarning, stacklevel=1)
 
 
-# Not a setting: the object for a function, as long as anybody holds it.
+MANY_VALUES = 3  # of one int among the params, after which it looks like a number
+MANY_FUNCTIONS = 20  # made of one piece of code, after which it looks like a loop
+_logger = logging.getLogger("jaxlag")
+# Not settings: how often a piece of code was declared anew; the object for a function, as long as
+# anybody holds it.
+_MADE: WeakKeyDictionary[CodeType, int] = WeakKeyDictionary()
 _ALIVE: WeakValueDictionary[Callable, Captured] = WeakValueDictionary()
 
 
+def _leaf(path: Any) -> str:
+    """A leaf of the params, by its path in the arguments of a function."""
+    return f"params{jax.tree_util.keystr(path[1:])}"
+
+
+def _count(function: Callable) -> None:
+    """Say once where a function is made anew again and again, as a lambda in a loop is."""
+    code = getattr(unwrap(function), "__code__", None)
+    if code is None:
+        return
+    _MADE[code] = _MADE.get(code, 0) + 1
+    if _MADE[code] == MANY_FUNCTIONS:
+        _logger.warning(
+            "%s (line %d of %s) was traced as a new function for the %dth time: systems made of "
+            "new functions compile anew. Define it once, outside of loops, and hand over what "
+            "changes in params.",
+            *(_named(function), code.co_firstlineno, code.co_filename, MANY_FUNCTIONS),
+        )
+
+
+def _called(function: Callable, arguments: list[Any]) -> Any:
+    """What the function returns; what goes wrong in it is said in our form where that helps."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        better = said(function, arguments, error)
+        if better is None:
+            raise
+        raise better from error
+
+
 def captured(function: Callable) -> Captured:
-    """The function as one that is traced once; the same object for the same function."""
+    """The function as one that is traced once; the same object for the same function.
+
+    Raises:
+        ValueError: it does not hash, as modules that hold arrays do not.
+    """
     if isinstance(function, Captured):
         return function
     try:
-        return _ALIVE.setdefault(function, Captured(function))
-    except TypeError:  # it has no hash
-        return Captured(function)
+        hash(function)
+    except TypeError as error:
+        module = getattr(function, "__self__", function)
+        raise bad(
+            f"function {_named(function)}",
+            "hash, as functions do that programs are compiled for",
+            f"the {type(module).__name__} that it belongs to holds arrays",
+            "Put the module into params and call it from a function: "
+            'def lagrangian(t, q, v, params): return params["model"](t, q, v).',
+        ) from error
+    return _ALIVE.setdefault(function, Captured(function))
 
 
 def once(function: Any) -> Any:

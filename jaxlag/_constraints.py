@@ -1,6 +1,6 @@
 """Constraints A(t,q) v + b(t,q) = 0, declared by one residual each; rows bear names."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -188,6 +188,9 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     if isinstance(constraints, AbstractConstraint):
         fix = "Write constraints=(constraint,)."
         raise bad("constraints", "be a sequence", "it was a single constraint", fix)
+    if not isinstance(constraints, Iterable):
+        was, fix = f"it was {constraints!r}", "Leave it out where there are none."
+        raise bad("constraints", "be a sequence of constraints", was, fix)
     constraints = tuple(constraints)
     names: list[str] = []
     for constraint in constraints:

@@ -15,13 +15,14 @@ class Coordinates:
     """Immutable, hashable table of coordinate names and shapes, in the order of flat q.
 
     Args:
-        declared: names, or a mapping from name to shape, e.g. `{"x": (8, 3), "theta": ()}`.
+        declared: names, or a mapping from name to shape, e.g. `{"x": (8, 3), "theta": ()}`; a
+            number n of entries stands for (n,).
 
     Raises:
         ValueError: no names, duplicate or empty names, shapes that are not tuples of sizes.
     """
 
-    def __init__(self, declared: Sequence[str] | Mapping[str, tuple[int, ...]]) -> None:
+    def __init__(self, declared: Sequence[str] | Mapping[str, tuple[int, ...] | int]) -> None:
         fix = 'Write coordinates=("x", "theta") or {"x": (8, 3), "theta": ()}.'
         if isinstance(declared, str) or not isinstance(declared, Sequence | Mapping):
             raise bad("coordinates", "be names, or names with shapes", f"it was {declared!r}", fix)
@@ -32,10 +33,11 @@ class Coordinates:
         )
         if not items:
             raise bad("coordinates", "name at least one coordinate", "it was empty", fix)
+        items = [(name, (s,) if _is_count(s) else s) for name, s in items]
         for name, shape in items:
             if not isinstance(name, str) or not name:
                 raise bad("coordinates", "be non-empty strings", f"one was {name!r}", fix)
-            if not isinstance(shape, tuple) or not all(isinstance(s, int) and s > 0 for s in shape):
+            if not isinstance(shape, tuple) or not all(map(_is_count, shape)):
                 raise bad(f"coordinates[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix)
         names = [name for name, _ in items]
         for name in names:
@@ -43,7 +45,8 @@ class Coordinates:
                 raise bad(
                     "coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times"
                 )
-        self.shapes: dict[str, tuple[int, ...]] = dict(items)
+        shapes: dict[str, Any] = dict(items)
+        self.shapes: dict[str, tuple[int, ...]] = shapes
         self.size = sum(math.prod(shape) for shape in self.shapes.values())
 
     @property
@@ -106,3 +109,7 @@ class Coordinates:
 
     def __repr__(self) -> str:
         return f"Coordinates({self.shapes})"
+
+
+def _is_count(x: Any) -> bool:
+    return isinstance(x, int) and not isinstance(x, bool) and x > 0

@@ -344,7 +344,9 @@ def _next_step(
     h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
     refused = (result != diffrax.RESULTS.successful) & ~cut
-    stuck = (~keep & ~(h > least)) | refused
+    # A controller with a least step proposes it again where no shorter one is left to try.
+    again = ~good & ~(h < t1 - t)
+    stuck = (~keep & ~(h > least)) | refused | again
     return keep & ~refused, h, control, jnp.asarray(jump), stuck
 
 

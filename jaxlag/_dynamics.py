@@ -12,14 +12,15 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
-from jaxlag._forces import reads_lam, sliding
+from jaxlag._errors import bad
+from jaxlag._forces import sliding
 from jaxlag._inputs import (
     all_knots,
     at_interval,
     evaluate,
     reads_state,
 )
-from jaxlag._kkt import independent_rows, row_sizes
+from jaxlag._kkt import Choice, independent_rows, row_sizes
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
@@ -51,6 +52,7 @@ class Dynamics(eqx.Module):
             quasi-velocities.
         stabilization: "projection", a `Baumgarte`, or None.
         regular: whether M is known to be positive definite without the constraints.
+        apart: whether rows whose multipliers forces read are known to be independent.
     """
 
     system: System
@@ -65,6 +67,7 @@ class Dynamics(eqx.Module):
     formulation: str = eqx.field(static=True, default="multipliers")
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool = eqx.field(static=True, default=False)
+    apart: bool = eqx.field(static=True, default=False)
 
     @property
     def terms(self) -> Terms:
@@ -77,7 +80,7 @@ class Dynamics(eqx.Module):
         return self._solved(terms)
 
     @property
-    def _array(self) -> ArrayTerms:
+    def array(self) -> ArrayTerms:
         """The array program."""
         terms = self.terms
         array = terms.array if isinstance(terms, ScalarTerms) else terms
@@ -102,9 +105,8 @@ class Dynamics(eqx.Module):
         if not self.rows.size:
             return terms
         baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
-        return replace(
-            terms, formulation=self.formulation, baumgarte=baumgarte, regular=self.regular
-        )
+        known = {"regular": self.regular, "apart": self.apart}
+        return replace(terms, formulation=self.formulation, baumgarte=baumgarte, **known)
 
     @property
     def projects(self) -> bool:
@@ -154,13 +156,20 @@ class Dynamics(eqx.Module):
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         there, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
         velocity = np.array(self.rows.velocity)
-        unread = np.ones(self.rows.size, bool)
-        if any(map(reads_lam, self.system.forces)):
-            unread = ~np.array(self._array.rows_read(t, q, v, params, values))
+        unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
         kept = independent_rows(M, A, 2 * velocity + unread, there=there)
         if not np.any(velocity & ~unread):  # then those that are read come first already
-            return RowChoice(kept, size, kept)
-        return RowChoice(kept, size, independent_rows(M, A, unread, there=there))
+            return RowChoice(kept, size, Choice(kept, there))
+        if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
+            label = self.rows.labels[int(np.argmax(velocity & ~unread))]
+            raise bad(
+                "project",
+                "be True where forces read multipliers of Pfaffian rows beside holonomic ones, "
+                "whose phi would not be damped if they follow from these",
+                f"it was {self.stabilization!r}, and a force reads {label!r}",
+            )
+        reacting = independent_rows(M, A, unread, there=there)
+        return RowChoice(kept, size, Choice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
@@ -316,7 +325,7 @@ class Dynamics(eqx.Module):
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> Array:
-            return self._array.correction(t, q, v, params, args.prepared, args.kept, chosen)
+            return self.array.correction(t, q, v, params, args.prepared, args.kept, chosen)
 
         def position(q: Array) -> Array:
             return terms.position(t, q, params)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxlag import _params
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import FORMULATIONS, augmented, factor_kkt, masked, row_sizes
+from jaxlag._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked, row_sizes
 from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
 from jaxlag._quasi import SINE
 from jaxlag._record import Outcome, Times
@@ -168,7 +168,11 @@ def _explained(
     row = jnp.full((), -1, jnp.int32)
     if dynamics.rows.size and dynamics.quasi is None:
         begin = jnp.concatenate([q0, w])
-        row = _dependent(dynamics, jnp.append(taus, start), jnp.vstack([states, begin]), args)
+        at = jnp.append(taus, start), jnp.vstack([states, begin]), args
+        row = _dependent(dynamics, args.kept, *at)
+        if args.rows is not None and args.rows.reacting.kept is not args.kept:
+            reacting = _dependent(dynamics, args.rows.reacting.kept, *at)
+            row = jnp.where(row >= 0, row, reacting)
     worst = jnp.where(jnp.all(jnp.isfinite(ahead)), worsts[1], worsts[0])
 
     unexplained = status == int(Status.nonfinite)
@@ -244,11 +248,14 @@ def _culprits(
     return first_unhealthy(M, factor), worst.astype(jnp.int32)
 
 
-def _dependent(dynamics: Dynamics, taus: Array, states: Array, args: Arguments) -> Int[Array, ""]:
+def _dependent(
+    dynamics: Dynamics, kept: Array | None, taus: Array, states: Array, args: Arguments
+) -> Int[Array, ""]:
     """The row that vanishes, or follows from those before it, or came close to that; -1 for none.
 
     Args:
         dynamics: what moves.
+        kept: rows that are solved with; None for all.
         taus: of a last good state, of one ahead of it, and of the start.
         states: these three.
         args: arguments.
@@ -259,21 +266,22 @@ def _dependent(dynamics: Dynamics, taus: Array, states: Array, args: Arguments) 
         t, q, v, params = dynamics.state(tau, y, args)
 
         def rows(q: Array) -> Array:
-            return masked(dynamics.terms.rows(t, q, v, params)[0], args.kept)
+            return masked(dynamics.terms.rows(t, q, v, params)[0], kept)
 
         A, M = rows(q), dynamics.mass(tau, y, args)
         there, _ = row_sizes(rows, q, A)
-        factor = factor_kkt(M, A, args.kept, FORMULATIONS[0])
+        factor = factor_kkt(M, A, kept, FORMULATIONS[0])
+        assert isinstance(factor, Multipliers)
         fine = factor.healthy[1] & there
-        return factor.schur.pivots, fine if args.kept is None else fine | ~args.kept
+        return factor.schur.pivots, fine if kept is None else fine | ~kept
 
     pivots, fine = jax.vmap(squares)(taus, states)
     eps = float(jnp.finfo(states.dtype).eps)
     # A small angle of its own, between rods that almost lie in line, is no fault.
     near = pivots[:2] < eps**0.5 * pivots[2]
     found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
-    if args.kept is not None:
-        found = found & args.kept
+    if kept is not None:
+        found = found & kept
     return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
 
 

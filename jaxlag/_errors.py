@@ -5,7 +5,10 @@ from inspect import Parameter, signature
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+
+from jaxlag._closed import plain
 
 
 class SimulationError(RuntimeError):
@@ -64,10 +67,19 @@ def real_scalar(argument: str, function: Callable) -> Callable:
             raise bad(argument, "return an array", f"it returned {value!r}", fix)
         value = jnp.asarray(value)
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-            raise bad(argument, must, f"it returned {value.dtype} of shape {value.shape}", fix)
+            was = f"it returned {value.dtype} of shape {value.shape}"
+            raise bad(argument, must, was, _narrowed(arguments[-1]) or fix)
         return value
 
     return checked
+
+
+def _narrowed(params: Any) -> str:
+    """What to do about a parameter of one entry, which makes arrays of scalars."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(plain(params))[0]:
+        if jnp.shape(leaf) == (1,):
+            return f"params{jax.tree_util.keystr(path)} has shape (1,): give a number, or index it."
+    return ""
 
 
 def wants(function: Callable, position: int, name: str) -> bool:
@@ -106,3 +118,21 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
             f"its signature was {signature(function)}",
             "Add or drop arguments so that it takes exactly these, in this order.",
         )
+    for place, (name, other) in enumerate(zip(names, _positional(function), strict=False)):
+        if other in names and names.index(other) != place:
+            raise bad(
+                argument,
+                f"take {form} in this order",
+                f"its signature was {signature(function)}",
+                f"{other!r} stands where {name!r} is handed over.",
+            )
+
+
+def _positional(function: Callable) -> list[str]:
+    """Names of the arguments that it takes by position, as far as they are known."""
+    try:
+        parameters = signature(function).parameters.values()
+    except ValueError:
+        return []
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return [p.name for p in parameters if p.kind in kinds]

@@ -66,9 +66,10 @@ class GeneralizedForce(AbstractForce):
     is in rad; positive Q_i pushes towards larger q_i (Pila, eq. 3.25 ff.).
 
     With `reaction=True` the force depends on the multipliers of constraints, as friction does on
-    a normal reaction; it is solved for together with them. Where no solution exists (Painleve's
-    paradox), a contact lifts off or its sliding stops or reverses, a motion ends with the status
-    no_reaction_solution.
+    a normal reaction; it is solved for together with them. Where rows depend on one another, those
+    that are read share the reaction as equals (of least norm), and others take none of it. Where no
+    solution exists (Painleve's paradox), a contact lifts off or its sliding stops or reverses, a
+    motion ends with the status no_reaction_solution.
 
     Args:
         Q: function `Q(t, q, v, params, inputs)` or `Q(t, q, v, params)` returning shape (n,); with
@@ -311,6 +312,9 @@ def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
     """Forces as a tuple; raises unless each is one of the classes here, under a name of its own."""
     if isinstance(forces, AbstractForce):
         raise bad("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
+    if not isinstance(forces, Iterable):
+        was = f"it was {forces!r}"
+        raise bad("forces", "be a sequence of forces", was, "Leave it out where there are none.")
     forces = tuple(forces)
     names: list[str] = []
     for force in forces:

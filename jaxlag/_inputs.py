@@ -77,29 +77,34 @@ def _inexact(x: Any) -> Array:
 
 def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
     times, values = _inexact(times), _inexact(values)
-    if times.ndim != 1 or times.shape[0] < 2:
-        raise bad(
-            f"{kind}: times", "be one row of at least 2 times", f"its shape was {times.shape}"
-        )
+    _increasing(f"{kind}: times", times, 2)
     if values.ndim < 1 or values.shape[0] != times.shape[0]:
         raise bad(
             f"{kind}: values",
             f"have one entry per time, {times.shape[0]}",
             f"its shape was {values.shape}",
         )
-    if concrete(times):
-        steps = np.diff(np.asarray(times, float))
-        if not np.all(steps > 0):
-            i = int(np.argmin(steps > 0))
-            raise bad(
-                f"{kind}: times",
-                "increase strictly",
-                f"times[{i}] = {times[i]} and times[{i + 1}] = {times[i + 1]}",
-                "Sort the table and drop repeated times.",
-            )
     if concrete(values) and not np.all(np.isfinite(values)):
         raise bad(f"{kind}: values", "be finite", "some were nan or inf")
     return times, values
+
+
+def _increasing(argument: str, times: Array, least: int) -> Array:
+    """Times as they are; raises unless there are so many and they increase, as far as is known."""
+    if times.ndim != 1 or times.shape[0] < least:
+        must = f"be one row of at least {least} times"
+        raise bad(argument, must, f"its shape was {times.shape}")
+    if concrete(times):
+        steps = np.diff(np.asarray(times, float))
+        if not np.all(steps > 0):
+            i, name = int(np.argmin(steps > 0)), argument.split()[-1]
+            raise bad(
+                argument,
+                "increase strictly",
+                f"{name}[{i}] = {times[i]} and {name}[{i + 1}] = {times[i + 1]}",
+                "Sort the times and drop repeated ones.",
+            )
+    return times
 
 
 def _interval(times: Array, t: Array, last: int) -> Array:
@@ -115,7 +120,8 @@ class ZeroOrderHold(AbstractTable):
 
     Args:
         times: shape (k,), s, strictly increasing, k >= 2.
-        values: shape (k, ...), in the unit the force expects.
+        values: shape (k, ...), in the unit the force expects; or (k - 1, ...), one for each
+            interval between the times, the last of which then holds at the last time, too.
 
     Raises:
         ValueError: shapes differ, times do not increase, values are not finite.
@@ -125,6 +131,10 @@ class ZeroOrderHold(AbstractTable):
     values: Array
 
     def __init__(self, times: Any, values: Any) -> None:
+        intervals = np.size(times) - 1
+        if intervals > 0 and np.shape(values)[:1] == (intervals,):
+            last = np.arange(intervals + 1).clip(max=intervals - 1)
+            values = np.asarray(values)[last] if concrete(values) else jnp.asarray(values)[last]
         self.times, self.values = _table("ZeroOrderHold", times, values)
 
     def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
@@ -190,22 +200,47 @@ def _called(f: Callable, params: Any, *arguments: Any) -> Any:
 
 
 class Function(AbstractInput):
-    """A signal u(t) given by a smooth function of time, or of time and params.
+    """A signal u(t) given by a function of time, or of time and params, smooth between its knots.
+
+    Where it jumps, or bends, name the times: steps end there, and each step sees the side that it
+    lies on. What is shorter than a step and not named may be stepped over; `simulate(dt_max=)`
+    bounds the steps.
 
     Args:
         f: function `f(t)` or `f(t, params)`; t in s. An equinox module keeps its arrays traced.
+        knots: shape (k,), s, increasing: where steps are to end. At a jump f(t) is the value from
+            there on.
 
     Raises:
-        ValueError: `f` is not callable in either form.
+        ValueError: `f` is not callable in either form; knots that are no row of increasing numbers.
     """
 
     f: Callable
     takes_params: bool = eqx.field(static=True)
+    times: Float[Array, " k"] | None
+    within: Float[Array, "2"] | None
 
-    def __init__(self, f: Callable) -> None:
+    def __init__(self, f: Callable, knots: Any = None) -> None:
         self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
         require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
         self.f = once(f)
+        self.times = self.within = None
+        if knots is not None:
+            self.times = _increasing("Function: knots", _inexact(knots), 1)
+            self.within = _inexact([-np.inf, np.inf])
+
+    def knots(self) -> Float[Array, " k"] | None:
+        """The times that were named."""
+        return self.times
+
+    def around(self, t: Float[Array, ""]) -> "Function":
+        """The same signal in the interval between knots that holds t, both of its ends included."""
+        assert self.times is not None
+        never = jnp.full((1,), jnp.inf, self.times.dtype)
+        ends = jnp.concatenate([-never, self.times, never])
+        start = jnp.searchsorted(self.times, t, side="right")
+        within = jax.lax.dynamic_slice_in_dim(ends, start, 2)
+        return eqx.tree_at(lambda s: s.within, self, within)
 
     def value(
         self,
@@ -216,6 +251,10 @@ class Function(AbstractInput):
         interval: Int[Array, ""] | int | None,
     ) -> Array:
         """f(t) or f(t, params)."""
+        if self.within is not None:
+            first, last = jax.lax.stop_gradient(self.within).astype(t.dtype)
+            inside = jnp.clip(t, first, jnp.nextafter(last, -jnp.inf))
+            t = t + jax.lax.stop_gradient(inside - t)
         more = (params,) if self.takes_params else ()
         return jnp.asarray(_called(self.f, params, t, *more))
 
@@ -325,7 +364,8 @@ def at_interval(
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """The inputs with the two rows of each table around a time, and where these begin.
 
-    In them the interval is the first one, and time counts from `origin`.
+    Functions with knots are those of the interval around it. In the tables the interval is the
+    first one, and time counts from `origin`.
     """
     starts = {}
     cuts = dict(inputs)
@@ -334,14 +374,19 @@ def at_interval(
         starts[name] = start = _interval(table.times, t, last)
         rows = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=2)
         cuts[name] = table.cut(rows(table.times) - origin, rows(table.values))
+    for name, signal in inputs.items():
+        if isinstance(signal, Function) and signal.times is not None:
+            cuts[name] = signal.around(t)
     return cuts, starts
 
 
 def in_order(inputs: Mapping[str, Any]) -> Bool[Array, ""]:
-    """Whether the times of all tables are finite and increase strictly."""
+    """Whether the times of all knots are finite and increase strictly."""
     right = jnp.array(True)
-    for table in tables(inputs).values():
-        times = table.times
+    for signal in inputs.values():
+        times = signal.knots() if isinstance(signal, AbstractInput) else None
+        if times is None:
+            continue
         right = right & jnp.all(jnp.isfinite(times)) & jnp.all(times[1:] > times[:-1])
     return right
 
@@ -360,8 +405,7 @@ def all_knots(inputs: Mapping[str, Any]) -> Float[Array, " k"] | None:
 
 def common_range(inputs: Mapping[str, Any]) -> tuple[Array, Array] | None:
     """(first, last) time at which every table is defined; None without tables."""
-    tables = [s.knots() for s in inputs.values() if isinstance(s, AbstractInput)]
-    present = [k for k in tables if k is not None]
+    present = [table.times for table in tables(inputs).values()]
     if not present:
         return None
     first = jnp.max(jnp.stack([k[0] for k in present]))

@@ -32,6 +32,22 @@ def closed_to(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
+class Choice(NamedTuple):
+    """Rows to solve with.
+
+    Attributes:
+        kept: a largest set of independent ones; the others follow from them.
+        there: those that are more than rounding.
+    """
+
+    kept: Bool[Array, " m"]
+    there: Bool[Array, " m"]
+
+
+ROUNDINGS = 16
+"""Of the coordinates: a row that they make is none."""
+
+
 class Multipliers(NamedTuple):
     """M + A^T W A and the Schur complement S = A (M + A^T W A)^-1 A^T, each factored once."""
 
@@ -343,21 +359,32 @@ def row_sizes(
 ) -> tuple[Bool[Array, " m"], Float[Array, " m"]]:
     """(whether rows are more than rounding, their lengths, or how fast they grow where not).
 
-    At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever.
+    At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever: what
+    a few roundings of the coordinates change.
 
     Args:
         rows: A as a function of q.
         q: coordinates.
         A: rows(q).
     """
-    eps = float(jnp.finfo(q.dtype).eps)
+    eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
-    signs = jnp.asarray((-1.0) ** np.arange(q.shape[0]), q.dtype)
-    beside = rows(q + small * signs * (1.0 + jnp.abs(q)))
-    norms, growth = (jnp.sqrt(jnp.sum(x**2, axis=1)) for x in (A, (beside - A) / small))
-    there = norms > 1e3 * eps * growth
+    signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
+    ways = jnp.concatenate([ROUNDINGS * eps * signs * jnp.abs(q), small * signs])
+    changes = jax.lax.stop_gradient(jax.vmap(rows)(q + ways) - A)
+    rounding, growth = jnp.max(_lengths(changes).reshape(2, 2, -1), axis=1)
+    growth = growth / small
+    norms = _lengths(A)
+    # What is not known, as derivatives beside the end of a domain, speaks for the row.
+    there = (norms > 0) & ~(norms <= rounding)
     size = jnp.where(there, norms, growth)
     return there, jnp.where(size > 0, size, 1.0)
+
+
+def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
+    """Lengths of rows; derivatives of those that vanish are 0."""
+    square = jnp.sum(A**2, axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def rows_hold(
@@ -412,7 +439,7 @@ def independent_rows(
     floor = rank_floor(A.dtype) if floor is None else floor
     nonzero = norms > 0
     usable = nonzero if there is None else nonzero & there
-    if m == 1:
+    if m == 1:  # nothing to depend on
         return usable
     A = A / jnp.where(usable, norms, 1.0)[:, None]
     mass = factor_mass(augmented(M, A)[0])
@@ -437,7 +464,10 @@ def independent_rows(
 
 
 def least_norm(
-    A: Float[Array, "m n"], lam: Float[Array, " m"], kept: Bool[Array, " m"] | None = None
+    A: Float[Array, "m n"],
+    lam: Float[Array, " m"],
+    kept: Bool[Array, " m"] | None = None,
+    there: Bool[Array, " m"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
 
@@ -450,6 +480,7 @@ def least_norm(
         A: rows.
         lam: multipliers with that A^T lam.
         kept: a largest set of independent rows; by default it is looked for.
+        there: rows that are more than rounding, see `row_sizes`; by default those that are not 0.
 
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
@@ -458,7 +489,9 @@ def least_norm(
         return lam
     if kept is None:
         kept = independent_rows(jnp.eye(n, dtype=A.dtype), jax.lax.stop_gradient(A))
-    norms = jnp.sqrt(jnp.sum(A**2, axis=1))
+    if there is not None:
+        A = jnp.where(there[:, None], A, 0.0)
+    norms = _lengths(A)
     norms = jnp.where(norms > 0, norms, 1.0)
     unit = A / norms[:, None]
     gram, one = unit @ unit.T, jnp.eye(m, dtype=A.dtype)
@@ -473,26 +506,24 @@ def least_norm(
     return (C @ jnp.linalg.solve(square, of_kept)) / norms
 
 
-def as_read(
+def shared(
     A: Float[Array, "m n"],
     lam: Float[Array, " m"],
-    kept: Bool[Array, " m"] | None,
-    read: tuple[bool, ...],
+    kept: Bool[Array, " m"],
+    there: Bool[Array, " m"],
+    group: Sequence[bool] | np.ndarray,
 ) -> Float[Array, " m"]:
-    """The multipliers as forces see them that read some of them: of least norm among those rows.
-
-    So two rows for one contact share its reaction, a row that nothing reads takes none of it, and
-    whatever else depends on these is of least norm among itself.
+    """The multipliers with those of a group of rows of least norm among themselves.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam, 0 where rows are not kept.
-        kept: a largest set of independent rows, first of those that are read; None for all.
-        read: for every row, whether a force reads its multiplier.
+        kept: a largest set of independent rows, first of those of the group.
+        there: rows that are more than rounding.
+        group: for every row, whether it belongs to the group.
     """
-    if kept is None:
+    chosen = np.flatnonzero(group)
+    if len(chosen) < 2:
         return lam
-    for group in (np.flatnonzero(read), np.flatnonzero(np.logical_not(read))):
-        if len(group) > 1:
-            lam = lam.at[group].set(least_norm(A[group], lam[group], kept[group]))
-    return lam
+    found = least_norm(*(x[chosen] for x in (A, lam, kept, there)))
+    return lam.at[chosen].set(found)

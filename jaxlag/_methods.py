@@ -1,6 +1,7 @@
 """From `method`, tolerances and dt to a diffrax solver and step-size controller."""
 
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
@@ -51,6 +52,25 @@ METHODS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "variational2": partial(LobattoIIIAB, 2),
     "variational4": partial(LobattoIIIAB, 3),
 }
+HABITS = {
+    **dict.fromkeys(("rk4", "runge-kutta", "rk"), "'dopri5' with dt=, of order 5"),
+    **dict.fromkeys(("rk45", "ode45", "dopri", "lsoda"), "'tsit5' or 'dopri5'"),
+    **dict.fromkeys(("rk23", "ode23"), "'bosh3'"),
+    **dict.fromkeys(("dop853", "dopri853", "rk8"), "'dopri8'"),
+    **dict.fromkeys(("radau", "bdf", "ode15s", "stiff", "implicit"), "'kvaerno5'"),
+    **dict.fromkeys(
+        ("symplectic", "hamiltonian", "geometric"),
+        "'splitting4' where L = T(v) - V(q), 'gauss4' for any L, 'variational4' under "
+        "constraints, each with dt=",
+    ),
+    **dict.fromkeys(
+        ("verlet", "leapfrog", "stormer", "semi_implicit_euler", "symplectic_euler"),
+        "'splitting2' with dt=",
+    ),
+    **dict.fromkeys(("yoshida", "forest-ruth"), "'splitting4' with dt="),
+    **dict.fromkeys(("midpoint_implicit", "implicit_midpoint"), "'gauss2' with dt="),
+}
+"""Names that other libraries have for methods, and what comes nearest to them here."""
 LOOSE, TIGHT = 1e-3, 1e-12  # rtol from which order 5, and up to which order 9 is taken
 IMPLICIT = "kvaerno5"  # where explicit steps run out
 FINER = {"bosh3": "tsit5", "tsit5": "dopri8", "dopri5": "dopri8", "dopri8": "prince9"}
@@ -67,7 +87,7 @@ def choose(
         method: "auto", a name of METHODS, a diffrax solver, or (solver, controller).
         adaptive: whether dt was left out.
         rtol: relative tolerance of the default controller, and of implicit equations.
-        atol: absolute tolerance, the same.
+        atol: absolute tolerance, the same; of every component of the state where it is an array.
 
     Raises:
         ValueError: unknown name, a solver for other kinds of equations, a controller together
@@ -89,7 +109,7 @@ def choose(
             )
     # rtol has no unit; atol has those of the coordinates.
     known = adaptive and _params.concrete((rtol, atol))
-    solver = _solver(method, (rtol if rtol > 0 else atol) if known else None)
+    solver = _solver(method, (rtol if rtol > 0 else np.min(atol)) if known else None)
     if adaptive and isinstance(solver, AbstractFixedStep):
         raise bad(
             "dt",
@@ -150,6 +170,16 @@ def name_of(solver: diffrax.AbstractSolver) -> str:
     return default
 
 
+def _nearest(name: str) -> str:
+    """What comes nearest to a name that other libraries have, or that is written otherwise."""
+    plain = name.lower().replace("-", "_")
+    found = HABITS.get(plain) or HABITS.get(plain.replace("_", "-"))
+    if found is None:
+        close = get_close_matches(plain, METHODS, 1)
+        found = repr(close[0]) if close else None
+    return "" if found is None else f"The nearest is {found}."
+
+
 def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
     if isinstance(method, str):
         name = automatic(tolerance) if method == "auto" else method
@@ -158,6 +188,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
                 "method",
                 f"be 'auto', one of {sorted(METHODS)}, a diffrax solver or (solver, controller)",
                 f"it was {method!r}",
+                _nearest(method),
             )
         method = METHODS[name]()
     if not isinstance(method, diffrax.AbstractSolver):
@@ -222,6 +253,34 @@ def _with_tolerances(
     )
 
 
+def for_state(solver: Any, controller: Any, n: int, size: int) -> tuple[Any, Any]:
+    """Solver and controller with one atol for every component of the state.
+
+    Where there was one for every coordinate; velocities have that of their coordinates.
+
+    Args:
+        solver: of `choose`.
+        controller: the same.
+        n: number of coordinates.
+        size: of the state (q, v), with whatever is integrated along behind it.
+    """
+
+    def of(owner: Any) -> Any:
+        atol: Any = getattr(owner, "atol", None)
+        if not eqx.is_array(atol) or atol.shape != (n,):
+            return owner
+        rest = jnp.full((size - 2 * n,), jnp.max(atol))
+        return eqx.tree_at(lambda x: x.atol, owner, jnp.concatenate([atol, atol, rest]))
+
+    finder = getattr(solver, "root_finder", None)
+    if finder is not None:
+        solver = eqx.tree_at(lambda s: s.root_finder, solver, of(finder))
+    return solver, of(controller)
+
+
 def default_tolerances(dtype: Any) -> tuple[float, float]:
-    """(rtol, atol): 1e-9 in float64, 1e-5 and 1e-6 in float32."""
-    return (1e-9, 1e-9) if jnp.finfo(dtype).bits == 64 else (1e-5, 1e-6)
+    """(rtol, atol): 1e-9 in float64, 1e-5 and 1e-6 in float32, 20 roundings in less than that."""
+    if jnp.finfo(dtype).bits >= 32:
+        return (1e-9, 1e-9) if jnp.finfo(dtype).bits == 64 else (1e-5, 1e-6)
+    least = 20.0 * float(jnp.finfo(dtype).eps)
+    return least, least

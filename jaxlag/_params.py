@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxlag._errors import bad
+
 
 class _Frozen:
-    """A concrete integer or boolean array, hashable by value."""
+    """A concrete array of truth values, or a number of numpy's, hashable by value."""
 
     def __init__(self, array: Any) -> None:
         self.array = np.array(array)  # a copy: the caller may change theirs
@@ -36,8 +38,53 @@ def concrete(*arrays: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
+def known(x: Any) -> np.ndarray | None:
+    """The value of a number or an array of numbers, of tracers where they have one; else None."""
+    look = getattr(x, "to_concrete_value", None) if isinstance(x, Tracer) else None
+    x = look() if look is not None else x
+    if x is None or isinstance(x, Tracer) or _is_key(x) or not eqx.is_array_like(x):
+        return None
+    return np.asarray(x)
+
+
+def check(params: Any) -> None:
+    """Raise on numbers that are not finite, and on objects that no program can be keyed by.
+
+    Raises:
+        ValueError: with the leaf by its path.
+    """
+    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        value = known(leaf)
+        if value is not None and np.issubdtype(value.dtype, np.inexact):
+            fine = np.isfinite(value)
+            if not np.all(fine):
+                at, was = "", value
+                if value.ndim:
+                    index = tuple(int(i) for i in np.argwhere(~fine)[0])
+                    at, was = f"[{', '.join(map(str, index))}]", value[index]
+                must = "be finite"
+                raise bad(f"params{jax.tree_util.keystr(path)}{at}", must, f"it was {was}")
+        elif value is None and not is_array(leaf):
+            try:
+                hash(leaf)
+            except TypeError as error:
+                raise bad(
+                    f"params{jax.tree_util.keystr(path)}",
+                    "be a number, an array, or an object that hashes",
+                    f"it was {leaf!r}",
+                    "Write a tuple for a list or a set, or make it an equinox module.",
+                ) from error
+
+
+def _is_key(x: Any) -> bool:
+    """Whether it is an array of typed random keys."""
+    return eqx.is_array(x) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
 def _is_traced(leaf: Any) -> bool:
-    if not concrete(leaf):
+    if not concrete(leaf) or _is_key(leaf):
+        return True
+    if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.integer):
         return True
     return eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
 
@@ -45,8 +92,8 @@ def _is_traced(leaf: Any) -> bool:
 def split(tree: Any) -> tuple[Any, Any]:
     """(traced, static) halves of a pytree, put together again by `join`.
 
-    Inexact arrays, Python floats and tracers are traced; integers, booleans, strings and
-    functions are static: part of the key under which the compiled program is cached.
+    Arrays of numbers, Python floats, random keys and tracers are traced; Python ints, truth values,
+    strings and functions are static: part of the key under which the compiled program is cached.
     """
 
     def traced_half(leaf: Any) -> Any:
@@ -69,7 +116,10 @@ def join(traced: Any, static: Any) -> Any:
 def shapes(traced: Any) -> Any:
     """Traced params without their values: shapes, dtypes, and which of them give way to others."""
     return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=bool(x.weak_type)), traced
+        lambda x: jax.ShapeDtypeStruct(
+            x.shape, x.dtype, weak_type=bool(getattr(x, "weak_type", False))
+        ),
+        traced,
     )
 
 

@@ -16,6 +16,7 @@ from jaxlag._constraints import Baumgarte
 from jaxlag._dynamics import Dynamics
 from jaxlag._gradient import Keep
 from jaxlag._inputs import all_knots, common_range, in_order
+from jaxlag._methods import for_state
 from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
@@ -44,6 +45,7 @@ class Plan(NamedTuple):
     stabilization: str | Baumgarte | None
     assemble: bool
     regular: bool
+    apart: bool
     keep: Keep
     auto: bool  # whether the method may be chosen by the structure of the system
 
@@ -61,6 +63,7 @@ class Values(NamedTuple):
     rtol: Array
     atol: Array
     step: Array | None  # dt or dt0
+    longest: Array | None = None  # dt_max
 
 
 def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
@@ -79,6 +82,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         formulation=plan.formulation,
         stabilization=plan.stabilization,
         regular=plan.regular,
+        apart=plan.apart,
     )
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
@@ -119,19 +123,22 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
     if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
         dynamics = replace(dynamics, stabilization=None)
+    solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
     settling = Settling(dynamics)
     settle = settling if settling.settles else None
     term = term_of(dynamics, start, y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
-    scheme = Scheme(solver, controller, term, dynamics.windows, settle, dynamics.projects)
+    how = (dynamics.windows, settle, dynamics.projects, values.longest)
+    scheme = Scheme(solver, controller, term, *how)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
     given = jnp.concatenate([values.q0, speeds])
     saves = dynamics.turned(values.ts, args)
-    valid = values_allowed(given, saves, values.rtol, values.atol, values.step)
+    steps = (values.step, values.longest)
+    valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
     valid = valid & in_order(inputs)
     finite = start_finite(dynamics, start, y0, args)
     pressed = settling.pressed(start, y0, args)

@@ -66,7 +66,8 @@ class AbstractReactions(AbstractQuantities):
     ) -> Float[Array, " n"]:
         """Acceleration a with M a + h = Q + A^T lam, shape (n,), m/s^2 or rad/s^2.
 
-        NaN where M is singular, under constraints where it is so on their tangent space.
+        NaN where M is singular, under constraints where it is so on their tangent space, and where
+        no acceleration satisfies all rows, as in turning through a dead point.
 
         Args:
             params: as the Lagrangian takes them.
@@ -94,8 +95,9 @@ class AbstractReactions(AbstractQuantities):
         """Multipliers lam of M a + h = Q + A^T lam, A a + gamma = 0, by the name of the row.
 
         Where rows depend on one another, those of least norm sum_k (|A_k| lam_k)^2, in which
-        |A_k lam_k| is the generalized force of row k alone. The unit is J over that of the row's
-        residual, for a `Pfaffian` W over it: N for a length or a velocity.
+        |A_k lam_k| is the generalized force of row k alone; where forces read multipliers, of least
+        norm among the rows that they read, as they see them, and among the others. The unit is J
+        over that of the row's residual, for a `Pfaffian` W over it: N for a length or a velocity.
 
         Args:
             params: as the Lagrangian takes them.

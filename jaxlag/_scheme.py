@@ -90,6 +90,7 @@ class Scheme(eqx.Module):
         eps = jnp.finfo(y.dtype).eps
         part = (jnp.maximum(controller.rtol, eps) * math.gamma(order + 1)) ** (1 / order)
         longest = jnp.where(unseen, part / rate, jnp.inf).astype(zero.dtype)
+        longest = longest if self.longest is None else jnp.minimum(longest, self.longest)
         return replace(self, longest=longest)
 
     def begin(self, t0: Array, t1: Array, y: PyTree, args: Any) -> Any:

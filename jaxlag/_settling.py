@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam, sliding
 from jaxlag._kkt import closed_to
-from jaxlag._lowering import ScalarPrepared, ScalarTerms
+from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
 from jaxlag._projection import Surface, project
 from jaxlag._step import Arguments, Verdict
 
@@ -80,7 +80,9 @@ class Settling(eqx.Module):
             if isinstance(args.prepared, ScalarPrepared) and isinstance(terms, ScalarTerms):
                 lam = terms.multipliers(t, q, v, params, values, args.prepared)
             else:
-                lam = terms.reactions(t, q, v, params, values)[1]
+                array, prepared = self.dynamics.array, args.prepared
+                assert isinstance(prepared, Prepared)
+                lam = array.multipliers(t, q, v, params, values, prepared, args.reacting)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
             assert args.senses is not None

@@ -12,6 +12,7 @@ import numpy as np
 from jaxlag import _params, _xla
 from jaxlag._arguments import (
     check_formulation,
+    check_longest,
     check_method,
     check_options,
     check_start,
@@ -29,6 +30,7 @@ from jaxlag._gradient import choose_gradient
 from jaxlag._inputs import check_inputs, check_range
 from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._patience import timed
+from jaxlag._placement import check_placement
 from jaxlag._pose import Plan, Values, pose, velocities_at
 from jaxlag._replay import solve
 from jaxlag._scheme import Scheme, remembers
@@ -58,6 +60,7 @@ def simulate(
     atol: Any = None,
     dt: Any = None,
     dt0: Any = None,
+    dt_max: Any = None,
     max_steps: int = MAX_STEPS,
     save: tuple[str, ...] = (),
     gradient: str = "auto",
@@ -70,14 +73,14 @@ def simulate(
     """Integrate M a + h = Q + A^T lam, A v + b = 0 from (q0, v0) at ts[0]; return it at ts.
 
     Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. Other values of q0, v0, ts,
-    inputs, rtol, atol, dt, dt0 and of the traced params never recompile, unless a tolerance makes
-    "auto" another method; another number of times, method, static or structure of params does, and
-    so does turning the direction of time round, and each transform. What takes more than 5 s is
-    said on the log "jaxlag".
+    inputs, rtol, atol, dt, dt0, dt_max and of the traced params never recompile, unless a tolerance
+    makes "auto" another method; another number of times, method, static or structure of params
+    does, and so does turning the direction of time round, and each transform. What takes more than
+    5 s is said on the log "jaxlag".
 
     The derivative under every transform is that of the solution at the frozen sequence of
     accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
-    coincide, only for moving them together). It is zero in dt, dt0, rtol and atol.
+    coincide, only for moving them together). It is zero in dt, dt0, dt_max, rtol and atol.
 
     Args:
         system: what moves.
@@ -108,15 +111,21 @@ def simulate(
             constraints held inside the step, so that `project` has nothing to do.
         formulation: what the state is and how accelerations are found.
             "quasi" ("auto" where quasi-velocities are declared and take care of all rows): (q, u)
-            with the quasi-velocities that are not constrained, no multipliers.
+            with the quasi-velocities that are not constrained, no multipliers. Kinematics do so
+            where they leave no more freedoms than there are coordinates less rows.
             "multipliers" ("auto" else): (q, v), M + A^T W A and its Schur complement, factored once
             each. "null_space": (q, v), M on the tangent space of the constraints. Both take an M
             that is singular, but not on that space (links without mass).
         rtol: relative bound on the local error; by default 1e-9 in float64, 1e-5 in float32.
-        atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32.
+        atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32. A
+            number, or one for every coordinate and its velocity: (n,) of them, or a dict by name.
         dt: fixed step in s (positive, whichever way time runs); the last one is shortened to
             land on ts[-1].
         dt0: first step in s of an adaptive solve, positive; by default chosen from the start.
+        dt_max: bound on the steps of an adaptive solve in s, positive; None for none. A pulse, of a
+            `Function` or of explicit time, that is shorter than a step and between two of its
+            stages is not seen: bound the steps by its length, or say where it begins and ends
+            (`Function(f, knots=)`).
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
             "potential", "Q", "power", "lam", "constraint_force", which the Solution computes on
@@ -172,9 +181,14 @@ def simulate(
     ts, direction = check_times(ts)
     inputs = check_inputs(inputs)
     check_range(inputs, ts)
-    rtol, atol = check_tolerances(method, rtol, atol, q0.dtype)
-    step = check_step(dt, dt0)
+    rtol, atol = check_tolerances(system, method, rtol, atol, q0.dtype)
+    step, longest = check_step(dt, dt0), check_longest(dt, dt_max)
+    _params.check(params)
+    check_placement("simulate", (q0, v0, u0, ts, params, inputs))
     formulation = check_formulation(system, formulation, project, params, q0.dtype)
+    if np.ndim(atol) and formulation == "quasi":
+        must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
+        raise bad("atol", must, was, "Or pass formulation='multipliers'.")
     params = closing(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
@@ -202,12 +216,14 @@ def simulate(
         stabilization=project if isinstance(project, Baumgarte) else _PROJECTION[project],
         assemble=assemble,
         regular=system.mass_regular(params, ts[0], q0, v0),
+        apart=not assemble and system.contacts_apart(params, ts[0], q0, v0, inputs),
         keep=choose_gradient(
             gradient, gradient_memory, max_steps, ts.shape[0], size, q0.dtype.itemsize
         ),
         auto=method == "auto" and "work" not in save,
     )
-    values = Values(q0, v0, u0, ts, params_traced, inputs_traced, scheme_traced, rtol, atol, step)
+    start = q0, v0, u0, ts, params_traced, inputs_traced
+    values = Values(*start, scheme_traced, rtol, atol, step, longest)
     _xla.warn_if_late()
     for function in functions_of((system, inputs)):
         function.warn()
@@ -308,6 +324,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
         tolerances=None if scheme.controller is None else (values.rtol, values.atol),
+        dt_max=values.longest,
     )
 
 

@@ -15,7 +15,7 @@ from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
 from jaxlag._projection import turns_needed
 from jaxlag._scheme import linearized
-from jaxlag._status import Status
+from jaxlag._status import ADVICE, ADVICE_FIXED, Status
 from jaxlag._term import term_of
 
 if TYPE_CHECKING:
@@ -59,11 +59,44 @@ class Rates(NamedTuple):
 
 def is_stiff(motion: "Solution") -> bool:
     """Whether explicit steps are about as long as the fastest decay lets them be stable."""
+    return _stiffness(motion) is not None
+
+
+def _stiffness(motion: "Solution") -> Rates | None:
+    """The decay that explicit steps are as short as they must be for; None where it is not so."""
     h = _mean_step(motion)
-    if h is None:
-        return False
+    if h is None or _implicit(motion):
+        return None
     rates = _rates(_look(motion, h, last=True))
-    return rates is not None and rates.kind == "decays" and _within(h * rates.fastest, STIFF)
+    if rates is None or rates.kind != "decays" or not _within(h * rates.fastest, STIFF):
+        return None
+    return rates
+
+
+def advice(motion: "Solution", status: Status) -> str:
+    """What to do about the end of a single motion, as far as its status tells."""
+    fixed = motion.tolerances is None
+    said = (ADVICE | ADVICE_FIXED if fixed else ADVICE).get(status, "")
+    if fixed:
+        return said
+    if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
+        return (
+            f"The motion is stiff: something in it decays at {rates.fastest:.3g} 1/s, and explicit "
+            f"steps must be about as short as that. Take method='kvaerno5'. {said}"
+        )
+    assert motion.tolerances is not None
+    if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
+        state = np.concatenate([np.ravel(x) for x in motion.last_state])
+        labels = motion.system.coordinates.labels
+        bounds = np.resize(motion.tolerances[1], state.shape)
+        names = (*labels, *(f"{label}'" for label in labels))
+        still = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
+        if still:
+            return (
+                f"With atol = 0 no error is small enough where a component is 0, as "
+                f"{', '.join(still)} here: give atol > 0, or start elsewhere."
+            )
+    return said
 
 
 def explain(motion: "Solution") -> str:
@@ -79,7 +112,9 @@ def explain(motion: "Solution") -> str:
     accepted, rejected = (int(motion.stats[name]) for name in ("accepted", "rejected"))
     how = "fixed steps"
     if motion.tolerances is not None:
-        how = "rtol {:.3g}, atol {:.3g}".format(*map(float, motion.tolerances))
+        rtol, atol = map(np.asarray, motion.tolerances)
+        least, most = np.min(atol), np.max(atol)
+        how = f"rtol {rtol:.3g}, atol {least:.3g}" + f" to {most:.3g}" * bool(most > least)
     lines = [
         f"method        {motion.method}, {how}, {motion.formulation}",
         f"status        {motion.message()}",
@@ -257,7 +292,8 @@ def _looks(scene: Scene, traced: Any) -> Look:
         turns = jnp.zeros((), jnp.int32)
         if dynamics.projects:
             turns = turns_needed(dynamics.surface(tau + h, y1, here), *dynamics.parts(y1))
-        scaled = jnp.abs(jnp.asarray(error)) / (atol + rtol * jnp.abs(y))
+        allowed = atol if atol.ndim == 0 else jnp.tile(atol, 2)
+        scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
         return Look(rates, dynamics.mass(tau, y, here), scaled, turns)
 
     return jax.lax.map(at, (ts, q, v))

@@ -17,9 +17,10 @@ from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
 from jaxlag._methods import METHODS
 from jaxlag._power import in_order
-from jaxlag._slowness import explain
-from jaxlag._status import ADVICE, CONCERNS_ROW, Status
+from jaxlag._slowness import advice, explain
+from jaxlag._status import CONCERNS_ROW, Status
 from jaxlag._system import System
+from jaxlag._views import as_dataset, as_dict, counted, described, plotted
 
 # Quantities of one state, by the name `save=` and the Solution know them under.
 QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Any]] = {
@@ -93,6 +94,7 @@ class Solution(eqx.Module):
         stabilization: "projection", a `Baumgarte`, or None: what kept states on the constraints
             between steps.
         tolerances: (rtol, atol) of the step-size control; None with fixed steps.
+        dt_max: bound on adaptive steps, s; None where none was given.
         error: with `estimate_error=True` the errors of (q, v) about to be expected at each row,
             each (s, n), in their units; else None.
     """
@@ -115,7 +117,8 @@ class Solution(eqx.Module):
     stabilization: str | Baumgarte | None = eqx.field(static=True)
     _ending: Ending
     _kinematic: bool = eqx.field(static=True)
-    tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch"]] | None
+    tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
+    dt_max: Float[Array, "*batch"] | None = None
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
 
     @property
@@ -174,8 +177,19 @@ class Solution(eqx.Module):
         """The inputs of this motion, by name."""
         return eqx.combine(self._inputs_traced, self._inputs_static.tree)
 
-    def __getitem__(self, name: str) -> Array:
-        """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,)."""
+    def __getitem__(self, name: Any) -> Any:
+        """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
+
+        Of a batch by an index, a slice, or an array of indices the motions that it says.
+
+        Raises:
+            ValueError: no such name; an index into a single motion.
+        """
+        if not isinstance(name, str):
+            if self.ts.ndim == 1:
+                must, was = "be a name, for a single motion", f"it was {name!r}"
+                raise bad("name", must, was, "Rows are those of motion.ts, motion.q, motion.v.")
+            return jax.tree.map(lambda x: x[name], self)
         quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]
@@ -266,9 +280,12 @@ class Solution(eqx.Module):
         return in_order(self.saved["work"], self.system.forces, self.system.constraints)
 
     def message(self) -> str:
-        """How a single motion ended, in words, with the coordinate and the likely remedy."""
+        """How a motion ended, in words, with the coordinate and the likely remedy.
+
+        Of a batch: how many ended in each status, and the message of the first of each.
+        """
         if self.ts.ndim != 1:
-            raise bad("message", "be asked of a single motion", f"batch {self.ts.shape[:-1]}")
+            return counted(self)
         status = Status(int(self.status))
         if status is Status.ok:
             return f"ok at t = {self.last_time}"
@@ -291,7 +308,7 @@ class Solution(eqx.Module):
         return (
             f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
             f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
-            f"{int(self.stats['rejected'])} rejected steps. {ADVICE.get(status, '')}{more}".rstrip()
+            f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
         )
 
     def explain(self) -> str:
@@ -309,6 +326,65 @@ class Solution(eqx.Module):
         """
         return explain(self)
 
+    def at(self, t: Any) -> "Solution":
+        """The motion at times between its rows, as accurate as its rows.
+
+        The equations are solved anew from the last row before, by the same method and tolerances.
+
+        Args:
+            t: a number or a row of them in any order, from ts[0] to last_time, s.
+
+        Returns:
+            A Solution with one row for every time.
+
+        Raises:
+            ValueError: times outside of the motion; a batch, fixed steps or a method without a
+                name: there rows have to be asked for when simulating.
+        """
+        from jaxlag._between import states_at  # which simulates, and makes solutions
+
+        return states_at(self, t)
+
+    def _rows(self, rows: list[int]) -> "Solution":
+        """The same with these rows only, in this order."""
+        index = np.array(rows)
+        parts = lambda s: (s.ts, s.q, s.v, s.saved, s.error)  # noqa: E731
+        chosen = jax.tree.map(lambda x: x[index], parts(self))
+        return eqx.tree_at(parts, self, chosen, is_leaf=lambda x: x is None)
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Numpy arrays by name: "t", s; every coordinate "x" and its velocity "x'", (s, *shape).
+
+        Quasi-velocities, and what `save=` named, are in it, too; of a batch every array has its
+        axes in front.
+        """
+        return as_dict(self)
+
+    def to_xarray(self) -> Any:
+        """What `to_dict` has as an `xarray.Dataset` over "t"; needs the extra "xarray".
+
+        Of a batch over "motion" as well (or "motion_0", ...); where its motions have times of their
+        own, over "row" in place of "t". "status" is a variable.
+
+        Raises:
+            ValueError: xarray is not installed.
+        """
+        return as_dataset(self)
+
+    def plot(self) -> Any:
+        """Coordinates and energy over time, and in the plane the paths; needs the extra "plot".
+
+        In the plane are coordinates called x and y, and points of two components. Of a batch up to
+        16 motions are drawn.
+
+        Returns:
+            A matplotlib `Figure`, which notebooks show; `figure.savefig("motion.png")` keeps it.
+
+        Raises:
+            ValueError: matplotlib is not installed.
+        """
+        return plotted(self)
+
     def _quantity(self, name: str) -> Any:
         if name in self.saved:
             return self.saved[name]
@@ -317,8 +393,7 @@ class Solution(eqx.Module):
         return _derived(name, self.system, self.formulation, key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:
-        names = ", ".join(self.system.coordinates.names)
-        return f"Solution({names}; shape {self.q.shape}, status {self.status})"
+        return described(self)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))

@@ -42,7 +42,9 @@ class Consistency(NamedTuple):
     complete: Bool[Array, ""]
 
 
-def values_allowed(y0: Array, saves: Array, rtol: Any, atol: Any, step: Any) -> Bool[Array, ""]:
+def values_allowed(
+    y0: Array, saves: Array, rtol: Any, atol: Any, step: Any, longest: Any
+) -> Bool[Array, ""]:
     """What concrete values have raised about already, for values that are traced."""
     floor = 10 * jnp.finfo(y0.dtype).eps
     checks = [
@@ -51,9 +53,8 @@ def values_allowed(y0: Array, saves: Array, rtol: Any, atol: Any, step: Any) -> 
         jnp.isfinite(rtol) & jnp.isfinite(atol),
         (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & ((rtol == 0) | (rtol >= floor)),
     ]
-    if step is not None:
-        checks.append(jnp.isfinite(step) & (step > 0))
-    return jnp.all(jnp.stack([jnp.asarray(check) for check in checks]))
+    checks += [jnp.isfinite(x) & (x > 0) for x in (step, longest) if x is not None]
+    return jnp.all(jnp.stack([jnp.all(jnp.asarray(check)) for check in checks]))
 
 
 def start_finite(dynamics: Dynamics, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:

@@ -41,7 +41,7 @@ CONCERNS_ROW = {
 ADVICE = {
     Status.max_steps: (
         "Raise max_steps, loosen rtol and atol, or shorten ts. What held the steps short is in "
-        "motion.explain(); a stiff motion wants method='kvaerno5'."
+        "motion.explain()."
     ),
     Status.step_below_resolution: (
         "The step shrank below the resolution of time: a singularity, a discontinuity that no "
@@ -61,7 +61,8 @@ ADVICE = {
     Status.rank_change: (
         "There this constraint row came to depend on the others, or no longer follows from them: "
         "a dead point or a change point, where the motion may go on in more than one way. Start "
-        "beyond it, or add the row that decides."
+        "beyond it, or add the row that decides. Of redundant rows those that are solved with are "
+        "chosen at the start: there, go on from last_state."
     ),
     Status.no_reaction_solution: (
         "No reaction goes with the forces that depend on it: the contact lifts off, its sliding "
@@ -71,14 +72,29 @@ ADVICE = {
         "No motion satisfies this constraint row together with the others: drop or correct one."
     ),
     Status.projection_failed: (
-        "The state was too far from this constraint to be moved back: reduce dt, rtol or atol."
+        "The state was too far from this constraint to be moved back: reduce rtol and atol."
     ),
     Status.inconsistent_start: (
         "q0 and v0 do not satisfy this constraint: pass assemble=True, or q0, v0 from jl.assemble."
     ),
     Status.implicit_solve_failed: (
-        "The implicit solver's equations did not converge: reduce dt or the first step dt0."
+        "The implicit solver's equations did not converge: loosen rtol and atol, or give a shorter "
+        "first step dt0."
     ),
     Status.input_range: "Extend the input's table to cover ts, or shorten ts.",
     Status.bad_value: "q0, v0, ts, tolerances and dt must be finite and within their bounds.",
 }
+
+
+ADVICE_FIXED = {
+    Status.max_steps: "Raise max_steps, lengthen dt, or shorten ts.",
+    Status.nonfinite: (
+        "The Lagrangian or a force is not finite there: check its domain, and whether dt is short "
+        "against the fastest motion; steps that are too long grow without bound."
+    ),
+    Status.projection_failed: (
+        "The state was too far from this constraint to be moved back: reduce dt."
+    ),
+    Status.implicit_solve_failed: ("The implicit solver's equations did not converge: reduce dt."),
+}
+"""What is to be done otherwise with fixed steps, where tolerances have no part."""

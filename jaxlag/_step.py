@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._kkt import Choice
+
 
 class RowChoice(NamedTuple):
     """Which constraint rows are solved with: a largest independent set at the start.
@@ -17,7 +19,7 @@ class RowChoice(NamedTuple):
 
     kept: Bool[Array, " m"]
     size: Float[Array, " m"]
-    reacting: Bool[Array, " m"]
+    reacting: Choice
 
 
 class Gaps(NamedTuple):
@@ -71,6 +73,6 @@ class Arguments(NamedTuple):
         return None if self.rows is None else self.rows.kept
 
     @property
-    def reacting(self) -> Bool[Array, " m"] | None:
+    def reacting(self) -> Choice | None:
         """Rows to solve accelerations with; None for all."""
         return None if self.rows is None else self.rows.reacting

@@ -18,6 +18,7 @@ from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, require_arity
 from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce, check_forces
+from jaxlag._inputs import evaluate
 from jaxlag._kkt import augmented
 from jaxlag._linalg import first_unhealthy
 from jaxlag._lowering import (
@@ -53,7 +54,9 @@ class System(AbstractReactions):
     possible. What needs no params is checked here, everything else at first use or by `check`.
 
     Methods that take a state are called as (params, q, v, t): `params` any pytree, q and v of
-    shape (n,) in SI units (m or rad, and per s), t in s. They compose with jit, vmap and every
+    shape (n,) in SI units (m or rad, and per s), t in s. Of params arrays and floats are traced,
+    with derivatives in the real ones; Python ints, truth values, text and functions are part of the
+    program, which compiles anew for each of their values. They compose with jit, vmap and every
     derivative of JAX. A system hashes by the identity of its functions: declare it once, not
     in a loop, or every declaration compiles anew. Every function is traced once for each kind of
     arguments (shapes, dtypes, static params), and what it reads from globals and closures holds as
@@ -63,7 +66,7 @@ class System(AbstractReactions):
     Args:
         lagrangian: scalar function `L(t, q, v, params)`, in J. Either this, or both of
             `kinetic` and `potential`.
-        coordinates: names, or names with shapes `{"x": (8, 3), "theta": ()}`; L receives q
+        coordinates: names, or names with shapes `{"x": (8, 3), "y": 3, "theta": ()}`; L receives q
             and v flat, `unflatten` gives the parts.
         kinetic: scalar function `T(t, q, v, params)`, in J; then L = T - V.
         potential: scalar function `V(t, q, params)`, in J.
@@ -100,7 +103,7 @@ class System(AbstractReactions):
     def __init__(
         self,
         lagrangian: Callable | None = None,
-        coordinates: Sequence[str] | Mapping[str, tuple[int, ...]] = (),
+        coordinates: Sequence[str] | Mapping[str, tuple[int, ...] | int] = (),
         *,
         kinetic: Callable | None = None,
         potential: Callable | None = None,
@@ -223,19 +226,19 @@ class System(AbstractReactions):
         """Whether M is positive definite for these params without the help of constraints.
 
         Looked at in the given state, where it is known, and in one other, as the mass of a link is
-        zero everywhere or nowhere; False where the params have no values, since they are traced,
-        or the state has none and M depends on it, as in polar coordinates at r = 0. Of use to a
-        system with constraints alone.
+        zero everywhere or nowhere; where the state is traced and M depends on it, in some where
+        inertias vanish, as that of polar coordinates does at r = 0. False where the params have no
+        values, since they are traced. Of use to a system with constraints alone.
         """
         if not self.constraints or not _params.concrete(params):
             return False
-        given = (t, q) if v is None else (t, q, v)
-        if not _params.concrete(given) and self.structure(params, q.dtype).mass & {"t", "q", "v"}:
-            return False
-        states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.size)))]
+        n = self.size
+        states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
         v = jnp.zeros_like(q) if v is None else v
         if _params.concrete((t, q, v)):
             states.append((t, q, v))
+        elif self.structure(params, q.dtype).mass & {"t", "q", "v"}:
+            states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
         floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
         for state in states:
             with jax.ensure_compile_time_eval():
@@ -251,6 +254,29 @@ class System(AbstractReactions):
             if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
                 return False
         return True
+
+    def contacts_apart(
+        self, params: Any, t: Any, q: Array, v: Array | None, inputs: Mapping[str, Any]
+    ) -> bool:
+        """Whether rows whose multipliers forces read are clearly independent of one another.
+
+        In the given state, where all has values; else False.
+        """
+        v = jnp.zeros_like(q) if v is None else v
+        if not self.constraints or not _params.concrete(params, t, q, v, inputs):
+            return False
+        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
+        t = jnp.asarray(t, float)
+        chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
+        if len(chosen) < 2:
+            return True
+        traced, static = _params.split(params)
+        with jax.ensure_compile_time_eval():
+            A = np.asarray(_rows(self, _params.Static(static), t, q, v, traced), np.float64)[chosen]
+        sizes = np.linalg.norm(A, axis=1, keepdims=True)
+        if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
+            return False
+        return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
 
     def rows(self, params: Any, dtype: Any) -> Layout:
         """Names and shapes of the constraint rows, for params like these.
@@ -359,6 +385,17 @@ class System(AbstractReactions):
 
         closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
         check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
+
+
+APART = 1e-3
+"""Least singular value of rows of unit length that count as clearly independent."""
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _rows(
+    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system.terms.rows(t, q, v, _params.join(traced, static.tree))[0]
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -8,6 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
+from jaxlag._kkt import Choice
 
 
 class Terms(eqx.Module):
@@ -91,7 +92,7 @@ class Terms(eqx.Module):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
         sense: Array | float = 1.0,
     ) -> Any:
         """What accelerations need of what depends on params alone, to be computed once per solve.
@@ -110,11 +111,11 @@ class Terms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        kept: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
     ) -> Float[Array, " n"]:
         """a, with one factorisation; NaN where M is not positive definite where A a = 0.
 
-        `prepared`: what `prepare` returned for these params; computed here if left out. `kept`:
+        `prepared`: what `prepare` returned for these params; computed here if left out. `reacting`:
         independent rows that imply the others; all if left out.
         """
 
@@ -127,7 +128,10 @@ class Terms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam); lam of least norm where rows depend on one another."""
+        """(a, lam); lam of least norm where rows depend on one another, NaN where they contradict.
+
+        Of rows that forces read among themselves, as these see them, and of the others.
+        """
 
     @abstractmethod
     def correction(

@@ -65,7 +65,10 @@ def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
 
 
 def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
-    """`x` as an inexact array of shape (n,); raises naming `argument` if it cannot be one."""
+    """`x` as an inexact array of shape (n,); raises naming `argument` if it cannot be one.
+
+    A number will do for a single coordinate.
+    """
     n = coordinates.size
     fix = f"Give one entry per coordinate, in the order {list(coordinates.labels)}."
     if isinstance(x, Mapping):
@@ -74,6 +77,8 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
         x = jnp.asarray(x)
     except (TypeError, ValueError) as error:
         raise bad(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
+    if n == 1 and x.shape == ():
+        x = x[None]
     if x.shape != (n,):
         raise bad(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):

@@ -253,7 +253,13 @@ def test_a_coordinate_without_inertia_is_named_by_simulate(n):
         ({"atol": -1e-6}, "atol must be finite and not negative, but it was -1e-06."),
         ({"rtol": np.nan}, "rtol must be finite and not negative, but it was nan."),
         ({"atol": np.inf}, "atol must be finite and not negative, but it was inf."),
-        ({"atol": [1e-6, 1e-3]}, "atol must be a number, but its shape was (2,)."),
+        (
+            {"atol": [1e-6, 1e-3, 1e-3]},
+            "atol must be a number, or one for each of 2 coordinates, but its shape was (3,).",
+        ),
+        ({"atol": [1e-6, -1e-3]}, "atol must be finite and not negative, but it was [ 1.e-06"),
+        ({"atol": {"x": 1e-6}}, "atol must name exactly ['x', 'y'], but it named ['x']."),
+        ({"rtol": [1e-6, 1e-6]}, "rtol must be a number, but its shape was (2,)."),
         ({"rtol": "tight"}, "rtol must be a number, but it was 'tight'."),
         ({"rtol": 0.0, "atol": 0}, "rtol and atol must not both be zero, but both were."),
         (
@@ -277,6 +283,11 @@ def test_a_coordinate_without_inertia_is_named_by_simulate(n):
         ({"dt": "small"}, "dt must be a number, but it was 'small'."),
         ({"dt0": -0.1}, "dt0 must be positive, whichever way time runs, but it was -0.1."),
         ({"dt": 0.1, "dt0": 0.1}, "dt and dt0 must be given one at a time, but both were given."),
+        ({"ts": [0.0, 1.0j]}, "ts must be one row of times, but it was [0.0, 1j]. Only real"),
+        ({"rtol": "1e-6"}, "rtol must be a number, but it was '1e-6'. Only real numbers will do."),
+        ({"rtol": 1e-6j}, "rtol must be a number, but it was 1e-06j. Only real numbers will do."),
+        ({"dt_max": 0.0}, "dt_max must be positive, whichever way time runs, but it was 0.0."),
+        ({"dt": 0.1, "dt_max": 0.1}, "dt_max must be left out with fixed steps, but dt was given"),
     ],
 )
 def test_a_bad_value_is_refused(changes, message):
@@ -376,6 +387,45 @@ def test_an_unknown_method_is_told_the_known_ones():
         assert name in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("rk4", "'dopri5' with dt="),
+        ("RK45", "'tsit5' or 'dopri5'"),
+        ("symplectic", "'splitting4' where L = T(v) - V(q)"),
+        ("leapfrog", "'splitting2' with dt="),
+        ("BDF", "'kvaerno5'"),
+        ("dopri_8", "'dopri8'"),
+    ],
+)
+def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
+    message = f"but it was {name!r}. The nearest is {nearest}"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run(method=name)
+
+
+def test_arguments_in_another_order_are_told():
+    """Where the names say so: q, v, t, p."""
+    message = r"^lagrangian must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
+    with pytest.raises(ValueError, match=message):
+        jl.System(lambda q, v, t, p: 0.5 * v @ v, ("x",))
+    with pytest.raises(ValueError, match=r"phi must take \(t, q, params\) in this order"):
+        jl.Holonomic(lambda q, t, params: q[0], "row")
+    jl.System(lambda time, x, v, p: 0.5 * v @ v, ("x",))
+
+
+def test_a_parameter_of_one_entry_is_told():
+    params = {"k": 1.0, "m": jnp.ones(1)}
+    with pytest.raises(ValueError, match=r"of shape \(1,\)\. params\['m'\] has shape \(1,\)"):
+        run(jl.System(lambda t, q, v, params: params["m"] * (v @ v), ("x", "y")), params=params)
+
+
+@pytest.mark.parametrize("parts", ["forces", "constraints"])
+def test_none_is_no_sequence(parts, unchecked):  # noqa: F811
+    with pytest.raises(ValueError, match=rf"^{parts} must be a sequence .*Leave it out"):
+        jl.System(SYSTEM.lagrangian, ("x", "y"), **{parts: None})
+
+
 # ---- Traced values -------------------------------------------------------------------------------
 
 NAN, INF = np.nan, np.inf
@@ -398,6 +448,8 @@ TRACED = {
     "one zero": ({"rtol": 0.0}, Status.ok),
     "dt0 negative": ({"dt0": -0.1}, Status.bad_value),
     "dt0 nan": ({"dt0": NAN}, Status.bad_value),
+    "dt_max zero": ({"dt_max": 0.0}, Status.bad_value),
+    "dt_max short": ({"dt_max": 0.01}, Status.ok),
     "L nan": ({"q0": [-1.0, 0.0]}, Status.nonfinite),
     "no inertia": ({"m": 0.0}, Status.mass_singular),
     "m nan": ({"m": NAN}, Status.mass_singular),
@@ -414,6 +466,7 @@ def test_traced_bad_values_end_in_a_status():
         "rtol": 1e-6,
         "atol": 1e-6,
         "dt0": 0.1,
+        "dt_max": 1.0,
         "m": 2.0,
     }
     lanes = [good | changes for changes, _ in TRACED.values()]
@@ -421,10 +474,9 @@ def test_traced_bad_values_end_in_a_status():
 
     @jax.jit
     @jax.vmap
-    def motions(q0, v0, ts, rtol, atol, dt0, m):
-        return jl.simulate(
-            system, q0, v0, ts, {"m": m}, rtol=rtol, atol=atol, dt0=dt0, method="bosh3"
-        )
+    def motions(q0, v0, ts, rtol, atol, dt0, dt_max, m):
+        steps = {"rtol": rtol, "atol": atol, "dt0": dt0, "dt_max": dt_max}
+        return jl.simulate(system, q0, v0, ts, {"m": m}, method="bosh3", **steps)
 
     found = motions(*stacked.values())
     names = [Status(int(status)).name for status in found.status]

@@ -425,3 +425,43 @@ def test_a_driven_system_is_assembled_without_its_inputs():
         lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), forces=(push,), constraints=(rod,)
     )
     np.testing.assert_allclose(jl.assemble(system, [1.2, 1.6], [0.0, 0.0], {}).q, [0.6, 0.8])
+
+
+# ---- Numbers that are ints, functions in loops ---------------------------------------------------
+
+
+def test_the_third_int_of_one_leaf_is_warned_about():
+    """Each compiles anew; exponents that stay, and flags, are no matter."""
+
+    def stiff(t, q, v, params):
+        kinetic = 0.5 * params["m"] * v[0] ** 2
+        return kinetic - q[0] ** params["n"] if params["on"] else kinetic
+
+    call = captured(stiff)
+
+    def of(m, n=2, on=True):
+        return call(jnp.array(0.0), jnp.ones(1), jnp.ones(1), {"m": m, "n": n, "on": on})
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for m, on in ((1, True), (2, False), (1.0, True), (2.0, True), (3.0, True), (2, True)):
+            of(m, on=on)
+    message = r"^params\['m'\] of .*stiff.* is the Python int 3"
+    with pytest.warns(UserWarning, match=message) as said:
+        of(3)
+    assert "Write 3.0 where it is a number" in str(said[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        of(4)  # once is enough
+
+
+def test_a_function_made_in_a_loop_is_told_once(caplog):
+    def made(k):
+        return captured(lambda t: k * t)
+
+    with caplog.at_level("WARNING", logger="jaxlag"):
+        for k in range(25):
+            made(float(k))(jnp.array(1.0))
+    (record,) = caplog.records
+    assert "was traced as a new function for the 20th time" in record.getMessage()
+    assert "hand over what changes in params" in record.getMessage()

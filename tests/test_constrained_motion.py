@@ -327,7 +327,8 @@ def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
     found = jl.simulate(
         slider_crank, q0, v0, np.linspace(0, 3, 31), equal, formulation="null_space", **options
     )
-    assert found.status in (jl.Status.ok, jl.Status.rank_change)
+    if found.status != jl.Status.ok:  # where its steps happen to end
+        assert found.status == jl.Status.rank_change
     params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}  # a + d = b + c
     start = jl.assemble(
         four_bar, four_bar_start(1.0, params), [5.0, 0.0, 0.0], params, hold=("crank'",)

@@ -76,7 +76,7 @@ def test_equal_tables_are_one_key():
         (("x", ""), "coordinates must be non-empty strings, but one was ''."),
         (("x", 3), "coordinates must be non-empty strings, but one was 3."),
         (("x", "y", "x"), "coordinates must be distinct, but 'x' occurs 2 times."),
-        ({"x": 3}, "coordinates['x'] must be a tuple of sizes, but it was 3."),
+        ({"x": -3}, "coordinates['x'] must be a tuple of sizes, but it was -3."),
         ({"x": [3]}, "coordinates['x'] must be a tuple of sizes, but it was [3]."),
         ({"x": (3, 0)}, "coordinates['x'] must be a tuple of sizes, but it was (3, 0)."),
         ({"x": (-1,)}, "coordinates['x'] must be a tuple of sizes, but it was (-1,)."),

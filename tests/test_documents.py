@@ -46,7 +46,7 @@ FIRST = 4
 
 
 @pytest.mark.parametrize(
-    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 7)], (FIRST, 2)), ids=["first", "all"]
+    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 10)], (FIRST, 2)), ids=["first", "all"]
 )
 def test_readme_runs_and_prints_what_it_says(count, outputs):
     namespace, printed, compared = {}, "", 0

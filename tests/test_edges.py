@@ -358,3 +358,73 @@ def test_a_gradient_holds_them_once_in_each_of_its_loops():
 def test_a_long_scalar_program_is_looped_over_as_well():
     """Nine elements of the force, all in one copy of the acceleration."""
     assert copies("scalar", motion_of, size=9) == 9 * 2
+
+
+# ---- Pulses --------------------------------------------------------------------------------------
+
+
+def kicked(signal, ts, **options):
+    """x'' = u(t) from rest."""
+    return moved(signal, ts, (0.0, 0.0), {"k": 0.0}, **options)
+
+
+START, END = 3.0, 3.001
+
+
+def pulse(t):
+    return jnp.where((t >= START) & (t < END), 1000.0, 0.0)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize("options", [{}, {"dt": 0.4, "method": "tsit5"}], ids=["adaptive", "fixed"])
+def test_a_pulse_that_is_named_is_met(options, sense):
+    """x' = 1 after a pulse of 1 ms, to rounding: no stage reads the wrong side of its edges."""
+    ts = np.array([0.0, 10.0])[:: int(sense)]
+    motion = kicked(jl.Function(pulse, knots=[START, END]), ts, **options)
+    np.testing.assert_allclose(motion.v[-1, 0], sense, rtol=1e-12)
+    way = 10.0 - 0.5 * (START + END) if sense > 0 else 0.5 * (START + END)
+    np.testing.assert_allclose(motion.q[-1, 0], way, rtol=1e-12)
+
+
+def test_a_pulse_moves_with_its_knots():
+    """d x/d start of a pulse of given length: minus its impulse, whatever the steps."""
+
+    @jax.jit
+    def end(start):
+        signal = jl.Function(
+            lambda t, params: jnp.where((t >= params["s"]) & (t < params["s"] + 0.5), 2.0, 0.0),
+            knots=jnp.stack([start, start + 0.5]),
+        )
+        params = {"k": 0.0, "s": start}
+        return moved(signal, [0.0, 4.0], (0.0, 0.0), params, method="tsit5").q[-1, 0]
+
+    value, slope = jax.value_and_grad(end)(1.3)
+    np.testing.assert_allclose(value, 4.0 - 1.3 - 0.25, rtol=1e-12)
+    np.testing.assert_allclose(slope, -1.0, rtol=1e-10)
+
+
+def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
+    """Stepped over without a word of it; met by steps no longer than itself."""
+    wide = jl.Function(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
+    ts = np.array([0.0, 10.0])
+    assert kicked(wide, ts, dt0=5.0, method="tsit5").v[-1, 0] < 0.5
+    found = kicked(wide, ts, dt_max=0.1, method="tsit5")
+    np.testing.assert_allclose(found.v[-1, 0], 1.0, atol=1e-6)
+    assert int(found.stats["accepted"]) >= 100
+    slope = jax.grad(lambda x: moved(wide, ts, (x, 0.0), {"k": 0.0}, dt_max=0.1).q[-1, 0])(0.0)
+    np.testing.assert_allclose(slope, 1.0, rtol=1e-12)
+
+
+def test_a_force_that_ends_is_not_waited_for():
+    """NaN beyond x = 1 under a least step: its status is that, after a few attempts."""
+    wall = jl.System(
+        lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
+        ("x",),
+        forces=(jl.GeneralizedForce(lambda t, q, v, p: jnp.where(q > 1.0, jnp.nan, 1.0), "wall"),),
+    )
+    control = diffrax.PIDController(rtol=1e-6, atol=1e-6, dtmin=1e-3)
+    motion = jl.simulate(
+        wall, [0.0], [1.0], [0.0, 5.0], method=(diffrax.Tsit5(), control), throw=False
+    )
+    assert motion.status == jl.Status.nonfinite
+    assert int(motion.stats["rejected"]) < 100

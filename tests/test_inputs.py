@@ -142,6 +142,41 @@ def test_a_default_of_a_function_is_no_place_for_params():
     assert [float(read(signal, jnp.array(0.5))) for signal in signals] == [1.0, 1.5]
 
 
+def test_a_hold_may_have_one_value_for_each_interval():
+    """As controls between edges are kept; the last one holds at the end, too."""
+    hold = jl.ZeroOrderHold([0.0, 1.0, 3.0], [2.0, 5.0])
+    np.testing.assert_array_equal(hold.values, [2.0, 5.0, 5.0])
+    pairs = jl.ZeroOrderHold([0, 1, 3], [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(pairs.values, [[1.0, 2.0], [3.0, 4.0], [3.0, 4.0]])
+    assert jnp.issubdtype(pairs.values.dtype, jnp.floating)
+
+
+def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
+    """Up to the knot, and from it on; its derivative in time is that of the function."""
+    step = jl.Function(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
+    np.testing.assert_array_equal(step.knots(), [1.0, 2.0])
+    before, after = step.around(jnp.array(0.3)), step.around(jnp.array(1.0))
+    knot = jnp.array(1.0)
+    np.testing.assert_allclose(read(before, knot), 2.0, rtol=1e-15)
+    assert read(after, knot) == read(step, knot) == 5.0
+    assert jax.grad(lambda t: read(before, t))(knot) == 2.0
+    beyond = step.around(jnp.array(2.5))
+    assert read(beyond, jnp.array(9.0)) == 45.0
+
+
+@pytest.mark.parametrize(
+    ("knots", "message"),
+    [
+        ([2.0, 1.0], r"increase strictly, but knots\[0\] = 2.0"),
+        (1.0, "be one row of at least 1 times"),
+        ([], "be one row of at least 1 times"),
+    ],
+)
+def test_bad_knots_of_a_function_are_refused(knots, message):
+    with pytest.raises(ValueError, match=f"^Function: knots must {message}"):
+        jl.Function(lambda t: t, knots=knots)
+
+
 def test_feedback_sees_the_state():
     found = read(jl.Feedback(lambda t, q, v, params: q[0] * v[1] + params["w"] * t), jnp.array(2.0))
     np.testing.assert_allclose(found, 0.4 * -2.0 + 3.0 * 2.0, rtol=4 * EPS)
@@ -271,12 +306,12 @@ def test_a_run_beyond_its_tables_is_refused(ts, cover):
             [1.0],
             "times must be one row of at least 2 times, but its shape was (1, 2)",
         ),
-        ([0.0, 1.0], [1.0], "values must have one entry per time, 2, but its shape was (1,)."),
+        ([0.0, 1.0, 2.0], [1.0], "values must have one entry per time, 3, but its shape was (1,)"),
         ([0.0, 1.0], 3.0, "values must have one entry per time, 2, but its shape was ()."),
         (
             [0.0, 1.0, 1.0, 2.0],
             [0.0] * 4,
-            "times must increase strictly, but times[1] = 1.0 and times[2] = 1.0. Sort the table",
+            "times must increase strictly, but times[1] = 1.0 and times[2] = 1.0. Sort the times",
         ),
         (
             [0.0, 2.0, 1.0],

@@ -224,3 +224,31 @@ def test_implicit_methods_solve_every_kind_of_system(name):
     for a, b in ((found.q, explicit.q), (found.v, explicit.v)):
         # Global errors of some tens of steps with a local bound of 1e-7: measured up to 4e-6.
         np.testing.assert_allclose(a[-1], b[-1], rtol=2e-5, atol=2e-5)
+
+
+# ---- Tolerances of coordinates -------------------------------------------------------------------
+
+
+def test_every_coordinate_may_have_a_tolerance_of_its_own():
+    """Of two springs apart only the one that is watched closely sets the step."""
+
+    def apart(t, q, v, params):
+        return 0.5 * v @ v - 0.5 * (q[0] ** 2 + 100.0 * q[1] ** 2)
+
+    system = jl.System(apart, ("slow", "quick"))
+
+    def steps(atol, method="tsit5"):
+        motion = jl.simulate(
+            system, [1.0, 1e-3], [0.0, 0.0], [0.0, 5.0], rtol=0.0, atol=atol, method=method
+        )
+        assert float(jnp.abs(motion["slow"][-1] - jnp.cos(5.0))) < 1e-5
+        return int(motion.stats["accepted"]), motion
+
+    close, _ = steps(1e-9)
+    same, _ = steps([1e-9, 1e-9])
+    assert close == same
+    loose, motion = steps({"slow": 1e-9, "quick": 1e-2})
+    assert loose < 0.5 * close
+    assert "atol 1e-09 to 0.01" in motion.explain()
+    implicit, _ = steps([1e-7, 1.0], "kvaerno5")
+    assert implicit < steps(1e-7, "kvaerno5")[0]

@@ -269,6 +269,62 @@ def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
     np.testing.assert_allclose(jax.jacfwd(height)(MU), expected, rtol=1e-11)
 
 
+def turned(t, q, params):
+    """A contact, and a row that psi takes away: sin(psi) is 0, or what rounding leaves at pi."""
+    return jnp.stack([q[1], jnp.sin(q[2]) * (q[1] + 0.5 * q[0])])
+
+
+def turned_drag(t, q, v, params, lam):
+    return jnp.stack([-0.1 * jnp.sum(lam["c"]), 0.0 * q[1], 0.0 * q[2]])
+
+
+@pytest.mark.parametrize("lowering", ["scalar", "array"])
+@pytest.mark.parametrize("psi", [0.0, np.pi])
+def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
+    """Deceleration 0.1 g, and the derivative of its way in every start."""
+    lock = jl.Holonomic(lambda t, q, params: q[2] - params, "lock")
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v - G * q[1],
+        ("x", "y", "psi"),
+        forces=(jl.GeneralizedForce(turned_drag, "drag", reaction=True),),
+        constraints=(jl.Holonomic(turned, "c"), lock),
+        lowering=lowering,
+    )
+
+    @jax.jit
+    def way(x):
+        q = jnp.stack([x, 0.0, psi])
+        start = q, jnp.array([1.0, 0.0, 0.0])
+        return jl.simulate(
+            system, *start, jnp.array([0.0, 0.5]), psi, dt=0.1, method="tsit5", throw=False
+        ).q[-1, 0]
+
+    value, slope = jax.value_and_grad(way)(0.0)
+    np.testing.assert_allclose(value, 0.5 - 0.5 * 0.1 * G * 0.25, rtol=1e-12)
+    np.testing.assert_allclose(slope, 1.0, rtol=1e-12)
+    a = system.acceleration(psi, [0.0, 0.0, psi], [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(a, [-0.1 * G, 0.0, 0.0], atol=1e-12)
+
+
+def test_damped_rows_are_those_that_are_solved_with():
+    """A holonomic row that a read Pfaffian one would replace is not damped: refused."""
+    system = sliding_on((PLANE, RATE), {"rate": 1.0})
+    with pytest.raises(ValueError, match=r"^project must be True .* and a force reads 'rate'"):
+        jl.simulate(system, [0.0] * 2, [1.0, 0.0], [0.0, 1.0], MU, project=jl.Baumgarte(5.0, 5.0))
+
+
+def test_known_contacts_are_not_looked_at_again():
+    """Apart where values are known: then nothing is shared, in either lowering; else it may be."""
+    apart = sliding_on((PLANE, jl.Holonomic(lambda t, q, p: q[0], "wall")), {"plane": 1, "wall": 1})
+    same = sliding_on((PLANE, AGAIN), {"plane": 1.0, "again": 1.0})
+    given = MU, jnp.array(0.0), jnp.zeros(2), jnp.zeros(2), {}
+    assert apart.contacts_apart(*given)
+    assert not same.contacts_apart(*given)
+    found = []
+    jax.jit(lambda q: found.append(apart.contacts_apart(MU, 0.0, q, None, {})) or q)(jnp.zeros(2))
+    assert found == [False]
+
+
 def table(t, q, v, params):
     """A table of mass 1 that slides upright; q: x, y, z of its mass centre, roll, pitch."""
     return 0.5 * (v @ v) - G * q[2]

@@ -1,5 +1,7 @@
 """Solution.explain: what held the steps short."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,8 +138,53 @@ def test_a_stopped_motion_is_told_how_far_it_came():
 
 
 def test_a_motion_without_a_step():
-    motion = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": np.nan}, throw=False)
+    nowhere = jl.System(lambda t, q, v, params: 0.5 * v[0] ** 2 + jnp.log(q[0]), ("x",))
+    motion = jl.simulate(nowhere, [-1.0], [0.0], TS, throw=False)
     assert line(motion.explain(), "steps") == "0 attempted, 0 rejected"
+
+
+# ---- Advice in messages --------------------------------------------------------------------------
+
+
+def test_fixed_steps_are_advised_no_tolerances():
+    stopped = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, dt=1e-3, max_steps=7, throw=False)
+    assert "max_steps" in stopped.message()
+    assert "lengthen dt" in stopped.message()
+    quartic = jl.System(lambda t, q, v, params: 0.5 * v[0] ** 2 + q[0] ** 4, ("x",))
+    away = jl.simulate(quartic, [1.0], [3.0], [0.0, 10.0], dt=0.5, method="tsit5", throw=False)
+    assert away.status == jl.Status.nonfinite
+    assert "whether dt is short" in away.message()
+    assert "tol" not in stopped.message() + away.message()
+
+
+def test_a_stiff_motion_is_told_so():
+    """Its decay rate, and a method for it: not where steps are many for another reason."""
+
+    def sticky(t, q, v, params):
+        return 0.5 * params * v[0] ** 2
+
+    slow = jl.System(
+        lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
+        ("x",),
+        forces=(jl.Rayleigh(sticky),),
+    )
+    stiff = jl.simulate(
+        slow, [1.0], [0.0], [0.0, 100.0], 1e4, method="dopri8", max_steps=200, throw=False
+    )
+    told = r"stiff: something in it decays at 1e\+04 1/s.*method='kvaerno5'"
+    assert re.search(told, stiff.message())
+    quick = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, max_steps=7, throw=False)
+    assert "stiff" not in quick.message()
+
+
+def test_no_absolute_tolerance_where_a_component_is_zero():
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q[0], ("x", "y"))
+    motion = jl.simulate(
+        system, [1.0, 0.0], [0.5, 0.0], [0.0, 1.0], rtol=1e-6, atol=0.0, throw=False
+    )
+    assert motion.status == jl.Status.step_below_resolution
+    assert "With atol = 0 no error is small enough" in motion.message()
+    assert "as y, y' here" in motion.message()
 
 
 @pytest.mark.full

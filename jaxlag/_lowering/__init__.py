@@ -1,6 +1,7 @@
 """From a declared system to the terms of its equations of motion."""
 
 from jaxlag._lowering._array import ArrayTerms as ArrayTerms
+from jaxlag._lowering._array import Prepared as Prepared
 from jaxlag._lowering._emit import elements as elements
 from jaxlag._lowering._findings import Findings as Findings
 from jaxlag._lowering._findings import find as find

@@ -1,7 +1,7 @@
 """The array program: terms by automatic differentiation of L on whole arrays."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -22,14 +22,14 @@ from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import real_scalar
 from jaxlag._forces import AbstractForce, components, reads_lam
 from jaxlag._kkt import (
-    as_read,
+    Choice,
     augmented,
     factor_kkt,
     independent_rows,
-    least_norm,
     masked,
     row_sizes,
     rows_hold,
+    shared,
     solve_kkt,
     solve_reactions,
 )
@@ -70,6 +70,7 @@ class ArrayTerms(Terms):
         baumgarte: stabilisation added to gamma.
         regular: whether M is known to be positive definite by itself, which the scalar program
             makes use of.
+        apart: whether rows whose multipliers forces read are known to be independent.
         quasi: quasi-velocities, where the state is (q, u) with those that are not constrained.
         in_u: L as a function of (t, q, u, params), where it was written so.
     """
@@ -80,6 +81,7 @@ class ArrayTerms(Terms):
     formulation: str = eqx.field(static=True, default="multipliers")
     baumgarte: Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool = eqx.field(static=True, default=False)
+    apart: bool = eqx.field(static=True, default=False)
     quasi: QuasiVelocities | None = None
     in_u: Callable | None = eqx.field(static=True, default=None)
 
@@ -169,6 +171,8 @@ class ArrayTerms(Terms):
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any]
     ) -> tuple[bool, ...]:
         """For every row, whether a force depends on the multipliers of its name."""
+        if not any(map(reads_lam, self.forces)):
+            return (False,) * layout(self.constraints, params, q.shape[0], q.dtype).size
         rows = layout(self.constraints, params, q.shape[0], q.dtype)
         named = rows.unflatten(jnp.zeros((rows.size,), q.dtype))
 
@@ -248,7 +252,7 @@ class ArrayTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
         sense: Array | float = 1.0,
     ) -> Prepared:
         """M and its factor where M depends on params alone."""
@@ -269,14 +273,14 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        kept: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
         prepared = self.prepare(q, params, inputs) if prepared is None else prepared
         M, right = self._balance(t, q, v, params, inputs, prepared)
         if not self.constraints:
             return solve_mass(M, right, prepared.factor)
-        return self._solved(M, right, t, q, v, params, inputs, kept, prepared.sense)[0]
+        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[0]
 
     def reactions(
         self,
@@ -291,15 +295,33 @@ class ArrayTerms(Terms):
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
-        felt = any(map(reads_lam, self.forces))
-        unread = np.logical_not(self.rows_read(t, q, v, params, inputs)) if felt else None
         still = jax.lax.stop_gradient
-        there, size = row_sizes(lambda q: still(self.rows(t, q, v, params)[0]), *still((q, A)))
-        kept = independent_rows(*still((M, A)), unread, there=there)
-        a, lam = self._solved(M, right, t, q, v, params, inputs, kept)
-        lam = lam if felt else least_norm(A, lam, kept)
-        fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
+        there, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        if A.shape[0] == 1:
+            a, lam = self._solved(M, right, t, q, v, params, inputs, None)
+            fine = there[0]
+        else:
+            read = self.rows_read(t, q, v, params, inputs)
+            kept = independent_rows(*still((M, A)), np.logical_not(read), there=there)
+            choice = Choice(kept, there)
+            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            lam = shared(A, lam, kept, there, np.logical_not(read))
+            fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
+
+    def multipliers(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: Prepared,
+        reacting: Choice | None,
+    ) -> Float[Array, " m"]:
+        """The multipliers as forces see them, solved with these rows."""
+        M, right = self._balance(t, q, v, params, inputs, prepared)
+        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[1]
 
     def _solved(
         self,
@@ -310,20 +332,26 @@ class ArrayTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        kept: Array | None,
+        reacting: Choice | None,
         sense: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """(a, lam) under constraints; lam as forces read it where some do."""
         (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
+        kept = None if reacting is None else reacting.kept
         if not any(map(reads_lam, self.forces)):
             return solve_kkt(M, A, right, gamma, kept, self.formulation)
+        read = self.rows_read(t, q, v, params, inputs)
+
+        def seen(lam: Array) -> Array:
+            if reacting is None or self.apart:
+                return lam
+            return shared(A, lam, *reacting, read)
 
         def push(lam: Array) -> Array:
             return self.reactive(t, q, v, params, inputs, lam)
 
         slopes = jax.make_jaxpr(jax.jacfwd(push))(gamma).jaxpr
         (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
-        seen = partial(as_read, A, kept=kept, read=self.rows_read(t, q, v, params, inputs))
         felt = lambda lam: push(seen(lam))  # noqa: E731
         a, lam = solve_reactions(M, A, right, felt, gamma, kept, affine=not reached)
         return a, seen(lam)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import as_read, augmented
+from jaxlag._kkt import augmented, shared
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._evaluate import evaluate
 from jaxlag._lowering._interpret import interpret
@@ -72,9 +72,17 @@ def compare(key: Key, scene: Scene, equations: Equations, known: list | None) ->
     def drawn(own: bool) -> float | None:
         """The difference at one more state; None where there is nothing to compare."""
         t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
-        params = [rng.uniform(0.5, 1.5, leaf.shape) for leaf in like]
+        params = [
+            rng.uniform(0.5, 1.5, leaf.shape)
+            if jnp.issubdtype(leaf.dtype, jnp.floating)
+            else rng.integers(1, 4, leaf.shape).astype(leaf.dtype)
+            for leaf in like
+        ]
         if own and known is not None:
-            params = [np.asarray(x, np.float64) for x in known]
+            params = [
+                np.asarray(x, np.float64 if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype)
+                for x in known
+            ]
         inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
         values: dict[tuple[str, int], Any] = {("t", 0): t, ("sense", 0): 1.0}
         for name, rows in (("q", [q]), ("v", [v]), ("params", params), ("inputs", inputs)):
@@ -84,6 +92,7 @@ def compare(key: Key, scene: Scene, equations: Equations, known: list | None) ->
         if right is None:
             return None
         values |= {("kept", k): float(x) for k, x in enumerate(right.kept)}
+        values |= {("there", k): 1.0 for k in range(len(right.kept))}
         roots = equations.accelerations
         if right.parts:
             roots = [*(x for row in equations.mass for x in row), *equations.bias]
@@ -315,7 +324,8 @@ def _augmented(M: Any, A: Any) -> np.ndarray:
 def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
     """What takes multipliers of the rows kept to those that forces see, in numbers."""
     with jax.ensure_compile_time_eval():
-        columns = [as_read(jnp.asarray(A), e, jnp.asarray(kept), read) for e in jnp.eye(len(A))]
+        rows, given = jnp.asarray(A), (jnp.asarray(kept), jnp.asarray(norm(A, axis=1) > 0))
+        columns = [shared(rows, e, *given, read) for e in jnp.eye(len(A), dtype=rows.dtype)]
         return np.asarray(jnp.stack(columns, axis=1))
 
 

@@ -24,7 +24,7 @@ class Constrained(NamedTuple):
         regular: whether M is known to be positive definite by itself.
         reaction: the forces that depend on multipliers; None without.
         lam: the multipliers that they depend on.
-        read: for every row, whether it is one of these.
+        sharing: how rows that depend on one another share what forces read; None where none do.
     """
 
     velocity: Sequence[Node]
@@ -36,7 +36,19 @@ class Constrained(NamedTuple):
     regular: bool
     reaction: Sequence[Node] | None = None
     lam: Sequence[Node] = ()
-    read: Sequence[bool] = ()
+    sharing: "Sharing | None" = None
+
+
+class Sharing(NamedTuple):
+    """Rows whose multipliers are of least norm among themselves where they depend on one another.
+
+    Attributes:
+        chosen: these.
+        there: for every row 1, or 0 where it is no more than rounding.
+    """
+
+    chosen: Sequence[int]
+    there: Sequence[Node]
 
 
 class Rows(NamedTuple):
@@ -117,7 +129,7 @@ def solve_with_reactions(
     found: Reaction,
     eps: float,
     kept: Sequence[Node] | None,
-    read: Sequence[bool],
+    sharing: Sharing | None,
     regular: bool,
 ) -> tuple[list[Node], list[Node]]:
     """(a, lam) with M a = r + Q_0 + (A^T + G) lam, A a + gamma = 0.
@@ -127,7 +139,7 @@ def solve_with_reactions(
     """
     m = len(rows.A)
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
-    seen = None if kept is None else _as_read(graph, A, kept, read, eps)
+    seen = None if kept is None or sharing is None else _shared(graph, A, kept, sharing, eps)
     if seen is not None:
         of_rows = zip(*seen, strict=True)
         G = [[_weighted(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
@@ -166,21 +178,20 @@ def _weighted(graph: Graph, weights: Sequence[Node], x: Sequence[Node]) -> Node:
     return graph.let(graph.sum(terms))
 
 
-def _as_read(
+def _shared(
     graph: Graph,
     A: Sequence[Sequence[Node]],
     kept: Sequence[Node],
-    read: Sequence[bool],
+    sharing: Sharing,
     eps: float,
-) -> list[list[Node]] | None:
-    """What takes multipliers of the rows kept to those that forces see; None where it is 1.
+) -> list[list[Node]]:
+    """What takes multipliers of the rows kept to those that forces see, m rows.
 
-    As `jaxlag._kkt.as_read` for the rows that are read: C (C^T C)^-1 C^T between rows of unit
-    length, C the rows in terms of those that are kept.
+    As `jaxlag._kkt.shared`: C (C^T C)^-1 C^T between rows of unit length, C the rows in terms of
+    those that are kept, which come first among the chosen ones.
     """
-    m, chosen = len(A), [k for k, is_read in enumerate(read) if is_read]
-    if len(chosen) < 2:
-        return None
+    m, chosen = len(A), sharing.chosen
+    A = [[graph.mul(there, x) for x in row] for there, row in zip(sharing.there, A, strict=True)]
     zero, one = graph.zero, graph.one
 
     def solved(S: list[list[Node]], columns: list[list[Node]]) -> list[list[Node]]:
@@ -206,10 +217,15 @@ def _as_read(
         for i in places
     ]
     C = solved(among, [[graph.mul(flags[j], gram[i][j]) for j in places] for i in places])
+    floor = graph.const(eps ** (2 / 3))
     for i, flag in enumerate(flags):
         keep = graph.call(GREATER, flag, graph.const(0.5))
-        itself = [one if i == j else zero for j in places]
-        C[i] = [graph.select(keep, x, y) for x, y in zip(itself, C[i], strict=True)]
+        # Squared distance from the rows kept: 1 for a row that is none.
+        near = graph.sum([(gram[i][i], 1.0), (_weighted(graph, C[i], gram[i]), -1.0)])
+        follows = graph.call(GREATER, floor, graph.let(near))
+        for j in places:
+            other = graph.select(follows, C[i][j], zero)
+            C[i][j] = graph.select(keep, one if i == j else zero, other)
     columns = list(zip(*C, strict=True))
     square = product(columns, columns)
     for j, flag in enumerate(flags):

@@ -94,7 +94,7 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
         if bound is None or found_rows is None:
             a = solve(graph, mass, right, eps)
         elif felt is not None:
-            how = bound.kept, bound.read, bound.regular
+            how = bound.kept, bound.sharing, bound.regular
             a, lam = solve_with_reactions(graph, mass, found_rows, right, felt, eps, *how)
         else:
             sides = [(right, found_rows.gamma)]

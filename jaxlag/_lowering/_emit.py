@@ -28,6 +28,7 @@ def prelude(
     params: Any,
     dtype: Any,
     kept: Array | None = None,
+    there: Array | None = None,
     sense: Array | float = 1.0,
 ) -> Float[Array, " k"]:
     """What the body needs of what does not change during a solve, in one row.
@@ -37,15 +38,16 @@ def prelude(
         params: as the Lagrangian takes them.
         dtype: of the results.
         kept: for every constraint row whether it is solved with; None for all.
+        there: for every one whether it is more than rounding; None for all.
         sense: -1 where time runs backwards.
     """
     slots = numbers(program, dtype)
     for given in FIXED:
         wanted = {index: slot for (name, index), slot in program.inputs.items() if name == given}
-        if given == "kept" and kept is None:
+        values = {"kept": kept, "there": there, "sense": sense}
+        if given in values and values[given] is None:
             slots |= {slot: jnp.ones((), dtype) for slot in wanted.values()}
         elif wanted:
-            values = {"kept": kept, "sense": sense}
             flat = leaves(_params.split(params)[0] if given == "params" else values[given])
             slots |= {slot: jnp.asarray(flat[index], dtype) for index, slot in wanted.items()}
     run(program.prelude, slots, program.whole)

@@ -19,7 +19,7 @@ Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
 
-FIXED = ("params", "kept", "sense")
+FIXED = ("params", "kept", "there", "sense")
 """Names of the inputs that do not change during a solve: parameters, the rows solved with, and
 whether time runs forwards (+1) or backwards (-1)."""
 

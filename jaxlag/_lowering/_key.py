@@ -29,6 +29,7 @@ class Key(NamedTuple):
     formulation: str
     baumgarte: Baumgarte | None
     regular: bool
+    apart: bool
     quasi: QuasiVelocities | None
     in_u: Callable | None
 
@@ -53,6 +54,7 @@ def key_of(terms: ArrayTerms, q: Any, params: Any, inputs: Mapping[str, Any], li
         terms.formulation,
         terms.baumgarte,
         terms.regular,
+        terms.apart,
         terms.quasi,
         terms.in_u,
     )

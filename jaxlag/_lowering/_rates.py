@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._errors import real_scalar
-from jaxlag._kkt import independent_rows, least_norm, masked
+from jaxlag._kkt import independent_rows, least_norm, masked, row_sizes
 from jaxlag._linalg import factor_mass, solve_mass
 from jaxlag._lowering._array import ArrayTerms
 
@@ -108,9 +108,11 @@ class Moving:
         a = self.velocity_rate(self.accelerations())
         left = terms.euler_lagrange(t, q, v, a, params) - self._force()
         A, _ = terms.rows(t, q, v, params)
-        kept = independent_rows(jnp.eye(q.shape[0], dtype=q.dtype), jax.lax.stop_gradient(A))
+        still = jax.lax.stop_gradient
+        there, _ = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A)))
+        kept = independent_rows(jnp.eye(q.shape[0], dtype=q.dtype), still(A), there=there)
         rows = masked(A, kept)
         gram = rows @ rows.T + jnp.diag((~kept).astype(q.dtype))
         factor = factor_mass(jax.lax.stop_gradient(gram))
         lam = solve_mass(gram, rows @ left, factor)
-        return a, least_norm(A, lam, kept)
+        return a, least_norm(A, lam, kept, there)

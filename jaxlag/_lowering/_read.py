@@ -11,7 +11,7 @@ from jaxlag._constraints import AbstractConstraint
 from jaxlag._errors import real_scalar
 from jaxlag._forces import reads_lam
 from jaxlag._lowering._array import ArrayTerms
-from jaxlag._lowering._constrained import Constrained
+from jaxlag._lowering._constrained import Constrained, Sharing
 from jaxlag._lowering._graph import Graph, Node
 from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
@@ -94,9 +94,12 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
     own = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
     kept = [graph.input("kept", k) for k in own] if len(every) > 1 else None
     holonomic = [every[k] for k in own]
-    lam, reaction, read_by_forces = [graph.input("lam", k) for k in range(m)], None, ()
+    lam, reaction = [graph.input("lam", k) for k in range(m)], None
+    sharing = None
     if any(map(reads_lam, key.forces)):
-        read_by_forces = rows_read(key, terms)
+        chosen = np.flatnonzero(rows_read(key, terms)).tolist()
+        if kept is not None and len(chosen) > 1 and not key.apart:
+            sharing = Sharing(chosen, [graph.input("there", k) for k in own])
         code = traced(key, terms.reactive, True, m)
         (Q,) = read(graph, code, *state, *params, *inputs, _array(lam, (m,)))
         reaction = [_node(graph, x) for x in Q]
@@ -113,7 +116,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         key.regular,
         reaction,
         lam,
-        read_by_forces,
+        sharing,
     )
 
 

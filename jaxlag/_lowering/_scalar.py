@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
+from jaxlag._kkt import Choice
 from jaxlag._lowering import _emit
 from jaxlag._lowering._array import ArrayTerms, Prepared
 from jaxlag._lowering._key import key_of
@@ -71,7 +72,7 @@ class ScalarTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
         sense: Array | float = 1.0,
     ) -> ScalarPrepared | Prepared:
         """All that accelerations and projections need of what depends on params alone."""
@@ -79,17 +80,22 @@ class ScalarTerms(Terms):
         if equations is None:
             return self.array.prepare(q, params, inputs, sample, kept, reacting, sense)
 
-        def before(code: Program | None, kept: Array | None) -> Array | None:
-            return None if code is None else _emit.prelude(code, params, q.dtype, kept, sense)
+        def before(
+            code: Program | None, kept: Array | None, there: Array | None = None
+        ) -> Array | None:
+            if code is None:
+                return None
+            return _emit.prelude(code, params, q.dtype, kept, there, sense)
 
-        first = before(equations.program, reacting)
+        solving = (None, None) if reacting is None else reacting
+        first = before(equations.program, *solving)
         assert first is not None
         rates = before(equations.velocity, kept)
         if equations.surface is None:
             return ScalarPrepared(first, rates=rates)
         *moving, lam = equations.surface
         others = [before(code, kept) for code in moving]
-        return ScalarPrepared(first, *others, lam=before(lam, reacting), rates=rates)
+        return ScalarPrepared(first, *others, lam=before(lam, *solving), rates=rates)
 
     def acceleration(
         self,
@@ -99,7 +105,7 @@ class ScalarTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        kept: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
     ) -> Float[Array, " n"]:
         """Acceleration a; NaN, whole, where M is not positive definite.
 
@@ -107,10 +113,10 @@ class ScalarTerms(Terms):
         their values: the step fails by the one that is NaN.
         """
         if self.lowered(q, params, inputs).equations is None:
-            return self.array.acceleration(t, q, v, params, inputs, prepared, kept)
+            return self.array.acceleration(t, q, v, params, inputs, prepared, reacting)
         if prepared is not None:
             return self.rates(t, q, v, params, inputs, prepared)
-        own: Any = self.prepare(q, params, inputs, kept=kept, reacting=kept)
+        own: Any = self.prepare(q, params, inputs, reacting=reacting)
         a = self.rates(t, q, v, params, inputs, own)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 

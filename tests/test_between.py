@@ -1,0 +1,66 @@
+"""States between the rows of a motion, as accurate as the rows."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+
+def spring(t, q, v, params):
+    return 0.5 * v[0] ** 2 - 0.5 * params * q[0] ** 2
+
+
+SYSTEM = jl.System(spring, ("x",))
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_states_between_rows_are_as_accurate_as_rows(sense):
+    """cos(2 t), in any order, rows and repeated times among them."""
+    ts = sense * np.array([0.0, 1.0, 4.0])
+    motion = jl.simulate(SYSTEM, [1.0], [0.0], ts, 4.0, rtol=1e-10, atol=1e-10, method="tsit5")
+    times = sense * np.array([3.3, 1.0, 2.5, 3.3, 4.0])
+    found = motion.at(times)
+    np.testing.assert_array_equal(found.ts, times)
+    np.testing.assert_allclose(found["x"], np.cos(2 * times), atol=1e-8)
+    np.testing.assert_allclose(found.rate("x"), -2 * np.sin(2 * times), atol=2e-8)
+    np.testing.assert_array_equal(motion.at(ts[1])["x"], motion["x"][1:2])
+
+
+def test_constrained_motions_stay_on_their_constraints():
+    rod = jl.Holonomic(lambda t, q, params: q @ q - 1.0, "rod")
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[1], ("x", "y"), constraints=(rod,)
+    )
+    motion = jl.simulate(system, [1.0, 0.0], [0.0, 0.0], [0.0, 1.0], rtol=1e-6, atol=1e-6)
+    found = motion.at(0.3)
+    np.testing.assert_allclose(jnp.sum(found.q**2), 1.0, atol=1e-14)
+    row = jl.simulate(system, [1.0, 0.0], [0.0, 0.0], [0.0, 0.3, 1.0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.q[0], row.q[1], atol=1e-5)
+
+
+def fixed():
+    return jl.simulate(SYSTEM, [1.0], [0.0], [0.0, 1.0], 4.0, dt=0.5, method="heun")
+
+
+def adaptive():
+    return jl.simulate(SYSTEM, [1.0], [0.0], [0.0, 1.0], 4.0, method="bosh3", rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "t", "message"),
+    [
+        (fixed, 0.3, "adaptive steps, but its steps were fixed"),
+        (adaptive, 1.5, r"lie within the motion, from 0.0 to 1.0 s, but one was 1.5"),
+        (adaptive, [[0.1]], r"be a number or one row of numbers, but its shape was \(1, 1\)"),
+        (
+            lambda: jax.vmap(lambda k: adaptive())(jnp.ones(2)),
+            0.3,
+            r"be a single one, .* batch \(2,\)\. Take one of them",
+        ),
+    ],
+)
+def test_what_cannot_be_told_is_refused(make, t, message):
+    with pytest.raises(ValueError, match=message):
+        make().at(t)

@@ -1,0 +1,100 @@
+"""A solution in words, by index, as a dict, as a dataset and as a figure."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+
+def plane(t, q, v, params):
+    return 0.5 * v @ v - 0.5 * params * q @ q
+
+
+SYSTEM = jl.System(plane, {"x": (), "y": (), "arm": (2, 2)})
+TS = np.linspace(0.0, 1.0, 5)
+Q0 = jnp.arange(1.0, 7.0)
+
+
+def moved(stiffness, **options):
+    return jl.simulate(
+        SYSTEM, Q0, 0.0 * Q0, TS, stiffness, throw=False, dt=0.25, method="heun", **options
+    )
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return moved(1.0)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """The third one without a stiffness."""
+    return jax.vmap(moved)(jnp.array([1.0, 2.0, jnp.nan, 3.0, jnp.nan]))
+
+
+def test_a_motion_is_described_in_one_line(motion, batch):
+    assert repr(motion) == "Solution(x, y, arm: 5 times from 0 to 1 s, ok)"
+    assert repr(batch) == "Solution(x, y, arm: batch (5,) of 5 times, 3 ok, 2 nonfinite)"
+    seen = []
+    jax.jit(lambda k: seen.append(repr(moved(k))) or k)(1.0)
+    assert seen == ["Solution(x, y, arm: 5 times, traced)"]
+
+
+def test_motions_of_a_batch_are_taken_by_index(batch, motion):
+    one = batch[0]
+    np.testing.assert_allclose(one.q, motion.q, rtol=1e-14)
+    assert one.message() == motion.message()
+    np.testing.assert_array_equal(batch[1:]["x"], batch["x"][1:])
+    np.testing.assert_array_equal(batch[np.array([3, 0])].energy, batch.energy[np.array([3, 0])])
+    with pytest.raises(ValueError, match=r"^name must be a name, for a single motion, .* was 3"):
+        motion[3]
+
+
+def test_a_batch_says_how_many_ended_how(batch):
+    first, second = batch.message().splitlines()
+    assert first == "5 motions: 3 ok, 2 nonfinite"
+    assert second.startswith("[2]: nonfinite")
+
+
+def test_a_dict_has_everything_by_name(motion, batch):
+    found = motion.to_dict()
+    assert list(found) == ["t", "x", "x'", "y", "y'", "arm", "arm'"]
+    assert all(isinstance(value, np.ndarray) for value in found.values())
+    np.testing.assert_array_equal(found["arm'"], motion.rate("arm"))
+    saved = moved(1.0, save=("energy",)).to_dict()
+    np.testing.assert_allclose(saved["energy"], motion.energy, rtol=1e-14)
+    assert batch.to_dict()["arm"].shape == (5, 5, 2, 2)
+
+
+def test_a_dataset_is_labelled(motion, batch):
+    pytest.importorskip("xarray")
+    found = motion.to_xarray()
+    np.testing.assert_array_equal(found["t"], TS)
+    np.testing.assert_allclose(float(found["x"].sel(t=0.5)), float(motion["x"][2]))
+    assert found["arm"].dims == ("t", "arm_0", "arm_1")
+    many = batch.to_xarray()
+    assert many["arm"].dims == ("motion", "t", "arm_0", "arm_1")
+    assert many["status"].to_numpy().tolist() == batch.status.tolist()
+    # Times of their own are no common coordinate.
+    own = jax.vmap(
+        lambda end: jl.simulate(
+            SYSTEM, Q0, 0.0 * Q0, jnp.array([0.0, 0.5, 1.0]) * end, 1.0, dt=0.25, method="heun"
+        )
+    )(jnp.array([1.0, 2.0]))
+    assert own.to_xarray()["t"].dims == ("motion", "row")
+
+
+def test_a_figure_shows_coordinates_energy_and_paths(motion, batch):
+    """What the lines are, not how they look."""
+    pytest.importorskip("matplotlib")
+    *panels, plane = motion.plot().axes
+    assert [ax.get_ylabel() for ax in panels] == ["x", "y", "arm", "energy [J]"]
+    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), motion["x"])
+    assert len(panels[2].lines) == 4
+    paths = [line.get_xydata() for line in plane.lines[::2]]
+    np.testing.assert_array_equal(paths[0], np.stack([motion["x"], motion["y"]], axis=1))
+    np.testing.assert_array_equal(paths[1], motion["arm"][:, 0])
+    np.testing.assert_array_equal(paths[2], motion["arm"][:, 1])
+    assert len(batch.plot().axes[0].lines) == 5
