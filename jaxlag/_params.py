@@ -1,5 +1,6 @@
 """Parameters: any pytree, split into what JAX traces and what the compiled program is keyed by."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -53,27 +54,35 @@ def check(params: Any) -> None:
     Raises:
         ValueError: with the leaf by its path.
     """
+    if all(map(_is_fine, jax.tree.leaves(params))):  # nearly always, and without any paths
+        return
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
-        value = known(leaf)
-        if value is not None and np.issubdtype(value.dtype, np.inexact):
-            fine = np.isfinite(value)
-            if not np.all(fine):
-                at, was = "", value
-                if value.ndim:
-                    index = tuple(int(i) for i in np.argwhere(~fine)[0])
-                    at, was = f"[{', '.join(map(str, index))}]", value[index]
-                must = "be finite"
-                raise bad(f"params{jax.tree_util.keystr(path)}{at}", must, f"it was {was}")
-        elif value is None and not is_array(leaf):
-            try:
-                hash(leaf)
-            except TypeError as error:
-                raise bad(
-                    f"params{jax.tree_util.keystr(path)}",
-                    "be a number, an array, or an object that hashes",
-                    f"it was {leaf!r}",
-                    "Write a tuple for a list or a set, or make it an equinox module.",
-                ) from error
+        name, value = f"params{jax.tree_util.keystr(path)}", known(leaf)
+        if _is_fine(leaf):
+            continue
+        if value is None:
+            must, fix = (
+                "be a number, an array, or an object that hashes",
+                "Write a tuple for a set.",
+            )
+            raise bad(name, must, f"it was {leaf!r}", fix)
+        if value.ndim:
+            index = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
+            name, value = f"{name}[{', '.join(map(str, index))}]", value[index]
+        raise bad(name, "be finite", f"it was {value}")
+
+
+def _is_fine(leaf: Any) -> bool:
+    if isinstance(leaf, float):
+        return math.isfinite(leaf)
+    value = known(leaf)
+    if value is not None:
+        return not np.issubdtype(value.dtype, np.inexact) or bool(np.all(np.isfinite(value)))
+    try:
+        hash(None if is_array(leaf) else leaf)
+    except TypeError:
+        return False
+    return True
 
 
 def _is_key(x: Any) -> bool:

@@ -19,6 +19,8 @@ def check_placement(function: str, values: Any) -> None:
         ValueError: with the axes, and what to write instead.
     """
     for leaf in jax.tree.leaves(values):
+        if not isinstance(leaf, Tracer) and not _spread(leaf):
+            continue
         varying, explicit = _axes(leaf)
         if varying:
             raise bad(
@@ -34,6 +36,11 @@ def check_placement(function: str, values: Any) -> None:
                 f"one lies along the explicit axes {sorted(explicit)}",
                 "Write jax.make_mesh(shape, names, axis_types=(jax.sharding.AxisType.Auto,) * n).",
             )
+
+
+def _spread(x: Any) -> bool:
+    """Whether it is an array with values on several devices."""
+    return isinstance(x, jax.Array) and len(x.sharding.device_set) > 1
 
 
 def _axes(x: Any) -> tuple[set[str], set[str]]:

@@ -374,8 +374,8 @@ class Solution(eqx.Module):
     def plot(self) -> Any:
         """Coordinates and energy over time, and in the plane the paths; needs the extra "plot".
 
-        In the plane are coordinates called x and y, and points of two components. Of a batch up to
-        16 motions are drawn.
+        In the plane are coordinates called x and y, or x1 and y1, and points of two components. Of
+        a batch up to 16 motions are drawn.
 
         Returns:
             A matplotlib `Figure`, which notebooks show; `figure.savefig("motion.png")` keeps it.

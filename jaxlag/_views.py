@@ -151,10 +151,16 @@ def _label(name: str, shape: tuple[int, ...], j: int) -> str:
 
 
 def _paths(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
-    """Functions of the coordinates by name that return (x, y) of points in the plane."""
+    """Functions of the coordinates by name that return (x, y) of points in the plane.
+
+    Of x and y, x1 and y1, and so on, and of points of two components.
+    """
     found: list[Any] = []
-    if shapes.get("x") == () and shapes.get("y") == () and "z" not in shapes:
-        found.append(lambda q: (q["x"], q["y"]))
+    scalars = {name for name, shape in shapes.items() if shape == ()}
+    for x in (name for name in shapes if name.startswith("x")):
+        y, z = f"y{x[1:]}", f"z{x[1:]}"
+        if {x, y} <= scalars and z not in shapes:
+            found.append(lambda q, x=x, y=y: (q[x], q[y]))
     for name, shape in shapes.items():
         if len(shape) in (1, 2) and shape[-1] == 2:
             for j in range(shape[0] if len(shape) == 2 else 1):

@@ -232,7 +232,7 @@ CONTACTS = {
 }
 
 
-@pytest.mark.parametrize("lowering", ["scalar", "array"])
+@pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
 @pytest.mark.parametrize("kind", mostly_full(list(CONTACTS), "both", "rate"))
 def test_a_contact_that_is_declared_twice_drags_once(kind, lowering):
     """Whichever row the friction reads; what it reads is what is told, and the books are kept."""
@@ -278,8 +278,12 @@ def turned_drag(t, q, v, params, lam):
     return jnp.stack([-0.1 * jnp.sum(lam["c"]), 0.0 * q[1], 0.0 * q[2]])
 
 
-@pytest.mark.parametrize("lowering", ["scalar", "array"])
-@pytest.mark.parametrize("psi", [0.0, np.pi])
+@pytest.mark.parametrize(
+    ("lowering", "psi"),
+    mostly_full(
+        [("scalar", np.pi), ("scalar", 0.0), ("array", np.pi), ("array", 0.0)], ("scalar", np.pi)
+    ),
+)
 def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
     """Deceleration 0.1 g, and the derivative of its way in every start."""
     lock = jl.Holonomic(lambda t, q, params: q[2] - params, "lock")
@@ -343,7 +347,8 @@ def feet_drag(t, q, v, params, lam):
     return jnp.zeros(5).at[0].set(-params[0] * jnp.sum(lam["feet"]) * jnp.sign(v[0]))
 
 
-@pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
+@pytest.mark.full
+@pytest.mark.parametrize("lowering", ["scalar", "array"])
 def test_four_feet_share_as_equals(lowering):
     """Of three alone one might have to pull; of least norm all four press."""
     force = jl.GeneralizedForce(feet_drag, "drag", reaction=True, contact="feet")
