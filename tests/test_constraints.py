@@ -243,6 +243,28 @@ def test_rows_that_are_refused_at_first_use(constraint, message):
             use()
 
 
+@jax.custom_vjp
+def squared(x):
+    return x**2
+
+
+squared.defvjp(lambda x: (x**2, x), lambda x, slope: (2.0 * x * slope,))
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        jl.Holonomic(lambda t, q, params: squared(q[0]) + q[1] ** 2 - 1.0, "rod"),
+        jl.Pfaffian(lambda t, q, v, params: squared(q[0]) * v[0] + v[1], "rod"),
+    ],
+)
+def test_rules_for_reverse_derivatives_alone_are_refused(row):
+    """Rates are forward derivatives; a Lagrangian may have such rules."""
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x", "y"), constraints=(row,))
+    with pytest.raises(ValueError, match=r"^constraint 'rod' must .* by jax.custom_vjp\. Write"):
+        system.rows({}, jnp.dtype(float))
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_options_that_are_refused():
     mechanism = double_pendulum()

@@ -1,6 +1,6 @@
 """Which rows A v + b there are, and what they contain: read from their program, not from values."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from math import prod
 from typing import Any, NamedTuple
@@ -53,15 +53,21 @@ def layout_of(
         def of_v(t: Array, q: Array, v: Array, traced: Any, c: Any = constraint) -> Array:
             return c.velocity(t, q, v, _params.join(traced, static.tree))
 
+        def residual(t: Array, q: Array, v: Array, traced: Any, c: Any = constraint) -> Array:
+            params = _params.join(traced, static.tree)
+            return c.position(t, q, params) if c.holonomic else c.velocity(t, q, v, params)
+
         def raw(t: Array, q: Array, v: Array, traced: Any, c: Any = constraint) -> Any:
             params = _params.join(traced, static.tree)
             return c.phi(t, q, params) if c.holonomic else c.residual(t, q, v, params)
 
         t = jax.ShapeDtypeStruct((), jnp.result_type(float))
         q = jax.ShapeDtypeStruct((n,), dtype)
+        argument = f"constraint {constraint.names!r}"
+        _check_rules(jax.make_jaxpr(residual)(t, q, q, like.tree), argument)
         (count,) = jax.eval_shape(of_v, t, q, q, like.tree).shape
         written = jax.make_jaxpr(raw)(t, q, q, like.tree)
-        check_indices(written, _watched(like, "v"), f"constraint {constraint.names!r}")
+        check_indices(written, _watched(like, "v"), argument)
         if isinstance(constraint.names, str):
             (shape,) = (x.shape for x in written.out_avals)
             shapes.append((constraint.names, shape))
@@ -74,6 +80,27 @@ def layout_of(
         holonomic += [constraint.holonomic] * count
         driven += _examine(constraint, labels[-count:], like, static, n, dtype)
     return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven))
+
+
+def _check_rules(written: ClosedJaxpr, argument: str) -> None:
+    """Raise where a function has a rule for reverse derivatives alone: rates are forward ones."""
+    if any(name.startswith("custom_vjp") for name in _primitives(written.jaxpr)):
+        raise bad(
+            argument,
+            "have forward derivatives, by which its rate along the motion is found",
+            "a function in it has a rule by jax.custom_vjp",
+            "Write that rule by jax.custom_jvp, from which both derivatives follow.",
+        )
+
+
+def _primitives(jaxpr: Any) -> Iterator[str]:
+    for eqn in jaxpr.eqns:
+        yield eqn.primitive.name
+        for value in eqn.params.values():
+            for inner in value if isinstance(value, tuple | list) else (value,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from _primitives(inner)
 
 
 def _watched(like: _params.Static, speeds: str) -> list[str | None]:
@@ -137,6 +164,7 @@ def _checked(
 
     closed = jax.make_jaxpr(written)(t, q, at, like.tree)
     check_indices(closed, _watched(like, speeds), "QuasiVelocities")
+    _check_rules(closed, "QuasiVelocities")
     if quasi.U is None:
         rows = examine(quasi.velocities, None, like, static, n, dtype, quasi.size)
         bent = [str(i) for i, row in enumerate(rows) if not row.affine]
