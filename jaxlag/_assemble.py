@@ -14,16 +14,10 @@ from jaxlag import _params
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._errors import AssemblyError, bad
-from jaxlag._kkt import (
-    augmented,
-    closed_to,
-    dependence_floor,
-    independent_rows,
-    row_sizes,
-    solve_kkt,
-)
-from jaxlag._linalg import factor_mass
+from jaxlag._kkt import augmented, solve_kkt
+from jaxlag._linalg import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
+from jaxlag._rank import independent_rows, row_sizes
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, real, state_vectors

@@ -20,11 +20,11 @@ from jaxlag._inputs import (
     evaluate,
     reads_state,
 )
-from jaxlag._kkt import Choice, independent_rows, row_sizes
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
 from jaxlag._quasi import QuasiVelocities
+from jaxlag._rank import Choice, independent_rows, row_sizes
 from jaxlag._step import Arguments, Gaps, RowChoice
 from jaxlag._system import System
 from jaxlag._terms import Terms

@@ -12,9 +12,10 @@ from jaxtyping import Array, Float, Int
 from jaxlag import _params
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked, row_sizes
+from jaxlag._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked
 from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
 from jaxlag._quasi import SINE
+from jaxlag._rank import row_sizes
 from jaxlag._record import Outcome, Times
 from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag import _params
 from jaxlag._errors import bad
 from jaxlag._inputs import all_knots
-from jaxlag._kkt import rank_floor
 from jaxlag._lanes import in_batches
+from jaxlag._linalg import rank_floor
 from jaxlag._methods import default_tolerances
 from jaxlag._solution import Solution
 from jaxlag._status import ADVICE, Status

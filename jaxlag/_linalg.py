@@ -16,6 +16,21 @@ UNROLL_UP_TO = 8
 LOOP_UP_TO = 16
 
 
+def dependence_floor(dtype: jnp.dtype) -> float:
+    """Square of the sine of the angle below which a row depends on others at a start: eps^1/2."""
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def rank_floor(dtype: jnp.dtype) -> float:
+    """The same in flight, where rows that were independent at the start no longer are: eps^2/3."""
+    return float(jnp.finfo(dtype).eps) ** (2 / 3)
+
+
+def closed_to(dtype: jnp.dtype) -> float:
+    """Residual over row and state up to which rows that were left out hold: eps^3/4."""
+    return float(jnp.finfo(dtype).eps) ** 0.75
+
+
 class MassFactor(NamedTuple):
     """Factor of M = L D L^T, with U = D L^T (upper) and the pivots' health.
 

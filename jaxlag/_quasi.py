@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._captured import captured
 from jaxlag._constraints import Pfaffian
 from jaxlag._errors import bad, require_arity
-from jaxlag._kkt import row_sizes
+from jaxlag._rank import row_sizes
 from jaxlag._vectors import real
 
 # Least sine of the angle between a row of dU/dv and those before it, in roundings.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam, sliding
-from jaxlag._kkt import closed_to
+from jaxlag._linalg import closed_to
 from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
 from jaxlag._projection import Surface, project
 from jaxlag._step import Arguments, Verdict

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from jaxlag._dynamics import Dynamics, still
-from jaxlag._kkt import closed_to, dependence_floor, independent_rows
+from jaxlag._linalg import closed_to, dependence_floor
+from jaxlag._rank import independent_rows
 from jaxlag._step import Arguments
 
 

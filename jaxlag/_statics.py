@@ -18,7 +18,7 @@ from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_t
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
-from jaxlag._kkt import least_norm
+from jaxlag._rank import least_norm
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, vector

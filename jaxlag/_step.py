@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._kkt import Choice
+from jaxlag._rank import Choice
 
 
 class RowChoice(NamedTuple):

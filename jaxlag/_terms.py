@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
-from jaxlag._kkt import Choice
+from jaxlag._rank import Choice
 
 
 class Terms(eqx.Module):

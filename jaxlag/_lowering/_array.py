@@ -21,22 +21,12 @@ from jaxlag._constraints import (
 from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import real_scalar
 from jaxlag._forces import AbstractForce, components, reads_lam
-from jaxlag._kkt import (
-    Choice,
-    augmented,
-    factor_kkt,
-    independent_rows,
-    masked,
-    row_sizes,
-    rows_hold,
-    shared,
-    solve_kkt,
-    solve_reactions,
-)
+from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions
 from jaxlag._linalg import MassFactor, factor_mass, solve_mass
 from jaxlag._lowering._rows import layout
 from jaxlag._lowering._structure import Structure, find_structure
 from jaxlag._quasi import QuasiVelocities
+from jaxlag._rank import Choice, independent_rows, row_sizes, rows_hold, shared
 from jaxlag._terms import Terms
 
 

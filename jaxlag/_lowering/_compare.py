@@ -9,7 +9,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import augmented, shared
+from jaxlag._kkt import augmented
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._evaluate import evaluate
 from jaxlag._lowering._interpret import interpret
@@ -17,6 +17,7 @@ from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._read import rows_read
 from jaxlag._lowering._rows import layout_of
 from jaxlag._lowering._scene import Equations, Scene
+from jaxlag._rank import shared
 
 STATES = 8  # random states at which both programs are compared
 LEAST = 6  # of them that must have been comparable

@@ -187,7 +187,7 @@ def _shared(
 ) -> list[list[Node]]:
     """What takes multipliers of the rows kept to those that forces see, m rows.
 
-    As `jaxlag._kkt.shared`: C (C^T C)^-1 C^T between rows of unit length, C the rows in terms of
+    As `jaxlag._rank.shared`: C (C^T C)^-1 C^T between rows of unit length, C the rows in terms of
     those that are kept, which come first among the chosen ones.
     """
     m, chosen = len(A), sharing.chosen

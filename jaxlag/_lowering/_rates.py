@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._errors import real_scalar
-from jaxlag._kkt import independent_rows, least_norm, masked, row_sizes
+from jaxlag._kkt import masked
 from jaxlag._linalg import factor_mass, solve_mass
 from jaxlag._lowering._array import ArrayTerms
+from jaxlag._rank import independent_rows, least_norm, row_sizes
 
 
 class Moving:

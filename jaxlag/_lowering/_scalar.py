@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
-from jaxlag._kkt import Choice
 from jaxlag._lowering import _emit
 from jaxlag._lowering._array import ArrayTerms, Prepared
 from jaxlag._lowering._key import key_of
@@ -16,6 +15,7 @@ from jaxlag._lowering._lower import Lowered, lower
 from jaxlag._lowering._program import Program
 from jaxlag._lowering._scene import Equations
 from jaxlag._projection import Surface
+from jaxlag._rank import Choice
 from jaxlag._terms import Terms
 
 
