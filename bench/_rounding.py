@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxlag._dependence import scan_sizes
+
 # Exact in floating point: a number moved, chosen or of another sign.
 _CHOSEN = ("abs", "neg", "sign", "max", "min", "clamp", "floor", "round", "select_n", "sort")
 _REDUCED = ("reduce_max", "reduce_min", "cummax", "cummin")
@@ -196,13 +198,13 @@ def _run(jaxpr: Any, consts: Any, args: Any, eps: float, rng: Any) -> list[Any]:
 
 def _scanned(eqn: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
     p = eqn.params
-    count, carried = p["num_consts"], p["num_consts"] + p["num_carry"]
-    consts, carry, rows = given[:count], given[count:carried], given[carried:]
+    fixed, carries = scan_sizes(p)
+    consts, carry, rows = given[:fixed], given[fixed : fixed + carries], given[fixed + carries :]
     written = []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
         found = evaluated(p["jaxpr"], [*consts, *carry, *(x[k] for x in rows)], eps, rng)
-        carry = found[: p["num_carry"]]
-        written.append(found[p["num_carry"] :])
+        carry = found[:carries]
+        written.append(found[carries:])
     written = written[:: -1 if p["reverse"] else 1]
     return [*carry, *(np.stack(column) for column in zip(*written, strict=True))]
 

@@ -44,6 +44,12 @@ class _Program(NamedTuple):
     inputs: frozenset[str]
 
 
+class _Traced(NamedTuple):
+    """In the place of a traced value that a function closes over: which one it is."""
+
+    id: int
+
+
 class Captured:
     """A function that is traced once for every kind of arguments, and never called again.
 
@@ -94,17 +100,29 @@ class Captured:
         except TypeError:  # a leaf without hash: no compiled program knows such params either
             return _called(self.function, [plain(x) for x in arguments])
         if program is None:
-            program = self._trace(kind, leaves)
+            program = self._closing(params, kind, leaves)
         else:
             self.warn()
         for i in named:
             arguments[i].read |= program.inputs
-        code = program.code
-        if isinstance(params, Closed):
-            instead = params.by_tracer
-            code = ClosedJaxpr(code.jaxpr, [instead.get(id(x), x) for x in code.consts])
-        found = map(jnp.asarray, jaxpr_as_fun(code)(*leaves))
+        found = map(jnp.asarray, jaxpr_as_fun(program.code)(*leaves))
         return eqx.combine(jax.tree.unflatten(program.form, found), program.static)
+
+    def _closing(self, params: Any, kind: Any, leaves: list) -> _Program:
+        """One that isn't kept, or not yet: with what stands for traced values of its closure."""
+        if not isinstance(params, Closed):
+            return self._trace(kind, leaves)
+        instead, made = params.by_tracer, params.programs
+        if (self, kind) not in made:
+            program = self._trace(kind, leaves)
+            # Without the tracers, which programs in a cache would keep alive.
+            reads = [_Traced(id(x)) if id(x) in instead else x for x in program.code.consts]
+            if not _params.concrete(reads):
+                return program
+            made[self, kind] = program._replace(code=ClosedJaxpr(program.code.jaxpr, reads))
+        program = made[self, kind]
+        consts = [instead[x.id] if isinstance(x, _Traced) else x for x in program.code.consts]
+        return program._replace(code=ClosedJaxpr(program.code.jaxpr, consts))
 
     def _trace(self, kind: Any, leaves: list) -> _Program:
         """The program for a new kind of arguments; kept, unless it closes over traced values."""
