@@ -49,7 +49,8 @@ class Closed:
     @classmethod
     def tree_unflatten(cls, fixed: tuple[tuple[int, ...], "Programs"], parts: Any) -> "Closed":
         """As JAX asks for it."""
-        return cls(*parts, *fixed)
+        (params, values), (tracers, programs) = parts, fixed
+        return cls(params, values, tracers, programs)
 
 
 def plain(params: Any) -> Any:
