@@ -4,69 +4,30 @@ Entries of R are at most 1 and take some three roundings, so identities of one o
 them hold to some 10 EPS; the worst found over the samples is written beside each bound.
 """
 
-import itertools
 import re
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from _families import mostly_full
+from _rotations import (
+    ALL,
+    ANGLES,
+    COUNT,
+    EPS,
+    LOCK,
+    anywhere,
+    batch,
+    crosses,
+    cube,
+    every,
+    every_angles,
+    principal,
+    worst,
+)
 from scipy.spatial.transform import Rotation
 
 from jaxlag import rotation
 from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
-
-EPS = np.finfo(float).eps
-ALL = {"yaw_pitch_roll": yaw_pitch_roll, "zxz": zxz, "quaternion": quaternion}
-ANGLES = {name: ALL[name] for name in ("yaw_pitch_roll", "zxz")}
-LOCK = {"yaw_pitch_roll": np.cos, "zxz": np.sin}  # |det W|
-COUNT = 500
-
-every = pytest.mark.parametrize("kind", ALL)
-every_angles = pytest.mark.parametrize("kind", ANGLES)
-
-
-def anywhere(kind, rng, count=COUNT):
-    """Coordinates of any size: angles of several turns, quaternions of norms 0.1 to 10."""
-    if kind != "quaternion":
-        return rng.uniform(-10.0, 10.0, (count, 3))
-    x = rng.normal(size=(count, 4))
-    return x / np.linalg.norm(x, axis=1)[:, None] * 10 ** rng.uniform(-1.0, 1.0, (count, 1))
-
-
-def principal(kind, rng, count=COUNT):
-    """Coordinates in their principal ranges, 0.2 rad or more from gimbal lock."""
-    if kind == "quaternion":
-        x = rng.normal(size=(count, 4))
-        x /= np.linalg.norm(x, axis=1)[:, None]
-        return x * np.where(x[:, :1] < 0, -1, 1)
-    x = rng.uniform(-np.pi, np.pi, (count, 3))
-    low, high = (0.2, np.pi - 0.2) if kind == "zxz" else (0.2 - np.pi / 2, np.pi / 2 - 0.2)
-    x[:, 1] = rng.uniform(low, high, count)
-    return x
-
-
-def batch(function, *arguments):
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(*arguments))
-
-
-def worst(found, expected):
-    return float(np.max(np.abs(np.asarray(found) - np.asarray(expected))))
-
-
-def crosses(a):
-    return batch(rotation.skew, a)
-
-
-def cube():
-    """The 24 proper rotations that take axes to axes; half and quarter turns among them."""
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            R = np.eye(3)[list(order)] * np.array(signs)
-            if np.linalg.det(R) > 0:
-                yield R
-
 
 # ---- Matrices ----------------------------------------------------------------------------------
 
@@ -359,226 +320,6 @@ def test_quaternions_of_half_turns():
         near /= np.linalg.norm(near)
         found = quaternion.from_matrix(quaternion.matrix(near))
         assert worst(found, near) <= 4 * EPS  # worst 0
-
-
-# ---- Gimbal lock -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("frame", ["body", "space"])
-@every_angles
-def test_at_gimbal_lock_two_rates_are_not_finite(kind, frame, dtype):
-    """Also at the representable angles nearest to it, and for the w of some finite x_dot."""
-    p, rng = ANGLES[kind], np.random.default_rng(16)
-    lock = np.pi * np.arange(-4, 5) + (np.pi / 2 if kind == "yaw_pitch_roll" else 0.0)
-    x = rng.uniform(-np.pi, np.pi, (len(lock), 3)).astype(dtype)
-    x[:, 1] = lock
-    x_dot, w = rng.normal(size=(2, *x.shape)).astype(dtype)
-    reachable = batch(getattr(p, f"{frame}_rates"), x, x_dot)
-    undo = getattr(p, f"from_{frame}_rates")
-    for rates in (reachable, w, np.zeros_like(w)):
-        found = batch(undo, x, rates)
-        assert found.dtype == dtype
-        assert not np.any(np.isfinite(found[:, [0, 2]]))
-    theta_dot = batch(undo, x, reachable)[:, 1]
-    assert worst(theta_dot, x_dot[:, 1]) <= 12 * np.finfo(dtype).eps  # worst 3, |w| <= 6
-    slope = batch(jax.jacfwd(undo), x, reachable)[:, [0, 2], 1]
-    assert not np.any(np.isfinite(slope))
-
-
-@every_angles
-def test_near_gimbal_lock_the_error_grows_as_its_inverse_distance(kind):
-    p, rng = ANGLES[kind], np.random.default_rng(17)
-    lock = np.pi / 2 if kind == "yaw_pitch_roll" else 0.0
-    theta = lock - np.repeat(10.0 ** np.arange(-1.0, -15.0, -1.0), 50)
-    x = rng.uniform(-np.pi, np.pi, (len(theta), 3))
-    x[:, 1] = theta
-    x_dot = rng.normal(size=x.shape)
-
-    def there(x, x_dot):
-        return (
-            p.from_body_rates(x, p.body_rates(x, x_dot)),
-            p.from_space_rates(x, p.space_rates(x, x_dot)),
-        )
-
-    determinant = np.abs(LOCK[kind](theta))[:, None]
-    for found in batch(there, x, x_dot):
-        # Each w is |x_dot| <= 8 times some roundings, divided by the determinant.
-        assert worst((found - x_dot) * determinant, 0) <= 8 * EPS  # worst 2.3
-
-
-def test_the_smallest_nutation_is_not_taken_for_lock():
-    """sin(theta) = theta is exact there, whatever its size."""
-    found = zxz.from_body_rates([0.0, 1e-200, 0.0], [0.5, 3e-200, 0.0])
-    np.testing.assert_allclose(found, [3.0, 0.5, -3.0], rtol=4 * EPS)
-
-
-@every_angles
-def test_from_matrix_has_no_derivative_at_gimbal_lock(kind):
-    """NaN in the first and last angle along any rotation, by forward and reverse mode."""
-    R = jnp.eye(3) if kind == "zxz" else jnp.eye(3)[jnp.array([1, 2, 0])]
-    from_matrix = ANGLES[kind].from_matrix
-    for w in np.eye(3):
-        R_dot = R @ rotation.skew(w)
-        for jacobian in (jax.jacfwd, jax.jacrev):
-            moved = jnp.sum(jacobian(from_matrix)(R) * R_dot, axis=(1, 2))
-            assert np.all(np.isnan(moved[jnp.array([0, 2])]))
-
-
-@pytest.mark.parametrize(("dtype", "powers"), [(np.float64, (-565, 565)), (np.float32, (-77, 90))])
-def test_quaternions_of_extreme_norms_are_rotations(dtype, powers):
-    """Squares of 2^-565 and 2^565 under- and overflow; R and its derivatives in e/s do not."""
-    e, e_dot = (np.random.default_rng(23).normal(size=(2, 4))).astype(dtype)
-
-    def rates(x, x_dot):
-        moved = jax.jvp(quaternion.matrix, (x,), (x_dot,))[1]
-        return quaternion.matrix(x), quaternion.body_rates(x, x_dot), moved
-
-    expected = rates(e, e_dot)
-    for power in powers:
-        scale = dtype(2.0) ** dtype(power)
-        for found, right in zip(rates(scale * e, scale * e_dot), expected, strict=True):
-            np.testing.assert_array_equal(found, right)
-
-
-def test_the_scale_of_a_quaternion_has_no_part_in_its_derivatives():
-    """To second order, forward and reverse, against R written out with sums of squares."""
-
-    def plain(x):
-        a, b, c, d = x
-        first = jnp.stack([a * a + b * b - c * c - d * d, 2 * (b * c + a * d), 2 * (b * d - a * c)])
-        return first / (x @ x)
-
-    def ours(x):
-        return quaternion.matrix(x)[:, 0]
-
-    x = jnp.array([0.7, -1.3, 0.2, 0.9])
-    for order in range(3):
-        found, expected = jax.jit(lambda x, f=ours, g=plain: (f(x), g(x)))(x)
-        np.testing.assert_allclose(found, expected, atol=32 * EPS * np.max(np.abs(expected)))
-        ours, plain = (jax.jacfwd if order else jax.jacrev)(ours), jax.jacfwd(plain)
-
-
-def test_the_zero_quaternion_is_no_rotation():
-    assert np.all(np.isnan(quaternion.matrix(np.zeros(4))))
-    assert np.all(np.isnan(quaternion.body_rates(np.zeros(4), np.ones(4))))
-
-
-# ---- Derivatives, batches, precision -----------------------------------------------------------
-
-
-def functions(p):
-    """Of x alone; x_dot and w are fixed, coordinates from matrices go along rotations."""
-
-    def x_dot(x):
-        return jnp.array([0.3, -0.8, 0.5, 1.1], x.dtype)[: len(p.names)]
-
-    def w(x):
-        return jnp.array([0.7, -0.2, 0.4], x.dtype)
-
-    return {
-        "matrix": p.matrix,
-        "body_rates": lambda x: p.body_rates(x, x_dot(x)),
-        "space_rates": lambda x: p.space_rates(x, x_dot(x)),
-        "body_rate_matrix": p.body_rate_matrix,
-        "from_body_rates": lambda x: p.from_body_rates(x, w(x)),
-        "from_space_rates": lambda x: p.from_space_rates(x, w(x)),
-        "from_matrix": lambda x: p.from_matrix(p.matrix(x)),
-    }
-
-
-@every
-@pytest.mark.parametrize("name", mostly_full(functions(zxz), "from_matrix", "from_space_rates"))
-def test_derivatives_agree_with_central_differences(kind, name):
-    p, h = ALL[kind], 1e-5
-    function = functions(p)[name]
-    x = principal(kind, np.random.default_rng(18), 20)
-    forward, reverse = batch(lambda x: (jax.jacfwd(function)(x), jax.jacrev(function)(x)), x)
-    steps = h * np.concatenate([np.eye(x.shape[1]), -np.eye(x.shape[1])])
-    ahead, behind = np.split(batch(jax.vmap(function), x + steps[:, None]), 2)
-    differences = np.moveaxis(ahead - behind, 0, -1) / (2 * h)
-    scale = np.max(np.abs(forward))
-    assert worst(forward, reverse) <= 8 * EPS * scale  # worst 3
-    # h^2/6 of the third derivative, at most 6/0.2^2 of the first, and EPS/h of the values.
-    atol = (h**2 / 0.2**2 + 10 * EPS / h) * scale
-    assert worst(forward, differences) <= atol
-    assert scale > 0.1
-
-
-@every
-def test_from_matrix_is_differentiable_along_rotations(kind):
-    """d/dt from_matrix(R) = from_body_rates(x, w) for R_dot = R [w]x."""
-    p, rng = ALL[kind], np.random.default_rng(19)
-    x, w = principal(kind, rng), rng.normal(size=(COUNT, 3))
-
-    def moved(x, w):
-        R = p.matrix(x)
-        return jax.jvp(p.from_matrix, (R,), (R @ rotation.skew(w),))[1]
-
-    assert worst(batch(moved, x, w), batch(p.from_body_rates, x, w)) <= 50 * EPS  # worst 16
-
-
-def by_parametrisation(p, x, a, b):
-    x_dot = p.from_body_rates(x, a)
-    rates = x_dot, p.from_space_rates(x, a), p.body_rates(x, x_dot), p.space_rates(x, x_dot)
-    return p.matrix(x), p.from_matrix(p.matrix(x)), p.body_rate_matrix(x), rates
-
-
-def by_matrix(p, x, a, b):
-    R = rotation.compose(rotation.about_x(a[0]), rotation.about_y(a[1]), rotation.about_z(a[2]))
-    R_dot = R @ rotation.skew(b)
-    return (
-        rotation.direction_cosines(R),
-        rotation.body_rates(R, R_dot),
-        rotation.space_rates(R, R_dot),
-        rotation.unskew(R),
-    )
-
-
-def by_quaternion(p, x, a, b):
-    return p.multiply(x, p.conjugate(jnp.concatenate([a, b[:1]])))
-
-
-@pytest.mark.parametrize(
-    ("kind", "function"),
-    [
-        *((kind, by_parametrisation) for kind in ALL),
-        ("zxz", by_matrix),
-        ("quaternion", by_quaternion),
-    ],
-)
-def test_single_precision_stays_single(kind, function):
-    p, rng = ALL[kind], np.random.default_rng(20)
-    x = principal(kind, rng, 50).astype(np.float32)
-    a, b = rng.normal(size=(2, 50, 3)).astype(np.float32)
-    single = batch(lambda *given: function(p, *given), x, a, b)
-    double = batch(lambda *given: function(p, *given), *(z.astype(float) for z in (x, a, b)))
-    eps = float(np.finfo(np.float32).eps)
-    for found, expected in zip(jax.tree.leaves(single), jax.tree.leaves(double), strict=True):
-        assert (found.dtype, expected.dtype) == (np.float32, np.float64)
-        # As in double: |a|, |b| <= 5 and 1/|det W| <= 5.
-        assert worst(found, expected) <= 25 * eps  # worst 5.5
-
-
-@every
-def test_gradients_in_single_precision_stay_single(kind):
-    x = jnp.asarray(principal(kind, np.random.default_rng(21), 1)[0], jnp.float32)
-    for function in functions(ALL[kind]).values():
-        gradient = jax.eval_shape(jax.grad(lambda x, f=function: jnp.sum(f(x))), x)
-        assert gradient.dtype == jnp.float32
-
-
-def test_numbers_and_lists_are_taken():
-    expected = np.asarray(zxz.matrix(np.array([1.0, 2.0, 3.0])))
-    np.testing.assert_array_equal(zxz.matrix([1, 2, 3]), expected)
-    np.testing.assert_array_equal(zxz.matrix((1.0, 2, 3.0)), expected)
-    np.testing.assert_array_equal(rotation.skew([1, 2, 3]), [[0, -3, 2], [3, 0, -1], [-2, 1, 0]])
-
-
-def test_the_names_are_the_coordinates():
-    assert yaw_pitch_roll.names == ("psi", "theta", "phi")
-    assert zxz.names == ("phi", "theta", "psi")
-    assert quaternion.names == ("e0", "e1", "e2", "e3")
 
 
 # ---- Errors ------------------------------------------------------------------------------------

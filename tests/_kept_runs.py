@@ -1,0 +1,20 @@
+"""What a kept run of a benchmark holds."""
+
+from bench import _results
+
+RUN_FIELDS = {"date", "commit", "machine", "versions", "native_loops", "quick"} | {
+    "rows",
+    "targets",
+    "references",
+}
+
+
+def check_fields(run):
+    assert set(run) == RUN_FIELDS
+    assert set(run["machine"]) == {"cpu", "cores", "platform", "load"}
+    assert set(run["versions"]) == {"python", *_results.PACKAGES}
+    for target in run["targets"]:
+        assert set(target) == {"claim", "figure", "relation", "bound", "met"}
+    for reference in run["references"]:
+        assert set(reference) == {"figure", "what"}
+    assert len({tuple(row) for row in run["rows"]}) == 1
