@@ -25,8 +25,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, help="of fuzz: how long to try")
     parser.add_argument("--first", type=int, help="of fuzz: the first seed")
     parser.add_argument("--python", help="of work-precision: an interpreter with another jax")
+    parser.add_argument("--data", help="of fits: the folder of recordings (else JAXLAG_DATA)")
     arguments = parser.parse_args(argv)
-    options = {name: vars(arguments)[name] for name in ("system", "python", "seconds", "first")}
+    names = ("system", "python", "seconds", "first", "data")
+    options = {name: vars(arguments)[name] for name in names}
     options = {name: value for name, value in options.items() if value}
     if arguments.name == "list":
         for name in BENCHMARKS:

@@ -20,6 +20,7 @@ BENCHMARKS = (
     "accuracy",
     "work-precision",
     "fuzz",
+    "fits",
 )
 
 RUNS_PER_TURN = 3

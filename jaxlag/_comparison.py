@@ -131,6 +131,9 @@ def compare(
     experiments; the error is that of its predictions of experiments held out, whose starts alone
     are fitted (`jl.predict`). More terms always fit better; they need not predict better.
 
+    Where candidates share params, or are combined, the search for those of one begins at the
+    estimates of an earlier model that has most of them: name the simple candidates first.
+
     Args:
         system: without the candidates.
         experiments: to fit to.
@@ -146,7 +149,7 @@ def compare(
 
     Raises:
         ValueError: an argument of wrong form or value, named; params of a candidate that the system
-            or another candidate has.
+            has, or another candidate that it may stand beside.
 
     Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.2.
     """
@@ -164,7 +167,7 @@ def compare(
             found = fit(
                 system.with_forces(*(force for term in terms for force in term.forces)),
                 experiments,
-                params,
+                params | _estimates(params, set(params0), models),
                 free=(*free, *(name for term in terms for name in term.params0)),
                 transforms=transform,
                 priors=prior,
@@ -174,6 +177,23 @@ def compare(
             error = _error(predicted, held_out)
             models.append(Ranked(" + ".join(names) or "none", error, found, predicted))
     return Comparison(tuple(sorted(models, key=lambda model: model.error)))
+
+
+def _estimates(
+    params: Mapping[str, Any], common: set[str], models: Sequence[Ranked]
+) -> dict[str, Any]:
+    """Those of the model that has most of these params, of the best such one.
+
+    Nothing where none has more than the params that are common to all: they may be far off there.
+    """
+    able = [model for model in models if model.error < float("inf") and model.fit.converged]
+    shared = [len(params.keys() & model.fit.params.keys()) for model in able]
+    if max(shared, default=0) <= len(common):
+        return {}
+    near = min(zip(able, shared, strict=True), key=lambda x: (-x[1], x[0].error))[0].fit
+    # A logarithm that has run off finds no way back.
+    held = {name.partition("[")[0].partition(".")[0] for name in near.on_bound}
+    return {name: near.params[name] for name in params if name in near.params.keys() - held}
 
 
 def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
@@ -194,7 +214,8 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> 
             if key in taken:
                 must = "bring params under names of its own"
                 raise bad(f"candidates[{name!r}]", must, f"{taken[key]} has {key!r}, too")
-            taken[key] = f"candidate {name!r}"
+            if most != 1:  # else candidates never meet
+                taken[key] = f"candidate {name!r}"
     if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= len(candidates):
         must = f"be an integer from 1 to the {len(candidates)} candidates"
         raise bad("most", must, f"it was {most!r}")

@@ -60,6 +60,16 @@ class Descent(eqx.Module):
         self.optimiser, self.epochs, self.batch = optimiser, epochs, batch
         self.seed, self.gap = seed, float(gap)
 
+    def steps(self, segments: int) -> tuple[int, int]:
+        """(steps in an epoch, segments in each)."""
+        batch = min(self.batch, segments)
+        return segments // batch, batch
+
+    def solves(self, segments: int) -> int:
+        """Motions of segments whose gradient is taken in all."""
+        steps, batch = self.steps(segments)
+        return self.epochs * steps * batch
+
 
 @eqx.filter_jit
 def descend(
@@ -74,8 +84,7 @@ def descend(
 
     update = with_extra_args_support(descent.optimiser).update
     count = guess.x.shape[0]
-    batch = min(descent.batch, count)
-    steps = count // batch
+    steps, batch = descent.steps(count)
     join = jnp.asarray(descent.gap)
 
     def step(carry: tuple[Guess, Any], which: Int[Array, " b"]) -> tuple[Any, tuple[Array, Array]]:
@@ -91,7 +100,9 @@ def descend(
         with jax.numpy_dtype_promotion("standard"):
             # Line searches ask for the last three.
             updates, state = update(slope, state, guess, value=cost, grad=slope, value_fn=value)
-        return (eqx.apply_updates(guess, updates), state), (cost, ~sound)
+        z, x = eqx.apply_updates(guess, updates)
+        held = jnp.clip(z, shooting.free.low, shooting.free.high)
+        return (Guess(held, x), state), (cost, ~sound)
 
     def epoch(carry: tuple[Guess, Any], key: Array) -> tuple[Any, tuple[Array, Array]]:
         order = jax.random.permutation(key, count)[: steps * batch]

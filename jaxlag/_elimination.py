@@ -60,14 +60,33 @@ def condense(rows: Rows) -> Rows:
     return rows._replace(measured=_triangle(rows.measured), prior=_triangle(rows.prior))
 
 
-def eliminate(rows: Rows, damping: Float[Array, ""]) -> Eliminated:
-    """Rows of condensed problems from which states and params follow by substitution."""
+def sizes_of(rows: Rows) -> Float[Array, " c"]:
+    """Norms of the columns of one state, the params and the right-hand side, all rows together."""
+    d = rows.measured.shape[-1] - rows.prior.shape[-1]
+    squares = jnp.sum(rows.measured**2, axis=(0, 1))
+    if rows.joined is not None:
+        squares += jnp.sum(rows.joined**2, axis=(0, 1))
+    return jnp.sqrt(squares.at[d:].add(jnp.sum(rows.prior**2, axis=0)))
+
+
+def eliminate(
+    rows: Rows, damping: Float[Array, ""], weights: Float[Array, " p"] | None = None
+) -> Eliminated:
+    """Rows of condensed problems from which states and params follow by substitution.
+
+    Args:
+        rows: of the problem.
+        damping: of all unknowns.
+        weights: by which its root is multiplied for params.
+    """
     count, _, columns = rows.measured.shape
     size = rows.prior.shape[1]
     d, dtype = columns - size, rows.measured.dtype
     root = jnp.sqrt(damping)
     held = jnp.concatenate([root * jnp.eye(d, dtype=dtype), jnp.zeros((d, size), dtype)], 1)
     weak = root * jnp.eye(size - 1, size, dtype=dtype)
+    if weights is not None:
+        weak = weights[:, None] * weak
     about = jnp.concatenate([rows.prior, weak])
     if rows.joined is None or rows.next is None:
         both = jnp.concatenate([rows.measured, jnp.broadcast_to(held, (count, d, columns))], 1)
@@ -96,8 +115,13 @@ def eliminate(rows: Rows, damping: Float[Array, ""]) -> Eliminated:
 
 def substitute(left: Eliminated) -> tuple[Float[Array, " p"], Float[Array, "k d"]]:
     """(p, x) of least squares."""
-    d = left.states.shape[1]
     p = solve_triangular(left.params[:-1, :-1], left.params[:-1, -1])
+    return p, states_of(left, p)
+
+
+def states_of(left: Eliminated, p: Float[Array, " p"]) -> Float[Array, "k d"]:
+    """The states x of least squares where the params are p."""
+    d = left.states.shape[1]
 
     def back(later: Array, row: Array) -> tuple[Array, Array]:
         known = row[:, -1] - row[:, d : 2 * d] @ later - row[:, 2 * d : -1] @ p
@@ -105,4 +129,4 @@ def substitute(left: Eliminated) -> tuple[Float[Array, " p"], Float[Array, "k d"
         return x, x
 
     _, states = jax.lax.scan(back, jnp.zeros(d, left.states.dtype), left.states, reverse=True)
-    return p, states
+    return states

@@ -90,8 +90,9 @@ def fit(
         ValueError: an argument of wrong form or value, named; fewer measurements than unknowns.
 
     Warns:
-        of a parameter that starts on a bound, one that nothing measured depends on, a channel that
-        is constant, segments whose solve fails, a search that did not converge, each by name.
+        of a parameter that starts or ends on a bound, one that nothing measured depends on, a
+        channel that is constant, segments whose solve fails, a search that did not converge, each
+        by name.
 
     Source: Bock (1983), see `_shooting`; Schittkowski, Numerical Data Fitting in Dynamical Systems
     (2002).
@@ -125,17 +126,20 @@ def fit(
     problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
     costs = np.zeros(0)
     if optimiser is None:
-        found = _stages(problem, tolerance, max_steps)
-        problem, noise, found = _with_its_noise(problem, noise, found, where, tolerance, max_steps)
+        found, turns = _stages(problem, tolerance, max_steps)
+        problem, noise, found, more = _with_its_noise(
+            problem, noise, found, where, tolerance, max_steps
+        )
+        solves = (turns + more) * len(where.owner)
     else:
-        guess, costs = _downhill(problem, optimiser, max_steps)
+        guess, costs, solves = _downhill(problem, optimiser, max_steps)
         if noise:
             seen = _judged(problem, guess, optimiser, costs, linear=False)
             noise = estimated_noise(seen, problem, where, noise)
             problem = with_noise(problem, where, noise)
         linear = len(unknown.u0) <= LARGEST_COVARIANCE
         found = _judged(problem, guess, optimiser, costs, linear)
-    result = summarised(problem, found, experiments, where, noise, own, costs)
+    result = summarised(problem, found, experiments, where, noise, own, costs, solves)
     _warn_after(result)
     return result
 
@@ -164,7 +168,7 @@ def _count(experiments: Sequence[Experiment], params: int, priors: int, start: i
 
 def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
     for name in free.on_bound:
-        text = f"{name} starts on its bound: moved a hundredth of the range inside."
+        text = f"{name} starts on its bound."
         warnings.warn(text, stacklevel=3)
     for each in experiments:
         for name, x in each.channels.items():
@@ -173,11 +177,13 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
                 warnings.warn(text, stacklevel=3)
 
 
-def _stages(problem: Shooting, tolerance: float, max_steps: int) -> Found:
-    """From loosely joined segments to one motion; by squares first, whatever the loss.
+def _stages(problem: Shooting, tolerance: float, max_steps: int) -> tuple[Found, int]:
+    """From loosely joined segments to one motion; and the steps of all stages.
 
-    Losses that count outliers for less have minima wherever everything is an outlier.
+    By squares first, whatever the loss: losses that count outliers for less have minima wherever
+    everything is an outlier.
     """
+    turns = 0
     guess = Guess(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
     by_squares = replace(problem, loss=squares)
     gaps = GAPS if problem.chained else (1.0,)
@@ -185,10 +191,11 @@ def _stages(problem: Shooting, tolerance: float, max_steps: int) -> Found:
         last = gap == gaps[-1] and problem.loss is squares
         rough = tolerance if last else max(tolerance, 1e-4)
         found = search(by_squares, guess, jnp.asarray(gap), rough, max_steps)
-        guess = found.guess
+        guess, turns = found.guess, turns + int(found.steps)
     if problem.loss is not squares:
         found = search(problem, guess, jnp.asarray(gaps[-1]), tolerance, max_steps)
-    return found
+        turns += int(found.steps)
+    return found, turns
 
 
 def _with_its_noise(
@@ -198,40 +205,45 @@ def _with_its_noise(
     where: Layout,
     tolerance: float,
     max_steps: int,
-) -> tuple[Shooting, dict[str, float], Found]:
-    """The problem, weighed by the noise that its residuals show, and what is found then."""
+) -> tuple[Shooting, dict[str, float], Found, int]:
+    """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
+    turns = 0
     join = jnp.asarray(GAPS[-1] if problem.chained else 1.0)
     for _ in range(NOISE_ROUNDS if noise else 0):
         changed = estimated_noise(found, problem, where, noise)
         settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
         noise, problem = changed, with_noise(problem, where, changed)
         found = search(problem, found.guess, join, tolerance, max_steps)
+        turns += int(found.steps)
         if settled:
             break
-    return problem, noise, found
+    return problem, noise, found, turns
 
 
 def _downhill(
     problem: Shooting, descent: Descent, max_steps: int
-) -> tuple[Guess, Float[np.ndarray, " epochs"]]:
-    """(where a descent ends, its costs); starts by least squares before it and after it."""
+) -> tuple[Guess, Float[np.ndarray, " epochs"], int]:
+    """(where a descent ends, its costs, solves); starts by least squares before and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
-    x = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
-    guess, costs, unsound = descend(problem, Guess(z, x), descent)
+    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
+    guess, costs, unsound = descend(problem, Guess(z, before.guess.x), descent)
     if int(unsound):
         text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
         warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
-    return Guess(guess.z, _starts(problem, guess.z, guess.x, join, max_steps)), np.asarray(costs)
+    after = _starts(problem, guess.z, guess.x, join, max_steps)
+    count = len(guess.x)
+    solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
+    return Guess(guess.z, after.guess.x), np.asarray(costs), solves
 
 
 def _join(problem: Shooting, descent: Descent) -> Float[Array, ""]:
     return jnp.asarray(descent.gap if problem.chained else 1.0)
 
 
-def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_steps: int) -> Array:
+def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_steps: int) -> Found:
     """Starts by least squares, params as they are at z."""
     held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
-    return search(held, Guess(jnp.zeros(0), x), join, 1e-4, max_steps).guess.x
+    return search(held, Guess(jnp.zeros(0), x), join, 1e-4, max_steps)
 
 
 def _judged(
@@ -263,5 +275,9 @@ def _warn_after(result: FitResult) -> None:
         warnings.warn(f"{text} wrong. Look for a square root or a norm at zero.", stacklevel=3)
     for name in result.unused:
         warnings.warn(f"nothing measured depends on {name}: it keeps its value.", stacklevel=3)
+    for name in result.on_bound:
+        at = result.values[result.names.index(name)]
+        text = f"{name} ended on its bound, {at:g}: widen the bound, or leave the parameter out."
+        warnings.warn(text, stacklevel=3)
     for text in result.failed:
         warnings.warn(f"{text}: it does not count.", stacklevel=3)

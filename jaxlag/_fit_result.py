@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxlag._channels import Reader
 from jaxlag._elimination import Rows, eliminate
 from jaxlag._experiment import Experiment
-from jaxlag._identifiability import Spectrum
+from jaxlag._identifiability import Spectrum, relative, run_off
 from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
 from jaxlag._segments import Layout
 from jaxlag._shooting import Found, Shooting
@@ -44,14 +44,16 @@ class FitResult(eqx.Module):
         values: their estimates, in their own units.
         covariance: of `values`, (e, e), from the derivatives at the estimates (Cramer-Rao); inf
             for numbers that take part in what is not determined. It holds for noise that is
-            independent from sample to sample. NaN after a `Descent` of more than 200 numbers, and
-            where derivatives at the estimates are not finite.
-        singular_values: of the weighted derivatives by relative changes of `values`, states
-            eliminated, falling: a relative change of eps along the i-th direction moves the
-            weighted residuals by eps times the i-th. NaN where there is no covariance.
+            independent from sample to sample. NaN after a `Descent` of more than 200 numbers, where
+            derivatives at the estimates are not finite, and of numbers on a bound.
+        singular_values: of the weighted derivatives by relative changes of `values` that are on no
+            bound, states eliminated, falling: a relative change of eps along the i-th direction
+            moves the weighted residuals by eps times the i-th. NaN where there is no covariance.
         unidentifiable: null directions, in words: which numbers change together without a trace.
         determined: what is known of those: "g/l".
         unused: numbers that nothing measured depends on.
+        on_bound: numbers that ended on a bound of their transform; the covariance of the others is
+            that with these held there.
         noise: channel -> standard deviation of its noise, where it was estimated.
         residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
             NaN where nothing was measured or the segment failed.
@@ -60,6 +62,8 @@ class FitResult(eqx.Module):
         converged: whether the optimiser met its tolerance; of a `Descent`, whether costs are finite
             and lower than at first.
         steps: how many it took in the last stage; of a `Descent`, epochs.
+        solves: motions of segments, each with its derivatives, that the search took in all; line
+            searches of a descent are not counted.
         cost: half the weighted sum of squares.
         failed: segments without a solution, each with its status.
         costs: of a `Descent`, mean cost of the steps of each epoch; else empty.
@@ -70,16 +74,18 @@ class FitResult(eqx.Module):
     names: tuple[str, ...]
     values: Float[np.ndarray, " e"]
     covariance: Float[np.ndarray, "e e"]
-    singular_values: Float[np.ndarray, " e"]
+    singular_values: Float[np.ndarray, " k"]
     unidentifiable: tuple[str, ...]
     determined: tuple[str, ...]
     unused: tuple[str, ...]
+    on_bound: tuple[str, ...]
     noise: dict[str, float]
     residuals: tuple[dict[str, np.ndarray], ...]
     starts: tuple[np.ndarray, ...]
     gap: float
     converged: bool
     steps: int
+    solves: int
     cost: float
     failed: tuple[str, ...]
     costs: Float[np.ndarray, " epochs"]
@@ -141,6 +147,7 @@ class FitResult(eqx.Module):
             low, high = interval[name]
             known = f"95 % in [{low:.6g}, {high:.6g}]" if np.isfinite(low) else "not determined"
             known = "no covariance" if np.isnan(low) else known
+            known = "on its bound" if name in self.on_bound else known
             lines.append(f"{name:<12} {value:.6g}   {known}")
         lines += [f"and {len(self.names) - SHOWN} more"] * (len(self.names) > SHOWN)
         lines += [f"unknown: {text}" for text in self.unidentifiable]
@@ -162,6 +169,7 @@ def summarised(
     noise: dict[str, float],
     own: Mapping[str, Reader],
     costs: Float[np.ndarray, " epochs"],
+    solves: int,
 ) -> FitResult:
     """The result of a search.
 
@@ -173,6 +181,7 @@ def summarised(
         noise: that was estimated.
         own: channels of the caller.
         costs: of the epochs of a descent.
+        solves: what it took.
     """
     z = found.guess.z
     values = np.asarray(problem.free.numbers(z))
@@ -188,12 +197,14 @@ def summarised(
         known.unidentifiable,
         known.determined,
         known.unused,
+        known.on_bound,
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
         tuple(np.asarray(found.starts)[firsts]),
         float(np.max(_gaps(found, problem), initial=0.0)),
         bool(found.converged),
         int(found.steps),
+        solves,
         float(found.cost),
         tuple(
             f"the segment of {experiments[where.owner[k]].name} that starts at"
@@ -214,31 +225,37 @@ class _Uncertainty(NamedTuple):
     unidentifiable: tuple[str, ...]
     determined: tuple[str, ...]
     unused: tuple[str, ...]
+    on_bound: tuple[str, ...]
 
 
 def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncertainty:
-    names = problem.free.names
+    names = np.array(problem.free.names)
     unknown = np.full((len(names), len(names)), np.nan)
-    nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), ())
+    nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), ())
     if found.rows is None:
         return nothing
-    by_z = np.asarray(jax.jacfwd(problem.free.numbers)(found.guess.z))
+    numbers = jax.jacfwd(problem.free.numbers)
+    by_z, at_first = (np.asarray(numbers(z)) for z in (found.guess.z, 0.0 * found.guess.z))
     factor = np.asarray(eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT)).params)
     factor = factor[:-1, :-1]
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
-    by_value = np.linalg.solve(by_z.T, factor.T).T
+    moves = ~(run_off(factor, by_z, at_first) | problem.free.at_limit(found.guess.z))
+    own = np.ix_(moves, moves)
+    by_value = np.linalg.solve(by_z[own].T, factor[:, moves].T).T
     # A column of round-off: nothing depends on it, whatever it is divided by.
-    sizes = np.linalg.norm(by_value * np.where(values == 0, 1.0, values), axis=0)
+    sizes = np.linalg.norm(by_value * relative(values[moves]), axis=0)
     least = 1e-9 * max(sizes, default=0.0)
-    unused = tuple(n for n, x in zip(names, sizes, strict=True) if x <= least)
-    spectrum = Spectrum(names, values, by_value)
+    spectrum = Spectrum(tuple(names[moves].tolist()), values[moves], by_value)
+    covariance = unknown
+    covariance[own] = spectrum.covariance()
     return _Uncertainty(
-        spectrum.covariance(),
+        covariance,
         spectrum.singular_values,
         spectrum.unidentifiable,
         spectrum.determined,
-        unused,
+        tuple(names[moves][sizes <= least].tolist()),
+        tuple(names[~moves].tolist()),
     )
 
 

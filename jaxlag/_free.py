@@ -7,13 +7,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlag._errors import bad
 from jaxlag._transforms import AbstractTransform, Free
 
 NO_PRIOR = np.zeros(0, int), np.zeros(0), np.zeros(0)
 """Of which numbers, means, standard deviations: nothing is known beforehand."""
+
+
+IDLE = 1e-3
+"""An unknown that moves its numbers by this part of what it did at first, and weighted residuals by
+this much, has run off: the numbers are on a bound, within this part of a standard deviation."""
 
 
 class Prior(eqx.Module):
@@ -86,7 +91,9 @@ class Unknowns(eqx.Module):
         params0: all params.
         u0: unconstrained numbers that make params0, (p,).
         scale: (p,), by which z is multiplied.
-        reach: (p,), how far z may go in one step: logarithms are no longer linear beyond 1.
+        reach: (p,), how far z may go in one step.
+        low: (p,), between which z may go.
+        high: (p,), likewise.
         on_bound: names of leaves that started on a bound.
     """
 
@@ -95,6 +102,8 @@ class Unknowns(eqx.Module):
     u0: np.ndarray
     scale: np.ndarray
     reach: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
     on_bound: tuple[str, ...] = eqx.field(static=True)
 
     def params(self, z: Float[Array, " p"]) -> Any:
@@ -109,13 +118,24 @@ class Unknowns(eqx.Module):
     def held(self, z: Float[Array, " p"]) -> "Unknowns":
         """No unknowns, and the params at z."""
         nothing = np.zeros(0)
-        return Unknowns((), self.params(z), nothing, nothing, nothing, ())
+        return Unknowns((), self.params(z), nothing, nothing, nothing, nothing, nothing, ())
 
     def numbers(self, z: Float[Array, " p"]) -> Float[Array, " e"]:
         """The numbers that are to be found, in their own units: as many as there are unknowns."""
         leaves = jax.tree.leaves(self.params(z))
         own = [leaves[leaf.index][leaf.columns].ravel() for leaf in self.leaves]
         return jnp.concatenate(own) if own else jnp.zeros(0)
+
+    def speeds(self, z: Float[Array, " p"]) -> Float[Array, " p"]:
+        """How much each unknown moves the numbers, over what it did at z = 0."""
+        by = jax.jacfwd(self.numbers)
+        now, first = (jnp.linalg.norm(by(at), axis=0) for at in (z, jnp.zeros_like(z)))
+        return now / first
+
+    def at_limit(self, z: Float[Array, " p"]) -> Bool[np.ndarray, " p"]:
+        """Which unknowns are as far as they may go, to rounding."""
+        near = 8 * np.finfo(float).eps * np.maximum(1.0, np.abs(z))
+        return np.asarray((z <= self.low + near) | (z >= self.high - near))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -157,7 +177,8 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         if not isinstance(transform, AbstractTransform):
             must = "be a transform such as jl.Positive()"
             raise bad(f"transforms[{name!r}]", must, f"it was {transform!r}")
-    leaves, starts, scales, reaches, on_bound = [], [], [], [], []
+    leaves, on_bound = [], []
+    columns: list[np.ndarray] = [np.zeros((5, 0))]
     k = 0
     for i in sorted(chosen):
         value = np.asarray(values[i])
@@ -166,18 +187,17 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         on_bound += [names[i]] * bound
         indices = transform.entries(value.shape)
         leaves.append(Leaf(names[i], i, value.shape, transform, k, indices))
-        starts.append(u)
         # Unknowns of order one: as multiples of the size that a leaf starts at, logarithms as they
         # are.
-        plain = isinstance(transform, Free)
-        size = float(np.sqrt(np.mean(u**2))) if plain and u.size else 1.0
-        scales.append(np.full(len(u), size or 1.0))
-        reaches.append(np.full(len(u), np.inf if plain else 1.0))
+        plain = np.isinf(transform.reach)
+        size = (float(np.sqrt(np.mean(u**2))) if plain and u.size else 1.0) or 1.0
+        one = np.ones(len(u))
+        low, high = ((limit - u) / size for limit in transform.limits)
+        columns.append(np.stack([u, size * one, transform.reach * one, low, high]))
         k += len(u)
-    parts = starts, scales, reaches
-    u0, scale, reach = (np.concatenate(x) if leaves else np.zeros(0) for x in parts)
     params0 = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, params0)
-    return Unknowns(tuple(leaves), params0, u0, scale, reach, tuple(on_bound))
+    u0, scale, reach, low, high = np.concatenate(columns, axis=1)
+    return Unknowns(tuple(leaves), params0, u0, scale, reach, low, high, tuple(on_bound))
 
 
 def _is_real(leaf: Any) -> bool:

@@ -10,6 +10,8 @@ from fractions import Fraction
 
 import numpy as np
 
+from jaxlag._free import IDLE
+
 NEGLIGIBLE = 1e-6
 """Singular values below this part of the largest are those of derivatives that vanish: solves at a
 tolerance of 1e-9 give derivatives to about 1e-8."""
@@ -73,13 +75,32 @@ def relative(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, 1.0, values)
 
 
+def run_off(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.ndarray:
+    """(e,) which numbers are on a bound of their transform, where no derivative moves them.
+
+    Of a matrix, all that its transform ties to such a number.
+
+    Args:
+        factor: (e, e), a factor of the weighted derivatives by the unknowns.
+        by_z: (e, e), derivatives of the numbers by the unknowns.
+        at_first: (e, e), likewise where the search began.
+    """
+    sizes, before, moved = (np.linalg.norm(x, axis=0) for x in (by_z, at_first, factor))
+    idle = (sizes <= IDLE * before) & (moved <= IDLE)
+    tied = (by_z != 0) | (at_first != 0)
+    tied |= tied.T
+    for _ in range(len(idle)):
+        idle = idle | tied[idle].any(axis=0)
+    return idle
+
+
 class Spectrum:
     """Singular values of the derivatives by relative changes, and what their null directions say.
 
     Args:
         names: of the numbers.
         values: of them.
-        factor: (e, e), triangular factor of the weighted derivatives by them.
+        factor: (e, e) or of more rows, a factor of the weighted derivatives by them.
 
     Attributes:
         singular_values: (e,), falling; a relative change of 1 along a direction moves the weighted
@@ -92,7 +113,8 @@ class Spectrum:
 
     def __init__(self, names: tuple[str, ...], values: np.ndarray, factor: np.ndarray) -> None:
         self.values = values
-        _, self.singular_values, self.directions = np.linalg.svd(factor * relative(values))
+        scaled = factor * relative(values)
+        _, self.singular_values, self.directions = np.linalg.svd(scaled, full_matrices=False)
         largest = max(self.singular_values, default=0.0)
         self.vanish = self.singular_values <= NEGLIGIBLE * largest
         self.null = self.directions[self.vanish]

@@ -18,9 +18,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._box import box_least_squares
 from jaxlag._channels import Reader, read
-from jaxlag._elimination import Rows, condense, eliminate, substitute
-from jaxlag._free import Unknowns
+from jaxlag._elimination import Rows, condense, eliminate, sizes_of, states_of
+from jaxlag._free import IDLE, Unknowns
 from jaxlag._lanes import in_batches
 from jaxlag._segments import Segments
 from jaxlag._simulate import simulate
@@ -242,11 +243,27 @@ def rows_of(
 
 
 class _Condensed(eqx.Module):
+    """A linear problem, and how its params are to be moved.
+
+    Attributes:
+        rows: condensed.
+        weights: (p,), of the damping.
+        down: (p,), how far each may go.
+        up: (p,), likewise.
+    """
+
     rows: Rows
+    weights: Float[Array, " p"]
+    down: Float[Array, " p"]
+    up: Float[Array, " p"]
 
 
 class Eliminating(optx.AbstractDescent):
-    """Steps -(J^T J + 1 / step_size)^-1 J^T r by elimination of states, linear in segments."""
+    """Steps -(J^T J + D / step_size)^-1 J^T r by elimination of states, linear in segments.
+
+    D is 1, and less for unknowns whose numbers have become slower: damped are changes of numbers,
+    or else a number on its way to a bound would take ever smaller steps.
+    """
 
     shooting: Shooting
     join: Float[Array, ""]
@@ -254,21 +271,27 @@ class Eliminating(optx.AbstractDescent):
     def init(self, y: Guess, f_info_struct: Any) -> _Condensed:
         """Of the right shapes."""
         shapes = eqx.filter_eval_shape(self._condense, f_info_struct)
-        return _Condensed(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+        rows = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return _Condensed(rows, y.z, y.z, y.z)
 
     def _condense(self, f_info: Any) -> Rows:
         return condense(rows_of(f_info.jac, f_info.residual, self.shooting, self.join))
 
     def query(self, y: Guess, f_info: Any, state: _Condensed) -> _Condensed:
         """Of new derivatives."""
-        return _Condensed(self._condense(f_info))
+        free, rows = self.shooting.free, self._condense(f_info)
+        speeds, p = free.speeds(y.z), y.z.shape[0]
+        idle = (speeds <= IDLE) & (sizes_of(rows)[-p - 1 : -1] <= IDLE)
+        reach = jnp.where(idle, 0.0, free.reach)
+        down, up = jnp.maximum(-reach, free.low - y.z), jnp.minimum(reach, free.high - y.z)
+        return _Condensed(rows, jnp.minimum(speeds, 1.0), down, up)
 
     def step(self, step_size: Array, state: _Condensed) -> tuple[Guess, optx.RESULTS]:
-        """Of a step size."""
-        z, x = substitute(eliminate(state.rows, 1.0 / step_size))
-        beyond = jnp.max(jnp.abs(z) / self.shooting.free.reach, initial=1.0)
-        short = 1.0 / beyond
-        return Guess(-short * z, -short * x), optx.RESULTS.successful
+        """Of a step size: the best within what each of the params may move."""
+        left = eliminate(state.rows, 1.0 / step_size, state.weights)
+        factor, right = left.params[:-1, :-1], left.params[:-1, -1]
+        z = box_least_squares(factor, -right, state.down, state.up)
+        return Guess(z, -states_of(left, -z)), optx.RESULTS.successful
 
 
 class Shooter(optx.AbstractGaussNewton):

@@ -26,7 +26,7 @@ class AbstractTransform(eqx.Module):
 
     @abstractmethod
     def start(self, name: str, value: Any) -> tuple[np.ndarray, bool]:
-        """(u that gives this value, whether the value was on a bound and had to be moved off it).
+        """(u that gives this value, whether the value is on a bound).
 
         Raises:
             ValueError: the value is not valid; `name` says whose it is.
@@ -35,6 +35,16 @@ class AbstractTransform(eqx.Module):
     def entries(self, shape: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
         """Indices of the numbers that say all of the leaf, as many as there are u."""
         return tuple(np.ndindex(*shape))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Between which each u may go."""
+        return -np.inf, np.inf
+
+    @property
+    def reach(self) -> float:
+        """How far u may go in one step: logarithms are no longer linear beyond 1."""
+        return 1.0
 
 
 def _lower(size: int) -> tuple[tuple[int, ...], ...]:
@@ -54,10 +64,19 @@ class Free(AbstractTransform):
         """The value itself."""
         return np.ravel(np.asarray(value, float)), False
 
+    @property
+    def reach(self) -> float:
+        """Any."""
+        return np.inf
+
 
 @final
 class Positive(AbstractTransform):
-    """Positive numbers: value = exp(u)."""
+    """Positive numbers: value = exp(u).
+
+    For what cannot be zero, such as masses and lengths; for what may, such as friction, take
+    `Bounded(0.0, np.inf)`: a logarithm that has gone far below finds no way back.
+    """
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
         """exp(u)."""
@@ -67,16 +86,16 @@ class Positive(AbstractTransform):
         """log(value); a value of 0 has none and raises."""
         x = np.ravel(np.asarray(value, float))
         if not np.all(x > 0):
-            fix = "Start it above 0, or bound it by jl.Bounded(0.0, upper)."
+            fix = "Start it above 0, or bound it by jl.Bounded(0.0, np.inf)."
             raise bad(f"params0[{name!r}]", "be positive (jl.Positive)", f"it was {value}", fix)
         return np.log(x), False
 
 
 @final
 class Bounded(AbstractTransform):
-    """Numbers between two bounds: value = lower + (upper - lower) / (1 + exp(-u)).
+    """Numbers between two bounds or on them: value = u, held there.
 
-    With one bound infinite value = lower + exp(u), or upper - exp(u).
+    A search that would leave the bounds goes on along them, and comes back where that is better.
 
     Args:
         lower: in the unit of the parameter; may be -inf.
@@ -98,30 +117,27 @@ class Bounded(AbstractTransform):
             raise bad("Bounded: lower and upper", "be finite, one at least", "neither was")
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
-        """Between the bounds."""
-        if math.isinf(self.upper):
-            x = self.lower + jnp.exp(u)
-        elif math.isinf(self.lower):
-            x = self.upper - jnp.exp(u)
-        else:
-            x = self.lower + (self.upper - self.lower) * jax.nn.sigmoid(u)
-        return x.reshape(shape)
+        """U, or the bound that it is beyond, with the derivative of u: also from there back."""
+        held = jnp.clip(u, self.lower, self.upper)
+        return (u + jax.lax.stop_gradient(held - u)).reshape(shape)
 
     def start(self, name: str, value: Any) -> tuple[np.ndarray, bool]:
-        """U of the value; one on a bound starts a hundredth of the range inside."""
+        """The value itself."""
         x = np.ravel(np.asarray(value, float))
-        low, high = self.lower, self.upper
-        if not np.all((x >= low) & (x <= high)):
-            must = f"lie between its bounds {low:g} and {high:g}"
+        if not np.all((x >= self.lower) & (x <= self.upper)):
+            must = f"lie between its bounds {self.lower:g} and {self.upper:g}"
             raise bad(f"params0[{name!r}]", must, f"it was {value}")
-        on_bound = bool(np.any((x == low) | (x == high)))
-        width = high - low if math.isfinite(high - low) else max(1.0, float(np.max(np.abs(x))))
-        x = np.clip(x, low + 0.01 * width * (x == low), high - 0.01 * width * (x == high))
-        if math.isinf(high):
-            return np.log(x - low), on_bound
-        if math.isinf(low):
-            return np.log(high - x), on_bound
-        return np.log(x - low) - np.log(high - x), on_bound
+        return x, bool(np.any((x == self.lower) | (x == self.upper)))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The bounds."""
+        return self.lower, self.upper
+
+    @property
+    def reach(self) -> float:
+        """As far as the bounds."""
+        return np.inf
 
 
 @final

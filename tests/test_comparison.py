@@ -1,11 +1,14 @@
 """Candidate forces ranked by what they predict."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from _measured import OPTIONS, TRUE, TS, angles
 
 import jaxlag as jl
+from jaxlag._comparison import Ranked, _estimates
 
 
 def lagrangian(t, q, v, p):
@@ -62,6 +65,38 @@ def test_combinations_and_what_is_useless():
         found["dry"]
 
 
+@pytest.mark.full
+def test_candidates_that_never_meet_may_share_params():
+    """The second begins at the estimates of the first, and ends where it does from elsewhere."""
+    both = jl.Candidate(*viscous.forces, *cubic.forces, params0=viscous.params0 | cubic.params0)
+    found = compare({"viscous": viscous, "viscous, cubic": both})["viscous, cubic"].fit
+    alone = compare({"viscous, cubic": both})["viscous, cubic"].fit
+    for name in ("l", "c", "k"):
+        near = 1e-2 * alone.std[name]
+        np.testing.assert_allclose(found.params[name], alone.params[name], atol=near)
+
+
+def test_where_the_search_of_a_model_begins():
+    """At the estimates of the best that shares most of its params; not on a bound."""
+
+    def ranked(error, params, on_bound=(), converged=True):
+        fit = SimpleNamespace(params=params, on_bound=on_bound, converged=converged)
+        return Ranked("", error, fit, None)
+
+    own = {"l": 1.0, "c": 1.0, "k": np.ones(2)}
+    none, bad = ranked(3.0, {"l": 2.0}), ranked(1.0, {"l": 9.0, "c": 9.0}, converged=False)
+    far = ranked(np.inf, {"l": 8.0, "c": 8.0})
+    better, worse = ranked(1.5, {"l": 3.0, "c": 4.0, "x": 1.0}), ranked(2.0, {"l": 5.0, "c": 6.0})
+    bound = ranked(1.0, {"l": 7.0, "k": np.zeros(2)}, ("k[1]",))
+
+    def start(*models):
+        return _estimates(own, {"l"}, models)
+
+    assert start() == start(none) == start(none, bad, far) == {}
+    assert start(none, bad, worse, far, better) == {"l": 3.0, "c": 4.0}
+    assert start(none, bound) == {"l": 7.0}
+
+
 def test_forces_are_added_to_a_system():
     more = bare.with_forces(*viscous.forces)
     params = {"l": 0.5, "g": 0.0, "c": 0.3}
@@ -79,7 +114,11 @@ def test_forces_are_added_to_a_system():
     [
         ({}, {}, r"candidates must be a dict of jl\.Candidate by name, but it was \{\}"),
         ({"a": 3}, {}, r"candidates\['a'\] must be a jl\.Candidate, but it was 3"),
-        ({"a": viscous, "b": viscous}, {}, r"names of its own, but candidate 'a' has 'c', too"),
+        (
+            {"a": viscous, "b": viscous},
+            {"most": 2},
+            r"names of its own, but candidate 'a' has 'c', too",
+        ),
         ({"a": viscous}, {"free": "l"}, r"free must be a sequence of names.*Write free=\('l',\)"),
         ({"a": viscous}, {"most": 2}, r"most must be an integer from 1 to the 1 candidates"),
     ],

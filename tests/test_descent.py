@@ -153,6 +153,14 @@ def test_of_more_than_200_numbers_no_covariance_is_computed():
     assert f"and {len(found.names) - 40} more" in str(found)
 
 
+def test_motions_of_a_descent_are_counted():
+    """Whole parts of equal size: one segment of five sits each epoch out."""
+    descent = jl.Descent(optax.sgd(1.0), epochs=3, batch=2)
+    assert descent.steps(5) == (2, 2)
+    assert descent.solves(5) == 3 * 2 * 2
+    assert descent.solves(1) == 3
+
+
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlag._elimination import Rows, condense, eliminate, substitute
+from jaxlag._elimination import Rows, condense, eliminate, sizes_of, states_of, substitute
 
 EPS = np.finfo(float).eps
 SEGMENTS, ROWS, STATES, PARAMS, DAMPING = 7, 9, 4, 3, 0.3
@@ -75,3 +75,37 @@ def test_what_is_left_is_the_information_of_the_params(chained):
     best = np.linalg.lstsq(damped, full)[0]
     residual = np.linalg.norm(damped @ best - full)
     np.testing.assert_allclose(abs(left.params[-1, -1]), residual, rtol=1e-12)
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_weights_of_the_damping_are_those_of_the_params(chained):
+    rows, matrix, right = problem(chained)
+    weights = np.array([1.0, 0.3, 0.1])
+    p, x = substitute(eliminate(condense(rows), jnp.asarray(DAMPING), jnp.asarray(weights)))
+    size = matrix.shape[1]
+    damping = np.sqrt(DAMPING) * np.append(weights, np.ones(size - PARAMS))
+    damped = np.concatenate([matrix, np.diag(damping)])
+    expected = np.linalg.lstsq(damped, np.append(right, np.zeros(size)))[0]
+    found = np.concatenate([p, np.ravel(x)])
+    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_states_follow_from_params_that_are_given(chained):
+    rows, matrix, right = problem(chained)
+    p = np.array([0.7, -0.2, 1.1])
+    x = states_of(eliminate(condense(rows), jnp.asarray(DAMPING)), jnp.asarray(p))
+    size = matrix.shape[1] - PARAMS
+    damped = np.concatenate([matrix[:, PARAMS:], np.sqrt(DAMPING) * np.eye(size)])
+    known = np.append(right - matrix[:, :PARAMS] @ p, np.zeros(size))
+    expected = np.linalg.lstsq(damped, known)[0]
+    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
+    np.testing.assert_allclose(np.ravel(x), expected, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_sizes_are_those_of_all_rows(chained):
+    rows, matrix, right = problem(chained)
+    sizes = np.append(np.linalg.norm(matrix[:, :PARAMS], axis=0), np.linalg.norm(right))
+    np.testing.assert_allclose(sizes_of(condense(rows))[STATES:], sizes, rtol=100 * EPS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlag._identifiability import Spectrum, combination
+from jaxlag._identifiability import Spectrum, combination, run_off
 
 
 def spectrum(names, values, *known):
@@ -40,3 +40,26 @@ def test_combinations_in_words():
     assert combination(names, np.array([1.0, 2.0, -1.0])) == "m l^2/g"
     assert combination(names, np.array([-1.0, 0.0, -0.5])) == "m g^(1/2)"
     assert combination(names, np.array([1.0, -0.123, 0.0])) == "1 dm/m -0.123 dl/l"
+
+
+def test_numbers_whose_unknowns_have_run_off_are_on_a_bound():
+    """b moves no longer; c moves little, but what it moves was measured."""
+    by_z, factor = np.diag([1.0, 1e-9, 1e-5]), np.diag([50.0, 1e-6, 3.0])
+    assert run_off(factor, by_z, np.eye(3)).tolist() == [False, True, False]
+
+
+def test_a_number_that_nothing_depends_on_is_on_no_bound():
+    assert run_off(np.diag([50.0, 0.0]), np.eye(2), np.eye(2)).tolist() == [False, False]
+
+
+def test_all_of_a_matrix_is_on_the_bound_that_one_of_its_unknowns_is_on():
+    """C C^T, C = ((e^u0, 0), (u2, e^u1)): its numbers (0, 0), (1, 0), (1, 1) by u at u0 = -30, and
+    a fourth number that is another leaf's."""
+    a, b, c = np.exp(-30.0), 1.0, 0.5
+    by_z = np.zeros((4, 4))
+    by_z[:3, :3] = [[2 * a * a, 0.0, 0.0], [a * c, 0.0, a], [0.0, 2 * b * b, 2 * c]]
+    at_first = np.zeros((4, 4))
+    at_first[:3, :3] = [[2.0, 0.0, 0.0], [c, 0.0, 1.0], [0.0, 2.0, 2 * c]]
+    by_z[3, 3] = at_first[3, 3] = 1.0
+    factor = 100.0 * by_z
+    assert run_off(factor, by_z, at_first).tolist() == [True, True, True, False]

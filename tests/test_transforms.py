@@ -87,7 +87,15 @@ def test_crossed_bounds_are_named(lower, upper, message):
         jl.Bounded(lower, upper)
 
 
-def test_a_start_on_a_bound_is_moved_inside():
+def test_a_start_on_a_bound_stays_there():
     u, on_bound = jl.Bounded(0.0, 2.0).start("x", 0.0)
     assert on_bound
-    np.testing.assert_allclose(jl.Bounded(0.0, 2.0).value(jnp.asarray(u), ()), 0.02, rtol=1e-12)
+    assert u.tolist() == [0.0]
+
+
+def test_beyond_a_bound_the_value_is_on_it_and_the_derivative_leads_back():
+    bounded = jl.Bounded(0.0, 2.0)
+    value, slope = jax.value_and_grad(lambda u: bounded.value(u, (3,))[0])(jnp.array([-1.0, 0, 3]))
+    assert value == 0.0
+    assert slope.tolist() == [1.0, 0.0, 0.0]
+    assert bounded.value(jnp.array([-1.0, 0.5, 3.0]), (3,)).tolist() == [0.0, 0.5, 2.0]
