@@ -57,7 +57,9 @@ def measured(path: Path, quick: bool) -> Part:
     free, options = tuple(params0), {"transforms": PHYSICS.transforms} | multiarm.OPTIONS
     plain = jl.System(multiarm.lagrangian, COORDINATES, forces=PHYSICS.forces)
     physics = jl.fit(plain, train, params0, free=free, **options)
-    network = eqx.nn.MLP(2, "scalar", WIDTH, 1, jnp.tanh, key=jax.random.key(0))
+    # Without a constant, which no motion tells.
+    key = jax.random.key(0)
+    network = eqx.nn.MLP(2, "scalar", WIDTH, 1, jnp.tanh, use_final_bias=False, key=key)
     both = jl.System(learned, COORDINATES, forces=PHYSICS.forces)
     epochs = QUICK_EPOCHS if quick else EPOCHS
     descent = jl.Descent(optax.lbfgs(memory_size=MEMORY), epochs=epochs, batch=len(train))
