@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxlag._channels import Reader
 from jaxlag._elimination import Rows, eliminate
 from jaxlag._experiment import Experiment
+from jaxlag._free import Unknowns
 from jaxlag._identifiability import Spectrum, relative, run_off
 from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
 from jaxlag._segments import Layout
@@ -184,14 +185,14 @@ def summarised(
         solves: what it took.
     """
     z = found.guess.z
-    values = np.asarray(problem.free.numbers(z))
+    params, values = _at(problem.free, z)
     firsts = np.flatnonzero(where.first == 0)
     status = np.asarray(found.seen.status)
-    known = _uncertainty(problem, found, values)
+    known = _uncertainty(problem, found, np.asarray(values))
     return FitResult(
-        jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, problem.free.params(z)),
+        jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, params),
         problem.free.names,
-        values,
+        np.asarray(values),
         known.covariance,
         known.singular_values,
         known.unidentifiable,
@@ -234,10 +235,7 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
     nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), ())
     if found.rows is None:
         return nothing
-    numbers = jax.jacfwd(problem.free.numbers)
-    by_z, at_first = (np.asarray(numbers(z)) for z in (found.guess.z, 0.0 * found.guess.z))
-    factor = np.asarray(eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT)).params)
-    factor = factor[:-1, :-1]
+    factor, by_z, at_first = map(np.asarray, _linear(problem.free, found))
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
     moves = ~(run_off(factor, by_z, at_first) | problem.free.at_limit(found.guess.z))
@@ -257,6 +255,21 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
         tuple(names[moves][sizes <= least].tolist()),
         tuple(names[~moves].tolist()),
     )
+
+
+@eqx.filter_jit  # one program: operation by operation they took seconds to compile
+def _at(free: Unknowns, z: Float[Array, " p"]) -> tuple[Any, Array]:
+    """(all params, the numbers found)."""
+    return free.params(z), free.numbers(z)
+
+
+@eqx.filter_jit
+def _linear(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
+    """(a factor of the weighted derivatives by z, derivatives of the numbers by z, those at 0)."""
+    numbers, z = jax.jacfwd(free.numbers), found.guess.z
+    assert found.rows is not None
+    left = eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT))
+    return left.params[:-1, :-1], numbers(z), numbers(jnp.zeros_like(z))
 
 
 def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
