@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from bench import _results
+from bench._fit_data import DataError
 from bench._harness import BENCHMARKS
 
 
@@ -46,7 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     jax.config.update("jax_enable_x64", True)
     circumstances = _results.circumstances()
-    report = run(arguments.quick, **options)
+    try:
+        report = run(arguments.quick, **options)
+    except DataError as error:
+        print(error, file=sys.stderr)
+        return 2
     path = _results.save(
         arguments.name,
         _headline(arguments.name),

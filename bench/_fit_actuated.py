@@ -16,6 +16,7 @@ A = I1 + m2 l1^2, C = m2 l1 r2, P1 = m1 r1 + m2 l1, P2 = m2 r2, I1 and I2 about 
 """
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,8 @@ LOSS = jl.Bounded(0.0, np.inf)  # friction takes energy
 
 # Of the documented masses: J about the axis with the rotor's inertia, kg m^2; m l, kg m.
 DOCUMENTED = {"J": 0.1485, "ml": 0.305}
-ARM_START = {"J": 0.15, "ml": 0.3, "b": 0.01, "cf": 0.1, "u0": 0.0, "s": 1.0}
+ARM_START = {"J": 0.15, "ml": 0.3, "u0": 0.0, "s": 1.0}
+ARM_START |= {"b": np.array([0.01]), "cf": np.array([0.1])}
 
 
 def arm_lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
@@ -130,17 +132,13 @@ def arm(path: Path, quick: bool) -> Part:
     if quick:
         train, test = train[:2], test[:2]
     figures = []
-    start = ARM_START | {"b": np.array([0.01]), "cf": np.array([0.1])}
     for model, free, fixed in (
         ("torque as measured", ("J", "ml", "b", "cf", "u0"), {}),
         ("documented masses", ("s", "b", "cf", "u0"), DOCUMENTED),
     ):
-        transforms = dict.fromkeys(("b", "cf"), LOSS)
-
-        def fit(free: Any = free, fixed: Any = fixed, transforms: Any = transforms) -> Any:
-            return jl.fit(ARM, train, start | fixed, free=free, transforms=transforms, **OPTIONS)
-
-        found, cost = timed(name, model, fit)
+        losses = dict.fromkeys(("b", "cf"), LOSS)
+        fit = partial(jl.fit, ARM, train, ARM_START | fixed, free=free, transforms=losses)
+        found, cost = timed(name, model, partial(fit, **OPTIONS))
         figures += cost + estimates(name, model, found, DOCUMENTED, "documented")
         figures += errors(name, model, "rms of training, 1 s", found.rms("q"))
         figures += errors(name, model, "rms of test, 1 s", found.predict(test).rms("q"))
@@ -164,12 +162,9 @@ def arms(path: Path, design: str, quick: bool) -> Part:
     train, test = read("train"), read("test")
     theirs = published(design)
     model = "viscous, Coulomb"
-
-    def fit() -> jl.FitResult:
-        transforms = dict.fromkeys(("b", "cf", "Ir"), LOSS)
-        return jl.fit(ARMS, train, theirs, free=tuple(theirs), transforms=transforms, **OPTIONS)
-
-    found, figures = timed(name, model, fit)
+    losses = dict.fromkeys(("b", "cf", "Ir"), LOSS)
+    fit = partial(jl.fit, ARMS, train, theirs, free=tuple(theirs), transforms=losses)
+    found, figures = timed(name, model, partial(fit, **OPTIONS))
     flat = {x: y for x, y in theirs.items() if np.ndim(y) == 0}
     flat |= {f"{x}[{i}]": theirs[x][i] for x in ("b", "cf") for i in range(2)}
     figures += estimates(name, model, found, flat, "published")

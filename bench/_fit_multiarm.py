@@ -11,6 +11,7 @@ fitted to then; segments whose number is divisible by 3 take no part in anything
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -162,8 +163,6 @@ def recordings(path: Path, arms: int, every: int) -> dict[int, jl.Experiment]:
 def measured(path: Path, arms: int, quick: bool) -> Part:
     """All that is found of one pendulum."""
     recording = f"{NAMES[arms]} pendulum"
-    coordinates = {"theta": (arms,)}
-    system = jl.System(lagrangian, coordinates)
     segments = recordings(path, arms, EVERY)
     train = [x for number, x in segments.items() if number % 3]
     test = [x for number, x in segments.items() if number % 3 == 0]
@@ -171,58 +170,56 @@ def measured(path: Path, arms: int, quick: bool) -> Part:
         train, test = train[:6], test[:2]
     if arms > 1:
         train = windows(train, 1.0)
+    chosen, fit, figures = _chosen(recording, arms, train, quick)
+    found, cost = timed(recording, chosen, fit)
+    figures += cost + estimates(recording, chosen, found, base(arms), "published")
+    figures += errors(recording, chosen, "rms of training", found.rms("theta"))
+    lengths = (
+        {"9.17 s": test, "1 s": windows(test, 1.0)} if arms == 1 else {"1 s": windows(test, 1.0)}
+    )
+    shown = {x: found.predict(data).rms("theta") for x, data in lengths.items()}
+    length, best = next(iter(shown.items()))
+    refitted = {length: (REFITTED[arms], "refitted to all")}
+    for x, rms in shown.items():
+        figures += errors(recording, chosen, f"rms of test, {x}", rms, *refitted.get(x, ()))
+    claims = [f"mrad: rms of test, {length}, angle {i + 1} of the {recording}" for i in range(arms)]
+    targets = [
+        Target(claim, 1e3 * float(own), "<=", MARGIN * other)
+        for claim, own, other in zip(claims, best, REFITTED[arms], strict=True)
+    ]
+    figures += _ahead(path, arms, recording, chosen, found, quick)
+    return Part(figures, targets, _unidentifiable(train, arms, recording, quick))
+
+
+def _chosen(
+    recording: str, arms: int, train: list[jl.Experiment], quick: bool
+) -> tuple[str, Callable[[], jl.FitResult], list[Figure]]:
+    """(the model of friction that predicts best, its fit to all, how the others do)."""
+    system = jl.System(lagrangian, {"theta": (arms,)})
     params0 = base(arms) | {"zero": np.zeros(arms)}
-    free = tuple(params0)
     models = candidates(arms)
     if quick:
         models = dict(list(models.items())[:2])
     held_out = train[1::3]
     fitted = [x for i, x in enumerate(train) if i % 3 != 1]
+    options = {"free": tuple(params0)} | OPTIONS
     begun = perf_counter()
-    compared = jl.compare(system, fitted, params0, models, held_out=held_out, free=free, **OPTIONS)
+    compared = jl.compare(system, fitted, params0, models, held_out=held_out, **options)
     spent = perf_counter() - begun
     figures = []
     for model in compared.models:
         rms = model.prediction.rms("theta")
         figures += errors(recording, model.name, "chosen by: rms of a third of training", rms)
-    best = compared.best
-    chosen = best.name
     solves = float(sum(model.fit.solves for model in compared.models))
     figures += [
         Figure(recording, "all of them", "run time of the comparison", "s", spent),
         Figure(recording, "all of them", "motions with derivatives", "1", solves),
     ]
-    term = models.get(chosen)
-    better = system.with_forces(*(term.forces if term else ()))
-    brought = term.params0 if term else {}
-
-    def fit() -> jl.FitResult:
-        return jl.fit(
-            better,
-            train,
-            best.fit.params,
-            free=(*free, *brought),
-            transforms=term.transforms if term else {},
-            **OPTIONS,
-        )
-
-    found, cost = timed(recording, chosen, fit)
-    figures += cost + estimates(recording, chosen, found, base(arms), "published")
-    figures += errors(recording, chosen, "rms of training", found.rms("theta"))
-    targets = []
-    length = "9.17 s" if arms == 1 else "1 s"
-    shown = found.predict(test if arms == 1 else windows(test, 1.0)).rms("theta")
-    figures += errors(
-        recording, chosen, f"rms of test, {length}", shown, REFITTED[arms], "refitted to all"
-    )
-    for i, (own, other) in enumerate(zip(shown, REFITTED[arms], strict=True)):
-        claim = f"mrad: rms of test, {length}, angle {i + 1} of the {recording}"
-        targets.append(Target(claim, 1e3 * float(own), "<=", MARGIN * other))
-    if arms == 1:
-        second = found.predict(windows(test, 1.0)).rms("theta")
-        figures += errors(recording, chosen, "rms of test, 1 s", second)
-    figures += _ahead(path, arms, recording, chosen, found, quick)
-    return Part(figures, targets, _unidentifiable(train, arms, recording, quick))
+    best, term = compared.best, models.get(compared.best.name)
+    if term is not None:
+        system = system.with_forces(*term.forces)
+        options |= {"free": (*params0, *term.params0), "transforms": term.transforms}
+    return best.name, partial(jl.fit, system, train, best.fit.params, **options), figures
 
 
 def _published(arms: int) -> jl.System:

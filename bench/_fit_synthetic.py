@@ -6,6 +6,7 @@ noise of a stated standard deviation. m1 and g are given; l1, l2 and m2 are foun
 are wrong by half of their values, up or down by chance, over five Lyapunov times.
 """
 
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,8 +18,8 @@ from jax import Array
 import jaxlag as jl
 from bench._fit_part import Figure, Part
 from bench._harness import Reference, Target
-from jaxlag._elimination import eliminate
 from jaxlag._fit import GAPS
+from jaxlag._fit_result import linearised
 from jaxlag._free import NO_PRIOR, unknowns
 from jaxlag._losses import squares
 from jaxlag._problem import pose, readers_of
@@ -36,7 +37,6 @@ OPTIONS = {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}
 TRUTH = {"rtol": 1e-11, "atol": 1e-11}
 SETTLING, STRETCHES = 20, 400  # s
 NEAR = 0.01
-QUANTILES = {95: 1.959964, 99: 2.575829}
 
 
 def lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
@@ -122,9 +122,9 @@ def recovered(ts: np.ndarray, seeds: int, segments: int) -> Tally:
             transforms=dict.fromkeys(FREE, jl.Positive()),
             **OPTIONS,
         )
-        off = {name: abs(fitted.params[name] - TRUE[name]) for name in FREE}
-        error = max(off[name] / TRUE[name] for name in FREE)
-        inside = all(off[name] <= QUANTILES[99] * fitted.std[name] for name in FREE)
+        error = max(abs(fitted.params[x] / TRUE[x] - 1) for x in FREE)
+        interval = fitted.interval(0.99)
+        inside = all(interval[x][0] <= TRUE[x] <= interval[x][1] for x in FREE)
         found += error <= NEAR and inside
         errors.append(error)
         solves.append(fitted.solves)
@@ -152,14 +152,14 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
     def one(values: Array) -> tuple[Array, Array]:
         own = eqx.tree_at(lambda x: x.segments.values, problem, values)
         found = search(own, nowhere, jnp.asarray(GAPS[-1]), 1e-6, 50)
-        factor = eliminate(found.rows, jnp.asarray(0.0)).params[:-1, :-1]
-        # Numbers are scale z.
-        inverse = jnp.linalg.inv(factor) * jnp.asarray(problem.free.scale)[:, None]
-        return problem.free.numbers(found.guess.z), jnp.sqrt(jnp.sum(inverse**2, axis=1))
+        factor, by_z, _ = linearised(problem.free, found)
+        root = by_z @ jnp.linalg.inv(factor)
+        return problem.free.numbers(found.guess.z), jnp.linalg.norm(root, axis=1)
 
     numbers, std = jax.jit(jax.vmap(one))(values)
     true = np.array([TRUE[name] for name in FREE])
-    return np.mean(np.abs(np.asarray(numbers) - true) <= QUANTILES[95] * np.asarray(std), axis=0)
+    within = NormalDist().inv_cdf(0.975) * np.asarray(std)
+    return np.mean(np.abs(np.asarray(numbers) - true) <= within, axis=0)
 
 
 def part(quick: bool) -> Part:

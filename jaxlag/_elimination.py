@@ -72,7 +72,7 @@ def sizes_of(rows: Rows) -> Float[Array, " c"]:
 def eliminate(
     rows: Rows, damping: Float[Array, ""], weights: Float[Array, " p"] | None = None
 ) -> Eliminated:
-    """Rows of condensed problems from which states and params follow by substitution.
+    """Rows of condensed problems from which params and states follow by substitution.
 
     Args:
         rows: of the problem.
@@ -111,12 +111,6 @@ def eliminate(
     (left, params), states = jax.lax.scan(one, start, (rows.measured, rows.joined, rows.next))
     # The last segment ends: what is left over holds p alone.
     return Eliminated(states, _triangle(jnp.concatenate([params, left[:, d:]])))
-
-
-def substitute(left: Eliminated) -> tuple[Float[Array, " p"], Float[Array, "k d"]]:
-    """(p, x) of least squares."""
-    p = solve_triangular(left.params[:-1, :-1], left.params[:-1, -1])
-    return p, states_of(left, p)
 
 
 def states_of(left: Eliminated, p: Float[Array, " p"]) -> Float[Array, "k d"]:

@@ -23,6 +23,8 @@ from jaxlag._system import System
 
 SHOWN = 40
 """Estimates in a result's text."""
+UNTOLD = 1e-9
+"""A column of round-off, over the largest: nothing measured depends on its number."""
 FAINT = 1e-20
 """Damping, in squares of unknowns of order one, that keeps starts regular that are not observed."""
 
@@ -235,20 +237,20 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
     nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), ())
     if found.rows is None:
         return nothing
-    factor, by_z, at_first = map(np.asarray, _linear(problem.free, found))
+    factor, by_z, at_first = map(np.asarray, linearised(problem.free, found))
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
-    moves = ~(run_off(factor, by_z, at_first) | problem.free.at_limit(found.guess.z))
+    told = np.linalg.norm(factor, axis=0) > UNTOLD * np.linalg.norm(factor)
+    held = problem.free.at_limit(found.guess.z) & told
+    moves = ~(run_off(factor, by_z, at_first) | held)
     own = np.ix_(moves, moves)
     by_value = np.linalg.solve(by_z[own].T, factor[:, moves].T).T
-    # A column of round-off: nothing depends on it, whatever it is divided by.
     sizes = np.linalg.norm(by_value * relative(values[moves]), axis=0)
-    least = 1e-9 * max(sizes, default=0.0)
+    least = UNTOLD * max(sizes, default=0.0)
     spectrum = Spectrum(tuple(names[moves].tolist()), values[moves], by_value)
-    covariance = unknown
-    covariance[own] = spectrum.covariance()
+    unknown[own] = spectrum.covariance()
     return _Uncertainty(
-        covariance,
+        unknown,
         spectrum.singular_values,
         spectrum.unidentifiable,
         spectrum.determined,
@@ -264,7 +266,7 @@ def _at(free: Unknowns, z: Float[Array, " p"]) -> tuple[Any, Array]:
 
 
 @eqx.filter_jit
-def _linear(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
+def linearised(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
     """(a factor of the weighted derivatives by z, derivatives of the numbers by z, those at 0)."""
     numbers, z = jax.jacfwd(free.numbers), found.guess.z
     assert found.rows is not None

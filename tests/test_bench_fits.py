@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
+from bench import __main__ as command
 from bench import _fit_actuated as actuated
 from bench import _fit_cube as cube
 from bench import _fit_multiarm as multiarm
@@ -56,6 +57,11 @@ def test_the_folder_of_recordings_must_be_named_and_there(tmp_path, monkeypatch)
         folder(str(tmp_path / "nowhere"))
     monkeypatch.setenv("JAXLAG_DATA", str(tmp_path))
     assert folder(None) == tmp_path
+
+
+def test_the_command_says_what_it_lacks(tmp_path, capsys):
+    assert command.main(["fits", "--data", str(tmp_path / "nowhere")]) == 2
+    assert "--data must name a folder" in capsys.readouterr().err
 
 
 def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.scipy.linalg import solve_triangular
 
-from jaxlag._elimination import Rows, condense, eliminate, sizes_of, states_of, substitute
+from jaxlag._elimination import Rows, condense, eliminate, sizes_of, states_of
 
 EPS = np.finfo(float).eps
 SEGMENTS, ROWS, STATES, PARAMS, DAMPING = 7, 9, 4, 3, 0.3
@@ -45,17 +46,24 @@ def problem(chained):
     return rows, np.concatenate(blocks), np.concatenate(right)
 
 
-@pytest.mark.parametrize("chained", [False, True])
-def test_the_solution_is_that_of_the_dense_problem(chained):
-    rows, matrix, right = problem(chained)
-    left = eliminate(condense(rows), jnp.asarray(DAMPING))
-    p, x = substitute(left)
-    size = matrix.shape[1]
-    damped = np.concatenate([matrix, np.sqrt(DAMPING) * np.eye(size)])
-    expected = np.linalg.lstsq(damped, np.append(right, np.zeros(size)))[0]
-    found = np.concatenate([p, np.ravel(x)])
-    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
+def close(found, matrix, right):
+    """Whether these are the least squares of a dense problem, to the rounding of its condition."""
+    expected = np.linalg.lstsq(matrix, np.append(right, np.zeros(len(matrix) - len(right))))[0]
+    bound = 10 * EPS * np.linalg.cond(matrix) * np.linalg.norm(expected)
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("weights", [None, np.array([1.0, 0.3, 0.1])], ids=["alike", "weighed"])
+@pytest.mark.parametrize("chained", [False, True])
+def test_the_solution_is_that_of_the_dense_problem(chained, weights):
+    rows, matrix, right = problem(chained)
+    given = None if weights is None else jnp.asarray(weights)
+    left = eliminate(condense(rows), jnp.asarray(DAMPING), given)
+    p = solve_triangular(left.params[:-1, :-1], left.params[:-1, -1])
+    damping = np.full(matrix.shape[1], np.sqrt(DAMPING))
+    damping[:PARAMS] *= 1.0 if weights is None else weights
+    found = np.append(p, states_of(left, p))
+    close(found, np.concatenate([matrix, np.diag(damping)]), right)
 
 
 @pytest.mark.parametrize("chained", [False, True])
@@ -78,30 +86,13 @@ def test_what_is_left_is_the_information_of_the_params(chained):
 
 
 @pytest.mark.parametrize("chained", [False, True])
-def test_weights_of_the_damping_are_those_of_the_params(chained):
-    rows, matrix, right = problem(chained)
-    weights = np.array([1.0, 0.3, 0.1])
-    p, x = substitute(eliminate(condense(rows), jnp.asarray(DAMPING), jnp.asarray(weights)))
-    size = matrix.shape[1]
-    damping = np.sqrt(DAMPING) * np.append(weights, np.ones(size - PARAMS))
-    damped = np.concatenate([matrix, np.diag(damping)])
-    expected = np.linalg.lstsq(damped, np.append(right, np.zeros(size)))[0]
-    found = np.concatenate([p, np.ravel(x)])
-    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
-
-
-@pytest.mark.parametrize("chained", [False, True])
 def test_states_follow_from_params_that_are_given(chained):
     rows, matrix, right = problem(chained)
     p = np.array([0.7, -0.2, 1.1])
     x = states_of(eliminate(condense(rows), jnp.asarray(DAMPING)), jnp.asarray(p))
-    size = matrix.shape[1] - PARAMS
-    damped = np.concatenate([matrix[:, PARAMS:], np.sqrt(DAMPING) * np.eye(size)])
-    known = np.append(right - matrix[:, :PARAMS] @ p, np.zeros(size))
-    expected = np.linalg.lstsq(damped, known)[0]
-    bound = 10 * EPS * np.linalg.cond(damped) * np.linalg.norm(expected)
-    np.testing.assert_allclose(np.ravel(x), expected, rtol=0, atol=bound)
+    damping = np.sqrt(DAMPING) * np.eye(matrix.shape[1] - PARAMS)
+    known = right - matrix[:, :PARAMS] @ p
+    close(np.ravel(x), np.concatenate([matrix[:, PARAMS:], damping]), known)
 
 
 @pytest.mark.parametrize("chained", [False, True])

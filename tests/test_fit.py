@@ -250,6 +250,10 @@ def test_warnings_name_what_they_are_about():
     with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
         found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0})
     assert found.params["spare"] == 1.0
+    spare = {"transforms": {"spare": jl.Bounded(0.0, 1.0)}}  # on its bound, but not held there
+    with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
+        found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0}, **spare)
+    assert found.on_bound == ()
     flat = jl.Experiment(TS, {"x": angles(), "x'": 0.0 * TS}, sigma={"x": NOISE, "x'": 1e3})
     with pytest.warns(UserWarning, match=r"channel \"x'\" of experiment is constant"):
         fit(flat)
