@@ -147,15 +147,17 @@ def predict(
         problem, _ = pose(system, these, where, fixed, shown, NO_PRIOR, squares, options, noise)
         return problem, where
 
-    problem, _ = posed(early)
-    nowhere = Guess(jnp.zeros(0), jnp.zeros(problem.segments.guess.shape))
-    found = search(problem, nowhere, jnp.asarray(1.0), tolerance, max_steps)
+    whole, where = posed(early)
+    nowhere = Guess(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
+    found = search(whole, nowhere, jnp.asarray(1.0), tolerance, max_steps)
     if not found.converged:
         text = f"The search for starts did not converge in {int(found.steps)} steps: raise "
         warnings.warn(text + "max_steps, or make settle longer.", stacklevel=2)
-    whole, where = posed(experiments)
-    whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
-    seen = moved(whole, Guess(nowhere.z, jnp.zeros(whole.segments.guess.shape)))
+    seen = found.seen
+    if settle is not None:
+        whole, where = posed(experiments)
+        whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
+        seen = moved(whole, nowhere)
     status = np.asarray(seen.status)
     rows = tuple(
         np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)

@@ -3,10 +3,9 @@
     J q'' = -m g l sin(q - zero) - c q' - f sign(q') - k q'|q'| + torque
 
 The motion is cut in windows of 1 s, each with a free start (q, q') of its own; the parameters are
-common to all. Levenberg-Marquardt minimises the sum of squares of simulated minus measured angle.
-Measured velocities are not used: rigs filter them. The models differ in friction: viscous (c),
-+ Coulomb (f), + quadratic (k). Parameters come from the training windows alone; on the test
-windows only the starts are fitted anew.
+common to all. Models differ in friction: none, viscous (c), + Coulomb (f), + quadratic (k).
+Measured velocities are not used: rigs filter them. Parameters come from the training windows alone;
+on the test windows only the starts are fitted anew (`jl.fit`, `FitResult.predict`).
 
 A free swing tells m g l, c, f and k over J only; a measured torque tells J too.
 """
@@ -16,20 +15,20 @@ from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
+import jaxlag as jl
 from systems import _pendulum_report as report
-from systems._pendulum_data import DataError, Recording, Segment, Windows
-from systems._pendulum_data import cut as cut
+from systems._pendulum_data import DataError, Recording, segment
 from systems._pendulum_data import read as read
-from systems._pendulum_fit import MRAD as MRAD
-from systems._pendulum_fit import NAMES, simulate
-from systems._pendulum_fit import free as free
-from systems._pendulum_fit import rms as rms
-from systems._pendulum_trials import choose as choose
-from systems._pendulum_trials import fit_segments as fit_segments
-from systems._pendulum_trials import try_models as try_models
+from systems._pendulum_data import split as split
+from systems._pendulum_fit import MODELS as MODELS
+from systems._pendulum_fit import NAMES, driven, free
+from systems._pendulum_fit import choose as choose
+from systems._pendulum_fit import fit as fit
+from systems._pendulum_fit import fit_segments as fit_segments
+from systems._pendulum_fit import guess as guess
+from systems._pendulum_fit import try_models as try_models
 
 # Without a recording: per J, as in a free swing.
 TRUTH = {"J": 1.0, "mgl": 60.0, "c": 0.05, "f": 0.2, "zero": 0.01}
@@ -87,13 +86,13 @@ def _run(path: Path | None, test: Path | None, seconds: float, plot: Path | None
     other = None if test is None else read(test)
     print(report.describe(recording))
     if truth:
-        print(f"  simulated by jaxlag, Gaussian noise of {NOISE / MRAD:g} mrad rms on the angle")
+        print(f"  simulated by jaxlag, Gaussian noise of {1e3 * NOISE:g} mrad rms on the angle")
     if other is not None:
         print(f"tested on {report.describe(other)}")
     trials = try_models(recording, other, seconds)
     print(*report.trials(recording, other, trials, truth), sep="\n")
     if path is not None and not recording.driven and len(recording.segments) > 1:
-        print(*report.segments(recording, fit_segments(recording)), sep="\n")
+        print(*report.segments(recording, fit_segments(recording, trials)), sep="\n")
     if plot is None and not report.can_plot():
         print(f"figure left out: {report.NEEDS_MATPLOTLIB}")
         return
@@ -119,10 +118,13 @@ def synthetic(
     generator = np.random.default_rng(seed)
     t = np.arange(500) / 100.0
     u = 0.4 * values["mgl"] * (np.sin(2.1 * t) + np.sin(5.3 * t)) if torque else None
+    system = driven if torque else free
+    inputs = None if u is None else {"torque": jl.Linear(t, u)}
     params = dict.fromkeys(NAMES, 0.0) | dict(values)
-    pieces = []
+    pieces = {}
     for number in range(segments):
-        start = jnp.array([2.4 - 2.0 * number / segments, 0.0])
-        q = np.asarray(simulate(params, start, Windows(t, t, u), rtol=1e-10, atol=1e-10))
-        pieces.append(Segment(number, t, q + noise * generator.standard_normal(len(t)), u))
-    return Recording("synthetic pendulum", tuple(pieces))
+        start = [2.4 - 2.0 * number / segments]
+        motion = jl.simulate(system, start, [0.0], t, params, inputs=inputs, rtol=1e-10, atol=1e-10)
+        q = np.asarray(motion["q"]) + noise * generator.standard_normal(len(t))
+        pieces[number] = segment(f"segment {number}", t, q, u)
+    return Recording("synthetic pendulum", pieces)
