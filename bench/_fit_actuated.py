@@ -26,7 +26,7 @@ from jax import Array
 
 import jaxlag as jl
 from bench._fit_data import table, windows
-from bench._fit_part import Part, errors, estimates, timed
+from bench._fit_part import Part, errors, estimates, missed, timed
 from bench._harness import Reference
 
 G = 9.81  # m/s^2
@@ -141,7 +141,7 @@ def arm(path: Path, quick: bool) -> Part:
         found, cost = timed(name, model, partial(fit, **OPTIONS))
         figures += cost + estimates(name, model, found, DOCUMENTED, "documented")
         figures += errors(name, model, "rms of training, 1 s", found.rms("q"))
-        figures += errors(name, model, "rms of test, 1 s", found.predict(test).rms("q"))
+        figures += errors(name, model, "rms of test, 1 s", missed(found.predict(test), "q"))
         if quick:
             break
     return Part(figures, [], [])
@@ -169,8 +169,8 @@ def arms(path: Path, design: str, quick: bool) -> Part:
     flat |= {f"{x}[{i}]": theirs[x][i] for x in ("b", "cf") for i in range(2)}
     figures += estimates(name, model, found, flat, "published")
     figures += errors(name, model, "rms of training, 0.5 s", found.rms("q"))
-    own = found.predict(test).rms("q")
-    other = 1e3 * jl.predict(ARMS, test, theirs, **OPTIONS).rms("q")
+    own = missed(found.predict(test), "q")
+    other = 1e3 * missed(jl.predict(ARMS, test, theirs, **OPTIONS), "q")
     figures += errors(name, model, "rms of test, 0.5 s", own, other, "published params")
     references = [Reference(name, f"unknown: {text}") for text in found.unidentifiable]
     return Part(figures, [], references)

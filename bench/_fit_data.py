@@ -56,6 +56,6 @@ def windows(recordings: Iterable[jl.Experiment], seconds: float) -> list[jl.Expe
     return [
         window
         for each in recordings
-        if each.ts[-1] - each.ts[0] >= 0.99 * seconds
+        if each.ts[-1] - each.ts[0] + np.median(np.diff(each.ts)) >= (1 - 1e-9) * seconds
         for window in each.windows(seconds)
     ]

@@ -22,7 +22,7 @@ from jax import Array
 
 import jaxlag as jl
 from bench._fit_data import pieces, table, windows
-from bench._fit_part import Figure, Part, errors, estimates, timed
+from bench._fit_part import Figure, Part, errors, estimates, missed, timed
 from bench._harness import Reference, Target
 
 NAMES = {1: "single", 2: "double", 3: "triple"}
@@ -168,8 +168,6 @@ def measured(path: Path, arms: int, quick: bool) -> Part:
     test = [x for number, x in segments.items() if number % 3 == 0]
     if quick:
         train, test = train[:6], test[:2]
-    if arms > 1:
-        train = windows(train, 1.0)
     chosen, fit, figures = _chosen(recording, arms, train, quick)
     found, cost = timed(recording, chosen, fit)
     figures += cost + estimates(recording, chosen, found, base(arms), "published")
@@ -177,7 +175,7 @@ def measured(path: Path, arms: int, quick: bool) -> Part:
     lengths = (
         {"9.17 s": test, "1 s": windows(test, 1.0)} if arms == 1 else {"1 s": windows(test, 1.0)}
     )
-    shown = {x: found.predict(data).rms("theta") for x, data in lengths.items()}
+    shown = {x: missed(found.predict(data), "theta") for x, data in lengths.items()}
     length, best = next(iter(shown.items()))
     refitted = {length: (REFITTED[arms], "refitted to all")}
     for x, rms in shown.items():
@@ -188,7 +186,12 @@ def measured(path: Path, arms: int, quick: bool) -> Part:
         for claim, own, other in zip(claims, best, REFITTED[arms], strict=True)
     ]
     figures += _ahead(path, arms, recording, chosen, found, quick)
-    return Part(figures, targets, _unidentifiable(train, arms, recording, quick))
+    return Part(figures, targets, _unidentifiable(fitted(train, arms), arms, recording, quick))
+
+
+def fitted(segments: list[jl.Experiment], arms: int) -> list[jl.Experiment]:
+    """What is fitted to: segments of one arm, which is not chaotic, and windows of several."""
+    return segments if arms == 1 else windows(segments, 1.0)
 
 
 def _chosen(
@@ -200,11 +203,11 @@ def _chosen(
     models = candidates(arms)
     if quick:
         models = dict(list(models.items())[:2])
-    held_out = train[1::3]
-    fitted = [x for i, x in enumerate(train) if i % 3 != 1]
+    held_out = fitted(train[1::3], arms)
+    rest = fitted([x for i, x in enumerate(train) if i % 3 != 1], arms)
     options = {"free": tuple(params0)} | OPTIONS
     begun = perf_counter()
-    compared = jl.compare(system, fitted, params0, models, held_out=held_out, **options)
+    compared = jl.compare(system, rest, params0, models, held_out=held_out, **options)
     spent = perf_counter() - begun
     figures = []
     for model in compared.models:
@@ -219,7 +222,11 @@ def _chosen(
     if term is not None:
         system = system.with_forces(*term.forces)
         options |= {"free": (*params0, *term.params0), "transforms": term.transforms}
-    return best.name, partial(jl.fit, system, train, best.fit.params, **options), figures
+    return (
+        best.name,
+        partial(jl.fit, system, fitted(train, arms), best.fit.params, **options),
+        figures,
+    )
 
 
 def _published(arms: int) -> jl.System:
@@ -239,8 +246,8 @@ def _ahead(
         recording,
         chosen,
         "rms 1 s ahead of 0.1 s",
-        own.rms("theta"),
-        1e3 * theirs.rms("theta"),
+        missed(own, "theta"),
+        1e3 * missed(theirs, "theta"),
         "published params",
     )
 

@@ -18,7 +18,7 @@ from jax import Array
 
 import jaxlag as jl
 from bench import _fit_multiarm as multiarm
-from bench._fit_part import Figure, Part, timed
+from bench._fit_part import Figure, Part, missed, timed
 from bench._harness import Target
 
 PHYSICS = multiarm.candidates(1)["viscous, falling, drag"]
@@ -72,7 +72,7 @@ def measured(path: Path, quick: bool) -> Part:
     figures.append(Figure(name, model, "numbers trained", "1", float(len(found.names))))
 
     def compared(what: str, others: list[jl.Experiment]) -> Figure:
-        own, alone = (1e3 * x.predict(others).rms("theta")[0] for x in (found, physics))
+        own, alone = (1e3 * missed(x.predict(others), "theta")[0] for x in (found, physics))
         return Figure(
             name, model, f"rms of {what}", "mrad", own, None, None, alone, "physics alone"
         )

@@ -4,6 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 import jaxlag as jl
 from bench._harness import Reference, Target
 
@@ -71,6 +74,12 @@ def estimates(
         own = None if other is None else whose
         rows.append(Figure(recording, model, name, "SI", value, low, high, other, own))
     return rows
+
+
+def missed(prediction: jl.Prediction, channel: str) -> Float[np.ndarray, " k"]:
+    """Root mean square of what a prediction misses; inf where a motion failed."""
+    rms = prediction.rms(channel)
+    return np.full_like(rms, np.inf) if prediction.failed else rms
 
 
 def errors(

@@ -18,9 +18,9 @@ from jax import Array
 import jaxlag as jl
 from bench._fit_part import Figure, Part
 from bench._harness import Reference, Target
-from jaxlag._fit import GAPS
-from jaxlag._fit_result import linearised
+from jaxlag._fit import last_gap
 from jaxlag._free import NO_PRIOR, unknowns
+from jaxlag._information import linearised
 from jaxlag._losses import squares
 from jaxlag._problem import pose, readers_of
 from jaxlag._segments import layout
@@ -147,16 +147,18 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     noise = NOISE * rng.normal(size=(fits, *segments.values.shape))
     values = segments.values + jnp.where(segments.weights > 0, noise, 0.0)
-    nowhere = Guess(jnp.zeros(len(FREE)), jnp.zeros(segments.guess.shape))
+    guess = Guess(jnp.zeros((fits, len(FREE))), jnp.zeros((fits, *segments.guess.shape)))
 
-    def one(values: Array) -> tuple[Array, Array]:
+    def one(values: Array, guess: Guess, join: Array) -> tuple[Guess, Array, Array]:
         own = eqx.tree_at(lambda x: x.segments.values, problem, values)
-        found = search(own, nowhere, jnp.asarray(GAPS[-1]), 1e-6, 50)
+        found = search(own, guess, join, jnp.asarray(1e-6), 50)
         factor, by_z, _ = linearised(problem.free, found)
         root = by_z @ jnp.linalg.inv(factor)
-        return problem.free.numbers(found.guess.z), jnp.linalg.norm(root, axis=1)
+        return found.guess, problem.free.numbers(found.guess.z), jnp.linalg.norm(root, axis=1)
 
-    numbers, std = jax.jit(jax.vmap(one))(values)
+    batch = jax.jit(jax.vmap(one, (0, 0, None)))
+    for join in (1e-5, last_gap(problem)):
+        guess, numbers, std = batch(values, guess, jnp.asarray(join))
     true = np.array([TRUE[name] for name in FREE])
     within = NormalDist().inv_cdf(0.975) * np.asarray(std)
     return np.mean(np.abs(np.asarray(numbers) - true) <= within, axis=0)

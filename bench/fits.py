@@ -17,6 +17,7 @@ A quick run takes a few windows of each recording.
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from bench import _fit_actuated, _fit_cube, _fit_multiarm, _fit_network, _fit_synthetic, _fit_video
@@ -43,10 +44,14 @@ def run(quick: bool, data: str | None = None) -> Report:
     path = folder(data)
     found, missing = [_fit_synthetic.part(quick)], []
     for recordings, part in PARTS:
-        if (path / recordings).is_dir():
-            found.append(part(path=path, quick=quick))
-        else:
+        if not (path / recordings).is_dir():
             missing.append(Reference(recordings, "not in the folder: left out"))
+            continue
+        try:
+            found.append(part(path=path, quick=quick))
+        except FileNotFoundError as error:
+            name = f"{recordings}/{Path(error.filename).name}"
+            missing.append(Reference(name, "not in the folder: its part is left out"))
     rows: list[dict[str, Any]] = [x._asdict() for part in found for x in part.figures]
     targets = [x for part in found for x in part.targets]
     return Report(rows, targets, [x for part in found for x in part.references] + missing)

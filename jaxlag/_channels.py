@@ -1,6 +1,6 @@
 """Channels: what a motion shows of a name that was measured."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 import jax.numpy as jnp
@@ -53,7 +53,25 @@ def standard(system: System, rows: tuple[str, ...]) -> dict[str, Reader]:
     return found
 
 
-def read(channels: Mapping[str, Reader], motion: Solution) -> Float[Array, "s m"]:
-    """All channels of a motion, side by side."""
-    count = motion.ts.shape[0]
-    return jnp.concatenate([f(motion).reshape(count, -1) for f in channels.values()], axis=1)
+def read(
+    channels: Mapping[str, Reader], widths: Sequence[int], motion: Solution
+) -> Float[Array, "s m"]:
+    """All channels of a motion, side by side.
+
+    Args:
+        channels: name -> function of a motion.
+        widths: columns that were measured of each.
+        motion: what is seen.
+
+    Raises:
+        ValueError: a channel shows another number of rows or columns.
+    """
+    count, shown = motion.ts.shape[0], []
+    for (name, function), width in zip(channels.items(), widths, strict=True):
+        x = jnp.asarray(function(motion))
+        x = x[:, None] if x.ndim == 1 else x
+        if x.shape != (count, width):
+            must = f"have as many columns as were measured, {width}, at each of {count} times"
+            raise bad(f"channels[{name!r}]", must, f"the motion shows {x.shape}")
+        shown.append(x)
+    return jnp.concatenate(shown, axis=1)

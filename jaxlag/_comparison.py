@@ -1,10 +1,12 @@
 """Models compared: which forces does a system need to predict what it was not fitted to?"""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxlag._errors import bad
@@ -14,8 +16,9 @@ from jaxlag._fit_result import FitResult
 from jaxlag._forces import AbstractForce
 from jaxlag._free import Prior
 from jaxlag._prediction import Prediction
-from jaxlag._problem import experiments_of
+from jaxlag._problem import experiments_of, spreads
 from jaxlag._system import System
+from jaxlag._transforms import AbstractTransform
 
 
 @final
@@ -42,7 +45,7 @@ class Candidate(eqx.Module):
         *forces: Any,
         params0: Mapping[str, Any] | None = None,
         transforms: Mapping[str, Any] | None = None,
-        priors: Mapping[str, Prior] | None = None,
+        priors: Mapping[str, Any] | None = None,
     ) -> None:
         if not forces or not all(isinstance(x, AbstractForce) for x in forces):
             fix = 'Write jl.Candidate(jl.Rayleigh(R, "friction"), params0={"k": 0.1}).'
@@ -122,7 +125,7 @@ def compare(
     most: int = 1,
     settle: float | int | None = None,
     transforms: Mapping[str, Any] | None = None,
-    priors: Mapping[str, Prior] | None = None,
+    priors: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Comparison:
     """Fit a system with and without candidate terms, and rank them by what they predict.
@@ -151,6 +154,9 @@ def compare(
         ValueError: an argument of wrong form or value, named; params of a candidate that the system
             has, or another candidate that it may stand beside.
 
+    Warns:
+        as `jl.fit` and `jl.predict` do, and where no model predicts all that was held out.
+
     Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.2.
     """
     experiments, held_out = experiments_of(experiments), experiments_of(held_out)
@@ -167,7 +173,7 @@ def compare(
             found = fit(
                 system.with_forces(*(force for term in terms for force in term.forces)),
                 experiments,
-                params | _estimates(params, set(params0), models),
+                params | _estimates(params, set(params0), models, transform),
                 free=(*free, *(name for term in terms for name in term.params0)),
                 transforms=transform,
                 priors=prior,
@@ -176,24 +182,57 @@ def compare(
             predicted = found.predict(held_out, settle)
             error = _error(predicted, held_out)
             models.append(Ranked(" + ".join(names) or "none", error, found, predicted))
-    return Comparison(tuple(sorted(models, key=lambda model: model.error)))
+    ranked = tuple(sorted(models, key=lambda model: model.error))
+    if np.isinf(ranked[0].error):
+        text = "No model predicts all that was held out: motions or searches for starts failed."
+        warnings.warn(f"{text} See `prediction.failed` of each.", stacklevel=2)
+    return Comparison(ranked)
 
 
 def _estimates(
-    params: Mapping[str, Any], common: set[str], models: Sequence[Ranked]
+    params: Mapping[str, Any],
+    common: set[str],
+    models: Sequence[Ranked],
+    transforms: Mapping[str, AbstractTransform],
 ) -> dict[str, Any]:
-    """Those of the model that has most of these params, of the best such one.
+    """Those of the model that has most of these params, of several of that which fits best.
 
-    Nothing where none has more than the params that are common to all: they may be far off there.
+    Nothing where none has more than the params that are common to all: they may be far off there;
+    and nothing of another form, or that a transform does not allow.
     """
     able = [model for model in models if model.error < float("inf") and model.fit.converged]
     shared = [len(params.keys() & model.fit.params.keys()) for model in able]
     if max(shared, default=0) <= len(common):
         return {}
-    near = min(zip(able, shared, strict=True), key=lambda x: (-x[1], x[0].error))[0].fit
+    near = min(
+        zip(able, shared, strict=True),
+        key=lambda x: (-x[1], _error(x[0].fit, x[0].fit.experiments)),
+    )[0].fit
     # A logarithm that has run off finds no way back.
     held = {name.partition("[")[0].partition(".")[0] for name in near.on_bound}
-    return {name: near.params[name] for name in params if name in near.params.keys() - held}
+    return {
+        name: near.params[name]
+        for name in params.keys() & near.params.keys() - held
+        if _alike(near.params[name], params[name])
+        and _allowed(transforms.get(name), name, near.params[name])
+    }
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two params have one structure and shapes."""
+    (a, of_a), (b, of_b) = jax.tree.flatten(one), jax.tree.flatten(other)
+    return of_a == of_b and all(np.shape(x) == np.shape(y) for x, y in zip(a, b, strict=True))
+
+
+def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool:
+    """Whether a search may begin there."""
+    if transform is None:
+        return True
+    try:
+        _, on_bound = transform.start(name, np.asarray(value))
+    except ValueError:
+        return False
+    return not on_bound
 
 
 def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
@@ -221,15 +260,14 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> 
         raise bad("most", must, f"it was {most!r}")
 
 
-def _error(predicted: Prediction, experiments: Sequence[Experiment]) -> float:
+def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:
     """Of all channels, each over how far it ranges; inf where a motion or a start failed."""
     if predicted.failed or not predicted.converged:
         return float("inf")
     shares = []
     for name in predicted.channels:
         rows = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
-        ranges = np.nanstd(rows, axis=0)
-        shares.append(predicted.rms(name) / np.where(ranges > 0, ranges, 1.0))
+        shares.append(predicted.rms(name) / spreads(rows))
     # A channel may have no number in the rows that were predicted.
     known = np.concatenate(shares)
     known = known[np.isfinite(known)]

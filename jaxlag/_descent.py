@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxlag._errors import bad
-from jaxlag._shooting import Guess, Shooting
+from jaxlag._shooting import Guess, Seen, Shooting
 
 
 @final
@@ -120,13 +120,13 @@ def cost_of(
 ) -> Float[Array, ""]:
     """Half the sum of squares over all segments, guessed from some of them; and of the priors."""
     segments = jax.tree.map(lambda x: x[which], shooting.segments)
-    residuals, ends, _ = jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments)
-    rows = shooting.weighed(guess.x[which], segments, residuals)
+    seen = Seen(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
+    rows = shooting.weighed(guess.x[which], segments, seen.residuals)
     total = jnp.sum(rows**2)
     if shooting.chained:
         after = (which + 1) % guess.x.shape[0]
         following = jax.tree.map(lambda x: x[after], shooting.segments)
         begins = jax.vmap(shooting.start)(guess.x[after], following)
-        total += jnp.sum(shooting.gaps(segments, ends, begins, join) ** 2)
+        total += jnp.sum(shooting.gaps(segments, seen, begins, join) ** 2)
     share = which.shape[0] / guess.x.shape[0]
     return 0.5 * (total / share + jnp.sum(shooting.known(guess.z) ** 2))

@@ -26,10 +26,11 @@ class Experiment(eqx.Module):
             (s, k). Of channels that are left out it is estimated from the residuals.
         q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.
             Where it is left out, the coordinates must be among the channels.
-        v0: velocities (quasi-velocities, of systems that have them), likewise; left out, they are
-            slopes of the measured coordinates.
+        v0: velocities, (n,) or (s, n), of systems that have quasi-velocities those, one for each
+            name, m/s or rad/s; left out, they are slopes of the measured coordinates.
         start_sigma: how well q0 and v0 are known: None, not at all, the state at ts[0] is free;
-            0, exactly; a number or (2n,), standard deviations of q0 and v0, m, rad, m/s, rad/s.
+            0, exactly; standard deviations, m, rad, m/s, rad/s: a number, or one for each of the
+            coordinates and of the velocities that no constraint takes.
         name: what messages call it.
 
     Raises:
@@ -71,10 +72,17 @@ class Experiment(eqx.Module):
             if key not in self.channels:
                 known = sorted(self.channels)
                 raise bad(f"{name}: sigma", f"name channels among {known}", f"one was {key!r}")
-            x = np.asarray(x, float)
-            x = np.broadcast_to(x[:, None] if x.ndim == 1 else x, self.channels[key].shape)
-            if not np.all(x > 0):
-                raise bad(f"{name}: sigma[{key!r}]", "be positive", f"its least was {np.min(x):g}")
+            x, shape = np.asarray(x, float), self.channels[key].shape
+            given = x.shape
+            try:
+                x = np.broadcast_to(x[:, None] if x.ndim == 1 else x, shape)
+            except ValueError:
+                must = f"be a number, {shape[0]} of them, or of shape {shape}"
+                raise bad(f"{name}: sigma[{key!r}]", must, f"its shape was {given}") from None
+            if not np.all((x > 0) & (x < np.inf)):
+                fix = "Write NaN into the channel where it does not count."
+                was = f"its least was {np.min(x):g}, its largest {np.max(x):g}"
+                raise bad(f"{name}: sigma[{key!r}]", "be positive and finite", was, fix)
             self.sigma[key] = x
         self.q0, self.v0 = _guess(name, "q0", q0, count), _guess(name, "v0", v0, count)
         self.start_sigma = None if start_sigma is None else np.asarray(start_sigma, float)
@@ -109,22 +117,27 @@ class Experiment(eqx.Module):
     def windows(self, seconds: float | int) -> tuple["Experiment", ...]:
         """Pieces of equal length side by side, each with a start of its own.
 
-        A remainder that is shorter is left out.
+        A remainder that is shorter is left out, and so are pieces in gaps, of less than two rows.
 
         Raises:
             ValueError: the recording is shorter than that, or a piece would have one row.
         """
+        if not 0 < seconds < np.inf:
+            raise bad("seconds", "be a positive number", f"it was {seconds!r}")
         per_row = np.median(np.diff(self.ts))
         count = int(np.floor((self.ts[-1] - self.ts[0] + per_row) / seconds * (1 + 1e-9)))
         if count < 1:
             length = self.ts[-1] - self.ts[0]
-            raise bad("seconds", f"be at most the {length:g} s of {self.name}", f"was {seconds:g}")
+            must = f"be at most the {length + per_row:g} s of {self.name}"
+            raise bad("seconds", must, f"it was {seconds:g}")
         edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_row
         rows = np.searchsorted(self.ts, edges)
-        if np.min(np.diff(rows)) < 2:
+        if seconds < 2 * per_row:
             raise bad("seconds", "be two samples or more", f"it was {seconds:g}")
         return tuple(
-            self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]") for a, b in pairwise(rows)
+            self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
+            for a, b in pairwise(rows)
+            if b - a >= 2  # none where the recording has a gap
         )
 
 
@@ -149,6 +162,9 @@ def _channel(name: str, key: str, x: Any, count: int) -> np.ndarray:
     if not np.any(np.isfinite(x)):
         fix = "Leave the channel out."
         raise bad(f"{name}: channels[{key!r}]", "hold some numbers", "all were NaN", fix)
+    if np.any(np.isinf(x)):
+        must = "be finite, or NaN where nothing was measured"
+        raise bad(f"{name}: channels[{key!r}]", must, "some were inf")
     return x[:, None] if x.ndim == 1 else x
 
 

@@ -14,9 +14,11 @@ from jaxlag._descent import Descent, descend
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._fit_result import FitResult, summarised
-from jaxlag._free import NO_PRIOR, Prior, Unknowns, prior_rows, unknowns
+from jaxlag._free import NO_PRIOR, Unknowns, prior_rows, unknowns
+from jaxlag._initial_states import start_freedom
 from jaxlag._losses import LOSSES, squares
 from jaxlag._problem import (
+    check_search,
     estimated_noise,
     experiments_of,
     plain_options,
@@ -28,8 +30,12 @@ from jaxlag._segments import Layout, layout
 from jaxlag._shooting import Found, Guess, Shooting, judged, search
 from jaxlag._system import System
 
-GAPS = (1e-1, 1e-2, 1e-3, 1e-5)
+GAPS = (1e-1, 1e-2, 1e-3, 1e-5, 1e-7, 1e-9)
 """Standard deviations of the gaps between segments, stage by stage, over the states' ranges."""
+TIGHT = 1e-2
+"""The last of them, over what all measurements together tell of a state."""
+TIGHTEST = 1e-11
+"""Below it, gaps are rounding."""
 LARGEST_COVARIANCE = 200
 """Numbers, beyond which a covariance costs more than the descent that found them."""
 NOISE_ROUNDS = 3
@@ -45,11 +51,11 @@ def fit(
     channels: Mapping[str, Reader] | None = None,
     segments: int = 1,
     transforms: Mapping[str, Any] | None = None,
-    priors: Mapping[str, Prior] | None = None,
+    priors: Mapping[str, Any] | None = None,
     loss: str = "squares",
     optimiser: Any = None,
     tolerance: float = 1e-6,
-    max_steps: int = 100,
+    max_iterations: int = 100,
     **options: Any,
 ) -> FitResult:
     r"""Params, and starts of experiments, for which motions come closest to what was measured.
@@ -77,13 +83,14 @@ def fit(
         segments: per experiment; 1 is single shooting.
         transforms: name -> transform of a free leaf.
         priors: name -> `Prior` of a free leaf, in its own unit.
-        loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less (of residuals over
-            sigma, so state sigma).
+        loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less: residuals beyond
+            about one sigma. The covariance is that of least squares with weights that fall with the
+            residuals; of Gaussian noise it is too large by up to a third (cauchy, soft_l1).
         optimiser: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
             There may then be more of them than measurements; no covariance is computed of more than
             200.
         tolerance: relative and absolute, of unknowns and residuals, both of order one.
-        max_steps: of Levenberg and Marquardt's method, in each stage.
+        max_iterations: of Levenberg and Marquardt's method, in each stage.
         options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
 
     Raises:
@@ -114,6 +121,7 @@ def fit(
     """
     experiments = experiments_of(experiments)
     _check(system, segments, loss, optimiser)
+    check_search(tolerance, max_iterations)
     options = plain_options(options, "jl.fit")
     unknown = unknowns(params0, free, dict(transforms or {}))
     own = dict(channels or {})
@@ -121,18 +129,18 @@ def fit(
     where = layout(experiments, segments)
     prior = prior_rows(unknown, dict(priors or {}))
     if optimiser is None:
-        _count(experiments, len(unknown.u0), len(prior[0]), 2 * system.size)
+        _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
     _warn_before(experiments, unknown)
     problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
     costs = np.zeros(0)
     if optimiser is None:
-        found, turns = _stages(problem, tolerance, max_steps)
+        found, turns = _stages(problem, tolerance, max_iterations)
         problem, noise, found, more = _with_its_noise(
-            problem, noise, found, where, tolerance, max_steps
+            problem, noise, found, where, tolerance, max_iterations
         )
         solves = (turns + more) * len(where.owner)
     else:
-        guess, costs, solves = _downhill(problem, optimiser, max_steps)
+        guess, costs, solves = _downhill(problem, optimiser, max_iterations)
         if noise:
             seen = _judged(problem, guess, optimiser, costs, linear=False)
             noise = estimated_noise(seen, problem, where, noise)
@@ -172,12 +180,13 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
         warnings.warn(text, stacklevel=3)
     for each in experiments:
         for name, x in each.channels.items():
+            x = x[:, np.isfinite(x).any(axis=0)]
             if np.all(np.nanmax(x, axis=0) == np.nanmin(x, axis=0)):
                 text = f"channel {name!r} of {each.name} is constant: it may be disconnected."
                 warnings.warn(text, stacklevel=3)
 
 
-def _stages(problem: Shooting, tolerance: float, max_steps: int) -> tuple[Found, int]:
+def _stages(problem: Shooting, tolerance: float, max_iterations: int) -> tuple[Found, int]:
     """From loosely joined segments to one motion; and the steps of all stages.
 
     By squares first, whatever the loss: losses that count outliers for less have minima wherever
@@ -186,16 +195,27 @@ def _stages(problem: Shooting, tolerance: float, max_steps: int) -> tuple[Found,
     turns = 0
     guess = Guess(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
     by_squares = replace(problem, loss=squares)
-    gaps = GAPS if problem.chained else (1.0,)
+    last = last_gap(problem)
+    gaps = (*(gap for gap in GAPS if gap > last), last) if problem.chained else (last,)
     for gap in gaps:
-        last = gap == gaps[-1] and problem.loss is squares
-        rough = tolerance if last else max(tolerance, 1e-4)
-        found = search(by_squares, guess, jnp.asarray(gap), rough, max_steps)
+        final = gap == last and problem.loss is squares
+        rough = jnp.asarray(tolerance if final else max(tolerance, 1e-4))
+        found = search(by_squares, guess, jnp.asarray(gap), rough, max_iterations)
         guess, turns = found.guess, turns + int(found.steps)
     if problem.loss is not squares:
-        found = search(problem, guess, jnp.asarray(gaps[-1]), tolerance, max_steps)
+        found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerance), max_iterations)
         turns += int(found.steps)
     return found, turns
+
+
+def last_gap(problem: Shooting) -> float:
+    """Of segments that are one motion, as far as measurements can see."""
+    if not problem.chained:
+        return 1.0
+    weights = np.asarray(problem.segments.weights)
+    precision = float(np.max(weights * np.asarray(problem.ranges)))
+    known = TIGHT / max(1.0, precision * np.sqrt(np.count_nonzero(weights)))
+    return float(max(TIGHTEST, min(GAPS[3], known)))
 
 
 def _with_its_noise(
@@ -204,16 +224,16 @@ def _with_its_noise(
     found: Found,
     where: Layout,
     tolerance: float,
-    max_steps: int,
+    max_iterations: int,
 ) -> tuple[Shooting, dict[str, float], Found, int]:
     """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
     turns = 0
-    join = jnp.asarray(GAPS[-1] if problem.chained else 1.0)
     for _ in range(NOISE_ROUNDS if noise else 0):
         changed = estimated_noise(found, problem, where, noise)
         settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
         noise, problem = changed, with_noise(problem, where, changed)
-        found = search(problem, found.guess, join, tolerance, max_steps)
+        join, own = jnp.asarray(last_gap(problem)), jnp.asarray(tolerance)
+        found = search(problem, found.guess, join, own, max_iterations)
         turns += int(found.steps)
         if settled:
             break
@@ -221,16 +241,16 @@ def _with_its_noise(
 
 
 def _downhill(
-    problem: Shooting, descent: Descent, max_steps: int
+    problem: Shooting, descent: Descent, max_iterations: int
 ) -> tuple[Guess, Float[np.ndarray, " epochs"], int]:
     """(where a descent ends, its costs, solves); starts by least squares before and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
-    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
+    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_iterations)
     guess, costs, unsound = descend(problem, Guess(z, before.guess.x), descent)
     if int(unsound):
         text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
         warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
-    after = _starts(problem, guess.z, guess.x, join, max_steps)
+    after = _starts(problem, guess.z, guess.x, join, max_iterations)
     count = len(guess.x)
     solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
     return Guess(guess.z, after.guess.x), np.asarray(costs), solves
@@ -240,10 +260,10 @@ def _join(problem: Shooting, descent: Descent) -> Float[Array, ""]:
     return jnp.asarray(descent.gap if problem.chained else 1.0)
 
 
-def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_steps: int) -> Found:
+def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_iterations: int) -> Found:
     """Starts by least squares, params as they are at z."""
     held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
-    return search(held, Guess(jnp.zeros(0), x), join, 1e-4, max_steps)
+    return search(held, Guess(jnp.zeros(0), x), join, jnp.asarray(1e-4), max_iterations)
 
 
 def _judged(
@@ -261,9 +281,11 @@ def _judged(
 
 def _warn_after(result: FitResult) -> None:
     if not result.converged:
-        text = f"The search did not converge in {result.steps} steps: raise max_steps, take more "
-        text += "segments, or start closer."
-        if result.costs.size:
+        text = f"The search did not converge in {result.iterations} iterations: raise "
+        text += "max_iterations, take more segments, or start closer."
+        if not result.freedom:
+            text = "No segment has a solution at the estimates: start closer."
+        elif result.costs.size:
             text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
             text += f"{result.costs[-1]:.3g}: take a lower learning rate."
         warnings.warn(text, stacklevel=3)

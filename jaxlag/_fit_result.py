@@ -9,13 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import stdtrit
 
 from jaxlag._channels import Reader
-from jaxlag._elimination import Rows, eliminate
+from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._free import Unknowns
-from jaxlag._identifiability import Spectrum, relative, run_off
+from jaxlag._identifiability import Spectrum, run_off
+from jaxlag._information import linearised
 from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
+from jaxlag._problem import freedom
 from jaxlag._segments import Layout
 from jaxlag._shooting import Found, Shooting
 from jaxlag._status import Status
@@ -23,10 +26,9 @@ from jaxlag._system import System
 
 SHOWN = 40
 """Estimates in a result's text."""
-UNTOLD = 1e-9
-"""A column of round-off, over the largest: nothing measured depends on its number."""
-FAINT = 1e-20
-"""Damping, in squares of unknowns of order one, that keeps starts regular that are not observed."""
+UNTOLD = 1e-8
+"""A column of round-off, over the largest, of unknowns of order one: nothing measured depends on
+its number. Solves at a tolerance of 1e-9 give derivatives to about that."""
 
 
 class Model(NamedTuple):
@@ -45,6 +47,8 @@ class FitResult(eqx.Module):
         params: all params, those that were free at their estimates.
         names: of the numbers found, "m", "I[1,0]".
         values: their estimates, in their own units.
+        freedom: how many more numbers were measured than went into unknowns, 0 if no segment has a
+            solution.
         covariance: of `values`, (e, e), from the derivatives at the estimates (Cramer-Rao); inf
             for numbers that take part in what is not determined. It holds for noise that is
             independent from sample to sample. NaN after a `Descent` of more than 200 numbers, where
@@ -61,10 +65,10 @@ class FitResult(eqx.Module):
         residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
             NaN where nothing was measured or the segment failed.
         starts: of each experiment, (q, v) or (q, u) at its first time.
-        gap: largest gap between segments, over the range of the states.
+        gap: largest gap between segments, over the range of the states; of those with a solution.
         converged: whether the optimiser met its tolerance; of a `Descent`, whether costs are finite
             and lower than at first.
-        steps: how many it took in the last stage; of a `Descent`, epochs.
+        iterations: how many it took in the last stage; of a `Descent`, epochs.
         solves: motions of segments, each with its derivatives, that the search took in all; line
             searches of a descent are not counted.
         cost: half the weighted sum of squares.
@@ -76,6 +80,7 @@ class FitResult(eqx.Module):
     params: Any
     names: tuple[str, ...]
     values: Float[np.ndarray, " e"]
+    freedom: float
     covariance: Float[np.ndarray, "e e"]
     singular_values: Float[np.ndarray, " k"]
     unidentifiable: tuple[str, ...]
@@ -87,7 +92,7 @@ class FitResult(eqx.Module):
     starts: tuple[np.ndarray, ...]
     gap: float
     converged: bool
-    steps: int
+    iterations: int
     solves: int
     cost: float
     failed: tuple[str, ...]
@@ -131,9 +136,19 @@ class FitResult(eqx.Module):
         """Standard deviation of each estimate, in its own unit."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
-    def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Of each estimate, the interval that holds the truth with this probability."""
+    def interval(self, level: float | int = 0.95) -> dict[str, tuple[float, float]]:
+        """Of each estimate, the interval that holds the truth with this probability.
+
+        By Student's t where noise was estimated, with `freedom`; else by the normal distribution.
+
+        Args:
+            level: between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise bad("level", "be between 0 and 1", f"it was {level}", "Write 0.95 for 95 %.")
         width = NormalDist().inv_cdf(0.5 + level / 2)
+        if self.noise and self.freedom > 0:
+            width = float(stdtrit(self.freedom, 0.5 + level / 2))
         return {
             name: (value - width * self.std[name], value + width * self.std[name])
             for name, value in zip(self.names, self.values.tolist(), strict=True)
@@ -158,9 +173,9 @@ class FitResult(eqx.Module):
         for name in self.channels:
             lines.append(f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name)))
         lines += list(self.failed)
-        steps = "epochs" if self.costs.size else "steps"
+        turns = "epochs" if self.costs.size else "iterations"
         ended = "converged" if self.converged else "not converged"
-        lines.append(f"{ended} in {self.steps} {steps}")
+        lines.append(f"{ended} in {self.iterations} {turns}")
         return "\n".join(lines)
 
 
@@ -191,10 +206,12 @@ def summarised(
     firsts = np.flatnonzero(where.first == 0)
     status = np.asarray(found.seen.status)
     known = _uncertainty(problem, found, np.asarray(values))
+    alive = bool(np.any(status == Status.ok)) and bool(np.isfinite(found.cost))
     return FitResult(
         jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, params),
         problem.free.names,
         np.asarray(values),
+        freedom(found, problem) if alive else 0.0,
         known.covariance,
         known.singular_values,
         known.unidentifiable,
@@ -204,8 +221,8 @@ def summarised(
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
         tuple(np.asarray(found.starts)[firsts]),
-        float(np.max(_gaps(found, problem), initial=0.0)),
-        bool(found.converged),
+        float(np.nanmax(_gaps(found, problem), initial=0.0)),
+        bool(found.converged) and alive,
         int(found.steps),
         solves,
         float(found.cost),
@@ -244,9 +261,7 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
     held = problem.free.at_limit(found.guess.z) & told
     moves = ~(run_off(factor, by_z, at_first) | held)
     own = np.ix_(moves, moves)
-    by_value = np.linalg.solve(by_z[own].T, factor[:, moves].T).T
-    sizes = np.linalg.norm(by_value * relative(values[moves]), axis=0)
-    least = UNTOLD * max(sizes, default=0.0)
+    by_value = np.linalg.solve(by_z[own].T, np.where(told, factor, 0.0)[:, moves].T).T
     spectrum = Spectrum(tuple(names[moves].tolist()), values[moves], by_value)
     unknown[own] = spectrum.covariance()
     return _Uncertainty(
@@ -254,7 +269,7 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
         spectrum.singular_values,
         spectrum.unidentifiable,
         spectrum.determined,
-        tuple(names[moves][sizes <= least].tolist()),
+        tuple(names[moves & ~told].tolist()),
         tuple(names[~moves].tolist()),
     )
 
@@ -265,32 +280,20 @@ def _at(free: Unknowns, z: Float[Array, " p"]) -> tuple[Any, Array]:
     return free.params(z), free.numbers(z)
 
 
-@eqx.filter_jit
-def linearised(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
-    """(a factor of the weighted derivatives by z, derivatives of the numbers by z, those at 0)."""
-    numbers, z = jax.jacfwd(free.numbers), found.guess.z
-    assert found.rows is not None
-    left = eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT))
-    return left.params[:-1, :-1], numbers(z), numbers(jnp.zeros_like(z))
-
-
 def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
-    """The status of a segment that failed, with all that can be said of it."""
+    """The status of a segment that failed, or the channel that is not finite."""
     segment = jax.tree.map(lambda x: x[k], problem.segments)
     start = jnp.asarray(found.starts)[k]
     motion = problem.motion(problem.free.params(z), start, segment.ts, segment.inputs)
+    if motion.ok:
+        for name, show in problem.channels:
+            if not np.all(np.isfinite(np.asarray(show(motion)))):
+                return f"a channel that is not finite: {name!r}"
     return Status(int(motion.status)).name
 
 
 def _gaps(found: Found, problem: Shooting) -> np.ndarray:
     """Ends less the starts that follow, over the range of the states."""
     apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states
-    return np.where(problem.segments.follows[:, None], apart, 0.0)
-
-
-def _without_failed(rows: Rows, found: Found) -> Rows:
-    """The linear problem without rows of segments that failed."""
-    ok = (found.seen.status == Status.ok)[:, None, None]
-    joined = None if rows.joined is None else jnp.where(ok, rows.joined, 0.0)
-    following = None if rows.next is None else jnp.where(ok[:, :, 0], rows.next, 0.0)
-    return rows._replace(measured=jnp.where(ok, rows.measured, 0.0), joined=joined, next=following)
+    ok = np.asarray(found.seen.status == Status.ok)[:, None]
+    return np.where(problem.segments.follows[:, None], np.where(ok, apart, np.nan), 0.0)

@@ -37,8 +37,11 @@ class Prior(eqx.Module):
 
     def __init__(self, mean: Any, sigma: Any) -> None:
         self.mean, self.sigma = np.asarray(mean, float), np.asarray(sigma, float)
-        if not np.all(self.sigma > 0):
-            raise bad("Prior: sigma", "be positive", f"it was {sigma}")
+        if not np.all(np.isfinite(self.mean)):
+            raise bad("Prior: mean", "be finite", f"it was {mean}")
+        if not np.all((self.sigma > 0) & (self.sigma < np.inf)):
+            fix = "Leave the prior out where nothing is known."
+            raise bad("Prior: sigma", "be positive and finite", f"it was {sigma}", fix)
 
 
 def paths(params: Any) -> list[str]:
@@ -205,7 +208,7 @@ def _is_real(leaf: Any) -> bool:
 
 
 def prior_rows(
-    free: Unknowns, priors: Mapping[str, Prior]
+    free: Unknowns, priors: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(which of the numbers, means, sigmas) that are known beforehand.
 
@@ -217,12 +220,16 @@ def prior_rows(
     for name, prior in priors.items():
         if name not in by_name:
             raise bad("priors", f"be of free parameters {list(by_name)}", f"one was of {name!r}")
+        if not isinstance(prior, Prior):
+            must, fix = "be a jl.Prior", "Write jl.Prior(mean, sigma)."
+            raise bad(f"priors[{name!r}]", must, f"it was {prior!r}", fix)
         leaf = by_name[name]
         try:
             mean, sigma = (np.broadcast_to(x, leaf.shape) for x in (prior.mean, prior.sigma))
         except ValueError:
-            must = f"be numbers or of shape {leaf.shape}"
-            raise bad(f"priors[{name!r}]", must, f"its mean had {prior.mean.shape}") from None
+            must = f"hold numbers or arrays of shape {leaf.shape}"
+            was = f"its mean had {prior.mean.shape}, its sigma {prior.sigma.shape}"
+            raise bad(f"priors[{name!r}]", must, was) from None
         which += range(leaf.first, leaf.first + len(leaf.indices))
         means.append(np.array([mean[index] for index in leaf.indices]))
         sigmas.append(np.array([sigma[index] for index in leaf.indices]))

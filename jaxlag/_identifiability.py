@@ -13,7 +13,7 @@ import numpy as np
 from jaxlag._free import IDLE
 
 NEGLIGIBLE = 1e-6
-"""Singular values below this part of the largest are those of derivatives that vanish: solves at a
+"""Singular values of normed columns below it are those of derivatives that vanish: solves at a
 tolerance of 1e-9 give derivatives to about 1e-8."""
 LARGEST = 4
 """Exponents of products are ratios of integers up to this one."""
@@ -100,30 +100,34 @@ class Spectrum:
     Args:
         names: of the numbers.
         values: of them.
-        factor: (e, e) or of more rows, a factor of the weighted derivatives by them.
+        factor: (e, e) or of more rows, a factor of the weighted derivatives by them; columns of
+            zeros of those that nothing measured depends on.
 
     Attributes:
         singular_values: (e,), falling; a relative change of 1 along a direction moves the weighted
             residuals by so much.
-        directions: (e, e), rows, in relative changes.
-        null: rows of `directions` that nothing measured depends on.
+        null: orthonormal rows, relative changes that nothing measured depends on.
         unidentifiable: in words: which numbers may change together.
         determined: in words: which combinations of those are known.
     """
 
     def __init__(self, names: tuple[str, ...], values: np.ndarray, factor: np.ndarray) -> None:
         self.values = values
-        scaled = factor * relative(values)
-        _, self.singular_values, self.directions = np.linalg.svd(scaled, full_matrices=False)
-        largest = max(self.singular_values, default=0.0)
-        self.vanish = self.singular_values <= NEGLIGIBLE * largest
-        self.null = self.directions[self.vanish]
+        self.singular_values = np.linalg.svd(factor * relative(values), compute_uv=False)
+        # What vanishes is seen in columns of one size: a number near zero, whose relative changes
+        # are small, may be known as well as any.
+        norms = np.linalg.norm(factor, axis=0)
+        self._norms = np.where(norms > 0, norms, 1.0)
+        _, self._sizes, self._directions = np.linalg.svd(factor / self._norms, full_matrices=False)
+        self._vanish = self._sizes <= NEGLIGIBLE * max(self._sizes, default=0.0)
+        null = self._directions[self._vanish] / (self._norms * relative(values))
+        self.null = np.linalg.qr(null.T).Q.T
         self.unidentifiable, self.determined = _in_words(names, self.null)
 
     def covariance(self) -> np.ndarray:
         """(R^T R)^-1; inf for numbers that take part in a null direction."""
-        kept = self.directions[~self.vanish] / self.singular_values[~self.vanish, None]
-        found = kept.T @ kept * np.outer(relative(self.values), relative(self.values))
+        kept = self._directions[~self._vanish] / self._sizes[~self._vanish, None] / self._norms
+        found = kept.T @ kept
         open_ended = np.any(np.abs(self.null) > 1e-3, axis=0)
         found[open_ended] = found[:, open_ended] = np.nan
         found[open_ended, open_ended] = np.inf

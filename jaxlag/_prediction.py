@@ -13,8 +13,9 @@ from jaxlag._channels import Reader
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._free import NO_PRIOR, unknowns
+from jaxlag._initial_states import start_freedom
 from jaxlag._losses import squares
-from jaxlag._problem import experiments_of, plain_options, pose, readers_of
+from jaxlag._problem import check_search, experiments_of, plain_options, pose, readers_of
 from jaxlag._segments import Layout, layout
 from jaxlag._shooting import Guess, Shooting, moved, search
 from jaxlag._status import Status
@@ -97,7 +98,7 @@ def predict(
     channels: Mapping[str, Reader] | None = None,
     noise: Mapping[str, float] | None = None,
     tolerance: float = 1e-6,
-    max_steps: int = 100,
+    max_iterations: int = 100,
     **options: Any,
 ) -> Prediction:
     """How well params predict experiments, of which none need have been used to find them.
@@ -114,15 +115,16 @@ def predict(
         noise: channel -> standard deviation, where the experiments state none: by which channels
             are weighed when starts are fitted.
         tolerance: of the starts, over how far states range.
-        max_steps: of the optimiser.
-        options: of `jl.simulate`.
+        max_iterations: of the optimiser.
+        options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
 
     Raises:
         ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
             measurements than a start has numbers.
 
     Warns:
-        where the search for the starts did not converge.
+        where the search for the starts did not converge, and of each motion that failed: its rows
+        do not count.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
@@ -138,7 +140,9 @@ def predict(
     """
     experiments = experiments_of(experiments)
     options = plain_options(options, "jl.predict")
-    early = tuple(_first(system, each, settle) for each in experiments)
+    check_search(tolerance, max_iterations)
+    fewest = start_freedom(system, params)
+    early = tuple(_first(fewest, each, settle) for each in experiments)
     fixed = unknowns(params, (), {})
     shown = readers_of(system, experiments, dict(channels or {}), params)
 
@@ -149,16 +153,22 @@ def predict(
 
     whole, where = posed(early)
     nowhere = Guess(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
-    found = search(whole, nowhere, jnp.asarray(1.0), tolerance, max_steps)
+    found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray(tolerance), max_iterations)
     if not found.converged:
-        text = f"The search for starts did not converge in {int(found.steps)} steps: raise "
-        warnings.warn(text + "max_steps, or make settle longer.", stacklevel=2)
+        text = f"The search for starts did not converge in {int(found.steps)} iterations: raise "
+        warnings.warn(text + "max_iterations, or make settle longer.", stacklevel=2)
     seen = found.seen
     if settle is not None:
         whole, where = posed(experiments)
         whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
         seen = moved(whole, nowhere)
     status = np.asarray(seen.status)
+    failed = tuple(
+        f"the motion of {experiments[k].name} ended with {Status(int(status[k])).name}"
+        for k in map(int, np.flatnonzero(status != Status.ok))
+    )
+    for text in failed:
+        warnings.warn(f"{text}: it does not count.", stacklevel=2)
     rows = tuple(
         np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)
         for each, first in zip(experiments, early, strict=True)
@@ -167,16 +177,13 @@ def predict(
         residuals_of(whole, np.asarray(seen.residuals), status, experiments, where),
         rows,
         tuple(np.asarray(found.starts)),
-        tuple(
-            f"the motion of {experiments[k].name} ended with {Status(int(status[k])).name}"
-            for k in map(int, np.flatnonzero(status != Status.ok))
-        ),
+        failed,
         bool(found.converged),
         experiments,
     )
 
 
-def _first(system: System, experiment: Experiment, settle: float | int | None) -> Experiment:
+def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> Experiment:
     """The rows that a start is fitted to."""
     if settle is None:
         return experiment
@@ -188,8 +195,8 @@ def _first(system: System, experiment: Experiment, settle: float | int | None) -
         raise bad("settle", f"leave rows of {experiment.name} to be predicted", was)
     known = experiment.start_sigma is not None
     numbers = sum(int(np.isfinite(x[:rows]).sum()) for x in experiment.channels.values())
-    if rows < 2 or (not known and numbers < 2 * system.size):
-        must = f"hold {2 * system.size} numbers or more of {experiment.name}, as many as a start"
+    if rows < 2 or (not known and numbers < fewest):
+        must = f"hold {fewest} numbers or more of {experiment.name}, as many as a start"
         raise bad("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
     return experiment.part(slice(0, rows))
 

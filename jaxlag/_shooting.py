@@ -25,6 +25,7 @@ from jaxlag._free import IDLE, Unknowns
 from jaxlag._lanes import in_batches
 from jaxlag._segments import Segments
 from jaxlag._simulate import simulate
+from jaxlag._status import Status
 from jaxlag._system import System
 
 MOVED_AT_ONCE = 64
@@ -33,6 +34,9 @@ AT_ONCE = 16
 """Motions without derivatives that run side by side."""
 FAR = 10.0
 """What a segment without a solution is off by, in multiples of how far its channels range."""
+LARGEST_GAP = 1e4
+"""Of such a segment to the next, over `join` times the range of the states: its square must leave
+digits for what else is summed up."""
 
 
 class Guess(NamedTuple):
@@ -77,6 +81,7 @@ class Shooting(eqx.Module):
         system: what moves.
         options: of `simulate`.
         channels: what is measured.
+        widths: columns of each.
         loss: by which residuals are made smaller; one of `LOSSES`.
         chained: whether any segment follows another.
         free: from z to params.
@@ -89,6 +94,7 @@ class Shooting(eqx.Module):
     system: System = eqx.field(static=True)
     options: tuple[tuple[str, Any], ...] = eqx.field(static=True)
     channels: tuple[tuple[str, Reader], ...] = eqx.field(static=True)
+    widths: tuple[int, ...] = eqx.field(static=True)
     loss: Callable[[Array], Array] = eqx.field(static=True)
     chained: bool = eqx.field(static=True)
     free: Unknowns
@@ -127,17 +133,21 @@ class Shooting(eqx.Module):
         """(residuals (s, m) before the loss, end less start, status) of one segment."""
         start = self.start(x, segment)
         motion = self.motion(self.free.params(z), start, segment.ts, segment.inputs)
-        ok = motion.ok
-        shown = read(dict(self.channels), motion)
+        shown = read(dict(self.channels), self.widths, motion)
+        measured = segment.weights > 0
+        known = jnp.all(jnp.isfinite(shown) | ~measured)
+        ended = motion._ending.status
+        status = jnp.where((ended == Status.ok) & ~known, Status.nonfinite, ended)
+        ok = status == Status.ok
         residuals = segment.weights * (shown - segment.values)
         far = FAR * segment.weights * self.ranges
         quasi = self.system.quasi
         rates = motion.v[-1] if quasi is None else motion.u[-1, jnp.array(quasi.free)]
         end = jnp.concatenate([motion.q[-1], rates])
         residuals = jnp.where(ok, residuals, far)
-        end = jnp.where(ok, end, start + FAR * self.states)
+        end = jnp.where(ok, end, start)
         # Rows beyond those that were measured hold nothing, not even NaN.
-        return jnp.where(segment.weights > 0, residuals, 0.0), end, motion._ending.status
+        return jnp.where(measured, residuals, 0.0), end, status
 
     def linearized(self, guess: Guess) -> tuple[Any, Any]:
         """((residuals, ends, status), their derivatives by z and by the segment's own x)."""
@@ -168,21 +178,15 @@ class Shooting(eqx.Module):
         seen = Seen(residuals, ends, status)
         residuals += r_z @ dz + jnp.einsum("ksmd,kd->ksm", r_x, dx)
         ends += e_z @ dz + jnp.einsum("ked,kd->ke", e_x, dx)
-        return self.compared(guess, residuals, ends, join), seen
+        return self.compared(guess, Seen(residuals, ends, status), join), seen
 
-    def compared(
-        self,
-        guess: Guess,
-        residuals: Float[Array, "k s m"],
-        ends: Float[Array, "k d"],
-        join: Float[Array, ""],
-    ) -> Residuals:
+    def compared(self, guess: Guess, seen: Seen, join: Float[Array, ""]) -> Residuals:
         """All that is to be small, of what segments do."""
         joined = None
         if self.chained:
             begins = jax.vmap(self.start)(guess.x, self.segments)
-            joined = self.gaps(self.segments, ends, jnp.roll(begins, -1, axis=0), join)
-        rows = self.weighed(guess.x, self.segments, residuals)
+            joined = self.gaps(self.segments, seen, jnp.roll(begins, -1, axis=0), join)
+        rows = self.weighed(guess.x, self.segments, seen.residuals)
         return Residuals(rows, joined, self.known(guess.z))
 
     def weighed(
@@ -195,14 +199,16 @@ class Shooting(eqx.Module):
         return jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
 
     def gaps(
-        self,
-        segments: Segments,
-        ends: Float[Array, "k d"],
-        begins: Float[Array, "k d"],
-        join: Float[Array, ""],
+        self, segments: Segments, seen: Seen, begins: Float[Array, "k d"], join: Float[Array, ""]
     ) -> Float[Array, "k d"]:
-        """Ends less the starts that follow, over `join` times the range of the states."""
-        return jnp.where(segments.follows[:, None], (ends - begins) / (join * self.states), 0.0)
+        """Ends less the starts that follow, over `join` times the range of the states.
+
+        A segment without a solution has no end: its gap is large, and nothing moves it.
+        """
+        ok = (seen.status == Status.ok)[:, None]
+        missing = jnp.minimum(FAR / join, LARGEST_GAP)
+        gaps = jnp.where(ok, (seen.ends - begins) / (join * self.states), missing)
+        return jnp.where(segments.follows[:, None], gaps, 0.0)
 
     def known(self, z: Float[Array, " p"]) -> Float[Array, " c"]:
         """Params less what is known of them beforehand, over its standard deviation."""
@@ -213,33 +219,43 @@ class Shooting(eqx.Module):
 # The optimiser: optimistix' Levenberg-Marquardt, its linear steps by elimination.
 
 
-def rows_of(
-    operator: lx.AbstractLinearOperator, residuals: Residuals, shooting: Shooting, join: Array
-) -> Rows:
+def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> Rows:
     """The linear problem: the operator's columns by z, and by the states of all segments at once.
 
     A segment's measured rows hold its own state only. The rows that join it to the next hold
-    that one, too, with the known coefficient -1/join.
+    that one, too, through a diagonal matrix. Segments are moved by turns, first those of even
+    number, so that the two can be told apart.
     """
     guess = operator.in_structure()
     p, (k, d) = guess.z.shape[0], guess.x.shape
     dtype = guess.x.dtype
     nothing = Guess(jnp.zeros(p, dtype), jnp.zeros((k, d), dtype))
     by_z = jax.vmap(lambda z: operator.mv(nothing._replace(z=z)))(jnp.eye(p, dtype=dtype))
-    same = jnp.broadcast_to(jnp.eye(d, dtype=dtype)[:, None], (d, k, d))
-    by_x = jax.vmap(lambda x: operator.mv(nothing._replace(x=x)))(same)
 
-    def columns(field: str, extra: Array | None = None) -> Array:
-        x, z = (jnp.moveaxis(getattr(by, field), 0, -1) for by in (by_x, by_z))
-        x = x if extra is None else x + extra
-        return jnp.concatenate([x, z, getattr(residuals, field)[..., None]], axis=-1)
+    def by_x(which: Array) -> Residuals:
+        moves = jnp.where(which[:, None], jnp.eye(d, dtype=dtype)[:, None], 0.0)
+        return jax.vmap(lambda x: operator.mv(nothing._replace(x=x)))(moves)
+
+    def columns(x: Array, z: Array, right: Array) -> Array:
+        x, z = jnp.moveaxis(x, 0, -1), jnp.moveaxis(z, 0, -1)
+        return jnp.concatenate([x, z, right[..., None]], axis=-1)
 
     prior = jnp.concatenate([by_z.prior.T, residuals.prior[:, None]], axis=1)
     if residuals.joined is None:
-        return Rows(columns("measured"), None, None, prior)
-    moves = jnp.where(shooting.segments.held == 0, 0.0, 1.0)
-    after = jnp.where(shooting.segments.follows[:, None], jnp.roll(moves, -1, axis=0), 0.0) / join
-    return Rows(columns("measured"), columns("joined", jax.vmap(jnp.diag)(after)), after, prior)
+        measured = by_x(jnp.ones(k, bool)).measured
+        return Rows(columns(measured, by_z.measured, residuals.measured), None, None, prior)
+    even = jnp.arange(k) % 2 == 0
+    evens, odds = by_x(even), by_x(~even)
+    assert evens.joined is not None
+    assert odds.joined is not None
+    own = jnp.where(even[:, None], evens.joined, odds.joined)
+    after = jnp.where(even[:, None], odds.joined, evens.joined)
+    return Rows(
+        columns(evens.measured + odds.measured, by_z.measured, residuals.measured),
+        columns(own, by_z.joined, residuals.joined),
+        -jnp.diagonal(after, axis1=0, axis2=2),
+        prior,
+    )
 
 
 class _Condensed(eqx.Module):
@@ -266,7 +282,6 @@ class Eliminating(optx.AbstractDescent):
     """
 
     shooting: Shooting
-    join: Float[Array, ""]
 
     def init(self, y: Guess, f_info_struct: Any) -> _Condensed:
         """Of the right shapes."""
@@ -275,7 +290,7 @@ class Eliminating(optx.AbstractDescent):
         return _Condensed(rows, y.z, y.z, y.z)
 
     def _condense(self, f_info: Any) -> Rows:
-        return condense(rows_of(f_info.jac, f_info.residual, self.shooting, self.join))
+        return condense(rows_of(f_info.jac, f_info.residual))
 
     def query(self, y: Guess, f_info: Any, state: _Condensed) -> _Condensed:
         """Of new derivatives."""
@@ -297,16 +312,16 @@ class Eliminating(optx.AbstractDescent):
 class Shooter(optx.AbstractGaussNewton):
     """Levenberg-Marquardt by `Eliminating`."""
 
-    rtol: float
-    atol: float
+    rtol: Array
+    atol: Array
     norm: Callable[[Any], Array]
     descent: Eliminating
     search: optx.ClassicalTrustRegion
     verbose: Callable[..., None]
 
-    def __init__(self, shooting: Shooting, join: Array, rtol: float, atol: float) -> None:
+    def __init__(self, shooting: Shooting, rtol: Array, atol: Array) -> None:
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
-        self.descent = Eliminating(shooting, join)
+        self.descent = Eliminating(shooting)
         self.search = optx.ClassicalTrustRegion()
         self.verbose = _quiet
 
@@ -339,7 +354,7 @@ class Found(NamedTuple):
 
 @eqx.filter_jit
 def search(
-    shooting: Shooting, guess: Guess, join: Array, tolerance: float, max_steps: int
+    shooting: Shooting, guess: Guess, join: Array, tolerance: Array, max_steps: int
 ) -> Found:
     """Least squares from a guess, with gaps of `join` times the range of the states."""
 
@@ -349,7 +364,7 @@ def search(
 
     solution = optx.least_squares(
         function,
-        Shooter(shooting, join, tolerance, tolerance),
+        Shooter(shooting, tolerance, tolerance),
         guess,
         args=(shooting, join),
         has_aux=True,
@@ -396,8 +411,8 @@ def judged(
     if linear:
         residuals, by, seen = jax.linearize(lambda x: shooting(x, join), guess, has_aux=True)
         operator = lx.FunctionLinearOperator(by, jax.eval_shape(lambda: guess))
-        rows = condense(rows_of(operator, residuals, shooting, join))
+        rows = condense(rows_of(operator, residuals))
     else:
         rows, seen = None, moved(shooting, guess)
-    residuals = shooting.compared(guess, seen.residuals, seen.ends, join)
+    residuals = shooting.compared(guess, seen, join)
     return 0.5 * optx.two_norm(residuals) ** 2, rows, seen, starts

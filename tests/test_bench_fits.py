@@ -2,6 +2,7 @@
 
 import gzip
 import math
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from bench import _fit_synthetic as synthetic
 from bench import _fit_video as video
 from bench import fits
 from bench._fit_data import DataError, folder, pieces, table, windows
-from bench._fit_part import Part, errors
+from bench._fit_part import Part, errors, missed
 from jaxlag import rotation
 
 EPS = np.finfo(float).eps
@@ -47,6 +48,15 @@ def test_tables_have_comments_and_names(tmp_path):
 def test_windows_of_recordings_that_are_too_short_are_left_out():
     long, short = (jl.Experiment(np.arange(n) / 10, {"x": np.arange(n)}) for n in (25, 9))
     assert [len(x.ts) for x in windows([long, short], 1.0)] == [10, 10]
+    fine = jl.Experiment(np.arange(497) * 2e-3, {"x": np.arange(497)})
+    assert windows([fine], 1.0) == []
+    assert len(windows([fine], 0.994)) == 1
+
+
+def test_a_prediction_of_which_a_motion_failed_misses_all():
+    rms = {"rms": lambda channel: np.array([1.0, 2.0])}
+    assert missed(SimpleNamespace(failed=(), **rms), "q").tolist() == [1.0, 2.0]
+    assert missed(SimpleNamespace(failed=("one",), **rms), "q").tolist() == [np.inf, np.inf]
 
 
 def test_the_folder_of_recordings_must_be_named_and_there(tmp_path, monkeypatch):
@@ -70,6 +80,11 @@ def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):
     assert len(report.rows) == 1
     named = {reference.figure for reference in report.references}
     assert named == {recordings for recordings, _ in fits.PARTS}
+    (tmp_path / "multiarm_pendulum").mkdir()
+    named = [reference.figure for reference in fits.run(quick=True, data=str(tmp_path)).references]
+    files = {f"multiarm_pendulum/{name}.csv.gz" for name in ("single", "double", "triple")}
+    assert files <= set(named)
+    assert "multiarm_pendulum" not in named
 
 
 def test_angles_of_a_video_are_from_where_gravity_points(tmp_path):
@@ -194,7 +209,7 @@ def test_a_chaotic_motion_gives_its_params():
 @pytest.mark.full
 def test_intervals_hold_the_truth_as_often_as_they_say():
     ts = synthetic.times(float(synthetic.lyapunov_exponent()))
-    count = 200
+    count = 100
     held = np.round(count * synthetic.coverage(ts, count)).astype(int)
     assert np.all(held >= fewest(count, 0.95))
     assert np.all(count - held >= fewest(count, 0.05))

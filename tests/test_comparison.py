@@ -79,8 +79,17 @@ def test_candidates_that_never_meet_may_share_params():
 def test_where_the_search_of_a_model_begins():
     """At the estimates of the best that shares most of its params; not on a bound."""
 
-    def ranked(error, params, on_bound=(), converged=True):
-        fit = SimpleNamespace(params=params, on_bound=on_bound, converged=converged)
+    def ranked(error, params, on_bound=(), converged=True, fitted=None):
+        data = jl.Experiment([0.0, 1.0], {"x": [0.0, 2.0]})  # ranges over 1
+        fit = SimpleNamespace(
+            params=params,
+            on_bound=on_bound,
+            converged=converged,
+            failed=(),
+            channels=("x",),
+            rms=lambda _: np.array([fitted or error]),
+            experiments=(data,),
+        )
         return Ranked("", error, fit, None)
 
     own = {"l": 1.0, "c": 1.0, "k": np.ones(2)}
@@ -89,12 +98,22 @@ def test_where_the_search_of_a_model_begins():
     better, worse = ranked(1.5, {"l": 3.0, "c": 4.0, "x": 1.0}), ranked(2.0, {"l": 5.0, "c": 6.0})
     bound = ranked(1.0, {"l": 7.0, "k": np.zeros(2)}, ("k[1]",))
 
-    def start(*models):
-        return _estimates(own, {"l"}, models)
+    def start(*models, transforms=None):
+        return _estimates(own, {"l"}, models, transforms or {})
 
     assert start() == start(none) == start(none, bad, far) == {}
     assert start(none, bad, worse, far, better) == {"l": 3.0, "c": 4.0}
     assert start(none, bound) == {"l": 7.0}
+    # What was held out has no say.
+    fits = ranked(9.0, {"l": 6.5, "c": 6.6}, fitted=1.0)
+    assert start(better, fits) == {"l": 6.5, "c": 6.6}
+    # Neither do params of another form, or that a transform does not allow.
+    other = ranked(1.0, {"l": 3.0, "c": 4.0, "k": np.ones(3)})
+    assert start(other) == {"l": 3.0, "c": 4.0}
+    bounds = {"c": jl.Bounded(0.0, 2.0), "l": jl.Positive()}
+    assert start(better, transforms=bounds) == {"l": 3.0}
+    bounds = {"c": jl.Bounded(0.0, 4.0)}
+    assert start(better, transforms=bounds) == {"l": 3.0}
 
 
 def test_forces_are_added_to_a_system():

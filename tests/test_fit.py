@@ -198,7 +198,7 @@ def test_friction_that_is_not_there_ends_at_zero():
 def test_motions_are_counted():
     data = experiment(sigma={"x": NOISE})
     found = fit(data.windows(1.0))
-    assert found.solves == 3 * found.steps
+    assert found.solves == 3 * found.iterations
 
 
 def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
@@ -243,6 +243,158 @@ def test_a_segment_that_fails_is_named_and_does_not_count():
     np.testing.assert_allclose(found.params["k"], alone.params["k"], rtol=1e-9)
 
 
+def pulse(t, q, v, p):
+    """Nothing, but for a while not a number."""
+    return jnp.where((t > 1.3) & (t < 1.5), jnp.nan, 0.0) * v
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("sigma", [{"x": NOISE}, None])
+def test_a_segment_that_fails_within_a_chain_moves_nothing(sigma):
+    """The gap that it leaves is not closed: what follows has a start of its own."""
+    system = pendulum.with_forces(jl.GeneralizedForce(pulse, "pulse"))
+    with pytest.warns(UserWarning, match=r"starts at t = 1\.2 s ended with nonfinite: it does not"):
+        found = fit(experiment(sigma=sigma), system=system, segments=5)
+    assert found.converged
+    assert len(found.failed) == 1
+    assert found.gap < 1e-6
+    within(found, ("l",))
+    # As two motions, one after the other.
+    data = experiment(sigma=sigma)
+    parts = fit((data.part(slice(0, 61)), data.part(slice(91, None))), system=system)
+    np.testing.assert_allclose(found.params["l"], parts.params["l"], atol=0.5 * parts.std["l"])
+    np.testing.assert_allclose(found.std["l"], parts.std["l"], rtol=0.2)
+
+
+@pytest.mark.full
+def test_a_channel_that_is_not_finite_is_named():
+    data = jl.Experiment(TS, {"root": np.sqrt(np.abs(angles()))}, q0=[1.0], v0=[0.0])
+    with pytest.warns(UserWarning, match="No segment has a solution at the estimates"):
+        found = fit(data, channels={"root": lambda motion: jnp.sqrt(motion["x"])})
+    assert not found.converged
+    assert "a channel that is not finite: 'root'" in found.failed[0]
+    assert np.isfinite(found.noise["root"])
+    assert found.freedom == 0
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("noise", [1e-4, 1e-7])
+def test_segments_are_one_motion_however_precise_measurements_are(noise):
+    """A spring; to a hundredth of the standard deviation."""
+    spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
+    ts = np.linspace(0.0, 10.0, 101)
+    x = 0.3 * np.cos(2.0 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
+    options = {"free": ("k",), "rtol": 1e-11, "atol": 1e-11, "tolerance": 1e-8}
+    data = jl.Experiment(ts, {"x": x})
+    one, many = (jl.fit(spring, data, {"k": 3.9}, segments=n, **options) for n in (1, 10))
+    assert abs(one.params["k"] - many.params["k"]) < 1e-2 * one.std["k"]
+    np.testing.assert_allclose(one.std["k"], many.std["k"], rtol=1e-3)
+    assert many.gap < 1e-2 * noise
+    np.testing.assert_allclose(one.freedom, many.freedom, atol=1e-6)
+
+
+@pytest.mark.full
+def test_a_number_that_is_zero_is_known_as_well_as_any():
+    """An offset whose truth is 0: its relative changes move nothing, it does."""
+    spring = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * (q[0] - p["x0"]) ** 2, ("x",)
+    )
+    ts = np.linspace(0.0, 30.0, 301)
+    options = {"free": ("k", "x0"), "rtol": 1e-9, "atol": 1e-9}
+    start = {"k": 3.9, "x0": 0.01}
+    with no_warning():
+        found = jl.fit(spring, jl.Experiment(ts, {"x": 0.3 * np.cos(2 * ts)}), start, **options)
+    assert found.unidentifiable == found.unused == ()
+    assert abs(found.params["x0"]) < 1e-9
+    assert found.std["x0"] < 1e-9
+    noise = 1e-4
+    x = 0.3 * np.cos(2 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
+    found = jl.fit(spring, jl.Experiment(ts, {"x": x}), start, **options)
+    # Of the mean of independent measurements: k and the start swing, and share little of it.
+    np.testing.assert_allclose(found.std["x0"], noise / np.sqrt(len(ts)), rtol=0.1)
+    assert abs(found.params["x0"]) < 3.5 * found.std["x0"]
+
+
+@pytest.mark.full
+def test_starts_that_are_known_take_nothing_from_the_noise():
+    rng = np.random.default_rng(0)
+    ts = np.linspace(0.0, 1.0, 3)
+    data = [
+        jl.Experiment(
+            ts,
+            {"x": angles(ts, a, noise=0.0) + 0.01 * rng.normal(size=3)},
+            q0=[a],
+            v0=[0.0],
+            start_sigma=0.0,
+        )
+        for a in 0.5 + 0.02 * np.arange(40)
+    ]
+    found = fit(data, ("l",))
+    np.testing.assert_allclose(found.freedom, 119.0, atol=1e-6)
+    rows = np.concatenate([each["x"] for each in found.residuals])
+    np.testing.assert_allclose(found.noise["x"], np.sqrt(np.sum(rows**2) / 119), rtol=1e-3)
+
+
+@pytest.mark.full
+def test_starts_on_a_rod_are_two_numbers_each():
+    rng = np.random.default_rng(0)
+    rod = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[1],
+        {"r": (2,)},
+        constraints=(jl.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2, "rod"),),
+    )
+    ts = np.linspace(0.0, 0.3, 4)
+    data = []
+    for a in 0.5 + 0.05 * np.arange(10):
+        motion = jl.simulate(pendulum, [a], [0.0], ts, TRUE | {"c": 0.0})
+        x = np.asarray(motion["x"])
+        r = TRUE["l"] * np.stack([np.sin(x), -np.cos(x)], axis=1)
+        data.append(jl.Experiment(ts, {"r": r + 5e-3 * rng.normal(size=r.shape)}))
+    found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(found.freedom, 80 - 21, atol=1e-4)
+    # 59 numbers tell it to 9 %.
+    np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
+
+
+def test_a_prior_takes_part_of_what_it_tells():
+    """One that is as good as exact leaves nothing to be told."""
+    data = experiment(sigma={"x": NOISE})
+    free, known = (fit(data, ("l",), priors={"l": jl.Prior(0.7, s)}) for s in (1e3, 1e-9))
+    np.testing.assert_allclose(free.freedom, 151 - 3, atol=1e-3)
+    np.testing.assert_allclose(known.freedom, 151 - 2, atol=1e-3)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
+def test_outliers_are_not_noise(loss):
+    y = angles()
+    y[::10] += 0.3
+    found = fit(jl.Experiment(TS, {"x": y}), loss=loss)
+    np.testing.assert_allclose(found.noise["x"], NOISE, rtol=0.4)
+    assert abs(found.params["l"] - TRUE["l"]) < 4 * found.std["l"]
+
+
+def test_intervals_of_few_measurements_are_those_of_student():
+    found = fit(experiment().part(slice(0, 150, 30)), ("l",))
+    np.testing.assert_allclose(found.freedom, 2.0, atol=1e-6)
+    low, high = found.interval()["l"]
+    # The quantile 0.975 of Student's t with 2 degrees of freedom, from a table.
+    np.testing.assert_allclose(high - low, 2 * 4.3027 * found.std["l"], rtol=1e-4)
+    with pytest.raises(ValueError, match=r"level must be between 0 and 1, but it was 95.*0\.95"):
+        found.interval(95)
+
+
+@pytest.mark.full
+def test_columns_measured_by_turns():
+    two = jl.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * p["k"] @ q**2, {"q": (2,)})
+    noise = 1e-4 * np.random.default_rng(0).normal(size=(151, 2))
+    q = 0.3 * np.cos(np.outer(TS, [2.0, 1.5])) + noise
+    q[::2, 0] = q[1::2, 1] = np.nan
+    data = jl.Experiment(TS, {"q": q})
+    found = jl.fit(two, data, {"k": np.full(2, 3.0)}, free=("k",), **OPTIONS)
+    np.testing.assert_allclose(found.params["k"], [4.0, 2.25], rtol=1e-3)
+
+
 @pytest.mark.full
 def test_warnings_name_what_they_are_about():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
@@ -273,6 +425,36 @@ def test_windows_and_parts():
     found = fit(pieces)
     within(found, ("l",))
     assert len(found.starts) == 3
+    gap = jl.Experiment(np.concatenate([TS, TS + 10.0]), {"x": np.tile(angles(), 2)})
+    assert [piece.ts[0] for piece in gap.windows(1.5)] == [0.0, 1.5, 10.0, 10.5]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "message"),
+    [
+        (0, r"seconds must be a positive number, but it was 0"),
+        (np.nan, r"seconds must be a positive number, but it was nan"),
+        (-1, r"seconds must be a positive number, but it was -1"),
+        (4.0, r"at most the 3\.02 s of experiment, but it was 4"),
+        (0.03, r"seconds must be two samples or more, but it was 0\.03"),
+    ],
+)
+def test_bad_windows_are_named(seconds, message):
+    with pytest.raises(ValueError, match=message):
+        experiment().windows(seconds)
+
+
+@pytest.mark.parametrize(
+    ("mean", "sigma", "message"),
+    [
+        (np.nan, 1.0, r"mean must be finite, but it was nan"),
+        (1.0, 0.0, r"sigma must be positive and finite, but it was 0"),
+        (1.0, np.inf, r"sigma must be positive and finite, .* Leave the prior out"),
+    ],
+)
+def test_bad_priors_are_named(mean, sigma, message):
+    with pytest.raises(ValueError, match=message):
+        jl.Prior(mean, sigma)
 
 
 NAN = np.full(len(TS), np.nan)
@@ -286,7 +468,15 @@ NAN = np.full(len(TS), np.nan)
         (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one row per time, 151"),
         (TS, {"x": NAN}, {}, r"channels\['x'\] must hold some numbers, but all were NaN"),
         (TS, {}, {}, r"one channel or more"),
+        (TS, {"x": np.where(TS > 1, np.inf, TS)}, {}, r"finite, or NaN where nothing was measured"),
         (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"sigma\['x'\] must be positive"),
+        (TS, {"x": TS}, {"sigma": {"x": np.inf}}, r"positive and finite, .* Write NaN into the"),
+        (
+            TS,
+            {"x": TS},
+            {"sigma": {"x": np.ones(3)}},
+            r"a number, 151 of them, or of shape \(151, 1",
+        ),
         (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
         (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"q0 must be \(n,\) numbers at ts\[0\]"),
         (TS, {"x": TS}, {"start_sigma": 0.0}, r"come with the start it is about"),
@@ -311,7 +501,33 @@ def test_a_bad_experiment_is_named(ts, channels, options, message):
         ({"transforms": {"l": 3}}, r"transforms\['l'\] must be a transform"),
         ({"priors": {"m": jl.Prior(1.0, 1.0)}}, r"priors must be of free parameters"),
         ({"params0": TRUE | {"l": 1}}, r"hold real numbers to be found, but it was 1"),
+        ({"priors": {"l": (1.0, 1.0)}}, r"priors\['l'\] must be a jl\.Prior, .* Write jl\.Prior"),
+        (
+            {"priors": {"l": jl.Prior(1.0, [1.0, 2.0])}},
+            r"shape \(\), but its mean had \(\), its sigma \(2,\)",
+        ),
+        ({"tolerance": -1.0}, r"tolerance must be a number between 0 and 1"),
+        ({"max_iterations": 0}, r"max_iterations must be a positive integer, but it was 0"),
         ({"save": ("a",)}, r"save must be left to jl\.fit"),
+        (
+            {"data": None},
+            r"experiments must be a jl\.Experiment or a sequence of them, but it was N",
+        ),
+        (
+            {"data": jl.Experiment(TS, {"x": np.stack([TS, TS], axis=1)})},
+            r"channels\['x'\] must have 1 columns.* but it had 2\. Fill columns",
+        ),
+        (
+            {
+                "data": jl.Experiment(TS, {"x": TS, "r": TS}),
+                "channels": {"r": lambda motion: motion.q[:, [0, 0]]},
+            },
+            r"channels\['r'\] must have as many columns as were measured, 1, .* shows \(151, 2\)",
+        ),
+        (
+            {"data": experiment(q0=[1.0], v0=[0.0], start_sigma=np.ones(3))},
+            r"start_sigma must be one number or 2, of all coordinates and velocities that are free",
+        ),
         ({"data": ()}, r"experiments must be a jl\.Experiment or a sequence"),
         ({"data": jl.Experiment(TS, {"y": TS})}, r"be named as one of .*, but one was 'y'"),
         ({"data": jl.Experiment(TS, {"energy": TS})}, r"be among the channels or in q0"),

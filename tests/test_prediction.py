@@ -1,5 +1,6 @@
 """Predictions of recordings that were not fitted, from starts that were."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from _measured import NOISE, OPTIONS, TRUE, TS, angles, experiment, pendulum
@@ -57,9 +58,26 @@ def test_a_fit_predicts_as_its_params_do():
 
 
 def test_a_search_that_did_not_converge_is_said():
-    with pytest.warns(UserWarning, match=r"search for starts did not converge in 1 steps: raise"):
-        found = predict(experiment(), settle=0.5, max_steps=1)
+    with pytest.warns(
+        UserWarning, match=r"search for starts did not converge in 1 iterations: raise"
+    ):
+        found = predict(experiment(), settle=0.5, max_iterations=1)
     assert not found.converged
+
+
+@pytest.mark.full
+def test_a_motion_that_fails_is_said():
+    """A stop of the clock at x = 1.2, which one of the two passes."""
+
+    def stop(t, q, v, p):
+        return jnp.where(jnp.abs(q) > 1.2, jnp.nan, 0.0) * v
+
+    system = pendulum.with_forces(jl.GeneralizedForce(stop, "stop"))
+    wide = jl.Experiment(TS, {"x": angles(q0=1.5)}, name="wide")
+    with pytest.warns(UserWarning, match=r"motion of wide ended with nonfinite: it does not count"):
+        found = jl.predict(system, (experiment(), wide), TRUE, **OPTIONS)
+    assert found.failed == ("the motion of wide ended with nonfinite",)
+    assert 0.8 * NOISE < found.rms("x")[0] < 1.2 * NOISE
 
 
 def test_figures_show_what_was_measured(tmp_path):
