@@ -118,6 +118,11 @@ class Unknowns(eqx.Module):
             leaves[leaf.index] = leaf.transform.value(own, leaf.shape)
         return jax.tree.unflatten(treedef, leaves)
 
+    @property
+    def plain(self) -> bool:
+        """Whether all unknowns are the numbers themselves, and may go anywhere."""
+        return all(isinstance(leaf.transform, Free) for leaf in self.leaves)
+
     def held(self, z: Float[Array, " p"]) -> "Unknowns":
         """No unknowns, and the params at z."""
         nothing = np.zeros(0)

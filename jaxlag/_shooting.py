@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._box import box_least_squares
@@ -263,15 +264,13 @@ class _Condensed(eqx.Module):
 
     Attributes:
         rows: condensed.
-        weights: (p,), of the damping.
-        down: (p,), how far each may go.
-        up: (p,), likewise.
+        weights: (p,), of the damping; None where all are 1.
+        box: how far each may go down and up, (p,) each; None where all may go anywhere.
     """
 
     rows: Rows
-    weights: Float[Array, " p"]
-    down: Float[Array, " p"]
-    up: Float[Array, " p"]
+    weights: Float[Array, " p"] | None
+    box: tuple[Float[Array, " p"], Float[Array, " p"]] | None
 
 
 class Eliminating(optx.AbstractDescent):
@@ -287,7 +286,9 @@ class Eliminating(optx.AbstractDescent):
         """Of the right shapes."""
         shapes = eqx.filter_eval_shape(self._condense, f_info_struct)
         rows = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return _Condensed(rows, y.z, y.z, y.z)
+        if self.shooting.free.plain:
+            return _Condensed(rows, None, None)
+        return _Condensed(rows, y.z, (y.z, y.z))
 
     def _condense(self, f_info: Any) -> Rows:
         return condense(rows_of(f_info.jac, f_info.residual))
@@ -295,17 +296,22 @@ class Eliminating(optx.AbstractDescent):
     def query(self, y: Guess, f_info: Any, state: _Condensed) -> _Condensed:
         """Of new derivatives."""
         free, rows = self.shooting.free, self._condense(f_info)
+        if free.plain:
+            return _Condensed(rows, None, None)
         speeds, p = free.speeds(y.z), y.z.shape[0]
         idle = (speeds <= IDLE) & (sizes_of(rows)[-p - 1 : -1] <= IDLE)
         reach = jnp.where(idle, 0.0, free.reach)
         down, up = jnp.maximum(-reach, free.low - y.z), jnp.minimum(reach, free.high - y.z)
-        return _Condensed(rows, jnp.minimum(speeds, 1.0), down, up)
+        return _Condensed(rows, jnp.minimum(speeds, 1.0), (down, up))
 
     def step(self, step_size: Array, state: _Condensed) -> tuple[Guess, optx.RESULTS]:
         """Of a step size: the best within what each of the params may move."""
         left = eliminate(state.rows, 1.0 / step_size, state.weights)
         factor, right = left.params[:-1, :-1], left.params[:-1, -1]
-        z = box_least_squares(factor, -right, state.down, state.up)
+        if state.box is None:
+            z = solve_triangular(factor, -right)
+        else:
+            z = box_least_squares(factor, -right, *state.box)
         return Guess(z, -states_of(left, -z)), optx.RESULTS.successful
 
 

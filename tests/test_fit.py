@@ -7,6 +7,7 @@ from _measured import NOISE, OPTIONS, TRUE, TS, angles, driven, experiment, pend
 from _silence import no_warning
 
 import jaxlag as jl
+from jaxlag import _shooting
 
 
 def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
@@ -145,6 +146,20 @@ def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
     held = fit(experiment(), transforms={"l": jl.Positive(), "c": jl.Bounded(0.0, 1.0)})
     np.testing.assert_allclose(held.values, plain.values, rtol=1e-4)
     np.testing.assert_allclose(held.covariance, plain.covariance, rtol=1e-3)
+
+
+@pytest.mark.full
+def test_without_bounds_no_box_is_compiled(monkeypatch):
+    """Numbers that may go anywhere take plain steps of least squares."""
+
+    def box(*_):
+        raise AssertionError("a box")
+
+    monkeypatch.setattr(_shooting, "box_least_squares", box)
+    data = experiment().part(slice(0, 77))  # of a shape that no other test has compiled
+    fit(data)
+    with pytest.raises(AssertionError, match="a box"):
+        fit(data, transforms={"l": jl.Positive()})
 
 
 BOUNDS = [jl.Bounded(0.1, 1.0), jl.Bounded(0.1, np.inf)]
