@@ -29,7 +29,7 @@ NAMES = {1: "single", 2: "double", 3: "triple"}
 EVERY = 10  # milliseconds: rows that are fitted to and compared
 EVERY_EARLY = 2  # where a start is fitted to 0.1 s
 SETTLE = 0.1  # s
-OPTIONS = {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}
+OPTIONS = {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}
 SLIP = 0.05  # rad/s, over which dry friction changes its sign
 ANGLE = 0.05  # rad, likewise the restoring moment
 # Of a fit to all segments, mrad: what is to be beaten (single: whole segments; else 1 s).

@@ -36,6 +36,12 @@ TIGHT = 1e-2
 """The last of them, over what all measurements together tell of a state."""
 TIGHTEST = 1e-11
 """Below it, gaps are rounding."""
+UNITS = 3
+"""Searches of one stage, with units that fit better each time."""
+FAR_OFF = 1e3
+"""By which an unknown's unit may be wrong."""
+ASTRAY = 0.3
+"""Standard deviations, within which estimates are to be where their derivatives lead."""
 LARGEST_COVARIANCE = 200
 """Numbers, beyond which a covariance costs more than the descent that found them."""
 NOISE_ROUNDS = 3
@@ -98,8 +104,8 @@ def fit(
 
     Warns:
         of a parameter that starts or ends on a bound, one that nothing measured depends on, a
-        channel that is constant, segments whose solve fails, a search that did not converge, each
-        by name.
+        channel that is constant, segments whose solve fails, a search that did not converge, or
+        that stopped where errors of the solver hide what params do, each by name.
 
     Source: Bock (1983), see `_shooting`; Schittkowski, Numerical Data Fitting in Dynamical Systems
     (2002).
@@ -134,7 +140,7 @@ def fit(
     problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
     costs = np.zeros(0)
     if optimiser is None:
-        found, turns = _stages(problem, tolerance, max_iterations)
+        problem, found, turns = _stages(problem, tolerance, max_iterations)
         problem, noise, found, more = _with_its_noise(
             problem, noise, found, where, tolerance, max_iterations
         )
@@ -186,26 +192,59 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
                 warnings.warn(text, stacklevel=3)
 
 
-def _stages(problem: Shooting, tolerance: float, max_iterations: int) -> tuple[Found, int]:
-    """From loosely joined segments to one motion; and the steps of all stages.
+def _stages(
+    problem: Shooting, tolerance: float, max_iterations: int
+) -> tuple[Shooting, Found, int]:
+    """(the problem in units that fit, what is found from loosely joined segments on, all steps).
 
     By squares first, whatever the loss: losses that count outliers for less have minima wherever
     everything is an outlier.
     """
     turns = 0
     guess = Guess(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
-    by_squares = replace(problem, loss=squares)
+    by_squares, loss = replace(problem, loss=squares), problem.loss
     last = last_gap(problem)
     gaps = (*(gap for gap in GAPS if gap > last), last) if problem.chained else (last,)
     for gap in gaps:
-        final = gap == last and problem.loss is squares
+        final = gap == last and loss is squares
         rough = jnp.asarray(tolerance if final else max(tolerance, 1e-4))
-        found = search(by_squares, guess, jnp.asarray(gap), rough, max_iterations)
-        guess, turns = found.guess, turns + int(found.steps)
-    if problem.loss is not squares:
+        for again in range(UNITS):
+            found = search(by_squares, guess, jnp.asarray(gap), rough, max_iterations)
+            guess, turns = found.guess, turns + int(found.steps)
+            scale = _units(by_squares, found)
+            if np.array_equal(scale, by_squares.free.scale) or again == UNITS - 1:
+                break
+            guess = guess._replace(z=guess.z * (by_squares.free.scale / scale))
+            by_squares = replace(by_squares, free=by_squares.free.rescaled(scale))
+    problem = replace(by_squares, loss=loss)
+    if loss is not squares:
         found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerance), max_iterations)
         turns += int(found.steps)
-    return found, turns
+    return problem, found, turns
+
+
+def _units(problem: Shooting, found: Found) -> Float[np.ndarray, " p"]:
+    """Scales of the unknowns: as they are, but for those that are far from what they measure.
+
+    An unknown is of order one where its unit is as large as it is; or, where it is about 0, as what
+    moves the residuals by their own size. The size that a search begins at says little: it may be
+    0, or a billionth of the truth.
+    """
+    free, rows = problem.free, found.rows
+    assert rows is not None
+    p = len(free.u0)
+    columns = np.asarray(rows.measured).reshape(-1, rows.measured.shape[-1])
+    moved = np.hypot(
+        np.linalg.norm(columns[:, -p - 1 : -1], axis=0),
+        np.linalg.norm(np.asarray(rows.prior)[:, :p], axis=0),
+    )
+    left = np.sqrt(2.0 * float(found.cost))
+    numbers = np.abs(free.u0 + free.scale * np.asarray(found.guess.z))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = free.scale * left / moved
+        wanted = np.where(numbers > least, numbers, np.maximum(free.scale, least))
+        off = np.abs(np.log(wanted / free.scale)) > np.log(FAR_OFF)
+    return np.where(np.isinf(free.reach) & np.isfinite(wanted) & off, wanted, free.scale)
 
 
 def last_gap(problem: Shooting) -> float:
@@ -289,6 +328,14 @@ def _warn_after(result: FitResult) -> None:
             text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
             text += f"{result.costs[-1]:.3g}: take a lower learning rate."
         warnings.warn(text, stacklevel=3)
+    if result.converged and result.distance > ASTRAY:
+        text = (
+            f"The search stopped {result.distance:.2g} standard deviations from where derivatives"
+        )
+        fix = "lower rtol and atol, or take fixed steps (dt)"
+        if result.costs.size:
+            fix = "take more epochs"
+        warnings.warn(f"{text} lead: {fix}.", stacklevel=3)
     few = len(result.names) <= LARGEST_COVARIANCE
     if few and np.isnan(result.singular_values).any():
         text = (

@@ -16,7 +16,7 @@ from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._free import Unknowns
 from jaxlag._identifiability import Spectrum, run_off
-from jaxlag._information import linearised
+from jaxlag._information import distance, linearised
 from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
 from jaxlag._problem import freedom
 from jaxlag._segments import Layout
@@ -26,9 +26,9 @@ from jaxlag._system import System
 
 SHOWN = 40
 """Estimates in a result's text."""
-UNTOLD = 1e-8
+UNTOLD = 1e-12
 """A column of round-off, over the largest, of unknowns of order one: nothing measured depends on
-its number. Solves at a tolerance of 1e-9 give derivatives to about that."""
+its number."""
 
 
 class Model(NamedTuple):
@@ -66,6 +66,9 @@ class FitResult(eqx.Module):
             NaN where nothing was measured or the segment failed.
         starts: of each experiment, (q, v) or (q, u) at its first time.
         gap: largest gap between segments, over the range of the states; of those with a solution.
+        distance: from the estimates to where derivatives lead, in standard deviations, all numbers
+            together; NaN where there is no covariance. Far below 1 where a search has converged;
+            more, where errors of the solver hide what params do.
         converged: whether the optimiser met its tolerance; of a `Descent`, whether costs are finite
             and lower than at first.
         iterations: how many it took in the last stage; of a `Descent`, epochs.
@@ -91,6 +94,7 @@ class FitResult(eqx.Module):
     residuals: tuple[dict[str, np.ndarray], ...]
     starts: tuple[np.ndarray, ...]
     gap: float
+    distance: float
     converged: bool
     iterations: int
     solves: int
@@ -222,6 +226,7 @@ def summarised(
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
         tuple(np.asarray(found.starts)[firsts]),
         float(np.nanmax(_gaps(found, problem), initial=0.0)),
+        known.distance,
         bool(found.converged) and alive,
         int(found.steps),
         solves,
@@ -246,12 +251,13 @@ class _Uncertainty(NamedTuple):
     determined: tuple[str, ...]
     unused: tuple[str, ...]
     on_bound: tuple[str, ...]
+    distance: float
 
 
 def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncertainty:
     names = np.array(problem.free.names)
     unknown = np.full((len(names), len(names)), np.nan)
-    nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), ())
+    nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), (), np.nan)
     if found.rows is None:
         return nothing
     factor, by_z, at_first = map(np.asarray, linearised(problem.free, found))
@@ -271,6 +277,7 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
         spectrum.determined,
         tuple(names[moves & ~told].tolist()),
         tuple(names[~moves].tolist()),
+        float(distance(found, jnp.asarray(moves & told))),
     )
 
 

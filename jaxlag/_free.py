@@ -97,6 +97,7 @@ class Unknowns(eqx.Module):
         reach: (p,), how far z may go in one step.
         low: (p,), between which z may go.
         high: (p,), likewise.
+        limits: (2, p), those of u.
         on_bound: names of leaves that started on a bound.
     """
 
@@ -107,11 +108,16 @@ class Unknowns(eqx.Module):
     reach: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    limits: np.ndarray
     on_bound: tuple[str, ...] = eqx.field(static=True)
 
     def params(self, z: Float[Array, " p"]) -> Any:
-        """All params at z."""
+        """All params at z; of an unknown at its limit, those of the limit to the last digit."""
         u = jnp.asarray(self.u0) + jnp.asarray(self.scale) * z
+        if not self.plain:
+            under, over = self._beyond(z)
+            exact = jnp.where(under, self.limits[0], jnp.where(over, self.limits[1], u))
+            u += jax.lax.stop_gradient(exact - u)
         leaves, treedef = jax.tree.flatten(self.params0)
         for leaf in self.leaves:
             own = u[leaf.first : leaf.first + len(leaf.indices)]
@@ -126,7 +132,24 @@ class Unknowns(eqx.Module):
     def held(self, z: Float[Array, " p"]) -> "Unknowns":
         """No unknowns, and the params at z."""
         nothing = np.zeros(0)
-        return Unknowns((), self.params(z), nothing, nothing, nothing, nothing, nothing, ())
+        return Unknowns(
+            (), self.params(z), nothing, nothing, nothing, nothing, nothing, np.zeros((2, 0)), ()
+        )
+
+    def rescaled(self, scale: np.ndarray) -> "Unknowns":
+        """The same unknowns u, in other units."""
+        by = self.scale / scale
+        return Unknowns(
+            self.leaves,
+            self.params0,
+            self.u0,
+            scale,
+            self.reach * by,
+            self.low * by,
+            self.high * by,
+            self.limits,
+            self.on_bound,
+        )
 
     def numbers(self, z: Float[Array, " p"]) -> Float[Array, " e"]:
         """The numbers that are to be found, in their own units: as many as there are unknowns."""
@@ -142,8 +165,13 @@ class Unknowns(eqx.Module):
 
     def at_limit(self, z: Float[Array, " p"]) -> Bool[np.ndarray, " p"]:
         """Which unknowns are as far as they may go, to rounding."""
-        near = 8 * np.finfo(float).eps * np.maximum(1.0, np.abs(z))
-        return np.asarray((z <= self.low + near) | (z >= self.high - near))
+        under, over = self._beyond(z)
+        return np.asarray(under | over)
+
+    def _beyond(self, z: Float[Array, " p"]) -> tuple[Array, Array]:
+        """Which unknowns are at their lower limit, and which at their upper one."""
+        near = 8 * jnp.finfo(float).eps * jnp.maximum(1.0, jnp.abs(z))
+        return z <= self.low + near, z >= self.high - near
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -186,7 +214,7 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
             must = "be a transform such as jl.Positive()"
             raise bad(f"transforms[{name!r}]", must, f"it was {transform!r}")
     leaves, on_bound = [], []
-    columns: list[np.ndarray] = [np.zeros((5, 0))]
+    columns: list[np.ndarray] = [np.zeros((7, 0))]
     k = 0
     for i in sorted(chosen):
         value = np.asarray(values[i])
@@ -201,11 +229,13 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         size = (float(np.sqrt(np.mean(u**2))) if plain and u.size else 1.0) or 1.0
         one = np.ones(len(u))
         low, high = ((limit - u) / size for limit in transform.limits)
-        columns.append(np.stack([u, size * one, transform.reach * one, low, high]))
+        least, most = (limit * one for limit in transform.limits)
+        columns.append(np.stack([u, size * one, transform.reach * one, low, high, least, most]))
         k += len(u)
     params0 = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, float) else x, params0)
-    u0, scale, reach, low, high = np.concatenate(columns, axis=1)
-    return Unknowns(tuple(leaves), params0, u0, scale, reach, low, high, tuple(on_bound))
+    u0, scale, reach, low, high, *limits = np.concatenate(columns, axis=1)
+    bounds = np.stack(limits)
+    return Unknowns(tuple(leaves), params0, u0, scale, reach, low, high, bounds, tuple(on_bound))
 
 
 def _is_real(leaf: Any) -> bool:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from jaxlag._elimination import Rows, eliminate
 from jaxlag._free import Unknowns
@@ -24,6 +24,26 @@ def linearised(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
     assert found.rows is not None
     left = eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT))
     return left.params[:-1, :-1], numbers(z), numbers(jnp.zeros_like(z))
+
+
+@eqx.filter_jit
+def distance(found: Found, moves: Bool[Array, " p"]) -> Float[Array, ""]:
+    """How far params are from where their derivatives lead, in standard deviations.
+
+    sqrt(dz . C^-1 dz), dz the step of Gauss and Newton, C the covariance, of unknowns that move.
+    Where a search has converged it is small.
+    """
+    assert found.rows is not None
+    p, rows = moves.shape[0], _without_failed(found.rows, found)
+
+    def kept(x: Array) -> Array:
+        """Columns of unknowns that may move."""
+        return x.at[..., -p - 1 : -1].multiply(jnp.where(moves, 1.0, 0.0))
+
+    joined = None if rows.joined is None else kept(rows.joined)
+    moving = Rows(kept(rows.measured), joined, rows.next, kept(rows.prior))
+    left = eliminate(moving, jnp.asarray(FAINT))
+    return jnp.linalg.norm(left.params[:-1, -1])
 
 
 def _without_failed(rows: Rows, found: Found) -> Rows:

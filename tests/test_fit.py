@@ -149,6 +149,53 @@ def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("start", [1e-6, 1e-12, 1e-18])
+def test_a_search_does_not_depend_on_the_size_that_a_number_starts_at(start):
+    plain = fit(experiment())
+    with no_warning():
+        found = fit(experiment(), ("l", "c"), TRUE | {"l": 0.69, "c": start})
+    np.testing.assert_allclose(found.values, plain.values, atol=1e-3 * plain.std["c"])
+    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-3)
+
+
+@pytest.mark.full
+def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
+    """From a third, so that rounding would show; and a search that begins there leaves it again."""
+    bound = jl.Bounded(0.1 + 0.2, 1.0)
+    with pytest.warns(UserWarning, match="c ended on its bound"):
+        found = fit(
+            experiment(), params0=TRUE | {"l": 0.5, "c": 0.7 / 0.9}, transforms={"c": bound}
+        )
+    assert float(found.params["c"]) == 0.1 + 0.2
+    with pytest.warns(UserWarning, match="c starts on its bound"):
+        again = fit(
+            experiment(), params0=found.params, transforms={"c": jl.Bounded(0.0, 0.1 + 0.2)}
+        )
+    within(again, ("l", "c"))
+
+
+@pytest.mark.full
+def test_a_search_that_errors_of_the_solver_stop_is_said():
+    """Dry friction, whose steep change of sign steps at 1e-5 pass over now and then."""
+    dry = jl.GeneralizedForce(lambda t, q, v, p: -p["f"] * jnp.tanh(v / 0.02), "dry")
+    system, ts = pendulum.with_forces(dry), np.linspace(0.0, 8.0, 401)
+    true = TRUE | {"f": 0.1}
+    motion = jl.simulate(system, [1.0], [0.0], ts, true, rtol=1e-10, atol=1e-10)
+    noise = 1e-4 * np.random.default_rng(0).normal(size=len(ts))
+    data = jl.Experiment(ts, {"x": np.asarray(motion["x"]) + noise}, sigma={"x": 1e-4})
+    options = {"free": ("l", "c", "f"), "method": "tsit5"}
+    start = true | {"l": 0.69, "c": 0.02, "f": 0.15}
+    with pytest.warns(UserWarning, match=r"standard deviations from where derivatives lead: lower"):
+        found = jl.fit(system, data, start, rtol=1e-5, atol=1e-5, **options)
+    assert found.distance > 0.3
+    with no_warning():
+        found = jl.fit(system, data, start, rtol=1e-10, atol=1e-10, **options)
+    assert found.distance < 0.05
+    for name in ("l", "c", "f"):
+        assert abs(found.params[name] - true[name]) < 3.5 * found.std[name]
+
+
+@pytest.mark.full
 def test_without_bounds_no_box_is_compiled(monkeypatch):
     """Numbers that may go anywhere take plain steps of least squares."""
 
