@@ -17,6 +17,7 @@ from jaxlag._forces import sliding
 from jaxlag._inputs import (
     all_knots,
     at_interval,
+    counted_from,
     evaluate,
     reads_state,
 )
@@ -208,7 +209,7 @@ class Dynamics(eqx.Module):
         located = args
         if args.gaps is not None and args.gaps.knots.size:
             gap = jnp.searchsorted(args.gaps.knots, tau, side="right")
-            inputs, starts = at_interval(inputs, args.gaps.lower[gap], args.origin)
+            inputs, starts = at_interval(inputs, args.gaps.lower[gap])
             none = Gaps(args.gaps.knots[:0], args.gaps.lower[:0])
             located = args._replace(inputs=self._traced(inputs), gaps=none)
 
@@ -291,7 +292,7 @@ class Dynamics(eqx.Module):
         """Values of the inputs within a step; else in the interval that starts at tau."""
         args = self.within(args, tau)
         (params, inputs), since = self.given(args), self.turned(tau, args)
-        first = dict.fromkeys(inputs, 0)
+        first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
         return evaluate(inputs, self.clock(tau, args), q, v, params, first, since)
 
     def mass(

@@ -360,12 +360,12 @@ def tables(inputs: Mapping[str, Any]) -> dict[str, AbstractTable]:
 
 
 def at_interval(
-    inputs: Mapping[str, Any], t: Float[Array, ""], origin: Float[Array, ""]
+    inputs: Mapping[str, Any], t: Float[Array, ""]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
     """The inputs with the two rows of each table around a time, and where these begin.
 
     Functions with knots are those of the interval around it. In the tables the interval is the
-    first one, and time counts from `origin`.
+    first one.
     """
     starts = {}
     cuts = dict(inputs)
@@ -373,11 +373,17 @@ def at_interval(
         last = table.times.shape[0] - 2
         starts[name] = start = _interval(table.times, t, last)
         rows = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=2)
-        cuts[name] = table.cut(rows(table.times) - origin, rows(table.values))
+        cuts[name] = table.cut(rows(table.times), rows(table.values))
     for name, signal in inputs.items():
         if isinstance(signal, Function) and signal.times is not None:
             cuts[name] = signal.around(t)
     return cuts, starts
+
+
+def counted_from(origin: Float[Array, ""], inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """The inputs, the times of tables counted from another one: small differences of late times."""
+    moved = {name: x.cut(x.times - origin, x.values) for name, x in tables(inputs).items()}
+    return dict(inputs) | moved
 
 
 def in_order(inputs: Mapping[str, Any]) -> Bool[Array, ""]:

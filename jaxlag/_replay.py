@@ -115,7 +115,8 @@ def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
             change = changes(tangents[0], outcome)
             record = outcome.record
             assert record is not None
-            walk = changed(inexact, rest, setup, static, record, change, points=True)
+            kept = record.points is not None  # none where derivatives go forwards
+            walk = changed(inexact, rest, setup, static, record, change, points=kept)
             record = dots.record._replace(points=walk.points)
             dots = dots._replace(
                 state=walk.last[0], time=walk.time, rows=walk.rows[0], record=record

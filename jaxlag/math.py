@@ -269,7 +269,8 @@ def _scaled(x: Array) -> tuple[Array, Array]:
 @jax.custom_jvp
 def _norm(x: Array) -> Array:
     scaled, scale = _scaled(x)
-    return scale[..., 0] * jnp.sqrt(jnp.sum(scaled**2, axis=-1))
+    # Safe by itself: partial evaluation of a loop may differentiate this, not the rule below.
+    return scale[..., 0] * sqrt(jnp.sum(scaled**2, axis=-1))
 
 
 @_norm.defjvp
@@ -281,7 +282,7 @@ def _norm_rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Ar
 @jax.custom_jvp
 def _unit(x: Array) -> Array:
     scaled, _ = _scaled(x)
-    length = jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
+    length = sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
     return scaled / jnp.where(length == 0, 1.0, length)
 
 

@@ -218,6 +218,23 @@ def test_rows_move_with_their_own_time():
     np.testing.assert_allclose(by_knot, -5 * 0.5 / 6, rtol=1e-12)  # x = 5 t^3 / (6 knot)
 
 
+@pytest.mark.parametrize("mode", mostly_full(("recorded", "checkpoints", "forward"), "recorded"))
+def test_dependence_on_the_start_under_a_table(mode):
+    """x'' = 1 + 2 t from rest at t0: dx(t1)/dt0 = -(1 + 2 t0) (t1 - t0), whatever t0 is counted
+    from in between."""
+    force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
+    table = jl.Linear([0.0, 1.0, 2.0, 3.0], [1.0, 3.0, 5.0, 7.0])
+
+    def end(t0):
+        ts = jnp.stack([t0, 2.5])
+        return jl.simulate(system, [0.0], [0.0], ts, inputs={"u": table}, gradient=mode).q[-1, 0]
+
+    for slope in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(slope(end)(0.3), -1.6 * 2.2, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(jax.grad(end))(0.3), 1.6 - 2 * 2.2, rtol=1e-11)
+
+
 def test_derivative_by_end_given_in_a_list():
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
     slope = jax.grad(lambda end: jl.simulate(free, [0.0], [2.0], [0.0, end]).q[-1, 0])(1.0)

@@ -262,6 +262,32 @@ def test_length_of_no_components_and_of_what_is_not_finite():
     assert np.isnan(math.norm([np.nan, 1.0]))
 
 
+@pytest.mark.parametrize("x", [[0.0, 0.0], [0.3, -0.4]])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: math.norm(v) * v,
+        lambda v: math.unit(v) * jnp.sum(v**2),
+        lambda v: math.sqrt(v**4),
+        lambda v: jnp.stack([math.atan2(v[0], v[1]) * v[0] ** 2, v[1]]),
+        lambda v: math.angle_between(v, jnp.array([1.0, 2.0])) * v,
+    ],
+    ids=["norm", "unit", "sqrt", "atan2", "angle_between"],
+)
+def test_second_derivatives_within_a_loop(function, x):
+    """There JAX may pass a derivative rule over, and differentiate what the rule stands for."""
+    x = jnp.array(x)
+
+    def loop(v):
+        return jax.lax.scan(lambda v, _: (function(v), None), v, None, length=2)[0]
+
+    expected = jax.jacfwd(jax.jacfwd(lambda v: function(function(v))))(x)
+    for outer in (jax.jacfwd, jax.jacrev):
+        for inner in (jax.jacfwd, jax.jacrev):
+            found = outer(inner(loop))(x)
+            assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
 def test_spring_of_no_length():
     """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| drops out."""
 
