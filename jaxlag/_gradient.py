@@ -43,6 +43,7 @@ def choose_gradient(
     rows: int,
     state: int,
     itemsize: int,
+    knots: bool = False,
 ) -> Keep:
     """What to keep of `max_steps` steps.
 
@@ -53,17 +54,18 @@ def choose_gradient(
         rows: saved.
         state: numbers in a state.
         itemsize: bytes of a number.
+        knots: whether inputs have some.
     """
     turns = max_steps + rows - 2  # at most, of lanes together
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
     needs = {
-        name: needed(turns if name == "recorded" else room, turns, state, itemsize)
+        name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])
     }
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
-        if memory is None or needed(room, turns, state, itemsize) <= memory:
+        if memory is None or needed(room, turns, state, itemsize, knots) <= memory:
             return Keep(mode, room)
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
@@ -78,7 +80,10 @@ def choose_gradient(
     return Keep(mode, rooms[mode])
 
 
-def needed(room: int, turns: int, state: int, itemsize: int) -> int:
-    """Bytes kept of one trajectory: times of all turns, states at points and between two."""
+def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:
+    """Bytes kept of one trajectory: times of all turns, states at points and between two.
+
+    With knots, of every turn the knot that it is counted from, and whether it begins with a jump.
+    """
     states = room + 1 + math.ceil(turns / room) if room else 0
-    return turns * 8 + states * state * itemsize
+    return turns * (8 + 5 * knots) + states * state * itemsize

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
@@ -165,14 +166,16 @@ def grad_growth(
 
     Raises:
         ValueError: not a Solution; fewer than 3 save times; a single motion that did not succeed,
-            or has a segment that cannot be solved again; tolerances out of range.
+            or has a segment that cannot be solved again; tolerances out of range; a derivative of
+            the results.
 
     Warns where a motion goes on beyond its horizon, if its values are known.
 
     Cost: s integrations of 2n + 4n^2 numbers, and s^2 norms of (2n, 2n) matrices, 2 us each.
 
-    Limits: where f jumps with the state, as with dry friction, what the jump itself contributes to
-    Phi is left out. A finite motion shows a finite-time exponent.
+    Limits: the numbers have no derivatives of their own. Where f jumps with the state, as with dry
+    friction, what the jump itself contributes to Phi is left out. A finite motion shows a
+    finite-time exponent.
 
     Source: Benettin, Galgani, Giorgilli, Strelcyn, Meccanica 15 (1980) 9 and 21; Hairer, Norsett,
     Wanner, Solving Ordinary Differential Equations I, sec. I.14 (variational equation).
@@ -214,7 +217,8 @@ def grad_growth(
 
     static = motion._params_static, motion._inputs_static
     key = motion.system, *static, motion.formulation, max_steps, motion.ts.ndim - 1
-    traced = (motion.ts, motion.q, motion.v, motion._params_traced, motion._inputs_traced)
+    given = (motion.ts, motion.q, motion.v, motion._params_traced, motion._inputs_traced)
+    traced = _not_differentiated(given)
     growth, statuses = _growth(key, traced, motion.status, (rtol, atol, tol))
     if single and int(growth.status) != int(Status.ok):
         i = int(np.argmax(np.asarray(statuses) != int(Status.ok)))
@@ -224,6 +228,21 @@ def grad_growth(
     if _params.concrete(growth.horizon):
         _warn_beyond(growth)
     return growth
+
+
+@jax.custom_jvp
+def _not_differentiated(x: Any) -> Any:
+    """The same; an error says where a derivative is asked for."""
+    return x
+
+
+@partial(_not_differentiated.defjvp, symbolic_zeros=True)
+def _refused(primals: tuple, tangents: tuple) -> Any:
+    leaves = jax.tree.leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    if not all(isinstance(x, SymbolicZero) for x in leaves):
+        fix = "Pass jax.lax.stop_gradient of the motion's start and params."
+        raise bad("grad_growth", "be left out of what is differentiated", "it was not", fix)
+    return primals[0], tangents[0]
 
 
 def _warn_beyond(growth: GradientGrowth) -> None:

@@ -72,21 +72,27 @@ class Scheme(eqx.Module):
         steps of any length, though perturbations of it turn or grow; and so does one whose fastest
         motions are at rest, beside slower ones. Its steps are bounded by the time in which the
         fastest perturbations turn or grow, as their own error estimate would have it. Other motions
-        keep their steps, and so do implicit methods, which need not follow what decays.
+        keep their steps. Implicit methods need not follow what decays: theirs are bounded, on CPU,
+        at rest alone and by what turns or grows.
         """
         controller: Any = self.controller
         explicit = isinstance(self.solver, AbstractExplicit | diffrax.AbstractERK)
         bounded = type(controller) is diffrax.PIDController and controller.dtmax is None
-        if not explicit or not bounded:
+        if not bounded or not (explicit or jax.default_backend() == "cpu"):
             return self
         zero = jnp.zeros_like(args.origin)
         y, args = jax.lax.stop_gradient((y, self.within(args, zero)))
 
         f, J = linearized(lambda y: self.term.vf(zero, y, args), y)
-        rate, power = _rate(J)
+        if explicit:
+            rate, power = _rate(J)
+            # In J^16 f only the fastest motions are left: those of half their rate to 1e-5.
+            seen = jnp.abs(power @ f)
+        else:
+            rate = _turning(J)
+            seen = jnp.abs(J @ f) / rate
         allowed = _UNSEEN * (controller.atol + controller.rtol * jnp.abs(y))
-        # In J^16 f only the fastest motions are left: those of half their rate are down to 1e-5.
-        unseen = jnp.all(jnp.abs(power @ f) < rate * allowed) & jnp.isfinite(rate)
+        unseen = jnp.all(seen < rate * allowed) & jnp.isfinite(rate)
         solver: Any = self.solver
         order = float(solver.error_order(self.term))
         eps = jnp.finfo(y.dtype).eps
@@ -241,6 +247,14 @@ def _rate(J: Array) -> tuple[Array, Array]:
         power = power / jnp.where(size > 0, size, 1.0)
         rate = rate * size ** (0.5**k)
     return rate, power
+
+
+def _turning(J: Array) -> Array:
+    """The largest eigenvalue in size among those that do not merely decay."""
+    finite = jnp.all(jnp.isfinite(J))
+    values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
+    turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
+    return jnp.where(finite, jnp.max(jnp.where(turning, jnp.abs(values), 0.0)), jnp.nan)
 
 
 def with_stages(solver: Any, kind: str) -> Any:

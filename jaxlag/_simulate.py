@@ -27,7 +27,7 @@ from jaxlag._ending import ended
 from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
 from jaxlag._gradient import choose_gradient
-from jaxlag._inputs import check_inputs, check_range
+from jaxlag._inputs import all_knots, check_inputs, check_range
 from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._patience import timed
 from jaxlag._placement import check_placement
@@ -218,7 +218,13 @@ def simulate(
         regular=system.mass_regular(params, ts[0], q0, v0),
         apart=not assemble and system.contacts_apart(params, ts[0], q0, v0, inputs),
         keep=choose_gradient(
-            gradient, gradient_memory, max_steps, ts.shape[0], size, q0.dtype.itemsize
+            gradient,
+            gradient_memory,
+            max_steps,
+            ts.shape[0],
+            size,
+            q0.dtype.itemsize,
+            all_knots(inputs) is not None,
         ),
         auto=method == "auto" and "work" not in save,
     )

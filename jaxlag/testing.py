@@ -284,9 +284,12 @@ class _Search:
         h = _check.step(self.eps)
         points = [self.at[name] for name in states]
         along = [self.along[name] for name in states]
-        for name in smooth:
-            points += [self._shifted(name, s * h) for s in (1, -1, 0.5, -0.5)]
-            along += [self.along[name]] * 4
+        # Along all arguments at once, and along each alone: a kink in one excuses no other.
+        lines = [(name, group) for name in smooth for group in self._groups()]
+        for name, group in lines:
+            d = self._along(name, group)
+            points += [self._shifted(name, s * h, d) for s in (0, 1, -1, 0.5, -0.5)]
+            along += [d] * 5
         batch = self.ladder.values(_stack(points), _stack(along), len(points))
         found: list[Finding] = []
         for i, name in enumerate(states):
@@ -297,17 +300,34 @@ class _Search:
             if batched is not None and (plain is None or batched[1] < plain[1]):
                 found += self._not_finite(name, *batched, vmapped=True)
             if plain is None and name in smooth:
-                start = len(states) + 4 * smooth.index(name)
-                around = [_lane(batch, k) for k in range(start, start + 4)]
-                wrong = _check.mismatch(alone, around, self.along[name], self.eps)
-                found += [] if wrong is None else [self._wrong(name, wrong)]
+                for k, (own, group) in enumerate(lines):
+                    if own != name:
+                        continue
+                    start = len(states) + 5 * k
+                    here, *around = (_lane(batch, j) for j in range(start, start + 5))
+                    here = alone if group is None else here
+                    wrong = _check.mismatch(here, around, self._along(name, group), self.eps)
+                    if wrong is not None:
+                        found.append(self._wrong(name, wrong, group))
+                        break
         return found
 
-    def _shifted(self, name: str, by: float) -> dict:
+    def _groups(self) -> list[str | None]:
+        """Arguments along which differences are taken; None for all of them at once."""
+        groups = self.ladder.groups
+        return [None, *(groups if len(groups) > 1 else [])]
+
+    def _along(self, name: str, group: str | None) -> dict:
+        d = self.along[name]
+        if group is None:
+            return d
+        return {key: x if key == group else jax.tree.map(jnp.zeros_like, x) for key, x in d.items()}
+
+    def _shifted(self, name: str, by: float, d: dict) -> dict:
         def shift(x: Array, d: Array) -> Array:
             return x + jnp.asarray(by, x.dtype) * d
 
-        return jax.tree.map(shift, self.at[name], self.along[name])
+        return jax.tree.map(shift, self.at[name], d)
 
     def _not_finite(self, name: str, mode: str, order: int, vmapped: bool) -> list[Finding]:
         z, d = self.at[name], self.along[name]
@@ -321,10 +341,11 @@ class _Search:
             for o, names in found
         ]
 
-    def _wrong(self, name: str, wrong: _check.Mismatch) -> Finding:
+    def _wrong(self, name: str, wrong: _check.Mismatch, group: str | None) -> Finding:
         rules = list(dict.fromkeys(self.ladder.program.rules))
+        of = "" if group is None else f" of {group} alone"
         hint = (
-            f"Its {wrong.mode} derivative along a random direction is {wrong.value:.8g}, its "
+            f"Its {wrong.mode} derivative along a random direction{of} is {wrong.value:.8g}, its "
             f"{wrong.against} {wrong.other:.8g}."
         )
         if len(rules) > 1:

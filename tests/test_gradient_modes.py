@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 from test_gradients import direction, dot
 
 import jaxlag as jl
 from jaxlag._gradient import choose_gradient, needed
-from jaxlag._scheme import _rate
+from jaxlag._scheme import _rate, _turning
 from systems._catalogue import find
 
 # Seconds that each runs for. Starts are assembled where they have to stay on constraints.
@@ -238,7 +238,7 @@ def test_gradients_are_traced_once():
 
 
 def test_memory_decides():
-    """The times of all steps take 8 bytes each; states what is left."""
+    """The times of all steps take 8 bytes each, and 5 more with knots; states what is left."""
     state, size, steps = 4, 8, 16384
     times = 8 * steps
     assert choose_gradient("auto", None, steps, 2, state, size).room == 512
@@ -246,6 +246,7 @@ def test_memory_decides():
     assert room == 128
     assert needed(room, steps, state, size) <= times + 10_000
     assert choose_gradient("auto", times, steps, 2, state, size).room == 0
+    assert needed(0, steps, state, size, knots=True) == 13 * steps
     assert choose_gradient("recorded", None, 1000, 2, state, size).room >= 1000
 
 
@@ -398,6 +399,55 @@ def test_a_slow_motion_beside_a_fast_one_at_rest(start):
         return jl.simulate(system, jnp.stack([1.0, start]), [0.0, 0.0], [0.0, 10.0], {}).q[-1, 1]
 
     np.testing.assert_allclose(jax.grad(fast)(start), np.cos(100.0), rtol=0, atol=1e-7)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["kvaerno3", "kvaerno5"])
+def test_implicit_methods_at_rest(method):
+    """They would step over swings that nobody sees, and damp them: theta'' = -4 sin theta."""
+    pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + 4.0 * jnp.cos(q[0]), ("a",))
+
+    def angle(v0):
+        motion = jl.simulate(pendulum, [0.0], [v0], [0.0, 10.0], {}, method=method)
+        return motion.q[-1, 0]
+
+    np.testing.assert_allclose(jax.grad(angle)(0.0), 0.5 * np.sin(20.0), rtol=0, atol=1e-6)
+
+
+@pytest.mark.full
+def test_implicit_methods_at_rest_step_over_what_decays():
+    """A dashpot of 1e6/s beside a spring: swings of 1 rad/s bound the steps, it does not."""
+    dashpot = jl.Rayleigh(lambda t, q, v, p: 0.5e6 * v[1] ** 2, "dashpot")
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - 0.5 * q[0] ** 2 - 5e3 * q[1] ** 2,
+        ("a", "b"),
+        forces=(dashpot,),
+    )
+
+    def end(a0):
+        q0 = jnp.stack([a0, 0.0])
+        motion = jl.simulate(system, q0, [0.0, 0.0], [0.0, 10.0], {}, method="kvaerno5")
+        return motion.q[-1, 0], motion.stats["accepted"]
+
+    slope, steps = jax.grad(end, has_aux=True)(0.0)
+    np.testing.assert_allclose(slope, np.cos(10.0), rtol=0, atol=1e-6)
+    assert steps < 1000
+
+
+def test_what_turns_and_what_decays():
+    """Eigenvalues +-3i and -1 +- 5i turn or nearly, -100 and -7 +- i decay, 2 grows."""
+
+    def block(real, imaginary):
+        return np.array([[real, imaginary], [-imaginary, real]])
+
+    def fastest(*blocks):
+        return float(_turning(jnp.asarray(block_diag(*blocks), float)))
+
+    np.testing.assert_allclose(fastest(block(0, 3), [[-100.0]]), 3.0, rtol=1e-12)
+    np.testing.assert_allclose(fastest(block(0, 3), block(-1, 5)), 26**0.5, rtol=1e-12)
+    np.testing.assert_allclose(fastest(block(-7, 1), [[2.0]]), 2.0, rtol=1e-12)
+    assert fastest([[-1.0]]) == 0.0
+    assert np.isnan(fastest([[np.nan]]))
 
 
 @pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 30.0, 1e4])

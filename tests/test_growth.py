@@ -466,6 +466,13 @@ def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
     with pytest.raises(ValueError, match="max_steps must be a positive integer, but it was 0"):
         jl.grad_growth(motion, max_steps=0)
 
+    def exponent(x):
+        return jl.grad_growth(linear_motion(INVERTED, jnp.stack([x, 0.0]), ts)).exponent
+
+    for slope in (jax.grad, jax.jacfwd):
+        with pytest.raises(ValueError, match=r"grad_growth must be left out of what is diff"):
+            slope(exponent)(0.0)
+
 
 @pytest.mark.full
 def test_many_coordinates_at_many_times():

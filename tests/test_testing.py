@@ -272,3 +272,15 @@ def test_functions_of_wrong_shapes_are_refused():
     system = jl.System(lambda t, q, v, params: v, ("x", "y"))
     with pytest.raises(ValueError, match="lagrangian must return a real scalar"):
         testing.check_derivatives(system, {}, Q, V)
+
+
+def test_a_kink_in_one_argument_excuses_no_other():
+    """1/2 (|q| - l)^2 at q = 0 and l = 0: its Hessian is 1, and comes out as 0."""
+
+    def spring(q, params):
+        return 0.5 * (jl.math.norm(q) - params["c"]) ** 2
+
+    report = check(spring, q=[0.0, 0.0])
+    (finding,) = (f for f in report.findings if f.state == "given")
+    assert (finding.kind, finding.order) == ("wrong", 2)
+    assert "of q alone" in finding.hint
