@@ -29,6 +29,7 @@ NAMES = {1: "single", 2: "double", 3: "triple"}
 EVERY = 10  # milliseconds: rows that are fitted to and compared
 EVERY_EARLY = 2  # where a start is fitted to 0.1 s
 SETTLE = 0.1  # s
+PIECES = 4  # of recordings of one arm, joined in the fit
 OPTIONS = {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}
 SLIP = 0.05  # rad/s, over which dry friction changes its sign
 ANGLE = 0.05  # rad, likewise the restoring moment
@@ -205,7 +206,8 @@ def _chosen(
         models = dict(list(models.items())[:2])
     held_out = fitted(train[1::3], arms)
     rest = fitted([x for i, x in enumerate(train) if i % 3 != 1], arms)
-    options = {"free": tuple(params0)} | OPTIONS
+    # A search in whole recordings of one arm ends in minima on the way.
+    options = {"free": tuple(params0), "segments": PIECES if arms == 1 else 1} | OPTIONS
     begun = perf_counter()
     compared = jl.compare(system, rest, params0, models, held_out=held_out, **options)
     spent = perf_counter() - begun

@@ -12,8 +12,9 @@ from jaxlag import _params
 from jaxlag._constraints import Holonomic, Pfaffian
 from jaxlag._errors import bad
 from jaxlag._forces import Couple, GeneralizedForce, PointForce, Rayleigh, reads_lam
-from jaxlag._inputs import AbstractInput, evaluate
+from jaxlag._inputs import evaluate
 from jaxlag._quasi import InQuasiVelocities, Vanishing
+from jaxlag._signals import AbstractInput
 from jaxlag._system import System
 
 STATES = ("given", "rest", "zero", "equal", "one", "random")

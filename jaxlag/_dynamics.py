@@ -19,6 +19,7 @@ from jaxlag._inputs import (
     at_interval,
     counted_from,
     evaluate,
+    marked,
     reads_state,
 )
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
@@ -54,6 +55,7 @@ class Dynamics(eqx.Module):
         stabilization: "projection", a `Baumgarte`, or None.
         regular: whether M is known to be positive definite without the constraints.
         apart: whether rows whose multipliers forces read are known to be independent.
+        onwards: whether the method has stages beyond the end of a step.
     """
 
     system: System
@@ -69,6 +71,7 @@ class Dynamics(eqx.Module):
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool = eqx.field(static=True, default=False)
     apart: bool = eqx.field(static=True, default=False)
+    onwards: bool = eqx.field(static=True, default=False)
 
     @property
     def terms(self) -> Terms:
@@ -174,10 +177,15 @@ class Dynamics(eqx.Module):
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
-        t = args.origin + self.turned(tau, args)
+        t, end = args.origin + self.turned(tau, args), args.end
         if self.direction is not None:
-            return (jnp.minimum if self.direction == 1 else jnp.maximum)(t, args.end)
-        return jnp.clip(t, *(f(args.origin, args.end) for f in (jnp.minimum, jnp.maximum)))
+            bounded = (jnp.minimum if self.direction == 1 else jnp.maximum)(t, end)
+        else:
+            bounded = jnp.clip(t, *(f(args.origin, end) for f in (jnp.minimum, jnp.maximum)))
+        if not self.onwards:
+            return bounded
+        rounding = 4 * jnp.finfo(t.dtype).eps * (jnp.abs(args.origin) + jnp.abs(end))
+        return jnp.where(jnp.abs(t - end) > rounding, t, bounded)
 
     def tau(self, t: Array, args: Arguments) -> Array:
         """Tau = sigma (t - t0)."""
@@ -213,14 +221,9 @@ class Dynamics(eqx.Module):
             none = Gaps(args.gaps.knots[:0], args.gaps.lower[:0])
             located = args._replace(inputs=self._traced(inputs), gaps=none)
 
-        def of(name: str, signal: Any) -> Any:
-            start = starts.get(name)
-            whole = signal is None or start is None
-            return jax.tree.map(lambda _: None if whole else start, signal)
-
         nowhere = jax.tree.map(lambda _: None, args)
-        here = {name: of(name, signal) for name, signal in args.inputs.items()}
-        marks = nowhere._replace(inputs=here)
+        here = {name: marked(args.inputs[name], start) for name, start in starts.items()}
+        marks = nowhere._replace(inputs=nowhere.inputs | here)
         return located, jax.tree.leaves(marks, is_leaf=lambda x: x is None)
 
     def acceleration(
@@ -293,7 +296,7 @@ class Dynamics(eqx.Module):
         args = self.within(args, tau)
         (params, inputs), since = self.given(args), self.turned(tau, args)
         first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
-        return evaluate(inputs, self.clock(tau, args), q, v, params, first, since)
+        return evaluate(inputs, self.clock(tau, args), q, v, params, first, since, self.onwards)
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments

@@ -20,7 +20,7 @@ from jaxlag._methods import for_state
 from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
-from jaxlag._scheme import Scheme
+from jaxlag._scheme import Scheme, looks_ahead
 from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
@@ -91,6 +91,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     if plan.auto and controller is None:
         splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
         solver = Splitting(8) if splitting else solver
+    dynamics = replace(dynamics, onwards=looks_ahead(solver))
     check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
 
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0

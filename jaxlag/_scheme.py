@@ -10,6 +10,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._settling import Settling
@@ -255,6 +256,13 @@ def _turning(J: Array) -> Array:
     values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
     turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
     return jnp.where(finite, jnp.max(jnp.where(turning, jnp.abs(values), 0.0)), jnp.nan)
+
+
+def looks_ahead(solver: diffrax.AbstractSolver) -> bool:
+    """Whether a method has stages beyond the end of its steps."""
+    tableau = getattr(solver, "tableau", None)
+    tableaus = getattr(tableau, "tableaus", () if tableau is None else (tableau,))
+    return any(np.max(x.c, initial=0.0) > 1 for x in tableaus)
 
 
 def with_stages(solver: Any, kind: str) -> Any:

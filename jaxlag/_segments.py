@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
-from jaxlag._inputs import AbstractInput, Linear, ZeroOrderHold
 from jaxlag._params import is_array
+from jaxlag._signals import AbstractInput, Linear, ZeroOrderHold
 from jaxlag._system import System
 
 

@@ -102,7 +102,8 @@ def simulate(
             better in orbits and pendulums, but not at steps beyond 1 / omega); and "kvaerno5",
             outside of transforms, where a stiff motion took max_steps explicit steps.
             `Solution.method` names it. Implicit methods by name solve their equations to a tenth of
-            the tolerance; instances of diffrax's classes do as they were made to.
+            the tolerance; instances of diffrax's classes do as they were made to. "kvaerno4" and
+            "kvaerno5" read forces up to a quarter of a step beyond the last time.
             Methods that keep the structure of the equations, for
             long runs with fixed steps dt: "splitting2", "splitting4", "splitting6", "splitting8"
             (`solvers.Splitting`) where M is constant and nothing that accelerates depends on v;

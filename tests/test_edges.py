@@ -403,6 +403,42 @@ def test_a_pulse_moves_with_its_knots():
     np.testing.assert_allclose(slope, -1.0, rtol=1e-10)
 
 
+@pytest.mark.parametrize(
+    # At 1e-7, worst of solution and derivatives: 4.3e-8 and 1.1e-7. Where f stood still beyond its
+    # knot, and time beyond its end, derivatives were wrong by 1e-4.
+    "method",
+    ["kvaerno4", pytest.param("kvaerno5", marks=pytest.mark.full)],
+)
+def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
+    """x'' = sin 5t to a knot, cos 3t from it on: d v/d knot and d v/d end are forces there."""
+
+    @jax.jit
+    def end(knot, stop):
+        signal = jl.Function(
+            lambda t, params: jnp.where(t < params["s"], jnp.sin(5 * t), jnp.cos(3 * t)),
+            knots=knot[None],
+        )
+        motion = moved(
+            signal,
+            jnp.stack([jnp.zeros(()), stop]),
+            (0.0, 0.0),
+            {"k": 0.0, "s": knot},
+            method=method,
+            rtol=1e-7,
+            atol=1e-7,
+        )
+        return motion.v[-1, 0]
+
+    knot, stop = jnp.array(1.3), jnp.array(2.0)
+    value, slopes = jax.value_and_grad(end, (0, 1))(knot, stop)
+    v = (1 - np.cos(5 * knot)) / 5 + (np.sin(3 * stop) - np.sin(3 * knot)) / 3
+    exact = [np.sin(5 * knot) - np.cos(3 * knot), np.cos(3 * stop)]
+    np.testing.assert_allclose(value, v, atol=3e-7)
+    np.testing.assert_allclose(slopes, exact, atol=3e-7)
+    forwards = jax.jacfwd(end, (0, 1))(knot, stop)
+    np.testing.assert_allclose(forwards, slopes, rtol=1e-12)
+
+
 def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
     """Stepped over without a word of it; met by steps no longer than itself."""
     wide = jl.Function(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))

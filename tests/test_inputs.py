@@ -11,7 +11,7 @@ import pytest
 from _user import unchecked  # noqa: F401
 
 import jaxlag as jl
-from jaxlag._inputs import all_knots, check_inputs, common_range, evaluate, locate
+from jaxlag._inputs import all_knots, at_interval, check_inputs, common_range, evaluate, locate
 
 EPS = np.finfo(float).eps
 TIMES = [0.0, 0.5, 2.0, 2.25]
@@ -151,16 +151,21 @@ def test_a_hold_may_have_one_value_for_each_interval():
     assert jnp.issubdtype(pairs.values.dtype, jnp.floating)
 
 
+def around(signal, t):
+    """The signal as a step from t reads it."""
+    return at_interval({"u": signal}, jnp.array(t))[0]["u"]
+
+
 def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     """Up to the knot, and from it on; its derivative in time is that of the function."""
     step = jl.Function(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
     np.testing.assert_array_equal(step.knots(), [1.0, 2.0])
-    before, after = step.around(jnp.array(0.3)), step.around(jnp.array(1.0))
+    before, after = around(step, 0.3), around(step, 1.0)
     knot = jnp.array(1.0)
     np.testing.assert_allclose(read(before, knot), 2.0, rtol=1e-15)
     assert read(after, knot) == read(step, knot) == 5.0
     assert jax.grad(lambda t: read(before, t))(knot) == 2.0
-    beyond = step.around(jnp.array(2.5))
+    beyond = around(step, 2.5)
     assert read(beyond, jnp.array(9.0)) == 45.0
 
 
