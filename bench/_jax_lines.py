@@ -2,7 +2,8 @@
 
 diffrax gets the explicit equations by hand and, as a first prototype would have it, naive
 autodiff: `jax.hessian` of L, Jacobians of the rows, `jnp.linalg.solve`. All are functions of start,
-parameters and tolerance (or step), compiled once and called again and again, as in a fit.
+parameters and tolerance (or step), compiled once and called again and again, as in a fit. What they
+return is what is read: coordinates at the end, whether it was reached, and the number of steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,30 +52,29 @@ def with_jaxlag(motion: Motion, method: str) -> Line:
     """
     fixed = isinstance(METHODS[method](), AbstractFixedStep)
 
-    def solve(q0: Array, v0: Array, params: Any, knob: Array) -> jl.Solution:
+    def solve(q0: Array, v0: Array, params: Any, knob: Array) -> tuple[Array, Array, Array]:
         options = {"dt": knob, "max_steps": MOST_STEPS}
         if not fixed:
             options = {"rtol": knob, "atol": knob, "max_steps": MOST_STEPS}
         ts = (0.0, motion.t1)
-        return jl.simulate(motion.system, q0, v0, ts, params, method=method, throw=False, **options)
+        end = jl.simulate(motion.system, q0, v0, ts, params, method=method, throw=False, **options)
+        return end.q[-1], end.status == 0, end.stats["accepted"]
 
     knobs = (
         steps(motion.t1, motion.fewest, MOST_STEPS) if fixed else tolerances(motion.loosest, 16.0)
     )
     args = (jnp.asarray(motion.q0), jnp.asarray(motion.v0), _params(motion))
 
-    def read(end: jl.Solution) -> Solved:
-        q = jnp.where((end.status == 0)[..., None], end.q[..., -1, :], jnp.nan)
-        return Solved(q, int(jnp.max(end.stats["accepted"])))
-
-    return _line(motion, solve, args, knobs, read, fixed)
+    return _line(motion, solve, args, knobs, fixed)
 
 
 def with_diffrax(motion: Motion, field: Callable, method: str, y0: Array) -> Line:
     """By `diffrax.diffeqsolve`, jitted."""
 
-    def solve(y0: Array, params: Any, knob: Array) -> Any:
-        return diffrax.diffeqsolve(
+    n = motion.q0.shape[-1]
+
+    def solve(y0: Array, params: Any, knob: Array) -> tuple[Array, Array, Array]:
+        end = diffrax.diffeqsolve(
             diffrax.ODETerm(field),
             DIFFRAX[method](),
             0.0,
@@ -86,21 +86,15 @@ def with_diffrax(motion: Motion, field: Callable, method: str, y0: Array) -> Lin
             max_steps=MOST_STEPS,
             throw=False,
         )
-
-    n = motion.q0.shape[-1]
-
-    def read(end: Any) -> Solved:
-        done = end.result == diffrax.RESULTS.successful
-        q = jnp.where(jnp.asarray(done)[..., None], end.ys[..., -1, :n], jnp.nan)
-        return Solved(q, int(jnp.max(end.stats["num_accepted_steps"])))
+        assert end.ys is not None
+        done = jnp.asarray(end.result == diffrax.RESULTS.successful)
+        return end.ys[-1, :n], done, end.stats["num_accepted_steps"]
 
     knobs = tolerances(motion.loosest, 16.0)
-    return _line(motion, solve, (y0, _params(motion)), knobs, read, False)
+    return _line(motion, solve, (y0, _params(motion)), knobs, False)
 
 
-def _line(
-    motion: Motion, solve: Callable, args: tuple, knobs: list[float], read: Callable, fixed: bool
-) -> Line:
+def _line(motion: Motion, solve: Callable, args: tuple, knobs: list[float], fixed: bool) -> Line:
     if motion.lanes > 1:
         moving = len(args) - 1  # all but the parameters and the knob
         solve = jax.vmap(solve, (0,) * moving + (None, None))
@@ -109,6 +103,10 @@ def _line(
     def make(knob: float) -> Callable[[], Any]:
         value = jnp.asarray(knob)
         return lambda: program.call(*args, value)
+
+    def read(end: tuple[Array, Array, Array]) -> Solved:
+        q, done, accepted = end
+        return Solved(jnp.where(done[..., None], q, jnp.nan), int(jnp.max(accepted)))
 
     return Line("step" if fixed else "tolerance", knobs, make, read, 0.0)
 

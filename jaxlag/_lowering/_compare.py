@@ -59,9 +59,10 @@ def compare(key: Key, scene: Scene, equations: Equations, known: list | None) ->
     """A program beside the array program, with the known params and with random ones.
 
     What is known may be special, and random params may be none that a system has: both are drawn
-    with, until there are states enough. Where M is not positive definite, M, h and Q are compared
-    in place of the acceleration, where the system has no constraints; else such states are left
-    out. Where the array program has no value the other must have none.
+    with, until there are states enough. Where M is not positive definite, M, h, Q, A and gamma are
+    compared in place of the acceleration, with quasi-velocities what is left of them, and v; where
+    forces read multipliers, such states are left out. Where the array program has no value the
+    other must have none.
     """
     expected = _Plain(key) if key.quasi is None else _Quasi(key)
     rng = np.random.default_rng(0)
@@ -97,7 +98,9 @@ def compare(key: Key, scene: Scene, equations: Equations, known: list | None) ->
         roots = equations.accelerations
         if right.parts:
             roots = [*(x for row in equations.mass for x in row), *equations.bias]
-            roots += scene.force or []
+            roots += (scene.force or []) if key.quasi is None else equations.accelerations[:n]
+            if equations.rows is not None:
+                roots += [*(x for row in equations.rows.A for x in row), *equations.rows.gamma]
         found = np.array([float(x) for x in evaluate(roots, values)])
         if not right.defined:
             return np.inf if np.all(np.isfinite(found)) else None
@@ -138,7 +141,8 @@ class _Right(NamedTuple):
         allowed: how far off a sound program may be.
         kept: rows that are solved with.
         defined: whether there is a value.
-        parts: whether x is M, h and Q.
+        parts: whether x is M, h, Q, A and gamma; with quasi-velocities B^T M B, B^T (h + M s - Q)
+            and v.
     """
 
     x: np.ndarray
@@ -201,7 +205,7 @@ class _Plain:
             (A, _), (gamma,) = (interpret(f, t, q, v, *params) for f in self.bound)
             kept = _independent(A, self.read)
             if not _definite(M if self.key.regular else _augmented(M, A[kept])):
-                return None
+                return None if self.felt is not None else self._parts(v, M, h, Q, A, gamma)
             G = np.zeros((n, len(A)))
             if self.felt is not None:
                 rest, G = interpret(self.felt, t, q, v, *params, *inputs, np.zeros(len(A)))
@@ -211,12 +215,19 @@ class _Plain:
             if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
                 return None
         elif not _definite(M):
-            # Terms of h that cancel are of the size of M v v.
-            size = 1.0 + norm(M) * (1.0 + norm(v) ** 2) + norm(h) + norm(Q)
-            parts = np.concatenate([np.ravel(M), h, Q])
-            return _Right(parts, SLACK * float(jnp.finfo(self.key.dtype).eps) * size, parts=True)
+            return self._parts(v, M, h, Q)
         found = _solved(self.key, M, right)
         return None if found is None else _Right(found[0][:n], found[1], kept)
+
+    def _parts(self, v: Any, M: Any, *others: Any) -> _Right | None:
+        """What accelerations follow from, in place of these; None where it has no value."""
+        parts = np.concatenate([np.ravel(x) for x in (M, *others)])
+        if not np.all(np.isfinite(parts)):
+            return None
+        # Terms of h and gamma that cancel are of the size of M v v and A v v.
+        size = 1.0 + sum(map(norm, others)) + (norm(M) + sum(map(norm, others[2:]))) * norm(v) ** 2
+        eps = float(jnp.finfo(self.key.dtype).eps)
+        return _Right(parts, SLACK * eps * (size + norm(M)), parts=True)
 
 
 class _Quasi:
@@ -255,15 +266,19 @@ class _Quasi:
         (M,) = interpret(self.mass, t, q, v, *params)
         (h,) = interpret(self.bias, t, q, v, *params)
         Q = interpret(self.force, t, q, v, *params, *inputs)[0] if self.force is not None else 0.0
-        reduced = B.T @ M @ B
-        if not _definite(reduced):
-            return None
-        found = _solved(self.key, reduced, B.T @ (Q - h - M @ s))
-        if found is None:
-            return None
+        reduced, right = B.T @ M @ B, B.T @ (Q - h - M @ s)
         # What is projected is larger than what is left of it, and B has errors of its own.
         parts = norm(Q) + norm(h) + norm(M) * norm(s)
         eps, size = float(jnp.finfo(self.key.dtype).eps), norm(B)
+        if not _definite(reduced):
+            x = np.concatenate([np.ravel(reduced), -right, v])
+            if not np.all(np.isfinite(x)):
+                return None
+            scale = (1.0 + size) ** 2 * (norm(M) * (1.0 + norm(v) ** 2) + parts) + 1.0
+            return _Right(x, SLACK * eps * scale + allowed, parts=True)
+        found = _solved(self.key, reduced, right)
+        if found is None:
+            return None
         more = SLACK * eps * parts * size * norm(np.linalg.inv(reduced))
         limits = [np.full(len(v), allowed), np.full(len(w), found[1] + more * (1.0 + size))]
         return _Right(np.concatenate([v, found[0]]), np.concatenate(limits))

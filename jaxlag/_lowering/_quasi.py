@@ -79,7 +79,8 @@ def derive_rates(scene: Scene, eps: float) -> Equations:
     found = []
     for words, right in sides[:WRITTEN_OUT]:
         rates = [*v, *solve(graph, mass, right, eps)]
-        found.append(Equations(declared, mass, [], rates, assemble(graph, rates), words))
+        rest = [graph.scale(x, -1.0) for x in right]
+        found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), words))
     best = min(found, key=lambda equations: equations.program.cost)
     best = best._replace(velocity=assemble(graph, v))
     bound = scene.constrained

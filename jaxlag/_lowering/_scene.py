@@ -45,10 +45,13 @@ class Scene(NamedTuple):
 class Equations(NamedTuple):
     """M a + h = Q, and the straight-line code for a.
 
+    Where quasi-velocities make the state, a stands for (v, u') and M, h and Q for what is left of
+    them in the equations of u', Q on the left, too.
+
     Attributes:
         lagrangian: L, simplified where that is possible.
         mass: M, n rows.
-        bias: h.
+        bias: h; of quasi-velocities h - Q.
         accelerations: a.
         program: straight-line code for a.
         form: how h was written, in words.
