@@ -281,9 +281,10 @@ class Function(AbstractInput):
         """The nearest time on this side of the knots; it moves with them where t lies beyond."""
         assert self.ends is not None
         first, last = self.ends.astype(t.dtype)
-        t = jnp.where(t > last, last, jnp.where(t < first, first, t))
-        here, before = jax.lax.stop_gradient((t, last))
-        return t + (jnp.minimum(here, jnp.nextafter(before, -jnp.inf)) - here)
+        slack = 4 * jnp.finfo(t.dtype).eps * jnp.abs(t)
+        t = jnp.where(t > last + slack, last, jnp.where(t < first - slack, first, t))
+        here, after, before = jax.lax.stop_gradient((t, first, last))
+        return t + (jnp.clip(here, after, jnp.nextafter(before, -jnp.inf)) - here)
 
 
 class Feedback(AbstractInput):

@@ -165,6 +165,10 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     np.testing.assert_allclose(read(before, knot), 2.0, rtol=1e-15)
     assert read(after, knot) == read(step, knot) == 5.0
     assert jax.grad(lambda t: read(before, t))(knot) == 2.0
+    late, early = knot + 2 * EPS, knot - EPS  # rounding of a step's ends is none of them
+    np.testing.assert_allclose([read(before, late), read(after, early)], [2.0, 5.0], rtol=4 * EPS)
+    assert jax.grad(lambda t: read(before, t))(late) == 2.0
+    assert jax.grad(lambda t: read(after, t))(early) == 5.0
     beyond = around(step, 2.5)
     assert read(beyond, jnp.array(9.0)) == 45.0
 
