@@ -14,6 +14,8 @@ from jaxlag._solution import Solution
 SHARE = 1.5
 # A method of higher order at a tenth of the tolerance leaves a hundredth of the error, or less.
 LEFT = 0.02
+# What rounding leaves, over eps sqrt(steps) |y|: both motions round, and their difference may be 0.
+ROUNDED = 32.0
 
 
 def check_estimate(estimate_error: Any, method: Any) -> None:
@@ -37,7 +39,8 @@ def with_error(motion: Solution, beside: Solution, left: float) -> Solution:
     """The motion with the estimate of its error, the difference of the two and half as much.
 
     Where the difference passes through 0 the error need not: it is at least what is left of the
-    largest so far in the finer motion. It is nan where the finer motion did not get.
+    largest so far in the finer motion, and what rounding leaves of steps that magnify nothing. It
+    is nan where the finer motion did not get.
 
     Args:
         motion: what was asked for.
@@ -46,10 +49,14 @@ def with_error(motion: Solution, beside: Solution, left: float) -> Solution:
             a tenth of the tolerance leaves about an eighth (its power p / (p + 1)) and half a step
             2^-p.
     """
+    steps = jnp.asarray(motion.stats["accepted"])[..., None, None]
 
     def estimate(fine: Array, coarse: Array) -> Array:
-        difference = jnp.abs(fine - coarse)
-        so_far = jax.lax.cummax(difference, axis=fine.ndim - 2)
-        return SHARE * jnp.maximum(difference, left * so_far)
+        difference, axis = jnp.abs(fine - coarse), fine.ndim - 2
+        so_far, size = (jax.lax.cummax(x, axis=axis) for x in (difference, jnp.abs(coarse)))
+        rounding = ROUNDED * jnp.finfo(size.dtype).eps * jnp.sqrt(steps.astype(size.dtype)) * size
+        at_first = jnp.arange(size.shape[axis])[:, None] == 0
+        rounding = jnp.where(at_first, 0.0, rounding)
+        return jnp.maximum(SHARE * jnp.maximum(difference, left * so_far), rounding)
 
     return replace(motion, error=(estimate(motion.q, beside.q), estimate(motion.v, beside.v)))

@@ -151,7 +151,8 @@ def simulate(
         estimate_error: whether to solve once more with a tenth of the tolerance and, where there
             is one, a method of higher order, or else with half the step dt, and give in
             `motion.error` what follows for the errors of q and v at every row (of the same method,
-            up to every row): global ones, where rtol and atol bound those of a step.
+            up to every row; not below 32 eps sqrt(steps) |y|, what rounding leaves): global ones,
+            where rtol and atol bound those of a step.
         throw: raise `SimulationError` where a concrete result has a status other than ok.
 
     Raises:

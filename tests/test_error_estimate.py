@@ -51,6 +51,20 @@ def test_with_fixed_steps(exact, method, dt):
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
+def test_of_a_motion_that_is_exact_but_for_rounding():
+    """Free fall, a parabola: the difference of two motions says nothing, and may be 0."""
+    fall = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - p["g"] * q[0], ("x",))
+    ts = np.linspace(0.0, 8.0, 33)
+    motion = jl.simulate(fall, [10.0], [3.0], ts, {"g": 9.81}, estimate_error=True)
+    t = ts.astype(np.longdouble)
+    x, v = 10 + 3 * t - np.longdouble(9.81) / 2 * t**2, 3 - np.longdouble(9.81) * t
+    for found, exact, estimate in zip((motion.q, motion.v), (x, v), motion.error, strict=True):
+        error, estimate = np.abs(np.asarray(found)[:, 0] - exact), np.asarray(estimate)[:, 0]
+        assert np.all(estimate >= error / 3)
+        assert estimate[0] == 0.0
+        assert np.all(estimate <= 200 * EPS * np.max(np.abs(exact)))
+
+
 @pytest.mark.full
 def test_of_the_same_order_where_there_is_no_higher_one(exact):
     """Most are between 1 and 2; here the largest error so far is meant."""
