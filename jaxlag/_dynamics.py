@@ -5,10 +5,11 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
@@ -22,6 +23,7 @@ from jaxlag._inputs import (
     marked,
     reads_state,
 )
+from jaxlag._linalg import clearly_definite
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
@@ -53,7 +55,8 @@ class Dynamics(eqx.Module):
         formulation: how accelerations are solved for under constraints; "quasi" for a state of
             quasi-velocities.
         stabilization: "projection", a `Baumgarte`, or None.
-        regular: whether M is known to be positive definite without the constraints.
+        regular: whether M is positive definite without the constraints; None where that shows at
+            the start of a solve alone.
         apart: whether rows whose multipliers forces read are known to be independent.
         onwards: whether the method has stages beyond the end of a step.
     """
@@ -69,7 +72,7 @@ class Dynamics(eqx.Module):
     rows: Layout = eqx.field(static=True, default=NO_ROWS)
     formulation: str = eqx.field(static=True, default="multipliers")
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
-    regular: bool = eqx.field(static=True, default=False)
+    regular: bool | None = eqx.field(static=True, default=False)
     apart: bool = eqx.field(static=True, default=False)
     onwards: bool = eqx.field(static=True, default=False)
 
@@ -105,11 +108,11 @@ class Dynamics(eqx.Module):
         """The terms with constraints solved for as asked."""
         if self.quasi is not None:
             in_u = self.system.in_u
-            return replace(terms, quasi=self.quasi, in_u=in_u, regular=self.regular)
+            return replace(terms, quasi=self.quasi, in_u=in_u, regular=bool(self.regular))
         if not self.rows.size:
             return terms
         baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
-        known = {"regular": self.regular, "apart": self.apart}
+        known = {"regular": bool(self.regular), "apart": self.apart}
         return replace(terms, formulation=self.formulation, baumgarte=baumgarte, **known)
 
     @property
@@ -149,8 +152,30 @@ class Dynamics(eqx.Module):
             args = args._replace(senses=jax.lax.stop_gradient(senses))
         sense = self.turned(jnp.ones_like(tau), args)
         rows = args.kept, args.reacting
-        prepared = self.terms.prepare(q, params, values, self.sample, *rows, sense)
+        given = q, params, values, self.sample, *rows, sense
+        prepared = self.terms.prepare(*given)
+        either = self.regular is None and self.formulation != "null_space"
+        if either and isinstance(prepared, ScalarPrepared):
+            terms = self.terms
+            assert isinstance(terms, ScalarTerms)
+            alone = terms.regular().prepare(*given)
+            if isinstance(alone, ScalarPrepared):
+                definite = self._definite(t, q, v, params)
+                prepared = prepared._replace(definite=definite, alone=alone)
         return args._replace(prepared=prepared)
+
+    def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
+        """Whether M is positive definite without the constraints, in all lanes.
+
+        Looked at as by `System.mass_regular`; a lane without values is none to be careful for.
+        """
+        t, q, v, params = still((t, q, v, params))
+        elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
+        found = []
+        for at, rates in ((q, v), tuple(jnp.asarray(elsewhere, q.dtype))):
+            M = self.terms.mass(t, at, rates, params)
+            found.append(clearly_definite(M) | ~jnp.all(jnp.isfinite(M)))
+        return eqxi.unvmap_all(jnp.stack(found))
 
     def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
         """The rows to solve with; None where there are not several."""

@@ -114,6 +114,15 @@ def _eliminated(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.lax.fori_loop(0, n, one, M)
 
 
+def clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:
+    """Whether M is positive definite: its pivots, each over M_ii, are above eps^1/2."""
+    units = jnp.sqrt(jnp.abs(jnp.diagonal(M)))
+    units_or_one = jnp.where(units > 0, units, 1)
+    scaled = M / jnp.outer(units_or_one, units_or_one)
+    floor = float(jnp.finfo(M.dtype).eps) ** 0.5
+    return jnp.all(units > 0) & jnp.all(factor_mass(scaled, relative=floor).healthy)
+
+
 def _floor(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     return 4 * M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
 

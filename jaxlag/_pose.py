@@ -44,7 +44,7 @@ class Plan(NamedTuple):
     formulation: str
     stabilization: str | Baumgarte | None
     assemble: bool
-    regular: bool
+    regular: bool | None
     apart: bool
     keep: Keep
     auto: bool  # whether the method may be chosen by the structure of the system

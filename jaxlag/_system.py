@@ -222,16 +222,18 @@ class System(AbstractReactions):
         """Flat vector, shape (n,), from a dict of named values."""
         return self.coordinates.flatten(parts)
 
-    def mass_regular(self, params: Any, t: Any, q: Array, v: Array | None) -> bool:
+    def mass_regular(self, params: Any, t: Any, q: Array, v: Array | None) -> bool | None:
         """Whether M is positive definite for these params without the help of constraints.
 
         Looked at in the given state, where it is known, and in one other, as the mass of a link is
         zero everywhere or nowhere; where the state is traced and M depends on it, in some where
-        inertias vanish, as that of polar coordinates does at r = 0. False where the params have no
+        inertias vanish, as that of polar coordinates does at r = 0. None where the params have no
         values, since they are traced. Of use to a system with constraints alone.
         """
-        if not self.constraints or not _params.concrete(params):
+        if not self.constraints:
             return False
+        if not _params.concrete(params):
+            return None
         n = self.size
         states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
         v = jnp.zeros_like(q) if v is None else v
@@ -246,7 +248,7 @@ class System(AbstractReactions):
                 at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
                 M = _mass(self, _params.Static(static), *at, traced)
             if not _params.concrete(M):
-                return False  # the Lagrangian closes over a traced value
+                return None  # the Lagrangian closes over a traced value
             M = np.asarray(M, np.float64)
             units = np.sqrt(np.abs(np.diagonal(M)))
             if not np.all(units > 0) or not np.all(np.isfinite(M)):

@@ -379,6 +379,19 @@ def test_links_without_mass(formulation):
     traced = jax.jit(angle, static_argnums=0)(heavy, params)
     np.testing.assert_allclose(traced, expected, atol=1e-10)
 
+    @jax.jit
+    def swings(inertias):
+        """Of links of several inertias, and how it depends on them."""
+        of = lambda inertia: angle(heavy, {"m": 2.0, "I": inertia})  # noqa: E731
+        return jax.vmap(jax.value_and_grad(of))(inertias)
+
+    values, slopes = swings(jnp.array([0.0, 1e-4, 0.1]))
+    np.testing.assert_allclose(values[0], expected, atol=1e-10)
+    np.testing.assert_allclose(slopes[0], (values[1] - values[0]) / 1e-4, rtol=1e-3)
+    alone = swings(jnp.array([0.1, 0.1, 0.1]))  # M is definite in all of them
+    np.testing.assert_allclose(alone[0], values[2], atol=1e-10)
+    np.testing.assert_allclose(alone[1], slopes[2], atol=1e-8)
+
 
 # ---- Batches -------------------------------------------------------------------------------------
 

@@ -1,10 +1,13 @@
 """The scalar program behind the terms: every element of every array its own scalar."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
@@ -20,7 +23,15 @@ from jaxlag._terms import Terms
 
 
 class ScalarPrepared(NamedTuple):
-    """What each program needs of what does not change during a solve."""
+    """What each program needs of what does not change during a solve.
+
+    Where nobody knows while tracing whether M is positive definite without the constraints, there
+    are programs for both cases.
+
+    Attributes:
+        definite: whether it is, in all lanes.
+        alone: what the shorter programs for such a mass matrix need; None where it is known.
+    """
 
     acceleration: Array
     position: Array | None = None
@@ -29,6 +40,12 @@ class ScalarPrepared(NamedTuple):
     kick: Array | None = None
     lam: Array | None = None
     rates: Array | None = None
+    definite: Bool[Array, ""] | None = None
+    alone: "ScalarPrepared | None" = None
+
+
+_WITH_INPUTS = ("acceleration", "lam")
+_BY_MASS = ("acceleration", "lam", "shift", "kick")  # where M is divided by
 
 
 class ScalarTerms(Terms):
@@ -130,8 +147,7 @@ class ScalarTerms(Terms):
         prepared: ScalarPrepared,
     ) -> Array:
         """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
-        program = self._equations(q, params, inputs).program
-        return self._run(program, prepared.acceleration, t, q, v, inputs)
+        return self._run("acceleration", t, q, v, params, inputs, prepared)
 
     def velocities(
         self,
@@ -143,21 +159,38 @@ class ScalarTerms(Terms):
         prepared: ScalarPrepared,
     ) -> Array:
         """v at (q, u) of quasi-velocities."""
-        code = self._equations(q, params, inputs).velocity
-        assert code is not None
-        return self._run(code, prepared.rates, t, q, u, {})
+        return self._run("rates", t, q, u, params, inputs, prepared)
 
     def _run(
         self,
-        program: Program,
-        carried: Array | None,
+        name: str,
         t: Array,
         q: Array,
         v: Array,
+        params: Any,
         inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
     ) -> Array:
-        assert carried is not None
-        return _emit.body(program, carried, t, q, v, inputs, self.lanes, self.in_loop)
+        """The results of one of the programs, whose prelude has this name."""
+
+        def by(terms: "ScalarTerms", prepared: ScalarPrepared) -> Array:
+            program = terms._equations(q, params, inputs).code(name)
+            carried = getattr(prepared, name)
+            assert program is not None
+            assert carried is not None
+            read = inputs if name in _WITH_INPUTS else {}
+            return _emit.body(program, carried, t, q, v, read, terms.lanes, terms.in_loop)
+
+        # Equations in quasi-velocities are projected: of them the projection alone divides by M.
+        projected = self.array.quasi is not None and name == "acceleration"
+        if prepared.alone is None or name not in _BY_MASS or projected:
+            return by(self, prepared)
+        alone = partial(by, self.regular(), prepared.alone)
+        return lax.cond(prepared.definite, alone, partial(by, self, prepared))
+
+    def regular(self) -> "ScalarTerms":
+        """The same where M is positive definite without the constraints."""
+        return replace(self, array=replace(self.array, regular=True))
 
     def _equations(self, q: Array, params: Any, inputs: Mapping[str, Any]) -> Equations:
         equations = self.lowered(q, params, inputs).equations
@@ -177,21 +210,22 @@ class ScalarTerms(Terms):
         code = self._equations(q, params, inputs).surface
         assert code is not None
 
-        def columns(program: Program, carried: Any) -> Callable:
-            K = self._run(program, carried, t, q, v, {}).reshape(-1, q.shape[0])
+        def run(name: str, q: Array, v: Array) -> Array:
+            return self._run(name, t, q, v, params, inputs, prepared)
+
+        def columns(name: str) -> Callable:
+            K = run(name, q, v).reshape(-1, q.shape[0])
             return lambda c: jnp.sum(c[:, None] * K, axis=0)
 
         def position(q: Array) -> Array:
-            return self._run(code.position, prepared.position, t, q, v, {})
+            return run("position", q, v)
 
-        def velocity(q: Array, v: Array) -> Array:
-            return self._run(code.velocity, prepared.velocity, t, q, v, {})
-
-        shift = columns(code.shift, prepared.shift)
+        shift = columns("shift")
         if self.array.quasi is not None:
             return Surface(position, None, shift, None)
-        kick = shift if code.kick is None else columns(code.kick, prepared.kick)
-        return Surface(position if code.position.results else None, velocity, shift, kick)
+        kick = shift if code.kick is None else columns("kick")
+        held = position if code.position.results else None
+        return Surface(held, partial(run, "velocity"), shift, kick)
 
     def multipliers(
         self,
@@ -203,10 +237,7 @@ class ScalarTerms(Terms):
         prepared: ScalarPrepared,
     ) -> Array:
         """The multipliers that forces depend on, at (q, v)."""
-        surface = self._equations(q, params, inputs).surface
-        assert surface is not None
-        assert surface.lam is not None
-        return self._run(surface.lam, prepared.lam, t, q, v, inputs)
+        return self._run("lam", t, q, v, params, inputs, prepared)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any

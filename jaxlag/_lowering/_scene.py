@@ -71,3 +71,8 @@ class Equations(NamedTuple):
     surface: Surface | None = None
     lam: list[Node] | None = None
     velocity: Program | None = None
+
+    def code(self, name: str) -> Program | None:
+        """The code whose prelude has this name in `ScalarPrepared`."""
+        own = {"acceleration": self.program, "rates": self.velocity}
+        return own[name] if name in own else getattr(self.surface, name)

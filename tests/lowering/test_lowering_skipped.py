@@ -112,9 +112,7 @@ def prelude(case):
 def evaluation(case, regular=False):
     """The operations of one acceleration inside a solve; whether M is known to be regular."""
     system, params, q, inputs = case
-    terms = system.terms
-    if regular:
-        terms = replace(terms, array=replace(terms.array, regular=True))
+    terms = system.terms.regular() if regular else system.terms
     prepared = terms.prepare(q, params, inputs)
 
     def acceleration(prepared, params, t, q, v, inputs):
@@ -166,6 +164,19 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
     assert count(program, "div") <= divisions
     assert names(program) <= SCALAR | PACKING | {"ne"}  # the rows that are solved with
     assert max(len(shape) for o in program for shape in o.shapes) <= 1
+
+
+@pytest.mark.parametrize("definite", [True, False])
+def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
+    """The other one is not read: it is poisoned."""
+    system, params, q, _ = case("double_pendulum_cartesian")
+    terms, given = system.terms, (jnp.zeros(()), q, 0.1 * q, params, {})
+    longer, shorter = (x.prepare(q, params, {}) for x in (terms, terms.regular()))
+    expected = terms.acceleration(*given, longer)
+    poison = lambda unread: jax.tree.map(lambda x: jnp.nan * x, unread)  # noqa: E731
+    longer, shorter = (poison(longer), shorter) if definite else (longer, poison(shorter))
+    either = longer._replace(definite=jnp.array(definite), alone=shorter)
+    np.testing.assert_allclose(terms.acceleration(*given, either), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
