@@ -260,7 +260,11 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     attempted = c.attempted + active.astype(jnp.int32)
     arrived = take & (t1 >= times.stop)
     failure = jnp.full((), int(Status.step_below_resolution))
+    smooth = jnp.array(True)
+    if c.rows is not None:
+        smooth = ~to_row | scheme.is_smooth(begin.y, y1, error)
     for right, kind in (
+        (smooth | (not scheme.moves), Status.projection_failed),
         (verdict.pressed, Status.no_reaction_solution),
         (verdict.closed, Status.rank_change),
         (verdict.found, Status.projection_failed),
@@ -278,7 +282,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         if rows.turns is None:  # for derivatives a row must move with its own time
             to_row = to_row | (take & (jnp.abs(due - t1) <= resolution(t1)))
         slot = jnp.where(to_row, rows.next, times.saves.shape[0] - 2)
-        value = jax.tree.map(lambda y: jnp.where(good, y, jnp.nan), settled)
+        value = jax.tree.map(lambda y: jnp.where(good & smooth, y, jnp.nan), settled)
         turns = rows.turns
         if turns is not None:
             # The slot after the last row is that of nothing: it stays beyond all turns.
@@ -290,7 +294,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
             next=rows.next + to_row.astype(jnp.int32),
             values=put(rows.values, slot, value),
             turns=turns,
-            missed=jnp.where(to_row & ~good, failure, rows.missed).astype(jnp.int32),
+            missed=jnp.where(to_row & ~(good & smooth), failure, rows.missed).astype(jnp.int32),
         )
 
     passed = t1 >= goal - slack

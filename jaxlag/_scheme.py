@@ -18,6 +18,8 @@ from jaxlag._step import Verdict
 from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
 
+_SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
+
 
 class Scheme(eqx.Module):
     """How one step is taken and the next one chosen; with no controller steps are fixed."""
@@ -125,6 +127,22 @@ class Scheme(eqx.Module):
             memory = jax.tree.map(partial(jnp.where, jump), fresh, memory)
         y1, error, _, memory, result = self.solver.step(self.term, t0, t1, y, args, memory, jump)
         return y1, error, memory, result == diffrax.RESULTS.successful
+
+    def is_smooth(self, y0: PyTree, y1: PyTree, error: PyTree) -> Bool[Array, ""]:
+        """Whether a step that no control rejects, to a row, went through a smooth field.
+
+        It is part of one that was accepted: an error estimate of a thousand times what is allowed
+        is that of a field which is singular, or jumps, where the row lies.
+        """
+        controller: Any = self.controller
+        if error is None or not isinstance(controller, diffrax.PIDController):
+            return jnp.array(True)
+
+        def small(y0: Array, y1: Array, error: Array) -> Array:
+            allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+            return jnp.all(jnp.abs(error) <= _SINGULAR * allowed)
+
+        return jax.tree.reduce(jnp.logical_and, jax.tree.map(small, y0, y1, error))
 
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False

@@ -28,6 +28,7 @@ from mechanisms import (
 )
 
 import jaxlag as jl
+from systems._catalogue import ENTRIES
 
 EPS = np.finfo(float).eps
 TS = np.linspace(0.0, 1.5, 7)
@@ -337,6 +338,22 @@ def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
     assert found.status == jl.Status.rank_change
     assert "('pin[0]')" in found.message()
     np.testing.assert_allclose(found.last_state[0], [np.pi, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.full
+def test_a_row_at_a_change_point_is_none():
+    """A parallelogram folded flat at t = 2: steps pass by, and velocities there are anything."""
+    entry = ENTRIES["four_bar"]
+    params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
+    q0, ts = np.array([2.0, 0.0, 2.0 - np.pi]), np.linspace(0.0, 4.0, 41)
+    found = jl.simulate(entry.system, q0, [-1.0, 0.0, -1.0], ts, params, throw=False)
+    expected = q0 - ts[:, None] * np.array([1.0, 0.0, 1.0])
+    assert found.status in (jl.Status.rank_change, jl.Status.projection_failed)
+    told = np.isfinite(np.asarray(found.q)).all(axis=1)
+    assert told[:20].all()
+    assert not told[20]
+    np.testing.assert_allclose(found.q[told], expected[told], atol=1e-9)
+    np.testing.assert_allclose(found.v[told], expected[told] * 0 + [-1.0, 0.0, -1.0], atol=1e-8)
 
 
 # ---- Links without mass --------------------------------------------------------------------------

@@ -439,6 +439,25 @@ def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
     np.testing.assert_allclose(forwards, slopes, rtol=1e-12)
 
 
+@pytest.mark.parametrize("derivatives", [False, True])
+def test_a_row_where_the_force_is_singular_is_none(derivatives):
+    """A spike that steps pass by and the step to a row meets: nothing is made up there."""
+    spike = jl.Function(lambda t: jnp.where(jnp.abs(t - 0.5) < 1e-9, 1e6, 0.0))
+    ts = np.array([0.0, 0.5, 1.0])
+
+    def rows(x0):
+        motion = moved(spike, ts, (x0, 0.0), {"k": 1.0}, method="dopri8")
+        return motion.q[:, 0], motion
+
+    if derivatives:
+        x, _, motion = jax.vjp(rows, 1.0, has_aux=True)
+    else:
+        x, motion = rows(1.0)
+    np.testing.assert_allclose(x[np.array([0, 2])], np.cosh(ts[::2]), rtol=1e-9)
+    assert np.isnan(x[1])
+    assert motion.status == jl.Status.step_below_resolution
+
+
 def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
     """Stepped over without a word of it; met by steps no longer than itself."""
     wide = jl.Function(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
