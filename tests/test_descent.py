@@ -89,7 +89,7 @@ def test_a_network_in_the_potential_is_found():
     )
     assert len(found.names) == 8 + 8 + 8 + 1
     worse, better = (x.predict(held_out, settle=0.3).rms("x")[0] for x in (plain, found))
-    assert better < 0.3 * worse  # measured 0.12; after more epochs it overfits
+    assert better < 0.2 * worse  # measured 0.12; after more epochs it overfits
     motion = jl.simulate(jl.System(both, ("x",)), [0.8], [0.0], ts, found.params, rtol=1e-10)
     energy = np.asarray(motion.energy)
     np.testing.assert_allclose(energy, energy[0], atol=1e-7)
