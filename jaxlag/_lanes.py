@@ -3,6 +3,10 @@
 On CPU a loop over a few numbers at once is compiled to vector instructions, one over thousands
 to a traversal of memory for every operation. A vmapped solve is therefore run in chunks of
 trajectories, one chunk after another, each by one loop that ends with its last trajectory.
+
+XLA splits large operations among threads, and a loop in which equations are solved for thousands
+of trajectories can wait for its own threads for ever (jaxlib 0.10.2; never seen on one thread,
+nor with matrices of 1e5 numbers in all). Chunks of implicit methods stay far below that.
 """
 
 from collections.abc import Callable
@@ -16,17 +20,28 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
 LANES = 16
+MOST = 64  # trajectories of an implicit method
+NUMBERS = 2**14  # of all their Jacobians of the vector field
 
 
-def in_lanes(single: Callable, vmapped: Callable, *args: PyTree) -> PyTree:
+def at_once_implicit(size: int) -> int:
+    """How many trajectories of `size` numbers an implicit method takes in one loop."""
+    return max(1, min(MOST, NUMBERS // size**2))
+
+
+def in_lanes(
+    single: Callable, vmapped: Callable, *args: PyTree, at_once: int = LANES, even: bool = False
+) -> PyTree:
     """single(*args), and under `jax.vmap` chunks of `vmapped`.
 
     No derivative is taken: that of the results is zero.
 
     Args:
         single: of arrays, returns arrays.
-        vmapped: the same function, in the form to be vmapped over up to LANES trajectories.
+        vmapped: the same function, in the form to be vmapped over up to `at_once` trajectories.
         args: pytrees of arrays.
+        at_once: the largest chunk.
+        even: whether chunks may be smaller to be equal.
     """
 
     @jax.custom_jvp
@@ -45,13 +60,13 @@ def in_lanes(single: Callable, vmapped: Callable, *args: PyTree) -> PyTree:
     @batched.def_vmap
     def _(size: int, mapped: list, args: tuple) -> tuple:
         own, shared = eqx.partition(args, mapped[0])
-        results = _batch(vmapped, size)(own, shared)
+        results = _batch(vmapped, size, at_once, even)(own, shared)
         return results, jax.tree.map(lambda _: True, results)
 
     return constant(args)
 
 
-def _batch(vmapped: Callable, size: int) -> Callable:
+def _batch(vmapped: Callable, size: int, at_once: int, even: bool) -> Callable:
     """(own, shared) -> results of `size` trajectories; own leaves have one row for each.
 
     A further vmap makes more rows.
@@ -62,7 +77,7 @@ def _batch(vmapped: Callable, size: int) -> Callable:
         def one(own: PyTree) -> PyTree:
             return vmapped(*eqx.combine(own, shared))
 
-        return in_batches(one, own, size, LANES, even=False)
+        return in_batches(one, own, size, at_once, even)
 
     @rows.def_vmap
     def _(outer: int, mapped: list, own: PyTree, shared: PyTree) -> tuple:
@@ -75,7 +90,7 @@ def _batch(vmapped: Callable, size: int) -> Callable:
 
         more, fewer = eqx.partition(shared, mapped[1])
         own = eqx.combine(jax.tree.map(flat, own, mapped[0]), jax.tree.map(spread, more))
-        results = _batch(vmapped, outer * size)(own, fewer)
+        results = _batch(vmapped, outer * size, at_once, even)(own, fewer)
         results = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), results)
         return results, jax.tree.map(lambda _: True, results)
 

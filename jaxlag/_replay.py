@@ -18,7 +18,7 @@ from jaxlag import _xla
 from jaxlag._again import again
 from jaxlag._drive import drive
 from jaxlag._gradient import GradientMode, Keep
-from jaxlag._lanes import in_lanes, lanes_first, zero_tangent
+from jaxlag._lanes import LANES, at_once_implicit, in_lanes, lanes_first, zero_tangent
 from jaxlag._record import Outcome, Times
 from jaxlag._status import Status
 from jaxlag._variations import Setup, changed, changes, filled, in_loops, path_of, unpack
@@ -131,7 +131,7 @@ def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
 
 
 def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) -> Outcome:
-    """The loop of steps; of scalar programs, where they are vmapped, in chunks."""
+    """The loop of steps; of scalar programs and implicit methods, vmapped, in chunks."""
 
     def single(inexact: Any, rest: Any, setup: Setup, lanes: bool = False) -> Outcome:
         y0, args, times, scheme, max_steps = unpack(inexact, rest, setup, static)
@@ -144,10 +144,13 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
         native = None if fast is None else _xla.native
         return drive(fast or scheme, y0, args, times, *rest_of_it, native)
 
-    scheme = unpack(inexact, rest, setup, static)[3]
-    if scheme.on_scalars() is None or jax.default_backend() != "cpu":
+    y0, _, _, scheme, _ = unpack(inexact, rest, setup, static)
+    on_scalars = scheme.on_scalars() is not None
+    if jax.default_backend() != "cpu" or not (on_scalars or scheme.implicit):
         return single(inexact, rest, setup)
-    return in_lanes(single, partial(single, lanes=True), inexact, rest, setup)
+    at_once = LANES if on_scalars else at_once_implicit(y0.size)
+    chunks = partial(in_lanes, at_once=at_once, even=not on_scalars)
+    return chunks(single, partial(single, lanes=True), inexact, rest, setup)
 
 
 def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> Rows:

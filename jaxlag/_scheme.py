@@ -40,6 +40,11 @@ class Scheme(eqx.Module):
         return remembers(self.solver)
 
     @property
+    def implicit(self) -> bool:
+        """Whether equations may be solved in a step."""
+        return not isinstance(self.solver, AbstractExplicit | Splitting | diffrax.AbstractERK)
+
+    @property
     def standard(self) -> bool:
         """Whether steps are fixed or chosen by diffrax's own control, not a variant of it."""
         return self.controller is None or type(self.controller) is diffrax.PIDController
@@ -79,7 +84,7 @@ class Scheme(eqx.Module):
         at rest alone and by what turns or grows.
         """
         controller: Any = self.controller
-        explicit = isinstance(self.solver, AbstractExplicit | diffrax.AbstractERK)
+        explicit = not self.implicit
         bounded = type(controller) is diffrax.PIDController and controller.dtmax is None
         if not bounded or not (explicit or jax.default_backend() == "cpu"):
             return self

@@ -121,6 +121,15 @@ def test_chunks_are_what_is_compiled(lowering):
         assert all(shape[0] == 37 for shape in rows)
 
 
+def test_chunks_of_implicit_methods():
+    """130 trajectories in 3 loops of 44, whatever the equations are computed on."""
+    many = jax.vmap(lambda q0: run(q0, method="gauss2").q)
+    program = operations(many, starts(130), turns=1)
+    rows = {s for o in program if "while" in o.inside and o.name == "lu" for s in o.shapes}
+    assert rows
+    assert all(shape[0] == 44 for shape in rows if len(shape) > 2)
+
+
 @pytest.mark.parametrize("lanes", [3, _lanes.LANES + 1])
 @pytest.mark.parametrize("dtype", [float, np.int32])
 def test_rows_are_put_where_each_lane_says(lanes, dtype):

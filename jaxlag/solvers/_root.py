@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import lu_factor, lu_solve
+from jaxtyping import PyTree
 
 MOST, EACH = 8, 12  # derivatives taken anew, iterations with each
 MEMORY = 3  # iterations in which increments halve while they fall
@@ -16,10 +18,11 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
     """(z with residual(z) = 0, whether it was found), by Newton's method with the derivative kept.
 
     Iterates until no component's increment falls any more: increments are roundings then, so that
-    no tolerance adds an error of one sign in every step. If they are not small beside z by
-    themselves, as near an equilibrium, where z is all rounding, the derivative is taken anew: where
-    it is what it was, the iteration contracts, and what does not fall is noise. Slow iterations go
-    on with the new derivative.
+    no tolerance adds an error of one sign in every step. Roundings may fall again by chance: where
+    all increments are small, a component that stopped has stopped. If they are not small beside z
+    by themselves, as near an equilibrium, where z is all rounding, the derivative is taken anew:
+    where it is what it was, the iteration contracts, and what does not fall is noise. Slow
+    iterations go on with the new derivative.
 
     The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr, forward, reverse, and forward
     over reverse to any order; reverse over reverse through a loop of steps JAX refuses.
@@ -33,18 +36,22 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
     Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.6 (iterations until
     convergence, and their round-off).
     """
-    function, given = jax.closure_convert(residual, guess)
+    # All that it closes over, truth values too, which `jax.closure_convert` leaves where they are.
+    given, static = eqx.partition(eqx.filter_closure_convert(residual, guess), eqx.is_array)
+
+    def function(z: Array, given: PyTree) -> Array:
+        return eqx.combine(given, static)(z)
 
     @jax.custom_jvp
-    def solve(guess: Array, rounded: Array, given: list) -> tuple[Array, Array]:
-        return _solved(lambda z: function(z, *given), guess, rounded)
+    def solve(guess: Array, rounded: Array, given: PyTree) -> tuple[Array, Array]:
+        return _solved(lambda z: function(z, given), guess, rounded)
 
     @solve.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple:
         given = primals[2]
         z, found = solve(*primals)
-        r_dot = jax.jvp(lambda given: function(z, *given), (given,), (tangents[2],))[1]
-        slope = jax.jacfwd(lambda z: function(z, *given))(z)
+        r_dot = jax.jvp(lambda given: function(z, given), (given,), (tangents[2],))[1]
+        slope = jax.jacfwd(lambda z: function(z, given))(z)
         return (z, found), (-jnp.linalg.solve(slope, r_dot), jnp.zeros_like(found))
 
     z, found = solve(guess, rounded, given)
@@ -60,22 +67,23 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
         """(z, whether increments stopped falling, whether they are small)."""
 
         def turn(carry: tuple) -> tuple:
-            z, least, _, _, k = carry
+            z, least, stopped, was_small, k = carry
             change = lu_solve(factor, residual(z))
             z, size = z - change, jnp.abs(change[:count])
             scale = jnp.abs(z[:count]) + rounded
             new = jnp.minimum(least[-1], size)
-            stopped = (size <= 4 * eps * scale) | ~(new < 0.5 * least[0])
             small = jnp.all(size <= eps**0.75 * scale)
-            return z, jnp.stack([*least[1:], new]), jnp.all(stopped), small, k + 1
+            stopped = stopped & was_small & small
+            stopped = stopped | (size <= 4 * eps * scale) | ~(new < 0.5 * least[0])
+            return z, jnp.stack([*least[1:], new]), stopped, small, k + 1
 
         def goes_on(carry: tuple) -> Array:
-            return ~carry[2] & (carry[4] < EACH)
+            return ~jnp.all(carry[2]) & (carry[4] < EACH)
 
         unknown = jnp.full((MEMORY, count), jnp.inf, guess.dtype)
-        begin = (z, unknown, no, no, zero)
+        begin = (z, unknown, jnp.zeros(count, bool), no, zero)
         z, _, stopped, small, _ = jax.lax.while_loop(goes_on, turn, begin)
-        return z, stopped & jnp.all(jnp.isfinite(z)), small
+        return z, jnp.all(stopped) & jnp.all(jnp.isfinite(z)), small
 
     def anew(carry: tuple) -> tuple:
         z, slope, _, k = carry
