@@ -40,3 +40,15 @@ def angles(ts=TS, q0=1.0, seed=0, noise=NOISE, **options):
 def experiment(**options):
     """One recording of the true pendulum."""
     return jl.Experiment(TS, {"x": angles()}, **options)
+
+
+def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
+    start = TRUE | {"l": 0.5, "c": 0.02} if params0 is None else params0
+    return jl.fit(system, data, start, free=free, **(OPTIONS | options))
+
+
+def within(found, names, deviations=3.5):
+    """Estimates within so many of their own standard deviations of the truth."""
+    for name in names:
+        assert found.std[name] < 0.05 * TRUE[name]
+        assert abs(found.params[name] - TRUE[name]) < deviations * found.std[name], name

@@ -3,23 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _measured import NOISE, OPTIONS, TRUE, TS, angles, driven, experiment, pendulum
+from _measured import NOISE, OPTIONS, TRUE, TS, angles, driven, experiment, fit, pendulum, within
 from _silence import no_warning
 
 import jaxlag as jl
-from jaxlag import _shooting
-
-
-def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
-    start = TRUE | {"l": 0.5, "c": 0.02} if params0 is None else params0
-    return jl.fit(system, data, start, free=free, **(OPTIONS | options))
-
-
-def within(found, names, deviations=3.5):
-    """Estimates within so many of their own standard deviations of the truth."""
-    for name in names:
-        assert found.std[name] < 0.05 * TRUE[name]
-        assert abs(found.params[name] - TRUE[name]) < deviations * found.std[name], name
 
 
 @pytest.mark.full
@@ -141,40 +128,6 @@ def test_priors_decide_what_measurements_do_not():
 
 
 @pytest.mark.full
-def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
-    plain = fit(experiment())
-    held = fit(experiment(), transforms={"l": jl.Positive(), "c": jl.Bounded(0.0, 1.0)})
-    np.testing.assert_allclose(held.values, plain.values, rtol=1e-4)
-    np.testing.assert_allclose(held.covariance, plain.covariance, rtol=1e-3)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("start", [1e-6, 1e-12, 1e-18])
-def test_a_search_does_not_depend_on_the_size_that_a_number_starts_at(start):
-    plain = fit(experiment())
-    with no_warning():
-        found = fit(experiment(), ("l", "c"), TRUE | {"l": 0.69, "c": start})
-    np.testing.assert_allclose(found.values, plain.values, atol=1e-3 * plain.std["c"])
-    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-3)
-
-
-@pytest.mark.full
-def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
-    """From a third, so that rounding would show; and a search that begins there leaves it again."""
-    bound = jl.Bounded(0.1 + 0.2, 1.0)
-    with pytest.warns(UserWarning, match="c ended on its bound"):
-        found = fit(
-            experiment(), params0=TRUE | {"l": 0.5, "c": 0.7 / 0.9}, transforms={"c": bound}
-        )
-    assert float(found.params["c"]) == 0.1 + 0.2
-    with pytest.warns(UserWarning, match="c starts on its bound"):
-        again = fit(
-            experiment(), params0=found.params, transforms={"c": jl.Bounded(0.0, 0.1 + 0.2)}
-        )
-    within(again, ("l", "c"))
-
-
-@pytest.mark.full
 def test_a_search_that_errors_of_the_solver_stop_is_said():
     """Dry friction, whose steep change of sign steps at 1e-5 pass over now and then."""
     dry = jl.GeneralizedForce(lambda t, q, v, p: -p["f"] * jnp.tanh(v / 0.02), "dry")
@@ -195,68 +148,6 @@ def test_a_search_that_errors_of_the_solver_stop_is_said():
         assert abs(found.params[name] - true[name]) < 3.5 * found.std[name]
 
 
-@pytest.mark.full
-def test_without_bounds_no_box_is_compiled(monkeypatch):
-    """Numbers that may go anywhere take plain steps of least squares."""
-
-    def box(*_):
-        raise AssertionError("a box")
-
-    monkeypatch.setattr(_shooting, "box_least_squares", box)
-    data = experiment().part(slice(0, 77))  # of a shape that no other test has compiled
-    fit(data)
-    with pytest.raises(AssertionError, match="a box"):
-        fit(data, transforms={"l": jl.Positive()})
-
-
-BOUNDS = [jl.Bounded(0.1, 1.0), jl.Bounded(0.1, np.inf)]
-
-
-@pytest.mark.parametrize(
-    "bounds", [BOUNDS[0], pytest.param(BOUNDS[1], marks=pytest.mark.full)], ids=["both", "one"]
-)
-def test_a_parameter_that_ends_on_its_bound_is_named_and_the_others_are_known(bounds):
-    """As where it is held there; the truth is below."""
-    data, start = experiment(sigma={"x": NOISE}), TRUE | {"l": 0.5, "c": 0.3}
-    with pytest.warns(UserWarning, match=r"c ended on its bound, 0\.1: widen the bound, or leave"):
-        found = fit(data, params0=start, transforms={"c": bounds})
-    held = fit(data, ("l",), TRUE | {"l": 0.5, "c": 0.1})
-    assert found.converged
-    assert found.on_bound == ("c",)
-    assert held.on_bound == found.unused == found.unidentifiable == ()
-    np.testing.assert_allclose(found.params["c"], 0.1, rtol=1e-15)
-    np.testing.assert_allclose(found.params["l"], held.params["l"], atol=1e-4 * held.std["l"])
-    np.testing.assert_allclose(found.std["l"], held.std["l"], rtol=1e-4)
-    assert np.isnan(found.std["c"])
-    assert "on its bound" in str(found)
-
-
-@pytest.mark.full
-def test_a_parameter_comes_back_from_its_bound():
-    """It starts there, or is driven there by a length that is far off."""
-    bounds = {"c": jl.Bounded(0.0, np.inf)}
-    with pytest.warns(UserWarning, match=r"c starts on its bound\."):
-        found = fit(experiment(), params0=TRUE | {"l": 0.5, "c": 0.0}, transforms=bounds)
-    within(found, ("l", "c"))
-    plain = fit(experiment())
-    np.testing.assert_allclose(found.values, plain.values, rtol=1e-5)
-    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-4)
-
-
-@pytest.mark.full
-def test_friction_that_is_not_there_ends_at_zero():
-    """Data of a pendulum without any: c goes to 0, the end of what is positive."""
-    motion = jl.simulate(pendulum, [1.0], [0.0], TS, TRUE | {"c": 0.0}, rtol=1e-11, atol=1e-11)
-    # Noise that would have it negative.
-    y = np.asarray(motion["x"]) * (1.0 + 2e-3 * TS)
-    start = TRUE | {"l": 0.5, "c": 0.3}
-    with pytest.warns(UserWarning, match=r"c ended on its bound, .*e-\d+: widen the bound"):
-        found = fit(jl.Experiment(TS, {"x": y}), params0=start, transforms={"c": jl.Positive()})
-    assert found.converged
-    assert 0.0 < found.params["c"] < 1e-5
-    np.testing.assert_allclose(found.params["l"], TRUE["l"], rtol=1e-2)
-
-
 def test_motions_are_counted():
     data = experiment(sigma={"x": NOISE})
     found = fit(data.windows(1.0))
@@ -270,17 +161,6 @@ def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
     assert exact.std["l"] < free.std["l"]
     rough = fit(experiment(q0=[1.1], v0=[0.0], start_sigma=1e-6))
     np.testing.assert_allclose(rough.starts[0], [1.1, 0.0], atol=1e-4)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
-def test_outliers_count_for_less(loss):
-    y = angles()
-    y[::10] += 0.3
-    data = jl.Experiment(TS, {"x": y}, sigma={"x": NOISE})
-    robust, plain = fit(data, loss=loss), fit(data)
-    off = [abs(found.params["l"] - TRUE["l"]) for found in (robust, plain)]
-    assert off[0] < 0.1 * off[1]
 
 
 @pytest.mark.full
@@ -340,124 +220,6 @@ def test_a_channel_that_is_not_finite_is_named():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("noise", [1e-4, 1e-7])
-def test_segments_are_one_motion_however_precise_measurements_are(noise):
-    """A spring; to a hundredth of the standard deviation."""
-    spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
-    ts = np.linspace(0.0, 10.0, 101)
-    x = 0.3 * np.cos(2.0 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
-    options = {"free": ("k",), "rtol": 1e-11, "atol": 1e-11, "tolerance": 1e-8}
-    data = jl.Experiment(ts, {"x": x})
-    one, many = (jl.fit(spring, data, {"k": 3.9}, segments=n, **options) for n in (1, 10))
-    assert abs(one.params["k"] - many.params["k"]) < 1e-2 * one.std["k"]
-    np.testing.assert_allclose(one.std["k"], many.std["k"], rtol=1e-3)
-    assert many.gap < 1e-2 * noise
-    np.testing.assert_allclose(one.freedom, many.freedom, atol=1e-6)
-
-
-@pytest.mark.full
-def test_a_number_that_is_zero_is_known_as_well_as_any():
-    """An offset whose truth is 0: its relative changes move nothing, it does."""
-    spring = jl.System(
-        lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * (q[0] - p["x0"]) ** 2, ("x",)
-    )
-    ts = np.linspace(0.0, 30.0, 301)
-    options = {"free": ("k", "x0"), "rtol": 1e-9, "atol": 1e-9}
-    start = {"k": 3.9, "x0": 0.01}
-    with no_warning():
-        found = jl.fit(spring, jl.Experiment(ts, {"x": 0.3 * np.cos(2 * ts)}), start, **options)
-    assert found.unidentifiable == found.unused == ()
-    assert abs(found.params["x0"]) < 1e-9
-    assert found.std["x0"] < 1e-9
-    noise = 1e-4
-    x = 0.3 * np.cos(2 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
-    found = jl.fit(spring, jl.Experiment(ts, {"x": x}), start, **options)
-    # Of the mean of independent measurements: k and the start swing, and share little of it.
-    np.testing.assert_allclose(found.std["x0"], noise / np.sqrt(len(ts)), rtol=0.1)
-    assert abs(found.params["x0"]) < 3.5 * found.std["x0"]
-
-
-@pytest.mark.full
-def test_starts_that_are_known_take_nothing_from_the_noise():
-    rng = np.random.default_rng(0)
-    ts = np.linspace(0.0, 1.0, 3)
-    data = [
-        jl.Experiment(
-            ts,
-            {"x": angles(ts, a, noise=0.0) + 0.01 * rng.normal(size=3)},
-            q0=[a],
-            v0=[0.0],
-            start_sigma=0.0,
-        )
-        for a in 0.5 + 0.02 * np.arange(40)
-    ]
-    found = fit(data, ("l",))
-    np.testing.assert_allclose(found.freedom, 119.0, atol=1e-6)
-    rows = np.concatenate([each["x"] for each in found.residuals])
-    np.testing.assert_allclose(found.noise["x"], np.sqrt(np.sum(rows**2) / 119), rtol=1e-3)
-
-
-@pytest.mark.full
-def test_starts_on_a_rod_are_two_numbers_each():
-    rng = np.random.default_rng(0)
-    rod = jl.System(
-        lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[1],
-        {"r": (2,)},
-        constraints=(jl.Holonomic(lambda t, q, p: q @ q - p["l"] ** 2, "rod"),),
-    )
-    ts = np.linspace(0.0, 0.3, 4)
-    data = []
-    for a in 0.5 + 0.05 * np.arange(10):
-        motion = jl.simulate(pendulum, [a], [0.0], ts, TRUE | {"c": 0.0})
-        x = np.asarray(motion["x"])
-        r = TRUE["l"] * np.stack([np.sin(x), -np.cos(x)], axis=1)
-        data.append(jl.Experiment(ts, {"r": r + 5e-3 * rng.normal(size=r.shape)}))
-    found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(found.freedom, 80 - 21, atol=1e-4)
-    # 59 numbers tell it to 9 %.
-    np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
-
-
-def test_a_prior_takes_part_of_what_it_tells():
-    """One that is as good as exact leaves nothing to be told."""
-    data = experiment(sigma={"x": NOISE})
-    free, known = (fit(data, ("l",), priors={"l": jl.Prior(0.7, s)}) for s in (1e3, 1e-9))
-    np.testing.assert_allclose(free.freedom, 151 - 3, atol=1e-3)
-    np.testing.assert_allclose(known.freedom, 151 - 2, atol=1e-3)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
-def test_outliers_are_not_noise(loss):
-    y = angles()
-    y[::10] += 0.3
-    found = fit(jl.Experiment(TS, {"x": y}), loss=loss)
-    np.testing.assert_allclose(found.noise["x"], NOISE, rtol=0.4)
-    assert abs(found.params["l"] - TRUE["l"]) < 4 * found.std["l"]
-
-
-def test_intervals_of_few_measurements_are_those_of_student():
-    found = fit(experiment().part(slice(0, 150, 30)), ("l",))
-    np.testing.assert_allclose(found.freedom, 2.0, atol=1e-6)
-    low, high = found.interval()["l"]
-    # The quantile 0.975 of Student's t with 2 degrees of freedom, from a table.
-    np.testing.assert_allclose(high - low, 2 * 4.3027 * found.std["l"], rtol=1e-4)
-    with pytest.raises(ValueError, match=r"level must be between 0 and 1, but it was 95.*0\.95"):
-        found.interval(95)
-
-
-@pytest.mark.full
-def test_columns_measured_by_turns():
-    two = jl.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * p["k"] @ q**2, {"q": (2,)})
-    noise = 1e-4 * np.random.default_rng(0).normal(size=(151, 2))
-    q = 0.3 * np.cos(np.outer(TS, [2.0, 1.5])) + noise
-    q[::2, 0] = q[1::2, 1] = np.nan
-    data = jl.Experiment(TS, {"q": q})
-    found = jl.fit(two, data, {"k": np.full(2, 3.0)}, free=("k",), **OPTIONS)
-    np.testing.assert_allclose(found.params["k"], [4.0, 2.25], rtol=1e-3)
-
-
-@pytest.mark.full
 def test_warnings_name_what_they_are_about():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
         fit(experiment(), params0=TRUE | {"c": 0.0}, transforms={"c": jl.Bounded(0.0, 1.0)})
@@ -478,34 +240,6 @@ def test_no_warning_without_reason():
         fit(experiment())
 
 
-@pytest.mark.full
-def test_windows_and_parts():
-    pieces = experiment().windows(1.0)
-    assert [len(piece.ts) for piece in pieces] == [50, 50, 50]
-    assert pieces[1].ts[0] == TS[50]
-    np.testing.assert_array_equal(pieces[2].channels["x"][:, 0], angles()[100:150])
-    found = fit(pieces)
-    within(found, ("l",))
-    assert len(found.starts) == 3
-    gap = jl.Experiment(np.concatenate([TS, TS + 10.0]), {"x": np.tile(angles(), 2)})
-    assert [piece.ts[0] for piece in gap.windows(1.5)] == [0.0, 1.5, 10.0, 10.5]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "message"),
-    [
-        (0, r"seconds must be a positive number, but it was 0"),
-        (np.nan, r"seconds must be a positive number, but it was nan"),
-        (-1, r"seconds must be a positive number, but it was -1"),
-        (4.0, r"at most the 3\.02 s of experiment, but it was 4"),
-        (0.03, r"seconds must be two samples or more, but it was 0\.03"),
-    ],
-)
-def test_bad_windows_are_named(seconds, message):
-    with pytest.raises(ValueError, match=message):
-        experiment().windows(seconds)
-
-
 @pytest.mark.parametrize(
     ("mean", "sigma", "message"),
     [
@@ -517,36 +251,6 @@ def test_bad_windows_are_named(seconds, message):
 def test_bad_priors_are_named(mean, sigma, message):
     with pytest.raises(ValueError, match=message):
         jl.Prior(mean, sigma)
-
-
-NAN = np.full(len(TS), np.nan)
-
-
-@pytest.mark.parametrize(
-    ("ts", "channels", "options", "message"),
-    [
-        (TS[::-1], {"x": TS}, {}, r"ts must increase strictly, but ts\[0\] = 3 and"),
-        (TS[:1], {"x": TS[:1]}, {}, r"one row of two times or more"),
-        (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one row per time, 151"),
-        (TS, {"x": NAN}, {}, r"channels\['x'\] must hold some numbers, but all were NaN"),
-        (TS, {}, {}, r"one channel or more"),
-        (TS, {"x": np.where(TS > 1, np.inf, TS)}, {}, r"finite, or NaN where nothing was measured"),
-        (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"sigma\['x'\] must be positive"),
-        (TS, {"x": TS}, {"sigma": {"x": np.inf}}, r"positive and finite, .* Write NaN into the"),
-        (
-            TS,
-            {"x": TS},
-            {"sigma": {"x": np.ones(3)}},
-            r"a number, 151 of them, or of shape \(151, 1",
-        ),
-        (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
-        (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"q0 must be \(n,\) numbers at ts\[0\]"),
-        (TS, {"x": TS}, {"start_sigma": 0.0}, r"come with the start it is about"),
-    ],
-)
-def test_a_bad_experiment_is_named(ts, channels, options, message):
-    with pytest.raises(ValueError, match=message):
-        jl.Experiment(ts, channels, **options)
 
 
 @pytest.mark.parametrize(
