@@ -7,7 +7,7 @@ import jax
 
 from jaxlag import _xla
 from jaxlag._constraints import Layout
-from jaxlag._lanes import LANES
+from jaxlag._lanes import LANES, MOST
 from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO
 from jaxlag._lowering import Equations, Lowered, Program, Structure, find
 from jaxlag.solvers import Dopri8
@@ -155,7 +155,8 @@ def _steps(lines: int | None) -> str:
 
 def _batches() -> str:
     return "batches       by jax.vmap: " + (
-        f"{LANES} trajectories at a time in one loop (explicit methods of jaxlag, without work)"
+        f"{LANES} trajectories at a time in one loop (explicit methods of jaxlag, without work), "
+        f"up to {MOST} by implicit methods"
         if jax.default_backend() == "cpu"
         else "all trajectories in one loop"
     )
