@@ -22,6 +22,13 @@ from jaxlag._lanes import LANES, in_batches
 Leaves = Sequence[Any]
 
 
+_TWICE = (
+    "Reverse derivatives of reverse derivatives must be taken through explicit methods: JAX does "
+    "not transpose the loops in which implicit ones solve their equations. Take second derivatives "
+    "forward over reverse, jax.hessian(f) or jax.jacfwd(jax.grad(f)), which all methods have."
+)
+
+
 @dataclass(frozen=True, eq=False)
 class LinearMap:
     """x -> A(r) x in four programs of (r, x) or (r, y), which close over no traced value.
@@ -122,7 +129,12 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
     def backward(residual: Leaves, y: Leaves) -> list:
         of, start = at(form.plain, residual)
         moved, x = start[: len(moving)], start[len(moving) :]
-        bars = list(jax.vjp(lambda *moved: of(*moved, *x), *moved)[1](list(y)))
+        try:
+            bars = list(jax.vjp(lambda *moved: of(*moved, *x), *moved)[1](list(y)))
+        except ValueError as error:
+            if "Reverse-mode differentiation does not work" in str(error):
+                raise ValueError(_TWICE) from error
+            raise
         return bars + (list(form.backward(list(residual[:count]), y)) if both else [])
 
     return LinearMap(

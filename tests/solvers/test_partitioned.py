@@ -392,3 +392,5 @@ def test_second_derivatives_forward_over_reverse():
     slope, h = jax.grad(last), 1e-4
     expected = (slope(1.0 + h) - slope(1.0 - h)) / (2 * h)
     np.testing.assert_allclose(jax.jacfwd(slope)(1.0), expected, rtol=0, atol=1e-7)
+    with pytest.raises(ValueError, match=r"forward over reverse, jax\.hessian\(f\)"):
+        jax.grad(slope)(1.0)
