@@ -1,7 +1,6 @@
 """System: the declaration of a mechanical system."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -356,10 +355,10 @@ class System(AbstractReactions):
         terms, lowered = self.terms, None
         if isinstance(terms, ScalarTerms):
             free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
-            array = ArrayTerms(self.lagrangian, free, self.constraints)
-            if self.quasi is not None:
-                array = replace(array, quasi=self.quasi, in_u=self.in_u)
-            terms = ScalarTerms(array, terms.limit)
+            whole = ArrayTerms(
+                self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self.in_u
+            )
+            terms = ScalarTerms(whole, terms.limit)
             lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
         return explain(self, self.structure(params, dtype), lowered, self.rows(params, dtype))
 
