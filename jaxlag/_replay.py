@@ -149,8 +149,8 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
     if jax.default_backend() != "cpu" or not (on_scalars or scheme.implicit):
         return single(inexact, rest, setup)
     at_once = LANES if on_scalars else at_once_implicit(y0.size)
-    chunks = partial(in_lanes, at_once=at_once, even=not on_scalars)
-    return chunks(single, partial(single, lanes=True), inexact, rest, setup)
+    vmapped, given = partial(single, lanes=True), (inexact, rest, setup)
+    return in_lanes(single, vmapped, *given, at_once=at_once, even=not on_scalars)
 
 
 def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> Rows:

@@ -7,12 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, expm
 from test_gradients import direction, dot
 
 import jaxlag as jl
 from jaxlag._gradient import choose_gradient, needed
-from jaxlag._scheme import _rate, _turning
 from systems._catalogue import find
 
 # Seconds that each runs for. Starts are assembled where they have to stay on constraints.
@@ -343,118 +341,3 @@ def test_every_transform():
     h = 1e-3
     by_differences = (second(starts[0, 0], p + h) - second(starts[0, 0], p - h)) / (2 * h)
     np.testing.assert_allclose(third, by_differences, rtol=1e-5)  # h^2 times the fifth, over it
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("form", ["auto", "array"])
-def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
-    """Error estimates see nothing there, and steps of any length would do for the motion.
-
-    Single, and beside a lane that moves. Tolerance 1e-9 over some ten steps.
-    """
-
-    def lagrangian(t, q, v, params):
-        c = jnp.cos(q[0] - q[1])
-        T = v[0] ** 2 + 0.5 * v[1] ** 2 + v[0] * v[1] * c
-        return T + params["g"] * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
-
-    system, params, t1 = jl.System(lagrangian, ("a", "b"), lowering=form), {"g": 9.81}, 3.0
-
-    def end(y0):
-        motion = jl.simulate(system, y0[:2], y0[2:], [0.0, t1], params)
-        return jnp.concatenate([motion.q[-1], motion.v[-1]]), motion.stats["accepted"]
-
-    M, K = np.array([[2.0, 1.0], [1.0, 1.0]]), 9.81 * np.diag([2.0, 1.0])
-    zero = np.zeros((2, 2))
-    flow = expm(t1 * np.block([[zero, np.eye(2)], [-np.linalg.solve(M, K), zero]]))
-    rest, moving = jnp.zeros(4), jnp.array([0.4, -0.2, 0.0, 0.1])
-    forward, count = jax.jacfwd(end, has_aux=True)(rest)
-    np.testing.assert_allclose(forward, flow, rtol=0, atol=1e-7)
-    assert count > end(rest)[1]
-    slope = jax.jit(jax.vmap(jax.jacrev(end, has_aux=True)))
-    lanes, counts = slope(jnp.stack([rest, moving]))
-    np.testing.assert_allclose(lanes[0], flow, rtol=0, atol=1e-7)
-    # A motion that error estimates see keeps its steps, whether or not it is differentiated.
-    assert list(counts) == [count, end(moving)[1]]
-
-
-def test_steady_motion_beside_a_pendulum_at_rest():
-    """Error estimates do not see a uniform motion either."""
-    system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 9.0 * jnp.cos(q[1]), ("x", "a"))
-
-    def angle(start):
-        return jl.simulate(system, [0.0, start], [1.0, 0.0], [0.0, 100.0], {}).q[-1, 1]
-
-    np.testing.assert_allclose(jax.jacfwd(angle)(0.0), np.cos(300.0), rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("start", [0.0, pytest.param(1e-9, marks=pytest.mark.full)])
-def test_a_slow_motion_beside_a_fast_one_at_rest(start):
-    """Two springs, of 0.1 and 10 rad/s: the fast one turns a hundred times unseen."""
-    system = jl.System(
-        lambda t, q, v, p: 0.5 * v @ v - 0.005 * q[0] ** 2 - 50.0 * q[1] ** 2, ("slow", "fast")
-    )
-
-    def fast(start):
-        return jl.simulate(system, jnp.stack([1.0, start]), [0.0, 0.0], [0.0, 10.0], {}).q[-1, 1]
-
-    np.testing.assert_allclose(jax.grad(fast)(start), np.cos(100.0), rtol=0, atol=1e-7)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("method", ["kvaerno3", "kvaerno5"])
-def test_implicit_methods_at_rest(method):
-    """They would step over swings that nobody sees, and damp them: theta'' = -4 sin theta."""
-    pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + 4.0 * jnp.cos(q[0]), ("a",))
-
-    def angle(v0):
-        motion = jl.simulate(pendulum, [0.0], [v0], [0.0, 10.0], {}, method=method)
-        return motion.q[-1, 0]
-
-    np.testing.assert_allclose(jax.grad(angle)(0.0), 0.5 * np.sin(20.0), rtol=0, atol=1e-6)
-
-
-@pytest.mark.full
-def test_implicit_methods_at_rest_step_over_what_decays():
-    """A dashpot of 1e6/s beside a spring: swings of 1 rad/s bound the steps, it does not."""
-    dashpot = jl.Rayleigh(lambda t, q, v, p: 0.5e6 * v[1] ** 2, "dashpot")
-    system = jl.System(
-        lambda t, q, v, p: 0.5 * v @ v - 0.5 * q[0] ** 2 - 5e3 * q[1] ** 2,
-        ("a", "b"),
-        forces=(dashpot,),
-    )
-
-    def end(a0):
-        q0 = jnp.stack([a0, 0.0])
-        motion = jl.simulate(system, q0, [0.0, 0.0], [0.0, 10.0], {}, method="kvaerno5")
-        return motion.q[-1, 0], motion.stats["accepted"]
-
-    slope, steps = jax.grad(end, has_aux=True)(0.0)
-    np.testing.assert_allclose(slope, np.cos(10.0), rtol=0, atol=1e-6)
-    assert steps < 1000
-
-
-def test_what_turns_and_what_decays():
-    """Eigenvalues +-3i and -1 +- 5i turn or nearly, -100 and -7 +- i decay, 2 grows."""
-
-    def block(real, imaginary):
-        return np.array([[real, imaginary], [-imaginary, real]])
-
-    def fastest(*blocks):
-        return float(_turning(jnp.asarray(block_diag(*blocks), float)))
-
-    np.testing.assert_allclose(fastest(block(0, 3), [[-100.0]]), 3.0, rtol=1e-12)
-    np.testing.assert_allclose(fastest(block(0, 3), block(-1, 5)), 26**0.5, rtol=1e-12)
-    np.testing.assert_allclose(fastest(block(-7, 1), [[2.0]]), 2.0, rtol=1e-12)
-    assert fastest([[-1.0]]) == 0.0
-    assert np.isnan(fastest([[np.nan]]))
-
-
-@pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 30.0, 1e4])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_fastest_rate(rate, dtype):
-    """In range though its 16th power is not; within the 16th root of the units' disparity."""
-    J = jnp.asarray([[0.0, 1.0, 0.0], [-(rate**2), 0.0, 0.0], [0.0, 0.0, 0.0]], dtype)
-    assert 0.9 * rate <= _rate(J)[0] <= max(rate, 1 / rate) ** (1 / 16) * 1.1 * rate
-    assert _rate(jnp.zeros((2, 2), dtype))[0] == 0.0
-    assert _rate(jnp.asarray([[0.0, 1.0], [0.0, 0.0]], dtype))[0] == 0.0

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _lowered import lowered
+from test_lowering_scalar import case
 
 import jaxlag as jl
+from bench._scenes import SCENES, links
 from jaxlag._lowering import _lower
 from systems import lamina_on_parabola, rigid_aircraft
 
@@ -131,3 +133,80 @@ def test_params_that_are_traced_need_not_be_known(module):
     params = jax.tree.map(jnp.asarray, dict(module.entry.example.params))
     jax.eval_shape(lambda params: found.append(lowered(module.system, params)), params)
     assert found[0].reason.startswith("equal to")
+
+
+# ---- The comparison before use -------------------------------------------------------------------
+
+
+def test_a_program_that_differs_is_not_used(monkeypatch):
+    """One sign flipped in h: the reason says so and the array program answers."""
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        right = derive(scene, eps, limit)
+        flipped = [scene.graph.scale(x, -1.0) for x in right.accelerations]
+        return right._replace(accelerations=flipped)
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.cos(q[0]), ("x",))
+    assert "differs from the array program" in system.explain({"k": 2.0})
+    a = system.acceleration({"k": 2.0}, [0.5], [0.0])
+    np.testing.assert_allclose(a, 2.0 * np.sin([0.5]), rtol=4 * EPS)
+
+
+def test_a_program_that_gives_nan_is_not_used(monkeypatch):
+    """Where the array program is finite; nan compares as smaller than nothing."""
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        right = derive(scene, eps, limit)
+        return right._replace(accelerations=[scene.graph.const(np.nan)])
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.sin(q[0]), ("x",))
+    assert "differs from the array program" in system.explain({"k": 2.0})
+
+
+def test_constrained_states_of_indefinite_mass_are_not_compared_at():
+    """Known params beside random ones, which may make M indefinite on what rows leave free."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * ((params["I"] - params["m"]) * v[0] ** 2 + v[1] ** 2) - q[0] * q[1]
+
+    row = jl.Holonomic(lambda t, q, p: q[1] - p["a"] * q[0] ** 2, ("parabola",))
+    system = jl.System(lagrangian, ("x", "y"), constraints=(row,))
+    assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
+
+
+def test_params_at_hand_are_compared_with():
+    """An inertia that random numbers would make indefinite."""
+    declared, params, q0, _ = case("lamina_two_forces_fixed_direction")
+
+    def fresh():
+        def lagrangian(t, q, v, params):
+            return declared.lagrangian(t, q, v, params)
+
+        return jl.System(lagrangian, declared.coordinates.shapes)
+
+    assert "equal to the array program at 12 random states" in fresh().explain(params)
+    simulated = fresh()
+    jl.simulate(simulated, q0, np.zeros(3), [0.0, 0.1], params)
+    assert "equal to the array program at 12 random states" in simulated.explain(params)
+
+
+@pytest.mark.full
+def test_too_many_operations_go_to_the_array_program():
+    scene = SCENES["chain_8"]
+    names = {"q": (8,)}
+    short = jl.System(scene.lagrangian, names)
+    assert "scalar program" in short.explain(dict(scene.params))
+    long = links(16)
+    system = jl.System(long.lagrangian, {"q": (16,)})
+    assert "array program (at least 1840 operations, more than 1500)" in system.explain(
+        dict(long.params)
+    )
+
+
+def test_bad_lowering_is_refused():
+    with pytest.raises(ValueError, match=r"^lowering must be 'auto', 'scalar' or 'array', but it"):
+        jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x",), lowering="fast")

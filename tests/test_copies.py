@@ -1,0 +1,68 @@
+"""How often a compiled motion and its gradient hold the equations."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import pytest
+from _jaxprs import operations
+
+import jaxlag as jl
+
+# ---- Copies of the equations ---------------------------------------------------------------------
+
+
+def _odd(t, q, v, params):
+    """A force with one operation that nothing else contains."""
+    return jax.lax.erf_inv(0.1 * jnp.sin(q)) - q
+
+
+def copies(lowering, function_of, size=2):
+    """How often the program of `function_of(system)` contains the force."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v + 0.1 * jnp.sum(jnp.cos(q[:, None] - q)) * v[0] ** 2
+
+    system = jl.System(
+        lagrangian,
+        {"x": (size,)},
+        forces=(jl.GeneralizedForce(_odd, "odd"),),
+        lowering=lowering,
+    )
+    program = operations(*function_of(system), turns=1)
+    return len([o for o in program if o.name == "erf_inv"])
+
+
+def motion_of(system, save=(), rows=11):
+    n = system.size
+
+    def run(q0):
+        ts = jnp.linspace(0.0, 1.0, rows)
+        motion = jl.simulate(system, q0, jnp.ones(n), ts, save=save, throw=False)
+        return motion.q, motion.v, motion.ok, motion.saved
+
+    return run, jnp.full(n, 0.3)
+
+
+def gradient_of(system):
+    run, q0 = motion_of(system)
+    return jax.grad(lambda q0: jnp.sum(run(q0)[0] ** 2)), q0
+
+
+def test_a_program_holds_the_equations_once_in_its_loop_and_once_before():
+    """On arrays: the loop over stages; the first stage and the estimate of the first step."""
+    assert copies("array", motion_of) == 2
+    assert copies("array", partial(motion_of, save=("a", "energy"))) == 3
+
+
+def test_a_gradient_holds_them_once_in_each_of_its_loops():
+    """The recorded motion, states found again between points, the transposed step; before them
+    the first step, and how fast perturbations turn.
+    """
+    assert copies("array", gradient_of) == 5
+
+
+@pytest.mark.full
+def test_a_long_scalar_program_is_looped_over_as_well():
+    """Nine elements of the force, all in one copy of the acceleration."""
+    assert copies("scalar", motion_of, size=9) == 9 * 2
