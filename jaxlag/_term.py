@@ -5,6 +5,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -36,6 +37,20 @@ class Term(diffrax.ODETerm):
     def works(self) -> bool:
         """Whether the state has work besides q and v."""
         return self.dynamics.power is not None and bool(self.dynamics.power.names)
+
+    @property
+    def lanes(self) -> bool:
+        """Whether it is written to be vmapped over a few trajectories."""
+        return self.dynamics.lanes
+
+    @property
+    def second_order(self) -> bool:
+        """Whether the state is (q, v) and q' = v."""
+        return self.dynamics.quasi is None and not self.works
+
+    def turned(self, x: Any, args: Arguments) -> Any:
+        """Sigma x, of a tree."""
+        return jax.tree.map(lambda x: self.dynamics.turned(x, args), x)
 
     def sections(self, y: Any) -> tuple[Any, Any, Any]:
         """(q, v, work) of a state or of its rates."""

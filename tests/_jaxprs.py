@@ -6,6 +6,8 @@ from typing import NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from jaxlag._lowering._trig import by_polynomials
+
 
 class Operation(NamedTuple):
     """One equation of a jaxpr: its primitive, its outputs' shapes, how often it is executed."""
@@ -47,6 +49,9 @@ def _walk(jaxpr, times, inside, turns):
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         shapes = tuple(getattr(v.aval, "shape", ()) for v in eqn.outvars)
+        if eqn.params.get("name") == by_polynomials.__name__:  # jaxlag's own elementary function
+            yield Operation("sincos", shapes, times, inside)
+            continue
         yield Operation(name, shapes, times, inside)
         repeats = eqn.params["length"] if name == "scan" else 1
         if name == "while":

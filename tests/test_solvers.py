@@ -48,6 +48,53 @@ def test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped):
         np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * max(most, 2))
 
 
+class Halves(diffrax.ODETerm):
+    """Two coupled pendulums with drag, y = (q, v) a vector; time may run backwards."""
+
+    lanes: bool
+    second_order: bool
+    sense: float
+
+    def __init__(self, lanes, second_order, sense):
+        def field(t, y, args):
+            q, v = y[:2], y[2:]
+            pull = args * jnp.cos(t) - jnp.sin(q) + 0.4 * q[::-1] - 0.3 * v * jnp.abs(v)
+            return sense * jnp.concatenate([v, pull])
+
+        super().__init__(field)
+        self.lanes, self.second_order, self.sense = lanes, second_order, sense
+
+    def sections(self, y):
+        return y[:2], y[2:], y[4:]
+
+    def turned(self, x, args):
+        return jax.tree.map(lambda x: self.sense * x, x)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["onwards", "backwards"])
+@pytest.mark.parametrize("second_order", [True, False], ids=["nystrom", "first_order"])
+@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "alone"])
+@NAMED
+def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, sense):
+    """To roundings of the largest sum: accelerations alone are added up, or rows of lanes."""
+    y0 = jnp.asarray(np.random.default_rng(2).uniform(-1.5, 1.5, (3, 4)))
+    t0, t1 = jnp.array(0.3), jnp.array(0.55)
+    forms = Halves(lanes, second_order, sense), Halves(False, False, sense)
+
+    def step(method, terms, y0):
+        memory = method.init(terms, t0, t1, y0, PUSH)
+        y1, error, dense, last, _ = method.step(terms, t0, t1, y0, PUSH, memory, made_jump=False)
+        return y1, error, dense["k"], last
+
+    found = jax.vmap(lambda y0: step(solver, forms[0], y0))(y0)
+    expected = jax.vmap(lambda y0: step(solver.stock, forms[1], y0))(y0)
+    most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
+    for a, b in zip(found, (*expected[:3], expected[3][1]), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * max(most, 2))
+    with_jump = solver.step(forms[0], t0, t1, y0[0], PUSH, None, made_jump=True)
+    np.testing.assert_allclose(with_jump[0], found[0][0], rtol=0, atol=EPS * 4)
+
+
 def trees(order):
     """Rooted trees with that many nodes, each the sorted tuple of its branches."""
 

@@ -61,9 +61,32 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
         found, kept = keeping(*primals)
         return (found, kept), _derivative(of_both, (primals, kept), tangents, (found, kept))
 
-    apart, both_apart = not_inlined(results), not_inlined(both)
-    of_results, of_both = _maps(lambda row, kept: both(row, kept)[0]), _maps(both)
+    boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
+    apart, both_apart = boundary(results), boundary(both)
+    of_results, of_both = (
+        _maps(function, boundary) for function in (lambda row, kept: both(row, kept)[0], both)
+    )
     return call
+
+
+def _by_numbers(function: Callable, dtype: Any) -> Callable:
+    """A function of rows that is not inlined; every number comes in and goes out by itself.
+
+    In lanes each is a row of its own. Code for a table of them would find out for every number of
+    it which row that is in, and compute all rows for each.
+    """
+
+    def stacked(rows: Any) -> Any:
+        def one(numbers: list[Array]) -> Array:
+            return jnp.stack(numbers) if numbers else jnp.zeros((0,), dtype)
+
+        return jax.tree.map(one, rows, is_leaf=lambda x: isinstance(x, list))
+
+    def separate(*numbers: Any) -> Any:
+        return jax.tree.map(elements, function(*stacked(numbers)))
+
+    inner = not_inlined(separate)
+    return lambda *rows: stacked(inner(*jax.tree.map(elements, rows)))
 
 
 def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:
@@ -74,8 +97,11 @@ def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:
     return linear(maps[which], at, dot)
 
 
-def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
-    """The derivative of function(row, kept) in the row, by which halves of it move."""
+def _maps(function: Callable, boundary: Callable) -> dict[tuple[bool, bool], LinearMap]:
+    """The derivative of function(row, kept) in the row, by which halves of it move.
+
+    `boundary` makes functions that are not inlined.
+    """
 
     def pushed(at: tuple, dot: tuple) -> Any:
         row, kept = at
@@ -91,6 +117,6 @@ def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
         return of
 
     return {
-        which: LinearMap(not_inlined(pushed), not_inlined(pulled(which)), pushed, at_once=None)
+        which: LinearMap(boundary(pushed), boundary(pulled(which)), pushed, at_once=None)
         for which in ((True, True), (False, True), (True, False))
     }

@@ -14,10 +14,9 @@ from jaxlag._lowering._ingest import Rule
 from jaxlag._lowering._program import Line, Program
 from jaxlag._lowering._trig import recalled, sincos
 
-# Functions whose results are kept by a division by 1: XLA's CPU backend takes them for cheap and
-# would compute them anew for every acceleration, but never does so with a division. On scalars the
-# compiler finds most of the repetitions in short code itself.
-_KEPT = ("sin", "cos")
+# From this many lines on, sines and cosines are kept by a division by 1: XLA's CPU backend would
+# compute them anew for every result that they lead to, but never does so with a division. In short
+# code on scalars the compiler finds the repetitions itself.
 KEEP_FROM = 120
 KEEP_FROM_IN_LANES = 14
 
@@ -46,10 +45,10 @@ def straight(
         slots[slot] = x != 0 if slot in program.truths else x
     keep_from = KEEP_FROM_IN_LANES if lanes else KEEP_FROM
     kept = len(program.body) > keep_from and jax.default_backend() == "cpu"
-    one = carried[-1] if kept and carried else None
+    one = carried[-1] if kept else None
     read = [slot for (name, _), slot in program.inputs.items() if name not in FIXED]
     slots |= dict(zip(read, given, strict=True))
-    run(program.body, slots, program.whole, lanes, one, pairs, known)
+    run(program.body, slots, program.whole, one, pairs, known)
     return tuple(jnp.asarray(slots[slot], dtype) for slot in program.results)
 
 
@@ -57,7 +56,6 @@ def run(
     lines: Sequence[Line],
     slots: dict[int, Any],
     whole: frozenset[int] = frozenset(),
-    lanes: bool = False,
     one: Array | None = None,
     pairs: Pairs | None = None,
     known: Pairs | None = None,
@@ -67,7 +65,6 @@ def run(
     XLA would move constants out of powers of what is `whole`, and out of the range of numbers.
     """
     ruled: dict[Any, Array] = {}
-    together = lanes or pairs is not None
     pairs = {} if pairs is None else pairs
     for line in lines:
         args = [slots[a] for a in line.args]
@@ -76,16 +73,14 @@ def run(
             if (rule, line.args) not in ruled:
                 ruled[rule, line.args] = _by_rule(rule, args)
             slots[line.to] = ruled[rule, line.args][index]
-        elif together and is_trig(line):
+        elif is_trig(line):
             (argument,) = line.args
             if argument not in pairs and known is not None:
                 pairs[argument] = recalled(*args, *known[argument])
             elif argument not in pairs:
-                s, c = sincos(*args) if lanes else (jnp.sin(*args), jnp.cos(*args))
+                s, c = sincos(*args)
                 pairs[argument] = (s, c) if one is None else (s / one, c / one)
             slots[line.to] = pairs[argument][line.data.name == "cos"]
-        elif one is not None and line.op == "call" and line.data.name in _KEPT:
-            slots[line.to] = lax.div(_line(line, args), one)
         else:
             slots[line.to] = _line(line, args)
         if line.to in whole:
@@ -94,7 +89,7 @@ def run(
 
 def is_trig(line: Line) -> bool:
     """Whether this is a sine or a cosine."""
-    return line.op == "call" and line.data.name in _KEPT
+    return line.op == "call" and line.data.name in ("sin", "cos")
 
 
 @jax.custom_jvp

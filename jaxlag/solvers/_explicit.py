@@ -43,6 +43,15 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     without calls. In a loop over stages the program holds f once: it compiles in a fraction of
     the time and runs as fast where f is long.
 
+    Where the terms say that they are of `second_order`, y = (q, v) with q' = v and v' = a, a step
+    that is written out is taken in Nystrom's form,
+
+        v_i = v + h sum_j a_ij a_j,    q_i = q + c_i h v + h^2 sum_j (A A)_ij a_j.
+
+    This is the same method, but stages meet only through accelerations, and q_i does not depend
+    on the one before it: its sines and cosines need not wait for that. Where terms are written for
+    `lanes`, every number of the state is a row of lanes, and sums are of such rows, not of tables.
+
     The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
     one of the next step.
 
@@ -104,19 +113,26 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
         """
         tableau = tableau_of(type(self))
         fresh = True if not tableau.fsal else made_jump
-        stages = _in_loop if self.looped else _written_out
+        written_out = _nystrom if getattr(terms, "second_order", False) else _written_out
+        stages = _in_loop if self.looped else written_out
         y1, error, k, last = stages(tableau, terms, t0, t1, y0, solver_state, fresh, args)
         # diffrax's interpolation takes the stages as increments.
         return y1, error, {"y0": y0, "y1": y1, "k": k}, last, diffrax.RESULTS.successful
 
 
 class Tableau(NamedTuple):
-    """Coefficients of stages 2, 3, ...; weights of the step and of its error estimate."""
+    """Coefficients of stages 2, 3, ...; weights of the step and of its error estimate.
+
+    And the products of all three with A, for Nystrom's form.
+    """
 
     rows: np.ndarray  # a_ij, (s - 1, s)
     c: np.ndarray
     b: np.ndarray
     e: np.ndarray
+    rows_squared: np.ndarray
+    b_squared: np.ndarray
+    e_squared: np.ndarray
     fsal: bool
 
 
@@ -128,11 +144,24 @@ def tableau_of(method: type[AbstractExplicit]) -> Tableau:
     for i, row in enumerate(tableau.a_lower):
         A[i, : len(row)] = row
     b, e = np.asarray(tableau.b_sol, float), np.asarray(tableau.b_error, float)
-    return Tableau(A, np.asarray(tableau.c, float), b, e, bool(tableau.fsal))
+    c, fsal = np.asarray(tableau.c, float), bool(tableau.fsal)
+    return Tableau(A, c, b, e, _by(A, A), _by(b, A), _by(e, A), fsal)
+
+
+def _by(x: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """x A, with what is zero up to rounding set to zero; A lacks its first row, of zeros."""
+    product, size = x[..., 1:] @ A, np.abs(x[..., 1:]) @ np.abs(A)
+    return np.where(np.abs(product) <= 2 * len(A) * np.finfo(float).eps * size, 0.0, product)
 
 
 def _added(y: Any, change: Any) -> Any:
     return jax.tree.map(jnp.add, y, change)
+
+
+def _scaled(factor: Any, x: Any) -> Any:
+    if isinstance(factor, float) and factor == 1.0:
+        return x
+    return jax.tree.map(lambda x: factor * x, x)
 
 
 def _sum(weights: np.ndarray, k: Sequence[Any]) -> Any:
@@ -148,31 +177,109 @@ def _sum(weights: np.ndarray, k: Sequence[Any]) -> Any:
     return jax.tree.map(total, *(stage for _, stage in used))
 
 
+def _first(terms: Any, t0: Any, y0: Any, known: Any, fresh: Any, args: Any) -> Any:
+    """dy/dt at the first stage."""
+    if fresh is True:
+        return terms.vf(t0, y0, args)
+    if fresh is False:
+        return known
+    return lax.cond(fresh, lambda _: terms.vf(t0, y0, args), lambda k: k, known)
+
+
+def _numbers(x: Array) -> list[Array]:
+    return [x[i] for i in range(x.shape[0])]
+
+
+def _kept(x: Any) -> Any:
+    """x, computed once and not anew wherever it is read: so XLA treats a division, here by 1."""
+    leaves, structure = jax.tree.flatten(x)
+    one = lax.optimization_barrier(jnp.ones((), leaves[0].dtype))
+    return jax.tree.unflatten(structure, [leaf / one for leaf in leaves])
+
+
 def _written_out(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
 ) -> tuple[Any, Any, Any, Any]:
     """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
-    per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
+    h = terms.contr(t0, t1)
+    per_step = lax.optimization_barrier(1.0 / h)
+    lanes = getattr(terms, "lanes", False)
+
+    def parts(y: Any) -> Any:
+        return _numbers(y) if lanes else y
+
+    def joined(y: Any) -> Any:
+        return jnp.stack(y) if lanes else y
 
     def increments(rates: Any) -> Any:
         """They are read in every later stage: they end in divisions, which XLA computes once."""
-        return jax.tree.map(lambda x: x / per_step, rates)
+        return jax.tree.map(lambda x: x / per_step, parts(rates))
 
-    if fresh is True:
-        first = terms.vf(t0, y0, args)
-    elif fresh is False:
-        first = known
-    else:
-        first = lax.cond(fresh, lambda _: terms.vf(t0, y0, args), lambda k: k, known)
-    k, stage, last = [increments(first)], y0, None
+    first = _first(terms, t0, y0, known, fresh, args)
+    y = _kept(parts(y0)) if lanes else y0
+    k, stage, last = [increments(first)], y, None
     for row, c in zip(tableau.rows, tableau.c, strict=True):
         t = t1 if c == 1.0 else t0 + float(c) * (t1 - t0)
-        stage = _added(y0, _sum(row, k))
-        last = terms.vf(t, stage, args)
+        stage = _added(y, _sum(row, k))
+        last = terms.vf(t, joined(stage), args)
         k.append(increments(last))
     if not tableau.fsal:
-        stage, last = _added(y0, _sum(tableau.b, k)), None
-    return stage, _sum(tableau.e, k), jax.tree.map(lambda *x: jnp.stack(x), *k), last
+        stage, last = _added(y, _sum(tableau.b, k)), None
+    stages = jax.tree.map(lambda *x: jnp.stack(x), *map(joined, k))
+    return joined(stage), joined(_sum(tableau.e, k)), stages, last
+
+
+def _nystrom(
+    tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
+) -> tuple[Any, Any, Any, Any]:
+    """The same of y = (q, v), q' = v."""
+    h = terms.contr(t0, t1)
+    per_step = lax.optimization_barrier(1.0 / h)
+
+    def parts(y: Array) -> Any:
+        q, v, _ = terms.sections(y)
+        return (_numbers(q), _numbers(v)) if terms.lanes else (q, v)
+
+    def joined(q: Any, v: Any) -> Array:
+        return jnp.stack([*q, *v]) if terms.lanes else jnp.concatenate([q, v])
+
+    first = _first(terms, t0, y0, known, fresh, args)
+    y, kick = parts(y0), parts(first)[1]
+    if terms.lanes:
+        y, kick = _kept((y, kick))
+    kicks, rates, last = [kick], [first], None
+
+    def per_time(row: np.ndarray, squared: np.ndarray, c: float) -> Any:
+        """What q and v gain, over h."""
+        turns = _scaled(h, _sum(squared, kicks)) if np.any(squared) else None
+        drift = None if c == 0.0 else _scaled(c, y[1])
+        if turns is not None:
+            drift = turns if drift is None else _added(drift, turns)
+        return terms.turned(drift, args), _sum(row, kicks)
+
+    def whole(gain: Any) -> Any:
+        """h times it. What a step returns is read in many places: XLA computes divisions once."""
+        return jax.tree.map(lambda x: x / per_step, gain)
+
+    def end(row: np.ndarray, squared: np.ndarray) -> Any:
+        return _added(y, whole(per_time(row, squared, 1.0)))
+
+    for i, (row, squared, c) in enumerate(
+        zip(tableau.rows, tableau.rows_squared, tableau.c, strict=True), 1
+    ):
+        t = t1 if c == 1.0 else t0 + float(c) * (t1 - t0)
+        if tableau.fsal and i == len(tableau.c):
+            stage = end(row, squared)
+        else:
+            stage = _added(y, _scaled(h, per_time(row, squared, float(c))))
+        last = terms.vf(t, joined(*stage), args)
+        kicks.append(parts(last)[1])
+        rates.append(last)
+    if not tableau.fsal:
+        stage, last = end(tableau.b, tableau.b_squared), None
+    # The weights of the error estimate have the sum 0: the velocity at the start drops out.
+    error = whole(per_time(tableau.e, tableau.e_squared, 0.0))
+    return joined(*stage), joined(*error), h * jnp.stack(rates), last
 
 
 def _in_loop(
