@@ -63,9 +63,7 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
 
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
     apart, both_apart = boundary(results), boundary(both)
-    of_results, of_both = (
-        _maps(function, boundary) for function in (lambda row, kept: both(row, kept)[0], both)
-    )
+    of_results, of_both = _maps(lambda row, kept: both(row, kept)[0]), _maps(both)
     return call
 
 
@@ -97,11 +95,8 @@ def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:
     return linear(maps[which], at, dot)
 
 
-def _maps(function: Callable, boundary: Callable) -> dict[tuple[bool, bool], LinearMap]:
-    """The derivative of function(row, kept) in the row, by which halves of it move.
-
-    `boundary` makes functions that are not inlined.
-    """
+def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
+    """The derivative of function(row, kept) in the row, by which halves of it move."""
 
     def pushed(at: tuple, dot: tuple) -> Any:
         row, kept = at
@@ -117,6 +112,6 @@ def _maps(function: Callable, boundary: Callable) -> dict[tuple[bool, bool], Lin
         return of
 
     return {
-        which: LinearMap(boundary(pushed), boundary(pulled(which)), pushed, at_once=None)
+        which: LinearMap(not_inlined(pushed), not_inlined(pulled(which)), pushed, at_once=None)
         for which in ((True, True), (False, True), (True, False))
     }
