@@ -14,11 +14,11 @@ import numpy as np
 from jax import Array, lax
 
 # Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
-# tracing and compiling and milliseconds of a solve, written out | in a loop: pendulum (4 lines)
-# 0.7, 0.07 | 0.6, 0.12; double pendulum (28) 1.1, 0.19 | 0.7, 0.24; elastic one (40) 1.1, 0.16 |
-# 0.8, 0.24; 3 links (85) 1.5, 0.14 | 1.0, 0.22; quadcopter (117) 2.1, 0.22 | 1.4, 0.29; 4 links
-# (156) 2.1, 0.18 | 1.0, 0.23; 15 coordinates of 5 bodies (233) 4.0, 0.19 | 1.3, 0.20; aircraft
-# (335) 5.2, 0.34 | 3.0, 0.47; 6 links (375) 4.4, 0.36 | 1.2, 0.32.
+# tracing and compiling and microseconds per step, written out | in a loop: elastic pendulum (21
+# lines) 0.9, 0.25 | 0.6, 0.37; heavy top (39) 1.2, 0.44 | 1.1, 0.87; 3 links (85) 1.7, 1.2 | 0.7,
+# 1.8; 4 links (156) 2.0, 1.5 | 0.8, 1.6; 15 coordinates of 5 bodies (223) 2.4, 2.2 | 0.8, 2.0;
+# double pendulum with constraints (242) 4.9, 0.7 | 3.1, 1.3; aircraft (366) 5.4, 4.7 | 2.9, 5.5; 6
+# links (375) 4.8, 2.6 | 1.5, 2.3.
 WRITTEN_OUT = 1600
 
 
