@@ -39,13 +39,13 @@ class Term(diffrax.ODETerm):
         return self.dynamics.power is not None and bool(self.dynamics.power.names)
 
     @property
-    def lanes(self) -> bool:
+    def in_lanes(self) -> bool:
         """Whether it is written to be vmapped over a few trajectories."""
         return self.dynamics.lanes
 
     @property
     def second_order(self) -> bool:
-        """Whether the state is (q, v) and q' = v."""
+        """Whether the state is (q, v): dq/dtau = sigma v, dv/dtau = sigma a."""
         return self.dynamics.quasi is None and not self.works
 
     def turned(self, x: Any, args: Arguments) -> Any:

@@ -129,6 +129,15 @@ def not_inlined(function: Callable, attributes: Any = None) -> Callable:
     return call
 
 
+def opaque_one(dtype: Any) -> jax.Array:
+    """1, in a way that XLA does not see through: it computes what is divided by it once.
+
+    What it takes for cheap, all but divisions, roots and the like, it computes anew wherever that
+    is read.
+    """
+    return jax.lax.optimization_barrier(jnp.ones((), dtype))
+
+
 def _plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
     """Whether a program holds nothing but operations on numbers that XLA itself emits code for."""
     for eqn in jaxpr.eqns:
@@ -167,17 +176,17 @@ def _inside(values: Any) -> Iterator[Jaxpr]:
 
 
 _PLAIN = frozenset(
-    """abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil
-    checkpoint clamp closed_call concatenate cond convert_element_type copy copy_p cos cosh
-    cummax cumsum custom_jvp_call custom_vjp_call custom_vmap_call div dynamic_slice
-    dynamic_update_slice empty2 eq erf exp exp2 expand_dims expm1 floor gather ge gt
-    integer_pow iota is_finite jit le le_to linear_map log log1p logistic lt lt_to max
-    maybe_set min mul ne neg nextafter nonbatchable nondifferentiable not one_minus_square
-    optimization_barrier or pad pjit polynomial pow reduce_and reduce_max reduce_min reduce_or
-    reduce_prod reduce_sum rem remat remat2 reshape rev round rsqrt scan scatter scatter-add
-    scatter_add select_and_gather_add select_n sign sin sinh slice split sqrt square squeeze
-    stack stop_gradient sub symbolic_zeros tan tanh transpose unstack unvmap_all unvmap_any
-    unvmap_max while xor""".split()  # noqa: SIM905
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type
+    broadcast_in_dim cbrt ceil checkpoint clamp closed_call concatenate cond
+    convert_element_type copy copy_p cos cosh cummax cumsum custom_jvp_call custom_vjp_call
+    custom_vmap_call div dynamic_slice dynamic_update_slice empty2 eq erf exp exp2 expand_dims
+    expm1 floor gather ge gt integer_pow iota is_finite jit le le_to linear_map log log1p
+    logistic lt lt_to max maybe_set min mul ne neg nextafter nonbatchable nondifferentiable not
+    one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max
+    reduce_min reduce_or reduce_prod reduce_sum rem remat remat2 reshape rev round rsqrt scan
+    scatter scatter-add scatter_add select_and_gather_add select_n shift_left sign sin sinh
+    slice split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh transpose
+    unstack unvmap_all unvmap_any unvmap_max while xor""".split()  # noqa: SIM905
 )
 
 

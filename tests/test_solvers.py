@@ -51,7 +51,7 @@ def test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped):
 class Halves(diffrax.ODETerm):
     """Two coupled pendulums with drag, y = (q, v) a vector; time may run backwards."""
 
-    lanes: bool
+    in_lanes: bool
     second_order: bool
     sense: float
 
@@ -62,7 +62,7 @@ class Halves(diffrax.ODETerm):
             return sense * jnp.concatenate([v, pull])
 
         super().__init__(field)
-        self.lanes, self.second_order, self.sense = lanes, second_order, sense
+        self.in_lanes, self.second_order, self.sense = lanes, second_order, sense
 
     def sections(self, y):
         return y[:2], y[2:], y[4:]
@@ -71,10 +71,20 @@ class Halves(diffrax.ODETerm):
         return jax.tree.map(lambda x: self.sense * x, x)
 
 
+class Heun(jl.solvers.AbstractExplicit):
+    """A method whose steps share no stage."""
+
+    interpolation_cls = diffrax.Heun.interpolation_cls
+
+    @property
+    def stock(self):
+        return diffrax.Heun()
+
+
 @pytest.mark.parametrize("sense", [1.0, -1.0], ids=["onwards", "backwards"])
 @pytest.mark.parametrize("second_order", [True, False], ids=["nystrom", "first_order"])
 @pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "alone"])
-@NAMED
+@pytest.mark.parametrize("solver", [*PAIRS, Heun()], ids=lambda solver: type(solver).__name__)
 def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, sense):
     """To roundings of the largest sum: accelerations alone are added up, or rows of lanes."""
     y0 = jnp.asarray(np.random.default_rng(2).uniform(-1.5, 1.5, (3, 4)))
@@ -89,10 +99,20 @@ def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, s
     found = jax.vmap(lambda y0: step(solver, forms[0], y0))(y0)
     expected = jax.vmap(lambda y0: step(solver.stock, forms[1], y0))(y0)
     most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
-    for a, b in zip(found, (*expected[:3], expected[3][1]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * max(most, 2))
-    with_jump = solver.step(forms[0], t0, t1, y0[0], PUSH, None, made_jump=True)
-    np.testing.assert_allclose(with_jump[0], found[0][0], rtol=0, atol=EPS * 4)
+    rounding = 32 * EPS * max(most, 2)
+    for a, b in zip(found[:3], expected[:3], strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=rounding)
+    assert solver.shares_stages == (found[3] is not None)
+    if solver.shares_stages:
+        np.testing.assert_allclose(found[3], expected[3][1], rtol=0, atol=rounding)
+
+    # The first stage anew where the field jumps, and where only the program's input says so.
+    def jumping(jumped, y0):
+        return solver.step(forms[0], t0, t1, y0, PUSH, jnp.full(4, jnp.nan), made_jump=jumped)[0]
+
+    for jumped in (True, jnp.array(True)):
+        anew = jax.vmap(jumping, (None, 0))(jumped, y0)
+        np.testing.assert_allclose(anew, found[0], rtol=0, atol=4 * EPS)
 
 
 def trees(order):

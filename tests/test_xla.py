@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jaxlag import _xla
+from systems import double_pendulum
 
 SOLVE = """
 {before}
@@ -178,6 +179,17 @@ def test_only_plain_operations_are_marked():
     assert not plain(jnp.linalg.cholesky, M)
     assert not plain(lambda x: jnp.linalg.solve(x, x), M)
     assert not plain(lambda x: jax.pure_callback(np.sin, x, x), M)
+
+
+def test_scalar_programs_are_plain():
+    """Else every loop would run operation by operation where XLA's setting came too late."""
+    terms, params = double_pendulum.system.terms, dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0)
+    q = jnp.ones((3, 2))
+    one = jax.make_jaxpr(lambda q: terms.acceleration(0.0, q, q, params, {}))
+    lanes = jax.make_jaxpr(jax.vmap(lambda q: terms.acceleration(0.0, q, q, params, {})))
+    for program in (one(q[0]), lanes(q)):
+        assert "round" in str(program)  # sines by polynomial
+        assert _xla._plain(program.jaxpr)
 
 
 def test_merging():

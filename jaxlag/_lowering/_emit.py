@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlag import _params
@@ -14,6 +13,7 @@ from jaxlag._lowering._called import called
 from jaxlag._lowering._graph import FIXED
 from jaxlag._lowering._program import Program
 from jaxlag._lowering._straight import elements, leaves, numbers, run, straight
+from jaxlag._xla import opaque_one
 
 # Code of more lines is one function that XLA does not inline: copied into every stage of a solver
 # it compiles in many times the time, and XLA's fusion computes shared lines anew in each use.
@@ -52,12 +52,7 @@ def prelude(
             slots |= {slot: jnp.asarray(flat[index], dtype) for index, slot in wanted.items()}
     run(program.prelude, slots, program.whole)
     row = [jnp.asarray(slots[slot], dtype) for slot in program.carried]
-    return jnp.stack([*row, _one(dtype)])
-
-
-def _one(dtype: Any) -> Array:
-    """1, in a way that the compiler does not see through."""
-    return lax.optimization_barrier(jnp.ones((), dtype))
+    return jnp.stack([*row, opaque_one(dtype)])
 
 
 def body(
@@ -79,7 +74,7 @@ def body(
         q: coordinates.
         v: velocities.
         inputs: values of the inputs by name.
-        lanes: whether this is vmapped: sines and cosines of one argument by one polynomial.
+        lanes: whether this is vmapped: every scalar is a row of numbers.
         in_loop: whether this is in a loop over one trajectory or a few lanes.
     """
     names, dtype = {name for name, _ in program.inputs}, q.dtype

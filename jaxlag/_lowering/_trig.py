@@ -42,7 +42,7 @@ _COSINE = (
 # pi/2 and what the rounding of x/pi adds to r; past 2^53 nothing is left of r but rounding.
 _MOST = 1.6
 
-# Added to an integer it makes a number that ends with the integer's last bit.
+# Added to an integer of less than 2^51 it makes a number that ends with the integer's last bit.
 _INTEGER = 1.5 * 2.0**52
 
 
@@ -52,8 +52,8 @@ def sincos(x: Float[Array, "*s"]) -> tuple[Float[Array, "*s"], Float[Array, "*s"
 
     On CPU in float64 by Cody and Waite's reduction modulo pi and polynomials. Up to |x| = 1e6 the
     sine is within 2 eps |sin x| of the exact value and the cosine within 2 eps; up to 1e13 both
-    are those of one x that is off by 2 eps |x|. Past 1e16 nothing of x is left but rounding; the
-    results stay within [-1, 1].
+    are those of one x that is off by 2 eps |x|. Beyond, nothing of x is left but rounding in the
+    end; the results stay within [-1, 1].
 
     Source: Cody, Waite, Software Manual for the Elementary Functions (1980), ch. 8.
     """
@@ -93,7 +93,7 @@ def by_polynomials(x: Array) -> tuple[Array, Array]:
     odd = lax.shift_left(_bits(n + _INTEGER), np.uint64(63))
     # The sign is ready before the sine's polynomial is.
     r = _negative(r, odd)
-    s = r + (r * z) * _polynomial(_SINE, z)
+    s = lax.clamp(-1.0, r + (r * z) * _polynomial(_SINE, z), 1.0)  # roundings may lead past 1
     c = (1.0 - 0.5 * z) + (z * z) * _polynomial(_COSINE, z)
     return s, _negative(c, odd)
 

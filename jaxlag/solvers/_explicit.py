@@ -13,6 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jaxlag._lowering._straight import elements
+from jaxlag._xla import opaque_one
+
 # Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
 # tracing and compiling and microseconds per step, written out | in a loop: elastic pendulum (21
 # lines) 0.9, 0.25 | 0.6, 0.37; heavy top (39) 1.2, 0.44 | 1.1, 0.87; 3 links (85) 1.7, 1.2 | 0.7,
@@ -43,14 +46,16 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     without calls. In a loop over stages the program holds f once: it compiles in a fraction of
     the time and runs as fast where f is long.
 
-    Where the terms say that they are of `second_order`, y = (q, v) with q' = v and v' = a, a step
-    that is written out is taken in Nystrom's form,
+    Where the terms say that they are of `second_order`, y = (q, v) with dq/dtau = sigma v, dv/dtau
+    = sigma a, sigma = -1 where time runs backwards, a step that is written out is taken in
+    Nystrom's form with k_i = sigma a_i,
 
-        v_i = v + h sum_j a_ij a_j,    q_i = q + c_i h v + h^2 sum_j (A A)_ij a_j.
+        v_i = v + h sum_j a_ij k_j,    q_i = q + h sigma (c_i v + h sum_j (A A)_ij k_j).
 
     This is the same method, but stages meet only through accelerations, and q_i does not depend
-    on the one before it: its sines and cosines need not wait for that. Where terms are written for
-    `lanes`, every number of the state is a row of lanes, and sums are of such rows, not of tables.
+    on the one before it: its sines and cosines need not wait for that. Where terms are written to
+    be used `in_lanes`, every number of the state is a row of lanes, and sums are of such rows, not
+    of tables.
 
     The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
     one of the next step.
@@ -186,15 +191,10 @@ def _first(terms: Any, t0: Any, y0: Any, known: Any, fresh: Any, args: Any) -> A
     return lax.cond(fresh, lambda _: terms.vf(t0, y0, args), lambda k: k, known)
 
 
-def _numbers(x: Array) -> list[Array]:
-    return [x[i] for i in range(x.shape[0])]
-
-
-def _kept(x: Any) -> Any:
-    """x, computed once and not anew wherever it is read: so XLA treats a division, here by 1."""
-    leaves, structure = jax.tree.flatten(x)
-    one = lax.optimization_barrier(jnp.ones((), leaves[0].dtype))
-    return jax.tree.unflatten(structure, [leaf / one for leaf in leaves])
+def _kept(x: list[Array]) -> list[Array]:
+    """The same numbers, each read from the table it is in once."""
+    one = opaque_one(x[0].dtype)
+    return [number / one for number in x]
 
 
 def _written_out(
@@ -203,10 +203,10 @@ def _written_out(
     """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
     h = terms.contr(t0, t1)
     per_step = lax.optimization_barrier(1.0 / h)
-    lanes = getattr(terms, "lanes", False)
+    lanes = getattr(terms, "in_lanes", False)
 
     def parts(y: Any) -> Any:
-        return _numbers(y) if lanes else y
+        return elements(y) if lanes else y
 
     def joined(y: Any) -> Any:
         return jnp.stack(y) if lanes else y
@@ -238,15 +238,15 @@ def _nystrom(
 
     def parts(y: Array) -> Any:
         q, v, _ = terms.sections(y)
-        return (_numbers(q), _numbers(v)) if terms.lanes else (q, v)
+        return (elements(q), elements(v)) if terms.in_lanes else (q, v)
 
     def joined(q: Any, v: Any) -> Array:
-        return jnp.stack([*q, *v]) if terms.lanes else jnp.concatenate([q, v])
+        return jnp.stack([*q, *v]) if terms.in_lanes else jnp.concatenate([q, v])
 
     first = _first(terms, t0, y0, known, fresh, args)
     y, kick = parts(y0), parts(first)[1]
-    if terms.lanes:
-        y, kick = _kept((y, kick))
+    if terms.in_lanes:
+        y, kick = tuple(map(_kept, y)), _kept(kick)
     kicks, rates, last = [kick], [first], None
 
     def per_time(row: np.ndarray, squared: np.ndarray, c: float) -> Any:
