@@ -90,21 +90,26 @@ def by_polynomials(x: Array) -> tuple[Array, Array]:
         r = r - n * part
     r = lax.clamp(-_MOST, r, _MOST)
     z = r * r
-    odd = lax.shift_left(_bits(n + _INTEGER), np.uint64(63))
+    sign = _parity(n)
     # The sign is ready before the sine's polynomial is.
-    r = _negative(r, odd)
+    r = sign * r
     s = lax.clamp(-1.0, r + (r * z) * _polynomial(_SINE, z), 1.0)  # roundings may lead past 1
     c = (1.0 - 0.5 * z) + (z * z) * _polynomial(_COSINE, z)
-    return s, _negative(c, odd)
+    return s, sign * c
+
+
+def _parity(n: Array) -> Array:
+    """(-1)^n, by bits of numbers, which have no derivative.
+
+    What it is a factor of has: JAX forgets the rule above in second derivatives of loops, and
+    differentiates the polynomials.
+    """
+    odd = lax.shift_left(_bits(n + _INTEGER), np.uint64(63))
+    return lax.bitcast_convert_type(lax.bitwise_xor(_bits(jnp.ones_like(n)), odd), n.dtype)
 
 
 def _bits(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.uint64)
-
-
-def _negative(x: Array, sign: Array) -> Array:
-    """-x where the first bit of `sign` is set."""
-    return lax.bitcast_convert_type(lax.bitwise_xor(_bits(x), sign), x.dtype)
 
 
 def _polynomial(coefficients: Sequence[float], z: Array) -> Array:
