@@ -195,6 +195,7 @@ def _judged(
     if (PENDULUM, HESSIAN, 1, pendulum.MAX_STEPS) in rows:
         hessian = of(rows, HESSIAN)
         targets += [
+            Target("error of the hessian", hessian["error"], "<=", 1e-6),
             Target("times the solve: hessian, 8 x 8", hessian["ratio"], "<=", 25.0),
             Target("s to compile a hessian", hessian["trace_s"] + hessian["compile_s"], "<=", 10.0),
         ]

@@ -274,6 +274,23 @@ def test_every_kind_of_solver(method, dt):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
+def test_hessian_of_a_short_program_is_right():
+    """All orders of the two modes, against differences of the gradient; sines by polynomial."""
+    pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
+    q0, p, h = jnp.array([0.1]), jnp.array(9.81), 1e-4
+
+    def loss(p):
+        motion = jl.simulate(pendulum, q0, [0.3], [0.0, 0.5, 1.0], p, method="tsit5", dt=0.02)
+        return jnp.sum(motion.q[1:] ** 2)
+
+    slope = jax.jit(jax.grad(loss))
+    by_differences = (slope(p + h) - slope(p - h)) / (2 * h)  # off by h^2 and by roundings over h
+    forward, reverse = jax.jacfwd, jax.grad
+    for outer, inner in itertools.product((forward, reverse), repeat=2):
+        found = jax.jit(outer(inner(loss)))(p)
+        np.testing.assert_allclose(found, by_differences, rtol=1e-6)
+
+
 @pytest.mark.full
 def test_hessian_is_symmetric_and_right():
     """jacfwd of grad: symmetric to round-off, equal to differences of the gradient (fixed grid)."""

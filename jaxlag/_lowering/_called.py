@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from jaxlag._linear import LinearMap, linear
 from jaxlag._lowering._program import Program
-from jaxlag._lowering._straight import Pairs, elements, is_trig, straight
+from jaxlag._lowering._straight import Pairs, elements, is_trig, stacked, straight
 from jaxlag._xla import not_inlined
 
 Row = tuple[Array, Array]  # (what does not change during a solve, state and inputs)
@@ -38,7 +38,7 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
         given = elements(row[0]), elements(row[1])
         found = jnp.stack(straight(program, dtype, *given, lanes, pairs, known))
         trig = [x for slot in slots for x in pairs[slot]]
-        return found, jnp.stack(trig) if trig else jnp.zeros((0,), dtype)
+        return found, stacked(trig, dtype)
 
     def results(row: Row) -> Array:
         return jnp.stack(straight(program, dtype, elements(row[0]), elements(row[1]), lanes))
@@ -74,17 +74,15 @@ def _by_numbers(function: Callable, dtype: Any) -> Callable:
     it which row that is in, and compute all rows for each.
     """
 
-    def stacked(rows: Any) -> Any:
-        def one(numbers: list[Array]) -> Array:
-            return jnp.stack(numbers) if numbers else jnp.zeros((0,), dtype)
-
+    def whole(rows: Any) -> Any:
+        one = partial(stacked, dtype=dtype)
         return jax.tree.map(one, rows, is_leaf=lambda x: isinstance(x, list))
 
     def separate(*numbers: Any) -> Any:
-        return jax.tree.map(elements, function(*stacked(numbers)))
+        return jax.tree.map(elements, function(*whole(numbers)))
 
     inner = not_inlined(separate)
-    return lambda *rows: stacked(inner(*jax.tree.map(elements, rows)))
+    return lambda *rows: whole(inner(*jax.tree.map(elements, rows)))
 
 
 def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:

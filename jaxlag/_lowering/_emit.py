@@ -12,7 +12,7 @@ from jaxlag import _params
 from jaxlag._lowering._called import called
 from jaxlag._lowering._graph import FIXED
 from jaxlag._lowering._program import Program
-from jaxlag._lowering._straight import elements, leaves, numbers, run, straight
+from jaxlag._lowering._straight import elements, leaves, numbers, run, stacked, straight
 from jaxlag._xla import opaque_one
 
 # Code of more lines is one function that XLA does not inline: copied into every stage of a solver
@@ -88,8 +88,7 @@ def body(
     if short or len(kinds) > 1 or jax.default_backend() != "cpu":
         return jnp.stack(_function(*kind)(carried, given))
     # One flat array in and one out.
-    row = jnp.stack(given) if given else jnp.zeros((0,), dtype)
-    return called(*kind)(carried, row)
+    return called(*kind)(carried, stacked(given, dtype))
 
 
 @lru_cache(maxsize=256)

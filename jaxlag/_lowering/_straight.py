@@ -143,6 +143,11 @@ def elements(array: Array) -> list[Array]:
     return [lax.squeeze(lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])]
 
 
+def stacked(numbers: Sequence[Array], dtype: Any) -> Array:
+    """Numbers in one row, which may be empty: the inverse of `elements`."""
+    return jnp.stack(numbers) if numbers else jnp.zeros((0,), dtype)
+
+
 def leaves(tree: Any) -> list[Array]:
     """All elements of all arrays of a pytree."""
     return [x for leaf in jax.tree.leaves(tree) for x in elements(jnp.asarray(leaf))]

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -201,8 +201,7 @@ def _written_out(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
 ) -> tuple[Any, Any, Any, Any]:
     """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
-    h = terms.contr(t0, t1)
-    per_step = lax.optimization_barrier(1.0 / h)
+    per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
     lanes = getattr(terms, "in_lanes", False)
 
     def parts(y: Any) -> Any:
@@ -232,7 +231,7 @@ def _written_out(
 def _nystrom(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """The same of y = (q, v), q' = v."""
+    """The same of second-order equations, y = (q, v)."""
     h = terms.contr(t0, t1)
     per_step = lax.optimization_barrier(1.0 / h)
 
@@ -251,11 +250,10 @@ def _nystrom(
 
     def per_time(row: np.ndarray, squared: np.ndarray, c: float) -> Any:
         """What q and v gain, over h."""
-        turns = _scaled(h, _sum(squared, kicks)) if np.any(squared) else None
-        drift = None if c == 0.0 else _scaled(c, y[1])
-        if turns is not None:
-            drift = turns if drift is None else _added(drift, turns)
-        return terms.turned(drift, args), _sum(row, kicks)
+        drifts = [] if c == 0.0 else [_scaled(c, y[1])]
+        if np.any(squared):
+            drifts.append(_scaled(h, _sum(squared, kicks)))
+        return terms.turned(reduce(_added, drifts), args), _sum(row, kicks)
 
     def whole(gain: Any) -> Any:
         """h times it. What a step returns is read in many places: XLA computes divisions once."""

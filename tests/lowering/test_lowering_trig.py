@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 
-from jaxlag._lowering._trig import by_polynomials, sincos
+from jaxlag._lowering._trig import _COSINE, _SINE, by_polynomials, sincos
 
 EPS = np.finfo(float).eps
 RNG = np.random.default_rng(0)
@@ -74,3 +75,14 @@ def test_the_polynomials_have_the_right_derivatives_themselves():
     (s, c), (s_dot, c_dot) = jax.jvp(by_polynomials, (x,), (ones,))
     np.testing.assert_allclose(s_dot, c, atol=16 * EPS)
     np.testing.assert_allclose(c_dot, -s, atol=16 * EPS)
+
+
+def test_polynomials_are_as_exact_as_they_say():
+    """sin r to 5.3e-18 of its size, cos r to 1.4e-17, between the zeros of the other one."""
+    with mpmath.workdps(40):
+        for r in np.linspace(1e-3, np.pi / 2, 400).tolist():
+            z, sine, cosine = mpmath.mpf(r) ** 2, mpmath.sin(r), mpmath.cos(r)
+            s = r + r * z * mpmath.polyval(_SINE[::-1], z)
+            c = 1 - z / 2 + z**2 * mpmath.polyval(_COSINE[::-1], z)
+            assert abs(s / sine - 1) <= 5.3e-18
+            assert abs(c - cosine) <= 1.4e-17
