@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._dynamics import Dynamics, still
@@ -38,6 +38,9 @@ class Ending(NamedTuple):
     tried: Float[Array, "*batch"]
     state: Float[Array, "*batch m"]
 
+
+_PARTS = np.array([0.0, *[1.0] * 32, *2.0 ** np.arange(1, 7)]) / 32
+"""Of a failed step, from its start to its end and beyond: where these meet it is looked at."""
 
 _OPEN = (
     *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
@@ -96,6 +99,7 @@ class Scene(NamedTuple):
     formulation: str
     stabilization: Any
     kinematic: bool  # quasi-velocities enter, whose kinematics may be singular
+    implicit: bool  # steps may be far longer than what decays takes
 
 
 def dynamics_of(
@@ -135,7 +139,7 @@ def explained(scene: Scene, batch: int, given: Any) -> Ending:
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
         dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)
         time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
-        return _explained(dynamics, ending, time, tried, start, q0, args, scene.kinematic)
+        return _explained(scene, dynamics, ending, time, tried, start, q0, args)
 
     for _ in range(batch):
         one = jax.vmap(one)
@@ -143,6 +147,7 @@ def explained(scene: Scene, batch: int, given: Any) -> Ending:
 
 
 def _explained(
+    scene: Scene,
     dynamics: Dynamics,
     ending: Ending,
     time: Array,
@@ -150,22 +155,26 @@ def _explained(
     start: Array,
     q0: Array,
     args: Arguments,
-    kinematic: bool,
 ) -> Ending:
-    """What can be said by the state a failed step started from and the one it was heading for.
+    """What can be said by the state a failed step started from and one that it was heading for.
 
-    The latter, q + (t1 - t0) v, is asked where the former is sound.
+    The latter is asked where the former is sound: the first one on the way with something that is
+    not finite, or q + (t1 - t0) v.
     """
     status = ending.status
-    # Both states in one batch: the terms are traced and compiled once.
+    unexplained = status == int(Status.nonfinite)
     q, w = dynamics.parts(ending.state)
     _, _, v, _ = dynamics.state(time, ending.state, args)
     ahead = jnp.concatenate([q + (tried - time).astype(q.dtype) * v, w])
     last = ending.state[: ahead.shape[0]]
-    taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
     args = dynamics.within(args, time)
-    masses, worsts = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
-    mass = jnp.where(masses[0] >= 0, masses[0], masses[1])
+    found, tau, y = _lost(dynamics, time, tried, ending.state, args, unexplained, scene.implicit)
+    tried = jnp.where(found, tau, tried)
+    ahead = jnp.where(found, y[: ahead.shape[0]], ahead)
+    # Both states in one batch: the terms are traced and compiled once.
+    taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
+    culprits = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
+    mass, lost = (jnp.where(x[0] >= 0, x[0], x[1]) for x in culprits[:2])
     row = jnp.full((), -1, jnp.int32)
     if dynamics.rows.size and dynamics.quasi is None:
         begin = jnp.concatenate([q0, w])
@@ -174,26 +183,25 @@ def _explained(
         if args.rows is not None and args.rows.reacting.kept is not args.kept:
             reacting = _dependent(dynamics, args.rows.reacting.kept, *at)
             row = jnp.where(row >= 0, row, reacting)
-    worst = jnp.where(jnp.all(jnp.isfinite(ahead)), worsts[1], worsts[0])
+    worst = jnp.where(jnp.all(jnp.isfinite(ahead)), culprits[2][1], culprits[2][0])
 
-    unexplained = status == int(Status.nonfinite)
     if dynamics.rows.size:
         short = status == int(Status.step_below_resolution)
-        lost = status == int(Status.projection_failed)
-        dependent = (unexplained | short | lost) & (row >= 0)
+        apart = status == int(Status.projection_failed)
+        dependent = (unexplained | short | apart) & (row >= 0)
         status = jnp.where(dependent, int(Status.rank_change), status)
         if any(map(reads_lam, dynamics.system.forces)):
             sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
             status = jnp.where(unexplained & sound, int(Status.no_reaction_solution), status)
     status = jnp.where(unexplained & (mass >= 0), int(Status.mass_singular), status)
     turned = jnp.full((), -1, jnp.int32)
-    if kinematic:
+    if scene.kinematic:
         turned = _turned(dynamics, time, q, start, q0, args)
         failed = unexplained | (status == int(Status.step_below_resolution))
         status = jnp.where(failed & (turned >= 0), int(Status.kinematics_singular), status)
     concerns = {
         Status.mass_singular: mass,
-        Status.nonfinite: worst,
+        Status.nonfinite: lost,
         Status.step_below_resolution: worst,
         Status.implicit_solve_failed: worst,
         Status.kinematics_singular: turned,
@@ -229,24 +237,62 @@ def _turned(
     return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
 
 
+def _lost(
+    dynamics: Dynamics,
+    time: Array,
+    tried: Array,
+    y: Array,
+    args: Arguments,
+    wanted: Array,
+    implicit: bool,
+) -> tuple[Bool[Array, ""], Array, Array]:
+    """(whether dy/dt is not finite somewhere on a step from y, the first such time, state there).
+
+    By Euler's steps from y on, or on the tangent of the motion: where steps are `implicit`, what
+    decays within one of them is over at y, and the tangent follows what is left. Stages may lie
+    beyond the end of the step, and one at the resolution of time does not move the state: parts of
+    doubling length follow.
+    """
+    lengths = (tried - time) * jnp.asarray(_PARTS, time.dtype)
+
+    def goes_on(carry: tuple) -> Array:
+        k, _, y, rates = carry
+        sound = jnp.all(jnp.isfinite(y)) & jnp.all(jnp.isfinite(rates))
+        return wanted & sound & (k < _PARTS.size)
+
+    def ahead(carry: tuple) -> tuple:
+        k, tau, y, rates = carry
+        tau, y = tau + lengths[k], y + lengths[k].astype(y.dtype) * rates
+        new = dynamics(tau, y, args)
+        if implicit:
+            new = jnp.where((k > 0) & jnp.all(jnp.isfinite(new)), rates, new)
+        return k + 1, tau, y, new
+
+    begin = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
+    _, tau, y, rates = jax.lax.while_loop(goes_on, ahead, begin)
+    # Where the state has grown beyond all numbers, so has all that depends on it.
+    found = wanted & ~jnp.all(jnp.isfinite(rates)) & jnp.all(jnp.isfinite(y))
+    return found, tau, y
+
+
 def _culprits(
     dynamics: Dynamics, tau: Array, y: Array, args: Arguments
-) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """(coordinate without inertia, one of non-finite Q - h or else largest |a|).
+) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
+    """Coordinates (without inertia, of non-finite Q - h, of the largest |a|).
 
     -1 where there is none.
     """
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
-    # A non-finite component spreads through the solve: look at the right-hand side first.
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
         M, _ = augmented(M, masked(A, args.kept))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
-    suspect = jnp.where(jnp.all(jnp.isfinite(effort)), a, effort)
-    finite = jnp.isfinite(suspect)
-    worst = jnp.where(jnp.all(finite), jnp.argmax(jnp.abs(a)), jnp.argmin(finite))
-    return first_unhealthy(M, factor), worst.astype(jnp.int32)
+    # A component that is not finite spreads through the solve: it is looked for before.
+    finite = jnp.isfinite(effort)
+    lost = jnp.where(jnp.all(finite), -1, jnp.argmin(finite))
+    worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
+    return first_unhealthy(M, factor), lost.astype(jnp.int32), worst.astype(jnp.int32)
 
 
 def _dependent(

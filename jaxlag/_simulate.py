@@ -330,6 +330,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         _solver="" if known else name,
         _ending=ending,
         _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
+        _implicit=scheme.implicit,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
         tolerances=None if scheme.controller is None else (values.rtol, values.atol),
         dt_max=values.longest,

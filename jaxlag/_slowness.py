@@ -35,8 +35,9 @@ class Look(NamedTuple):
     Attributes:
         rates: d(dy/dt)/dy, (m, m).
         mass: M, (n, n).
-        error: its local error estimate over the tolerance, (m,); over 1 where there is none.
-        turns: of the projection at the end of the step.
+        error: local error of a step of order 8 over the tolerance, (m,); over 1 where there is
+            none.
+        turns: of the projection at the end of this step.
     """
 
     rates: Float[Array, "m m"]
@@ -65,7 +66,7 @@ def is_stiff(motion: "Solution") -> bool:
 def _stiffness(motion: "Solution") -> Rates | None:
     """The decay that explicit steps are as short as they must be for; None where it is not so."""
     h = _mean_step(motion)
-    if h is None or _implicit(motion):
+    if h is None or motion.scene.implicit:
         return None
     rates = _rates(_look(motion, h, last=True))
     if rates is None or rates.kind != "decays" or not _within(h * rates.fastest, STIFF):
@@ -79,6 +80,8 @@ def advice(motion: "Solution", status: Status) -> str:
     said = (ADVICE | ADVICE_FIXED if fixed else ADVICE).get(status, "")
     if fixed:
         return said
+    if status in (Status.max_steps, Status.step_below_resolution):
+        said += _about_time(motion)
     if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
         return (
             f"The motion is stiff: something in it decays at {rates.fastest:.3g} 1/s, and explicit "
@@ -140,13 +143,21 @@ def explain(motion: "Solution") -> str:
             "Many steps were rejected: forces that jump or bend make the step shrink each time. "
             "Let them read an input with knots, where steps end, or loosen the tolerance."
         )
+    fixed = motion.tolerances is None
+    if coarse := _about_time(motion).strip():
+        advice.append(coarse)
     looks = _look(motion, h)
     lines += _about_rates(motion, h, _rates(looks), advice)
     lines += _about_mass(motion, looks, advice)
-    if not _implicit(motion):  # these are looked at in an explicit step
-        lines += _about_errors(motion, looks)
+    if not motion.scene.implicit:  # these are looked at in an explicit step
+        lines += [] if fixed else _about_errors(motion, looks)
         lines += _about_projection(motion, looks, advice)
-    if not advice:
+    if not advice and fixed:
+        advice.append(
+            "dt alone sets the number of steps, and nothing stands out. Whether a longer one would "
+            "do is told by estimate_error=True."
+        )
+    elif not advice:
         advice.append("Accuracy sets the step, and nothing stands out: a looser tolerance is all.")
     heads = ["advice        ", *["              "] * (len(advice) - 1)]
     return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
@@ -158,8 +169,19 @@ def _mean_step(motion: "Solution") -> float | None:
     return elapsed / accepted if accepted and elapsed > 0 else None
 
 
-def _implicit(motion: "Solution") -> bool:
-    return motion.method.lower().startswith(("kvaerno", "implicit"))
+def _about_time(motion: "Solution") -> str:
+    """Of times so far from 0 that what depends on them is rougher than the tolerance."""
+    h = _mean_step(motion)
+    if h is None or motion.tolerances is None:
+        return ""
+    farthest = float(jnp.max(jnp.abs(motion.ts)))
+    digit = float(jnp.finfo(motion.ts.dtype).eps) * farthest
+    if digit <= 10 * float(np.max(np.asarray(motion.tolerances[0]))) * h:
+        return ""
+    return (
+        f" Times near {farthest:.3g} s are {digit:.2g} s apart: steps this short see jumps of what "
+        "depends on time. Measure time from the start, and make the start a parameter."
+    )
 
 
 def _within(x: float, bounds: tuple[float, float]) -> bool:
@@ -173,7 +195,7 @@ def _about_rates(motion: "Solution", h: float, rates: Rates | None, advice: list
     if rates.kind == "grows":
         return [f"rates         fastest growth e-fold in {time:.3g} s, {1 / product:.2g} steps"]
     if rates.kind == "decays":
-        if _within(product, STIFF) and not _implicit(motion):
+        if _within(product, STIFF) and not motion.scene.implicit:
             advice.append(
                 f"It is stiff: what decays in {time:.3g} s is over, but keeps explicit steps about "
                 "as short. Steps of method='kvaerno5' need not follow."
@@ -181,7 +203,7 @@ def _about_rates(motion: "Solution", h: float, rates: Rates | None, advice: list
         return [f"rates         fastest decay 1/e in {time:.3g} s, {1 / product:.2g} steps"]
     period = 2 * np.pi * time
     turns = abs(float(motion.ts[-1] - motion.ts[0])) / period
-    if _within(period / h, FOLLOWED) and turns > OFTEN and not _implicit(motion):
+    if _within(period / h, FOLLOWED) and turns > OFTEN and not motion.scene.implicit:
         advice.append(
             f"The steps follow an oscillation of period {period:.3g} s, {turns:.2g} of them in "
             "ts: if it does not matter, put a constraint in the place of the stiff part."

@@ -117,6 +117,7 @@ class Solution(eqx.Module):
     stabilization: str | Baumgarte | None = eqx.field(static=True)
     _ending: Ending
     _kinematic: bool = eqx.field(static=True)
+    _implicit: bool = eqx.field(static=True)
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
     dt_max: Float[Array, "*batch"] | None = None
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
@@ -144,7 +145,7 @@ class Solution(eqx.Module):
     def scene(self) -> Scene:
         """What moved, as compiled programs are keyed by it."""
         keys = self._params_static, self._inputs_static, self.formulation, self.stabilization
-        return Scene(self.system, *keys, self._kinematic)
+        return Scene(self.system, *keys, self._kinematic, self._implicit)
 
     def _explained(self) -> Ending:
         if not is_open(self._ending):
@@ -315,8 +316,9 @@ class Solution(eqx.Module):
         """Why the solve took as many steps as it did, and what to change; for a single motion.
 
         Looks at up to 8 of the rows: the fastest rates of the linear equations there (stiffness),
-        rejected steps, the component whose error sets the step, cond(M), and the number of turns
-        in which a step is moved back onto the constraints.
+        rejected steps, cond(M), and, of an explicit step of order 8 from there as long as the
+        motion's were, the component with the largest error and the number of turns in which it is
+        moved back onto the constraints.
 
         Returns:
             A few lines of text, the last of them advice.

@@ -135,6 +135,56 @@ def test_force_that_becomes_nan_in_flight():
         jl.simulate(system, [0.0, 0.0], [1.0, 0.0], [0.0, 2.0], 0.7, dt=0.1)
 
 
+def fades(t, q, v):
+    return jnp.sqrt(0.8 - v[1])
+
+
+def flickers(t, q, v):
+    return jnp.where((t > 1.04) & (t < 1.06), jnp.nan, 1.0)
+
+
+def ends(t, q, v):
+    return jnp.sqrt(0.8 - q[1])
+
+
+@pytest.mark.parametrize(
+    ("law", "options"),
+    [
+        (fades, {}),
+        (fades, {"method": "tsit5", "dt": 0.1}),
+        (flickers, {"method": "dopri8", "dt": 0.1}),
+        (flickers, {"method": "variational4", "dt": 0.1}),
+        (ends, {"method": "kvaerno5"}),
+    ],
+)
+def test_the_coordinate_of_what_is_nowhere_finite_is_found_inside_the_step(law, options):
+    """Of velocity, time or position: neither end of the step needs to be where it fails.
+
+    Another coordinate has the larger acceleration.
+    """
+    force = jl.GeneralizedForce(
+        lambda t, q, v, p: jnp.stack([0.0 * t, 0.3 + 1e-3 * law(t, q, v)]), "law"
+    )
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * (v @ v) - 50.0 * q[0] ** 2, ("x", "y"), forces=(force,)
+    )
+    start = [1.0, 0.0], [0.0, 0.5]
+    motion = jl.simulate(system, *start, [0.0, 3.0], {}, throw=False, **options)
+    assert motion.status == Status.nonfinite
+    assert motion.where == 1
+    assert "nonfinite ('y')" in motion.message()
+
+
+def test_what_grows_beyond_all_numbers_names_no_innocent():
+    """The coordinate whose steps are unstable, or none: all that depends on it is lost too."""
+    system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) - 5e5 * q[0] ** 2 - q[0] * q[1], ("x", "y"))
+    motion = jl.simulate(
+        system, [1.0, 0.0], [0.0, 0.0], [0.0, 9.0], {}, method="tsit5", dt=0.05, throw=False
+    )
+    assert motion.status == Status.nonfinite
+    assert motion.where in (-1, 0)
+
+
 def test_mass_that_vanishes_in_flight():
     """A mass m(x) that reaches zero at x = 1, approached at unit rate."""
     system = jl.System(

@@ -143,6 +143,37 @@ def test_a_motion_without_a_step():
     assert line(motion.explain(), "steps") == "0 attempted, 0 rejected"
 
 
+@pytest.mark.parametrize("method", ["gauss4", "tsit5"])
+def test_fixed_steps_have_no_tolerance_to_loosen(method):
+    """What decays 3 times in a step keeps explicit steps short, implicit ones not."""
+    slow = jl.System(
+        lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
+        ("x",),
+        forces=(jl.Rayleigh(lambda t, q, v, params: 0.5 * params * v[0] ** 2),),
+    )
+    text = jl.simulate(slow, [1.0], [0.0], TS, 300.0, method=method, dt=0.008).explain()
+    assert "tolerance" not in text
+    assert ("It is stiff" in text) == (method == "tsit5")
+    calm = jl.simulate(slow, [1.0], [0.0], TS, 3.0, method=method, dt=0.008).explain()
+    assert line(calm, "advice").startswith("dt alone sets the number of steps")
+
+
+def test_times_far_from_zero_are_told():
+    """1e9 s has digits of 1e-7 s: a force that depends on time is a staircase there."""
+    force = jl.GeneralizedForce(lambda t, q, v, p: jnp.cos(1.3 * (t - p))[None], "shaken")
+    shaken = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2, ("x",), forces=(force,)
+    )
+    options = {"rtol": 1e-12, "atol": 1e-12, "max_steps": 200, "throw": False}
+    late = jl.simulate(shaken, [1.0], [0.0], 1e9 + TS, 1e9, **options)
+    assert late.status == jl.Status.max_steps
+    told = "Times near 1e+09 s are 2.2e-07 s apart"
+    assert told in late.message()
+    assert told in late.explain()
+    early = jl.simulate(shaken, [1.0], [0.0], TS, 0.0, **options)
+    assert "apart" not in early.explain()
+
+
 # ---- Advice in messages --------------------------------------------------------------------------
 
 

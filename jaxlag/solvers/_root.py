@@ -17,12 +17,12 @@ MEMORY = 3  # iterations in which increments halve while they fall
 def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tuple[Array, Array]:
     """(z with residual(z) = 0, whether it was found), by Newton's method with the derivative kept.
 
-    Iterates until no component's increment falls any more: increments are roundings then, so that
-    no tolerance adds an error of one sign in every step. Roundings may fall again by chance: where
-    all increments are small, a component that stopped has stopped. If they are not small beside z
-    by themselves, as near an equilibrium, where z is all rounding, the derivative is taken anew:
-    where it is what it was, the iteration contracts, and what does not fall is noise. Slow
-    iterations go on with the new derivative.
+    Iterates until no component's increment falls any more, or is the last digit of the component
+    itself: increments are roundings then, so that no tolerance adds an error of one sign in every
+    step. Roundings may fall again by chance: where all increments are small, a component that
+    stopped has stopped. If they are not small beside z by themselves, as near an equilibrium, where
+    z is all rounding, the derivative is taken anew: where it is what it was, the iteration
+    contracts, and what does not fall is noise. Slow iterations go on with the new derivative.
 
     The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr, forward, reverse, and forward
     over reverse to any order; reverse over reverse through a loop of steps JAX refuses.
@@ -31,7 +31,8 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
         residual: of z, shape (m,), as many components.
         guess: near the solution. It is returned if nothing was found, nan where the residual is
             not finite there.
-        rounded: what the first components of z, velocities, are roundings of; these are looked at.
+        rounded: what the first components of z, velocities, may be roundings of; these are looked
+            at. It says what increments are small, not where the iteration stops.
 
     Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.6 (iterations until
     convergence, and their round-off).
@@ -70,11 +71,11 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
             z, least, stopped, was_small, k = carry
             change = lu_solve(factor, residual(z))
             z, size = z - change, jnp.abs(change[:count])
-            scale = jnp.abs(z[:count]) + rounded
+            scale = jnp.abs(z[:count]) + jnp.abs(guess[:count])
             new = jnp.minimum(least[-1], size)
-            small = jnp.all(size <= eps**0.75 * scale)
+            small = jnp.all(size <= eps**0.75 * (scale + rounded))
             stopped = stopped & was_small & small
-            stopped = stopped | (size <= 4 * eps * scale) | ~(new < 0.5 * least[0])
+            stopped = stopped | (size <= eps * scale) | ~(new < 0.5 * least[0])
             return z, jnp.stack([*least[1:], new]), stopped, small, k + 1
 
         def goes_on(carry: tuple) -> Array:

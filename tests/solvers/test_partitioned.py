@@ -313,7 +313,21 @@ def test_a_force_that_is_not_finite_is_named():
     options = {"method": "gauss4", "dt": 0.1, "throw": False}
     motion = jl.simulate(system, [0.0], [0.0], [0.0, 1.0], {}, **options)
     assert motion.status == jl.Status.nonfinite
+    assert motion.where == 0
     np.testing.assert_allclose(motion.last_time, 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["gauss4", "variational2"])
+def test_velocities_know_nothing_of_the_origin(method):
+    """Where forces read no q, positions of 1e10 m cost no digit of v (q / h has 1e-5 m/s)."""
+    drag = jl.GeneralizedForce(lambda t, q, v, p: -v * jnp.abs(v), "drag")
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(drag,))
+
+    def last(x0):
+        return jl.simulate(system, [x0], [10.0], [0.0, 1.0], {}, method=method, dt=0.1).v[-1, 0]
+
+    # Roundings of v in 10 steps.
+    np.testing.assert_allclose(last(1e10), last(0.0), rtol=40 * EPS)
 
 
 @pytest.mark.full
