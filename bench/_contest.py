@@ -132,6 +132,13 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
         if figure > 2.0:
             text = profile(rows, system, 1e-9, is_peer)
             profiles.append(Reference(text, f"{figure:.3g} times the best peer: {system} at 1e-09"))
+        for error in ERRORS:
+            others = diffrax("by hand", True)
+            figure = ratio(rows, system, error, others)
+            if figure > 1.0:
+                text = profile(rows, system, error, others)
+                words = f"diffrax by hand with the setting: {system} at {error:.0e}"
+                profiles.append(Reference(text, f"{figure:.3g} times {words}"))
     return targets, profiles
 
 

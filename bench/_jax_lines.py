@@ -21,7 +21,7 @@ from bench._harness import build
 from bench._motions import Motion
 from bench._sweep import Line, Solved, steps, tolerances
 from jaxlag._methods import METHODS
-from jaxlag.solvers import AbstractFixedStep
+from jaxlag.solvers import AbstractFixedStep, GaussLegendre, LobattoIIIAB
 
 ORDER = 5  # of diffrax's own methods from which on they get a line
 MOST_STEPS = 1 << 22
@@ -51,12 +51,15 @@ def with_jaxlag(motion: Motion, method: str) -> Line:
         ValueError: the method is not for such systems.
     """
     fixed = isinstance(METHODS[method](), AbstractFixedStep)
+    canonical = isinstance(METHODS[method](), GaussLegendre | LobattoIIIAB)
+    # Momenta go with velocities, not with quasi-velocities.
+    formulation = "multipliers" if canonical and motion.system.quasi is not None else "auto"
 
     def solve(q0: Array, v0: Array, params: Any, knob: Array) -> tuple[Array, Array, Array]:
         options = {"dt": knob, "max_steps": MOST_STEPS}
         if not fixed:
             options = {"rtol": knob, "atol": knob, "max_steps": MOST_STEPS}
-        ts = (0.0, motion.t1)
+        ts, options["formulation"] = (0.0, motion.t1), formulation
         end = jl.simulate(motion.system, q0, v0, ts, params, method=method, throw=False, **options)
         return end.q[-1], end.status == 0, end.stats["accepted"]
 

@@ -38,6 +38,7 @@ class Line(NamedTuple):
         make: a call that returns finished work for one value.
         read: what it returned.
         build_s: what it took to get here, compilation in it; `make` may add to that.
+        said: what runs that failed said, added to as they do.
     """
 
     knob: str
@@ -45,6 +46,13 @@ class Line(NamedTuple):
     make: Callable[[float], Call]
     read: Callable[[Any], Solved]
     build_s: float
+    said: Sequence[str] = ()
+
+    def why_none(self, patience_s: float) -> str:
+        """Of a line without a point."""
+        if self.said:
+            return self.said[-1]
+        return f"no run of at most {FACTOR * patience_s:g} s ended with an error below {WRONG:g}"
 
 
 def tolerances(loosest: float = 2.5, tightest: float = 14.0, each: float = 0.5) -> list[float]:

@@ -58,6 +58,8 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
         except Exception as error:  # what a method says of a system not for it, a broken library
             facts["none"][words] = f"{type(error).__name__}: {error}".splitlines()[0]
             continue
+        if not points:
+            facts["none"][words] = line.why_none(PATIENCE_S)
         facts["points"][words] = points
         calls |= {f"{words}|{value}": call for value, call in found.items()}
         for value, point in zip(found, points, strict=True):

@@ -98,6 +98,13 @@ def test_failed_runs_are_no_points():
     assert (len(calls), len(points)) == (1, 1)
 
 
+def test_a_line_without_a_point_says_why():
+    line = made_up_line({1e-1: math.nan})
+    assert swept(line, float, patience_s=0.5)[1] == []
+    assert line.why_none(0.5) == "no run of at most 2 s ended with an error below 0.1"
+    assert line._replace(said=["first", "too much work"]).why_none(0.5) == "too much work"
+
+
 def points(*pairs):
     return [{"error": error, "min_us": us} for error, us in pairs]
 
@@ -144,6 +151,14 @@ def test_every_solver_of_ours_has_a_line():
     lanes = _jax_lines.methods(MOTIONS["16 double pendulums"]())
     assert "dopri8" in lanes
     assert not any(isinstance(METHODS[name](), AbstractFixedStep) for name in lanes)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["gauss8", "variational4"])
+def test_canonical_methods_have_a_line_where_the_state_is_of_quasi_velocities(method):
+    motion = motion_of("heavy top")._replace(t1=0.1)
+    line = _jax_lines.with_jaxlag(motion, method)
+    assert line.read(line.make(0.1 / 64)()).steps == 64
 
 
 @pytest.mark.parametrize("lanes", mostly_full([False, True], False))

@@ -81,6 +81,10 @@ def test_targets_are_judged_and_what_misses_is_explained():
     )
     slow = _contest.judged(made_up_rows(ours=3.0), SYSTEMS)[1]
     assert any(reference.what.startswith("3.75 times the best peer") for reference in slow)
+    assert not any("times diffrax by hand" in reference.what for reference in slow)
+    slower = {reference.what for reference in _contest.judged(made_up_rows(ours=5.0), SYSTEMS)[1]}
+    words = "1.25 times diffrax by hand with the setting: Kepler, e = 0.6 at 1e-09"
+    assert words in slower
 
 
 @pytest.mark.parametrize(("fixed", "expected"), [(70.0, (70.0, 0.6)), (0.0, (0.0, 0.6))])
