@@ -61,7 +61,7 @@ def with_jaxlag(motion: Motion, method: str) -> Line:
             options = {"rtol": knob, "atol": knob, "max_steps": MOST_STEPS}
         ts, options["formulation"] = (0.0, motion.t1), formulation
         end = jl.simulate(motion.system, q0, v0, ts, params, method=method, throw=False, **options)
-        return end.q[-1], end.status == 0, end.stats["accepted"]
+        return end.q[-1], end.ok, end.stats["accepted"]
 
     knobs = (
         steps(motion.t1, motion.fewest, MOST_STEPS) if fixed else tolerances(motion.loosest, 16.0)

@@ -19,8 +19,9 @@ class Splitting(AbstractFixedStep):
     For systems with constant M in which nothing that accelerates depends on v: L = T(v) - V(t, q)
     with T quadratic, and forces Q(t, q). Both parts are solved exactly, so every composition
     keeps the symplectic form, momenta of symmetries of T and V, and, being symmetric, reverses.
-    A drift comes first and takes time along. The work that is asked for is that of every kick; with
-    order 6, whose composition is one for accelerations that depend on q alone, it is of order 4.
+    A drift comes first, with order 6 a kick, and drifts take time along. The work that is asked for
+    is that of every kick; with order 6, whose composition is one for accelerations that depend on q
+    alone, it is of order 4.
 
     In `diffrax.diffeqsolve` y is a pair (q, v) of pytrees, `vf(t, y, args)` the pair (v, M^-1 F).
     The terms of `simulate` take y apart by `sections(y) -> (q, v, work)`, put it together by
