@@ -12,10 +12,15 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 class Found(NamedTuple):
-    """How a row ended: its figure, and the statuses of its motions in their order."""
+    """How a row ended: its figure, and the statuses of its motions in their order.
+
+    Attributes:
+        details: what the figure was made of, in words and numbers.
+    """
 
     figure: float
     statuses: tuple[str, ...]
+    details: str = ""
 
 
 class Case(NamedTuple):
@@ -27,6 +32,7 @@ class Case(NamedTuple):
         bound: the figure must not exceed it where the status is ok.
         statuses: statuses other than ok that say what is singular; () where none is due.
         run: from `quick`.
+        quick_bound: of a quick run, where fewer steps tell less.
     """
 
     name: str
@@ -34,6 +40,12 @@ class Case(NamedTuple):
     bound: float
     statuses: tuple[str, ...]
     run: Callable[[bool], Found]
+    quick_bound: float | None = None
+
+    def in_quick(self, quick: bool) -> "Case":
+        """The row with the bound that holds for this run."""
+        loose = quick and self.quick_bound is not None
+        return self._replace(bound=self.quick_bound) if loose else self
 
 
 class Rows:
@@ -43,12 +55,17 @@ class Rows:
         self.cases: list[Case] = []
 
     def row(
-        self, name: str, figure: str, bound: float, statuses: Sequence[str] = ()
+        self,
+        name: str,
+        figure: str,
+        bound: float,
+        statuses: Sequence[str] = (),
+        quick_bound: float | None = None,
     ) -> Callable[[Callable[[bool], Found]], Callable[[bool], Found]]:
         """A decorator: the function runs this row."""
 
         def added(run: Callable[[bool], Found]) -> Callable[[bool], Found]:
-            self.cases.append(Case(name, figure, bound, tuple(statuses), run))
+            self.cases.append(Case(name, figure, bound, tuple(statuses), run, quick_bound))
             return run
 
         return added

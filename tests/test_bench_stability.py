@@ -7,7 +7,9 @@ import pytest
 
 import jaxlag as jl
 from bench import (
+    _drifts,
     _long_runs,
+    _references,
     _stress,
     stability,
 )
@@ -59,6 +61,47 @@ def test_stress_rows_are_named_once_and_quick_ones_exist():
     assert len(set(names)) == len(names)
     assert set(names) >= stability.QUICK
     assert sum(not case.statuses for case in stability.CASES) >= stability.LEAST
+
+
+def test_a_quick_run_is_judged_by_its_own_bound():
+    case = stressed(figure=1.5)._replace(quick_bound=2.0)
+    assert stability.judged(case, quick=True)["verdict"] == "within"
+    assert stability.judged(case, quick=False)["verdict"] == "silent"
+
+
+def oscillating(drift, noise):
+    """Two incommensurate oscillations of 1e12, in 20 motions of 200 000 steps, rows 20 apart."""
+    steps = np.arange(1, 10_001) * 20
+    random = np.random.default_rng(0)
+    phases = random.uniform(0, 2 * np.pi, (2, 20, 1))
+    a, b = np.cos(0.1 * steps + phases[0]), np.cos(0.1 * np.sqrt(2) * steps + phases[1])
+    walk = noise * np.sqrt(20) * np.cumsum(random.normal(size=(20, len(steps))), axis=1)
+    return (1e12 * (a + b + a * b) + drift * steps + walk) * _drifts.EPS
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.03, -0.03])
+def test_a_drift_shows_below_oscillations_and_walks(drift):
+    """Without one the figure is within what a walk of its size explains, with one it is beyond."""
+    length = _drifts.Length(200_000, 5_000, 20)
+    found = _drifts.drift(oscillating(drift, 1.0), 20, ("ok",))
+    bound = _drifts.walked(3, length)  # of a walk of 1.04 eps a step
+    assert (found.figure <= bound) == (drift == 0.0)
+    mean = float(found.details.split()[1])
+    assert abs(mean - drift) < 4e-3
+
+
+def test_a_drift_that_cannot_be_told_is_beyond_its_bound():
+    """An error bar that is too wide fails the row as a drift does."""
+    found = _drifts.drift(oscillating(0.0, 30.0), 20, ("ok",))
+    assert found.figure > _drifts.walked(3, _drifts.Length(200_000, 5_000, 20))
+
+
+def test_a_derivative_by_the_imaginary_part_is_that_of_the_motion():
+    """Of motions written by hand, against a difference."""
+    along = np.array([0.3, -1.0])
+    ends = [_references.double_pendulum([1.0, 0.5] + h * along, 1.0, 2.0)[0] for h in (1e-4, -1e-4)]
+    slope = _references.double_pendulum(np.array([1.0, 0.5]), 1.0, 2.0, along)[1]
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-4, rtol=0, atol=1e-6)
 
 
 @pytest.mark.full
