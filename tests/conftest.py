@@ -20,7 +20,7 @@ if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
 
 import jax
 import pytest
-from _footprint import MAPS, Footprint, maps
+from _footprint import BYTES, MAPS, Footprint, held, maps
 
 import jaxlag as jl  # before the first compilation: it sets XLA's bound on small loops
 from jaxlag._lowering import ArrayTerms
@@ -80,9 +80,9 @@ def drop():
 
 @pytest.fixture(autouse=True)
 def bounded():
-    """A module of many programs lets go of them on the way, half the bound of the guard left."""
+    """A module of many programs lets go of them on the way, half the bounds of the guard left."""
     yield
-    if maps() > MAPS / 2:
+    if maps() > MAPS / 2 or held() > BYTES / 2:
         drop()
 
 

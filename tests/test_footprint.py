@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from _footprint import held
 
 CONFTEST = """
 from _footprint import Footprint
@@ -69,3 +70,13 @@ def test_every_worker_reports_and_a_run_within_the_bounds_passes(tmp_path):
     assert status == 0
     assert re.findall(r"^(gw\d): \d+ memory maps", output, re.MULTILINE) == ["gw0", "gw1"]
     assert "TOO MUCH" not in output
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is not told here")
+def test_memory_is_that_of_now():
+    before = held()
+    block = b"x" * (64 << 20)
+    full = held()
+    assert 60e6 < full - before < 80e6
+    del block
+    assert held() < full - 60e6
