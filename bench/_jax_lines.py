@@ -21,7 +21,7 @@ from bench._harness import build
 from bench._motions import Motion
 from bench._sweep import Line, Solved, steps, tolerances
 from jaxlag._methods import METHODS
-from jaxlag.solvers import AbstractFixedStep, GaussLegendre, LobattoIIIAB
+from jaxlag.solvers import AbstractFixedStep
 
 ORDER = 5  # of diffrax's own methods from which on they get a line
 MOST_STEPS = 1 << 22
@@ -51,9 +51,8 @@ def with_jaxlag(motion: Motion, method: str) -> Line:
         ValueError: the method is not for such systems.
     """
     fixed = isinstance(METHODS[method](), AbstractFixedStep)
-    canonical = isinstance(METHODS[method](), GaussLegendre | LobattoIIIAB)
-    # Momenta go with velocities, not with quasi-velocities.
-    formulation = "multipliers" if canonical and motion.system.quasi is not None else "auto"
+    # Methods that keep a structure have velocities in their state, not quasi-velocities.
+    formulation = "multipliers" if fixed and motion.system.quasi is not None else "auto"
 
     def solve(q0: Array, v0: Array, params: Any, knob: Array) -> tuple[Array, Array, Array]:
         options = {"dt": knob, "max_steps": MOST_STEPS}

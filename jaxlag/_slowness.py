@@ -81,7 +81,7 @@ def advice(motion: "Solution", status: Status) -> str:
     if fixed:
         return said
     if status in (Status.max_steps, Status.step_below_resolution):
-        said += _about_time(motion)
+        said = f"{said} {_about_time(motion)}".strip()
     if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
         return (
             f"The motion is stiff: something in it decays at {rates.fastest:.3g} 1/s, and explicit "
@@ -144,7 +144,7 @@ def explain(motion: "Solution") -> str:
             "Let them read an input with knots, where steps end, or loosen the tolerance."
         )
     fixed = motion.tolerances is None
-    if coarse := _about_time(motion).strip():
+    if coarse := _about_time(motion):
         advice.append(coarse)
     looks = _look(motion, h)
     lines += _about_rates(motion, h, _rates(looks), advice)
@@ -179,7 +179,7 @@ def _about_time(motion: "Solution") -> str:
     if digit <= 10 * float(np.max(np.asarray(motion.tolerances[0]))) * h:
         return ""
     return (
-        f" Times near {farthest:.3g} s are {digit:.2g} s apart: steps this short see jumps of what "
+        f"Times near {farthest:.3g} s are {digit:.2g} s apart: steps this short see jumps of what "
         "depends on time. Measure time from the start, and make the start a parameter."
     )
 

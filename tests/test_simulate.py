@@ -157,7 +157,7 @@ def ends(t, q, v):
         (ends, {"method": "kvaerno5"}),
     ],
 )
-def test_the_coordinate_of_what_is_nowhere_finite_is_found_inside_the_step(law, options):
+def test_a_force_that_fails_inside_a_step_is_found_there(law, options):
     """Of velocity, time or position: neither end of the step needs to be where it fails.
 
     Another coordinate has the larger acceleration.
