@@ -22,6 +22,7 @@ from bench import (
     _long_runs,
     _places,
     _single_precision,
+    _walls,
 )
 from bench._harness import Reference, Report, Target
 from bench._stress import Case, Found, verdict
@@ -35,6 +36,7 @@ PARTS = (
     _single_precision,
     _gradient_rows,
     _fit_rows,
+    _walls,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
 LEAST = 25  # rows that must end in success
@@ -61,6 +63,8 @@ QUICK = {
     "a force that becomes nan",
     "fewer steps than it takes",
     "steps far too long for a stiff spring",
+    "sharp: one-sided spring",
+    "sharp: exponential barrier",
 }
 
 

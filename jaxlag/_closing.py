@@ -30,21 +30,39 @@ def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
     return Closed(params, tracers, tuple(map(id, tracers))) if tracers else params
 
 
+def declared(
+    system: System, t: Array, q: Array, v: Array, params: Any, values: Any, lam: Array | None
+) -> Any:
+    """Everything that is declared, at one state; without values of the inputs, no forces.
+
+    Args:
+        system: whose functions are called.
+        t: time.
+        q: coordinates.
+        v: velocities.
+        params: as the Lagrangian takes them.
+        values: of the inputs, by name; None without.
+        lam: multipliers that forces read; None for zeros.
+    """
+    terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
+    L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
+    u = None if system.quasi is None else system.quasi.of(t, q, v, params)
+    rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
+    if values is None:
+        return L, u, rows
+    slides = [slide(t, q, v, params) for slide in sliding(system.forces)]
+    lam = jnp.zeros_like(rows[1]) if lam is None else lam
+    return L, u, rows, slides, terms.force(t, q, v, params, values, lam)
+
+
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
     """The constants of a program that calls every function of the declaration."""
     traced, static = _params.split((params, inputs))
-    terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
         params, inputs = _params.join(traced, static)
-        L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
-        u = None if system.quasi is None else system.quasi.of(t, q, v, params)
-        rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
-        if inputs is None:
-            return L, u, rows
-        slides = [slide(t, q, v, params) for slide in sliding(system.forces)]
-        values = evaluate(inputs, t, q, v, params)
-        return L, u, rows, slides, terms.force(t, q, v, params, values, jnp.zeros_like(rows[1]))
+        values = None if inputs is None else evaluate(inputs, t, q, v, params)
+        return declared(system, t, q, v, params, values, None)
 
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.make_jaxpr(everything)(t, q, q, traced).consts

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._put import put
 from jaxlag._record import Outcome, Record, Times
-from jaxlag._scheme import Scheme, all_finite, resolution
+from jaxlag._scheme import Estimate, Scheme, all_finite, resolution
 from jaxlag._status import Status
 
 # The record is a whole number of chunks of this many turns.
@@ -249,11 +249,11 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         t1 = jnp.where(to_row, due, t1)
     jumped = False if begin.jump is None else begin.jump
     args = scheme.within(loop.args, begin.t)
-    y1, error, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
+    y1, estimate, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
     finite = all_finite(y1)
     settled, verdict = scheme.settled(t1, y1, args)
     good = finite & solved & verdict.good
-    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, error, good, lands)
+    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, estimate, good, lands)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -262,7 +262,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     failure = jnp.full((), int(Status.step_below_resolution))
     smooth = jnp.array(True)
     if c.rows is not None:
-        smooth = ~to_row | scheme.is_smooth(begin.y, y1, error)
+        smooth = ~to_row | scheme.is_smooth(begin.y, y1, estimate)
     for right, kind in (
         (smooth | (not scheme.moves), Status.projection_failed),
         (verdict.pressed, Status.no_reaction_solution),
@@ -321,7 +321,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
 
 
 def _next_step(
-    loop: _Loop, c: _Carry, t1: Array, y1: PyTree, error: PyTree, good: Array, lands: Array
+    loop: _Loop, c: _Carry, t1: Array, y1: PyTree, estimate: Estimate, good: Array, lands: Array
 ) -> tuple[Array, Array, Any, Array, Array]:
     """Whether to keep this step, and the next one.
 
@@ -333,7 +333,9 @@ def _next_step(
     if scheme.controller is None:
         return good, c.h, None, jnp.zeros_like(good), ~good
     order: Any = scheme.solver.error_order(scheme.term)
-    error = jax.tree.map(lambda e: jnp.where(good, e, jnp.inf), error)
+    error = scheme.held_to(t, t1, y, y1, estimate)
+    error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
+    y1 = _select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
     proposal: Any = scheme.controller.adapt_step_size(
         t, t1, y, y1, loop.args, error, order, c.control
     )

@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
+from jaxlag._closing import declared
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
 from jaxlag._errors import bad
 from jaxlag._forces import sliding
+from jaxlag._input_values import InputValues
 from jaxlag._inputs import (
     all_knots,
     at_interval,
@@ -23,12 +25,14 @@ from jaxlag._inputs import (
     marked,
     reads_state,
 )
+from jaxlag._kinks import has_kinks
 from jaxlag._linalg import clearly_definite
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
 from jaxlag._quasi import QuasiVelocities
 from jaxlag._rank import Choice, independent_rows, row_sizes
+from jaxlag._signals import AbstractInput, AbstractTable
 from jaxlag._step import Arguments, Gaps, RowChoice
 from jaxlag._system import System
 from jaxlag._terms import Terms
@@ -397,6 +401,34 @@ class Dynamics(eqx.Module):
         assert self.power is not None
         columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
+
+    def has_kinks(self, tau: Array, y: Array, args: Arguments) -> bool:
+        """Whether forces, or what they follow from, may bend or jump within a step.
+
+        Tables and functions with knots do so at ends of steps.
+        """
+        _, q, v, params, values = self.at(tau, y, args)
+        _, inputs = self.given(args)
+        inside = {
+            name: x
+            for name, x in inputs.items()
+            if isinstance(x, AbstractInput)
+            and not isinstance(x, AbstractTable)
+            and x.knots() is None
+        }
+        traced, static = _params.split((params, inside))
+
+        def everything(t: Array, q: Array, v: Array, lam: Array, values: Any, traced: Any) -> Any:
+            params, inside = _params.join(traced, static)
+            found = evaluate(inside, t, q, v, params)
+            values = InputValues(values | dict(found))
+            return declared(self.system, t, q, v, params, values, lam)
+
+        lam = jnp.zeros((self.rows.size,), q.dtype)
+        moving = (self.clock(tau, args), q, v, lam, dict(values))
+        program = jax.make_jaxpr(everything)(*moving, traced).jaxpr
+        count = len(jax.tree.leaves(moving))
+        return has_kinks(program, [i < count for i in range(len(program.invars))])
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Lines of the scalar program for states and arguments like these, where there is one."""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -17,8 +17,24 @@ from jaxlag._settling import Settling
 from jaxlag._step import Verdict
 from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
+from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
 _SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
+
+
+class Estimate(NamedTuple):
+    """What a step says of its error.
+
+    Attributes:
+        error: its estimate; None of methods that have none.
+        unseen: what that takes no notice of; None where there is nothing.
+        apart: difference of h dy/dt at the end of the step and at the stage before, where both are
+            of that time and it is asked for.
+    """
+
+    error: PyTree
+    unseen: PyTree | None = None
+    apart: PyTree | None = None
 
 
 class Scheme(eqx.Module):
@@ -33,6 +49,8 @@ class Scheme(eqx.Module):
     settle: Callable | None = eqx.field(static=True, default=None)
     moves: bool = eqx.field(static=True, default=False)  # whether `settle` moves the state
     longest: Array | None = None  # bound on adaptive steps
+    # whether errors are held to the change of the state over a step, not to the state alone
+    by_change: bool = eqx.field(static=True, default=False)
 
     @property
     def remembers(self) -> bool:
@@ -82,11 +100,22 @@ class Scheme(eqx.Module):
         fastest perturbations turn or grow, as their own error estimate would have it. Other motions
         keep their steps. Implicit methods need not follow what decays: theirs are bounded, on CPU,
         at rest alone and by what turns or grows.
+
+        Where forces may bend, perturbations jump: steps are held to more (`held_to`).
         """
         controller: Any = self.controller
+        if type(controller) is not diffrax.PIDController:
+            return self
+        zero = jnp.zeros_like(args.origin)
+        kinks = isinstance(self.term, Term) and self.term.dynamics.has_kinks(zero, y, args)
+        scheme = replace(self, by_change=True) if kinks else self
+        return scheme._unseen_bounded(y, args)
+
+    def _unseen_bounded(self, y: Array, args: Any) -> "Scheme":
+        """With steps bounded where error estimates do not see what perturbations do."""
+        controller: Any = self.controller
         explicit = not self.implicit
-        bounded = type(controller) is diffrax.PIDController and controller.dtmax is None
-        if not bounded or not (explicit or jax.default_backend() == "cpu"):
+        if controller.dtmax is not None or not (explicit or jax.default_backend() == "cpu"):
             return self
         zero = jnp.zeros_like(args.origin)
         y, args = jax.lax.stop_gradient((y, self.within(args, zero)))
@@ -121,8 +150,8 @@ class Scheme(eqx.Module):
 
     def step(
         self, t0: Array, t1: Array, y: PyTree, args: Any, memory: Any, jump: Any
-    ) -> tuple[PyTree, PyTree, Any, Bool[Array, "..."]]:
-        """(y1, error estimate or None, solver state, whether implicit equations were solved)."""
+    ) -> tuple[PyTree, Estimate, Any, Bool[Array, "..."]]:
+        """(y1, its error, solver state, whether implicit equations were solved)."""
         if self.moves:
             # The state is not the one that the last step ended in: its last stage is of no use.
             jump = True if isinstance(self.solver, AbstractExplicit) else jnp.array(True)
@@ -130,16 +159,60 @@ class Scheme(eqx.Module):
             # What was remembered is of the other side.
             fresh = self.solver.init(self.term, t0, t1, y, args)
             memory = jax.tree.map(partial(jnp.where, jump), fresh, memory)
-        y1, error, _, memory, result = self.solver.step(self.term, t0, t1, y, args, memory, jump)
-        return y1, error, memory, result == diffrax.RESULTS.successful
+        if isinstance(self.solver, AbstractExplicit):
+            y1, error, beside, k, memory = self.solver.attempt(
+                self.term, t0, t1, y, args, memory, jump
+            )
+            return y1, self._estimate(error, beside, k), memory, jnp.array(True)
+        y1, error, dense, memory, result = self.solver.step(
+            self.term, t0, t1, y, args, memory, jump
+        )
+        solved = result == diffrax.RESULTS.successful
+        tableau = _explicit_tableau(self.solver)
+        if self.controller is None or tableau is None:
+            return y1, Estimate(error), memory, solved
+        stages = unweighted_stages(tableau.b_sol, tableau.b_error)
+        beside = unseen(unstacked(dense["k"]), stages) if stages else None
+        return y1, self._estimate(error, beside, dense["k"]), memory, solved
 
-    def is_smooth(self, y0: PyTree, y1: PyTree, error: PyTree) -> Bool[Array, ""]:
+    def _estimate(self, error: PyTree, beside: PyTree, k: PyTree) -> Estimate:
+        wanted = self.by_change and ends_twice(self.solver)
+        return Estimate(error, beside, k[-1] - k[-2] if wanted else None)
+
+    def held_to(self, t0: Array, t1: Array, y0: Array, y1: Array, estimate: Estimate) -> PyTree:
+        """The error that the controller bounds: of the step, or `by_change` of its derivative, too.
+
+        Where a force bends, its derivative jumps by J. A step of h across leaves an error of order
+        h^2 J in the state, and one of order h J in perturbations of it: the former over the length
+        of the step. So the error is bounded by a part of the change over the step,
+
+            |error| <= rtol |y1 - y0|     in the controller's norm,
+
+        and by a hundredth of that where it is above |h dy/dt(y1) - h dy/dt(last stage)|, as it is
+        across a bend alone: there an estimate is a small part of the error. Steps near what times
+        can resolve are bounded by their own error.
+        """
+        error = at_least(estimate.error, estimate.unseen)
+        if not self.by_change:
+            return error
+        controller: Any = self.controller
+        allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
+        part = controller.rtol * controller.norm((y1 - y0) / allowed)
+        if estimate.apart is not None:
+            bends = controller.norm(estimate.error / allowed) > controller.norm(
+                estimate.apart / allowed
+            )
+            part = jnp.where(bends, _ACROSS * part, part)
+        told = (part > 0) & (t1 - t0 > _FINE * resolution(t1))
+        return error / jnp.where(told, jnp.minimum(part, 1.0), 1.0)
+
+    def is_smooth(self, y0: PyTree, y1: PyTree, estimate: Estimate) -> Bool[Array, ""]:
         """Whether a step that no control rejects, to a row, went through a smooth field.
 
         It is part of one that was accepted: an error estimate of a thousand times what is allowed
         is that of a field which is singular, or jumps, where the row lies.
         """
-        controller: Any = self.controller
+        controller, error = self.controller, estimate.error
         if error is None or not isinstance(controller, diffrax.PIDController):
             return jnp.array(True)
 
@@ -236,6 +309,8 @@ def _scaled_norm(controller: Any, y0: Array, x: Array) -> Array:
     return controller.norm(x / (controller.atol + controller.rtol * jnp.abs(y0)))
 
 
+_FINE = 64.0  # resolutions of time
+_ACROSS = 0.01  # of the change that an error across a bend may be, in tolerances
 _UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of perturbations
 
 
@@ -279,6 +354,18 @@ def _turning(J: Array) -> Array:
     values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
     turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
     return jnp.where(finite, jnp.max(jnp.where(turning, jnp.abs(values), 0.0)), jnp.nan)
+
+
+def ends_twice(solver: diffrax.AbstractSolver) -> bool:
+    """Whether the last two stages of an explicit method are at the end of the step."""
+    tableau = _explicit_tableau(getattr(solver, "stock", solver))
+    return tableau is not None and bool(np.all(tableau.c[-2:] == 1.0))
+
+
+def _explicit_tableau(solver: diffrax.AbstractSolver) -> Any:
+    """The coefficients of an explicit Runge-Kutta method; None of others, wrapped ones included."""
+    explicit = isinstance(solver, diffrax.AbstractERK)
+    return getattr(solver, "tableau", None) if explicit else None
 
 
 def looks_ahead(solver: diffrax.AbstractSolver) -> bool:

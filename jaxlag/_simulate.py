@@ -82,6 +82,12 @@ def simulate(
     accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
     coincide, only for moving them together). It is zero in dt, dt0, dt_max, rtol and atol.
 
+    Where L or a force compares what moves (max(x, 0), where, abs), perturbations jump as the force
+    bends, and steps along which derivatives are taken are held to the change of the state, too. A
+    first derivative is then about as good as the motion. A second one leaves out what every bend
+    adds, where the force's second derivative is infinite, as JAX's own of such functions do: smooth
+    the force (softplus) where that matters.
+
     Args:
         system: what moves.
         q0: coordinates at ts[0]: (n,) numbers or a dict by name; m or rad.

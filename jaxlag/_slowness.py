@@ -26,6 +26,7 @@ STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stabil
 FOLLOWED = (1.5, 25.0)  # steps per turn of an oscillation that they follow
 OFTEN = 1000  # turns within ts from which on following each is a reason to be slow
 REJECTED = 0.3  # part of the attempts
+UNEVEN = 0.1  # from this part on steps are as long as the sharpest places let them
 TURNS = 3  # of the projection, after one step
 
 
@@ -140,8 +141,9 @@ def explain(motion: "Solution") -> str:
         )
     if attempts >= 20 and rejected > REJECTED * attempts:
         advice.append(
-            "Many steps were rejected: forces that jump or bend make the step shrink each time. "
-            "Let them read an input with knots, where steps end, or loosen the tolerance."
+            "Many steps were rejected: forces that jump, bend or rise within a short way make the "
+            "step shrink each time. Where that is at known times, let them read an input with "
+            "knots, where steps end. Where it depends on the position, these steps are needed."
         )
     fixed = motion.tolerances is None
     if coarse := _about_time(motion):
@@ -157,6 +159,8 @@ def explain(motion: "Solution") -> str:
             "dt alone sets the number of steps, and nothing stands out. Whether a longer one would "
             "do is told by estimate_error=True."
         )
+    elif not advice and rejected > UNEVEN * attempts:
+        advice.append("Accuracy sets the step, where forces change fast most of all.")
     elif not advice:
         advice.append("Accuracy sets the step, and nothing stands out: a looser tolerance is all.")
     heads = ["advice        ", *["              "] * (len(advice) - 1)]

@@ -39,6 +39,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxlag._errors import bad
+from jaxlag._kinks import smooth
 
 # Of the Taylor series of sin(x)/x in z = x^2. Up to |z| = 4 the first term left out is below EPSEPS
 # of the sum, in each of its first three derivatives too; beyond, the quotient loses few digits.
@@ -46,6 +47,7 @@ _SINC_TERMS = 13
 _SINC_SERIES_BELOW = 4.0
 
 
+@smooth
 def norm(x: Any) -> Float[Array, "..."]:
     """Euclidean length |x| = sqrt(sum x_i^2), free of overflow and underflow on the way.
 
@@ -67,6 +69,7 @@ def norm(x: Any) -> Float[Array, "..."]:
     return _norm(_vector("norm: x", x))
 
 
+@smooth
 def unit(x: Any) -> Float[Array, "..."]:
     """Direction x/|x|, dimensionless, in the shape of x; at x = 0 it and its derivatives are 0.
 
@@ -81,6 +84,7 @@ def unit(x: Any) -> Float[Array, "..."]:
     return _unit(_vector("unit: x", x))
 
 
+@smooth
 def angle_between(a: Any, b: Any) -> Float[Array, "..."]:
     """Angle in [0, pi] between two vectors, rad: atan2(|a ^ b|, a . b), to some eps everywhere.
 
@@ -129,6 +133,7 @@ def sqrt(x: Any) -> Float[Array, "..."]:
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, x)))
 
 
+@smooth
 def atan2(y: Any, x: Any) -> Float[Array, "..."]:
     """Angle of the point (x, y) from the x axis, rad, in [-pi, pi]: y = r sin, x = r cos.
 
@@ -173,6 +178,7 @@ def asin(x: Any) -> Float[Array, "..."]:
     return jnp.arctan2(x, sqrt((1 - x) * (1 + x)))
 
 
+@smooth
 def sinc(x: Any) -> Float[Array, "..."]:
     """sin(x)/x, NOT sin(pi x)/(pi x) as in numpy; 1 at x = 0. Smooth and even.
 
@@ -187,6 +193,7 @@ def sinc(x: Any) -> Float[Array, "..."]:
     return jnp.where(small, _sinc_series(0, jnp.where(small, x, 0.0) ** 2), jnp.sin(away) / away)
 
 
+@smooth
 def sinc_sqrt(z: Any) -> Float[Array, "..."]:
     """sin(x)/x as a function of z = x^2; smooth at z = 0, NaN for z <= -4.
 
@@ -216,6 +223,7 @@ def one_minus_cos(x: Any) -> Float[Array, "..."]:
     return 2.0 * jnp.sin(0.5 * _real("one_minus_cos: x", x)) ** 2
 
 
+@smooth
 def cosc(x: Any) -> Float[Array, "..."]:
     """(1 - cos(x))/x^2 = sinc(x/2)^2/2; 1/2 at x = 0. Smooth and even.
 
@@ -227,6 +235,7 @@ def cosc(x: Any) -> Float[Array, "..."]:
     return 0.5 * sinc(0.5 * _real("cosc: x", x)) ** 2
 
 
+@smooth
 def cosc_sqrt(z: Any) -> Float[Array, "..."]:
     """(1 - cos(x))/x^2 as a function of z = x^2, as `sinc_sqrt`; NaN for z <= -16.
 

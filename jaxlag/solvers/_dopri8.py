@@ -16,6 +16,13 @@ class Dopri8(AbstractExplicit):
     8.8e-9). `simulate` takes a step to each saved time instead, which is as accurate as any: 1e-11
     there.
 
+    Hairer's 8(5,3), whose estimate joins those of orders 5 and 3, takes 0.9 to 1.3 times as many
+    evaluations to equal errors (pendulums, Henon and Heiles, Kepler orbits, two coupled rates;
+    errors 1e-4 to 1e-10). On twelve sharp potentials of 1,000 starts it leaves 1 to 80 motions of
+    each more than 1 % off in energy at 1e-6, where this one leaves 0 or 1: with the part of
+    stages without weight in its error estimate, as in `AbstractExplicit`. Without that it passed
+    through walls in up to 10 % of the motions.
+
     Source: Prince, Dormand, High order embedded Runge-Kutta formulae, J. Comp. Appl. Math. 7
     (1981), with the coefficients of `diffrax.Dopri8`.
     """

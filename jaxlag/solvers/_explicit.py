@@ -15,6 +15,7 @@ from jax import Array, lax
 
 from jaxlag._lowering._straight import elements
 from jaxlag._xla import opaque_one
+from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
 # Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
 # tracing and compiling and microseconds per step, written out | in a loop: elastic pendulum (21
@@ -60,7 +61,9 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
     one of the next step.
 
-    Steps, error estimates and interpolation are those of `stock`, up to the order of sums. With a
+    Steps, error estimates and interpolation are those of `stock`, up to the order of sums, but
+    where stages without weight meet what others do not: there the estimate is larger, see
+    `unseen`, so that no step passes through a wall that one of its stages met. With a
     loop over stages, reverse derivatives need `made_jump` to be known while tracing.
 
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1, II.14.
@@ -116,13 +119,38 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
 
         Where `made_jump` is the constant True, `solver_state` is not read.
         """
+        y1, error, beside, k, last = self.attempt(terms, t0, t1, y0, args, solver_state, made_jump)
+        # diffrax's interpolation takes the stages as increments.
+        dense = {"y0": y0, "y1": y1, "k": k}
+        return y1, at_least(error, beside), dense, last, diffrax.RESULTS.successful
+
+    def attempt(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> "Attempt":
+        """The same, with the parts of its error estimate apart."""
         tableau = tableau_of(type(self))
         fresh = True if not tableau.fsal else made_jump
         written_out = _nystrom if getattr(terms, "second_order", False) else _written_out
         stages = _in_loop if self.looped else written_out
-        y1, error, k, last = stages(tableau, terms, t0, t1, y0, solver_state, fresh, args)
-        # diffrax's interpolation takes the stages as increments.
-        return y1, error, {"y0": y0, "y1": y1, "k": k}, last, diffrax.RESULTS.successful
+        return stages(tableau, terms, t0, t1, y0, solver_state, fresh, args)
+
+
+class Attempt(NamedTuple):
+    """One step.
+
+    Attributes:
+        y1: the state at its end.
+        error: h sum_i e_i k_i.
+        unseen: what that takes no notice of; None of methods all of whose stages have a weight.
+        k: h dy/dt at every stage.
+        last: dy/dt at the last one where steps share it.
+    """
+
+    y1: Any
+    error: Any
+    unseen: Any
+    k: Any
+    last: Any
 
 
 class Tableau(NamedTuple):
@@ -139,6 +167,7 @@ class Tableau(NamedTuple):
     b_squared: np.ndarray
     e_squared: np.ndarray
     fsal: bool
+    unweighted: tuple[int, ...]  # stages that neither b nor e weighs
 
 
 @lru_cache
@@ -150,7 +179,8 @@ def tableau_of(method: type[AbstractExplicit]) -> Tableau:
         A[i, : len(row)] = row
     b, e = np.asarray(tableau.b_sol, float), np.asarray(tableau.b_error, float)
     c, fsal = np.asarray(tableau.c, float), bool(tableau.fsal)
-    return Tableau(A, c, b, e, _by(A, A), _by(b, A), _by(e, A), fsal)
+    unweighted = unweighted_stages(b, e)
+    return Tableau(A, c, b, e, _by(A, A), _by(b, A), _by(e, A), fsal, unweighted)
 
 
 def _by(x: np.ndarray, A: np.ndarray) -> np.ndarray:
@@ -199,8 +229,8 @@ def _kept(x: list[Array]) -> list[Array]:
 
 def _written_out(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
-) -> tuple[Any, Any, Any, Any]:
-    """(y1, error estimate, h dy/dt at every stage, dy/dt at the last one where steps share it)."""
+) -> Attempt:
+    """A step, its stages one after the other."""
     per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
     lanes = getattr(terms, "in_lanes", False)
 
@@ -224,13 +254,14 @@ def _written_out(
         k.append(increments(last))
     if not tableau.fsal:
         stage, last = _added(y, _sum(tableau.b, k)), None
+    beside = joined(unseen(k, tableau.unweighted)) if tableau.unweighted else None
     stages = jax.tree.map(lambda *x: jnp.stack(x), *map(joined, k))
-    return joined(stage), joined(_sum(tableau.e, k)), stages, last
+    return Attempt(joined(stage), joined(_sum(tableau.e, k)), beside, stages, last)
 
 
 def _nystrom(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
-) -> tuple[Any, Any, Any, Any]:
+) -> Attempt:
     """The same of second-order equations, y = (q, v)."""
     h = terms.contr(t0, t1)
     per_step = lax.optimization_barrier(1.0 / h)
@@ -276,13 +307,16 @@ def _nystrom(
     if not tableau.fsal:
         stage, last = end(tableau.b, tableau.b_squared), None
     # The weights of the error estimate have the sum 0: the velocity at the start drops out.
-    error = whole(per_time(tableau.e, tableau.e_squared, 0.0))
-    return joined(*stage), joined(*error), h * jnp.stack(rates), last
+    error, beside = whole(per_time(tableau.e, tableau.e_squared, 0.0)), None
+    if tableau.unweighted:
+        nothing = jax.tree.map(jnp.zeros_like, y[0])
+        beside = joined(nothing, whole(unseen(kicks, tableau.unweighted)))
+    return Attempt(joined(*stage), joined(*error), beside, h * jnp.stack(rates), last)
 
 
 def _in_loop(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
-) -> tuple[Any, Any, Any, Any]:
+) -> Attempt:
     """The same, with dy/dt once in the program."""
     h, size = terms.contr(t0, t1), len(tableau.c) + 1
     rows = np.concatenate([np.zeros((1, size)), tableau.rows])
@@ -317,4 +351,6 @@ def _in_loop(
         y1, last = last_stage, jax.tree.map(lambda x: x[-1], k)
     else:
         y1, last = _added(y0, sums(jnp.asarray(tableau.b), k)), None
-    return y1, sums(jnp.asarray(tableau.e), k), jax.tree.map(lambda x: h * x, k), last
+    increments = jax.tree.map(lambda x: h * x, k)
+    beside = unseen(unstacked(increments), tableau.unweighted) if tableau.unweighted else None
+    return Attempt(y1, sums(jnp.asarray(tableau.e), k), beside, increments, last)
