@@ -392,6 +392,10 @@ class Dynamics(eqx.Module):
         terms = 0 if self.power is None else len(self.power.names)
         return jnp.concatenate([q0, w0, jnp.zeros((terms,), q0.dtype)])
 
+    def idle(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
+        """y without the work done."""
+        return y[..., : self.system.size + self.speeds]
+
     def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
         """Work done since the start by every term of dH/dt, by name."""
         assert self.power is not None
