@@ -32,7 +32,7 @@ def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
     """The constants of a program that calls every function of the declaration."""
-    traced, static = _params.split((params, inputs))
+    traced, static = _params.halves((params, inputs))
     terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._captured import warn_of_changes
 from jaxlag._errors import bad, require_arity
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
@@ -79,6 +80,7 @@ def inverse_dynamics(
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
+    warn_of_changes(system, inputs)
     traced, static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
@@ -232,6 +233,7 @@ def equilibrium(
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
+    warn_of_changes(system, inputs)
     traced, static = _params.split(closing(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
