@@ -17,7 +17,7 @@ from jaxlag._errors import bad, require_arity
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._system import System
-from jaxlag._vectors import common, real
+from jaxlag._vectors import of_state, real
 
 
 def inverse_dynamics(
@@ -155,7 +155,7 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
         raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
     if _params.concrete(t) and not np.all(np.isfinite(t)):
         raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
-    q, v, a = common(*vectors)
+    q, v, a = of_state("q, v and a", *vectors)
     return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
 
 

@@ -22,7 +22,7 @@ from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._rank import least_norm
 from jaxlag._status import Status
 from jaxlag._system import System
-from jaxlag._vectors import number, vector
+from jaxlag._vectors import number, of_state, vector
 
 
 class Equilibrium(eqx.Module):
@@ -218,7 +218,7 @@ def equilibrium(
             "it has others",
             "Under these it may be at rest in more than isolated states: declare it without them.",
         )
-    q0 = vector(system.coordinates, "q0", q0)
+    (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
     if _params.concrete(q0) and not np.all(np.isfinite(q0)):
         raise bad("q0", "be finite", f"it was {q0}")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
