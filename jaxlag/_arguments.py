@@ -17,7 +17,7 @@ from jaxlag._methods import default_tolerances
 from jaxlag._params import concrete
 from jaxlag._solution import QUANTITIES
 from jaxlag._system import System
-from jaxlag._vectors import common, vector
+from jaxlag._vectors import of_state, vector
 
 
 def check_options(
@@ -126,7 +126,7 @@ def check_start(
         if concrete(values) and not np.all(np.isfinite(values)):
             i = int(np.argmin(np.isfinite(values)))
             raise bad(argument, "be finite", f"{argument}[{i}] ({words[i]!r}) was {values[i]}")
-    q0, x = common(q0, x)
+    q0, x = of_state(f"q0 and {name}", q0, x)
     return (q0, None, x) if name == "u0" else (q0, x, None)
 
 

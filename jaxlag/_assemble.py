@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
+from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._errors import AssemblyError, bad
@@ -155,6 +156,7 @@ def assemble(
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
     _params.check(params)
+    warn_of_changes(system)
     traced, static = _params.split(closing(system, params, q, None))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxlag import _params
@@ -55,9 +58,14 @@ def states_at(motion: Any, t: Any) -> Any:
         formulation="auto" if plain else motion.formulation,
         rtol=motion.tolerances[0],
         atol=motion.tolerances[1],
+        save=tuple(motion.saved),
         project=project,
         dt_max=motion.dt_max,
         throw=False,
     )
+    if "work" in motion.saved:
+        done = {name: work[row] for name, work in motion.saved["work"].items()}
+        since = jax.tree.map(jnp.add, further.saved["work"], done)
+        further = eqx.tree_at(lambda x: x.saved["work"], further, since)
     places = np.searchsorted(sense * np.asarray(further.ts), sense * asked)
     return further._rows(places.tolist())

@@ -24,7 +24,7 @@ from jaxlag._closed import Closed, plain
 from jaxlag._errors import bad
 from jaxlag._input_values import InputValues
 from jaxlag._mishaps import said
-from jaxlag._outside import Outside, changes, outside
+from jaxlag._outside import Outside, changes, of_library, outside
 from jaxlag._owned import owned
 
 
@@ -89,16 +89,15 @@ class Captured:
         """The same; what stands for traced values of its closure comes with the params."""
         named = tuple(i for i, x in enumerate(arguments) if isinstance(x, InputValues))
         given = [x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments]
-        traced, rest = _params.split(given)
+        traced, rest = _params.halves(given)
         leaves, tree = jax.tree.flatten(traced)
         if len({x.dtype for x in leaves}) == 1:  # numbers of Python's have nothing to give way to
             leaves = [jnp.asarray(x, x.dtype) for x in leaves]
         static = _params.Static(rest)
-        try:
-            kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
-            program = self._programs.get(kind)
-        except TypeError:  # a leaf without hash: no compiled program knows such params either
+        if not _params.are_keys(rest):  # no compiled program knows such params either
             return _called(self.function, [plain(x) for x in arguments])
+        kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
+        program = self._programs.get(kind)
         if program is None:
             program = self._closing(params, kind, leaves)
         else:
@@ -269,8 +268,15 @@ def captured(function: Callable) -> Captured:
 
 
 def once(function: Any) -> Any:
-    """The same of a plain function; a module, whose arrays are traced, as it is."""
-    return function if isinstance(function, eqx.Module) else captured(function)
+    """The same of a plain function; a module, whose arrays are traced, as it is.
+
+    Raises:
+        ValueError: a module whose static fields can change.
+    """
+    if not isinstance(function, eqx.Module):
+        return captured(function)
+    _params.check_keys(function, type(function).__name__)
+    return function
 
 
 def as_written(function: Any) -> Any:
@@ -285,14 +291,29 @@ def as_written(function: Any) -> Any:
 
 def functions_of(declared: Any) -> Iterator[Captured]:
     """All the functions in a declaration, or in inputs."""
+    return (part for part in _parts_of(declared) if isinstance(part, Captured))
+
+
+def warn_of_changes(*declared: Any) -> None:
+    """Say what in declarations, or in inputs, reads something from outside that has changed."""
+    for part in _parts_of(declared):
+        if isinstance(part, Captured):
+            part.warn()
+        elif not of_library(part):
+            _params.check_keys(part, type(part).__name__)
+
+
+def _parts_of(declared: Any) -> Iterator[Any]:
+    """The functions and the modules."""
     if isinstance(declared, Captured):
         yield declared
     elif isinstance(declared, tuple | Mapping):
         for part in declared.values() if isinstance(declared, Mapping) else declared:
-            yield from functions_of(part)
+            yield from _parts_of(part)
     elif isinstance(declared, eqx.Module):
+        yield declared
         for part in vars(declared).values():
-            yield from functions_of(part)
+            yield from _parts_of(part)
 
 
 def _config() -> tuple:

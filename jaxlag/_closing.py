@@ -57,7 +57,7 @@ def declared(
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
     """The constants of a program that calls every function of the declaration."""
-    traced, static = _params.split((params, inputs))
+    traced, static = _params.halves((params, inputs))
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
         params, inputs = _params.join(traced, static)

@@ -396,6 +396,10 @@ class Dynamics(eqx.Module):
         terms = 0 if self.power is None else len(self.power.names)
         return jnp.concatenate([q0, w0, jnp.zeros((terms,), q0.dtype)])
 
+    def idle(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
+        """y without the work done."""
+        return y[..., : self.system.size + self.speeds]
+
     def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
         """Work done since the start by every term of dH/dt, by name."""
         assert self.power is not None
@@ -416,7 +420,7 @@ class Dynamics(eqx.Module):
             and not isinstance(x, AbstractTable)
             and x.knots() is None
         }
-        traced, static = _params.split((params, inside))
+        traced, static = _params.halves((params, inside))
 
         def everything(t: Array, q: Array, v: Array, lam: Array, values: Any, traced: Any) -> Any:
             params, inside = _params.join(traced, static)

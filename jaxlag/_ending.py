@@ -30,7 +30,7 @@ class Ending(NamedTuple):
         status: int32, see `Status`; `explained` may tell more.
         where: index of the coordinate or constraint row that it concerns; -1 if none is known.
         tried: end of the last attempted step, s.
-        state: the last good state.
+        state: (q, v), or (q, u), of the last good state.
     """
 
     status: Int[Array, "*batch"]
@@ -79,7 +79,7 @@ def ended(
         )
         where = jnp.where(fault, begun.consistent.row, where)
     tried = dynamics.clock(outcome.tried, args)
-    found = status.astype(jnp.int32), where.astype(jnp.int32), tried, outcome.state
+    found = status.astype(jnp.int32), where.astype(jnp.int32), tried, dynamics.idle(outcome.state)
     return still(Ending(*found))
 
 

@@ -21,7 +21,9 @@ class Experiment(eqx.Module):
             where nothing was measured. A name is that of a coordinate ("theta"), of a velocity
             ("theta'"), an acceleration ("theta''"), a quasi-velocity, a constraint row (its
             multiplier), or one of the `channels` given to `jl.fit`.
-        inputs: as for `jl.simulate`; tables must reach from ts[0] to ts[-1].
+        inputs: as for `jl.simulate`; tables must reach from ts[0] to ts[-1]. Experiments that are
+            fitted together have the same names; under each, tables of one kind in all, of any
+            length, or any functions and constants. Those that another one has are computed beside.
         sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
             (s, k). Of channels that are left out it is estimated from the residuals.
         q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.

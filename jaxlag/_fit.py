@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlag._captured import warn_of_changes
 from jaxlag._channels import Reader
 from jaxlag._descent import Descent, descend
 from jaxlag._errors import bad
@@ -17,6 +18,7 @@ from jaxlag._fit_result import FitResult, summarised
 from jaxlag._free import NO_PRIOR, Unknowns, prior_rows, unknowns
 from jaxlag._initial_states import start_freedom
 from jaxlag._losses import LOSSES, squares
+from jaxlag._params import check_keys
 from jaxlag._problem import (
     check_search,
     estimated_noise,
@@ -131,6 +133,9 @@ def fit(
     options = plain_options(options, "jl.fit")
     unknown = unknowns(params0, free, dict(transforms or {}))
     own = dict(channels or {})
+    check_keys(params0)
+    check_keys(own, "channels")
+    warn_of_changes(system, *(each.inputs for each in experiments))
     shown = readers_of(system, experiments, own, params0)
     where = layout(experiments, segments)
     prior = prior_rows(unknown, dict(priors or {}))

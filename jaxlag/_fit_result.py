@@ -291,7 +291,8 @@ def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
     """The status of a segment that failed, or the channel that is not finite."""
     segment = jax.tree.map(lambda x: x[k], problem.segments)
     start = jnp.asarray(found.starts)[k]
-    motion = problem.motion(problem.free.params(z), start, segment.ts, segment.inputs)
+    inputs = segment.inputs.by_name
+    motion = problem.motion(problem.free.params(z), start, segment.ts, inputs)
     if motion.ok:
         for name, show in problem.channels:
             if not np.all(np.isfinite(np.asarray(show(motion)))):

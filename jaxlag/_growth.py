@@ -14,6 +14,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
+from jaxlag._captured import warn_of_changes
 from jaxlag._errors import bad
 from jaxlag._inputs import all_knots
 from jaxlag._lanes import in_batches
@@ -215,6 +216,7 @@ def grad_growth(
     atol = _not_negative("atol", atol, defaults[1], dtype, zero=False)
     tol = _not_negative("tol", tol, finest, dtype, zero=False)
 
+    warn_of_changes(motion.system, motion.inputs)
     static = motion._params_static, motion._inputs_static
     key = motion.system, *static, motion.formulation, max_steps, motion.ts.ndim - 1
     given = (motion.ts, motion.q, motion.v, motion._params_traced, motion._inputs_traced)

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._captured import warn_of_changes
 from jaxlag._errors import bad, require_arity
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._system import System
-from jaxlag._vectors import common, real
+from jaxlag._vectors import of_state, real
 
 
 def inverse_dynamics(
@@ -79,6 +80,7 @@ def inverse_dynamics(
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
+    warn_of_changes(system, inputs)
     traced, static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static))
@@ -153,7 +155,7 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
         raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
     if _params.concrete(t) and not np.all(np.isfinite(t)):
         raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
-    q, v, a = common(*vectors)
+    q, v, a = of_state("q, v and a", *vectors)
     return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
 
 

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxlag._closed import plain
 from jaxlag._errors import bad
+from jaxlag._immutable import check_nodes, is_fixed, refusal
 
 
 class _Frozen:
@@ -54,35 +56,51 @@ def check(params: Any) -> None:
     Raises:
         ValueError: with the leaf by its path.
     """
-    if all(map(_is_fine, jax.tree.leaves(params))):  # nearly always, and without any paths
+    check_keys(params)
+    if all(map(_is_finite, jax.tree.leaves(params))):  # nearly always, and without any paths
         return
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
-        name, value = f"params{jax.tree_util.keystr(path)}", known(leaf)
-        if _is_fine(leaf):
+        if _is_finite(leaf):
             continue
-        if value is None:
-            must, fix = (
-                "be a number, an array, or an object that hashes",
-                "Write a tuple for a set.",
-            )
-            raise bad(name, must, f"it was {leaf!r}", fix)
+        name, value = f"params{jax.tree_util.keystr(path)}", known(leaf)
+        assert value is not None
         if value.ndim:
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
             name, value = f"{name}[{', '.join(map(str, index))}]", value[index]
         raise bad(name, "be finite", f"it was {value}")
 
 
-def _is_fine(leaf: Any) -> bool:
+def check_keys(params: Any, name: str = "params") -> None:
+    """Raise on what can change, and would be part of the key of compiled programs.
+
+    Raises:
+        ValueError: with the leaf, or the static field, by its path.
+    """
+    params = plain(params)
+    check_nodes(params, name)
+    if all(map(_is_fine, jax.tree.leaves(params))):
+        return
+    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        if not _is_fine(leaf):
+            raise refusal(leaf, f"{name}{jax.tree_util.keystr(path)}")
+
+
+def are_keys(static: Any) -> bool:
+    """Whether a static half can be part of a key."""
+    return all(map(_is_fine, jax.tree.leaves(static)))
+
+
+def _is_finite(leaf: Any) -> bool:
     if isinstance(leaf, float):
         return math.isfinite(leaf)
     value = known(leaf)
-    if value is not None:
-        return not np.issubdtype(value.dtype, np.inexact) or bool(np.all(np.isfinite(value)))
-    try:
-        hash(None if is_array(leaf) else leaf)
-    except TypeError:
-        return False
-    return True
+    if value is None or not np.issubdtype(value.dtype, np.inexact):
+        return True
+    return bool(np.all(np.isfinite(value)))
+
+
+def _is_fine(leaf: Any) -> bool:
+    return is_array(leaf) or isinstance(leaf, _Frozen) or is_fixed(leaf)
 
 
 def _is_key(x: Any) -> bool:
@@ -98,12 +116,21 @@ def _is_traced(leaf: Any) -> bool:
     return eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
 
 
-def split(tree: Any) -> tuple[Any, Any]:
-    """(traced, static) halves of a pytree, put together again by `join`.
+def split(params: Any) -> tuple[Any, Any]:
+    """(traced, static) halves of params, put together again by `join`.
 
     Arrays of numbers, Python floats, random keys and tracers are traced; Python ints, truth values,
     strings and functions are static: part of the key under which the compiled program is cached.
+
+    Raises:
+        ValueError: something static can change, by its path.
     """
+    check_keys(params)
+    return halves(params)
+
+
+def halves(tree: Any) -> tuple[Any, Any]:
+    """The same of any pytree, whatever its leaves."""
 
     def traced_half(leaf: Any) -> Any:
         return jnp.asarray(leaf) if _is_traced(leaf) else None

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxlag._captured import warn_of_changes
 from jaxlag._channels import Reader
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._free import NO_PRIOR, unknowns
 from jaxlag._initial_states import start_freedom
 from jaxlag._losses import squares
+from jaxlag._params import check_keys
 from jaxlag._problem import check_search, experiments_of, plain_options, pose, readers_of
 from jaxlag._segments import Layout, layout
 from jaxlag._shooting import Guess, Shooting, moved, search
@@ -141,10 +143,14 @@ def predict(
     experiments = experiments_of(experiments)
     options = plain_options(options, "jl.predict")
     check_search(tolerance, max_iterations)
+    own = dict(channels or {})
+    check_keys(params)
+    check_keys(own, "channels")
+    warn_of_changes(system, *(each.inputs for each in experiments))
     fewest = start_freedom(system, params)
     early = tuple(_first(fewest, each, settle) for each in experiments)
     fixed = unknowns(params, (), {})
-    shown = readers_of(system, experiments, dict(channels or {}), params)
+    shown = readers_of(system, experiments, own, params)
 
     def posed(these: tuple[Experiment, ...]) -> tuple[Shooting, Layout]:
         where = layout(these, 1)

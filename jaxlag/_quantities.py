@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag import _params
+from jaxlag._captured import warn_of_changes
 from jaxlag._constraints import AbstractConstraint, Layout
 from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, real_scalar
@@ -241,11 +242,13 @@ class AbstractQuantities(eqx.Module):
         return function
 
     def _state(self, params: Any, q: Any, v: Any, t: Any) -> tuple[Array, Array, Any, Any]:
-        traced, static = _params.split(params)
+        warn_of_changes(self)
+        traced, static = _params.halves(params)
         q, v = state_vectors(self.coordinates, q, v)
         return jnp.asarray(t, jnp.result_type(float)), q, v, _params.join(traced, static)
 
     def _inputs_at(self, inputs: Any, t: Array, q: Array, v: Array, params: Any) -> InputValues:
         inputs = check_inputs(inputs)
         check_range(inputs, t, "t")
+        warn_of_changes(inputs)
         return evaluate(inputs, t, q, v, params)

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
-from jaxlag._params import is_array
-from jaxlag._signals import AbstractInput, Linear, ZeroOrderHold
+from jaxlag._signals import Linear, ZeroOrderHold
+from jaxlag._stacked_inputs import StackedInputs, stacked
 from jaxlag._system import System
 
 
@@ -37,7 +35,7 @@ class Segments(NamedTuple):
     values: Float[Array, "k s m"]
     weights: Float[Array, "k s m"]
     follows: Bool[Array, " k"]
-    inputs: Any
+    inputs: StackedInputs
     guess: Float[Array, "k d"]
     held: Float[Array, "k d"]
 
@@ -134,7 +132,7 @@ def pack(
         jnp.asarray(values),
         jnp.asarray(weights),
         jnp.asarray(where.follows),
-        _stacked(inputs),
+        stacked(inputs, ts[:, -1].tolist()),
         jnp.asarray(guess),
         jnp.asarray(held),
     )
@@ -152,37 +150,3 @@ def _inputs_between(inputs: dict[str, Any], start: float, end: float) -> dict[st
         return type(signal)(times[a:b], np.asarray(signal.values)[a:b])
 
     return {name: cut(signal) for name, signal in inputs.items()}
-
-
-def _stacked(inputs: Sequence[dict[str, Any]]) -> Any:
-    """One dict with a leading axis; shorter tables go on with their last value."""
-    for name in inputs[0]:
-        if any(other.keys() != inputs[0].keys() for other in inputs):
-            must, was = "be the same in every experiment", "one had others"
-            raise bad("names of the inputs", must, was)
-        tables = [each[name] for each in inputs]
-        if isinstance(tables[0], Linear | ZeroOrderHold):
-            longest = max(len(table.times) for table in tables)
-            for each in inputs:
-                each[name] = _filled(each[name], longest)
-
-    def arrays(tree: Any) -> Any:
-        return eqx.filter(tree, is_array)
-
-    static = [eqx.filter(each, is_array, inverse=True) for each in inputs]
-    if any(not eqx.tree_equal(other, static[0]) for other in static):
-        was = "their kinds or functions differed"
-        raise bad("inputs", "be of the same kind in every experiment", was)
-    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *map(arrays, inputs))
-    return eqx.combine(stacked, static[0])
-
-
-def _filled(table: Any, length: int) -> AbstractInput:
-    times, values = np.asarray(table.times), np.asarray(table.values)
-    missing = length - len(times)
-    if not missing:
-        return table
-    step = times[-1] - times[-2]
-    later = times[-1] + step * np.arange(1, missing + 1)
-    held = np.broadcast_to(values[-1], (missing, *values.shape[1:]))
-    return type(table)(np.concatenate([times, later]), np.concatenate([values, held]))

@@ -20,7 +20,7 @@ from jaxlag._arguments import (
     check_times,
     check_tolerances,
 )
-from jaxlag._captured import functions_of
+from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Baumgarte
 from jaxlag._ending import ended
@@ -95,7 +95,7 @@ def simulate(
         ts: (s,) times in s, strictly monotone either way, s >= 2. ts[0] is the start; the rest
             are save times and cost no steps.
         params: pytree handed to the Lagrangian and the forces. Floats and inexact arrays are
-            traced and differentiable, the rest is static.
+            traced and differentiable, the rest is static, and must be of types that cannot change.
         u0: quasi-velocities at ts[0], for systems that declare them: (k,) numbers in the order of
             their names, or a dict by name; constrained ones are zero, and may be left out of a
             dict; m/s or rad/s.
@@ -239,8 +239,7 @@ def simulate(
     start = q0, v0, u0, ts, params_traced, inputs_traced
     values = Values(*start, scheme_traced, rtol, atol, step, longest)
     _xla.warn_if_late()
-    for function in functions_of((system, inputs)):
-        function.warn()
+    warn_of_changes(system, inputs)
     motion = timed(_simulate, system, plan, values)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
         other = _simulate(*_with_method(plan, values, IMPLICIT, rtol, atol, step))

@@ -337,7 +337,7 @@ class Solution(eqx.Module):
             t: a number or a row of them in any order, from ts[0] to last_time, s.
 
         Returns:
-            A Solution with one row for every time.
+            A Solution with one row for every time, and what was saved there; work from ts[0] on.
 
         Raises:
             ValueError: times outside of the motion; a batch, fixed steps or a method without a

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
+from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
@@ -21,7 +22,7 @@ from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._rank import least_norm
 from jaxlag._status import Status
 from jaxlag._system import System
-from jaxlag._vectors import number, vector
+from jaxlag._vectors import number, of_state, vector
 
 
 class Equilibrium(eqx.Module):
@@ -217,7 +218,7 @@ def equilibrium(
             "it has others",
             "Under these it may be at rest in more than isolated states: declare it without them.",
         )
-    q0 = vector(system.coordinates, "q0", q0)
+    (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
     if _params.concrete(q0) and not np.all(np.isfinite(q0)):
         raise bad("q0", "be finite", f"it was {q0}")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
@@ -232,6 +233,7 @@ def equilibrium(
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
+    warn_of_changes(system, inputs)
     traced, static = _params.split(closing(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)

@@ -52,6 +52,20 @@ def common(*arrays: Array) -> list[Array]:
     return [x.astype(dtype) for x in arrays]
 
 
+def of_state(argument: str, *arrays: Array) -> list[Array]:
+    """Arrays of one dtype, that of a state; raises where it has less than 32 bits.
+
+    Of a motion in half precision whole percents are rounding, whatever the steps are.
+    """
+    state = common(*arrays)
+    dtype = state[0].dtype
+    if jnp.finfo(dtype).bits < 32:
+        was = f"in {dtype.name} equations keep {jnp.finfo(dtype).precision} digits at most"
+        fix = f"Write {argument.replace(',', ' ').split()[0]}.astype(float)."
+        raise bad(argument, "be float32 or float64", was, fix)
+    return state
+
+
 def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
     """Real arrays of one dtype from (argument, value, shape); raises naming the argument."""
     arrays = []
@@ -90,7 +104,6 @@ def state_vectors(coordinates: Coordinates, q: Any, v: Any) -> tuple[Array, Any]
     """(q, v) as flat vectors of one dtype, the result type of both; v may be None."""
     q = vector(coordinates, "q", q)
     if v is None:
-        return q, None
-    v = vector(coordinates, "v", v)
-    dtype = jnp.result_type(q, v)
-    return q.astype(dtype), v.astype(dtype)
+        return of_state("q", q)[0], None
+    q, v = of_state("q and v", q, vector(coordinates, "v", v))
+    return q, v

@@ -180,13 +180,13 @@ _PLAIN = frozenset(
     broadcast_in_dim cbrt ceil checkpoint clamp closed_call concatenate cond
     convert_element_type copy copy_p cos cosh cummax cumsum custom_jvp_call custom_vjp_call
     custom_vmap_call div dynamic_slice dynamic_update_slice empty2 eq erf exp exp2 expand_dims
-    expm1 floor gather ge gt integer_pow iota is_finite jit le le_to linear_map log log1p
+    expm1 floor gather ge gt integer_pow iota is_finite jit largest le le_to linear_map log log1p
     logistic lt lt_to max maybe_set min mul ne neg nextafter nonbatchable nondifferentiable not
     one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max
     reduce_min reduce_or reduce_prod reduce_sum rem remat remat2 reshape rev round rsqrt scan
     scatter scatter-add scatter_add select_and_gather_add select_n shift_left sign sin sinh
-    slice split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh transpose
-    unstack unvmap_all unvmap_any unvmap_max while xor""".split()  # noqa: SIM905
+    slice smallest split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh
+    transpose unstack unvmap_all unvmap_any unvmap_max while xor""".split()  # noqa: SIM905
 )
 
 

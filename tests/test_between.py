@@ -40,6 +40,19 @@ def test_constrained_motions_stay_on_their_constraints():
     np.testing.assert_allclose(found.q[0], row.q[1], atol=1e-5)
 
 
+def test_what_was_saved_is_there_between_rows():
+    """Work counts from the start of the motion: all that the damper took, as the energy tells."""
+    damper = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "damper")
+    system = SYSTEM.with_forces(damper)
+    motion = jl.simulate(system, [1.0], [0.0], [0.0, 1.0, 4.0], 4.0, save=("work", "energy"))
+    found = motion.at([2.5, 1.0, 3.3])
+    assert set(found.saved) == {"work", "energy"}
+    lost = found.energy - motion.energy[0]
+    assert max(lost) < -0.1
+    np.testing.assert_allclose(found.work["damper"], lost, atol=1e-8)
+    np.testing.assert_array_equal(found.work["damper"][1], motion.work["damper"][1])
+
+
 def fixed():
     return jl.simulate(SYSTEM, [1.0], [0.0], [0.0, 1.0], 4.0, dt=0.5, method="heun")
 

@@ -2,7 +2,6 @@
 
 import pickle
 import warnings
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -55,107 +54,6 @@ def test_a_function_defined_anew_reads_anew(monkeypatch):
         assert fall(declare())[2] == -2.0
         monkeypatch.setitem(globals(), "GRAVITY", 5.0)
         assert fall(declare())[2] == -5.0
-
-
-def _array_in_place():
-    k = np.array([2.0])
-
-    def change():
-        k[0] = 5.0
-
-    return lambda t, q, v, params: 0.5 * v @ v - k @ q, change, "k"
-
-
-def _array_in_a_compiled_helper():
-    k = np.array([2.0])
-
-    @jax.jit
-    def potential(q):
-        return jnp.asarray(k) @ q
-
-    def change():
-        k[0] = 5.0
-
-    return lambda t, q, v, params: 0.5 * v @ v - potential(q), change, "k"
-
-
-def _number_of_numpy_in_place():
-    k = np.array(2.0)
-
-    def change():
-        k[...] = 5.0
-
-    return lambda t, q, v, params: 0.5 * v @ v - k * q[0], change, "k"
-
-
-def _helper():
-    def potential(q):
-        return 2.0 * q[0]
-
-    def change():
-        nonlocal potential
-        potential = jnp.sum
-
-    return lambda t, q, v, params: 0.5 * v @ v - potential(q), change, "potential"
-
-
-def _dict():
-    given = {"g": [2.0]}
-
-    def change():
-        given["g"][0] = 5.0
-
-    return lambda t, q, v, params: 0.5 * v @ v - given["g"][0] * q[0], change, "given"
-
-
-def _attribute():
-    given = SimpleNamespace(g=2.0, other=object())
-
-    def change():
-        given.g = 5.0
-
-    return lambda t, q, v, params: 0.5 * v @ v - given.g * q[0], change, r"given\.g"
-
-
-def _method():
-    class Body:
-        g = 2.0
-
-        def __init__(self):
-            self.g = 2.0
-
-        def lagrangian(self, t, q, v, params):
-            return 0.5 * v @ v - self.g * q[0]
-
-    body = Body()
-
-    def change():
-        body.g = 5.0
-
-    return body.lagrangian, change, r"self\.g"
-
-
-OUTSIDE = [
-    _array_in_place,
-    _array_in_a_compiled_helper,
-    _number_of_numpy_in_place,
-    _helper,
-    _dict,
-    _attribute,
-    _method,
-]
-
-
-@pytest.mark.parametrize("declared", OUTSIDE)
-def test_what_changes_outside_is_named_and_changes_nothing(declared):
-    lagrangian, change, name = declared()
-    system = jl.System(lagrangian, ("x",))
-    at = {}, [0.0], [0.0]
-    assert system.acceleration(*at) == -2.0
-    change()
-    with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
-        again = system.acceleration(*at), system.energy({}, [1.0], [0.0])
-    assert again == (-2.0, 2.0)
 
 
 def test_forces_constraints_and_quasi_velocities_are_traced_once():

@@ -197,6 +197,43 @@ def test_rows_not_reached_have_no_work():
         assert np.isnan(rows[2])
 
 
+DRAG = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "drag")
+WELL = jl.System(lambda t, q, v, params: 0.5 * v @ v - jnp.log(q[0]), ("x", "y"), forces=(DRAG,))
+
+
+def into_the_well(v0, save=("work",)):
+    """The forces at x = 0 are without bound; from v0 < 0 the motion ends there."""
+    return jl.simulate(WELL, [1.0, 0.0], [v0, 0.5], [0.0, 0.1, 1.0], save=save, throw=False)
+
+
+def test_how_a_motion_with_work_ended_is_explained():
+    """The state of the failed step has work besides (q, v); that it concerns x is the state's."""
+    motion = into_the_well(-3.0)
+    assert motion.status == jl.Status.step_below_resolution
+    assert motion.message().startswith("step_below_resolution ('x')")
+    assert motion.status == into_the_well(-3.0, save=()).status
+
+    def found(v0):
+        motion = into_the_well(v0)
+        return motion.status, motion.where
+
+    status, where = jax.jit(jax.vmap(found))(jnp.array([-3.0, 3.0]))
+    np.testing.assert_array_equal(status, [jl.Status.step_below_resolution, jl.Status.ok])
+    np.testing.assert_array_equal(where, [0, -1])
+
+
+def test_growth_along_a_motion_with_work_is_that_of_its_state():
+    """Work is no part of what errors grow in; inside jit the status is asked for in full."""
+
+    def growth(save):
+        def kappa(v0):
+            return jl.grad_growth(into_the_well(v0, save)).kappa[-1]
+
+        return jax.jit(kappa)(3.0)
+
+    np.testing.assert_allclose(growth(("work",)), growth(()), rtol=1e-5)
+
+
 def test_driven_pivot_agrees_with_the_force_on_the_pivot():
     """Explicit time does the work of the drive less the change of what H leaves out.
 

@@ -172,6 +172,14 @@ def _atan2(graph: Graph, node: Node, y: Node, x: Node) -> list[Node]:
     return [graph.div(x, square), graph.scale(graph.div(y, square), -1.0)]
 
 
+def _extreme(graph: Graph, node: Node, *args: Node) -> list[Node]:
+    """1/k for each of the k that tie, as in JAX."""
+    ties = [graph.is_extreme(arg, args, node.data) for arg in args]
+    count = graph.add(*(graph.select(tie, graph.one, graph.zero) for tie in ties))
+    share = graph.power(count, -1)
+    return [graph.select(tie, share, graph.zero) for tie in ties]
+
+
 _TABLE = {
     "sin": lambda g, node, x: [g.call(COS, x)],
     "cos": lambda g, node, x: [g.scale(g.call(SIN, x), -1.0)],
@@ -182,6 +190,8 @@ _TABLE = {
     "sqrt": _sqrt,
     "pow": _pow,
     "atan2": _atan2,
+    "largest": _extreme,
+    "smallest": _extreme,
 }
 # Piecewise constant.
 _FLAT = {"eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite"}

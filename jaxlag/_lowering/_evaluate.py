@@ -1,6 +1,7 @@
 """A graph evaluated at numbers: the interpreter that compiled programs are checked with."""
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -58,4 +59,8 @@ def _value(node: Node, args: list, values: Mapping[tuple[str, int], Any]) -> Any
 
 _NUMPY = {name: getattr(np, name) for name in ("sin", "cos", "tan", "sqrt", "exp", "log", "tanh")}
 _NUMPY |= {"atan2": np.arctan2, "abs": np.abs, "ge": np.greater_equal, "lt": np.less}
+_NUMPY |= {
+    "largest": lambda *xs: reduce(np.maximum, xs),
+    "smallest": lambda *xs: reduce(np.minimum, xs),
+}
 _NUMPY |= {"gt": np.greater, "le": np.less_equal, "max": np.maximum, "min": np.minimum}

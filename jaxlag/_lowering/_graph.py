@@ -15,6 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxlag._lowering._extremes import largest_p, smallest_p
+
 Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
@@ -90,7 +92,8 @@ SQRT, SIN, COS = (named(name, **_ACCURACY) for name in ("sqrt", "sin", "cos"))
 ODD = {"sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "erf", "cbrt"}
 EVEN = {"cos", "cosh", "abs"}
 _AND = named("and")
-_ORDER = {"max": "ge", "min": "le"}
+_ORDER = {"max": "ge", "min": "le", "largest": "ge", "smallest": "le"}
+LARGEST, SMALLEST = Primitive(largest_p, {}), Primitive(smallest_p, {})
 
 
 class Graph:
@@ -259,15 +262,16 @@ class Graph:
                 if other.op == "call" and other.data.name in _ORDER:
                     rest = _operands(other, other.data)
                     if one in rest:
-                        return self._is_extreme(one, rest, named(_ORDER[other.data.name]))
+                        return self.is_extreme(one, rest, other.data)
         return self._node("call", primitive, args)
 
-    def _is_extreme(self, node: Node, others: Sequence[Node], order: Primitive) -> Node:
+    def is_extreme(self, node: Node, others: Sequence[Node], primitive: Primitive) -> Node:
         """Whether the node is the largest or smallest, by comparing it with every other.
 
         So asks the derivative of max in JAX: x == max(x, y). XLA's CPU backend may compute x
         twice, once with a fused multiply-add and once without, and x differs from itself then.
         """
+        order = named(_ORDER[primitive.name])
         truths = [self.call(order, node, other) for other in others if other is not node]
         if not truths:
             return self.const(True)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlag._lowering._graph import Graph, Node, named
+from jaxlag._lowering._graph import LARGEST, SMALLEST, Graph, Node, Primitive, named
 from jaxlag._lowering._interpret import NUMPY
 from jaxlag._lowering._nodes import Missing, broadcast, nodes, scalar, take
 
@@ -184,6 +184,48 @@ def _pairwise(name: str) -> Callable:
     return combine
 
 
+def _of_row(name: str, many: Primitive) -> Callable:
+    """The largest, or smallest; of two by the primitive that takes two."""
+    pair = _pairwise(name)
+
+    def combine(graph: Graph, nodes: list[Node]) -> Node:
+        return pair(graph, nodes) if len(nodes) < 3 else graph.call(many, *nodes)
+
+    return combine
+
+
+_LARGEST, _SMALLEST = _of_row("max", LARGEST), _of_row("min", SMALLEST)
+
+
+def _scanned(combine: Callable) -> Callable:
+    """Running extremes by pairs, paired as JAX pairs them: so the derivative is shared by ties."""
+
+    def scan(graph: Graph, rows: list[np.ndarray]) -> list[np.ndarray]:
+        if len(rows) < 2:
+            return rows
+
+        def joined(left: list[np.ndarray], right: list[np.ndarray]) -> list[np.ndarray]:
+            pairs = zip(left, right, strict=False)
+            return [broadcast(graph, lambda a, b: combine(graph, [a, b]), x, y) for x, y in pairs]
+
+        odd = scan(graph, joined(rows[:-1:2], rows[1::2]))
+        out = list(rows)
+        out[1::2] = odd
+        out[2::2] = joined(odd, rows[2::2])
+        return out
+
+    def running(graph: Graph, eqn: Any, operands: list) -> np.ndarray:
+        array = np.moveaxis(operands[0], eqn.params["axis"], 0)
+        array = array[::-1] if eqn.params["reverse"] else array
+        out = array.copy()
+        for i, row in enumerate(scan(graph, [array[i : i + 1] for i in range(len(array))])):
+            out[i : i + 1] = row
+        out = out[::-1] if eqn.params["reverse"] else out
+        return np.moveaxis(out, 0, eqn.params["axis"])
+
+    return running
+
+
 def _cumulative(combine: Callable) -> Callable:
     def running(graph: Graph, eqn: Any, operands: list) -> np.ndarray:
         array = np.moveaxis(operands[0], eqn.params["axis"], 0)
@@ -223,19 +265,19 @@ WHOLE: dict[str, Callable] = {
     "scatter": _scatter,
     "scatter-add": _scatter_with(_sum),
     "scatter-mul": _scatter_with(_product),
-    "scatter-min": _scatter_with(_pairwise("min")),
-    "scatter-max": _scatter_with(_pairwise("max")),
+    "scatter-min": _scatter_with(_SMALLEST),
+    "scatter-max": _scatter_with(_LARGEST),
     "argmax": _extreme("gt"),
     "argmin": _extreme("lt"),
     "dot_general": _dot_general,
     "reduce_sum": _reduce(_sum),
     "reduce_prod": _reduce(_product),
-    "reduce_max": _reduce(_pairwise("max")),
-    "reduce_min": _reduce(_pairwise("min")),
+    "reduce_max": _reduce(_LARGEST),
+    "reduce_min": _reduce(_SMALLEST),
     "reduce_and": _reduce(_pairwise("and")),
     "reduce_or": _reduce(_pairwise("or")),
     "cumsum": _cumulative(_sum),
     "cumprod": _cumulative(_product),
-    "cummax": _cumulative(_pairwise("max")),
-    "cummin": _cumulative(_pairwise("min")),
+    "cummax": _scanned(_pairwise("max")),
+    "cummin": _scanned(_pairwise("min")),
 }

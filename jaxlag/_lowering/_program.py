@@ -66,7 +66,7 @@ class Program(NamedTuple):
 
 _FREE = ("stop",)
 _TRUTHS = {"eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite"}
-_CHEAP = _TRUTHS | {"abs", "max", "min", "sign"}
+_CHEAP = _TRUTHS | {"abs", "max", "min", "largest", "sign", "smallest"}
 
 
 def _kind(line: Line) -> str:

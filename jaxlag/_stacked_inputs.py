@@ -1,0 +1,168 @@
+"""The inputs of many experiments as those of one batch: what differs is told by an index."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxlag import _params
+from jaxlag._errors import bad
+from jaxlag._signals import AbstractInput, AbstractTable, Feedback, Function, Linear, ZeroOrderHold
+
+
+class StackedInputs(eqx.Module):
+    """Inputs by name, every array with an axis of experiments in front.
+
+    A leaf of a batch may be no function: what is no array stands apart.
+    """
+
+    arrays: Any
+    rest: _params.Static = eqx.field(static=True)
+
+    @property
+    def by_name(self) -> dict[str, Any]:
+        """As for `jl.simulate`."""
+        return eqx.combine(self.arrays, self.rest.tree)
+
+
+class _OfTime(eqx.Module):
+    """One of several functions of time or constants, u(t, params)."""
+
+    name: str = eqx.field(static=True)
+    which: Int[Array, ""]
+    among: tuple[Any, ...]
+
+    def __call__(self, t: Array, params: Any) -> Array:
+        """That which is meant; the others are computed beside it."""
+        nothing = jnp.zeros(0)
+        return _chosen(self, t, nothing, nothing, params)
+
+
+class _OfState(eqx.Module):
+    """The same of functions among which some read the state, u(t, q, v, params)."""
+
+    name: str = eqx.field(static=True)
+    which: Int[Array, ""]
+    among: tuple[Any, ...]
+
+    def __call__(self, t: Array, q: Array, v: Array, params: Any) -> Array:
+        """That which is meant; the others are computed beside it."""
+        return _chosen(self, t, q, v, params)
+
+
+def _chosen(
+    choice: _OfTime | _OfState, t: Array, q: Array, v: Array, params: Any
+) -> Float[Array, "..."]:
+    values = [
+        x.value(t, q, v, params, None) if isinstance(x, AbstractInput) else x for x in choice.among
+    ]
+    dtype = jnp.result_type(*values)
+    values = [jnp.asarray(x, dtype) for x in values]
+    shapes = {x.shape for x in values}
+    if len(shapes) > 1:
+        was = f"they had {sorted(shapes)}"
+        raise bad(f"inputs[{choice.name!r}]", "have one shape in all experiments", was)
+    return jax.lax.select_n(choice.which, *values)
+
+
+def stacked(inputs: Sequence[dict[str, Any]], ends: Sequence[float]) -> StackedInputs:
+    """The inputs of segments, with a leading axis.
+
+    Tables go on with their last value as far as the longest. Functions and constants may differ:
+    all of them are part of the program then.
+
+    Args:
+        inputs: of each segment.
+        ends: its last time, s.
+
+    Raises:
+        ValueError: other names in one than in another, tables beside what is none.
+    """
+    if any(each.keys() != inputs[0].keys() for each in inputs):
+        was = " or ".join(sorted({str(sorted(each)) for each in inputs}))
+        raise bad("names of the inputs", "be the same in every experiment", f"they were {was}")
+    columns = {name: _alike(name, [each[name] for each in inputs], ends) for name in inputs[0]}
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    halves = [eqx.partition(row, _params.is_array) for row in rows or [{}] * len(inputs)]
+    arrays = jax.tree.map(lambda *x: jnp.stack(list(map(jnp.asarray, x))), *(a for a, _ in halves))
+    return StackedInputs(arrays, _params.Static(halves[0][1]))
+
+
+def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
+    """The same signals, of one structure."""
+    kinds = sorted({_kind(signal) for signal in signals})
+    tables = any(isinstance(signal, AbstractTable) for signal in signals)
+    must = "be tables of one kind in every experiment, or functions and constants in all"
+    if tables and len(kinds) > 1:
+        raise bad(f"inputs[{name!r}]", must, f"they were {' and '.join(kinds)}")
+    if all(isinstance(signal, Linear | ZeroOrderHold) for signal in signals):
+        longest = max(len(table.times) for table in signals)
+        return [_filled(table, longest) for table in signals]
+    of_state = any(isinstance(signal, Feedback) for signal in signals)
+    knots = [signal.knots() if isinstance(signal, Function) else None for signal in signals]
+    most = max(0 if times is None else len(times) for times in knots)
+    if of_state and most:
+        must = "be without knots where another experiment has a Feedback in its place"
+        raise bad(f"inputs[{name!r}]", must, f"one had {most}")
+    plain = [Function(x.f) if isinstance(x, Function) else x for x in signals]
+    if not _equal(plain):
+        among = _different(plain)
+        plain = [_choice(name, one, among, of_state) for one in plain]
+    if not most:
+        return plain
+    rows = (_later(times, most, end) for times, end in zip(knots, ends, strict=True))
+    return [Function(x.f, times) for x, times in zip(plain, rows, strict=True)]
+
+
+def _choice(name: str, signal: Any, among: list[Any], of_state: bool) -> Function | Feedback:
+    """The same signal, where its structure stands among those of all experiments."""
+    i = next(i for i, other in enumerate(among) if _equal([signal, other]))
+    which = jnp.asarray(i, jnp.int32), (*among[:i], signal, *among[i + 1 :])
+    return Feedback(_OfState(name, *which)) if of_state else Function(_OfTime(name, *which))
+
+
+def _kind(signal: Any) -> str:
+    return type(signal).__name__ if isinstance(signal, AbstractInput) else "a constant"
+
+
+def _equal(signals: list[Any]) -> bool:
+    """Whether they are of one structure, so that only their arrays need an axis in front."""
+    first, *others = ((jax.tree.structure(a), _params.Static(b)) for a, b in map(_halves, signals))
+    shapes = [[np.shape(x) for x in jax.tree.leaves(_halves(signal)[0])] for signal in signals]
+    return all(other == first for other in others) and all(x == shapes[0] for x in shapes)
+
+
+def _halves(signal: Any) -> tuple[Any, Any]:
+    return eqx.partition(signal, _params.is_array)
+
+
+def _different(signals: list[Any]) -> list[Any]:
+    """One of each structure, in order."""
+    found: list[Any] = []
+    for signal in signals:
+        if not any(_equal([signal, other]) for other in found):
+            found.append(signal)
+    return found
+
+
+def _later(times: Array | None, count: int, end: float) -> Float[np.ndarray, " k"]:
+    """As many knots: those that are missing lie where nobody looks."""
+    own = np.zeros(0) if times is None else np.asarray(times, float)
+    last = max([end, *own])
+    return np.concatenate([own, last + 1.0 + np.arange(count - len(own))])
+
+
+def _filled(table: Any, length: int) -> AbstractInput:
+    """A table that goes on with its last value."""
+    times, values = np.asarray(table.times), np.asarray(table.values)
+    missing = length - len(times)
+    if not missing:
+        return table
+    step = times[-1] - times[-2]
+    later = times[-1] + step * np.arange(1, missing + 1)
+    held = np.broadcast_to(values[-1], (missing, *values.shape[1:]))
+    return type(table)(np.concatenate([times, later]), np.concatenate([values, held]))
