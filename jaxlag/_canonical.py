@@ -5,10 +5,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxlag._dynamics import Dynamics
+from jaxlag._dynamics import Dynamics, still
 from jaxlag._errors import real_scalar
+from jaxlag._kkt import augmented, masked
+from jaxlag._linalg import factor_mass
 from jaxlag._step import Arguments
 
 
@@ -44,6 +46,18 @@ class Canonical(eqx.Module):
         if not self.dynamics.system.forces:
             return p, slope
         return p, slope + self.dynamics.terms.force(t, q, v, params, values)
+
+    def regular(
+        self, tau: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
+    ) -> Bool[Array, ""]:
+        """Whether d2L/dv2 is positive definite, under constraints where these leave motion."""
+        tau, q, v, form = still((tau, q, v, self))
+        t, params = form._at(tau)
+        M = form.dynamics.terms.mass(t, q, v, params)
+        if form.rows:
+            A, _ = form.dynamics.terms.rows(t, q, v, params)
+            M, _ = augmented(M, masked(A, form.args.kept))
+        return jnp.all(factor_mass(M).healthy)
 
     def position(
         self, tau: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]

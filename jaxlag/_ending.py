@@ -193,7 +193,8 @@ def _explained(
         if any(map(reads_lam, dynamics.system.forces)):
             sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
             status = jnp.where(unexplained & sound, int(Status.no_reaction_solution), status)
-    status = jnp.where(unexplained & (mass >= 0), int(Status.mass_singular), status)
+    unsolved = status == int(Status.implicit_solve_failed)
+    status = jnp.where((unexplained | unsolved) & (mass >= 0), int(Status.mass_singular), status)
     turned = jnp.full((), -1, jnp.int32)
     if scene.kinematic:
         turned = _turned(dynamics, time, q, start, q0, args)

@@ -96,7 +96,7 @@ def solve_with_rows(
         return _null_space(graph, M, A, right, eps, kept)
     if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
         M, right = _augmented(graph, M, A, right, kept)
-    return bordered(graph, M, A, right, eps, kept)
+    return bordered(graph, M, A, right, eps, kept, checked=True)
 
 
 class Reaction(NamedTuple):

@@ -46,9 +46,9 @@ def solve(graph: Graph, M: Sequence[Sequence[Node]], r: Sequence[Node], eps: flo
 
     L D L^T (Golub, Van Loan, Matrix Computations, sec. 4.1) of every block in order of least
     coupling; in double precision the last two unknowns by Cramer's rule. A pivot must exceed
-    4 n eps M_ii, as in `jaxlag._linalg.factor_mass`.
+    4 n eps M_ii, as in `jaxlag._linalg.factor_mass`, also where nothing is divided by it.
     """
-    return bordered(graph, M, [], [(r, [])], eps)[0]
+    return bordered(graph, M, [], [(r, [])], eps, checked=True)[0]
 
 
 def bordered(
@@ -58,6 +58,7 @@ def bordered(
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
     kept: Sequence[Node] | None = None,
+    checked: bool = False,
 ) -> list[list[Node]]:
     """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0.
 
@@ -73,6 +74,8 @@ def bordered(
         right: right-hand sides.
         eps: of the numbers.
         kept: for every row 1, or 0 where it is left out; None for all 1.
+        checked: whether an x that is 0 whatever M is, as nothing pushes there, is NaN as well where
+            a pivot of coordinates is too small.
     """
     n, m = len(M), len(A)
     whole = [[*M[i], *(row[i] for row in A)] for i in range(n)]
@@ -80,7 +83,10 @@ def bordered(
     sides = [[*r, *(graph.scale(x, -1.0) for x in c)] for r, c in right]
     out: list[list[Node]] = [[graph.zero] * n for _ in right]
     for block in blocks(whole, graph.zero):
-        found = _Elimination(graph, whole, sides, block, n, eps, kept).solve()
+        elimination = _Elimination(graph, whole, sides, block, n, eps, kept)
+        found = elimination.solve()
+        if checked:
+            found = [[elimination.checked(x) for x in values] for values in found]
         for i, values in zip(block, found, strict=True):
             if i < n:
                 for side, x in zip(out, values, strict=True):
@@ -134,6 +140,7 @@ class _Elimination:
         self.right = {i: [graph.let(side[i]) for side in right] for i in block}
         self.diagonal = {i: self.entry[i, i] for i in block}
         self.touched: set[int] = set()
+        self.sound: dict[int, Node] = {}  # truth values, by coordinate
         zero = graph.zero
         self.contains = {
             i: {j for j in block if j < coordinates and matrix[i][j] is not zero}
@@ -163,6 +170,13 @@ class _Elimination:
             found[k] = self._over(values, pivot)
         return [found[i] for i in self.block]
 
+    def checked(self, x: Node) -> Node:
+        """A solution that is zero without a division, NaN where M is not positive definite."""
+        if x is self.graph.zero:
+            for healthy in self.sound.values():
+                x = self.graph.select(healthy, x, self.graph.const(np.nan))
+        return x
+
     def _over(self, values: Sequence[Node], pivot: Node) -> list[Node]:
         graph = self.graph
         return [x if x is graph.zero else graph.let(graph.div(x, pivot)) for x in values]
@@ -180,7 +194,7 @@ class _Elimination:
         graph, pivot = self.graph, self.entry[i, i]
         nan = graph.const(np.nan)
         if i < self.coordinates:
-            healthy = graph.call(GREATER, pivot, self._bound(i))
+            healthy = self.sound[i] = graph.call(GREATER, pivot, self._bound(i))
             return graph.let(graph.select(healthy, pivot, nan))
         bound = graph.scale(self.diagonal[i], self.row_floor)
         pivot = graph.let(graph.select(graph.call(GREATER, bound, pivot), pivot, nan))
@@ -221,7 +235,7 @@ class _Elimination:
         # Rounding left its share of M_ii in a and of M_jj in c.
         shares = graph.add(graph.mul(a, self.diagonal[j]), graph.mul(c, self.diagonal[i]))
         bound = graph.scale(shares, self.floor)
-        healthy = graph.call(GREATER, determinant, bound)
+        healthy = self.sound[j] = graph.call(GREATER, determinant, bound)
         determinant = graph.let(graph.select(healthy, determinant, graph.const(np.nan)))
         found[i], found[j] = [], []
         for r, s in zip(self.right[i], self.right[j], strict=True):

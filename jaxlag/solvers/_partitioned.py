@@ -45,13 +45,15 @@ class AbstractPartitioned(AbstractFixedStep):
     (q, v); momenta are taken from it at the start of a step and turned into velocities at its end.
 
     The equations are solved for the velocities V_i until the increments stop falling; a step
-    where they do not is reported as not solved. Work that is asked for follows by the weights b.
+    where they do not is reported as not solved, and velocities are NaN where d2L/dv2 is not
+    positive definite. Work that is asked for follows by the weights b.
     Second derivatives are taken forward over reverse, as by `jax.hessian`.
 
     The terms have the methods `sections`, `joined` (as for `Splitting`) and `canonical(args)`, an
     object with
 
         span(tau0, tau1) -> t1 - t0,    canonical(tau, q, v) -> (p, F),
+        regular(tau, q, v) -> whether d2L/dv2 is positive definite,
         power(tau, q, v) -> rates of work,    rows -> their number,
         reaction(tau, q, lam) -> A^T lam,    position(tau, q, lam) -> phi,
         velocity(tau, q, v, lam) -> A v + b,
@@ -124,7 +126,9 @@ class AbstractPartitioned(AbstractFixedStep):
         z, ended = root(last, guess, rounded)
         if terms.works:
             work = work + h * (b @ jax.vmap(form.power)(ts, Q, V))
-        y1 = terms.joined(q1, z[:n], work)
+        # Momenta tell velocities where M is indefinite, too, but no motion.
+        v1 = jnp.where(form.regular(t1, q1, z[:n]), z[:n], jnp.nan)
+        y1 = terms.joined(q1, v1, work)
         results: Any = diffrax.RESULTS
         lost = results.nonlinear_divergence
         result = results.where(found & ended, results.successful, lost)
