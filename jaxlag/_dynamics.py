@@ -25,7 +25,7 @@ from jaxlag._inputs import (
     marked,
     reads_state,
 )
-from jaxlag._kinks import has_kinks
+from jaxlag._kinks import outcomes
 from jaxlag._linalg import clearly_definite
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
@@ -406,12 +406,13 @@ class Dynamics(eqx.Module):
         columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
 
-    def has_kinks(self, tau: Array, y: Array, args: Arguments) -> bool:
-        """Whether forces, or what they follow from, may bend or jump within a step.
+    def branches(self, tau: Array, y: Array, args: Arguments) -> Array | None:
+        """Outcomes of the comparisons in what is declared, at (tau, y); None where there are none.
 
-        Tables and functions with knots do so at ends of steps.
+        As long as they stay the same, forces are smooth. Tables and functions with knots bend and
+        jump at ends of steps; multipliers that forces read are taken for 0.
         """
-        _, q, v, params, values = self.at(tau, y, args)
+        t, q, v, params, values = self.at(tau, y, args)
         _, inputs = self.given(args)
         inside = {
             name: x
@@ -422,17 +423,16 @@ class Dynamics(eqx.Module):
         }
         traced, static = _params.halves((params, inside))
 
-        def everything(t: Array, q: Array, v: Array, lam: Array, values: Any, traced: Any) -> Any:
+        def everything(t: Array, q: Array, v: Array, values: Any, traced: Any) -> Any:
             params, inside = _params.join(traced, static)
             found = evaluate(inside, t, q, v, params)
-            values = InputValues(values | dict(found))
-            return declared(self.system, t, q, v, params, values, lam)
+            return declared(self.system, t, q, v, params, InputValues(values | dict(found)), None)
 
-        lam = jnp.zeros((self.rows.size,), q.dtype)
-        moving = (self.clock(tau, args), q, v, lam, dict(values))
-        program = jax.make_jaxpr(everything)(*moving, traced).jaxpr
-        count = len(jax.tree.leaves(moving))
-        return has_kinks(program, [i < count for i in range(len(program.invars))])
+        moving, rest = (t, q, v, dict(values)), jax.tree.leaves(traced)
+        program = jax.make_jaxpr(everything)(*moving, traced)
+        first = jax.tree.leaves(moving)
+        which = [True] * len(first) + [False] * len(rest)
+        return outcomes(program, [*first, *rest], which)
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Lines of the scalar program for states and arguments like these, where there is one."""

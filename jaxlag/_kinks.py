@@ -1,60 +1,106 @@
-"""Whether a traced program bends or jumps: comparisons, and what is made of them."""
+"""Where a traced program bends or jumps: the comparisons in it, and how they come out.
 
-from collections.abc import Sequence
+A function of `max`, `where`, `abs` and the like is smooth as long as every comparison within comes
+out as before. Of a loop the integers that come out are looked at (an interval of a table), not the
+comparisons in its body; so with `cond`, whose index is looked at.
+"""
+
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax import Array
+from jax.extend.core import ClosedJaxpr, Literal
 
-_BENDS = {"lt", "le", "gt", "ge", "max", "min", "abs", "sign", "clamp", "floor", "ceil", "round"}
-_BENDS |= {"rem", "reduce_max", "reduce_min", "argmax", "argmin", "cummax", "cummin", "sort"}
 _SMOOTH = "jaxlag smooth"
-# JAX's functions that compare to stay in range.
-_IN_RANGE = {"softplus", "log_softmax", "hypot"}
-
 smooth = jax.named_scope(_SMOOTH)
 """Decorator of a function that compares, and is smooth all the same."""
 
+_CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
-def has_kinks(jaxpr: Jaxpr, moving: Sequence[bool]) -> bool:
-    """Whether something is compared that moves: a function of it may bend or jump there.
 
-    A comparison that merely guards a singular place is found as well; one with == or != is taken
-    for such. What comes out of a call, a loop or a branch moves where anything moves that goes in.
+def outcomes(program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool]) -> Array | None:
+    """How the comparisons of what moves come out, as numbers in a row; None where there are none.
+
+    A comparison with == or != is taken for the guard of a single place, and not listed.
 
     Args:
-        jaxpr: the traced program.
-        moving: which of its inputs move.
+        program: the traced program.
+        args: its arguments.
+        moving: which of these move.
     """
+    found: list[Array] = []
+    _run(program, list(args), list(moving), found)
+    return jnp.concatenate(found) if found else None
+
+
+def _run(
+    program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array]
+) -> tuple[list[Any], list[bool]]:
+    """(results, which of them move); outcomes of comparisons are added to `found`."""
+    jaxpr = program.jaxpr
+    known = dict(zip(jaxpr.constvars, program.consts, strict=True))
+    known |= dict(zip(jaxpr.invars, args, strict=True))
     moves = {x for x, does in zip(jaxpr.invars, moving, strict=True) if does}
     for eqn in jaxpr.eqns:
-        given = [not isinstance(x, Literal) and x in moves for x in eqn.invars]
-        if not any(given):
+        given = [x.val if isinstance(x, Literal) else known[x] for x in eqn.invars]
+        touched = [not isinstance(x, Literal) and x in moves for x in eqn.invars]
+        inner = _called(eqn)
+        if inner is not None:
+            looks = found if _SMOOTH not in str(eqn.source_info.name_stack) else []
+            results, does = _run(inner, given, touched, looks)
+        else:
+            results = eqn.primitive.bind(*given, **eqn.params)
+            results = results if eqn.primitive.multiple_results else [results]
+            does = [any(touched)] * len(results)
+            if any(touched) and _SMOOTH not in str(eqn.source_info.name_stack):
+                found.extend(_outcomes(eqn, given, results))
+        known.update(zip(eqn.outvars, results, strict=True))
+        moves.update(x for x, moved in zip(eqn.outvars, does, strict=True) if moved)
+    ends = [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
+    return ends, [not isinstance(x, Literal) and x in moves for x in jaxpr.outvars]
+
+
+def _called(eqn: Any) -> ClosedJaxpr | None:
+    """The program of a call; None of a loop, a choice, or an operation."""
+    if eqn.primitive.name in ("scan", "while", "cond"):
+        return None
+    for key in _CALLS:
+        inner = eqn.params.get(key)
+        if inner is None:
             continue
-        if eqn.params.get("name") in _IN_RANGE or _SMOOTH in str(eqn.source_info.name_stack):
-            moves.update(eqn.outvars)
-            continue
-        name = eqn.primitive.name
-        if name in _BENDS and _is_inexact(eqn.invars[0]):
-            return True
-        if any(has_kinks(inner, [True] * len(inner.invars)) for inner in _inner(eqn.params)):
-            return True
-        moves.update(eqn.outvars)
-    return False
+        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+        return closed if len(closed.jaxpr.invars) == len(eqn.invars) else None
+    return None
 
 
-def _inner(params: dict[str, Any]) -> list[Jaxpr]:
-    """The programs within an equation."""
-    found = []
-    for value in params.values():
-        for x in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(x, ClosedJaxpr):
-                found.append(x.jaxpr)
-            elif isinstance(x, Jaxpr):
-                found.append(x)
-    return found
+def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:
+    """Those of one operation."""
+    name, first = eqn.primitive.name, given[0]
+    if name in ("eq", "ne", "is_finite"):
+        return
+    for x in results:
+        if not jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+            yield _row(x)
+    if not jnp.issubdtype(jnp.result_type(first), jnp.inexact):
+        return
+    if name in ("max", "min"):
+        yield _row(jnp.sign(given[0] - given[1]))
+    elif name in ("abs", "sign"):
+        yield _row(jnp.sign(first))
+    elif name == "clamp":
+        low, x, high = given
+        yield _row(jnp.sign(x - low) + jnp.sign(x - high))
+    elif name in ("floor", "ceil", "round"):
+        yield _row(results[0])
+    elif name == "rem":
+        yield _row(jnp.trunc(given[0] / given[1]))
+    elif name in ("reduce_max", "reduce_min"):
+        yield _row(first == jnp.expand_dims(results[0], eqn.params["axes"]))
+    elif name in ("cummax", "cummin", "sort"):
+        yield _row(first == results[0])
 
 
-def _is_inexact(x: Any) -> bool:
-    return jnp.issubdtype(x.aval.dtype, jnp.inexact)
+def _row(x: Any) -> Array:
+    return jnp.ravel(jnp.asarray(x)).astype(float)

@@ -28,13 +28,12 @@ class Estimate(NamedTuple):
     Attributes:
         error: its estimate; None of methods that have none.
         unseen: what that takes no notice of; None where there is nothing.
-        apart: difference of h dy/dt at the end of the step and at the stage before, where both are
-            of that time and it is asked for.
+        turn: h dy/dt at the start less that at the end; None where nobody asks, or it is not known.
     """
 
     error: PyTree
     unseen: PyTree | None = None
-    apart: PyTree | None = None
+    turn: PyTree | None = None
 
 
 class Scheme(eqx.Module):
@@ -49,8 +48,8 @@ class Scheme(eqx.Module):
     settle: Callable | None = eqx.field(static=True, default=None)
     moves: bool = eqx.field(static=True, default=False)  # whether `settle` moves the state
     longest: Array | None = None  # bound on adaptive steps
-    # whether errors are held to the change of the state over a step, not to the state alone
-    by_change: bool = eqx.field(static=True, default=False)
+    # whether steps in which a comparison comes out otherwise are held to what derivatives need
+    across: bool = eqx.field(static=True, default=False)
 
     @property
     def remembers(self) -> bool:
@@ -107,11 +106,11 @@ class Scheme(eqx.Module):
         if type(controller) is not diffrax.PIDController:
             return self
         zero = jnp.zeros_like(args.origin)
-        kinks = isinstance(self.term, Term) and self.term.dynamics.has_kinks(zero, y, args)
-        scheme = replace(self, by_change=True) if kinks else self
-        return scheme._unseen_bounded(y, args)
+        compares = isinstance(self.term, Term) and self._branches(zero, y, args) is not None
+        scheme = replace(self, across=True) if compares else self
+        return scheme._bounded_at_rest(y, args)
 
-    def _unseen_bounded(self, y: Array, args: Any) -> "Scheme":
+    def _bounded_at_rest(self, y: Array, args: Any) -> "Scheme":
         """With steps bounded where error estimates do not see what perturbations do."""
         controller: Any = self.controller
         explicit = not self.implicit
@@ -163,7 +162,7 @@ class Scheme(eqx.Module):
             y1, error, beside, k, memory = self.solver.attempt(
                 self.term, t0, t1, y, args, memory, jump
             )
-            return y1, self._estimate(error, beside, k), memory, jnp.array(True)
+            return y1, Estimate(error, beside, self._turn(k)), memory, jnp.array(True)
         y1, error, dense, memory, result = self.solver.step(
             self.term, t0, t1, y, args, memory, jump
         )
@@ -173,37 +172,58 @@ class Scheme(eqx.Module):
             return y1, Estimate(error), memory, solved
         stages = unweighted_stages(tableau.b_sol, tableau.b_error)
         beside = unseen(unstacked(dense["k"]), stages) if stages else None
-        return y1, self._estimate(error, beside, dense["k"]), memory, solved
+        return y1, Estimate(error, beside, self._turn(dense["k"])), memory, solved
 
-    def _estimate(self, error: PyTree, beside: PyTree, k: PyTree) -> Estimate:
-        wanted = self.by_change and ends_twice(self.solver)
-        return Estimate(error, beside, k[-1] - k[-2] if wanted else None)
+    def _turn(self, k: PyTree) -> PyTree:
+        """h dy/dt at the start less that at the end, where it is asked for."""
+        return k[0] - k[-1] if self.across else None
 
-    def held_to(self, t0: Array, t1: Array, y0: Array, y1: Array, estimate: Estimate) -> PyTree:
-        """The error that the controller bounds: of the step, or `by_change` of its derivative, too.
+    def _branches(self, tau: Array, y: Array, args: Any) -> Array | None:
+        """Outcomes of the comparisons in what is declared."""
+        term: Any = self.term
+        return term.dynamics.branches(tau, y, self.within(args, tau))
+
+    def held_to(
+        self,
+        t0: Array,
+        t1: Array,
+        y0: Array,
+        y1: Array,
+        args: Any,
+        estimate: Estimate,
+        spare: Array,
+    ) -> PyTree:
+        """The error that the controller bounds; `across` a bend, that of the derivative, too.
 
         Where a force bends, its derivative jumps by J. A step of h across leaves an error of order
         h^2 J in the state, and one of order h J in perturbations of it: the former over the length
-        of the step. So the error is bounded by a part of the change over the step,
+        of the step. So in a step in which a comparison comes out otherwise at its end than at its
+        start, or in its middle, the error is bounded by a part of the change over the step,
 
-            |error| <= rtol |y1 - y0|     in the controller's norm,
+            |error| <= rtol |y1 - y0| / 100     in the controller's norm;
 
-        and by a hundredth of that where it is above |h dy/dt(y1) - h dy/dt(last stage)|, as it is
-        across a bend alone: there an estimate is a small part of the error. Steps near what times
-        can resolve are bounded by their own error.
+        a hundredth, as the estimate is a small part of the error there: it is that of rules for
+        functions without a bend. Steps near what times can resolve, and all of them where there are
+        none to `spare`, are bounded by their own error.
         """
         error = at_least(estimate.error, estimate.unseen)
-        if not self.by_change:
+        if not self.across:
             return error
         controller: Any = self.controller
         allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-        part = controller.rtol * controller.norm((y1 - y0) / allowed)
-        if estimate.apart is not None:
-            bends = controller.norm(estimate.error / allowed) > controller.norm(
-                estimate.apart / allowed
-            )
-            part = jnp.where(bends, _ACROSS * part, part)
-        told = (part > 0) & (t1 - t0 > _FINE * resolution(t1))
+        part = _ACROSS * controller.rtol * controller.norm((y1 - y0) / allowed)
+        middle = 0.5 * (y0 + y1)
+        if estimate.turn is not None:
+            middle = middle + 0.125 * estimate.turn
+        half = t0 + 0.5 * (t1 - t0)
+        before, between, after = (
+            self._branches(tau, y, args) for tau, y in ((t0, y0), (half, middle), (t1, y1))
+        )
+        crossed = jnp.any(before != between) | jnp.any(between != after)
+        span = jnp.abs(args.end - args.origin)
+        told = (
+            spare & crossed & (part > 0) & (t1 - t0 > _FINE * (resolution(span) + resolution(t1)))
+        )
         return error / jnp.where(told, jnp.minimum(part, 1.0), 1.0)
 
     def is_smooth(self, y0: PyTree, y1: PyTree, estimate: Estimate) -> Bool[Array, ""]:
@@ -354,12 +374,6 @@ def _turning(J: Array) -> Array:
     values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
     turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
     return jnp.where(finite, jnp.max(jnp.where(turning, jnp.abs(values), 0.0)), jnp.nan)
-
-
-def ends_twice(solver: diffrax.AbstractSolver) -> bool:
-    """Whether the last two stages of an explicit method are at the end of the step."""
-    tableau = _explicit_tableau(getattr(solver, "stock", solver))
-    return tableau is not None and bool(np.all(tableau.c[-2:] == 1.0))
 
 
 def _explicit_tableau(solver: diffrax.AbstractSolver) -> Any:

@@ -83,10 +83,11 @@ def simulate(
     coincide, only for moving them together). It is zero in dt, dt0, dt_max, rtol and atol.
 
     Where L or a force compares what moves (max(x, 0), where, abs), perturbations jump as the force
-    bends, and steps along which derivatives are taken are held to the change of the state, too. A
-    first derivative is then about as good as the motion. A second one leaves out what every bend
-    adds, where the force's second derivative is infinite, as JAX's own of such functions do: smooth
-    the force (softplus) where that matters.
+    bends: steps along which derivatives are taken are shortened where a comparison comes out
+    otherwise, as far as `max_steps` lets them. A first derivative is then about as good as the
+    motion. It leaves out how the time moves at which a force itself jumps (sign(v), where between
+    two values), and a second one what every bend adds, as JAX's own derivatives of such functions
+    do: smooth the force (tanh, softplus) where that matters.
 
     Args:
         system: what moves.

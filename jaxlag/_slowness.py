@@ -15,7 +15,7 @@ from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
 from jaxlag._projection import turns_needed
 from jaxlag._scheme import linearized
-from jaxlag._status import ADVICE, ADVICE_FIXED, Status
+from jaxlag._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, Status
 from jaxlag._term import term_of
 
 if TYPE_CHECKING:
@@ -77,8 +77,10 @@ def _stiffness(motion: "Solution") -> Rates | None:
 
 def advice(motion: "Solution", status: Status) -> str:
     """What to do about the end of a single motion, as far as its status tells."""
-    fixed = motion.tolerances is None
-    said = (ADVICE | ADVICE_FIXED if fixed else ADVICE).get(status, "")
+    fixed, (accepted, rejected) = motion.tolerances is None, _counts(motion)
+    sharp = rejected > UNEVEN * (accepted + rejected)
+    special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
+    said = (ADVICE | special).get(status, "")
     if fixed:
         return said
     if status in (Status.max_steps, Status.step_below_resolution):
@@ -113,7 +115,7 @@ def explain(motion: "Solution") -> str:
         raise bad("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
     if not _params.concrete(motion.status, motion.q, motion.last_time, motion.ts):
         raise bad("explain", "be asked outside jit and vmap", "the motion is traced")
-    accepted, rejected = (int(motion.stats[name]) for name in ("accepted", "rejected"))
+    accepted, rejected = _counts(motion)
     how = "fixed steps"
     if motion.tolerances is not None:
         rtol, atol = map(np.asarray, motion.tolerances)
@@ -165,6 +167,11 @@ def explain(motion: "Solution") -> str:
         advice.append("Accuracy sets the step, and nothing stands out: a looser tolerance is all.")
     heads = ["advice        ", *["              "] * (len(advice) - 1)]
     return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
+
+
+def _counts(motion: "Solution") -> tuple[int, int]:
+    """Steps (accepted, rejected)."""
+    return int(motion.stats["accepted"]), int(motion.stats["rejected"])
 
 
 def _mean_step(motion: "Solution") -> float | None:

@@ -98,3 +98,10 @@ ADVICE_FIXED = {
     Status.implicit_solve_failed: ("The implicit solver's equations did not converge: reduce dt."),
 }
 """What is to be done otherwise with fixed steps, where tolerances have no part."""
+
+ADVICE_SHARP = {
+    Status.max_steps: (
+        "Raise max_steps, or shorten ts. What held the steps short is in motion.explain()."
+    ),
+}
+"""Where forces change within a short way, and a looser tolerance would pass over it."""

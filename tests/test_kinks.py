@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._kinks import has_kinks
+from jaxlag._kinks import outcomes
 
 G = 9.81
-X = jnp.array([0.3, -0.2, 0.5])
-
+A, B = jnp.array([0.3, -0.2, 0.6]), jnp.array([-0.3, 1.9, 1.7])  # every comparison differs
 BENT = {
     "minimum": lambda x: jnp.minimum(x[0], 0.0),
     "where": lambda x: jnp.where(x[0] > 0, x[0], 2 * x[0]),
     "abs": lambda x: jnp.abs(x[0]),
     "largest": jnp.max,
+    "order": lambda x: jnp.sort(x)[0],
     "relu": lambda x: jax.nn.relu(x[0]),
     "cond": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x[1]),
-    "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, c: jnp.maximum(c, x[0]), x[1]),
-    "under jit": jax.jit(lambda x: jnp.clip(x[0], -1.0, 1.0)),
-    "table": lambda x: jnp.interp(x[0], X, X),
-    "round": lambda x: x[0] - jnp.round(x[0]),
+    "under jit": jax.jit(lambda x: jnp.clip(x[0], -0.1, 0.1)),
+    "table": lambda x: jnp.interp(x[2], jnp.array([0.0, 1.0, 2.0]), A),
+    "round": lambda x: x[2] - jnp.round(x[2]),
+    "integers": lambda x: (10 * x[0]).astype(int),
+    "modulo": lambda x: jnp.mod(x[2], 1.0),
 }
 SMOOTH = {
     "sine": lambda x: jnp.sin(x[0]),
     "norm": lambda x: jl.math.norm(x) + jnp.linalg.norm(x),
     "angle": lambda x: jl.math.atan2(x[0], x[1]) + jl.math.sinc(x[2]) + jl.math.cosc_sqrt(x[0]),
-    "softplus": lambda x: jax.nn.softplus(x[0]),
     "a place": lambda x: jnp.where(x[0] == 0, 1.0, jnp.sin(x[0])),
     "determinant": lambda x: jnp.linalg.det(jnp.eye(3) * x[0]),
     "loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, c: c * x[i], 1.0),
@@ -35,24 +35,28 @@ SMOOTH = {
 }
 
 
-def bends(function, *fixed):
-    program = jax.make_jaxpr(function)(X, *fixed).jaxpr
-    return has_kinks(program, [i == 0 for i in range(len(program.invars))])
+def compared(function, x, *fixed):
+    program = jax.make_jaxpr(function)(x, *fixed)
+    return outcomes(program, [x, *fixed], [True] + [False] * len(fixed))
 
 
 @pytest.mark.parametrize("name", BENT)
 def test_a_program_that_bends(name):
-    assert bends(BENT[name])
+    """Comparisons come out otherwise at the other state, and the same nearby."""
+    here, there, near = (compared(BENT[name], x) for x in (A, B, A + 1e-9))
+    assert np.any(here != there)
+    np.testing.assert_array_equal(here, near)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_a_program_that_does_not(name):
-    assert not bends(SMOOTH[name])
+    found = compared(SMOOTH[name], A)
+    assert found is None or np.all(found == compared(SMOOTH[name], B))
 
 
 def test_what_does_not_move_is_compared_freely():
-    assert not bends(lambda x, p: jnp.where(p > 0, x[0], jnp.sin(x[0])), jnp.array(1.0))
-    assert not bends(lambda x, i: x[jnp.where(i > 1, i, 0)], jnp.array(2))
+    assert compared(lambda x, p: jnp.where(p > 0, x[0], jnp.sin(x[0])), A, jnp.array(1.0)) is None
+    assert compared(lambda x, i: x[jnp.where(i > 1, i, 0)], A, jnp.array(2)) is None
 
 
 def floor(t, q, v, params):
@@ -85,7 +89,7 @@ def ball():
 def test_derivatives_across_a_bend(ball, mode):
     """In height and stiffness: 1 to 2 % off where the motion was right to 1e-8 m.
 
-    Worst of 300 heights and stiffnesses: 4e-5; of these four 1e-7 and 2e-6.
+    Of 300 heights and stiffnesses the worst is 3e-4 off, half of them less than 3e-7.
     """
     k = jnp.array([1e3, 1e4, 8e4, 1e6])
     h = jnp.ones(4)
@@ -103,23 +107,77 @@ def test_derivatives_across_a_bend_by_other_methods(ball, method):
     np.testing.assert_allclose(slopes, exact, rtol=1e-3 if method == "kvaerno5" else 1e-4)
 
 
-def test_smooth_motions_keep_their_steps():
-    """A spring of a length: a norm compares within, but nothing bends. A switch far away does."""
+def test_motions_that_cross_no_bend_keep_their_steps():
+    """A norm is compared within, and a switch far away never comes out otherwise."""
 
     def lagrangian(t, q, v, params):
         stretch = jl.math.norm(q) - 1.0
-        far = jnp.where(q[0] > 1e3, q[0], 0.0) if params["switch"] else 0.0
-        return 0.5 * (v @ v) - 4.0 * stretch**2 - q[1] + far
+        return 0.5 * (v @ v) - 4.0 * stretch**2 - q[1] + jnp.where(q[0] > 1e3, q[0], 0.0)
 
     system = jl.System(lagrangian, ("x", "y"))
 
-    def end(q0, switch):
-        params = {"switch": switch}
-        motion = jl.simulate(system, q0, [0.0, 0.0], [0.0, 3.0], params)
+    def end(q0):
+        motion = jl.simulate(system, q0, [0.0, 0.0], [0.0, 3.0], {})
         return motion.q[-1, 0], motion.stats["accepted"] + motion.stats["rejected"]
 
-    for switch, more in ((False, 1.0), (True, 1.6)):
-        q0 = jnp.array([1.2, 0.1])
-        plain = int(end(q0, switch)[1])
-        (_, count), _ = jax.value_and_grad(end, has_aux=True)(q0, switch)
-        assert plain <= int(count) <= more * plain
+    q0 = jnp.array([1.2, 0.1])
+    (_, count), _ = jax.value_and_grad(end, has_aux=True)(q0)
+    assert count == end(q0)[1]
+
+
+def contact(t, q, v, params):
+    """A damped floor that only presses."""
+    press = jnp.maximum(-params["k"] * q - params["c"] * v, 0.0)
+    return jnp.where(q < 0, press, 0.0)
+
+
+def saturated(t, q, v, params):
+    return jnp.clip(params["k"] * (1 - q) - 9.0 * v, -5.0, 5.0)
+
+
+def friction(t, q, v, params):
+    return -params["k"] * jnp.sign(v) - 4.0 * q
+
+
+@pytest.mark.parametrize(
+    ("force", "weight", "q0", "k", "t", "slope"),
+    [
+        (contact, G, 1.0, 1e3, 10.0, 9.81e-6),  # it settles: q = -g/k
+        pytest.param(saturated, 0.0, 0.0, 20.0, 10.0, 0.0, marks=pytest.mark.full),
+        (friction, 0.0, 1.0, 0.05, 0.7, (1 - np.cos(1.4)) / 4),  # a jump where it starts
+    ],
+)
+def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, k, t, slope):
+    """At rest no change is left to hold an error to, and a jump leaves the same in any step."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v[0] ** 2 - weight * q[0]
+
+    system = jl.System(lagrangian, ("x",), forces=(jl.GeneralizedForce(force, "force"),))
+
+    @jax.jit
+    def end(k):
+        motion = jl.simulate(system, [q0], [0.0], [0.0, t], {"k": k, "c": 10.0})
+        return motion.q[-1, 0], motion.status
+
+    (_, status), found = jax.value_and_grad(end, has_aux=True)(k)
+    assert status == jl.Status.ok
+    np.testing.assert_allclose(found, slope, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.full
+def test_many_bends_do_not_use_up_the_steps():
+    """Twelve thousand attempts of 16,384 are left to the motion, the rest to its derivative."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v[0] ** 2 - 0.5 * params["k"] * jnp.maximum(jnp.abs(q[0]) - 0.1, 0.0) ** 2
+
+    system = jl.System(lagrangian, ("x",))
+
+    def end(k):
+        motion = jl.simulate(system, [1.0], [0.0], [0.0, 200.0], {"k": k})
+        return motion.q[-1, 0], motion.stats["accepted"] + motion.stats["rejected"]
+
+    (_, count), slope = jax.value_and_grad(end, has_aux=True)(10.0)
+    assert 12_000 < int(end(10.0)[1]) < int(count) < 16_384
+    np.testing.assert_allclose(slope, -1.6593087, rtol=5e-3)

@@ -24,8 +24,8 @@ from systems._catalogue import ENTRIES
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
 PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}
 STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
-# Divisions of a step itself: 1/h; of the gains of q and v, their errors and what these do not see by
-# that; the error over its tolerance, two in the factor by which h changes.
+# Divisions of a step itself: 1/h; by that, of the gains of q and v, their errors and what these do
+# not see; the error over its tolerance, two in the factor by which h changes.
 STEP = 9
 
 CEILINGS = {  # angles of sines and cosines, divisions

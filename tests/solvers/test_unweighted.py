@@ -163,7 +163,11 @@ def test_a_barrier_too_steep_for_numbers():
 
 def test_explain_does_not_advise_a_looser_tolerance_there():
     for lagrangian in (spring, softplus):
-        motion = jl.simulate(jl.System(lagrangian, ("x",)), [1.0], [0.0], [0.0, 3.0], {"k": 1e5})
+        system = jl.System(lagrangian, ("x",))
+        motion = jl.simulate(system, [1.0], [0.0], [0.0, 3.0], {"k": 1e5})
         text = motion.explain()
         assert "loose" not in text
         assert "change fast" in text or "Many steps were rejected" in text
+    short = jl.simulate(system, [1.0], [0.0], [0.0, 3.0], {"k": 1e5}, max_steps=50, throw=False)
+    assert "loose" not in short.explain()
+    assert "Raise max_steps, or shorten ts." in short.message()
