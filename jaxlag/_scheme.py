@@ -119,7 +119,15 @@ class Scheme(eqx.Module):
         zero = jnp.zeros_like(args.origin)
         y, args = jax.lax.stop_gradient((y, self.within(args, zero)))
 
-        f, J = linearized(lambda y: self.term.vf(zero, y, args), y)
+        def field(y: Array) -> Array:
+            rates = self.term.vf(zero, y, args)
+            outcomes = self._branches(zero, y, args) if self.across else None
+            return rates if outcomes is None else jnp.append(rates, outcomes.astype(rates.dtype))
+
+        f, J = linearized(field, y)
+        # Differences across a jump or a bend say nothing.
+        smooth = ~jnp.any(J[y.size :] != 0)
+        f, J = f[: y.size], J[: y.size]
         if explicit:
             rate, power = _rate(J)
             # In J^16 f only the fastest motions are left: those of half their rate to 1e-5.
@@ -128,7 +136,7 @@ class Scheme(eqx.Module):
             rate = _turning(J)
             seen = jnp.abs(J @ f) / rate
         allowed = _UNSEEN * (controller.atol + controller.rtol * jnp.abs(y))
-        unseen = jnp.all(seen < rate * allowed) & jnp.isfinite(rate)
+        unseen = jnp.all(seen < rate * allowed) & jnp.isfinite(rate) & smooth
         solver: Any = self.solver
         order = float(solver.error_order(self.term))
         eps = jnp.finfo(y.dtype).eps

@@ -23,6 +23,7 @@ from jaxlag._arguments import (
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Baumgarte
+from jaxlag._dynamics import still
 from jaxlag._ending import ended
 from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
@@ -346,4 +347,5 @@ def _simulate(plan: Plan, values: Values) -> Solution:
 def _raise_unless_ok(motion: Solution) -> None:
     status = motion._ending.status
     if np.ndim(status) == 0 and int(status) != int(Status.ok):
+        motion = still(motion)  # under grad its numbers are traced, and have values all the same
         raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

@@ -140,14 +140,17 @@ def friction(t, q, v, params):
 
 
 @pytest.mark.parametrize(
-    ("force", "weight", "q0", "k", "t", "slope"),
+    ("force", "weight", "q0", "v0", "k", "t", "slope"),
     [
-        (contact, G, 1.0, 1e3, 10.0, 9.81e-6),  # it settles: q = -g/k
-        pytest.param(saturated, 0.0, 0.0, 20.0, 10.0, 0.0, marks=pytest.mark.full),
-        (friction, 0.0, 1.0, 0.05, 0.7, (1 - np.cos(1.4)) / 4),  # a jump where it starts
+        (contact, G, 1.0, 0.0, 1e3, 10.0, 9.81e-6),  # it settles: q = -g/k
+        pytest.param(saturated, 0.0, 0.0, 0.0, 20.0, 10.0, 0.0, marks=pytest.mark.full),
+        (friction, 0.0, 1.0, 0.0, 0.05, 0.7, (1 - np.cos(1.4)) / 4),  # a jump where it starts
+        pytest.param(
+            *(friction, 0.0, 1.0, -1e-9, 0.05, 0.7, (1 - np.cos(1.4)) / 4), marks=pytest.mark.full
+        ),
     ],
 )
-def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, k, t, slope):
+def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, v0, k, t, slope):
     """At rest no change is left to hold an error to, and a jump leaves the same in any step."""
 
     def lagrangian(t, q, v, params):
@@ -157,7 +160,7 @@ def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, k, t, slo
 
     @jax.jit
     def end(k):
-        motion = jl.simulate(system, [q0], [0.0], [0.0, t], {"k": k, "c": 10.0})
+        motion = jl.simulate(system, [q0], [v0], [0.0, t], {"k": k, "c": 10.0})
         return motion.q[-1, 0], motion.status
 
     (_, status), found = jax.value_and_grad(end, has_aux=True)(k)

@@ -345,3 +345,14 @@ def test_tolerance_is_kept_across_solvers():
         motion = run(method=method, rtol=1e-6, atol=1e-6)
         # Measured worst 2026-11-21: 2e-5, bosh3.
         np.testing.assert_allclose(motion.q, truth.q, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
+def test_a_motion_that_fails_under_an_eager_derivative_says_so(mode):
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
+
+    def end(k):
+        return jl.simulate(system, [1.0], [0.0], [0.0, 10.0], {"k": k}, max_steps=20)["x"][-1]
+
+    with pytest.raises(SimulationError, match=r"max_steps: last good state at t = 4\.\d+ of 10"):
+        mode(end)(4.0)
