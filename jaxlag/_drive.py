@@ -334,8 +334,8 @@ def _next_step(
         return good, c.h, None, jnp.zeros_like(good), ~good
     order: Any = scheme.solver.error_order(scheme.term)
     # What derivatives need must not use up the steps of the motion: as many as get through it.
-    passed = jnp.maximum(0.25, 0.9 * t / loop.times.stop)
-    spare = c.attempted.astype(t.dtype) < loop.max_steps * passed
+    stop = loop.times.stop
+    spare = c.attempted.astype(t.dtype) * stop < loop.max_steps * jnp.maximum(0.25 * stop, 0.9 * t)
     error = scheme.held_to(t, t1, y, y1, loop.args, estimate, spare)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
     y1 = _select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
