@@ -9,13 +9,16 @@ from typing import Any
 
 FUNCTIONS = (FunctionType, MethodType)
 # Attributes that enum and JAX write; wrappers copy the latter.
-_INTERNAL = {"_value_", "_name_", "_sort_order_", "_inverted_", "_fun", "_jit_info"}
+_INTERNAL = {
+    *("_value_", "_name_", "_sort_order_", "_inverted_", "__objclass__"),
+    *("_fun", "_jit_info"),
+}
 
 
 def own_attributes(x: Any) -> dict[str, Any]:
     """What was written to a function, or to a member of an enumeration, as an attribute."""
     found = getattr(x, "__dict__", {})
-    if not found:
+    if found.keys() <= _INTERNAL:  # nearly always
         return {}
     return {
         name: value

@@ -26,7 +26,7 @@ from jax.core import Tracer
 from jaxlag._alike import is_bare, types_in
 from jaxlag._code import own_attributes, unwrapped
 from jaxlag._errors import bad
-from jaxlag._home import of_library
+from jaxlag._home import of_arrays, of_library
 from jaxlag._outside import reading
 from jaxlag._watched import Outside, changes
 
@@ -115,7 +115,7 @@ def _found(search: "_Search", place: _Place | None, x: Any, hashed: bool) -> _Fa
     if place is not None:
         where = " of ".join(reversed(place.path))
         what = "class" if isinstance(place.thing, type) else type(place.thing).__name__
-        what = f"{'an' if what[0] in 'aeiouAEIOU' else 'a'} {what}"
+        what = f"{'an' if what[0] in 'aeioAEIO' else 'a'} {what}"
         thing = f"{where}, {what}," if where else what
         return _Fault(f"{thing} {place.why}", _fix(x, place))
     if hashed and not _hashes(x):
@@ -329,10 +329,15 @@ def _fault_of_node(kind: type, data: Any, search: "_Search") -> _Fault | None:
     """What stands against the data and the class of a node."""
     if is_bare(kind, data):
         return None
-    if of_library(kind):
+    if _is_known(kind):
         return _found(search, search.data(data), data, False)
     fault = _found(search, search.kind(kind, ()), kind, False)
     return fault or _found(search, search.place(data, ()), data, True)
+
+
+def _is_known(kind: type) -> bool:
+    """Whether a node keeps there what is its library's own business, besides what it was given."""
+    return of_arrays(kind) or kind.__module__ in ("builtins", "collections")
 
 
 def _data(tree: Any, name: str) -> Iterator[tuple[str, Any, _Fault | None]]:
@@ -345,7 +350,7 @@ def _data(tree: Any, name: str) -> Iterator[tuple[str, Any, _Fault | None]]:
         found = [(f".{f.name}", getattr(tree, f.name, None)) for f in parts]
         found = [(part, value) for part, value in found if id(value) not in own]
         for part, value in found or [("", data)]:
-            yield name + part, value, _fault(value, of_library(kind))
+            yield name + part, value, _fault(value, _is_known(kind))
         yield name, tree, None if of_library(kind) else _fault_of_kind(kind)
     for path, child in children:
         if child is not tree:
@@ -358,7 +363,7 @@ def _words(x: Any) -> str:
 
 
 _OF_FUNCTION = "Hand over in params what it reads; numbers and arrays of jax.numpy may stay."
-_OF_CLASS = "Make it a field, or hand it over in params; numbers and tuples of them may stay."
+_OF_CLASS = "Make it a field, or hand it over in params; numbers and arrays of jax.numpy may stay."
 
 
 def _fix(x: Any, place: _Place | None) -> str:

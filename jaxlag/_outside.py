@@ -183,6 +183,9 @@ class _Reader:
         watching = self._watching
         installed = is_installed(x)
         self._watching = watching or installed
+        if not of_library(x):  # notebooks that load modules again write to functions
+            place = id(x), "__code__"
+            self._keep(f"{x.__name__}.__code__", place, lambda: x.__code__, x.__code__)
         if not (installed and self._apart):
             self._code(x, depth)
         self._watching = watching
@@ -213,9 +216,9 @@ class _Reader:
         count = x.__code__.co_argcount
         given = x.__code__.co_varnames[count - len(x.__defaults__ or ()) : count]
         for i, name in enumerate(given):
-            looks[name] = (id(x), name), partial(_item, x.__defaults__, i)
+            looks[name] = (id(x), name), lambda i=i: _item(x.__defaults__, i)
         for name in x.__kwdefaults__ or ():
-            looks[name] = (id(x), name), partial(_item, x.__kwdefaults__, name)
+            looks[name] = (id(x), name), lambda name=name: _item(x.__kwdefaults__, name)
         for name, (place, look) in looks.items():
             if name not in stored and look() is not GONE:
                 self._source(name, place, look, names, depth)

@@ -3,6 +3,7 @@
 What can change in place is refused at once, a number when it has changed.
 """
 
+import argparse
 import collections
 import enum
 import functools
@@ -69,6 +70,13 @@ class Registered(dict):
     @classmethod
     def tree_unflatten(cls, data, children):
         return cls(zip(data[0], children, strict=True), data[1])
+
+
+jax.tree_util.register_pytree_node(
+    argparse.Namespace,
+    lambda x: ((x.x,), x.settings),
+    lambda data, children: argparse.Namespace(x=children[0], settings=data),
+)
 
 
 class LawOfTable(enum.Enum):
@@ -145,6 +153,14 @@ def of_own_list():
 
 
 of_own_list.k = [1.0]
+
+
+def by_default(x=0.0, k=2.0):
+    return k * x
+
+
+def by_code():
+    return 2.0
 
 
 def counting():
@@ -315,6 +331,10 @@ READS = "which it reads from outside, a dict, can change in place. Hand over in 
 REFUSED = {
     "named tuple": (PairOfTable(), METHODS),
     "data of a dict": (Registered({"x": 1.0}, Plain()), "its element 1, a Plain, can .*eqx.Module"),
+    "data of a namespace": (
+        argparse.Namespace(x=1.0, settings=collections.UserDict(k=1.0)),
+        "an? UserDict can change",
+    ),
     "enum": (LawOfTable.A, METHODS),
     "attribute of an enum": (Listed.A, "its attribute 'k', a list, can change in place"),
     "class of an enum": (LawOfTable, METHODS),
@@ -389,6 +409,8 @@ CHANGED = {
         "of_own_attribute.k, which it reads from outside, was 1.0 before and is 5.0 now. Hand",
     ),
     "class variable": (OfClass(), (OfClass, "factor"), "OfClass.factor, which its methods read"),
+    "default": (by_default, (by_default, "__defaults__"), "k, which it reads .* was 2.0 before"),
+    "code": (by_code, (by_code, "__code__"), "by_code.__code__, which it reads from outside"),
     "method": (OfNumber(), (OfNumber, "law"), "OfNumber.law, which its methods read .* now"),
 }
 
@@ -418,7 +440,8 @@ def test_a_number_is_refused_when_it_has_changed(name, monkeypatch):
     if isinstance(place, str):
         monkeypatch.setitem(globals(), place, 5.0)
     else:
-        monkeypatch.setattr(*place, 5.0)
+        new = {"__defaults__": (0.0, 5.0), "__code__": (lambda: 5.0).__code__}
+        monkeypatch.setattr(*place, new.get(place[1], 5.0))
     with pytest.raises(ValueError, match=rf"^params\['a'\] must be .*{message}"):
         check_keys({"a": leaf})
 
