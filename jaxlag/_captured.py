@@ -22,10 +22,12 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxlag import _params
 from jaxlag._closed import Closed, plain
 from jaxlag._errors import bad
+from jaxlag._home import of_library
 from jaxlag._input_values import InputValues
 from jaxlag._mishaps import said
-from jaxlag._outside import Outside, changes, of_library, outside
+from jaxlag._outside import outside
 from jaxlag._owned import owned
+from jaxlag._watched import Outside, changes
 
 
 class _Program(NamedTuple):

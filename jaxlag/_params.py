@@ -9,9 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxlag._alike import types_in, types_of
 from jaxlag._closed import plain
 from jaxlag._errors import bad
 from jaxlag._immutable import check_nodes, is_fixed, refusal
+
+_TRACED = {float: True, int: False, bool: False, str: False}  # of plain leaves
 
 
 class _Frozen:
@@ -100,7 +103,8 @@ def _is_finite(leaf: Any) -> bool:
 
 
 def _is_fine(leaf: Any) -> bool:
-    return is_array(leaf) or isinstance(leaf, _Frozen) or is_fixed(leaf)
+    # Numbers with a fraction are traced, whatever their class.
+    return is_array(leaf) or isinstance(leaf, float | complex | _Frozen) or is_fixed(leaf)
 
 
 def _is_key(x: Any) -> bool:
@@ -109,7 +113,9 @@ def _is_key(x: Any) -> bool:
 
 
 def _is_traced(leaf: Any) -> bool:
-    if not concrete(leaf) or _is_key(leaf):
+    if type(leaf) in _TRACED:
+        return _TRACED[type(leaf)]
+    if isinstance(leaf, Tracer) or _is_key(leaf):
         return True
     if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.integer):
         return True
@@ -131,16 +137,14 @@ def split(params: Any) -> tuple[Any, Any]:
 
 def halves(tree: Any) -> tuple[Any, Any]:
     """The same of any pytree, whatever its leaves."""
-
-    def traced_half(leaf: Any) -> Any:
-        return jnp.asarray(leaf) if _is_traced(leaf) else None
-
-    def static_half(leaf: Any) -> Any:
-        if _is_traced(leaf):
-            return None
-        return _Frozen(leaf) if is_array(leaf) else leaf
-
-    return jax.tree.map(traced_half, tree), jax.tree.map(static_half, tree)
+    leaves, form = jax.tree.flatten(tree)
+    are = [_is_traced(x) for x in leaves]
+    traced = [jnp.asarray(x) if is_it else None for x, is_it in zip(leaves, are, strict=True)]
+    static = [
+        None if is_it else _Frozen(x) if is_array(x) else x
+        for x, is_it in zip(leaves, are, strict=True)
+    ]
+    return jax.tree.unflatten(form, traced), jax.tree.unflatten(form, static)
 
 
 def join(traced: Any, static: Any) -> Any:
@@ -165,6 +169,14 @@ class Static:
     def __init__(self, tree: Any) -> None:
         leaves, self.treedef = jax.tree.flatten(tree)
         self.leaves = tuple(leaves)
+        self._types: Any = None
+
+    @property
+    def types(self) -> Any:
+        """Those of all that it holds, as far as equal values may be of others."""
+        if self._types is None:
+            self._types = types_in(self.treedef), tuple(map(types_of, self.leaves))
+        return self._types
 
     @property
     def tree(self) -> Any:
@@ -177,11 +189,8 @@ class Static:
         return (
             isinstance(other, Static)
             and self.treedef == other.treedef
-            and len(self.leaves) == len(other.leaves)
-            and all(
-                type(a) is type(b) and a == b
-                for a, b in zip(self.leaves, other.leaves, strict=True)
-            )
+            and self.leaves == other.leaves
+            and self.types == other.types
         )
 
 

@@ -243,20 +243,6 @@ def test_a_function_that_reads_another_number_is_refused(monkeypatch):
             check_keys(each)
 
 
-class Scaled(eqx.Module):
-    k: float
-
-    def __call__(self, x):
-        return self.k * FACTORS[0] * x
-
-
-def test_what_the_methods_of_modules_read_is_watched(monkeypatch):
-    check_keys({"law": Scaled(1.0)})
-    monkeypatch.setitem(globals(), "FACTORS", [3.0])
-    with pytest.warns(UserWarning, match=r"^FACTORS, which Scaled in params .* \[1.0\] .* \[3.0\]"):
-        check_keys({"law": Scaled(1.0)})
-
-
 def test_modules_that_are_declared_may_not_change_either():
     with pytest.raises(ValueError, match=r"^Static\.law must be .* a Plain can change"):
         jl.Function(Static(Plain(1.0)))

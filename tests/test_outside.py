@@ -1,8 +1,9 @@
 """What declared functions read from outside: a change of it is named, and changes nothing."""
 
+from enum import Enum
 from functools import partial, wraps
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -241,7 +242,60 @@ def _large_array():
     return lambda t, q, v, params: 0.5 * v @ v - k[0] * q[0], change, "k"
 
 
+class _Rule(Enum):
+    LINEAR = 1
+
+    def stiffness(self):
+        return _RULES["k"]
+
+
+class _Row(NamedTuple):
+    x: float = 1.0
+
+    def stiffness(self):
+        return _RULES["k"]
+
+
+class _Word(str):
+    def stiffness(self):
+        return _RULES["k"]
+
+
+_RULES = {"k": 2.0}
+
+
+def _method_of(x):
+    _RULES["k"] = 2.0
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v - x.stiffness() * q[0]
+
+    return lagrangian, lambda: _RULES.update(k=5.0), "_RULES"
+
+
+def _own_attribute():
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v - lagrangian.k * q[0]  # pyright: ignore[reportFunctionMemberAccess]
+
+    lagrangian.k = 2.0  # pyright: ignore[reportFunctionMemberAccess]
+    return lagrangian, lambda: setattr(lagrangian, "k", 5.0), r"lagrangian\.k"
+
+
+def _global_by_its_name():
+    _RULES["k"] = 2.0
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * v @ v - globals()["_RULES"]["k"] * q[0]
+
+    return lagrangian, lambda: _RULES.update(k=5.0), "_RULES"
+
+
 OUTSIDE = [
+    partial(_method_of, _Rule.LINEAR),
+    partial(_method_of, _Row()),
+    partial(_method_of, _Word("a")),
+    _own_attribute,
+    _global_by_its_name,
     _instance,
     _method_of_an_object,
     _object_in_an_object,

@@ -1,0 +1,89 @@
+"""Python functions, and what wraps them: their code, names in it, attributes."""
+
+import re
+from collections.abc import Iterator
+from functools import cached_property, partial, partialmethod, singledispatchmethod
+from inspect import getattr_static, unwrap
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
+from typing import Any
+
+FUNCTIONS = (FunctionType, MethodType)
+# Attributes that enum and JAX write; wrappers copy the latter.
+_INTERNAL = {
+    *("_value_", "_name_", "_sort_order_", "_inverted_", "__objclass__"),
+    *("_fun", "_jit_info"),
+}
+
+
+def own_attributes(x: Any) -> dict[str, Any]:
+    """What was written to a function, or to a member of an enumeration, as an attribute."""
+    found = getattr(x, "__dict__", {})
+    if found.keys() <= _INTERNAL:  # nearly always
+        return {}
+    return {
+        name: value
+        for name, value in found.items()
+        if not (name in _INTERNAL or name.startswith("__"))
+        and not isinstance(getattr_static(type(x), name, None), cached_property)
+    }
+
+
+def unwrapped(x: Any) -> Any:
+    """The function inside jit and the like."""
+    try:
+        return unwrap(x)
+    except ValueError:  # whatever has every attribute
+        return x
+
+
+def is_generated(own: Any) -> bool:
+    """Whether a method was made by dataclass or NamedTuple."""
+    own = own.__func__ if isinstance(own, staticmethod) else own
+    if not isinstance(own, FunctionType) or not own.__name__.startswith("__"):
+        return False
+    return own.__code__.co_filename == "<string>" or own.__code__.co_filename.startswith("<string ")
+
+
+def behind(own: Any) -> Iterator[Any]:
+    """The functions in a method, a property and the like."""
+    if isinstance(own, property):
+        yield from (x for x in (own.fget,) if x is not None)
+    elif isinstance(own, cached_property | partialmethod):
+        yield own.func
+        yield from own.args if isinstance(own, partialmethod) else ()
+    elif isinstance(own, singledispatchmethod):
+        yield own.func
+        yield from own.dispatcher.registry.values()
+    elif isinstance(own, staticmethod | classmethod):
+        yield from behind(own.__func__)
+    elif isinstance(unwrapped(own), (*FUNCTIONS, partial, BuiltinFunctionType)):
+        yield own
+
+
+def codes_of(code: CodeType) -> Iterator[CodeType]:
+    """A code and those of the functions written inside it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from codes_of(constant)
+
+
+def texts_of(codes: list[CodeType]) -> set[str]:
+    """All words in the texts of a code, and the attributes that it asks for."""
+    texts = [x for code in codes for x in code.co_consts if isinstance(x, str)]
+    words = (x for text in texts for x in re.findall(r"\w+|[\w.]+", text))
+    return {*texts, *words, *(name for code in codes for name in code.co_names)}
+
+
+def named_in(function: Any) -> set[str]:
+    """The attributes that a function may ask for, by getattr as well."""
+    if not isinstance(function, FunctionType):
+        return set()
+    codes = list(codes_of(function.__code__))
+    texts = (x for code in codes for x in code.co_consts if isinstance(x, str) and x.isidentifier())
+    return {*(name for code in codes for name in code.co_names), *texts}
+
+
+def is_called(kind: type) -> bool:
+    """Whether its instances are called by a function of the user's."""
+    return isinstance(getattr_static(kind, "__call__", None), FunctionType)
