@@ -2,28 +2,35 @@
 
 import re
 from collections.abc import Iterator
+from enum import Enum
 from functools import cached_property, partial, partialmethod, singledispatchmethod
 from inspect import getattr_static, unwrap
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any
 
+import jax
+
 FUNCTIONS = (FunctionType, MethodType)
-# Attributes that enum and JAX write; wrappers copy the latter.
-_INTERNAL = {
-    *("_value_", "_name_", "_sort_order_", "_inverted_", "__objclass__"),
-    *("_fun", "_jit_info"),
+# Attributes that enum writes; those that functools and JAX write, and wrappers copy.
+_OF_ENUM = {"_value_", "_name_", "_sort_order_", "_inverted_", "__objclass__"}
+_OF_WRAPPERS = {
+    *("cache_parameters", "register", "dispatch", "registry", "_clear_cache"),
+    *("_fun", "_jit_info", "jvp", "fwd", "bwd"),
+    *vars(jax.custom_jvp(abs)),
+    *vars(jax.custom_vjp(abs)),
 }
 
 
 def own_attributes(x: Any) -> dict[str, Any]:
     """What was written to a function, or to a member of an enumeration, as an attribute."""
     found = getattr(x, "__dict__", {})
-    if found.keys() <= _INTERNAL:  # nearly always
+    internal = _OF_ENUM if isinstance(x, Enum) else _OF_WRAPPERS if "__wrapped__" in found else ()
+    if all(name in internal for name in found):  # nearly always
         return {}
     return {
         name: value
         for name, value in found.items()
-        if not (name in _INTERNAL or name.startswith("__"))
+        if not (name in internal or name.startswith("__"))
         and not isinstance(getattr_static(type(x), name, None), cached_property)
     }
 

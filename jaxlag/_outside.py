@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Mapping, MutableMapping
 from dis import get_instructions
 from enum import Enum
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from inspect import getattr_static
 from logging import Logger
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
@@ -43,10 +43,14 @@ class Reading(NamedTuple):
 
 
 _STORES = ("STORE_GLOBAL", "STORE_DEREF")
+# Types of functions that users write attributes to; others keep their own there.
+_WRITTEN_TO = (
+    *(FunctionType, type(jax.jit(abs)), type(lru_cache(abs))),
+    *(jax.custom_jvp, jax.custom_vjp),
+)
 _GLOBALS = ("LOAD_GLOBAL", "LOAD_NAME")
 _LOOKED_UP = {"globals", "eval", "exec", "__globals__"}  # names are texts then
 _IMPORTED = {"__import__", "import_module"}
-_COMPILED = type(jax.jit(abs))
 _CHANGING = (dict, list, set, bytearray, MutableMapping)
 # Methods that make an instance: what they read is in its fields.
 _MAKING = {"__init__", "__new__", "__post_init__", "__check_init__", "__init_subclass__"}
@@ -170,7 +174,8 @@ class _Reader:
 
     def own(self, x: Any) -> None:
         """The attributes of a function itself."""
-        if isinstance(x, FunctionType | partial | _COMPILED) or not of_library(type(x)):
+        users = isinstance(x, _WRITTEN_TO) and not of_library(unwrapped(x))
+        if users or isinstance(x, partial) or not of_library(type(x)):
             self._own(getattr(unwrapped(x), "__name__", type(x).__name__), x)
 
     def _own(self, owner: str, x: Any) -> None:
@@ -245,6 +250,7 @@ class _Reader:
         if isinstance(x, ModuleType | type):
             if not of_library(x) and not (self._apart and is_installed(x)):
                 self._attributes(name, place, look, names, depth)
+                self._made(x, depth)
             return
         value = value_of(x)
         if not self._watching:
@@ -259,6 +265,14 @@ class _Reader:
         if not of_library(x) or (opaque and not of_arrays(x)):
             self._attributes(name, place, look, names, depth)
             self.function(x, depth - 1)
+
+    def _made(self, x: Any, depth: int) -> None:
+        """What the code of a class reads that it may make an instance of: watched only."""
+        watching, self._watching = self._watching, True
+        for name in _MAKING if isinstance(x, type) else ():
+            if isinstance(part := getattr_static(x, name, None), FunctionType):
+                self.function(part, depth - 1)
+        self._watching = watching
 
     def _keep(self, name: str, place: Any, look: Callable[[], Any], value: Any) -> None:
         while self._places.setdefault(name, place) != place:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxlag as jl
+from jaxlag._captured import captured
 from jaxlag._params import check_keys
 
 TABLE = {"k": 2.0}
@@ -161,6 +162,23 @@ def by_default(x=0.0, k=2.0):
 
 def by_code():
     return 2.0
+
+
+def by_instance():
+    return Named("k").k
+
+
+@jax.custom_jvp
+def with_rule(x):
+    return x
+
+
+with_rule.k = 2.0  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@functools.singledispatch
+def dispatched_purely(x):
+    return x
 
 
 def counting():
@@ -382,7 +400,10 @@ FIXED = {
     "default": collections.defaultdict(float, {"a": 1.0}),
     "module": Named.steel(),
     "frozen": Frozen(),
+    "declared": Static(captured(of_own_attribute)),
     "circle": of_circle,
+    "dispatched": dispatched_purely,
+    "remembered": functools.lru_cache(lambda x: x),
     "counting": counting,
     "networks": (
         eqx.nn.MLP(1, 1, 2, 1, activation=jax.nn.softplus, key=jax.random.key(0)),
@@ -392,6 +413,8 @@ FIXED = {
         eqx.nn.MultiheadAttention(2, 2, key=jax.random.key(0)),
     ),
 }
+PARTIAL = functools.partial(of_own_attribute)
+PARTIAL.k = 2.0  # pyright: ignore[reportAttributeAccessIssue]
 # By what changes: what is given, and the words.
 NUMBER = "STIFFNESS, which its methods read from outside, was 2.0 before and is 5.0 now. Make it"
 CHANGED = {
@@ -408,6 +431,9 @@ CHANGED = {
         (of_own_attribute, "k"),
         "of_own_attribute.k, which it reads from outside, was 1.0 before and is 5.0 now. Hand",
     ),
+    "attribute of a partial": (PARTIAL, (PARTIAL, "k"), "partial.k, which it reads .* 2.0 before"),
+    "attribute of custom_jvp": (with_rule, (with_rule, "k"), "with_rule.k, which it reads .* 2.0"),
+    "made inside": (by_instance, "TABLE", "TABLE, which it reads .* is 5.0 now"),
     "class variable": (OfClass(), (OfClass, "factor"), "OfClass.factor, which its methods read"),
     "default": (by_default, (by_default, "__defaults__"), "k, which it reads .* was 2.0 before"),
     "code": (by_code, (by_code, "__code__"), "by_code.__code__, which it reads from outside"),
