@@ -17,6 +17,8 @@ _SMOOTH = "jaxlag smooth"
 smooth = jax.named_scope(_SMOOTH)
 """Decorator of a function that compares, and is smooth all the same."""
 
+# Of a single place, and the order of an elimination, which its results do not depend on.
+_GUARDS = ("eq", "ne", "is_finite", "lu")
 _CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
@@ -78,12 +80,12 @@ def _called(eqn: Any) -> ClosedJaxpr | None:
 def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:
     """Those of one operation."""
     name, first = eqn.primitive.name, given[0]
-    if name in ("eq", "ne", "is_finite"):
+    if name in _GUARDS or not any(_is_inexact(x) for x in given):
         return
     for x in results:
-        if not jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+        if not _is_inexact(x):
             yield _row(x)
-    if not jnp.issubdtype(jnp.result_type(first), jnp.inexact):
+    if not _is_inexact(first):
         return
     if name in ("max", "min"):
         yield _row(jnp.sign(given[0] - given[1]))
@@ -100,6 +102,10 @@ def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]
         yield _row(first == jnp.expand_dims(results[0], eqn.params["axes"]))
     elif name in ("cummax", "cummin", "sort"):
         yield _row(first == results[0])
+
+
+def _is_inexact(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
 
 
 def _row(x: Any) -> Array:
