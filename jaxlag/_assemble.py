@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._captured import warn_of_changes
-from jaxlag._closing import closing
+from jaxlag._closing import check_params, closing
 from jaxlag._constraints import Layout
 from jaxlag._custom_jvp import keeping_rules
 from jaxlag._dynamics import still
@@ -157,7 +157,7 @@ def assemble(
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
-    _params.check(params)
+    check_params(system, params, q, None)
     warn_of_changes(system)
     traced, static = _params.split(closing(system, params, q, None))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._dynamics import Dynamics, still
-from jaxlag._errors import real_scalar
+from jaxlag._errors import gradient
 from jaxlag._kkt import augmented, masked
 from jaxlag._linalg import factor_mass
 from jaxlag._step import Arguments
@@ -41,8 +41,8 @@ class Canonical(eqx.Module):
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """(p, dL/dq + Q)."""
         t, params, values = self._given(tau, q, v)
-        lagrangian = real_scalar("lagrangian", self.dynamics.system.lagrangian)
-        slope, p = jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
+        slopes = gradient("lagrangian", self.dynamics.system.lagrangian, (1, 2))
+        slope, p = slopes(t, q, v, params)
         if not self.dynamics.system.forces:
             return p, slope
         return p, slope + self.dynamics.terms.force(t, q, v, params, values)

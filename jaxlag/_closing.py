@@ -1,16 +1,18 @@
-"""Traced values that a declaration closes over, made arguments of the program."""
+"""What a declaration reads: traced values that it closes over, and params."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from jaxlag import _params
 from jaxlag._captured import functions_of
 from jaxlag._closed import Closed
-from jaxlag._errors import real_scalar
+from jaxlag._dependence import outputs_depend_on
+from jaxlag._errors import bad, real_scalar
 from jaxlag._forces import sliding
 from jaxlag._inputs import evaluate
 from jaxlag._lowering import ArrayTerms
@@ -55,8 +57,36 @@ def declared(
     return L, u, rows, slides, terms.force(t, q, v, params, values, lam)
 
 
+def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> None:
+    """Raise on numbers that are not finite and that anything declared reads.
+
+    And on objects that no program can be keyed by. Without inputs the forces read nothing.
+
+    Raises:
+        ValueError: with the leaf by its path.
+    """
+    _params.check_keys(params)
+    faults = _params.not_finite(params)
+    if not faults:
+        return
+    program, nothing = _program(system, params, q, inputs), frozenset()
+    given = [nothing] * 3 + [frozenset({path}) for path in _params.paths(params)]
+    given += [nothing] * (len(program.jaxpr.invars) - len(given))
+    read = nothing.union(*outputs_depend_on(program.jaxpr, given))
+    for path, name, was in faults:
+        if path in read:
+            raise bad(name, "be finite", f"it was {was}")
+
+
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
-    """The constants of a program that calls every function of the declaration."""
+    """What the declared functions close over."""
+    return _program(system, params, q, inputs).consts
+
+
+def _program(
+    system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
+) -> ClosedJaxpr:
+    """Everything that is declared as a program of (t, q, v, params, inputs)."""
     traced, static = _params.halves((params, inputs))
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
@@ -65,4 +95,4 @@ def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
         return declared(system, t, q, v, params, values, None)
 
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    return jax.make_jaxpr(everything)(t, q, q, traced).consts
+    return jax.make_jaxpr(everything)(t, q, q, traced)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlag._closed import plain
+from jaxlag._lines import line_of
 
 
 class SimulationError(RuntimeError):
@@ -62,7 +63,10 @@ def real_scalar(argument: str, function: Callable) -> Callable:
 
     def checked(*arguments: Any) -> Any:
         value = function(*arguments)
-        must, fix = "return a real scalar", "Sum over bodies with jnp.sum; use real energies."
+        must, fix = (
+            "return a real scalar",
+            "Sum with jnp.sum, of one coordinate take v[0]; use real energies.",
+        )
         if not eqx.is_array_like(value):
             raise bad(argument, "return an array", f"it returned {value!r}", fix)
         value = jnp.asarray(value)
@@ -72,6 +76,32 @@ def real_scalar(argument: str, function: Callable) -> Callable:
         return value
 
     return checked
+
+
+def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) -> Callable:
+    """The gradient of a real scalar function of (t, q, v, params), as `jax.grad` has it.
+
+    It raises in our form where a loop in the function has no reverse derivative.
+    """
+    scalar = real_scalar(argument, function)
+
+    def of(*arguments: Any) -> Any:
+        try:
+            return jax.grad(scalar, argnums)(*arguments)
+        except ValueError as error:
+            if "Reverse-mode differentiation does not work" not in str(error):
+                raise
+            *state, params = arguments
+            line = line_of(jax.make_jaxpr(lambda *state: scalar(*state, params))(*state), "while")
+            raise bad(
+                argument,
+                "have reverse derivatives, from which momenta and forces follow",
+                f"a loop in it has no fixed number of turns: {line}",
+                "Write it by jax.lax.scan, or fori_loop between numbers; or give its derivative "
+                "by jax.custom_jvp, by jax.lax.custom_root where it solves an equation.",
+            ) from error
+
+    return of
 
 
 def _narrowed(params: Any) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxlag._captured import captured
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import accepts, bad, real_scalar, require_arity, wants
+from jaxlag._errors import accepts, bad, gradient, require_arity, wants
 
 EXPLICIT_TIME = "explicit time"
 """Name of the power -dL/dt at fixed (q, v), which no force may bear."""
@@ -304,8 +304,7 @@ class Rayleigh(AbstractForce):
         inputs: Mapping[str, Any],
     ) -> Float[Array, " n"]:
         """-dR/dv, shape (n,)."""
-        R = real_scalar(f"Rayleigh {self.name!r}: R", self.R)
-        return -jax.grad(R, argnums=2)(t, q, v, params)
+        return -gradient(f"Rayleigh {self.name!r}: R", self.R, 2)(t, q, v, params)
 
 
 def check_forces(forces: Any) -> tuple[AbstractForce, ...]:

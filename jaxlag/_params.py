@@ -11,7 +11,6 @@ from jax.core import Tracer
 
 from jaxlag._alike import types_in, types_of
 from jaxlag._closed import plain
-from jaxlag._errors import bad
 from jaxlag._immutable import check_nodes, is_fixed, refusal
 
 _TRACED = {float: True, int: False, bool: False, str: False}  # of plain leaves
@@ -53,24 +52,29 @@ def known(x: Any) -> np.ndarray | None:
     return np.asarray(x)
 
 
-def check(params: Any) -> None:
-    """Raise on numbers that are not finite, and on objects that no program can be keyed by.
-
-    Raises:
-        ValueError: with the leaf by its path.
-    """
-    check_keys(params)
+def not_finite(params: Any) -> list[tuple[str, str, Any]]:
+    """(Path, path of the number, the number) for every leaf with one that is not finite."""
+    params = plain(params)
     if all(map(_is_finite, jax.tree.leaves(params))):  # nearly always, and without any paths
-        return
+        return []
+    found = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
         if _is_finite(leaf):
             continue
         name, value = f"params{jax.tree_util.keystr(path)}", known(leaf)
         assert value is not None
+        whole = name
         if value.ndim:
             index = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
             name, value = f"{name}[{', '.join(map(str, index))}]", value[index]
-        raise bad(name, "be finite", f"it was {value}")
+        found.append((whole, name, value))
+    return found
+
+
+def paths(params: Any) -> list[str]:
+    """Of the leaves that are traced."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(halves(plain(params))[0])
+    return [f"params{jax.tree_util.keystr(path)}" for path, _ in leaves]
 
 
 def check_keys(params: Any, name: str = "params") -> None:

@@ -175,7 +175,7 @@ def velocities_at(
     safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
     ts, safe, args = still_unless(moved, (ts, safe, args))
     v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)
-    return q, jnp.where(reached, v, jnp.nan)
+    return q, jnp.where(reached, v, q[:, :1])  # which is NaN there, with NaN for its derivatives
 
 
 def _times(

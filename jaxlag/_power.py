@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._constraints import AbstractConstraint, Layout
-from jaxlag._errors import real_scalar
+from jaxlag._errors import gradient
 from jaxlag._forces import EXPLICIT_TIME, AbstractForce, components, reads_lam
 from jaxlag._terms import Terms
 
@@ -59,8 +58,7 @@ class Power(eqx.Module):
             done = self.rows.unflatten(-b * lam)
             terms |= {name: jnp.sum(done[name]) for name in self.rows.driven_names}
         if self.explicit_time:
-            lagrangian = real_scalar("lagrangian", self.lagrangian)
-            dL_dt = jax.grad(lambda t: lagrangian(t, q, v, params))(t)
+            dL_dt = gradient("lagrangian", self.lagrangian, 0)(t, q, v, params)
             terms[EXPLICIT_TIME] = -dL_dt.astype(q.dtype)
         return terms
 

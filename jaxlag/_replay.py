@@ -22,6 +22,7 @@ from jaxlag._gradient import GradientMode, Keep
 from jaxlag._lanes import LANES, at_once_implicit, in_lanes
 from jaxlag._record import Outcome, Times
 from jaxlag._status import Status
+from jaxlag._unreached import unreached
 from jaxlag._variations import Setup, changed, changes, filled, in_loops, path_of, unpack
 
 
@@ -69,6 +70,8 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
             rows, told = _told(outcome)
             rows_dot = Rows(walk.rows[0], walk.last[0], walk.time)
         told = told._replace(gradient=_mode(outcome, static))
+        reached = jnp.all(jnp.isfinite(outcome.rows), axis=tuple(range(1, outcome.rows.ndim)))
+        rows_dot = rows_dot._replace(saved=unreached(reached, inexact, change, rows_dot.saved))
         return (rows, told), (rows_dot, jax.tree.map(lambda _: None, told))
 
     return run(inexact, rest, setup)

@@ -21,7 +21,7 @@ from jaxlag._arguments import (
     check_tolerances,
 )
 from jaxlag._captured import warn_of_changes
-from jaxlag._closing import closing
+from jaxlag._closing import check_params, closing
 from jaxlag._constraints import Baumgarte
 from jaxlag._dynamics import still
 from jaxlag._ending import ended
@@ -193,7 +193,7 @@ def simulate(
     check_range(inputs, ts)
     rtol, atol = check_tolerances(system, method, rtol, atol, q0.dtype)
     step, longest = check_step(dt, dt0), check_longest(dt, dt_max)
-    _params.check(params)
+    check_params(system, params, q0, inputs)
     check_placement("simulate", (q0, v0, u0, ts, params, inputs))
     formulation = check_formulation(system, formulation, project, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":

@@ -66,9 +66,10 @@ def over_rows(
 
     def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
         # Rows not reached are NaN: evaluate at the start instead, so that derivatives stay finite.
+        unknown = q[0]  # NaN there, with NaN for its derivatives
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
         value = quantity(system, t, q, v, params, inputs)
-        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan), value)
+        return jax.tree.map(lambda x: jnp.where(reached, x, unknown.astype(x.dtype)), value)
 
     t0, q0, v0 = ts[0], q[0], v[0]
     return jax.vmap(at)(ts, q, v, reached)

@@ -59,7 +59,7 @@ NOT_SCALAR = [
 @pytest.mark.parametrize(("lagrangian", "was"), NOT_SCALAR)
 def test_the_lagrangian_must_be_a_real_scalar(lagrangian, was):
     system = jl.System(lagrangian, ("x", "y"))
-    message = f"lagrangian must return a real scalar, but it returned {was}. Sum over bodies with"
+    message = f"lagrangian must return a real scalar, but it returned {was}. Sum with"
     refused(message, system=system)
     for ask in (system.check, lambda *state: system.explain(state[0])):
         with pytest.raises(ValueError, match="^" + re.escape(message)):
@@ -371,3 +371,31 @@ def test_traced_bad_values_end_in_a_status():
     rows = list(TRACED)
     np.testing.assert_array_equal(found.where[np.array([rows.index("q0 nan")])], [1])
     np.testing.assert_array_equal(found.where[np.array([rows.index("v0 inf")])], [0])
+
+
+def growing(t, q, v, params):
+    grown = jax.lax.while_loop(lambda c: c < 2.0, lambda c: c * (1.0 + q[0]), 1.0)
+    return 0.5 * v @ v - grown
+
+
+@pytest.mark.parametrize("lowering", ["auto", "array"])
+def test_loops_without_a_number_of_turns_are_named_by_their_line(lowering):
+    system = jl.System(growing, ("x",), lowering=lowering)
+    line = growing.__code__.co_firstlineno + 1
+    message = rf"^lagrangian must have reverse derivatives.*test_arguments.py:{line}:.*\(growing\)"
+    for ask in (jl.equilibrium, lambda system, q: jl.simulate(system, q, [0.0], [0.0, 1.0])):
+        with pytest.raises(ValueError, match=message):
+            ask(system, [1.0])
+
+
+@pytest.mark.parametrize("unread", [np.inf, np.array([1.0, np.nan])])
+def test_params_that_nothing_reads_may_be_anything(unread):
+    def lagrangian(t, q, v, params):
+        return 0.5 * params["m"] * v @ v
+
+    system = jl.System(lagrangian, ("x",), constraints=())
+    options = {"method": "euler", "dt": 0.5}
+    motion = jl.simulate(system, [0.0], [1.0], [0.0, 1.0], {"m": 1.0, "limit": unread}, **options)
+    assert motion.q[-1] == 1.0
+    with pytest.raises(ValueError, match=r"^params\['m'\] must be finite, but it was inf\."):
+        jl.simulate(system, [0.0], [1.0], [0.0, 1.0], {"m": np.inf, "limit": unread}, **options)

@@ -19,7 +19,7 @@ from jaxlag._constraints import (
     velocity_rows,
 )
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import real_scalar
+from jaxlag._errors import gradient
 from jaxlag._forces import AbstractForce, components, reads_lam
 from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions
 from jaxlag._linalg import MassFactor, factor_mass, solve_mass
@@ -79,7 +79,7 @@ class ArrayTerms(Terms):
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
         """Momentum p = dL/dv by one reverse pass."""
-        return jax.grad(real_scalar("lagrangian", self.lagrangian), argnums=2)(t, q, v, params)
+        return gradient("lagrangian", self.lagrangian, 2)(t, q, v, params)
 
     def mass(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -95,10 +95,10 @@ class ArrayTerms(Terms):
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> Float[Array, " n"]:
         """Bias h = dp/dt - dL/dq at a = 0: one derivative of (dL/dq, p) along (t', q') = (1, v)."""
-        lagrangian = real_scalar("lagrangian", self.lagrangian)
+        gradients_of = gradient("lagrangian", self.lagrangian, (1, 2))
 
         def gradients(t: Array, q: Array) -> tuple[Array, Array]:
-            return jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
+            return gradients_of(t, q, v, params)
 
         (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q), (jnp.ones_like(t), v))
         return p_dot - dL_dq
@@ -112,10 +112,10 @@ class ArrayTerms(Terms):
         params: Any,
     ) -> Float[Array, " n"]:
         """The same derivative as in h, along (t', q', v') = (1, v, a)."""
-        lagrangian = real_scalar("lagrangian", self.lagrangian)
+        gradients_of = gradient("lagrangian", self.lagrangian, (1, 2))
 
         def gradients(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
-            return jax.grad(lagrangian, argnums=(1, 2))(t, q, v, params)
+            return gradients_of(t, q, v, params)
 
         (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q, v), (jnp.ones_like(t), v, a))
         return p_dot - dL_dq

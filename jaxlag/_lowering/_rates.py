@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._errors import real_scalar
+from jaxlag._errors import gradient
 from jaxlag._kkt import masked
 from jaxlag._linalg import factor_mass, solve_mass
 from jaxlag._lowering._array import ArrayTerms
@@ -81,11 +81,11 @@ class Moving:
         """
         t, q, v, params, free = self.t, self.q, self.v, self.params, self.quasi.free
         assert self.terms.in_u is not None
-        L = real_scalar("lagrangian", self.terms.in_u)
+        L = self.terms.in_u
         u = self.quasi.full(self.u)
 
         def momentum(t: Array, q: Array, u: Array) -> Array:
-            return jax.grad(L, argnums=2)(t, q, self.quasi.full(u), params)
+            return gradient("lagrangian", L, 2)(t, q, self.quasi.full(u), params)
 
         p = momentum(t, q, self.u)
 
@@ -94,7 +94,7 @@ class Moving:
 
         turning = self._along(lambda t, q: jax.grad(weighted, argnums=2)(t, q, v))
         gamma_p = turning - jax.grad(weighted, argnums=1)(t, q, v)
-        effort = self._force() + jax.grad(L, argnums=1)(t, q, u, params) - gamma_p
+        effort = self._force() + gradient("lagrangian", L, 1)(t, q, u, params) - gamma_p
         rate = self._along(lambda t, q: momentum(t, q, self.u))[free]
 
         def column(e: Array) -> Array:
