@@ -79,7 +79,8 @@ class Solution(eqx.Module):
     """A motion at the requested times, and how it ended.
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
-    the batch axes in front. Rows not reached are NaN.
+    the batch axes in front. Rows not reached are NaN, and so are derivatives of them: a loss over a
+    batch leaves failed motions out by `jnp.where(motion.ok, loss, 0.0)`.
 
     Attributes:
         system: what was simulated.
