@@ -252,8 +252,10 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     y1, estimate, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
     finite = all_finite(y1)
     settled, verdict = scheme.settled(t1, y1, args)
-    good = finite & solved & verdict.good
-    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, estimate, good, lands)
+    passage = scheme.passage(begin.t, t1, begin.y, settled, args, estimate.turn)
+    regular, share = (jnp.array(True), None) if passage is None else passage
+    good = finite & solved & (regular | to_row) & verdict.good
+    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, estimate, good, lands, share)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -266,6 +268,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     for right, kind in (
         (smooth | (not scheme.moves), Status.projection_failed),
         (verdict.pressed, Status.no_reaction_solution),
+        (regular, Status.kinematics_singular),
         (verdict.closed, Status.rank_change),
         (verdict.found, Status.projection_failed),
         (solved, Status.implicit_solve_failed),
@@ -321,7 +324,14 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
 
 
 def _next_step(
-    loop: _Loop, c: _Carry, t1: Array, y1: PyTree, estimate: Estimate, good: Array, lands: Array
+    loop: _Loop,
+    c: _Carry,
+    t1: Array,
+    y1: PyTree,
+    estimate: Estimate,
+    good: Array,
+    lands: Array,
+    share: Array | None,
 ) -> tuple[Array, Array, Any, Array, Array]:
     """Whether to keep this step, and the next one.
 
@@ -337,6 +347,8 @@ def _next_step(
     stop = loop.times.stop
     spare = c.attempted.astype(t.dtype) * stop < loop.max_steps * jnp.maximum(0.25 * stop, 0.9 * t)
     error = scheme.held_to(t, t1, y, y1, loop.args, estimate, spare)
+    if share is not None:
+        error = jax.tree.map(lambda e: e / share, error)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
     y1 = _select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
     proposal: Any = scheme.controller.adapt_step_size(
