@@ -199,7 +199,7 @@ def _explained(
     if scene.kinematic:
         beyond, _ = dynamics.parts(states[1])
         turned, passed = _turned(dynamics, taus, jnp.stack([q, beyond]), start, q0, args)
-        failed = unexplained | (status == int(Status.step_below_resolution))
+        failed = unexplained | unsolved | (status == int(Status.step_below_resolution))
         turned = jnp.where(status == int(Status.kinematics_singular), passed, turned)
         status = jnp.where(failed & (turned >= 0), int(Status.kinematics_singular), status)
     concerns = {
