@@ -33,6 +33,12 @@ class QuasiVelocities(eqx.Module):
     A name in `constrained` is a constraint: the row U_name = 0, whose multiplier bears the name.
     In the quasi-velocity formulation it is left out of the state.
 
+    There may be places where dU/dv is singular, as at a pitch of 90 degrees or where a wheel is
+    steered across the way: v does not follow from u there, though the motion may well go on. A
+    motion whose state holds u ends just before such a place in the status kinematics_singular, one
+    with fixed steps a step before it. With formulation "auto", outside of transforms and with L a
+    function of v, `simulate` goes on from the start by multipliers, and says so.
+
     Args:
         U: function `U(t, q, v, params)`, affine in v, returning shape (k,), in m/s or rad/s.
         names: k names; as many as there are coordinates where U is given, no more than that and
