@@ -249,8 +249,8 @@ def _turned(
     # A small angle of its own, as of v0 + 1e-5 v1 and v0, is no fault.
     found = (now < jnp.minimum(eps**0.25, 0.01 * sines(tau0, q0))) | ~(now > SINE * eps)
     found = found & jnp.all(jnp.isfinite(q[0]))
-    known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
     if dynamics.quasi is None:
+        known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
         return known, known
 
     def parts(tau: Array, q: Array) -> Array:
@@ -258,6 +258,8 @@ def _turned(
         return jnp.where(jnp.isnan(size), -jnp.inf, size)
 
     begin, *there = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
+    found = found | (there[0] - begin < 0.5 * np.log(eps))
+    known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
     changed = jnp.max(jnp.abs(jnp.stack(there) - begin), axis=0)
     turned_back = taus[1] > tau0
     return known, jnp.where(turned_back, jnp.argmax(changed).astype(jnp.int32), known)
