@@ -258,7 +258,8 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     passage = scheme.passage(*step)
     regular, share, volumes = (jnp.array(True), None, None) if passage is None else passage
     good = finite & solved & (regular | to_row) & verdict.good
-    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, estimate, good, lands, share)
+    rest = (estimate, good, lands, share, regular | to_row)
+    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -336,6 +337,7 @@ def _next_step(
     good: Array,
     lands: Array,
     share: Array | None,
+    regular: Array,
 ) -> tuple[Array, Array, Any, Array, Array]:
     """Whether to keep this step, and the next one.
 
@@ -368,6 +370,9 @@ def _next_step(
         control = _uncut(scheme.controller, cut, h, c.control, control)
     h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
+    if share is not None:  # before a singular place a state in fewer digits would stand still
+        coarse = 64 * float(jnp.finfo(share.dtype).eps) * loop.times.stop
+        least = jnp.where(regular, least, jnp.maximum(least, coarse))
     refused = (result != diffrax.RESULTS.successful) & ~cut
     # A controller with a least step proposes it again where no shorter one is left to try.
     again = ~good & ~(h < t1 - t)
