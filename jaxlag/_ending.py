@@ -258,7 +258,7 @@ def _turned(
         return jnp.where(jnp.isnan(size), -jnp.inf, size)
 
     begin, *there = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
-    found = found | (there[0] - begin < 0.5 * np.log(eps))
+    found = found | (there[0] - begin < 0.5 * float(np.log(eps)))
     known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
     changed = jnp.max(jnp.abs(jnp.stack(there) - begin), axis=0)
     turned_back = taus[1] > tau0
