@@ -15,6 +15,7 @@ from typing import Any
 
 from bench import (
     _chaos,
+    _crossings,
     _drifts,
     _extremes,
     _fit_rows,
@@ -37,6 +38,7 @@ PARTS = (
     _gradient_rows,
     _fit_rows,
     _walls,
+    _crossings,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
 LEAST = 25  # rows that must end in success
@@ -65,6 +67,7 @@ QUICK = {
     "steps far too long for a stiff spring",
     "sharp: one-sided spring",
     "sharp: exponential barrier",
+    "singular quasi-velocities: cos(y) x', crossed",
 }
 
 

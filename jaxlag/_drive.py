@@ -34,6 +34,7 @@ class _Place(NamedTuple):
     y: PyTree
     memory: Any  # the solver's own state
     jump: Array | None  # whether the field jumps there; None where nothing ever does
+    volumes: Array | None  # see `Scheme.volumes`
 
 
 class _Rows(NamedTuple):
@@ -135,7 +136,8 @@ def drive(
         memory, h, control = scheme.begin(t0, times.stop, y0, args), first_step, None
         sound = scheme.is_sound(memory)
     jumps = times.knots is not None or not scheme.standard
-    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None)
+    volumes = scheme.volumes(t0, y0, args)
+    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, volumes)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
@@ -252,8 +254,12 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     y1, estimate, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
     finite = all_finite(y1)
     settled, verdict = scheme.settled(t1, y1, args)
-    good = finite & solved & verdict.good
-    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, estimate, good, lands)
+    step = (begin.t, t1, begin.y, settled, args, estimate.turn, begin.volumes)
+    passage = scheme.passage(*step)
+    regular, share, volumes = (jnp.array(True), None, None) if passage is None else passage
+    good = finite & solved & (regular | to_row) & verdict.good
+    rest = (estimate, good, lands, share, regular | to_row)
+    keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -266,6 +272,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     for right, kind in (
         (smooth | (not scheme.moves), Status.projection_failed),
         (verdict.pressed, Status.no_reaction_solution),
+        (regular, Status.kinematics_singular),
         (verdict.closed, Status.rank_change),
         (verdict.found, Status.projection_failed),
         (solved, Status.implicit_solve_failed),
@@ -300,7 +307,8 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     passed = t1 >= goal - slack
     own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
-    end = _Place(t1, settled, memory, None if c.at.jump is None else jump | lands)
+    jump = None if c.at.jump is None else jump | lands
+    end = _Place(t1, settled, memory, jump, volumes)
     at = _select(take, end, c.at)
     kept = None if c.kept is None else _written(loop, c, c.kept, at.t, anchor)
     return _Carry(
@@ -321,7 +329,15 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
 
 
 def _next_step(
-    loop: _Loop, c: _Carry, t1: Array, y1: PyTree, estimate: Estimate, good: Array, lands: Array
+    loop: _Loop,
+    c: _Carry,
+    t1: Array,
+    y1: PyTree,
+    estimate: Estimate,
+    good: Array,
+    lands: Array,
+    share: Array | None,
+    regular: Array,
 ) -> tuple[Array, Array, Any, Array, Array]:
     """Whether to keep this step, and the next one.
 
@@ -337,6 +353,8 @@ def _next_step(
     stop = loop.times.stop
     spare = c.attempted.astype(t.dtype) * stop < loop.max_steps * jnp.maximum(0.25 * stop, 0.9 * t)
     error = scheme.held_to(t, t1, y, y1, loop.args, estimate, spare)
+    if share is not None:
+        error = jax.tree.map(lambda e: e / share, error)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
     y1 = _select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
     proposal: Any = scheme.controller.adapt_step_size(
@@ -352,6 +370,9 @@ def _next_step(
         control = _uncut(scheme.controller, cut, h, c.control, control)
     h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
+    if share is not None:  # before a singular place a state in fewer digits would stand still
+        coarse = 64 * float(jnp.finfo(share.dtype).eps) * loop.times.stop
+        least = jnp.where(regular, least, jnp.maximum(least, coarse))
     refused = (result != diffrax.RESULTS.successful) & ~cut
     # A controller with a least step proposes it again where no shorter one is left to try.
     again = ~good & ~(h < t1 - t)

@@ -168,6 +168,21 @@ class Dynamics(eqx.Module):
                 prepared = prepared._replace(definite=definite, alone=alone)
         return args._replace(prepared=prepared)
 
+    def volumes(self, tau: Array, q: Array, args: Arguments) -> Array | None:
+        """What is 0 or infinite where quasi-velocities are singular; None where nothing ever is.
+
+        Determinants of blocks of dU/dv or dv/du, those left out that do not change.
+        """
+        assert self.quasi is not None
+        terms, t, (params, _) = self.terms, self.clock(tau, args), self.given(args)
+        if isinstance(args.prepared, ScalarPrepared) and args.prepared.volumes is not None:
+            assert isinstance(terms, ScalarTerms)
+            values = self.inputs_at(tau, q, jnp.zeros_like(q), args)
+            found = terms.volumes(t, q, params, values, args.prepared)
+        else:
+            found = self.quasi.volumes(t, q, params) if self.quasi.moves(q, params) else None
+        return None if found is None or not found.size else found
+
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
 

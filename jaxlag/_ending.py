@@ -195,10 +195,12 @@ def _explained(
             status = jnp.where(unexplained & sound, int(Status.no_reaction_solution), status)
     unsolved = status == int(Status.implicit_solve_failed)
     status = jnp.where((unexplained | unsolved) & (mass >= 0), int(Status.mass_singular), status)
-    turned = jnp.full((), -1, jnp.int32)
+    turned = passed = jnp.full((), -1, jnp.int32)
     if scene.kinematic:
-        turned = _turned(dynamics, time, q, start, q0, args)
-        failed = unexplained | (status == int(Status.step_below_resolution))
+        beyond, _ = dynamics.parts(states[1])
+        turned, passed = _turned(dynamics, taus, jnp.stack([q, beyond]), start, q0, args)
+        failed = unexplained | unsolved | (status == int(Status.step_below_resolution))
+        turned = jnp.where(status == int(Status.kinematics_singular), passed, turned)
         status = jnp.where(failed & (turned >= 0), int(Status.kinematics_singular), status)
     concerns = {
         Status.mass_singular: mass,
@@ -221,9 +223,21 @@ def _explained(
 
 
 def _turned(
-    dynamics: Dynamics, tau: Array, q: Array, tau0: Array, q0: Array, args: Arguments
-) -> Int[Array, ""]:
-    """The quasi-velocity that follows from those before it, or came close to it; -1 for none."""
+    dynamics: Dynamics, taus: Array, q: Array, tau0: Array, q0: Array, args: Arguments
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The quasi-velocity that follows from those before it, or came close to it; -1 for none.
+
+    And the one that a step was turned back for: its part that does not follow from those before it
+    has changed most since the start.
+
+    Args:
+        dynamics: what moves.
+        taus: of a last good state and of one ahead of it.
+        q: the coordinates of both.
+        tau0: start of the motion.
+        q0: coordinates there.
+        args: arguments.
+    """
     quasi, params = dynamics.system.quasi, dynamics.given(args)[0]
     assert quasi is not None
     eps = float(jnp.finfo(q.dtype).eps)
@@ -231,11 +245,24 @@ def _turned(
     def sines(tau: Array, q: Array) -> Array:
         return quasi.sines(dynamics.clock(tau, args), q, params, q.dtype)
 
-    now = sines(tau, q)
+    now = sines(taus[0], q[0])
     # A small angle of its own, as of v0 + 1e-5 v1 and v0, is no fault.
     found = (now < jnp.minimum(eps**0.25, 0.01 * sines(tau0, q0))) | ~(now > SINE * eps)
-    found = found & jnp.all(jnp.isfinite(q))
-    return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+    found = found & jnp.all(jnp.isfinite(q[0]))
+    if dynamics.quasi is None:
+        known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+        return known, known
+
+    def parts(tau: Array, q: Array) -> Array:
+        size = jnp.log(quasi.pivots(dynamics.clock(tau, args), q, params))
+        return jnp.where(jnp.isnan(size), -jnp.inf, size)
+
+    begin, *there = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
+    found = found | (there[0] - begin < 0.5 * float(np.log(eps)))
+    known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+    changed = jnp.max(jnp.abs(jnp.stack(there) - begin), axis=0)
+    turned_back = taus[1] > tau0
+    return known, jnp.where(turned_back, jnp.argmax(changed).astype(jnp.int32), known)
 
 
 def _lost(

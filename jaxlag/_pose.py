@@ -13,10 +13,11 @@ from jaxlag import _params
 from jaxlag._arguments import check_declaration
 from jaxlag._assemble import assembled
 from jaxlag._constraints import Baumgarte
-from jaxlag._dynamics import Dynamics
+from jaxlag._dynamics import Dynamics, still
 from jaxlag._gradient import Keep
 from jaxlag._inputs import all_knots, common_range, in_order
 from jaxlag._methods import for_state
+from jaxlag._passage import usual
 from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
@@ -111,11 +112,13 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         known = (q0, dynamics.velocities(t0, q0, w0, params))
         known = (*known, *residuals(dynamics, t0, q0, v0, params))
         sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
-        q0, w0, still = still_unless(sound, (q0, w0, args.params))
-        args = args._replace(params=still)
+        q0, w0, known = still_unless(sound, (q0, w0, args.params))
+        args = args._replace(params=known)
     y0 = dynamics.start(q0, w0)
     start = jnp.zeros_like(args.origin)
     args = dynamics.prepare(start, y0, args)
+    if dynamics.quasi is not None:
+        args = args._replace(volumes=usual(dynamics, *still((start, q0, args))))
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.rows.size:
         y0, args = still_unless(consistent.ok, (y0, args))
@@ -131,7 +134,8 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
     how = (dynamics.windows, settle, dynamics.projects, values.longest)
-    scheme = Scheme(solver, controller, term, *how)
+    passes = args.volumes is not None
+    scheme = Scheme(solver, controller, term, *how, passes=passes)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     speeds = values.u0 if values.v0 is None else values.v0

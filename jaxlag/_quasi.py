@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._captured import captured
 from jaxlag._constraints import Pfaffian
+from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import bad, require_arity
 from jaxlag._rank import row_sizes
 from jaxlag._vectors import real
@@ -31,6 +32,12 @@ class QuasiVelocities(eqx.Module):
 
     A name in `constrained` is a constraint: the row U_name = 0, whose multiplier bears the name.
     In the quasi-velocity formulation it is left out of the state.
+
+    There may be places where dU/dv is singular, as at a pitch of 90 degrees or where a wheel is
+    steered across the way: v does not follow from u there, though the motion may well go on. A
+    motion whose state holds u ends just before such a place in the status kinematics_singular, one
+    with fixed steps a step before it. With formulation "auto", outside of transforms and with L a
+    function of v, `simulate` goes on from the start by multipliers, and says so.
 
     Args:
         U: function `U(t, q, v, params)`, affine in v, returning shape (k,), in m/s or rad/s.
@@ -182,14 +189,55 @@ class QuasiVelocities(eqx.Module):
         """
 
         def rows(q: Array) -> Array:
-            if self.U is None:
-                return self._affine(t, q, dtype, params)[0].T
-            rest = jnp.zeros(q.shape, dtype)
-            return jax.jacfwd(lambda v: self.of(t, q, v, params))(rest)
+            return self._columns(t, q, params, dtype).T
 
         here = rows(q)
         there, _ = row_sizes(rows, q, here)
         return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
+
+    def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """Distance of every quasi-velocity's coefficients from the span of those before it.
+
+        Of its column of B, where `kinematics` are given.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            params: as U takes them.
+        """
+        size, _, R = _factored(self._columns(t, q, params, q.dtype))
+        return size * jnp.abs(jnp.diagonal(R))
+
+    def volumes(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, " 1"]:
+        """det dU/dv, or det B, or det B^T B where B is tall: 0 or infinite where it is singular.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            params: as U takes them.
+        """
+        columns = self._columns(t, q, params, q.dtype)
+        square = columns.shape[0] == columns.shape[1]
+        return jnp.linalg.det(columns if square else columns.T @ columns)[None]
+
+    def moves(self, q: Any, params: Any) -> bool:
+        """Whether dU/dv, or B, depends on time or coordinates, as far as its program shows.
+
+        Args:
+            q: coordinates, or one like them.
+            params: as U takes them.
+        """
+        like = jax.ShapeDtypeStruct(q.shape, q.dtype)
+        time = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+        def volumes(t: Array, q: Array) -> Array:
+            return self.volumes(t, q, params)
+
+        program = jax.make_jaxpr(volumes)(time, like).jaxpr
+        (found,) = outputs_depend_on(program, [frozenset("t"), frozenset("q")])
+        return bool(found)
 
     def regular(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Bool[Array, ""]:
         """Whether v follows from u there, and u from v.
@@ -230,6 +278,13 @@ class QuasiVelocities(eqx.Module):
         if not self.constrained:
             return w
         return jnp.zeros((self.size,), w.dtype).at[self.free].set(w)
+
+    def _columns(self, t: Array, q: Array, params: Any, dtype: Any) -> Array:
+        """(dU/dv)^T or B: a column for every quasi-velocity."""
+        if self.U is None:
+            return self._affine(t, q, dtype, params)[0]
+        rest = jnp.zeros(q.shape, dtype)
+        return jax.jacfwd(lambda v: self.of(t, q, v, params))(rest).T
 
     def _affine(self, t: Array, q: Array, dtype: Any, params: Any) -> tuple[Array, Array]:
         """(B, c)."""

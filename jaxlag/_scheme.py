@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._passage import Passage, passage, volumes
 from jaxlag._settling import Settling
 from jaxlag._step import Verdict
 from jaxlag._term import Term
@@ -50,6 +51,8 @@ class Scheme(eqx.Module):
     longest: Array | None = None  # bound on adaptive steps
     # whether steps in which a comparison comes out otherwise are held to what derivatives need
     across: bool = eqx.field(static=True, default=False)
+    # whether quasi-velocities may become singular on the way
+    passes: bool = eqx.field(static=True, default=False)
 
     @property
     def remembers(self) -> bool:
@@ -184,7 +187,7 @@ class Scheme(eqx.Module):
 
     def _turn(self, k: PyTree) -> PyTree:
         """h dy/dt at the start less that at the end, where it is asked for."""
-        return k[0] - k[-1] if self.across else None
+        return k[0] - k[-1] if self.across or self.passes else None
 
     def _branches(self, tau: Array, y: Array, args: Any) -> Array | None:
         """Outcomes of the comparisons in what is declared."""
@@ -249,6 +252,45 @@ class Scheme(eqx.Module):
             return jnp.all(jnp.abs(error) <= _SINGULAR * allowed)
 
         return jax.tree.reduce(jnp.logical_and, jax.tree.map(small, y0, y1, error))
+
+    def volumes(self, tau: Array, y: Array, args: Any) -> Array | None:
+        """What is 0 or infinite where quasi-velocities are singular; None where nothing ever is."""
+        if not self.passes:
+            return None
+        dynamics = cast(Term, self.term).dynamics
+        return volumes(dynamics, tau, dynamics.parts(y)[0], self.within(args, tau))
+
+    def passage(
+        self,
+        t0: Array,
+        t1: Array,
+        y0: Array,
+        y1: Array,
+        args: Any,
+        turn: Array | None,
+        first: Array | None,
+    ) -> Passage | None:
+        """Whether v follows from quasi-velocities all along a step; None where it always does.
+
+        Args:
+            t0: start of the step.
+            t1: its end.
+            y0: state at its start.
+            y1: state at its end.
+            args: arguments of the step.
+            turn: h dy/dt at the start less that at the end; None where it is not known.
+            first: `volumes` at its start.
+        """
+        if first is None or not self.passes:
+            return None
+        term: Any = self.term
+        controller, tolerance = self.controller, None
+        if isinstance(controller, diffrax.PIDController):
+            bounds: Any = controller.rtol, controller.atol
+            tolerance = jnp.maximum(*(jnp.max(jnp.asarray(x, y1.dtype)) for x in bounds))
+        elif controller is not None:
+            tolerance = jnp.ones((), y1.dtype)
+        return passage(term.dynamics, t0, t1, y0, y1, args, turn, tolerance, first)
 
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False

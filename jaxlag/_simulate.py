@@ -1,6 +1,7 @@
 """simulate: from a declared system and a start to a Solution."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,6 +30,7 @@ from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
 from jaxlag._gradient import choose_gradient
 from jaxlag._inputs import all_knots, check_inputs, check_range
+from jaxlag._kkt import FORMULATIONS
 from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._patience import timed
 from jaxlag._placement import check_placement
@@ -43,6 +45,11 @@ from jaxlag._system import System
 from jaxlag.solvers import AbstractPartitioned
 
 MAX_STEPS = 16384
+_MAY_BE_SINGULAR = (
+    Status.kinematics_singular,
+    Status.nonfinite,
+    Status.step_below_resolution,
+)
 _PROJECTION = {True: "projection", False: None}
 
 
@@ -122,9 +129,14 @@ def simulate(
             "quasi" ("auto" where quasi-velocities are declared and take care of all rows): (q, u)
             with the quasi-velocities that are not constrained, no multipliers. Kinematics do so
             where they leave no more freedoms than there are coordinates less rows.
-            "multipliers" ("auto" else): (q, v), M + A^T W A and its Schur complement, factored once
-            each. "null_space": (q, v), M on the tangent space of the constraints. Both take an M
-            that is singular, but not on that space (links without mass).
+            "multipliers" ("auto" else; and where quasi-velocities become singular on the way,
+            outside of transforms and with L in v, which `motion.message()` says then): (q, v),
+            M + A^T W A and its Schur complement, factored once each. "null_space": (q, v), M on the
+            tangent space of the constraints. Both take an M that is singular, but not on that space
+            (links without mass).
+            A motion in quasi-velocities that comes to a place where these are singular, as a
+            steered wheel at 90 degrees, ends just before it in the status kinematics_singular;
+            with fixed steps one step before it.
         rtol: relative bound on the local error; by default 1e-9 in float64, 1e-5 in float32.
         atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32. A
             number, or one for every coordinate and its velocity: (n,) of them, or a dict by name.
@@ -195,6 +207,7 @@ def simulate(
     step, longest = check_step(dt, dt0), check_longest(dt, dt_max)
     check_params(system, params, q0, inputs)
     check_placement("simulate", (q0, v0, u0, ts, params, inputs))
+    asked = formulation
     formulation = check_formulation(system, formulation, project, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":
         must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
@@ -243,8 +256,15 @@ def simulate(
     _xla.warn_if_late()
     warn_of_changes(system, inputs)
     motion = timed(_simulate, system, plan, values)
+    either = asked == "auto" and system.in_u is None
+    if either:
+        plan, motion = _past_singular(plan, values, motion)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
-        other = _simulate(*_with_method(plan, values, IMPLICIT, rtol, atol, step))
+        implicit, given = _with_method(plan, values, IMPLICIT, rtol, atol, step)
+        other = _simulate(implicit, given)
+        if either:
+            implicit, other = _past_singular(implicit, given, other)
+            plan = plan._replace(formulation=implicit.formulation)
         if abs(other.last_time - ts[0]) > abs(motion.last_time - ts[0]):
             motion, method = other, IMPLICIT
             scheme = choose(IMPLICIT, True, rtol, atol)
@@ -275,6 +295,25 @@ def _with_method(
     traced, static = eqx.partition(scheme, _params.is_array)
     plan = plan._replace(scheme=_params.Static(static))
     return plan, values._replace(scheme=traced, rtol=rtol, atol=atol, step=step)
+
+
+def _past_singular(plan: Plan, values: Values, motion: Solution) -> tuple[Plan, Solution]:
+    """The motion by multipliers where one in quasi-velocities ends as these are singular.
+
+    One motion, with values, and where it gets further so.
+    """
+    status = motion._ending.status
+    single = np.ndim(status) == 0 and _params.concrete(status, motion.q)
+    if plan.formulation != "quasi" or not single or int(status) not in _MAY_BE_SINGULAR:
+        return plan, motion
+    if int(motion.status) != int(Status.kinematics_singular) or int(motion.where) < 0:
+        return plan, motion  # quasi-velocities that are too few are another fault
+    multipliers = plan._replace(formulation=FORMULATIONS[0])
+    other = _simulate(multipliers, values)
+    start = values.ts[0]
+    if not abs(other.last_time - start) > abs(motion.last_time - start):
+        return plan, motion
+    return multipliers, replace(other, _singular=(motion.last_time, motion.where))
 
 
 def _ran_out(motion: Solution) -> bool:

@@ -125,6 +125,8 @@ def explain(motion: "Solution") -> str:
         f"method        {motion.method}, {how}, {motion.formulation}",
         f"status        {motion.message()}",
     ]
+    if motion.instead:
+        lines.append(f"formulation   {motion.instead}")
     h, advice = _mean_step(motion), []
     attempts = accepted + rejected
     lines.append(

@@ -123,6 +123,8 @@ class Solution(eqx.Module):
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
     dt_max: Float[Array, "*batch"] | None = None
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
+    # (last good time, index of the quasi-velocity) where those end that "auto" went on without
+    _singular: tuple[Float[Array, ""], Int[Array, ""]] | None = None
 
     @property
     def status(self) -> Int[Array, "*batch"]:
@@ -291,7 +293,8 @@ class Solution(eqx.Module):
             return counted(self)
         status = Status(int(self.status))
         if status is Status.ok:
-            return f"ok at t = {self.last_time}"
+            said = f"ok at t = {self.last_time}"
+            return f"{said}, {self.instead}" if self._singular is not None else said
         index = int(self.where)
         labels, more = self.system.coordinates.labels, ""
         if status is Status.kinematics_singular:
@@ -299,6 +302,8 @@ class Solution(eqx.Module):
             labels = self.system.quasi.names
             if index < 0:
                 more = " The quasi-velocities are fewer than the freedoms that constraints leave."
+            else:
+                more = f" {self._fallen(index)}"
         if status in CONCERNS_ROW:
             rows = self.system.rows(self._given, self.q.dtype)
             labels = rows.labels
@@ -313,6 +318,29 @@ class Solution(eqx.Module):
             f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
             f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
         )
+
+    @property
+    def instead(self) -> str:
+        """Why formulation "auto" took multipliers in place of quasi-velocities; "" where not."""
+        if self._singular is None or self.system.quasi is None:
+            return ""
+        time, index = self._singular
+        name = self.system.quasi.names[int(index)]
+        return f"by multipliers, as dU/dv is singular at t = {float(time):.6g} ({name!r})"
+
+    def _fallen(self, index: int) -> str:
+        """What has become of a quasi-velocity where it is singular, in words."""
+        quasi, (q, _) = self.system.quasi, self.last_state
+        assert quasi is not None
+        times, states = (self.ts[0], self.last_time), (self.q[0], q)
+        begin, end = (
+            float(quasi.pivots(t, q, self._given)[index])
+            for t, q in zip(times, states, strict=True)
+        )
+        if not (begin > 0 and end > 0) or begin == end:
+            return ""
+        what = "its part that does not follow from those before it"
+        return f"Since the start {what} has changed by a factor of {end / begin:.2g}."
 
     def explain(self) -> str:
         """Why the solve took as many steps as it did, and what to change; for a single motion.

@@ -54,9 +54,10 @@ ADVICE = {
         "or drop it."
     ),
     Status.kinematics_singular: (
-        "There dU/dv is singular: this quasi-velocity follows from the others, and v does not "
-        "follow from u (pitch at 90 degrees, a steered wheel across the way). Use other "
-        "coordinates or quasi-velocities near it."
+        "There dU/dv is singular: this quasi-velocity follows from the others or vanishes, and v "
+        "does not follow from u (pitch at 90 degrees, a steered wheel across the way). Use other "
+        "coordinates or quasi-velocities near it, or formulation='multipliers', which passes "
+        "where the motion itself does."
     ),
     Status.rank_change: (
         "There this constraint row came to depend on the others, or no longer follows from them: "

@@ -66,6 +66,7 @@ class Arguments(NamedTuple):
     prepared: Any  # what accelerations need of what depends on params alone
     rows: RowChoice | None = None  # None where there is no choice: at most one row
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
+    volumes: Float[Array, " b"] | None = None  # usual ones, where they change on the way
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:

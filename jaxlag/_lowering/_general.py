@@ -28,6 +28,7 @@ class Inverse:
 
     Attributes:
         healthy: truth values, all of which hold where J is regular to working precision.
+        determinants: of the blocks; their product is det J up to its sign.
 
     Raises:
         Unsupported: J is singular in every state, or couples more than LARGEST unknowns.
@@ -38,6 +39,7 @@ class Inverse:
     ) -> None:
         self.graph, self.expansion, self.J, self.floor = graph, expansion, J, FLOOR * eps
         self.healthy: list[Node] = []
+        self.determinants: list[Node] = []
         self._steps: list[tuple[list[int], list[int], list[list[Node]], Node]] = []
         n, zero = len(J), graph.zero
         rows, columns = set(range(n)), set(range(n))
@@ -101,6 +103,7 @@ class Inverse:
             determinant = self._short(graph.sum(terms))
         if determinant is graph.zero:
             raise Unsupported("kinematics that are singular in every state")
+        self.determinants.append(determinant)
         if determinant.constant is None and self.floor:
             lengths = [graph.sum([(graph.power(x, 2), 1.0) for x in self.J[i]]) for i in rows]
             bound = graph.scale(reduce(graph.mul, map(self._short, lengths)), self.floor**2)

@@ -12,6 +12,7 @@ from jaxlag._lowering._expand import Expansion
 from jaxlag._lowering._forms import attempt, cost, mass_matrix
 from jaxlag._lowering._general import Inverse
 from jaxlag._lowering._graph import Graph, Node, order, substitute
+from jaxlag._lowering._ingest import Unsupported
 from jaxlag._lowering._program import assemble
 from jaxlag._lowering._scene import Equations, Kinematics, Scene
 from jaxlag._lowering._solve import solve
@@ -29,6 +30,8 @@ class _Moved(NamedTuple):
         B: columns dv/du of the free ones.
         s: dv/dt at u' = 0, the bound ones zero.
         healthy: truth values, all of which hold where v follows from u.
+        volumes: what vanishes, or grows beyond bounds, where one of v and u does not follow from
+            the other: determinants of blocks of dU/dv or dV/du. None where they are too long.
     """
 
     V: list[Node]
@@ -36,6 +39,7 @@ class _Moved(NamedTuple):
     B: list[list[Node]]
     s: list[Node]
     healthy: list[Node]
+    volumes: list[Node] | None
 
 
 def derive_rates(scene: Scene, eps: float) -> Equations:
@@ -83,6 +87,9 @@ def derive_rates(scene: Scene, eps: float) -> Equations:
         found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), words))
     best = min(found, key=lambda equations: equations.program.cost)
     best = best._replace(velocity=assemble(graph, v))
+    if moved.volumes is not None:
+        moving = [x for x in moved.volumes if not x.fixed]
+        best = best._replace(volumes=assemble(graph, moving))
     bound = scene.constrained
     if bound is None:
         return best
@@ -102,12 +109,13 @@ def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: floa
     graph, healthy = scene.graph, []
     if kinematics.V is not None:
         V = list(kinematics.V)
+        volumes = _volumes(graph, expansion, affine(graph, V, kinematics.u)[0])
     else:
         assert kinematics.U is not None
         theta, theta_0 = affine(graph, kinematics.U, scene.v)
         inverse = Inverse(graph, expansion, theta, eps)
         right = [graph.sub(*pair) for pair in zip(kinematics.u, theta_0, strict=True)]
-        V, healthy = inverse(right), inverse.healthy
+        V, healthy, volumes = inverse(right), inverse.healthy, inverse.determinants
     short = attempt(partial(expansion.simplified, V))
     if short is not None and cost(graph, [short]) <= cost(graph, [V]):
         V = short
@@ -115,7 +123,25 @@ def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: floa
     v = substitute(graph, V, still)
     B = [tangents(graph, V, {u: graph.one}) for u in kinematics.free]
     s = tangents(graph, v, dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one})
-    return _Moved(V, v, B, s, healthy)
+    return _Moved(V, v, B, s, healthy, volumes)
+
+
+def _volumes(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[Node] | None:
+    """Determinants of blocks of B, or of B^T B where it is tall; None where they are too long."""
+    k = len(B[0])
+    try:
+        square = B if len(B) == k else _gram(graph, expansion, B)
+        return Inverse(graph, expansion, square, 0.0).determinants
+    except Unsupported:
+        return None
+
+
+def _gram(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[list[Node]]:
+    """B^T B."""
+    columns = list(zip(*B, strict=True))
+    gram = [[_dot(graph, one, other) for other in columns] for one in columns]
+    short = _short(expansion, gram)
+    return gram if short is None else short
 
 
 def affine(
@@ -134,16 +160,10 @@ def _quasi(scene: Scene, kinematics: Kinematics, expansion: Expansion) -> list[N
         return list(kinematics.U)
     assert kinematics.V is not None
     B, c = affine(graph, kinematics.V, kinematics.u)
-    k = len(kinematics.u)
-    gram = [
-        [graph.sum([(graph.mul(row[i], row[j]), 1.0) for row in B]) for j in range(k)]
-        for i in range(k)
-    ]
-    short = _short(expansion, gram)
+    gram = _gram(graph, expansion, B)
     rest = [graph.sub(*pair) for pair in zip(scene.v, c, strict=True)]
-    right = [_dot(graph, [row[i] for row in B], rest) for i in range(k)]
-    inverse = Inverse(graph, expansion, gram if short is None else short, 0.0)
-    return inverse(right)
+    right = [_dot(graph, column, rest) for column in zip(*B, strict=True)]
+    return Inverse(graph, expansion, gram, 0.0)(right)
 
 
 def _projected(scene: Scene, moved: _Moved, L: Node) -> tuple[list[list[Node]], list[Node]]:

@@ -40,6 +40,7 @@ class ScalarPrepared(NamedTuple):
     kick: Array | None = None
     lam: Array | None = None
     rates: Array | None = None
+    volumes: Array | None = None
     definite: Bool[Array, ""] | None = None
     alone: "ScalarPrepared | None" = None
 
@@ -107,12 +108,13 @@ class ScalarTerms(Terms):
         solving = (None, None) if reacting is None else reacting
         first = before(equations.program, *solving)
         assert first is not None
-        rates = before(equations.velocity, kept)
+        rates, volumes = before(equations.velocity, kept), before(equations.volumes, None)
         if equations.surface is None:
-            return ScalarPrepared(first, rates=rates)
+            return ScalarPrepared(first, rates=rates, volumes=volumes)
         *moving, lam = equations.surface
         others = [before(code, kept) for code in moving]
-        return ScalarPrepared(first, *others, lam=before(lam, *solving), rates=rates)
+        reacting_too = before(lam, *solving)
+        return ScalarPrepared(first, *others, lam=reacting_too, rates=rates, volumes=volumes)
 
     def acceleration(
         self,
@@ -160,6 +162,18 @@ class ScalarTerms(Terms):
     ) -> Array:
         """v at (q, u) of quasi-velocities."""
         return self._run("rates", t, q, u, params, inputs, prepared)
+
+    def volumes(
+        self, t: Array, q: Array, params: Any, inputs: Mapping[str, Any], prepared: ScalarPrepared
+    ) -> Array | None:
+        """What vanishes where quasi-velocities are singular; None where there is no program."""
+        if prepared.volumes is None:
+            return None
+        code = self._equations(q, params, inputs).volumes
+        assert code is not None
+        if not code.results:
+            return jnp.zeros((0,), q.dtype)
+        return self._run("volumes", t, q, q, params, inputs, prepared)  # no speed is read
 
     def _run(
         self,
