@@ -396,7 +396,7 @@ def _written(loop: _Loop, c: _Carry, kept: _Kept, t: Array, anchor: Array) -> _K
     """The record with this turn."""
     anchors, jumps, points = kept.anchors, kept.jumps, kept.points
     if anchors is None:
-        offset = jnp.where(anchor == 1, jnp.inf, t)
+        offset = jnp.where(anchor == 1, -1.0, t)
     else:
         anchors = put(anchors, c.turn, anchor)
         offset = t - loop.anchors[anchor]

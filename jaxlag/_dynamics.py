@@ -136,7 +136,7 @@ class Dynamics(eqx.Module):
             return args
         # They say which rows are read, and no derivative passes through that.
         knots = jnp.sort(jax.lax.stop_gradient(knots.astype(ts.dtype)))
-        never = jnp.full((1,), -jnp.inf, ts.dtype)
+        never = jnp.full((1,), jnp.finfo(ts.dtype).min, ts.dtype)
         ahead = Gaps(self.tau(knots, args), jnp.concatenate([never, knots]))
         back = Gaps(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
         onwards = self.turned(jnp.ones_like(ts[0]), args) > 0

@@ -353,7 +353,7 @@ def _dependent(
     pivots, fine = jax.vmap(squares)(taus, states)
     eps = float(jnp.finfo(states.dtype).eps)
     # A small angle of its own, between rods that almost lie in line, is no fault.
-    near = pivots[:2] < eps**0.5 * pivots[2]
+    near = pivots[:2] < eps**0.5 * pivots[2:]
     found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
     if kept is not None:
         found = found & kept

@@ -49,8 +49,8 @@ def newton(forces: Forces, q: Float[Array, " n"]) -> Newton:
 
 def _newton(F: Array, J: Array, noise: Array) -> Newton:
     c = units(J, F)
-    floor = 4 * jnp.linalg.norm(c[:, None] * noise * c)
-    return Newton(F, J, c, *_decompose(c[:, None] * J * c, floor))
+    floor = 4 * jnp.linalg.norm(c[:, None] * noise * c[None])
+    return Newton(F, J, c, *_decompose(c[:, None] * J * c[None], floor))
 
 
 def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -66,7 +66,7 @@ def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
     d = jnp.abs(jnp.diagonal(J))
     c = jnp.where(d > 0, jax.lax.rsqrt(jnp.where(d > 0, d, 1)), 1)
     for _ in range(4):
-        size = jnp.abs(c[:, None] * J * c)
+        size = jnp.abs(c[:, None] * J * c[None])
         largest = jnp.maximum(jnp.max(size, axis=0), jnp.max(size, axis=1))
         c = c * jnp.where(largest > 0, jax.lax.rsqrt(jnp.where(largest > 0, largest, 1)), 1)
     free = ~jnp.any(J != 0, axis=0) & ~jnp.any(J != 0, axis=1)
@@ -114,7 +114,7 @@ class RelativeDamping(optx.AbstractDescent):
         J, r = f_info.jac.as_matrix(), f_info.residual
         norms = jnp.linalg.norm(J, axis=0)
         c = 1 / jnp.where(norms > 0, norms, 1)
-        left, sizes, right, regular = _decompose(J * c)
+        left, sizes, right, regular = _decompose(J * c[None])
         part, sizes = jnp.where(regular, left.T @ r, 0), jnp.where(regular, sizes, 1)
         length = jnp.linalg.norm(part / sizes)
         gain = jnp.linalg.norm(r) / jnp.where(length > 0, length, 1)
@@ -194,9 +194,9 @@ def solve_tangent(linear: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
     A = jax.jacfwd(linear)(y)
     fixed = jax.lax.stop_gradient(A)
     c = units(fixed, jnp.zeros_like(y))
-    left, _, right, regular = _decompose(c[:, None] * fixed * c)
+    left, _, right, regular = _decompose(c[:, None] * fixed * c[None])
     left, right = jnp.where(regular, 0, left), jnp.where(regular, 0, right)
-    scaled = c[:, None] * A * c + left @ right.T
+    scaled = c[:, None] * A * c[None] + left @ right.T
     y = c * y
     return c * jnp.linalg.solve(scaled, y - left @ (left.T @ y))
 
@@ -246,7 +246,7 @@ def judge(
     # Forces that cancel inside F leave more rounding than its own size tells.
     slack = jnp.asarray(4 * eps * (-1.0) ** np.arange(n), q.dtype) * reach
     beside = jax.lax.map(forces, jnp.stack([q + slack, q - slack]))
-    rounding = 8 * n * eps * scale + 4 * jnp.max(jnp.abs(beside - F), axis=0)
+    rounding = 8 * n * eps * scale + 4 * jnp.max(jnp.abs(beside - F[None]), axis=0)
     balanced = jnp.all(jnp.abs(F) <= rounding)
     near = jnp.where(balanced, tol**0.4, tol) * reach
     settled = (jnp.abs(s) <= near) | (bend <= tol * jnp.abs(s))
@@ -275,7 +275,7 @@ def _variation(
     It is no less than four Newton steps, nor than what rounding of F leaves open in q.
     """
     eps = float(jnp.finfo(q.dtype).eps)
-    J = here.c[:, None] * here.J * here.c
+    J = here.c[:, None] * here.J * here.c[None]
     J = jnp.where(jnp.isfinite(J), J, 0)
     axes = jnp.linalg.eigh(-0.5 * (J + J.T))[1]
     u = axes[:, 0]
@@ -293,7 +293,7 @@ def _variation(
     steps = 4 * jnp.linalg.norm(here.step / here.c)
     d = jnp.maximum(eps**0.4 * size, jnp.maximum(steps, unresolved)) * here.c * u
     there = jax.lax.map(jax.jacfwd(forces), jnp.stack([q + d, q - d]))
-    return jnp.max(jnp.abs(there - here.J), axis=0)
+    return jnp.max(jnp.abs(there - here.J[None]), axis=0)
 
 
 @CustomJVP

@@ -302,6 +302,6 @@ def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
 
 def _gaps(found: Found, problem: Shooting) -> np.ndarray:
     """Ends less the starts that follow, over the range of the states."""
-    apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states
+    apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states[None]
     ok = np.asarray(found.seen.status == Status.ok)[:, None]
     return np.where(problem.segments.follows[:, None], np.where(ok, apart, np.nan), 0.0)

@@ -171,7 +171,7 @@ class Unknowns(eqx.Module):
     def _beyond(self, z: Float[Array, " p"]) -> tuple[Array, Array]:
         """Which unknowns are at their lower limit, and which at their upper one."""
         near = 8 * jnp.finfo(float).eps * jnp.maximum(1.0, jnp.abs(z))
-        return z <= self.low + near, z >= self.high - near
+        return z - near <= self.low, z + near >= self.high
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -292,7 +292,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         kept = tangent(ts, y, w)
         steps = kept[1:] @ (Phi * w[:-1, None, :] / w[1:, :, None]) @ kept[:-1]
         # Weights that stay the same: the exponent is that of the motion alone.
-        scale = w / (atol + rtol * jnp.max(jnp.abs(y), axis=0))
+        scale = w / (atol + rtol * jnp.max(jnp.abs(y), axis=0))[None]
         log_kappa, log_norm, log_size = _products(steps, kept, scale)
 
         tau = jnp.abs(ts - ts[0]).astype(y.dtype)

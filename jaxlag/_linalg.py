@@ -109,7 +109,7 @@ def _eliminated(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
     def one(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
         # XLA would divide again for every entry.
         ratio = jax.lax.optimization_barrier(M[k] / M[k, k])
-        return jnp.where((at > k)[:, None], M - ratio[:, None] * M[k], M)
+        return jnp.where((at > k)[:, None], M - ratio[:, None] * M[k][None], M)
 
     return jax.lax.fori_loop(0, n, one, M)
 

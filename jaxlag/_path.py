@@ -53,14 +53,15 @@ class Clock(NamedTuple):
     def time(self, k: Array, anchors: Array) -> Array:
         """Time after turn k."""
         offset, anchor = at(self.record.offsets, k), self.anchor(k)
-        moved = anchors[anchor] + jnp.where(jnp.isinf(offset), 0.0, offset)
-        return jnp.where(k < 0, anchors[0], moved)
+        if self.record.anchors is None:
+            offset = jnp.maximum(offset, 0.0)
+        return jnp.where(k < 0, anchors[0], anchors[anchor] + offset)
 
     def anchor(self, k: Array) -> Array:
         """The anchor that it moves with."""
         if self.record.anchors is not None:
             return jnp.where(k < 0, 0, at(self.record.anchors, k))
-        return ((k >= 0) & jnp.isinf(at(self.record.offsets, k))).astype(jnp.int32)
+        return ((k >= 0) & (at(self.record.offsets, k) < 0)).astype(jnp.int32)
 
     def jump(self, k: Array) -> Array | None:
         """Whether the vector field jumps where turn k starts."""

@@ -363,7 +363,7 @@ def _factored(columns: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
     columns = lax.stop_gradient(columns)
     size = jnp.sqrt(jnp.sum(columns**2, axis=0))
     size = jnp.where(size > 0, size, 1.0)
-    Q, R = jnp.linalg.qr(columns / size)
+    Q, R = jnp.linalg.qr(columns / size[None])
     return size, Q, R
 
 

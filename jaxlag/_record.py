@@ -26,7 +26,8 @@ class Times(NamedTuple):
 
     def dues(self) -> Float[Array, " r"]:
         """Times of the rows between the first and the last, and then never."""
-        return jnp.concatenate([self.saves[1:-1], jnp.full((1,), jnp.inf, self.saves.dtype)])
+        never = jnp.full((1,), jnp.finfo(self.saves.dtype).max, self.saves.dtype)
+        return jnp.concatenate([self.saves[1:-1], never])
 
 
 class Record(NamedTuple):
@@ -37,7 +38,7 @@ class Record(NamedTuple):
     Attributes:
         offsets: time after every turn, from its anchor, with which it moves.
         anchors: which of `Times.anchors` that is. None without knots: the start, or where the
-            offset is infinite the stop, at which the turn ends.
+            offset is negative the stop, at which the turn ends.
         jumps: whether the vector field jumps where the turn starts; None where it never does.
         points: states before turn 0, `stride`, 2 `stride`, ...; None where nobody needs them.
         stride: a power of 2.

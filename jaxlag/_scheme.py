@@ -398,9 +398,9 @@ def remembers(solver: diffrax.AbstractSolver) -> bool:
 def linearized(field: Callable, y: Array) -> tuple[Array, Array]:
     """(f, df/dy) at y by differences: half the digits, and compiled in a fraction of the time."""
     beside = jnp.sqrt(jnp.finfo(y.dtype).eps) * (1.0 + jnp.abs(y))
-    states = jnp.concatenate([y[None], y + jnp.diag(beside)])
+    states = jnp.concatenate([y[None], y[None] + jnp.diag(beside)])
     f, *others = jax.lax.map(field, states)
-    return f, (jnp.stack(others, 1) - f[:, None]) / beside
+    return f, (jnp.stack(others, 1) - f[:, None]) / beside[None]
 
 
 def _rate(J: Array) -> tuple[Array, Array]:

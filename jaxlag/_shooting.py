@@ -141,7 +141,7 @@ class Shooting(eqx.Module):
         status = jnp.where((ended == Status.ok) & ~known, Status.nonfinite, ended)
         ok = status == Status.ok
         residuals = segment.weights * (shown - segment.values)
-        far = FAR * segment.weights * self.ranges
+        far = FAR * segment.weights * self.ranges[None]
         quasi = self.system.quasi
         rates = motion.v[-1] if quasi is None else motion.u[-1, jnp.array(quasi.free)]
         end = jnp.concatenate([motion.q[-1], rates])
@@ -196,7 +196,7 @@ class Shooting(eqx.Module):
         """Rows of what was measured by the loss, and of starts that are known roughly."""
         known = jnp.isfinite(segments.held) & (segments.held > 0)
         sigma = jnp.where(known, segments.held, 1.0)
-        starts = jnp.where(known, x * self.states / sigma, 0.0)
+        starts = jnp.where(known, x * self.states[None] / sigma, 0.0)
         return jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
 
     def gaps(

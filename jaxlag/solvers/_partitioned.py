@@ -91,14 +91,14 @@ class AbstractPartitioned(AbstractFixedStep):
 
         def stage(V: Array, lam: Array) -> tuple[Array, Array, Array, Array]:
             """(Q, P, F, impulses A^T h Lam) of all stages."""
-            Q = q0 + h * (a @ V)
+            Q = q0[None] + h * (a @ V)
             P, F = jax.vmap(form.canonical)(ts, Q, V)
             return Q, P, F, jax.vmap(form.reaction)(ts, Q, lam)
 
         def residual(z: Array) -> Array:
             V, lam = unpacked(z)
             Q, P, F, push = stage(V, lam)
-            motion = P - p0 - ah @ (h * F + push)
+            motion = P - p0[None] - ah @ (h * F + push)
             if not rows:
                 return motion.reshape(-1)
             held = jax.vmap(form.position)(ts[1:], Q[1:], lam[:-1]) / h
