@@ -190,7 +190,9 @@ class Dynamics(eqx.Module):
         there, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
-        kept = independent_rows(M, A, 2 * velocity + unread, there=there)
+        # Where multipliers are read, what is left out is told by those that are kept.
+        reads = not np.all(unread)
+        kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
         if not np.any(velocity & ~unread):  # then those that are read come first already
             return RowChoice(kept, size, Choice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
@@ -201,7 +203,7 @@ class Dynamics(eqx.Module):
                 "whose phi would not be damped if they follow from these",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
-        reacting = independent_rows(M, A, unread, there=there)
+        reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
         return RowChoice(kept, size, Choice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._kkt import augmented
@@ -13,6 +14,9 @@ from jaxlag._linalg import eliminate, factor_mass, rank_floor
 
 ROUNDINGS = 16
 """Of the coordinates: a row that they make is none."""
+
+ALIKE = 0.01
+"""Pivots above this part of the largest one are as good as it."""
 
 
 class Choice(NamedTuple):
@@ -90,6 +94,7 @@ def independent_rows(
     turn: Sequence[int] | np.ndarray | None = None,
     floor: float | None = None,
     there: Bool[Array, " m"] | None = None,
+    mobile_first: bool = False,
 ) -> Bool[Array, " m"]:
     """A largest set of rows that are independent of one another, found greedily.
 
@@ -104,6 +109,8 @@ def independent_rows(
             all at once.
         floor: least pivot; by default `rank_floor`.
         there: rows that are not taken for zero; by default those that are not.
+        mobile_first: of rows whose pivots are much alike take that along which a force of the same
+            size moves most. By it `least_norm` tells well what the others take.
 
     Source: Golub, Van Loan, Matrix Computations, sec. 4.2.8.
     """
@@ -128,8 +135,10 @@ def independent_rows(
         left = jnp.where(kept | ~usable, -1.0, jnp.diagonal(S))
         now = jnp.min(jnp.where(left > floor, turns, np.max(turns, initial=0)))
         left = jnp.where(turns > now, -1.0, left)
+        if mobile_first:
+            left = jnp.where(left > ALIKE * jnp.max(left), left * pivots, -1.0)
         k = jnp.argmax(left > 0.999 * jnp.max(left))  # the first of nearly equal ones
-        take = left[k] > floor
+        take = ~kept[k] & usable[k] & (S[k, k] > floor)
         reduced = S - jnp.outer(S[:, k], S[k]) / jnp.where(take, S[k, k], 1.0)
         return jnp.where(take, reduced, S), kept.at[k].set(kept[k] | take)
 
@@ -141,42 +150,69 @@ def least_norm(
     lam: Float[Array, " m"],
     kept: Bool[Array, " m"] | None = None,
     there: Bool[Array, " m"] | None = None,
+    units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
 
     |A_k lam_k| is the generalized force of row k alone, so that the choice does not depend on
-    how a residual is scaled. With C the rows in terms of those that are kept, A = C A_kept,
-    lam = C (C^T C)^-1 lam_kept: the same where none is left out. Rows that do not follow from
-    those that are kept have none. Derivatives are those at constant rank of A.
+    how a residual is scaled. Rows are compared in units of the coordinates, for short levers make
+    rows alike that are not: with unit rows a_k there, those that are left out are a_j = C_j a_kept,
+    and what they take, z_j, the kept ones give, mu_kept - C^T z. Of all z the least norm is a
+    problem of least squares; A^T lam stays what it is, however well that is solved. Rows that do
+    not follow from those that are kept have none. Derivatives are those at constant rank of A.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam.
         kept: a largest set of independent rows; by default it is looked for.
         there: rows that are more than rounding, see `row_sizes`; by default those that are not 0.
+        units: of the coordinates, in which rows are compared; by default 1.
 
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
     m, n = A.shape
-    if m == 1:
-        return lam
-    if kept is None:
-        kept = independent_rows(jnp.eye(n, dtype=A.dtype), jax.lax.stop_gradient(A))
     if there is not None:
         A = jnp.where(there[:, None], A, 0.0)
-    norms = _lengths(A)
-    norms = jnp.where(norms > 0, norms, 1.0)
-    unit = A / norms[:, None]
-    gram, one = unit @ unit.T, jnp.eye(m, dtype=A.dtype)
-    among = jnp.where(jnp.outer(kept, kept), gram, one)
-    C = jnp.linalg.solve(among, jnp.where(kept[:, None], gram, 0.0)).T
+    if m == 1:
+        return lam if there is None else jnp.where(there, lam, 0.0)
+    units = jnp.ones((n,), A.dtype) if units is None else jax.lax.stop_gradient(units)
+    if kept is None:
+        metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
+        kept = independent_rows(metric, fixed, there=there, mobile_first=True)
+    norms, sizes = _lengths(A), _lengths(A * units)
+    norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
+    unit = A * units / sizes[:, None]
+    C = _least_squares(unit.T, unit.T, kept).T
     apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
-    C = jnp.where((apart <= rank_floor(A.dtype))[:, None], C, 0.0)
-    C = jnp.where(kept[:, None], jnp.where(kept, one, 0.0), C)
-    # What all rows do, by those that are kept: with C^T, for lam may be on any of them.
-    of_kept = C.T @ (norms * lam)
-    square = C.T @ C + jnp.where(kept, 0.0, one)
-    return (C @ jnp.linalg.solve(square, of_kept)) / norms
+    follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))
+    # What a row has of another by rounding alone may be much to one of smaller weight.
+    rounding = jnp.abs(C) <= ROUNDINGS * float(jnp.finfo(A.dtype).eps)
+    C = C - jax.lax.stop_gradient(jnp.where(rounding, C, 0.0))
+    C = jnp.where(follows[:, None], C, 0.0)
+    mu, weights = sizes * lam, norms / sizes
+    of_kept = jnp.where(kept, mu + mu @ C, 0.0)
+    # Normal equations, in units in which their diagonal is 1: weights may be as unlike as forces
+    # and moments of short levers, and rows of small ones are kept, so that they are no worse.
+    moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
+    lengths = _lengths(moved.T)
+    lengths = jnp.where(lengths > 0, lengths, 1.0)
+    square = (moved.T @ moved) / jnp.outer(lengths, lengths)
+    square = square + jnp.diag((~follows).astype(A.dtype))
+    z = jnp.linalg.solve(square, (weights * of_kept) @ moved / lengths) / lengths
+    found = jnp.where(kept, of_kept - z @ C, z)
+    left = (jnp.where(kept | follows, mu, 0.0) - found) @ unit
+    return (found + _least_squares(unit.T, left[:, None], kept)[:, 0]) / sizes
+
+
+def _least_squares(
+    X: Float[Array, "r m"], Y: Float[Array, "r k"], columns: Bool[Array, " m"]
+) -> Float[Array, "m k"]:
+    """The x that minimise |X x - Y| over these columns of X, 0 in the others; by Q R."""
+    m = X.shape[1]
+    spare = jnp.diag((~columns).astype(X.dtype))
+    Q, R = jnp.linalg.qr(jnp.concatenate([jnp.where(columns, X, 0.0), spare]))
+    right = jnp.concatenate([Y, jnp.zeros((m, Y.shape[1]), Y.dtype)])
+    return jnp.where(columns[:, None], solve_triangular(R, Q.T @ right), 0.0)
 
 
 def shared(
@@ -185,6 +221,7 @@ def shared(
     kept: Bool[Array, " m"],
     there: Bool[Array, " m"],
     group: Sequence[bool] | np.ndarray,
+    units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with those of a group of rows of least norm among themselves.
 
@@ -194,9 +231,10 @@ def shared(
         kept: a largest set of independent rows, first of those of the group.
         there: rows that are more than rounding.
         group: for every row, whether it belongs to the group.
+        units: of the coordinates, in which rows are compared.
     """
     chosen = np.flatnonzero(group)
     if len(chosen) < 2:
         return lam
-    found = least_norm(*(x[chosen] for x in (A, lam, kept, there)))
+    found = least_norm(A[chosen], lam[chosen], kept[chosen], there[chosen], units)
     return lam.at[chosen].set(found)

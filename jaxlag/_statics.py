@@ -15,7 +15,13 @@ from jaxlag._arguments import check_declaration
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
-from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
+from jaxlag._equilibrium_search import (
+    differentiable_if,
+    judge,
+    newton,
+    search,
+    solve_tangent,
+)
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
@@ -286,7 +292,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
     if rows.size:
         # Of multipliers of dependent rows the search finds those nearest to where it began.
         q, lam = z[:n], z[n:]
-        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam)])
+        softness = jax.lax.stop_gradient(newton(whole, z).c)[:n]
+        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam, units=softness)])
 
     still, start, t, tol, *given = jax.lax.stop_gradient((z, z0, t, tol, *given))
     still_parts, _, fixed = forces(t, *given)

@@ -21,7 +21,7 @@ from jaxlag._constraints import (
 from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import real_scalar
 from jaxlag._forces import AbstractForce, components, reads_lam
-from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions
+from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
 from jaxlag._linalg import MassFactor, factor_mass, solve_mass
 from jaxlag._lowering._rows import layout
 from jaxlag._lowering._structure import Structure, find_structure
@@ -292,10 +292,11 @@ class ArrayTerms(Terms):
             fine = there[0]
         else:
             read = self.rows_read(t, q, v, params, inputs)
-            kept = independent_rows(*still((M, A)), np.logical_not(read), there=there)
+            unread = np.logical_not(read)
+            kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
             choice = Choice(kept, there)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
-            lam = shared(A, lam, kept, there, np.logical_not(read))
+            lam = shared(A, lam, kept, there, unread, units_of(*still((M, A))))
             fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
@@ -335,7 +336,7 @@ class ArrayTerms(Terms):
         def seen(lam: Array) -> Array:
             if reacting is None or self.apart:
                 return lam
-            return shared(A, lam, *reacting, read)
+            return shared(A, lam, *reacting, read, units_of(M, A))
 
         def push(lam: Array) -> Array:
             return self.reactive(t, q, v, params, inputs, lam)
