@@ -18,7 +18,8 @@ from jaxlag._errors import AssemblyError, bad
 from jaxlag._kkt import augmented, solve_kkt
 from jaxlag._linalg import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
-from jaxlag._rank import independent_rows, row_sizes
+from jaxlag._rank import ROUNDINGS, independent_rows, row_sizes
+from jaxlag._roundings import with_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, real, state_vectors
@@ -219,12 +220,19 @@ def _assembled(
         v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
-    size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))[1]
+    size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A))).size
     floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
+
+    def residuals(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
+        found = terms.position(t, q, params), terms.velocity(t, q, v, params)
+        return rows.of_all(found[0]), found[1]
+
+    (at_q, at_v), (less_q, less_v) = with_rounding(residuals, t, q, v)
     off = jnp.maximum(
-        jnp.abs(rows.of_all(position)) / size / (1.0 + jnp.max(jnp.abs(q))),
-        jnp.abs(velocity) / size / (1.0 + jnp.max(jnp.abs(v))),
+        jnp.maximum(jnp.abs(at_q) - ROUNDINGS * less_q, 0.0) / (1.0 + jnp.max(jnp.abs(q))),
+        jnp.maximum(jnp.abs(at_v) - ROUNDINGS * less_v, 0.0) / (1.0 + jnp.max(jnp.abs(v))),
     )
+    off = off / size
     ok = jnp.all(off <= floor)
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
     failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))
@@ -256,7 +264,7 @@ def _independent(
     """A largest set of independent rows at q, rounding left out."""
     W, q = jax.lax.stop_gradient((W, q))
     A = jax.lax.stop_gradient(rows(q))
-    there, _ = row_sizes(rows, q, A)
+    there = row_sizes(rows, q, A).there
     return independent_rows(W, A, turn, floor, there)
 
 

@@ -182,12 +182,14 @@ class Dynamics(eqx.Module):
         return eqxi.unvmap_all(jnp.stack(found))
 
     def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
-        """The rows to solve with; None where there are not several."""
-        if self.rows.size < 2 or (self.quasi is not None and not self.projects):
+        """The rows to solve with; None where no multipliers are solved for."""
+        if not self.rows.size or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = still((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
-        there, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
+        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
+        if self.rows.size == 1:  # one that vanishes here alone is not to be done without
+            return RowChoice(~void, size, Choice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
         # Where multipliers are read, what is left out is told by those that are kept.

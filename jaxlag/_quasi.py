@@ -188,7 +188,7 @@ class QuasiVelocities(eqx.Module):
             return jax.jacfwd(lambda v: self.of(t, q, v, params))(rest)
 
         here = rows(q)
-        there, _ = row_sizes(rows, q, here)
+        there = row_sizes(rows, q, here).there
         return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
 
     def regular(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Bool[Array, ""]:

@@ -1,6 +1,7 @@
 """Which constraint rows are independent, and how rows that are not share what they exert."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -11,9 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._kkt import augmented
 from jaxlag._linalg import eliminate, factor_mass, rank_floor
+from jaxlag._roundings import with_rounding
 
 ROUNDINGS = 16
-"""Of the coordinates: a row that they make is none."""
+"""Of what a row is made of: if that is all of it, it is none."""
 
 ALIKE = 0.01
 """Pivots above this part of the largest one are as good as it."""
@@ -31,13 +33,28 @@ class Choice(NamedTuple):
     there: Bool[Array, " m"]
 
 
+class Sizes(NamedTuple):
+    """How large rows are.
+
+    Attributes:
+        there: those that are more than rounding.
+        void: those that are rounding here and nearby: 0 = 0, whatever the motion.
+        size: their lengths; of those that are rounding how fast they grow, or what they are made
+            of if that is more.
+    """
+
+    there: Bool[Array, " m"]
+    void: Bool[Array, " m"]
+    size: Float[Array, " m"]
+
+
 def row_sizes(
     rows: Callable[[Array], Array], q: Float[Array, " n"], A: Float[Array, "m n"]
-) -> tuple[Bool[Array, " m"], Float[Array, " m"]]:
-    """(whether rows are more than rounding, their lengths, or how fast they grow where not).
+) -> Sizes:
+    """Which rows are more than rounding, and how large.
 
     At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever: what
-    a few roundings of the coordinates change.
+    a few roundings of the coordinates, and of all that is computed from them, change.
 
     Args:
         rows: A as a function of q.
@@ -47,15 +64,16 @@ def row_sizes(
     eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
     signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
-    ways = jnp.concatenate([ROUNDINGS * eps * signs * jnp.abs(q), small * signs])
-    changes = jax.lax.stop_gradient(jax.vmap(rows)(q + ways) - A)
-    rounding, growth = jnp.max(_lengths(changes).reshape(2, 2, -1), axis=1)
-    growth = growth / small
-    norms = _lengths(A)
+    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q + small * signs]))
+    found, rounding = jax.vmap(partial(with_rounding, rows))(places)
+    rounding, norms = _lengths(rounding), _lengths(A)
+    growth = _lengths(found[1:] - jax.lax.stop_gradient(A))
     # What is not known, as derivatives beside the end of a domain, speaks for the row.
-    there = (norms > 0) & ~(norms <= rounding)
-    size = jnp.where(there, norms, growth)
-    return there, jnp.where(size > 0, size, 1.0)
+    there = (norms > 0) & ~(norms <= ROUNDINGS * rounding[0])
+    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[0] + rounding[1:]), axis=0)
+    made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
+    size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
+    return Sizes(there, void, jnp.where(size > 0, size, 1.0))
 
 
 def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
@@ -121,7 +139,7 @@ def independent_rows(
     usable = nonzero if there is None else nonzero & there
     if m == 1:  # nothing to depend on
         return usable
-    A = A / jnp.where(usable, norms, 1.0)[:, None]
+    A = jnp.where(usable[:, None], A, 0.0) / jnp.where(usable, norms, 1.0)[:, None]
     mass = factor_mass(augmented(M, A)[0])
     S = A @ jax.vmap(lambda row: eliminate(mass, row))(A).T
     pivots = jnp.diagonal(S)

@@ -4,11 +4,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._linalg import closed_to, dependence_floor
-from jaxlag._rank import independent_rows
+from jaxlag._rank import ROUNDINGS, independent_rows, row_sizes
+from jaxlag._roundings import with_rounding
 from jaxlag._step import Arguments
 
 
@@ -100,10 +101,17 @@ def _rows_consistent(
     t, q, v, params, args = still((t, q, v, params, args))
     terms = dynamics.terms
     A, _ = terms.rows(t, q, v, params)
-    unit = jnp.sqrt(jnp.sum(A**2, axis=1))
-    unit = jnp.where(unit > 0, unit, 1.0) if args.rows is None else args.rows.size
+    unit = _sizes(dynamics, t, q, v, params) if args.rows is None else args.rows.size
     floor = dependence_floor(q.dtype)
-    phi, rate = residuals(dynamics, t, q, v, params)
+
+    def everything(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
+
+    (phi, rate, gamma), noise = with_rounding(everything, t, q, v)
+    phi, rate, gamma = (
+        jnp.where(jnp.abs(c) <= ROUNDINGS * less, 0.0, c)
+        for c, less in zip((phi, rate, gamma), noise, strict=True)
+    )
     if dynamics.quasi is not None:
         off = jnp.zeros_like(unit)
         for c, x in ((phi, q), (rate, v)):
@@ -126,11 +134,19 @@ def _rows_consistent(
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
-    gamma = terms.gamma(t, q, v, params)
     turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
     bent = left(gamma) / (floor * jnp.where(turn > 0, turn, 1.0))
     bad = jnp.where(near, jnp.maximum(bent, bad), bad)
     return _consistency(off, bad, near, phi, rate)
+
+
+def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Float[Array, " m"]:
+    """Of every row, see `row_sizes`."""
+
+    def rows(q: Array) -> Array:
+        return dynamics.terms.rows(t, q, v, params)[0]
+
+    return row_sizes(rows, q, rows(q)).size
 
 
 def _fitting(
@@ -144,7 +160,8 @@ def _fitting(
     size = jnp.sqrt(jnp.sum(B**2, axis=0))
     B = B / jnp.where(size > 0, size, 1.0)
     sines = jnp.abs(A @ B) / unit[:, None]
-    rows = jnp.concatenate([A / unit[:, None], B.T])
+    void = row_sizes(lambda q: dynamics.terms.rows(t, q, v, params)[0], q, A).void
+    rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
     # Singular kinematics, as at gimbal lock, are a fault of their own.
     sound = jnp.all(jnp.isfinite(rows))
     rows = jnp.where(sound, rows, jnp.eye(*rows.shape, dtype=q.dtype))
@@ -166,9 +183,10 @@ def rows_hold(
     ts, q, v, params = still((ts, q, v, params))
     rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
-    unit = jnp.sqrt(jnp.sum(A**2, axis=2))
+    first = _sizes(dynamics, ts[0], q[0], v[0], params)
+    unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
     speed = 1.0 + jnp.max(jnp.abs(v), axis=1)[:, None]
-    off = jnp.abs(rates) / jnp.where(unit > 0, unit, 1.0) / speed / dependence_floor(q.dtype)
+    off = jnp.abs(rates) / unit / speed / dependence_floor(q.dtype)
     off = jnp.max(jnp.where(jnp.isfinite(off), off, 0.0), axis=0)
     return jnp.all(off <= 1.0), jnp.argmax(off).astype(jnp.int32)
 

@@ -25,7 +25,8 @@ from jaxlag._equilibrium_search import (
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
-from jaxlag._rank import least_norm
+from jaxlag._rank import ROUNDINGS, least_norm, row_sizes
+from jaxlag._roundings import with_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, of_state, vector
@@ -257,6 +258,22 @@ def _search(key: Any, values: Any) -> Equilibrium:
     params = _params.join(given[0], params_static.tree)
     rows = system.rows(params, q0.dtype)
 
+    def idle_rows(t: Array, params: Any) -> Array:
+        """Rows that are 0 = 0 but for rounding at the start and nearby: their lam is 0."""
+        params = _params.join(params, params_static.tree)
+
+        def of(q: Array) -> Array:
+            return system.terms.rows(t, q, rest, params)[0]
+
+        def phi(t: Array, q: Array) -> Array:
+            return system.terms.position(t, q, params)
+
+        here, less = with_rounding(phi, t, q0)
+        void = row_sizes(of, *jax.lax.stop_gradient((q0, of(q0)))).void
+        return void & (jnp.abs(here) <= ROUNDINGS * less)
+
+    idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else jnp.zeros((0,), bool)
+
     def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any]:
         """(triple of Q, h and A, Q - h + A^T lam, the same and phi of z) at (q, v)."""
         params = _params.join(params, params_static.tree)
@@ -266,7 +283,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
         def parts(q: Array, v: Array) -> tuple[Array, Array, Array]:
             given = evaluate(inputs, t, q, v, params)
             Q, h = system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
-            return Q, h, system.terms.rows(t, q, rest, params)[0]
+            A = system.terms.rows(t, q, rest, params)[0]
+            return Q, h, jnp.where(idle[:, None], 0.0, A)
 
         def unbalanced(q: Array, v: Array, lam: Array) -> Array:
             Q, h, A = parts(q, v)
@@ -276,7 +294,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
             q, lam = z[:n], z[n:]
             if not rows.size:
                 return unbalanced(q, rest, lam)
-            phi = system.terms.position(t, q, params)
+            phi = jnp.where(idle, lam, system.terms.position(t, q, params))
             return jnp.concatenate([unbalanced(q, rest, lam), phi])
 
         return parts, unbalanced, whole

@@ -38,8 +38,9 @@ def row_of(function):
 )
 def test_rows_are_none_where_rounding_is_all_of_them(function, q, there, dtype):
     rows, q = row_of(function), jnp.array(q, dtype)
-    found, size = row_sizes(rows, q, rows(q))
+    found, void, size = row_sizes(rows, q, rows(q))
     assert found.tolist() == [there]
+    assert void.tolist() == [False]  # it is one nearby
     if there:
         np.testing.assert_allclose(size[0], jnp.linalg.norm(rows(q)), rtol=1e-6)
     else:

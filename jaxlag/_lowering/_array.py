@@ -286,10 +286,12 @@ class ArrayTerms(Terms):
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
         still = jax.lax.stop_gradient
-        there, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        there, void, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
         if A.shape[0] == 1:
-            a, lam = self._solved(M, right, t, q, v, params, inputs, None)
-            fine = there[0]
+            choice = Choice(~void, ~void)
+            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            lam = jnp.where(void, 0.0, lam)
+            fine = (there | void)[0]
         else:
             read = self.rows_read(t, q, v, params, inputs)
             unread = np.logical_not(read)

@@ -110,7 +110,7 @@ class Moving:
         left = terms.euler_lagrange(t, q, v, a, params) - self._force()
         A, _ = terms.rows(t, q, v, params)
         still = jax.lax.stop_gradient
-        there, _ = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A)))
+        there = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A))).there
         units = units_of(*still((terms.mass(t, q, v, params), A)))
         metric = jnp.diag(units**-2)
         kept = independent_rows(metric, still(A), there=there, mobile_first=True)
