@@ -21,6 +21,7 @@ from bench import (
     _gradient_rows,
     _long_runs,
     _places,
+    _redundant,
     _single_precision,
     _walls,
 )
@@ -37,6 +38,7 @@ PARTS = (
     _gradient_rows,
     _fit_rows,
     _walls,
+    _redundant,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
 LEAST = 25  # rows that must end in success
@@ -65,6 +67,8 @@ QUICK = {
     "steps far too long for a stiff spring",
     "sharp: one-sided spring",
     "sharp: exponential barrier",
+    "reactions beside redundant rows, levers to 10 nm",
+    "rows that are 0 = 0 but for rounding",
 }
 
 

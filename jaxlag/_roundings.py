@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 RUNS = 4
@@ -98,7 +98,7 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
     """
     args = jax.lax.stop_gradient(args)
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    exact = jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *jax.tree.leaves(args))
+    exact = jaxpr_as_fun(closed)(*jax.tree.leaves(args))
     draw = np.random.default_rng(7)
     table = draw.uniform(0.5, 1.0, (RUNS, _TABLE)) * draw.choice([-1.0, 1.0], (RUNS, _TABLE))
 

@@ -66,12 +66,12 @@ class Settling(eqx.Module):
             verdict = Verdict(found, closed, true)
         elif args.rows is not None:
 
-            def closed() -> Array:
+            def look() -> Array:
                 surface = self.dynamics.surface(*still((tau, y, args)))
                 return self._closed(surface, *self.dynamics.parts(still(y)), args)
 
             one = self.dynamics.rows.size == 1
-            hold = jax.lax.cond(args.rows.kept[0], lambda: true, closed) if one else closed()
+            hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
             verdict = Verdict(true, hold, true)
         return y, verdict._replace(pressed=self.pressed(tau, y, args))
 

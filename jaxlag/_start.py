@@ -104,7 +104,7 @@ def _rows_consistent(
     unit = _sizes(dynamics, t, q, v, params) if args.rows is None else args.rows.size
     floor = dependence_floor(q.dtype)
 
-    def everything(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    def everything(t: Array, q: Array, v: Array) -> tuple[Array, ...]:
         return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
 
     (phi, rate, gamma), noise = with_rounding(everything, t, q, v)
