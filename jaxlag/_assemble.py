@@ -14,6 +14,8 @@ from jaxlag import _params
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
+from jaxlag._custom_jvp import keeping_rules
+from jaxlag._dynamics import still
 from jaxlag._errors import AssemblyError, bad
 from jaxlag._kkt import augmented, solve_kkt
 from jaxlag._linalg import closed_to, dependence_floor, factor_mass
@@ -163,6 +165,7 @@ def assemble(
     key = system, _params.Static(static), held, rates_held
     found = _run(key, (q, v, traced, t, diagonal))
     if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
+        found = still(found)  # under grad its numbers are traced, and have values all the same
         fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
         raise AssemblyError(f"Assembly ended with status {found.message()}{fix}", found)
     return found
@@ -311,7 +314,11 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
     def tangent(linear: Callable, y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)
 
-    return jax.lax.custom_root(flat, jnp.concatenate([q, lam]), found, tangent)[:n]
+    @keeping_rules
+    def root(z: Array) -> Array:
+        return jax.lax.custom_root(flat, z, found, tangent)
+
+    return root(jnp.concatenate([q, lam]))[:n]
 
 
 def _still(phi: Callable, q: Array) -> Array:

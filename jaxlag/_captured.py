@@ -21,6 +21,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag import _params
 from jaxlag._closed import Closed, plain
+from jaxlag._custom_jvp import with_rules_kept
 from jaxlag._errors import bad
 from jaxlag._home import of_library
 from jaxlag._input_values import InputValues
@@ -161,7 +162,8 @@ class Captured:
             return found
 
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
-        return _Program(owned(code), form, static_part, frozenset(read))
+        code = with_rules_kept(owned(code))
+        return _Program(code, form, static_part, frozenset(read))
 
     def _warn_of_counts(self, kind: Any) -> None:
         """Say where ints of Python's are given as if they were numbers: each value compiles anew.

@@ -9,6 +9,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._custom_jvp import CustomJVP
+
 Forces = Callable[[Array], Array]
 """F(q): what is to vanish, (n,) in and out."""
 
@@ -294,7 +296,7 @@ def _variation(
     return jnp.max(jnp.abs(there - here.J), axis=0)
 
 
-@jax.custom_jvp
+@CustomJVP
 def differentiable_if(known: Bool[Array, ""], x: Float[Array, " n"]) -> Float[Array, " n"]:
     """x, with NaN for its derivatives unless `known`."""
     return x

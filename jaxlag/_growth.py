@@ -10,11 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
 from jaxlag._captured import warn_of_changes
+from jaxlag._custom_jvp import CustomJVP
 from jaxlag._errors import bad
 from jaxlag._inputs import all_knots
 from jaxlag._lanes import in_batches
@@ -232,7 +232,7 @@ def grad_growth(
     return growth
 
 
-@jax.custom_jvp
+@CustomJVP
 def _not_differentiated(x: Any) -> Any:
     """The same; an error says where a derivative is asked for."""
     return x
@@ -240,11 +240,10 @@ def _not_differentiated(x: Any) -> Any:
 
 @partial(_not_differentiated.defjvp, symbolic_zeros=True)
 def _refused(primals: tuple, tangents: tuple) -> Any:
-    leaves = jax.tree.leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
-    if not all(isinstance(x, SymbolicZero) for x in leaves):
+    if jax.tree.leaves(tangents):
         fix = "Pass jax.lax.stop_gradient of the motion's start and params."
         raise bad("grad_growth", "be left out of what is differentiated", "it was not", fix)
-    return primals[0], tangents[0]
+    return primals[0], None
 
 
 def _warn_beyond(growth: GradientGrowth) -> None:

@@ -19,6 +19,8 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
+from jaxlag._custom_jvp import CustomJVP
+
 LANES = 16
 MOST = 64  # trajectories of an implicit method
 NUMBERS = 2**14  # of all their Jacobians of the vector field
@@ -44,14 +46,13 @@ def in_lanes(
         even: whether chunks may be smaller to be equal.
     """
 
-    @jax.custom_jvp
+    @CustomJVP
     def constant(args: tuple) -> PyTree:
         return batched(args)
 
     @constant.defjvp
     def _(primals: tuple, _: tuple) -> tuple:
-        results = constant(*primals)
-        return results, jax.tree.map(zero_tangent, results)
+        return constant(*primals), None
 
     @custom_vmap
     def batched(args: tuple) -> PyTree:
@@ -118,35 +119,3 @@ def in_batches(
     parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), rows)
     results = lax.map(jax.vmap(function), parts)
     return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
-
-
-def lanes_first(tree: PyTree) -> PyTree:
-    """The same values, with the axis of a vmap in front.
-
-    JAX takes the results of a `custom_jvp` function and of its rule to have it in one place.
-    """
-
-    @jax.custom_jvp
-    def same(x: Any) -> Any:
-        return placed(x)
-
-    @same.defjvp
-    def _(primals: tuple, tangents: tuple) -> tuple:
-        return same(*primals), tangents[0]
-
-    @custom_vmap
-    def placed(x: Any) -> Any:
-        return x
-
-    @placed.def_vmap
-    def _(_: int, mapped: list, x: Any) -> tuple:
-        return x, mapped[0]
-
-    return jax.tree.map(same, tree)
-
-
-def zero_tangent(x: Any) -> Any:
-    """The tangent of a constant."""
-    if jnp.issubdtype(x.dtype, jnp.inexact):
-        return jnp.zeros_like(x)
-    return jnp.zeros(x.shape, jax.dtypes.float0)

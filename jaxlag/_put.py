@@ -13,7 +13,8 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from jaxlag._lanes import LANES, zero_tangent
+from jaxlag._custom_jvp import CustomJVP
+from jaxlag._lanes import LANES
 
 
 def put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
@@ -21,7 +22,7 @@ def put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
     return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, row)
 
 
-@jax.custom_jvp
+@CustomJVP
 def _put(buffer: Array, row: Array, index: Array) -> Array:
     return _place(buffer, row, index)
 
@@ -31,7 +32,7 @@ def _(primals: tuple, tangents: tuple) -> tuple:
     (*_, index), (buffer_dot, row_dot, _) = primals, tangents
     result = _put(*primals)
     if not jnp.issubdtype(result.dtype, jnp.inexact):
-        return result, zero_tangent(result)
+        return result, None
     return result, _put(buffer_dot, row_dot, index)
 
 

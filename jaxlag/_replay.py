@@ -16,9 +16,10 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxlag import _xla
 from jaxlag._again import again
+from jaxlag._custom_jvp import CustomJVP
 from jaxlag._drive import drive
 from jaxlag._gradient import GradientMode, Keep
-from jaxlag._lanes import LANES, at_once_implicit, in_lanes, lanes_first, zero_tangent
+from jaxlag._lanes import LANES, at_once_implicit, in_lanes
 from jaxlag._record import Outcome, Times
 from jaxlag._status import Status
 from jaxlag._variations import Setup, changed, changes, filled, in_loops, path_of, unpack
@@ -48,10 +49,10 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
     """Integrate and save; differentiable in y0, args and times."""
     inexact, rest, setup, static = halves(problem)
 
-    @jax.custom_jvp
+    @CustomJVP
     def run(inexact: Any, rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
         outcome = _driven(inexact, rest, setup, static, record=False)
-        return lanes_first(_told(outcome))
+        return _told(outcome)
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
@@ -68,8 +69,7 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
             rows, told = _told(outcome)
             rows_dot = Rows(walk.rows[0], walk.last[0], walk.time)
         told = told._replace(gradient=_mode(outcome, static))
-        rows, told = lanes_first((rows, told))
-        return (rows, told), (rows_dot, jax.tree.map(zero_tangent, told))
+        return (rows, told), (rows_dot, jax.tree.map(lambda _: None, told))
 
     return run(inexact, rest, setup)
 
@@ -102,15 +102,15 @@ def _mode(outcome: Outcome, static: Any) -> Array:
 def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
     """The loop with its record; states on the way and rows are differentiable."""
 
-    @jax.custom_jvp
+    @CustomJVP
     def run(inexact: Any, rest: Any, setup: Setup) -> Outcome:
-        return lanes_first(_driven(inexact, rest, setup, static, record=True))
+        return _driven(inexact, rest, setup, static, record=True)
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
         inexact, rest, setup = primals
         outcome = _recorded(inexact, rest, setup, static)
-        dots = jax.tree.map(zero_tangent, outcome)
+        dots = jax.tree.map(lambda _: None, outcome)
         if not static[1].remembers:
             change = changes(tangents[0], outcome)
             record = outcome.record

@@ -15,6 +15,8 @@ from jaxlag._arguments import check_declaration
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
+from jaxlag._custom_jvp import keeping_rules
+from jaxlag._dynamics import still
 from jaxlag._equilibrium_search import (
     differentiable_if,
     judge,
@@ -246,6 +248,7 @@ def equilibrium(
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
     found = _search(key, (q0, t, tol, traced, inputs_traced))
     if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
+        found = still(found)  # under grad its numbers are traced, and have values all the same
         raise EquilibriumError(f"Search ended with status {found.message()}", found)
     return found
 
@@ -304,9 +307,13 @@ def _search(key: Any, values: Any) -> Equilibrium:
     if rows.size:
         Q, h, A = jax.lax.stop_gradient(parts(q0, rest))
         z0 = jnp.concatenate([q0, jnp.linalg.lstsq(A.T, h - Q)[0]])
-    z, steps = jax.lax.custom_root(
-        whole, z0, partial(search, max_steps), solve_tangent, has_aux=True
-    )
+
+    @keeping_rules
+    def root(z0: Array) -> tuple[Array, Array]:
+        solve = partial(search, max_steps)
+        return jax.lax.custom_root(whole, z0, solve, solve_tangent, has_aux=True)
+
+    z, steps = root(z0)
     if rows.size:
         # Of multipliers of dependent rows the search finds those nearest to where it began.
         q, lam = z[:n], z[n:]

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._again import again
@@ -36,17 +35,13 @@ def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
 
 
 def changes(tangents: Any, outcome: Outcome) -> Any:
-    """The directions of what moves, None for what does not.
+    """The directions of what moves, None still for what does not.
 
     A trajectory that took no step depends on nothing but its start: its derivatives, which may
     not be finite, are kept out.
     """
     moved = outcome.accepted > 0
-
-    def change(dot: Any) -> Any:
-        return None if isinstance(dot, SymbolicZero) else jnp.where(moved, dot, 0.0)
-
-    return jax.tree.map(change, tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    return jax.tree.map(lambda dot: jnp.where(moved, dot, 0.0), tangents)
 
 
 def filled(change: Any, like: Any) -> Any:

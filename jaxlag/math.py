@@ -28,16 +28,16 @@ Scalars act element by element, vectors along the last axis. The dtype is that o
 integers become the default float, complex numbers raise a ValueError.
 """
 
-from functools import partial
+from functools import cache
 from math import factorial, perm
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from jaxlag._custom_jvp import CustomJVP
 from jaxlag._errors import bad
 from jaxlag._kinks import smooth
 
@@ -190,7 +190,7 @@ def sinc(x: Any) -> Float[Array, "..."]:
     x = _real("sinc: x", x)
     small = jnp.abs(x) < _SINC_SERIES_BELOW**0.5
     away = jnp.where(small, 1.0, x)
-    return jnp.where(small, _sinc_series(0, jnp.where(small, x, 0.0) ** 2), jnp.sin(away) / away)
+    return jnp.where(small, _sinc_series(0)(jnp.where(small, x, 0.0) ** 2), jnp.sin(away) / away)
 
 
 @smooth
@@ -209,7 +209,7 @@ def sinc_sqrt(z: Any) -> Float[Array, "..."]:
     z = _real("sinc_sqrt: z", z)
     small = jnp.abs(z) < _SINC_SERIES_BELOW
     x = jnp.sqrt(jnp.where(small, 1.0, z))
-    return jnp.where(small, _sinc_series(0, jnp.where(small, z, 0.0)), jnp.sin(x) / x)
+    return jnp.where(small, _sinc_series(0)(jnp.where(small, z, 0.0)), jnp.sin(x) / x)
 
 
 def one_minus_cos(x: Any) -> Float[Array, "..."]:
@@ -275,10 +275,9 @@ def _scaled(x: Array) -> tuple[Array, Array]:
 
 # With rules of their own, since the chain rule through the scaling passes through |x|^-2 on its way
 # to the second derivative of |x|, of order 1/|x|, and overflows. Those of |x| for n = 1 are exact.
-@jax.custom_jvp
+@CustomJVP
 def _norm(x: Array) -> Array:
     scaled, scale = _scaled(x)
-    # Safe by itself: partial evaluation of a loop may differentiate this, not the rule below.
     return scale[..., 0] * sqrt(jnp.sum(scaled**2, axis=-1))
 
 
@@ -288,7 +287,7 @@ def _norm_rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Ar
     return _norm(x), jnp.sum(_unit(x) * dx, axis=-1)
 
 
-@jax.custom_jvp
+@CustomJVP
 def _unit(x: Array) -> Array:
     scaled, _ = _scaled(x)
     length = sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
@@ -305,18 +304,20 @@ def _unit_rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Ar
 
 
 # With a rule of its own, as differentiating the sum costs many times the sum of the derivatives.
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sinc_series(order: int, z: Array) -> Array:
+@cache
+def _sinc_series(order: int) -> CustomJVP:
     """d^order/dz^order of sum_k (-z)^k/(2k + 1)!, by nested multiplication."""
-    total = jnp.zeros_like(z)
-    for k in reversed(range(order, order + _SINC_TERMS)):
-        total = (-1) ** k * perm(k, order) / factorial(2 * k + 1) + z * total
-    return total
 
+    @CustomJVP
+    def series(z: Array) -> Array:
+        total = jnp.zeros_like(z)
+        for k in reversed(range(order, order + _SINC_TERMS)):
+            total = (-1) ** k * perm(k, order) / factorial(2 * k + 1) + z * total
+        return total
 
-@_sinc_series.defjvp
-def _sinc_series_rule(
-    order: int, primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[Array, Array]:
-    (z,), (dz,) = primals, tangents
-    return _sinc_series(order, z), _sinc_series(order + 1, z) * dz
+    @series.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        (z,), (dz,) = primals, tangents
+        return series(z), _sinc_series(order + 1)(z) * dz
+
+    return series

@@ -12,9 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from jaxlag._custom_jvp import CustomJVP
 from jaxlag._linear import LinearMap, linear
 from jaxlag._lowering._program import Program
 from jaxlag._lowering._straight import Pairs, elements, is_trig, stacked, straight
@@ -43,23 +43,23 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
     def results(row: Row) -> Array:
         return jnp.stack(straight(program, dtype, elements(row[0]), elements(row[1]), lanes))
 
-    @jax.custom_jvp
+    @CustomJVP
     def call(carried: Array, given: Array) -> Array:
         return apart((carried, given))
 
     @partial(call.defjvp, symbolic_zeros=True)
     def _(primals: Row, tangents: tuple) -> tuple:
         found, kept = keeping(*primals)
-        return found, _derivative(of_results, (primals, kept), tangents, found)
+        return found, _derivative(of_results, (primals, kept), tangents)
 
-    @jax.custom_jvp
+    @CustomJVP
     def keeping(carried: Array, given: Array) -> tuple[Array, Array]:
         return both_apart((carried, given))
 
     @partial(keeping.defjvp, symbolic_zeros=True)
     def _(primals: Row, tangents: tuple) -> tuple:
         found, kept = keeping(*primals)
-        return (found, kept), _derivative(of_both, (primals, kept), tangents, (found, kept))
+        return (found, kept), _derivative(of_both, (primals, kept), tangents)
 
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
     apart, both_apart = boundary(results), boundary(both)
@@ -85,12 +85,9 @@ def _by_numbers(function: Callable, dtype: Any) -> Callable:
     return lambda *rows: whole(inner(*jax.tree.map(elements, rows)))
 
 
-def _derivative(maps: dict, at: tuple, tangents: tuple, like: Any) -> Any:
-    dot = tuple(None if isinstance(x, SymbolicZero) else x for x in tangents)
-    which = tuple(x is not None for x in dot)
-    if not any(which):
-        return jax.tree.map(jnp.zeros_like, like)
-    return linear(maps[which], at, dot)
+def _derivative(maps: dict, at: tuple, tangents: tuple) -> Any:
+    which = tuple(x is not None for x in tangents)
+    return linear(maps[which], at, tangents)
 
 
 def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:

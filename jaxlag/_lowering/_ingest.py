@@ -15,6 +15,7 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxlag import _params
+from jaxlag._custom_jvp import with_rule_kept
 from jaxlag._dependence import scan_sizes
 from jaxlag._lowering._elementwise import ELEMENTWISE, elementwise
 from jaxlag._lowering._graph import Graph, Node, named
@@ -31,7 +32,7 @@ class Unsupported(Exception):
 
 
 class Rule:
-    """A function with a derivative rule of its own (jax.custom_jvp), as one call of it.
+    """A function with a derivative rule of its own, as one call of it.
 
     Attributes:
         avals: shapes and dtypes of its operands.
@@ -40,12 +41,11 @@ class Rule:
     """
 
     def __init__(self, eqn: Any) -> None:
-        self.eqn = eqn
+        self.eqn = eqn = with_rule_kept(eqn)
         self.avals = [v.aval for v in eqn.invars]
         self.shapes = [v.aval.shape for v in eqn.outvars]
         self.body: ClosedJaxpr = eqn.params["call_jaxpr"]
-        rule = eqn.params["jvp_jaxpr_fun"]
-        known = None if self.body.consts else (str(self.body), id(getattr(rule, "f", rule)))
+        known = None if self.body.consts else (str(self.body), eqn.params["rule"].key)
         self.key = known or id(self)
 
     def __hash__(self) -> int:
@@ -56,8 +56,7 @@ class Rule:
 
     def call(self, *operands: Any) -> list[Any]:
         """The results, as arrays; derivatives follow the rule."""
-        params = self.eqn.primitive.get_bind_params(self.eqn.params)
-        return self.eqn.primitive.bind(*operands, **params)
+        return self.eqn.primitive.bind(*operands, **self.eqn.params)
 
     @cached_property
     def tangents(self) -> ClosedJaxpr:

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaxlag._custom_jvp import CustomJVP
 from jaxlag._lowering._graph import FIXED
 from jaxlag._lowering._ingest import Rule
 from jaxlag._lowering._program import Line, Program
@@ -92,7 +93,7 @@ def is_trig(line: Line) -> bool:
     return line.op == "call" and line.data.name in ("sin", "cos")
 
 
-@jax.custom_jvp
+@CustomJVP
 def _quotient(x: Array, y: Array) -> Array:
     """x / y, whose derivative (dx - x/y dy) / y forms no square of y, as that of JAX does."""
     return x / y

@@ -13,6 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxlag._custom_jvp import CustomJVP
+
 # pi in parts: 33 bits, 33 bits and the rest, so that multiples of the first two are exact up to
 # 2^20.
 _PI = (3.1415926534682512, 1.2154201012607932e-10, 4.044532497591901e-21)
@@ -46,7 +48,7 @@ _MOST = 1.6
 _INTEGER = 1.5 * 2.0**52
 
 
-@jax.custom_jvp
+@CustomJVP
 def sincos(x: Float[Array, "*s"]) -> tuple[Float[Array, "*s"], Float[Array, "*s"]]:
     """(sin x, cos x); NaN for infinite x.
 
@@ -69,7 +71,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple:
     return (s, c), (c * x_dot, -s * x_dot)
 
 
-@jax.custom_jvp
+@CustomJVP
 def recalled(x: Array, s: Array, c: Array) -> tuple[Array, Array]:
     """(sin x, cos x) = (s, c), found before."""
     return s, c
@@ -99,11 +101,7 @@ def by_polynomials(x: Array) -> tuple[Array, Array]:
 
 
 def _parity(n: Array) -> Array:
-    """(-1)^n, by bits of numbers, which have no derivative.
-
-    What it is a factor of has: JAX forgets the rule above in second derivatives of loops, and
-    differentiates the polynomials.
-    """
+    """(-1)^n, by bits of numbers."""
     odd = lax.shift_left(_bits(n + _INTEGER), np.uint64(63))
     return lax.bitcast_convert_type(lax.bitwise_xor(_bits(jnp.ones_like(n)), odd), n.dtype)
 

@@ -10,6 +10,8 @@ from jax import Array
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import PyTree
 
+from jaxlag._custom_jvp import CustomJVP
+
 MOST, EACH = 8, 12  # derivatives taken anew, iterations with each
 MEMORY = 3  # iterations in which increments halve while they fall
 
@@ -43,7 +45,7 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
     def function(z: Array, given: PyTree) -> Array:
         return eqx.combine(given, static)(z)
 
-    @jax.custom_jvp
+    @CustomJVP
     def solve(guess: Array, rounded: Array, given: PyTree) -> tuple[Array, Array]:
         return _solved(lambda z: function(z, given), guess, rounded)
 
@@ -53,7 +55,7 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
         z, found = solve(*primals)
         r_dot = jax.jvp(lambda given: function(z, given), (given,), (tangents[2],))[1]
         slope = jax.jacfwd(lambda z: function(z, given))(z)
-        return (z, found), (-jnp.linalg.solve(slope, r_dot), jnp.zeros_like(found))
+        return (z, found), (-jnp.linalg.solve(slope, r_dot), None)
 
     z, found = solve(guess, rounded, given)
     return z, found > 0

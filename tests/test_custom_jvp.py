@@ -1,0 +1,366 @@
+"""Rules of their own stay with functions: through every transform, to second derivatives.
+
+The rule of `sine` is unlike the derivative of its body: f' = 2 f, so that f'' = 4 f. What drops it
+gives -f.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._custom_jvp import CustomJVP, keeping_rules
+
+X = 0.3
+LOOPS = {
+    "scan": lambda f: lambda x: jax.lax.scan(lambda c, _: (f(c), None), x, None, length=1)[0],
+    "map": lambda f: lambda x: jax.lax.map(f, x[None])[0],
+    "fori_loop": lambda f: lambda x: jax.lax.fori_loop(0, 1, lambda _, c: f(c), x),
+    "cond": lambda f: lambda x: jax.lax.cond(x > 0, f, lambda x: x, x),
+    "checkpoint": jax.checkpoint,
+    "vmap": lambda f: lambda x: jax.vmap(f)(x[None])[0],
+    "jit": jax.jit,
+}
+DERIVATIVES = {
+    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1],
+    "grad": jax.grad,
+    "jacfwd": jax.jacfwd,
+    "jacrev": jax.jacrev,
+}
+PAIRS = list(itertools.product(DERIVATIVES, DERIVATIVES))
+
+
+def twice(pair, f):
+    outer, inner = pair
+    return DERIVATIVES[outer](DERIVATIVES[inner](f))
+
+
+@CustomJVP
+def sine(x):
+    return jnp.sin(x)
+
+
+@sine.defjvp
+def _(primals, tangents):
+    return sine(*primals), 2.0 * sine(*primals) * tangents[0]
+
+
+@jax.custom_jvp
+def users(x):
+    return jnp.sin(x)
+
+
+@users.defjvp
+def _(primals, tangents):
+    return users(*primals), 2.0 * users(*primals) * tangents[0]
+
+
+def of_pairs(fs, pairs):
+    """All second derivatives at X, in one program."""
+    found = jax.jit(lambda x: [twice(pair, f)(x) for f in fs for pair in pairs])(jnp.asarray(X))
+    return dict(zip(itertools.product(range(len(fs)), pairs), map(float, found), strict=True))
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_rules_survive_loops(loop):
+    """Ours, and one by `jax.custom_jvp` in a program in which they are kept."""
+    found = of_pairs([LOOPS[loop](f) for f in (sine, keeping_rules(users))], PAIRS)
+    wanted = 4 * np.sin(X)
+    assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
+
+
+@pytest.mark.parametrize("outer", LOOPS)
+def test_rules_survive_loops_within_loops(outer):
+    inner = [LOOPS[outer](LOOPS[inner](sine)) for inner in LOOPS]
+    found = of_pairs(inner, [("jvp", "grad"), ("grad", "grad")])
+    wanted = 4 * np.sin(X)
+    assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
+
+
+def test_rules_by_jax_are_dropped_by_the_loops_of_jax():
+    """Why the rule is a primitive's. Once this fails, on all supported versions, it need not be."""
+    found = jax.jvp(jax.grad(LOOPS["scan"](users)), (X,), (1.0,))[1]
+    assert np.isclose(found, 4 * np.sin(X)) or np.isclose(found, 2 * np.cos(X))
+
+
+@CustomJVP
+def scaled(tree, count, factor):
+    """Of a dict, an integer and a number."""
+    return {"sum": jnp.sum(tree["x"]) * factor, "count": count + 1}, tree["x"] * factor
+
+
+SEEN = []
+
+
+def scaled_rule(primals, tangents):
+    tree, _, factor = primals
+    SEEN.append(jax.tree.map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None))
+    dot = jnp.zeros_like(tree["x"]) if tangents[0]["x"] is None else tangents[0]["x"]
+    moved = 0.0 if tangents[2] is None else tangents[2]
+    rows = dot * factor + tree["x"] * moved
+    return scaled(*primals), ({"sum": 10.0 * jnp.sum(rows), "count": None}, rows)
+
+
+scaled.defjvp(scaled_rule, symbolic_zeros=True)
+
+
+def test_trees_integers_and_zero_tangents():
+    x = jnp.array([1.0, 2.0])
+
+    def total(x, factor):
+        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + rows[0]
+
+    SEEN.clear()
+    np.testing.assert_allclose(jax.grad(total)(x, 5.0), [55.0, 50.0])
+    assert SEEN == [({"x": True}, False, False)]
+    np.testing.assert_allclose(jax.grad(total, argnums=1)(x, 5.0), 31.0)
+    assert SEEN[1] == ({"x": False}, False, True)
+    np.testing.assert_allclose(jax.jit(jax.grad(total, argnums=1))(x, 5.0), 31.0)
+    assert jax.jit(lambda x: scaled({"x": x}, jnp.asarray(3), 5.0)[0]["count"])(x) == 4
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
+def test_rows_of_some_arguments(axes):
+    x, factor = jnp.arange(6.0).reshape(3, 2), jnp.array([2.0, 3.0, 5.0])
+    given = x if axes[0] == 0 else x[0], factor if axes[1] == 0 else factor[0]
+
+    def total(x, factor):
+        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + rows[0]
+
+    for derivative in (jax.grad, jax.jacfwd):
+        by = derivative(total, argnums=(0, 1))
+        found = jax.jit(jax.vmap(by, axes))(*given)
+        single = [
+            by(given[0][i] if axes[0] == 0 else given[0], given[1][i] if axes[1] == 0 else given[1])
+            for i in range(3)
+        ]
+        for k in (0, 1):
+            np.testing.assert_allclose(found[k], jnp.stack([row[k] for row in single]))
+    # The derivative of the batch, not the batch of derivatives.
+    whole = jax.jit(jax.jacrev(lambda *given: jax.vmap(total, axes)(*given), argnums=(0, 1)))
+    jac = whole(*given)[0]
+    for i in range(3):
+        row = jac[i, i] if axes[0] == 0 else jac[i]
+        expected = jax.grad(total)(
+            given[0][i] if axes[0] == 0 else given[0], given[1][i] if axes[1] == 0 else given[1]
+        )
+        np.testing.assert_allclose(row, expected)
+
+
+def test_a_number_without_a_transform_is_computed_at_once():
+    """Nothing is traced where there is nothing to differentiate."""
+    calls = []
+
+    @CustomJVP
+    def seen(x):
+        calls.append(x)
+        return x * x
+
+    seen.defjvp(lambda p, t: (seen(*p), 3.0 * t[0]))
+    assert seen(2.0) == 4.0
+    assert calls == [2.0]
+    assert jax.grad(seen)(2.0) == 3.0
+    with jax.disable_jit():
+        assert jax.grad(seen)(2.0) == 3.0
+
+
+def test_rules_within_rules_are_kept():
+    """The rule of the outer function calls one by `jax.custom_jvp` itself."""
+
+    @jax.custom_jvp
+    def outer(x):
+        return x
+
+    @outer.defjvp
+    def _(primals, tangents):
+        return outer(*primals), users(*primals) * tangents[0]
+
+    kept = LOOPS["scan"](keeping_rules(outer))
+    first = jax.grad(kept)(X)
+    second = jax.jvp(jax.grad(kept), (X,), (1.0,))[1]
+    third = jax.grad(lambda x: jax.jvp(jax.grad(kept), (x,), (1.0,))[1])(X)
+    np.testing.assert_allclose([first, second, third], np.array([1, 2, 4]) * np.sin(X), rtol=1e-15)
+
+
+# ---- What jaxlag makes of it --------------------------------------------------------------------
+
+
+def pendulum(function, lowering="auto"):
+    def lagrangian(t, q, v, params):
+        return 0.5 * v[0] ** 2 + params[0] * jnp.cos(q[0]) + params[1] * function(q[0])
+
+    return jl.System(lagrangian, ("angle",), lowering=lowering)
+
+
+rod = jl.System(
+    lambda t, q, v, params: 0.5 * v @ v + params[0] * q[0] + params[1] * users(q[1]),
+    ("x", "y"),
+    constraints=(jl.Holonomic(lambda t, q, params: q @ q - 1.0, "rod"),),
+)
+PARAMS, STARTS = jnp.array([1.3, 0.4]), jnp.array([0.3, 0.8])
+
+
+def end(system, **options):
+    def angle(start, params):
+        motion = jl.simulate(system, [start], [0.0], [0.0, 1.0], params, **options)
+        return motion["angle"][-1]
+
+    return angle
+
+
+pulled = jl.System(
+    lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p[0] * q[0] ** 2 + p[1] * jnp.sin(q[0] + 1.0), ("x",)
+)
+
+
+def resting(start, params):
+    return start * jl.equilibrium(pulled, [start], params).q[0]
+
+
+def assembled(start, params):
+    q = jnp.stack([jnp.sin(start), params[0] * jnp.cos(start)])
+    return jl.assemble(rod, q, jnp.zeros(2), params=params).q[0] * params[1] ** 2
+
+
+def swung(start, params):
+    q = jnp.stack([jnp.sin(start), jnp.cos(start)])
+    return jl.simulate(rod, q, [0.0, 0.0], [0.0, 0.5], params)["x"][-1]
+
+
+def accelerated(start, params):
+    q = (start * params[0])[None]
+    return pendulum(users).acceleration(params**2, q, jnp.ones(1))[0]
+
+
+def lengths(start, params):
+    x = jnp.stack([start * params[0], params[1]])
+    return jl.math.norm(x) + params[1] ** 2 * jl.math.sinc(1e-3 * x[0]) + jl.math.unit(x)[1]
+
+
+CHEAP = {"accelerated": accelerated, "lengths": lengths, "assembled": assembled}
+CHEAP |= {"resting": resting}
+MOTIONS = {
+    "auto": end(pendulum(users)),
+    "array": end(pendulum(users, "array")),
+    "constrained": swung,
+    "fixed": end(pendulum(users), method="dopri5", dt=0.1),
+    "gauss4": end(pendulum(users), method="gauss4", dt=0.1),
+    "implicit": end(pendulum(users), method="kvaerno5"),
+    "implicit fixed": end(pendulum(users), method="implicit_euler", dt=0.1),
+    "variational2": end(pendulum(users), method="variational2", dt=0.1),
+    "splitting4": end(pendulum(users), method="splitting4", dt=0.1),
+}
+AROUND = {
+    "scan": lambda f, w: jax.lax.scan(lambda c, q: (c + f(q, w), None), 0.0 * w[0], STARTS)[0],
+    "map": lambda f, w: jax.lax.map(lambda q: f(q, w), STARTS).sum(),
+    "fori_loop": lambda f, w: jax.lax.fori_loop(0, 2, lambda i, c: c + f(STARTS[i], w), 0.0 * w[0]),
+    "vmap": lambda f, w: jax.vmap(lambda q: f(q, w))(STARTS).sum(),
+    "cond": lambda f, w: sum(
+        jax.lax.cond(q < w[0], lambda q: f(q, w), lambda q: q, q) for q in STARTS
+    ),
+    "checkpoint": lambda f, w: sum(jax.checkpoint(f)(q, w) for q in STARTS),
+    "map of checkpoint": lambda f, w: jax.lax.map(jax.checkpoint(lambda q: f(q, w)), STARTS).sum(),
+    "checkpoint of map": lambda f, w: jax.checkpoint(AROUND["map"], static_argnums=0)(f, w),
+    "vmap of scan": lambda f, w: jax.vmap(
+        lambda q: jax.lax.scan(lambda c, k: (c + f(q, k * w), None), 0.0 * w[0], jnp.ones(1))[0]
+    )(STARTS).sum(),
+    "scan of vmap": lambda f, w: jax.lax.scan(
+        lambda c, k: (c + AROUND["vmap"](f, k * w), None), 0.0 * w[0], jnp.ones(1)
+    )[0],
+    "vmap of cond": lambda f, w: jax.vmap(
+        lambda q: jax.lax.cond(q < w[0], lambda q: f(q, w), lambda q: q, q)
+    )(STARTS).sum(),
+}
+
+
+def matrix(derivative):
+    """From a function of params to the row, or the matrix, of its derivatives."""
+    if derivative == "jvp":
+        return lambda f: lambda w: jnp.stack([jax.jvp(f, (w,), (e,))[1] for e in jnp.eye(2)], -1)
+    if derivative == "grad":
+
+        def rows(f):
+            def of(w):
+                if jax.eval_shape(f, w).shape == ():
+                    return jax.grad(f)(w)
+                return jnp.stack([jax.grad(lambda w, i=i: f(w)[i])(w) for i in range(2)])
+
+            return of
+
+        return rows
+    return DERIVATIVES[derivative]
+
+
+def hessian_of(function):
+    """In no loop, where no rule is dropped."""
+
+    def total(w):
+        return function(STARTS[0], w) + function(STARTS[1], w)
+
+    return jax.hessian(total), jax.jacfwd(jax.jacfwd(total))
+
+
+def check(function, loops, pairs, rtol):
+    """Everything in one program; forward derivatives alone, and no loop, say what is right."""
+    chosen = list(itertools.product(loops, pairs))
+    ways = [
+        matrix(outer)(matrix(inner)(eqx.Partial(AROUND[loop], function)))
+        for loop, (outer, inner) in chosen
+    ]
+    by = jax.jit(lambda w: [way(w) for way in (*ways, *hessian_of(function))])
+    *found, reverse, wanted = by(PARAMS)
+    scale = jnp.max(jnp.abs(wanted))
+    for name, x in zip([*chosen, "no loop"], [*found, reverse], strict=True):
+        assert jnp.max(jnp.abs(x - wanted)) <= rtol * scale, (name, x, wanted)
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_second_derivatives_of_values_in_loops(name):
+    check(CHEAP[name], ["map"], [("jvp", "grad"), ("grad", "grad")], 1e-10)
+
+
+@pytest.mark.parametrize("lowering", ["auto", "array"])
+def test_second_derivatives_of_motions_in_loops(lowering):
+    """And without a loop of the user's: that of the steps drops no rule either."""
+    angle = end(pendulum(users, lowering), method="bosh3", dt=0.25)
+
+    def alone(w):
+        return angle(0.3, jnp.stack([1.3, w]))
+
+    def looped(w):
+        return jax.lax.map(lambda start: angle(start, jnp.stack([1.3, w])), jnp.array([0.3]))[0]
+
+    def jvp(f):
+        return lambda w: jax.jvp(f, (w,), (1.0,))[1]
+
+    ways = [jvp(jax.grad(looped)), jvp(jax.grad(alone)), jvp(jvp(alone))]
+    *found, wanted = jax.jit(lambda w: [way(w) for way in ways])(0.4)
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("loop", AROUND)
+@pytest.mark.parametrize("name", CHEAP)
+def test_all_pairs_of_values(name, loop):
+    check(CHEAP[name], [loop], PAIRS, 1e-10)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("loop", AROUND)
+def test_all_pairs_of_motions(loop):
+    check(MOTIONS["auto"], [loop], PAIRS, 1e-7)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", MOTIONS)
+def test_pairs_of_all_methods(name):
+    pairs = [("jvp", "grad"), ("jvp", "jacfwd"), ("grad", "jvp")]
+    if "implicit" not in name:
+        pairs.append(("grad", "grad"))
+    check(MOTIONS[name], ["map", "vmap of scan"], pairs, 1e-7)
