@@ -20,8 +20,7 @@ from jaxlag._errors import AssemblyError, bad
 from jaxlag._kkt import augmented, solve_kkt
 from jaxlag._linalg import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
-from jaxlag._rank import ROUNDINGS, independent_rows, row_sizes
-from jaxlag._roundings import with_rounding
+from jaxlag._rank import independent_rows, row_sizes, without_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, real, state_vectors
@@ -223,19 +222,15 @@ def _assembled(
         v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
-    size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A))).size
+    _, void, size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))
     floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
 
-    def residuals(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
-        found = terms.position(t, q, params), terms.velocity(t, q, v, params)
-        return rows.of_all(found[0]), found[1]
+    def residuals(q: Array, v: Array) -> tuple[Array, Array]:
+        return rows.of_all(phi(q)), terms.velocity(t, q, v, params)
 
-    (at_q, at_v), (less_q, less_v) = with_rounding(residuals, t, q, v)
-    off = jnp.maximum(
-        jnp.maximum(jnp.abs(at_q) - ROUNDINGS * less_q, 0.0) / (1.0 + jnp.max(jnp.abs(q))),
-        jnp.maximum(jnp.abs(at_v) - ROUNDINGS * less_v, 0.0) / (1.0 + jnp.max(jnp.abs(v))),
-    )
-    off = off / size
+    off = jnp.zeros_like(size)
+    for c, x in zip(without_rounding(residuals, void, size, q, v), (q, v), strict=True):
+        off = jnp.maximum(off, jnp.abs(c) / size / (1.0 + jnp.max(jnp.abs(x))))
     ok = jnp.all(off <= floor)
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
     failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))

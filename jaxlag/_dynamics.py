@@ -189,14 +189,14 @@ class Dynamics(eqx.Module):
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
         if self.rows.size == 1:  # one that vanishes here alone is not to be done without
-            return RowChoice(~void, size, Choice(~void, ~void))
+            return RowChoice(~void, size, void, Choice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
         # Where multipliers are read, what is left out is told by those that are kept.
         reads = not np.all(unread)
         kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
         if not np.any(velocity & ~unread):  # then those that are read come first already
-            return RowChoice(kept, size, Choice(kept, there))
+            return RowChoice(kept, size, void, Choice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise bad(
@@ -206,7 +206,7 @@ class Dynamics(eqx.Module):
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
         reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
-        return RowChoice(kept, size, Choice(reacting, there))
+        return RowChoice(kept, size, void, Choice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._kkt import augmented
 from jaxlag._linalg import eliminate, factor_mass, rank_floor
-from jaxlag._roundings import with_rounding
+from jaxlag._roundings import with_rounding, with_scatter
 
 ROUNDINGS = 16
 """Of what a row is made of: if that is all of it, it is none."""
@@ -74,6 +74,30 @@ def row_sizes(
     made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
     size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
     return Sizes(there, void, jnp.where(size > 0, size, 1.0))
+
+
+def without_rounding(
+    residuals: Callable[..., tuple[Array, ...]],
+    void: Bool[Array, " m"],
+    size: Float[Array, " m"],
+    *args: Array,
+) -> tuple[Array, ...]:
+    """Residuals of rows; of those that are void 0 if they are no more than rounding.
+
+    Of such a row a residual does not depend on the state: what changes beside it is rounding.
+
+    Args:
+        residuals: of all rows, of coordinates and what else they are taken to be functions of.
+        void: rows, see `row_sizes`.
+        size: of the rows.
+        args: coordinates, velocities.
+    """
+    found, scatter = with_scatter(residuals, *args)
+    least = float(jnp.finfo(size.dtype).eps) * size
+    return tuple(
+        jnp.where(void & (jnp.abs(c) <= ROUNDINGS * jnp.maximum(less, least)), 0.0, c)
+        for c, less in zip(found, scatter, strict=True)
+    )
 
 
 def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:

@@ -16,12 +16,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
 RUNS = 4
 STRENGTH = 256.0
 """Roundings by which results are changed: so many that the rounding of the runs is none to them."""
+
+NEARBY = 8
+"""Places; that all of so many results agree by luck is not to be feared."""
 
 _TABLE = 1021
 _EXACT = frozenset(
@@ -98,16 +101,15 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
     """
     args = jax.lax.stop_gradient(args)
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    exact = jaxpr_as_fun(closed)(*jax.tree.leaves(args))
+    leaves = jax.tree.leaves(args)
     draw = np.random.default_rng(7)
     table = draw.uniform(0.5, 1.0, (RUNS, _TABLE)) * draw.choice([-1.0, 1.0], (RUNS, _TABLE))
 
-    def run(signs: Array) -> list[Array]:
+    def run(signs: Array) -> tuple[list[Any], list[Any]]:
         changed = _Changed(signs)
-        given = [changed(x) for x in jax.tree.leaves(args)]
-        return changed.run(closed, jax.tree.leaves(args), given)[1]
+        return changed.run(closed, leaves, [changed(x) for x in leaves])
 
-    runs = jax.vmap(run)(jnp.asarray(table))
+    exact, runs = jax.vmap(run, out_axes=(None, 0))(jnp.asarray(table))
     found = [
         jnp.max(jnp.abs(several - one), axis=0) / STRENGTH
         for several, one in zip(runs, exact, strict=True)
@@ -116,32 +118,52 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
     return jax.lax.stop_gradient((jax.tree.unflatten(tree, exact), jax.tree.unflatten(tree, found)))
 
 
+def with_scatter(function: Callable, *args: Array) -> tuple[Any, Any]:
+    """(Results, how far they differ at places nearby), from one program.
+
+    Of what does not change with its arguments that is its rounding, whatever it is made of.
+
+    Args:
+        function: of arrays, with arrays as results.
+        args: its arguments.
+    """
+    args = jax.lax.stop_gradient(args)
+    draw = np.random.default_rng(11)
+
+    def around(x: Array) -> Array:
+        off = draw.uniform(-1.0, 1.0, (NEARBY, *x.shape)) * float(jnp.finfo(x.dtype).eps) ** 0.5
+        beside = x + jnp.asarray(off, x.dtype) * (1.0 + jnp.abs(x))
+        return jnp.concatenate([x[None], beside])
+
+    found = jax.vmap(function)(*map(around, args))
+    here = jax.tree.map(lambda x: x[0], found)
+    scatter = jax.tree.map(lambda x: jnp.max(x, axis=0) - jnp.min(x, axis=0), found)
+    return jax.lax.stop_gradient((here, scatter))
+
+
 class _Changed:
     """One run; every change takes the next numbers of a row of random ones."""
 
     def __init__(self, signs: Array) -> None:
         self.signs, self.place = signs, 0
+        self.factors: dict[Any, Array] = {}
 
     def __call__(self, x: Any) -> Any:
         """Each element changed by some roundings of its size."""
         if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
             return x
         x = jnp.asarray(x)
-        factor = jnp.ones((), x.dtype)
-        for axis, size in enumerate((1, *x.shape)):
-            start = self.place % _TABLE
-            self.place += size + 1
-            if start + size > _TABLE:
-                start = 0
-            part = self.signs[start : start + size].astype(x.dtype)
-            if size > _TABLE:
-                part = jnp.resize(self.signs.astype(x.dtype), (size,))
-            if axis == 0:
-                factor = part[0]
-            elif size > 1:
-                factor = factor * jnp.reshape(part, (size,) + (1,) * (x.ndim - axis))
-        amount = STRENGTH * float(jnp.finfo(x.dtype).eps)
-        return x * (1.0 + amount * factor)
+        if x.dtype not in self.factors:
+            amount = STRENGTH * float(jnp.finfo(x.dtype).eps)
+            self.factors[x.dtype] = 1.0 + amount * self.signs.astype(x.dtype)
+        part, size = self.factors[x.dtype], x.size
+        if size < _TABLE:
+            start = self.place % (_TABLE - size)
+            part = part[start : start + size]
+            self.place += size
+        else:
+            part = jnp.resize(part, (size,))
+        return x * part.reshape(x.shape)
 
     def run(
         self, closed: ClosedJaxpr, exact: Sequence[Any], given: Sequence[Any]

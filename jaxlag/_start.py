@@ -4,12 +4,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._linalg import closed_to, dependence_floor
-from jaxlag._rank import ROUNDINGS, independent_rows, row_sizes
-from jaxlag._roundings import with_rounding
+from jaxlag._rank import Sizes, independent_rows, row_sizes, without_rounding
 from jaxlag._step import Arguments
 
 
@@ -101,23 +100,22 @@ def _rows_consistent(
     t, q, v, params, args = still((t, q, v, params, args))
     terms = dynamics.terms
     A, _ = terms.rows(t, q, v, params)
-    unit = _sizes(dynamics, t, q, v, params) if args.rows is None else args.rows.size
+    if args.rows is None:
+        _, void, unit = _sizes(dynamics, t, q, v, params)
+    else:
+        void, unit = args.rows.void, args.rows.size
     floor = dependence_floor(q.dtype)
 
-    def everything(t: Array, q: Array, v: Array) -> tuple[Array, ...]:
+    def everything(q: Array, v: Array) -> tuple[Array, ...]:
         return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
 
-    (phi, rate, gamma), noise = with_rounding(everything, t, q, v)
-    phi, rate, gamma = (
-        jnp.where(jnp.abs(c) <= ROUNDINGS * less, 0.0, c)
-        for c, less in zip((phi, rate, gamma), noise, strict=True)
-    )
+    phi, rate, gamma = without_rounding(everything, void, unit, q, v)
     if dynamics.quasi is not None:
         off = jnp.zeros_like(unit)
         for c, x in ((phi, q), (rate, v)):
             off = jnp.maximum(off, jnp.abs(c) / unit / (floor * (1.0 + jnp.max(jnp.abs(x)))))
         near = jnp.all(off <= 1.0)
-        bad, complete = _fitting(dynamics, t, q, v, params, A, unit)
+        bad, complete = _fitting(dynamics, t, q, v, params, A, void, unit)
         bad = jnp.where(near, bad / floor, 0.0)
         found = _consistency(off, bad, near, phi, rate)
         return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
@@ -140,17 +138,24 @@ def _rows_consistent(
     return _consistency(off, bad, near, phi, rate)
 
 
-def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Float[Array, " m"]:
+def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Sizes:
     """Of every row, see `row_sizes`."""
 
     def rows(q: Array) -> Array:
         return dynamics.terms.rows(t, q, v, params)[0]
 
-    return row_sizes(rows, q, rows(q)).size
+    return row_sizes(rows, q, rows(q))
 
 
 def _fitting(
-    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, A: Array, unit: Array
+    dynamics: Dynamics,
+    t: Array,
+    q: Array,
+    v: Array,
+    params: Any,
+    A: Array,
+    void: Bool[Array, " m"],
+    unit: Array,
 ) -> tuple[Array, Bool[Array, ""]]:
     """How far off A B = 0 every row is, as a sine; whether B and A leave no velocity out."""
     quasi = dynamics.quasi
@@ -160,7 +165,6 @@ def _fitting(
     size = jnp.sqrt(jnp.sum(B**2, axis=0))
     B = B / jnp.where(size > 0, size, 1.0)
     sines = jnp.abs(A @ B) / unit[:, None]
-    void = row_sizes(lambda q: dynamics.terms.rows(t, q, v, params)[0], q, A).void
     rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
     # Singular kinematics, as at gimbal lock, are a fault of their own.
     sound = jnp.all(jnp.isfinite(rows))
@@ -183,7 +187,7 @@ def rows_hold(
     ts, q, v, params = still((ts, q, v, params))
     rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
-    first = _sizes(dynamics, ts[0], q[0], v[0], params)
+    first = _sizes(dynamics, ts[0], q[0], v[0], params).size
     unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
     speed = 1.0 + jnp.max(jnp.abs(v), axis=1)[:, None]
     off = jnp.abs(rates) / unit / speed / dependence_floor(q.dtype)

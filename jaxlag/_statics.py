@@ -27,8 +27,7 @@ from jaxlag._equilibrium_search import (
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
-from jaxlag._rank import ROUNDINGS, least_norm, row_sizes
-from jaxlag._roundings import with_rounding
+from jaxlag._rank import least_norm, row_sizes, without_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, of_state, vector
@@ -268,12 +267,12 @@ def _search(key: Any, values: Any) -> Equilibrium:
         def of(q: Array) -> Array:
             return system.terms.rows(t, q, rest, params)[0]
 
-        def phi(t: Array, q: Array) -> Array:
-            return system.terms.position(t, q, params)
+        def phi(q: Array) -> tuple[Array]:
+            return (system.terms.position(t, q, params),)
 
-        here, less = with_rounding(phi, t, q0)
-        void = row_sizes(of, *jax.lax.stop_gradient((q0, of(q0)))).void
-        return void & (jnp.abs(here) <= ROUNDINGS * less)
+        _, void, size = row_sizes(of, *jax.lax.stop_gradient((q0, of(q0))))
+        (here,) = without_rounding(phi, void, size, q0)
+        return void & (here == 0.0)
 
     idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else jnp.zeros((0,), bool)
 

@@ -14,11 +14,13 @@ class RowChoice(NamedTuple):
         kept: these rows, holonomic ones first; the others follow from them as long as the rank does
             not change.
         size: of every row at the start and beside.
+        void: those that are 0 = 0 but for rounding.
         reacting: such a set with as many as possible of the rows whose multipliers forces read.
     """
 
     kept: Bool[Array, " m"]
     size: Float[Array, " m"]
+    void: Bool[Array, " m"]
     reacting: Choice
 
 
