@@ -182,12 +182,13 @@ class Dynamics(eqx.Module):
         return eqxi.unvmap_all(jnp.stack(found))
 
     def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
-        """The rows to solve with; None where no multipliers are solved for."""
-        if not self.rows.size or (self.quasi is not None and not self.projects):
+        """The rows to solve with; None where that is no question."""
+        if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = still((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
-        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
+        sure = all(self.rows.sure)
+        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
         if self.rows.size == 1:  # one that vanishes here alone is not to be done without
             return RowChoice(~void, size, void, Choice(~void, ~void))
         velocity = np.array(self.rows.velocity)

@@ -49,7 +49,10 @@ class Sizes(NamedTuple):
 
 
 def row_sizes(
-    rows: Callable[[Array], Array], q: Float[Array, " n"], A: Float[Array, "m n"]
+    rows: Callable[[Array], Array],
+    q: Float[Array, " n"],
+    A: Float[Array, "m n"],
+    sure: bool = False,
 ) -> Sizes:
     """Which rows are more than rounding, and how large.
 
@@ -60,11 +63,20 @@ def row_sizes(
         rows: A as a function of q.
         q: coordinates.
         A: rows(q).
+        sure: whether none is known to be void, so that roundings of the coordinates tell enough.
     """
     eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
     signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
     places = jax.lax.stop_gradient(jnp.concatenate([q[None], q + small * signs]))
+    if sure:
+        places = jnp.concatenate([places, q + ROUNDINGS * eps * signs * jnp.abs(places[0])])
+        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A))
+        growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
+        norms = _lengths(A)
+        there = (norms > 0) & ~(norms <= rounding)
+        size = jnp.where(there, norms, growth)
+        return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
     found, rounding = jax.vmap(partial(with_rounding, rows))(places)
     rounding, norms = _lengths(rounding), _lengths(A)
     growth = _lengths(found[1:] - jax.lax.stop_gradient(A))

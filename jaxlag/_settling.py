@@ -52,8 +52,8 @@ class Settling(eqx.Module):
         """Whether a step's end is moved, or looked at beyond its being finite."""
         if self.dynamics.quasi is not None:
             return self.dynamics.projects
-        some = self.dynamics.rows.size > 0  # which may have been left out
-        return self.dynamics.projects or some or bool(self._contacts) or bool(self._slides)
+        chosen = self.dynamics.rows.chooses  # then some may have been left out
+        return self.dynamics.projects or chosen or bool(self._contacts) or bool(self._slides)
 
     def __call__(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False

@@ -100,16 +100,23 @@ def _rows_consistent(
     t, q, v, params, args = still((t, q, v, params, args))
     terms = dynamics.terms
     A, _ = terms.rows(t, q, v, params)
-    if args.rows is None:
-        _, void, unit = _sizes(dynamics, t, q, v, params)
-    else:
+    sure = all(dynamics.rows.sure)
+    if args.rows is not None:
         void, unit = args.rows.void, args.rows.size
+    elif sure:
+        unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+        void, unit = unit < 0, jnp.where(unit > 0, unit, 1.0)
+    else:
+        _, void, unit = _sizes(dynamics, t, q, v, params)
     floor = dependence_floor(q.dtype)
 
     def everything(q: Array, v: Array) -> tuple[Array, ...]:
         return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
 
-    phi, rate, gamma = without_rounding(everything, void, unit, q, v)
+    if sure:
+        phi, rate, gamma = everything(q, v)
+    else:
+        phi, rate, gamma = without_rounding(everything, void, unit, q, v)
     if dynamics.quasi is not None:
         off = jnp.zeros_like(unit)
         for c, x in ((phi, q), (rate, v)):

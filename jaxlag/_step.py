@@ -66,7 +66,7 @@ class Arguments(NamedTuple):
     end: Float[Array, ""]  # beyond which no time is read
     gaps: Gaps | None  # None without tables
     prepared: Any  # what accelerations need of what depends on params alone
-    rows: RowChoice | None = None  # None where there are none
+    rows: RowChoice | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
 
     @property
