@@ -22,6 +22,7 @@ from bench import (
     _gradient_rows,
     _long_runs,
     _places,
+    _redundant,
     _single_precision,
     _walls,
 )
@@ -39,6 +40,7 @@ PARTS = (
     _fit_rows,
     _walls,
     _crossings,
+    _redundant,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
 LEAST = 25  # rows that must end in success
@@ -68,6 +70,8 @@ QUICK = {
     "sharp: one-sided spring",
     "sharp: exponential barrier",
     "singular quasi-velocities: cos(y) x', crossed",
+    "reactions beside redundant rows, levers to 10 nm",
+    "rows that are 0 = 0 but for rounding",
 }
 
 

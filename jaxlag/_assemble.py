@@ -20,7 +20,7 @@ from jaxlag._errors import AssemblyError, bad
 from jaxlag._kkt import augmented, solve_kkt
 from jaxlag._linalg import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
-from jaxlag._rank import independent_rows, row_sizes
+from jaxlag._rank import independent_rows, row_sizes, without_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, real, state_vectors
@@ -222,12 +222,15 @@ def _assembled(
         v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
-    size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))[1]
+    _, void, size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))
     floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
-    off = jnp.maximum(
-        jnp.abs(rows.of_all(position)) / size / (1.0 + jnp.max(jnp.abs(q))),
-        jnp.abs(velocity) / size / (1.0 + jnp.max(jnp.abs(v))),
-    )
+
+    def residuals(q: Array, v: Array) -> tuple[Array, Array]:
+        return rows.of_all(phi(q)), terms.velocity(t, q, v, params)
+
+    off = jnp.zeros_like(size)
+    for c, x in zip(without_rounding(residuals, void, size, q, v), (q, v), strict=True):
+        off = jnp.maximum(off, jnp.abs(c) / size / (1.0 + jnp.max(jnp.abs(x))))
     ok = jnp.all(off <= floor)
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
     failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))
@@ -259,7 +262,7 @@ def _independent(
     """A largest set of independent rows at q, rounding left out."""
     W, q = jax.lax.stop_gradient((W, q))
     A = jax.lax.stop_gradient(rows(q))
-    there, _ = row_sizes(rows, q, A)
+    there = row_sizes(rows, q, A).there
     return independent_rows(W, A, turn, floor, there)
 
 

@@ -236,12 +236,19 @@ class Layout(NamedTuple):
         labels: one label for every row: the name, or name[i].
         holonomic: for every row, whether it has a position residual.
         driven: for every row, whether b may differ from 0, so that the row may do work.
+        sure: for every row, whether its program shows that A is no mere rounding.
     """
 
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
     labels: tuple[str, ...]
     holonomic: tuple[bool, ...]
     driven: tuple[bool, ...]
+    sure: tuple[bool, ...]
+
+    @property
+    def chooses(self) -> bool:
+        """Whether rows to solve with are chosen: of several, or whether a single one is any."""
+        return self.size > 1 or not all(self.sure)
 
     @property
     def size(self) -> int:
@@ -304,7 +311,7 @@ class Layout(NamedTuple):
         return parts
 
 
-NO_ROWS = Layout((), (), (), ())
+NO_ROWS = Layout((), (), (), (), ())
 
 
 def position_rows(

@@ -197,17 +197,22 @@ class Dynamics(eqx.Module):
         return eqxi.unvmap_all(jnp.stack(found))
 
     def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
-        """The rows to solve with; None where there are not several."""
-        if self.rows.size < 2 or (self.quasi is not None and not self.projects):
+        """The rows to solve with; None where that is no question."""
+        if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = still((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
-        there, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A)
+        sure = all(self.rows.sure)
+        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
+        if self.rows.size == 1:  # one that vanishes here alone is not to be done without
+            return RowChoice(~void, size, void, Choice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
-        kept = independent_rows(M, A, 2 * velocity + unread, there=there)
+        # Where multipliers are read, what is left out is told by those that are kept.
+        reads = not np.all(unread)
+        kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
         if not np.any(velocity & ~unread):  # then those that are read come first already
-            return RowChoice(kept, size, Choice(kept, there))
+            return RowChoice(kept, size, void, Choice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise bad(
@@ -216,8 +221,8 @@ class Dynamics(eqx.Module):
                 "whose phi would not be damped if they follow from these",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
-        reacting = independent_rows(M, A, unread, there=there)
-        return RowChoice(kept, size, Choice(reacting, there))
+        reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
+        return RowChoice(kept, size, void, Choice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""

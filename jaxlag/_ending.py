@@ -344,7 +344,7 @@ def _dependent(
             return masked(dynamics.terms.rows(t, q, v, params)[0], kept)
 
         A, M = rows(q), dynamics.mass(tau, y, args)
-        there, _ = row_sizes(rows, q, A)
+        there = row_sizes(rows, q, A).there
         factor = factor_kkt(M, A, kept, FORMULATIONS[0])
         assert isinstance(factor, Multipliers)
         fine = factor.healthy[1] & there

@@ -149,7 +149,7 @@ def _size(M: Array) -> Array:
     return jnp.where(trace > 0, trace, jnp.ones_like(trace))
 
 
-def _units(M: Array, A: Array) -> Array:
+def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n"]:
     """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
     inertias = jnp.diagonal(M)
     inertias = jnp.where(inertias > 0, inertias, jnp.diagonal(augmented(M, A)[0]))
@@ -160,7 +160,7 @@ def _null_space(
     M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None
 ) -> NullSpace:
     """Rows made orthonormal one after the other, each twice (Gram-Schmidt, "twice is enough")."""
-    units = _units(M, A)
+    units = units_of(M, A)
     M, A = units[:, None] * M * units, A * units
     m, n = A.shape
     Y = jnp.zeros((m, n), A.dtype)

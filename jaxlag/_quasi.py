@@ -192,7 +192,7 @@ class QuasiVelocities(eqx.Module):
             return self._columns(t, q, params, dtype).T
 
         here = rows(q)
-        there, _ = row_sizes(rows, q, here)
+        there = row_sizes(rows, q, here).there
         return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
 
     def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:

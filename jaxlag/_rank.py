@@ -1,18 +1,24 @@
 """Which constraint rows are independent, and how rows that are not share what they exert."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._kkt import augmented
 from jaxlag._linalg import eliminate, factor_mass, rank_floor
+from jaxlag._roundings import with_rounding, with_scatter
 
 ROUNDINGS = 16
-"""Of the coordinates: a row that they make is none."""
+"""Of what a row is made of: if that is all of it, it is none."""
+
+ALIKE = 0.01
+"""Pivots above this part of the largest one are as good as it."""
 
 
 class Choice(NamedTuple):
@@ -27,31 +33,83 @@ class Choice(NamedTuple):
     there: Bool[Array, " m"]
 
 
+class Sizes(NamedTuple):
+    """How large rows are.
+
+    Attributes:
+        there: those that are more than rounding.
+        void: those that are rounding here and nearby: 0 = 0, whatever the motion.
+        size: their lengths; of those that are rounding how fast they grow, or what they are made
+            of if that is more.
+    """
+
+    there: Bool[Array, " m"]
+    void: Bool[Array, " m"]
+    size: Float[Array, " m"]
+
+
 def row_sizes(
-    rows: Callable[[Array], Array], q: Float[Array, " n"], A: Float[Array, "m n"]
-) -> tuple[Bool[Array, " m"], Float[Array, " m"]]:
-    """(whether rows are more than rounding, their lengths, or how fast they grow where not).
+    rows: Callable[[Array], Array],
+    q: Float[Array, " n"],
+    A: Float[Array, "m n"],
+    sure: bool = False,
+) -> Sizes:
+    """Which rows are more than rounding, and how large.
 
     At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever: what
-    a few roundings of the coordinates change.
+    a few roundings of the coordinates, and of all that is computed from them, change.
 
     Args:
         rows: A as a function of q.
         q: coordinates.
         A: rows(q).
+        sure: whether none is known to be void, so that roundings of the coordinates tell enough.
     """
     eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
     signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
-    ways = jnp.concatenate([ROUNDINGS * eps * signs * jnp.abs(q), small * signs])
-    changes = jax.lax.stop_gradient(jax.vmap(rows)(q + ways) - A)
-    rounding, growth = jnp.max(_lengths(changes).reshape(2, 2, -1), axis=1)
-    growth = growth / small
-    norms = _lengths(A)
+    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q + small * signs]))
+    if sure:
+        places = jnp.concatenate([places, q + ROUNDINGS * eps * signs * jnp.abs(places[0])])
+        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A))
+        growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
+        norms = _lengths(A)
+        there = (norms > 0) & ~(norms <= rounding)
+        size = jnp.where(there, norms, growth)
+        return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
+    found, rounding = jax.vmap(partial(with_rounding, rows))(places)
+    rounding, norms = _lengths(rounding), _lengths(A)
+    growth = _lengths(found[1:] - jax.lax.stop_gradient(A))
     # What is not known, as derivatives beside the end of a domain, speaks for the row.
-    there = (norms > 0) & ~(norms <= rounding)
-    size = jnp.where(there, norms, growth)
-    return there, jnp.where(size > 0, size, 1.0)
+    there = (norms > 0) & ~(norms <= ROUNDINGS * rounding[0])
+    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[0] + rounding[1:]), axis=0)
+    made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
+    size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
+    return Sizes(there, void, jnp.where(size > 0, size, 1.0))
+
+
+def without_rounding(
+    residuals: Callable[..., tuple[Array, ...]],
+    void: Bool[Array, " m"],
+    size: Float[Array, " m"],
+    *args: Array,
+) -> tuple[Array, ...]:
+    """Residuals of rows; of those that are void 0 if they are no more than rounding.
+
+    Of such a row a residual does not depend on the state: what changes beside it is rounding.
+
+    Args:
+        residuals: of all rows, of coordinates and what else they are taken to be functions of.
+        void: rows, see `row_sizes`.
+        size: of the rows.
+        args: coordinates, velocities.
+    """
+    found, scatter = with_scatter(residuals, *args)
+    least = float(jnp.finfo(size.dtype).eps) * size
+    return tuple(
+        jnp.where(void & (jnp.abs(c) <= ROUNDINGS * jnp.maximum(less, least)), 0.0, c)
+        for c, less in zip(found, scatter, strict=True)
+    )
 
 
 def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
@@ -90,6 +148,7 @@ def independent_rows(
     turn: Sequence[int] | np.ndarray | None = None,
     floor: float | None = None,
     there: Bool[Array, " m"] | None = None,
+    mobile_first: bool = False,
 ) -> Bool[Array, " m"]:
     """A largest set of rows that are independent of one another, found greedily.
 
@@ -104,6 +163,8 @@ def independent_rows(
             all at once.
         floor: least pivot; by default `rank_floor`.
         there: rows that are not taken for zero; by default those that are not.
+        mobile_first: of rows whose pivots are much alike take that along which a force of the same
+            size moves most. By it `least_norm` tells well what the others take.
 
     Source: Golub, Van Loan, Matrix Computations, sec. 4.2.8.
     """
@@ -114,7 +175,7 @@ def independent_rows(
     usable = nonzero if there is None else nonzero & there
     if m == 1:  # nothing to depend on
         return usable
-    A = A / jnp.where(usable, norms, 1.0)[:, None]
+    A = jnp.where(usable[:, None], A, 0.0) / jnp.where(usable, norms, 1.0)[:, None]
     mass = factor_mass(augmented(M, A)[0])
     S = A @ jax.vmap(lambda row: eliminate(mass, row))(A).T
     pivots = jnp.diagonal(S)
@@ -128,8 +189,10 @@ def independent_rows(
         left = jnp.where(kept | ~usable, -1.0, jnp.diagonal(S))
         now = jnp.min(jnp.where(left > floor, turns, np.max(turns, initial=0)))
         left = jnp.where(turns > now, -1.0, left)
+        if mobile_first:
+            left = jnp.where(left > ALIKE * jnp.max(left), left * pivots, -1.0)
         k = jnp.argmax(left > 0.999 * jnp.max(left))  # the first of nearly equal ones
-        take = left[k] > floor
+        take = ~kept[k] & usable[k] & (S[k, k] > floor)
         reduced = S - jnp.outer(S[:, k], S[k]) / jnp.where(take, S[k, k], 1.0)
         return jnp.where(take, reduced, S), kept.at[k].set(kept[k] | take)
 
@@ -141,42 +204,69 @@ def least_norm(
     lam: Float[Array, " m"],
     kept: Bool[Array, " m"] | None = None,
     there: Bool[Array, " m"] | None = None,
+    units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
 
     |A_k lam_k| is the generalized force of row k alone, so that the choice does not depend on
-    how a residual is scaled. With C the rows in terms of those that are kept, A = C A_kept,
-    lam = C (C^T C)^-1 lam_kept: the same where none is left out. Rows that do not follow from
-    those that are kept have none. Derivatives are those at constant rank of A.
+    how a residual is scaled. Rows are compared in units of the coordinates, for short levers make
+    rows alike that are not: with unit rows a_k there, those that are left out are a_j = C_j a_kept,
+    and what they take, z_j, the kept ones give, mu_kept - C^T z. Of all z the least norm is a
+    problem of least squares; A^T lam stays what it is, however well that is solved. Rows that do
+    not follow from those that are kept have none. Derivatives are those at constant rank of A.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam.
         kept: a largest set of independent rows; by default it is looked for.
         there: rows that are more than rounding, see `row_sizes`; by default those that are not 0.
+        units: of the coordinates, in which rows are compared; by default 1.
 
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
     m, n = A.shape
-    if m == 1:
-        return lam
-    if kept is None:
-        kept = independent_rows(jnp.eye(n, dtype=A.dtype), jax.lax.stop_gradient(A))
     if there is not None:
         A = jnp.where(there[:, None], A, 0.0)
-    norms = _lengths(A)
-    norms = jnp.where(norms > 0, norms, 1.0)
-    unit = A / norms[:, None]
-    gram, one = unit @ unit.T, jnp.eye(m, dtype=A.dtype)
-    among = jnp.where(jnp.outer(kept, kept), gram, one)
-    C = jnp.linalg.solve(among, jnp.where(kept[:, None], gram, 0.0)).T
+    if m == 1:
+        return lam if there is None else jnp.where(there, lam, 0.0)
+    units = jnp.ones((n,), A.dtype) if units is None else jax.lax.stop_gradient(units)
+    if kept is None:
+        metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
+        kept = independent_rows(metric, fixed, there=there, mobile_first=True)
+    norms, sizes = _lengths(A), _lengths(A * units)
+    norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
+    unit = A * units / sizes[:, None]
+    C = _least_squares(unit.T, unit.T, kept).T
     apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
-    C = jnp.where((apart <= rank_floor(A.dtype))[:, None], C, 0.0)
-    C = jnp.where(kept[:, None], jnp.where(kept, one, 0.0), C)
-    # What all rows do, by those that are kept: with C^T, for lam may be on any of them.
-    of_kept = C.T @ (norms * lam)
-    square = C.T @ C + jnp.where(kept, 0.0, one)
-    return (C @ jnp.linalg.solve(square, of_kept)) / norms
+    follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))
+    # What a row has of another by rounding alone may be much to one of smaller weight.
+    rounding = jnp.abs(C) <= ROUNDINGS * float(jnp.finfo(A.dtype).eps)
+    C = C - jax.lax.stop_gradient(jnp.where(rounding, C, 0.0))
+    C = jnp.where(follows[:, None], C, 0.0)
+    mu, weights = sizes * lam, norms / sizes
+    of_kept = jnp.where(kept, mu + mu @ C, 0.0)
+    # Normal equations, in units in which their diagonal is 1: weights may be as unlike as forces
+    # and moments of short levers, and rows of small ones are kept, so that they are no worse.
+    moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
+    lengths = _lengths(moved.T)
+    lengths = jnp.where(lengths > 0, lengths, 1.0)
+    square = (moved.T @ moved) / jnp.outer(lengths, lengths)
+    square = square + jnp.diag((~follows).astype(A.dtype))
+    z = jnp.linalg.solve(square, (weights * of_kept) @ moved / lengths) / lengths
+    found = jnp.where(kept, of_kept - z @ C, z)
+    left = (jnp.where(kept | follows, mu, 0.0) - found) @ unit
+    return (found + _least_squares(unit.T, left[:, None], kept)[:, 0]) / sizes
+
+
+def _least_squares(
+    X: Float[Array, "r m"], Y: Float[Array, "r k"], columns: Bool[Array, " m"]
+) -> Float[Array, "m k"]:
+    """The x that minimise |X x - Y| over these columns of X, 0 in the others; by Q R."""
+    m = X.shape[1]
+    spare = jnp.diag((~columns).astype(X.dtype))
+    Q, R = jnp.linalg.qr(jnp.concatenate([jnp.where(columns, X, 0.0), spare]))
+    right = jnp.concatenate([Y, jnp.zeros((m, Y.shape[1]), Y.dtype)])
+    return jnp.where(columns[:, None], solve_triangular(R, Q.T @ right), 0.0)
 
 
 def shared(
@@ -185,6 +275,7 @@ def shared(
     kept: Bool[Array, " m"],
     there: Bool[Array, " m"],
     group: Sequence[bool] | np.ndarray,
+    units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with those of a group of rows of least norm among themselves.
 
@@ -194,9 +285,10 @@ def shared(
         kept: a largest set of independent rows, first of those of the group.
         there: rows that are more than rounding.
         group: for every row, whether it belongs to the group.
+        units: of the coordinates, in which rows are compared.
     """
     chosen = np.flatnonzero(group)
     if len(chosen) < 2:
         return lam
-    found = least_norm(*(x[chosen] for x in (A, lam, kept, there)))
+    found = least_norm(A[chosen], lam[chosen], kept[chosen], there[chosen], units)
     return lam.at[chosen].set(found)

@@ -96,7 +96,10 @@ class AbstractReactions(AbstractQuantities):
 
         Where rows depend on one another, those of least norm sum_k (|A_k| lam_k)^2, in which
         |A_k lam_k| is the generalized force of row k alone; where forces read multipliers, of least
-        norm among the rows that they read, as they see them, and among the others. The unit is J
+        norm among the rows that they read, as they see them, and among the others. |A_k| is the
+        Euclidean length of the row in the units of the coordinates, so that metres against
+        millimetres, or radians against degrees, share otherwise; A^T lam is the same, to rounding,
+        whatever the units and however short the levers. The unit is J
         over that of the row's residual, for a `Pfaffian` W over it: N for a length or a velocity.
 
         Args:

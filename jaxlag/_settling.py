@@ -4,6 +4,7 @@ from functools import reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
@@ -51,8 +52,8 @@ class Settling(eqx.Module):
         """Whether a step's end is moved, or looked at beyond its being finite."""
         if self.dynamics.quasi is not None:
             return self.dynamics.projects
-        several = self.dynamics.rows.size > 1  # some of which may have been left out
-        return self.dynamics.projects or several or bool(self._contacts) or bool(self._slides)
+        chosen = self.dynamics.rows.chooses  # then some may have been left out
+        return self.dynamics.projects or chosen or bool(self._contacts) or bool(self._slides)
 
     def __call__(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
@@ -64,9 +65,14 @@ class Settling(eqx.Module):
             y, found, closed = self.project(tau, y, args, differentiable)
             verdict = Verdict(found, closed, true)
         elif args.rows is not None:
-            surface = self.dynamics.surface(*still((tau, y, args)))
-            q, v = self.dynamics.parts(still(y))
-            verdict = Verdict(true, self._closed(surface, q, v, args), true)
+
+            def look() -> Array:
+                surface = self.dynamics.surface(*still((tau, y, args)))
+                return self._closed(surface, *self.dynamics.parts(still(y)), args)
+
+            one = self.dynamics.rows.size == 1
+            hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
+            verdict = Verdict(true, hold, true)
         return y, verdict._replace(pressed=self.pressed(tau, y, args))
 
     def pressed(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._linalg import closed_to, dependence_floor
-from jaxlag._rank import independent_rows
+from jaxlag._rank import Sizes, independent_rows, row_sizes, without_rounding
 from jaxlag._step import Arguments
 
 
@@ -100,16 +100,29 @@ def _rows_consistent(
     t, q, v, params, args = still((t, q, v, params, args))
     terms = dynamics.terms
     A, _ = terms.rows(t, q, v, params)
-    unit = jnp.sqrt(jnp.sum(A**2, axis=1))
-    unit = jnp.where(unit > 0, unit, 1.0) if args.rows is None else args.rows.size
+    sure = all(dynamics.rows.sure)
+    if args.rows is not None:
+        void, unit = args.rows.void, args.rows.size
+    elif sure:
+        unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+        void, unit = unit < 0, jnp.where(unit > 0, unit, 1.0)
+    else:
+        _, void, unit = _sizes(dynamics, t, q, v, params)
     floor = dependence_floor(q.dtype)
-    phi, rate = residuals(dynamics, t, q, v, params)
+
+    def everything(q: Array, v: Array) -> tuple[Array, ...]:
+        return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
+
+    if sure:
+        phi, rate, gamma = everything(q, v)
+    else:
+        phi, rate, gamma = without_rounding(everything, void, unit, q, v)
     if dynamics.quasi is not None:
         off = jnp.zeros_like(unit)
         for c, x in ((phi, q), (rate, v)):
             off = jnp.maximum(off, jnp.abs(c) / unit / (floor * (1.0 + jnp.max(jnp.abs(x)))))
         near = jnp.all(off <= 1.0)
-        bad, complete = _fitting(dynamics, t, q, v, params, A, unit)
+        bad, complete = _fitting(dynamics, t, q, v, params, A, void, unit)
         bad = jnp.where(near, bad / floor, 0.0)
         found = _consistency(off, bad, near, phi, rate)
         return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
@@ -126,15 +139,30 @@ def _rows_consistent(
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
-    gamma = terms.gamma(t, q, v, params)
     turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
     bent = left(gamma) / (floor * jnp.where(turn > 0, turn, 1.0))
     bad = jnp.where(near, jnp.maximum(bent, bad), bad)
     return _consistency(off, bad, near, phi, rate)
 
 
+def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Sizes:
+    """Of every row, see `row_sizes`."""
+
+    def rows(q: Array) -> Array:
+        return dynamics.terms.rows(t, q, v, params)[0]
+
+    return row_sizes(rows, q, rows(q))
+
+
 def _fitting(
-    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, A: Array, unit: Array
+    dynamics: Dynamics,
+    t: Array,
+    q: Array,
+    v: Array,
+    params: Any,
+    A: Array,
+    void: Bool[Array, " m"],
+    unit: Array,
 ) -> tuple[Array, Bool[Array, ""]]:
     """How far off A B = 0 every row is, as a sine; whether B and A leave no velocity out."""
     quasi = dynamics.quasi
@@ -144,7 +172,7 @@ def _fitting(
     size = jnp.sqrt(jnp.sum(B**2, axis=0))
     B = B / jnp.where(size > 0, size, 1.0)
     sines = jnp.abs(A @ B) / unit[:, None]
-    rows = jnp.concatenate([A / unit[:, None], B.T])
+    rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
     # Singular kinematics, as at gimbal lock, are a fault of their own.
     sound = jnp.all(jnp.isfinite(rows))
     rows = jnp.where(sound, rows, jnp.eye(*rows.shape, dtype=q.dtype))
@@ -166,9 +194,10 @@ def rows_hold(
     ts, q, v, params = still((ts, q, v, params))
     rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
-    unit = jnp.sqrt(jnp.sum(A**2, axis=2))
+    first = _sizes(dynamics, ts[0], q[0], v[0], params).size
+    unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
     speed = 1.0 + jnp.max(jnp.abs(v), axis=1)[:, None]
-    off = jnp.abs(rates) / jnp.where(unit > 0, unit, 1.0) / speed / dependence_floor(q.dtype)
+    off = jnp.abs(rates) / unit / speed / dependence_floor(q.dtype)
     off = jnp.max(jnp.where(jnp.isfinite(off), off, 0.0), axis=0)
     return jnp.all(off <= 1.0), jnp.argmax(off).astype(jnp.int32)
 

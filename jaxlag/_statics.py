@@ -17,11 +17,17 @@ from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._custom_jvp import keeping_rules
 from jaxlag._dynamics import still
-from jaxlag._equilibrium_search import differentiable_if, judge, search, solve_tangent
+from jaxlag._equilibrium_search import (
+    differentiable_if,
+    judge,
+    newton,
+    search,
+    solve_tangent,
+)
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
-from jaxlag._rank import least_norm
+from jaxlag._rank import least_norm, row_sizes, without_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, of_state, vector
@@ -254,6 +260,22 @@ def _search(key: Any, values: Any) -> Equilibrium:
     params = _params.join(given[0], params_static.tree)
     rows = system.rows(params, q0.dtype)
 
+    def idle_rows(t: Array, params: Any) -> Array:
+        """Rows that are 0 = 0 but for rounding at the start and nearby: their lam is 0."""
+        params = _params.join(params, params_static.tree)
+
+        def of(q: Array) -> Array:
+            return system.terms.rows(t, q, rest, params)[0]
+
+        def phi(q: Array) -> tuple[Array]:
+            return (system.terms.position(t, q, params),)
+
+        _, void, size = row_sizes(of, *jax.lax.stop_gradient((q0, of(q0))))
+        (here,) = without_rounding(phi, void, size, q0)
+        return void & (here == 0.0)
+
+    idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else jnp.zeros((0,), bool)
+
     def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any]:
         """(triple of Q, h and A, Q - h + A^T lam, the same and phi of z) at (q, v)."""
         params = _params.join(params, params_static.tree)
@@ -263,7 +285,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
         def parts(q: Array, v: Array) -> tuple[Array, Array, Array]:
             given = evaluate(inputs, t, q, v, params)
             Q, h = system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
-            return Q, h, system.terms.rows(t, q, rest, params)[0]
+            A = system.terms.rows(t, q, rest, params)[0]
+            return Q, h, jnp.where(idle[:, None], 0.0, A)
 
         def unbalanced(q: Array, v: Array, lam: Array) -> Array:
             Q, h, A = parts(q, v)
@@ -273,7 +296,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
             q, lam = z[:n], z[n:]
             if not rows.size:
                 return unbalanced(q, rest, lam)
-            phi = system.terms.position(t, q, params)
+            phi = jnp.where(idle, lam, system.terms.position(t, q, params))
             return jnp.concatenate([unbalanced(q, rest, lam), phi])
 
         return parts, unbalanced, whole
@@ -293,7 +316,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
     if rows.size:
         # Of multipliers of dependent rows the search finds those nearest to where it began.
         q, lam = z[:n], z[n:]
-        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam)])
+        softness = jax.lax.stop_gradient(newton(whole, z).c)[:n]
+        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam, units=softness)])
 
     still, start, t, tol, *given = jax.lax.stop_gradient((z, z0, t, tol, *given))
     still_parts, _, fixed = forces(t, *given)

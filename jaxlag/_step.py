@@ -14,11 +14,13 @@ class RowChoice(NamedTuple):
         kept: these rows, holonomic ones first; the others follow from them as long as the rank does
             not change.
         size: of every row at the start and beside.
+        void: those that are 0 = 0 but for rounding.
         reacting: such a set with as many as possible of the rows whose multipliers forces read.
     """
 
     kept: Bool[Array, " m"]
     size: Float[Array, " m"]
+    void: Bool[Array, " m"]
     reacting: Choice
 
 
@@ -64,7 +66,7 @@ class Arguments(NamedTuple):
     end: Float[Array, ""]  # beyond which no time is read
     gaps: Gaps | None  # None without tables
     prepared: Any  # what accelerations need of what depends on params alone
-    rows: RowChoice | None = None  # None where there is no choice: at most one row
+    rows: RowChoice | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     volumes: Float[Array, " b"] | None = None  # usual ones, where they change on the way
 

@@ -21,7 +21,7 @@ from jaxlag._constraints import (
 from jaxlag._dependence import outputs_depend_on
 from jaxlag._errors import gradient
 from jaxlag._forces import AbstractForce, components, reads_lam
-from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions
+from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
 from jaxlag._linalg import MassFactor, factor_mass, solve_mass
 from jaxlag._lowering._rows import layout
 from jaxlag._lowering._structure import Structure, find_structure
@@ -286,16 +286,19 @@ class ArrayTerms(Terms):
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
         still = jax.lax.stop_gradient
-        there, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        there, void, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
         if A.shape[0] == 1:
-            a, lam = self._solved(M, right, t, q, v, params, inputs, None)
-            fine = there[0]
+            choice = Choice(~void, ~void)
+            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            lam = jnp.where(void, 0.0, lam)
+            fine = (there | void)[0]
         else:
             read = self.rows_read(t, q, v, params, inputs)
-            kept = independent_rows(*still((M, A)), np.logical_not(read), there=there)
+            unread = np.logical_not(read)
+            kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
             choice = Choice(kept, there)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
-            lam = shared(A, lam, kept, there, np.logical_not(read))
+            lam = shared(A, lam, kept, there, unread, units_of(*still((M, A))))
             fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
@@ -335,7 +338,7 @@ class ArrayTerms(Terms):
         def seen(lam: Array) -> Array:
             if reacting is None or self.apart:
                 return lam
-            return shared(A, lam, *reacting, read)
+            return shared(A, lam, *reacting, read, units_of(M, A))
 
         def push(lam: Array) -> Array:
             return self.reactive(t, q, v, params, inputs, lam)

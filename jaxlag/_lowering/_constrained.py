@@ -139,7 +139,9 @@ def solve_with_reactions(
     """
     m = len(rows.A)
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
-    seen = None if kept is None or sharing is None else _shared(graph, A, kept, sharing, eps)
+    seen = None
+    if kept is not None and sharing is not None:
+        seen = _shared(graph, A, _units(graph, M, A, regular), kept, sharing, eps)
     if seen is not None:
         of_rows = zip(*seen, strict=True)
         G = [[_weighted(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
@@ -181,62 +183,114 @@ def _weighted(graph: Graph, weights: Sequence[Node], x: Sequence[Node]) -> Node:
 def _shared(
     graph: Graph,
     A: Sequence[Sequence[Node]],
+    units: Sequence[Node],
     kept: Sequence[Node],
     sharing: Sharing,
     eps: float,
 ) -> list[list[Node]]:
     """What takes multipliers of the rows kept to those that forces see, m rows.
 
-    As `jaxlag._rank.shared`: C (C^T C)^-1 C^T between rows of unit length, C the rows in terms of
-    those that are kept, which come first among the chosen ones.
+    As `jaxlag._rank.shared`, in whose words these are a_k, C, z and weights.
     """
     m, chosen = len(A), sharing.chosen
-    A = [[graph.mul(there, x) for x in row] for there, row in zip(sharing.there, A, strict=True)]
-    zero, one = graph.zero, graph.one
+    zero, one, places = graph.zero, graph.one, range(len(chosen))
+    A = [[graph.mul(sharing.there[k], x) for x in A[k]] for k in chosen]
+    scaled = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
 
-    def solved(S: list[list[Node]], columns: list[list[Node]]) -> list[list[Node]]:
-        return bordered(graph, S, [], [(column, []) for column in columns], eps)
+    def length(x: Sequence[Node]) -> Node:
+        """Of a vector; 1 where it is 0."""
+        square = graph.let(_weighted(graph, x, x))
+        some = graph.let(graph.select(graph.call(GREATER, square, zero), square, one))
+        return graph.let(graph.sqrt(some))
 
-    def product(x: Sequence[Sequence[Node]], y: Sequence[Sequence[Node]]) -> list[list[Node]]:
-        """x y^T."""
-        return [[_weighted(graph, a, b) for b in y] for a in x]
-
-    squares = [_weighted(graph, A[k], A[k]) for k in chosen]
-    there = [graph.call(GREATER, x, zero) for x in squares]
-    sizes = [
-        graph.let(graph.sqrt(graph.let(graph.select(*pair, one))))
-        for pair in zip(there, squares, strict=True)
-    ]
+    norms, sizes = [length(row) for row in A], [length(row) for row in scaled]
+    weights = [graph.let(graph.div(*pair)) for pair in zip(norms, sizes, strict=True)]
     unit = [
-        [graph.let(graph.div(x, size)) for x in A[k]] for k, size in zip(chosen, sizes, strict=True)
+        [graph.let(graph.div(x, size)) for x in row]
+        for row, size in zip(scaled, sizes, strict=True)
     ]
-    gram, flags = product(unit, unit), [kept[k] for k in chosen]
-    places = range(len(chosen))
-    among = [
-        [one if i == j else graph.mul(flags[i], flags[j], gram[i][j]) for j in places]
-        for i in places
+    flags = [kept[k] for k in chosen]
+    L, Y = _orthonormal(graph, unit, flags)
+    C, others = [], []
+    for row, flag in zip(unit, flags, strict=True):
+        parts = [_weighted(graph, y, row) for y in Y]
+        rest = _without(graph, row, list(zip(parts, Y, strict=True)))
+        near = graph.call(GREATER, graph.const(eps), _weighted(graph, rest, rest))
+        follows = graph.let(graph.select(near, graph.sum([(flag, -1.0)], 1.0), zero))
+        others.append(follows)
+        C.append([graph.let(graph.mul(follows, x)) for x in _backward(graph, L, parts)])
+    moved = [
+        [
+            graph.mul(weights[k], graph.sum([(others[j], -1.0)]) if j == k else C[j][k])
+            for k in places
+        ]
+        for j in places
     ]
-    C = solved(among, [[graph.mul(flags[j], gram[i][j]) for j in places] for i in places])
-    floor = graph.const(eps ** (2 / 3))
-    for i, flag in enumerate(flags):
-        keep = graph.call(GREATER, flag, graph.const(0.5))
-        # Squared distance from the rows kept: 1 for a row that is none.
-        near = graph.sum([(gram[i][i], 1.0), (_weighted(graph, C[i], gram[i]), -1.0)])
-        follows = graph.call(GREATER, floor, graph.let(near))
-        for j in places:
-            other = graph.select(follows, C[i][j], zero)
-            C[i][j] = graph.select(keep, one if i == j else zero, other)
-    columns = list(zip(*C, strict=True))
-    square = product(columns, columns)
-    for j, flag in enumerate(flags):
-        square[j][j] = graph.sum([(square[j][j], 1.0), (flag, -1.0)], 1.0)
-    least = product(C, solved(square, C))
+    square = [[_weighted(graph, x, y) for y in moved] for x in moved]
+    for j in places:
+        square[j][j] = graph.sum([(square[j][j], 1.0), (others[j], -1.0)], 1.0)
+    sides = [[graph.mul(weights[k], flags[k], x[k]) for x in moved] for k in places]
+    columns = bordered(graph, square, [], [(side, []) for side in sides], eps)
     seen = [[one if i == j else zero for j in range(m)] for i in range(m)]
-    for i, k in enumerate(chosen):
-        for j, other in enumerate(chosen):
-            ratio = graph.div(graph.mul(least[i][j], sizes[j]), sizes[i])
-            seen[k][other] = graph.let(ratio)
+    for j, z in enumerate(columns):
+        for i in places:
+            taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
+            own = [(flags[i], 1.0)] if i == j else []
+            share = graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken]))
+            seen[chosen[i]][chosen[j]] = graph.let(graph.div(graph.mul(share, sizes[j]), sizes[i]))
     return seen
+
+
+def _orthonormal(
+    graph: Graph,
+    rows: Sequence[Sequence[Node]],
+    kept: Sequence[Node] | None,
+    floor: float = 0.0,
+) -> tuple[list[list[Node]], list[list[Node]]]:
+    """(L, Y) with rows = L Y, each made orthonormal to those before it, twice (Gram-Schmidt).
+
+    Rows that are not kept have 0 in Y and 1 in L; NaN where a square is no more than `floor` of
+    what it was.
+    """
+    Y: list[list[Node]] = []
+    L: list[list[Node]] = []
+    for k, row in enumerate(rows):
+        if kept is not None:
+            row = [graph.mul(kept[k], x) for x in row]
+        first = [_weighted(graph, y, row) for y in Y]
+        rest = _without(graph, row, list(zip(first, Y, strict=True)))
+        second = [_weighted(graph, y, rest) for y in Y]
+        rest = _without(graph, rest, list(zip(second, Y, strict=True)))
+        square = _weighted(graph, rest, rest)
+        bound = graph.scale(_weighted(graph, row, row), floor) if floor else graph.zero
+        square = graph.select(graph.call(GREATER, square, bound), square, graph.const(np.nan))
+        if kept is not None:
+            keep = graph.call(GREATER, kept[k], graph.const(0.5))
+            square = graph.select(keep, square, graph.one)
+        norm = graph.let(graph.sqrt(graph.let(square)))
+        Y.append([x if x is graph.zero else graph.let(graph.div(x, norm)) for x in rest])
+        L.append([graph.add(a, b) for a, b in zip(first, second, strict=True)] + [norm])
+    return L, Y
+
+
+def _without(
+    graph: Graph, x: Sequence[Node], parts: Sequence[tuple[Node, Sequence[Node]]]
+) -> list[Node]:
+    """x less the sum of factors times vectors."""
+    return [
+        graph.let(graph.sum([(a, 1.0), *((graph.mul(f, y[i]), -1.0) for f, y in parts)]))
+        for i, a in enumerate(x)
+    ]
+
+
+def _backward(graph: Graph, L: Sequence[Sequence[Node]], right: Sequence[Node]) -> list[Node]:
+    """The x with L^T x = right."""
+    m = len(right)
+    x: list[Node] = [graph.zero] * m
+    for k in reversed(range(m)):
+        known = [(graph.mul(L[j][k], x[j]), -1.0) for j in range(k + 1, m)]
+        x[k] = graph.let(graph.div(graph.sum([(right[k], 1.0), *known]), L[k][k]))
+    return x
 
 
 def _less(terms: list[tuple[Node, float]]) -> list[tuple[Node, float]]:
@@ -313,7 +367,7 @@ def _null_space(
 ) -> list[list[Node]]:
     """As `jaxlag._kkt.NullSpace`: rows made orthonormal, M on what they leave free."""
     n, m = len(M), len(A)
-    units = _units(graph, M, A)
+    units = _units(graph, M, A, False)
     M = [[graph.mul(units[i], M[i][j], units[j]) for j in range(n)] for i in range(n)]
     A = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
     right = [([graph.mul(x, s) for x, s in zip(r, units, strict=True)], c) for r, c in right]
@@ -321,33 +375,10 @@ def _null_space(
     def dot(x: Sequence[Node], y: Sequence[Node]) -> Node:
         return graph.let(graph.sum([(graph.mul(a, b), 1.0) for a, b in zip(x, y, strict=True)]))
 
-    def less(x: Sequence[Node], parts: Sequence[tuple[Node, Sequence[Node]]]) -> list[Node]:
-        return [
-            graph.let(graph.sum([(x[i], 1.0), *((graph.mul(f, y[i]), -1.0) for f, y in parts)]))
-            for i in range(n)
-        ]
-
-    Y: list[list[Node]] = []
-    L: list[list[Node]] = []
-    for k, row in enumerate(A):
-        if kept is not None:
-            row = [graph.mul(kept[k], x) for x in row]
-        first = [dot(y, row) for y in Y]
-        rest = less(row, list(zip(first, Y, strict=True)))
-        second = [dot(y, rest) for y in Y]
-        rest = less(rest, list(zip(second, Y, strict=True)))
-        square = dot(rest, rest)
-        bound = graph.scale(dot(row, row), eps ** (2 / 3))
-        square = graph.select(graph.call(GREATER, square, bound), square, graph.const(np.nan))
-        if kept is not None:
-            keep = graph.call(GREATER, kept[k], graph.const(0.5))
-            square = graph.select(keep, square, graph.one)
-        norm = graph.let(graph.sqrt(graph.let(square)))
-        Y.append([x if x is graph.zero else graph.let(graph.div(x, norm)) for x in rest])
-        L.append([graph.add(a, b) for a, b in zip(first, second, strict=True)] + [norm])
+    L, Y = _orthonormal(graph, A, kept, eps ** (2 / 3))
 
     def tangent(x: Sequence[Node]) -> list[Node]:
-        return less(x, [(dot(y, x), y) for y in Y])
+        return _without(graph, x, [(dot(y, x), y) for y in Y])
 
     size = graph.let(graph.scale(_size(graph, M), 1.0 / n))
     columns = [tangent([M[i][j] for i in range(n)]) for j in range(n)]  # P M
@@ -366,7 +397,7 @@ def _null_space(
             value = c[k] if kept is None else graph.mul(kept[k], c[k])
             top = graph.sum([(value, 1.0), *known])
             z.append(top if top is graph.zero else graph.let(graph.div(top, L[k][k])))
-        offset = less([graph.zero] * n, list(zip(z, Y, strict=True)))
+        offset = _without(graph, [graph.zero] * n, list(zip(z, Y, strict=True)))
         moved = [
             graph.sum([(r[i], 1.0), *((graph.mul(M[i][j], offset[j]), -1.0) for j in range(n))])
             for i in range(n)
@@ -380,9 +411,13 @@ def _null_space(
     return out
 
 
-def _units(graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]]) -> list[Node]:
+def _units(
+    graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]], regular: bool
+) -> list[Node]:
     """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
     inertias = [M[i][i] for i in range(len(M))]
+    if regular:
+        return [graph.let(graph.div(graph.one, graph.sqrt(x))) for x in inertias]
     full = _augmented(graph, M, A, [], None)[0]
     units = []
     for i, inertia in enumerate(inertias):

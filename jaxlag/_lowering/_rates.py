@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._errors import gradient
-from jaxlag._kkt import masked
+from jaxlag._kkt import masked, units_of
 from jaxlag._linalg import factor_mass, solve_mass
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._rank import independent_rows, least_norm, row_sizes
@@ -110,10 +110,17 @@ class Moving:
         left = terms.euler_lagrange(t, q, v, a, params) - self._force()
         A, _ = terms.rows(t, q, v, params)
         still = jax.lax.stop_gradient
-        there, _ = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A)))
-        kept = independent_rows(jnp.eye(q.shape[0], dtype=q.dtype), still(A), there=there)
-        rows = masked(A, kept)
+        there = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A))).there
+        units = units_of(*still((terms.mass(t, q, v, params), A)))
+        metric = jnp.diag(units**-2)
+        kept = independent_rows(metric, still(A), there=there, mobile_first=True)
+        rows = masked(A, kept) * units
+        sizes = jnp.sqrt(jnp.sum(still(rows) ** 2, axis=1))
+        sizes = jnp.where(kept, sizes, 1.0)
+        rows = rows / sizes[:, None]
         gram = rows @ rows.T + jnp.diag((~kept).astype(q.dtype))
-        factor = factor_mass(jax.lax.stop_gradient(gram))
+        factor = factor_mass(still(gram))
+        left = units * left
         lam = solve_mass(gram, rows @ left, factor)
-        return a, least_norm(A, lam, kept, there)
+        lam = lam + solve_mass(gram, rows @ (left - lam @ rows), factor)
+        return a, least_norm(A, lam / sizes, kept, there, units)

@@ -90,9 +90,10 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
 
     (phi,) = read(graph, traced(key, position, False), *state, *params)
     m = rates.size
-    every = layout_of(key.constraints, key.params, key.static, key.size, key.dtype).holonomic
+    layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
+    every = layout.holonomic
     own = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
-    kept = [graph.input("kept", k) for k in own] if len(every) > 1 else None
+    kept = [graph.input("kept", k) for k in own] if layout.chooses else None
     holonomic = [every[k] for k in own]
     lam, reaction = [graph.input("lam", k) for k in range(m)], None
     sharing = None

@@ -25,6 +25,24 @@ from jaxlag._quasi import QuasiVelocities
 LIMIT = 20_000  # scalar operations: beyond, reading them takes longer than their detail is worth
 
 
+class Contents(NamedTuple):
+    """What holds in every state and for all params.
+
+    Attributes:
+        affine: whether the row is of first degree in v, as far as its program tells.
+        empty: whether A is zero.
+        driven: whether b may differ from zero: False only where it certainly is zero.
+        sure: whether A certainly is none that vanishes wherever it holds, as rounding does.
+        zero: whether the residual is 0, and phi as well.
+    """
+
+    affine: bool
+    empty: bool
+    driven: bool
+    sure: bool = False
+    zero: bool = False
+
+
 def layout(constraints: tuple[AbstractConstraint, ...], params: Any, n: int, dtype: Any) -> Layout:
     """The rows of all constraints, for params like these; checked to be affine in v."""
     if not constraints:
@@ -48,6 +66,7 @@ def layout_of(
     labels: list[str] = []
     holonomic: list[bool] = []
     driven: list[bool] = []
+    sure: list[bool] = []
     for constraint in constraints:
 
         def of_v(t: Array, q: Array, v: Array, traced: Any, c: Any = constraint) -> Array:
@@ -78,8 +97,10 @@ def layout_of(
             shapes += [(name, ()) for name in constraint.names]
             labels += constraint.names
         holonomic += [constraint.holonomic] * count
-        driven += _examine(constraint, labels[-count:], like, static, n, dtype)
-    return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven))
+        contents = _examine(constraint, labels[-count:], like, static, n, dtype)
+        driven += [row.driven for row in contents]
+        sure += [row.sure for row in contents]
+    return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven), tuple(sure))
 
 
 def _check_rules(written: ClosedJaxpr, argument: str) -> None:
@@ -115,8 +136,8 @@ def _examine(
     static: _params.Static,
     n: int,
     dtype: Any,
-) -> list[bool]:
-    """Whether each row is driven; raises for rows that are not affine in v, or free of v."""
+) -> list[Contents]:
+    """Of each row; raises for rows that are not affine in v, or free of v where they are not 0."""
     position = constraint.position if constraint.holonomic else None
     rows = examine(constraint.velocity, position, like, static, n, dtype)
     bent = [label for label, row in zip(labels, rows, strict=True) if not row.affine]
@@ -127,7 +148,7 @@ def _examine(
             "its slope depends on v, as far as its program tells",
             f"Write A(t, q) v + b(t, q): {_AFFINE.format('v')}",
         )
-    empty = [label for label, row in zip(labels, rows, strict=True) if row.empty]
+    empty = [label for label, row in zip(labels, rows, strict=True) if row.empty and not row.zero]
     if empty:
         raise bad(
             f"constraint {_listed(empty)}",
@@ -135,7 +156,7 @@ def _examine(
             "none enters it: its row of A is zero",
             "Drop the row, or check which entry of q it reads.",
         )
-    return [row.driven for row in rows]
+    return rows
 
 
 _AFFINE = (
@@ -194,20 +215,6 @@ def _listed(labels: list[str]) -> str:
     return ", ".join(map(repr, labels))
 
 
-class Contents(NamedTuple):
-    """What holds in every state and for all params.
-
-    Attributes:
-        affine: whether the row is of first degree in v, as far as its program tells.
-        empty: whether A is zero.
-        driven: whether b may differ from zero: False only where it certainly is zero.
-    """
-
-    affine: bool
-    empty: bool
-    driven: bool
-
-
 def examine(
     rows: Callable,
     positions: Callable | None,
@@ -238,18 +245,26 @@ def examine(
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     q = jax.ShapeDtypeStruct((n,), dtype)
     v = jax.ShapeDtypeStruct((n if speeds is None else speeds,), dtype)
+
+    def phi(t: Any, q: Any, v: Any, traced: Any) -> Any:
+        assert positions is not None
+        return positions(t, q, _params.join(traced, static.tree))
+
     closed = jax.make_jaxpr(velocity)(t, q, v, like.tree)
     try:
-        return _as_scalars(closed)
+        found = _as_scalars(closed)
+        if positions is not None and any(row.zero for row in found):
+            graph, residuals, given = _scalars(jax.make_jaxpr(phi)(t, q, v, like.tree))
+            somewhere = dict.fromkeys((*given[0].flat, *given[1]), graph.zero)
+            residuals = substitute(graph, residuals, somewhere)
+            pairs = zip(found, residuals, strict=True)
+            found = [row._replace(zero=row.zero and x is graph.zero) for row, x in pairs]
+        return found
     except Unsupported:
         slope = _reached(jax.make_jaxpr(along)(t, q, v, v, like.tree), "tqvw")
         driven = True
         if positions is not None:
-
-            def phi(t: Any, q: Any, traced: Any) -> Any:
-                return positions(t, q, _params.join(traced, static.tree))
-
-            driven = "t" in _reached(jax.make_jaxpr(phi)(t, q, like.tree), "tq")
+            driven = "t" in _reached(jax.make_jaxpr(phi)(t, q, v, like.tree), "tqv")
         # As one array the rows share what any of them contains.
         shared = Contents("v" not in slope, "w" not in slope, driven)
         return [shared] * closed.out_avals[0].shape[0]
@@ -263,7 +278,16 @@ def _reached(closed: ClosedJaxpr, names: str) -> frozenset[str]:
 
 
 def _as_scalars(closed: ClosedJaxpr) -> list[Contents]:
-    """The same from the scalars of a program (t, q, v, *params) -> A v + b.
+    """The same from the scalars of a program (t, q, v, *params) -> A v + b."""
+    graph, rows, given = _scalars(closed)
+    v = list(given[2])
+    at_rest = substitute(graph, rows, dict.fromkeys(v, graph.zero))
+    q = set(given[1])
+    return [_contents(graph, row, b, q, set(v)) for row, b in zip(rows, at_rest, strict=True)]
+
+
+def _scalars(closed: ClosedJaxpr) -> tuple[Graph, list[Node], list[np.ndarray]]:
+    """(graph, rows, arguments) of a program of one array.
 
     Raises:
         Unsupported: it has no such form, or a long one.
@@ -274,10 +298,7 @@ def _as_scalars(closed: ClosedJaxpr) -> list[Contents]:
         raise Unsupported(f"more than {LIMIT} scalar operations")
     graph = Graph()
     given = [_inputs(graph, str(i), aval.shape) for i, aval in enumerate(closed.in_avals)]
-    v = list(given[2])
-    rows = list(nodes(graph, read(graph, closed, *given)[0]))
-    at_rest = substitute(graph, rows, dict.fromkeys(v, graph.zero))
-    return [_contents(graph, row, b, set(v)) for row, b in zip(rows, at_rest, strict=True)]
+    return graph, list(nodes(graph, read(graph, closed, *given)[0])), given
 
 
 def _effort(eqn: Any) -> int:
@@ -295,14 +316,50 @@ def _inputs(graph: Graph, name: str, shape: tuple[int, ...]) -> np.ndarray:
     return array.reshape(shape)
 
 
-def _contents(graph: Graph, row: Node, at_rest: Node, v: set[Node]) -> Contents:
+def _contents(graph: Graph, row: Node, at_rest: Node, q: set[Node], v: set[Node]) -> Contents:
     present = order([row])
     slopes = gradient(graph, row, [node for node in present if node in v])
+    moving, empty = _moving(slopes, q), all(slope is graph.zero for slope in slopes)
     return Contents(
         affine=v.isdisjoint(order(slopes)) and not _bends(present, v),
-        empty=all(slope is graph.zero for slope in slopes),
+        empty=empty,
         driven=at_rest is not graph.zero,
+        sure=any(_counts(slope.constant) or moving[slope] for slope in slopes),
+        zero=empty and at_rest is graph.zero,
     )
+
+
+SMALL = 1e-3
+"""Numbers below may be what rounding has left of larger ones."""
+
+_ANALYTIC = frozenset(["sin", "cos", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "atan"])
+
+
+def _moving(slopes: Sequence[Node], q: set[Node]) -> dict[Node, frozenset[Node]]:
+    """For every node the coordinates that it certainly depends on, at almost every place.
+
+    Where just one term of a sum, or factor of a product whose others are not 0, holds a coordinate
+    and moves with it, then so does the whole: terms with nothing in common do not cancel.
+    """
+    none: frozenset[Node] = frozenset()
+    held: dict[Node, frozenset[Node]] = {}
+    moving: dict[Node, frozenset[Node]] = {}
+    for node in order(slopes):
+        held[node] = none.union(*(held[arg] for arg in node.args), {node} & q)
+        moving[node] = frozenset({node} & q)
+        once = [x for x in held[node] if sum(x in held[arg] for arg in node.args) == 1]
+        telling = list(node.args)
+        if node.op == "sum":
+            telling = [arg for arg, factor in node.data[1] if _counts(factor)]
+        whole = all(_counts(arg.constant) or moving[arg] for arg in node.args)
+        analytic = node.op == "call" and node.data.name in _ANALYTIC
+        if node.op in ("sum", "let") or (node.op == "product" and whole) or analytic:
+            moving[node] = frozenset(x for x in once if any(x in moving[arg] for arg in telling))
+    return moving
+
+
+def _counts(number: float | None) -> bool:
+    return number is not None and abs(number) >= SMALL
 
 
 def _bends(present: Sequence[Node], v: set[Node]) -> bool:

@@ -1,0 +1,186 @@
+"""What numbers that are 0 but for rounding are made of, and rows of such numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _families import mostly_full
+
+import jaxlag as jl
+from jaxlag._rank import row_sizes
+from jaxlag._roundings import with_rounding
+
+TILT = np.asarray(jl.rotation.about_x(0.5)) @ np.asarray(jl.rotation.about_y(0.35))
+
+
+def identity(q):
+    return (jnp.sin(q[0]) ** 2 + jnp.cos(q[0]) ** 2 - 1.0) * q[1]
+
+
+def tilted(q):
+    """The third component, in the axes of a tilted plane, of a vector in that plane."""
+    R = jnp.asarray(TILT, q.dtype)
+    return (R.T @ (R @ jnp.stack([jnp.cos(q[0]) + q[1], jnp.sin(q[0]), 0.0 * q[0]])))[2]
+
+
+def converged(q):
+    """By Newton's method in a loop, whose roundings do not pile up: the root of 2 is left."""
+    return jax.lax.fori_loop(0, 20, lambda _, x: x - (x * x - 2.0) / (2.0 * x), q[0]) - q[1]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize(
+    ("function", "size"),
+    [
+        (identity, 1.3 * 2.0),
+        (tilted, 1.5),
+        (converged, 1.4),
+        (lambda q: q[0] - q[1], 1.3),
+        (lambda q: 1e-9 * q[1], 1.3e-9),
+        (lambda q: jnp.ones(1000, q.dtype) @ jnp.full(1000, q[1]) - 1300.0, 1300.0),
+    ],
+)
+def test_rounding_is_that_of_the_terms(function, size, dtype):
+    """Within a factor of 4 either way; and what rounding leaves is no more than 4 of it."""
+    q, eps = jnp.array([0.3, 1.3], dtype), float(jnp.finfo(dtype).eps)
+    value, rounding = jax.jit(lambda q: with_rounding(function, q))(q)
+    assert float(value) == float(jax.jit(function)(q))
+    assert 0.25 < float(rounding) / (eps * size) < 4.0
+    exact = {identity: 0.0, tilted: 0.0}.get(function)
+    if exact is not None:
+        assert abs(float(value) - exact) < 4.0 * float(rounding)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_rows_that_are_rounding_everywhere_are_void(dtype):
+    """And what vanishes at one place, is small, or is scaled down, is not."""
+
+    def rows(q):
+        functions = [identity, tilted, lambda q: q[1] ** 2, lambda q: 1e-9 * (q[0] - q[1])]
+        return jnp.stack([jax.grad(f)(q) for f in functions])
+
+    for q in ([0.3, 0.0], [2.0, 0.0], [-1.1, 0.0]):
+        q = jnp.array(q, dtype)
+        there, void, size = row_sizes(rows, q, rows(q))
+        assert there.tolist() == [False, False, False, True]
+        assert void.tolist() == [True, True, False, False]
+        assert float(size[1]) > 0.1
+    q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometres
+    there, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
+    assert there.tolist() == [True]
+    assert void.tolist() == [False]
+
+
+# ---- Constraints ---------------------------------------------------------------------------------
+
+
+def falling(t, q, v, params):
+    return 0.5 * v @ v - 9.81 * q[1]
+
+
+def rod(t, q, params):
+    return q @ q - 1.0
+
+
+ROD = jl.Holonomic(rod, "rod")
+VOID = {
+    "holonomic": jl.Holonomic(lambda t, q, p: identity(q) + p * t**2, "void"),
+    "led": jl.Holonomic(lambda t, q, p: (1.0 + t) * identity(q) + p, "void"),
+    "Pfaffian": jl.Pfaffian(lambda t, q, v, p: identity(q[:1].repeat(2)) * v[1] + p, "void"),
+}
+START = np.array([0.6, -0.8]), np.array([0.24, 0.18])
+SHORT = {"dt": 0.02, "method": "tsit5", "throw": False}
+
+
+def systems(kind, alone, lowering="auto"):
+    """(with the row, without it)."""
+    others = () if alone else (ROD,)
+    rows = (*others, VOID[kind]), others
+    return tuple(jl.System(falling, ("x", "y"), constraints=r, lowering=lowering) for r in rows)
+
+
+@pytest.mark.parametrize("dtype", mostly_full([jnp.float64, jnp.float32], jnp.float64))
+@pytest.mark.parametrize(
+    ("kind", "alone", "options"),
+    mostly_full(
+        [
+            (kind, alone, options)
+            for kind in VOID
+            for alone in (False, True)
+            for options in (
+                {},
+                {"formulation": "null_space"},
+                {"assemble": True},
+                {"lowering": "array"},
+                {"project": False},
+            )
+        ],
+        ("holonomic", False, {}),
+        ("Pfaffian", True, {}),
+    ),
+)
+def test_a_row_that_says_nothing_changes_nothing(kind, alone, options, dtype):
+    options = dict(options)
+    system, without = systems(kind, alone, options.pop("lowering", "auto"))
+    q, v, ts = (jnp.asarray(x, dtype) for x in (*START, [0.0, 0.1]))
+    found = jl.simulate(system, q, v, ts, jnp.zeros((), dtype), **SHORT, **options)
+    expected = jl.simulate(without, q, v, ts, **SHORT)
+    assert found.status == jl.Status.ok, found.message()
+    np.testing.assert_allclose(found.q, expected.q, atol=16 * float(jnp.finfo(dtype).eps))
+    np.testing.assert_array_equal(found.lam["void"], 0.0)
+    a, lam = (of(0.0, q, v) for of in (system.acceleration, system.multipliers))
+    np.testing.assert_allclose(a, without.acceleration(None, q, v), rtol=1e-5)
+    assert lam["void"] == 0
+
+
+@pytest.mark.parametrize("gap", mostly_full([1e-3, 1e-9], 1e-9))
+@pytest.mark.parametrize(
+    ("kind", "alone"),
+    mostly_full([(k, a) for k in VOID for a in (False, True)], ("led", True), ("holonomic", False)),
+)
+def test_a_row_that_says_what_cannot_be_is_told(kind, alone, gap):
+    """In its place, rate or acceleration."""
+    system, _ = systems(kind, alone)
+    found = jl.simulate(system, *START, [0.0, 0.1], gap, **SHORT)
+    if kind == "holonomic" and gap < 1e-6:  # of t^2: so little that no step sees it
+        gap = 1e-3
+        found = jl.simulate(system, *START, [0.0, 0.1], gap, **SHORT)
+    assert found.status == jl.Status.contradictory_rows
+    assert "('void')" in found.message()
+
+
+@pytest.mark.parametrize("project", mostly_full([True, False], True))
+def test_a_row_that_says_so_later_is_told(project):
+    late = jl.Holonomic(lambda t, q, p: identity(q) + jnp.maximum(t - 0.05, 0.0) ** 2, "late")
+    system = jl.System(falling, ("x", "y"), constraints=(late,))
+    found = jl.simulate(system, *START, [0.0, 0.1], project=project, **SHORT)
+    assert found.status == jl.Status.rank_change
+    assert 0.03 < found.last_time < 0.07
+
+
+def test_a_closure_in_a_tilted_plane():
+    """Assembled, at rest, and in a batch: its third row is 0 = 0."""
+
+    def closure(t, q, params):
+        R = jnp.asarray(TILT, q.dtype)
+        r = jnp.stack([q[0] - jnp.sin(q[2]), q[1] + jnp.cos(q[2]), 0.0 * q[0]])
+        return R.T @ (R @ r) + params * jnp.array([0.0, 0.0, 1.0])
+
+    system = jl.System(falling, ("x", "y", "theta"), constraints=(jl.Holonomic(closure, "pin"),))
+    state = jl.assemble(system, [0.5, -0.9, 0.5], [0.3, 0.0, 0.2], 0.0)
+    assert state.dependent == ("pin[2]",)
+    rest = jl.equilibrium(system, [0.1, -0.9, 0.15], 0.0)
+    np.testing.assert_allclose(rest.q, [0.0, -1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(rest.lam["pin"], [0.0, 9.81, 0.0], atol=1e-12)
+    assert jl.equilibrium(system, [0.1, -0.9, 0.15], 1e-3, throw=False).status != jl.Status.ok
+    with pytest.raises(jl.AssemblyError, match=r"contradictory_rows \('pin\[2\]'\)"):
+        jl.assemble(system, [0.5, -0.9, 0.5], [0.3, 0.0, 0.2], 1e-9)
+
+    def swung(angle):
+        q = jnp.stack([jnp.sin(angle), -jnp.cos(angle), angle])
+        return jl.simulate(system, q, 0.0 * q, jnp.array([0.0, 0.2]), 0.0, **SHORT)
+
+    found = jax.vmap(swung)(jnp.linspace(-1.0, 1.0, 5))
+    np.testing.assert_array_equal(found.status, int(jl.Status.ok))
+    energy = 0.5 * jnp.sum(found.v**2, axis=-1) + 9.81 * found.q[..., 1]
+    np.testing.assert_allclose(energy[:, 1], energy[:, 0], atol=1e-6)
