@@ -134,13 +134,13 @@ def augmented(
     """
     inertias = jnp.diagonal(M)
     there = inertias > 0
-    mobility = jnp.sum(jnp.where(there, A**2 / jnp.where(there, inertias, 1.0), 0.0), axis=1)
+    mobility = jnp.sum(jnp.where(there, A**2 / jnp.where(there, inertias, 1.0)[None], 0.0), axis=1)
     square = jnp.sum(A**2, axis=1)
     some = mobility > 0
     alone = _size(M) / jnp.where(square > 0, square, 1.0)
     weights = jnp.where(some, 1.0 / jnp.where(some, mobility, 1.0), alone)
     weights = jnp.where(square > 0, weights, 0.0)
-    return M + (A.T * weights) @ A, weights
+    return M + (A.T * weights[None]) @ A, weights
 
 
 def _size(M: Array) -> Array:
@@ -161,7 +161,7 @@ def _null_space(
 ) -> NullSpace:
     """Rows made orthonormal one after the other, each twice (Gram-Schmidt, "twice is enough")."""
     units = units_of(M, A)
-    M, A = units[:, None] * M * units, A * units
+    M, A = units[:, None] * M * units[None], A * units[None]
     m, n = A.shape
     Y = jnp.zeros((m, n), A.dtype)
     L, healthy = [], []

@@ -68,10 +68,10 @@ def row_sizes(
     eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
     signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
-    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q + small * signs]))
+    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q[None] + small * signs]))
     if sure:
-        places = jnp.concatenate([places, q + ROUNDINGS * eps * signs * jnp.abs(places[0])])
-        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A))
+        places = jnp.concatenate([places, q[None] + ROUNDINGS * eps * signs * jnp.abs(places[:1])])
+        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A)[None])
         growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
         norms = _lengths(A)
         there = (norms > 0) & ~(norms <= rounding)
@@ -79,10 +79,10 @@ def row_sizes(
         return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
     found, rounding = jax.vmap(partial(with_rounding, rows))(places)
     rounding, norms = _lengths(rounding), _lengths(A)
-    growth = _lengths(found[1:] - jax.lax.stop_gradient(A))
+    growth = _lengths(found[1:] - jax.lax.stop_gradient(A)[None])
     # What is not known, as derivatives beside the end of a domain, speaks for the row.
     there = (norms > 0) & ~(norms <= ROUNDINGS * rounding[0])
-    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[0] + rounding[1:]), axis=0)
+    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
     made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
     size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
     return Sizes(there, void, jnp.where(size > 0, size, 1.0))
@@ -181,7 +181,7 @@ def independent_rows(
     pivots = jnp.diagonal(S)
     usable = usable & (pivots > 0)
     scale = jax.lax.rsqrt(jnp.where(usable, pivots, 1.0))
-    S = scale[:, None] * S * scale
+    S = scale[:, None] * S * scale[None]
     turns = np.zeros(m, int) if turn is None else np.asarray(turn, int)
 
     def choose(_: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -233,9 +233,9 @@ def least_norm(
     if kept is None:
         metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
         kept = independent_rows(metric, fixed, there=there, mobile_first=True)
-    norms, sizes = _lengths(A), _lengths(A * units)
+    norms, sizes = _lengths(A), _lengths(A * units[None])
     norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
-    unit = A * units / sizes[:, None]
+    unit = A * units[None] / sizes[:, None]
     C = _least_squares(unit.T, unit.T, kept).T
     apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
     follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))

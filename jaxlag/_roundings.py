@@ -111,7 +111,7 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
 
     exact, runs = jax.vmap(run, out_axes=(None, 0))(jnp.asarray(table))
     found = [
-        jnp.max(jnp.abs(several - one), axis=0) / STRENGTH
+        jnp.max(jnp.abs(several - one[None]), axis=0) / STRENGTH
         for several, one in zip(runs, exact, strict=True)
     ]
     tree = jax.tree.structure(shape)
@@ -132,7 +132,7 @@ def with_scatter(function: Callable, *args: Array) -> tuple[Any, Any]:
 
     def around(x: Array) -> Array:
         off = draw.uniform(-1.0, 1.0, (NEARBY, *x.shape)) * float(jnp.finfo(x.dtype).eps) ** 0.5
-        beside = x + jnp.asarray(off, x.dtype) * (1.0 + jnp.abs(x))
+        beside = x[None] + jnp.asarray(off, x.dtype) * (1.0 + jnp.abs(x))[None]
         return jnp.concatenate([x[None], beside])
 
     found = jax.vmap(function)(*map(around, args))

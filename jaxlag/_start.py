@@ -170,7 +170,7 @@ def _fitting(
     u = quasi.of(t, q, v, params)
     B = jax.jacfwd(lambda w: dynamics.velocities(t, q, w, params))(u[quasi.free])
     size = jnp.sqrt(jnp.sum(B**2, axis=0))
-    B = B / jnp.where(size > 0, size, 1.0)
+    B = B / jnp.where(size > 0, size, 1.0)[None]
     sines = jnp.abs(A @ B) / unit[:, None]
     rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
     # Singular kinematics, as at gimbal lock, are a fault of their own.
