@@ -326,6 +326,7 @@ def _ran_out(motion: Solution) -> bool:
 @partial(jax.jit, static_argnums=0)
 def _simulate(plan: Plan, values: Values) -> Solution:
     """The compiled program: pose, solve, derive what `save` names."""
+    values = values._replace(ts=jnp.asarray(values.ts))  # under jax.disable_jit it is numpy's
     dynamics, start, problem = pose(plan, values)
     scheme: Scheme = eqx.combine(problem.setup.scheme, problem.scheme)
     name = name_of(scheme.solver)
