@@ -23,6 +23,7 @@ from mechanisms import (
 )
 
 import jaxlag as jl
+from jaxlag._lowering._rows import layout
 
 EPS = np.finfo(float).eps
 
@@ -188,6 +189,38 @@ def test_bad_declarations(make, message):
 def solved(q, v):
     """(1 + q q^T)^-1 v, by a factorization that has no form on scalars."""
     return jnp.linalg.solve(jnp.eye(q.shape[0]) + jnp.outer(q, q), v)
+
+
+@pytest.mark.parametrize(
+    ("phi", "sure"),
+    [
+        (lambda t, q, p: q @ q - 1.0, True),
+        (lambda t, q, p: q[0] - 3.0 * q[1], True),
+        (lambda t, q, p: jnp.sin(q[0]) - jnp.sin(q[1] + q[2] ** 2), True),
+        (lambda t, q, p: (jnp.sin(q[0]) ** 2 + jnp.cos(q[0]) ** 2 - 1.0) * q[1], False),
+        (lambda t, q, p: q[0] * (q[1] + 1.0) - q[0] * q[1] - q[0], False),
+        (lambda t, q, p: (0.1 + 0.2 - 0.3) * q[0], False),  # the coefficient is rounding
+        (lambda t, q, p: p * q[0], False),
+        (lambda t, q, p: t * q[0], False),
+        (lambda t, q, p: jnp.maximum(q[0], 0.0), False),
+        (lambda t, q, p: 0.0 * q[0], False),
+    ],
+)
+def test_which_rows_are_known_to_be_no_rounding(phi, sure):
+    """From the program alone; of the others their numbers tell."""
+    assert layout((jl.Holonomic(phi, "a"),), jnp.zeros(()), 3, jnp.float64).sure == (sure,)
+
+
+def test_a_row_of_the_number_0_says_nothing():
+    """It is accepted, and leaves the motion free; another number is refused, see above."""
+    row = jl.Holonomic(lambda t, q, params: jnp.stack([q[0] - q[1], 0.0 * q[0]]), ("a", "zero"))
+    system = declared(row)
+    q, v = jnp.zeros(4), jnp.array([1.0, 1.0, 0.5, -0.5])
+    without = declared(jl.Holonomic(lambda t, q, params: q[:1] - q[1:2], ("a",)))
+    np.testing.assert_allclose(
+        system.acceleration(BOBS, q, v), without.acceleration(BOBS, q, v), rtol=1e-12
+    )
+    assert system.multipliers(BOBS, q, v)["zero"] == 0.0
 
 
 @pytest.mark.parametrize(

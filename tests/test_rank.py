@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from jaxlag._kkt import units_of
+from jaxlag._lowering._constrained import Sharing, _shared
+from jaxlag._lowering._evaluate import evaluate
+from jaxlag._lowering._graph import Graph
 from jaxlag._rank import independent_rows, least_norm, row_sizes
 
 
@@ -108,6 +111,42 @@ def test_least_norm_with_levers_of_any_length(kind, dtype):
         worst = np.max(np.abs(sizes * (found - expected))) / np.max(np.abs(sizes * expected))
         assert worst < 16 * eps  # 4 eps is the worst there is
         left = np.abs(found @ exact - f) / (np.abs(found) @ np.abs(exact) + np.abs(f))
+        assert left.max() < 8 * eps
+
+
+def on_the_graph(A, units, kept, lam):
+    """The same by scalar code, in numbers."""
+    graph, (m, n) = Graph(), A.shape
+    rows = [
+        [graph.input("A", i * n + j) if A[i, j] else graph.zero for j in range(n)] for i in range(m)
+    ]
+    given = {"A": A.ravel(), "units": units, "kept": kept, "there": np.ones(m)}
+    units, kept, there = (
+        [graph.input(name, i) for i in range(given[name].size)]
+        for name in ("units", "kept", "there")
+    )
+    sharing = Sharing(list(range(m)), there)
+    found = _shared(graph, rows, units, kept, sharing, float(np.finfo(float).eps))
+    values = {(name, i): float(x) for name, xs in given.items() for i, x in enumerate(xs)}
+    flat = [float(x) for x in evaluate([x for row in found for x in row], values)]
+    return np.reshape(flat, (m, m)) @ lam
+
+
+@pytest.mark.parametrize("kind", list(ROLLERS))
+def test_least_norm_on_the_graph_is_as_accurate(kind):
+    eps = float(np.finfo(float).eps)
+    for r in 10.0 ** -np.arange(9):
+        A = np.array(ROLLERS[kind](r))
+        M = jnp.diag(jnp.array([1.0, r**2, 2 * r**2]))
+        units = units_of(M, jnp.asarray(A))
+        kept = np.asarray(independent_rows(M, jnp.asarray(A), mobile_first=True))
+        lam = np.where(kept, np.array([0.3, 1.1, 0.7, -0.4])[: len(A)], 0.0)
+        lam = lam / np.linalg.norm(A * np.asarray(units), axis=1)
+        found, f = on_the_graph(A, np.asarray(units), kept, lam), A.T @ lam
+        expected, sizes = least_by_hand(A, f), np.linalg.norm(A, axis=1)
+        worst = np.max(np.abs(sizes * (found - expected))) / np.max(np.abs(sizes * expected))
+        assert worst < 16 * eps  # 3 eps is the worst there is
+        left = np.abs(found @ A - f) / (np.abs(found) @ np.abs(A) + np.abs(f))
         assert left.max() < 8 * eps
 
 

@@ -9,6 +9,7 @@ from jaxlag._lowering._diff import tangents
 from jaxlag._lowering._graph import Graph, Node, dependencies, substitute
 from jaxlag._lowering._ingest import Unsupported
 from jaxlag._lowering._solve import GREATER, bordered, solve_general
+from jaxlag._rank import ROUNDINGS
 
 
 class Constrained(NamedTuple):
@@ -211,14 +212,17 @@ def _shared(
     ]
     flags = [kept[k] for k in chosen]
     L, Y = _orthonormal(graph, unit, flags)
-    C, others = [], []
+    C, others, rounding = [], [], graph.const((ROUNDINGS * eps) ** 2)
     for row, flag in zip(unit, flags, strict=True):
         parts = [_weighted(graph, y, row) for y in Y]
         rest = _without(graph, row, list(zip(parts, Y, strict=True)))
         near = graph.call(GREATER, graph.const(eps), _weighted(graph, rest, rest))
         follows = graph.let(graph.select(near, graph.sum([(flag, -1.0)], 1.0), zero))
         others.append(follows)
-        C.append([graph.let(graph.mul(follows, x)) for x in _backward(graph, L, parts)])
+        # What a row has of another by rounding alone may be much to one of smaller weight.
+        found = [(x, graph.let(graph.power(x, 2))) for x in _backward(graph, L, parts)]
+        found = [graph.select(graph.call(GREATER, s, rounding), x, zero) for x, s in found]
+        C.append([graph.let(graph.mul(follows, x)) for x in found])
     moved = [
         [
             graph.mul(weights[k], graph.sum([(others[j], -1.0)]) if j == k else C[j][k])
@@ -226,17 +230,28 @@ def _shared(
         ]
         for j in places
     ]
+    # In units in which the diagonal is 1: weights may be as unlike as forces and short levers.
+    lengths = [length(x) for x in moved]
+    moved = [[graph.let(graph.div(x, s)) for x in y] for y, s in zip(moved, lengths, strict=True)]
     square = [[_weighted(graph, x, y) for y in moved] for x in moved]
     for j in places:
         square[j][j] = graph.sum([(square[j][j], 1.0), (others[j], -1.0)], 1.0)
     sides = [[graph.mul(weights[k], flags[k], x[k]) for x in moved] for k in places]
     columns = bordered(graph, square, [], [(side, []) for side in sides], eps)
     seen = [[one if i == j else zero for j in range(m)] for i in range(m)]
-    for j, z in enumerate(columns):
+    for j, found in enumerate(columns):
+        z = [graph.let(graph.div(x, s)) for x, s in zip(found, lengths, strict=True)]
+        shares = []
         for i in places:
             taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
             own = [(flags[i], 1.0)] if i == j else []
-            share = graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken]))
+            shares.append(graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken])))
+        # What all exert together stays what it is.
+        exerted = [graph.mul(flags[j], x) for x in unit[j]]
+        left = _without(graph, exerted, list(zip(shares, unit, strict=True)))
+        more = _backward(graph, L, [_weighted(graph, y, left) for y in Y])
+        for i in places:
+            share = graph.let(graph.add(shares[i], graph.mul(flags[i], more[i])))
             seen[chosen[i]][chosen[j]] = graph.let(graph.div(graph.mul(share, sizes[j]), sizes[i]))
     return seen
 
