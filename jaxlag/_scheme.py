@@ -109,7 +109,7 @@ class Scheme(eqx.Module):
         if type(controller) is not diffrax.PIDController:
             return self
         zero = jnp.zeros_like(args.origin)
-        compares = isinstance(self.term, Term) and self._branches(zero, y, args) is not None
+        compares = isinstance(self.term, Term) and self._compares(zero, y, args)
         scheme = replace(self, across=True) if compares else self
         return scheme._bounded_at_rest(y, args)
 
@@ -188,6 +188,11 @@ class Scheme(eqx.Module):
     def _turn(self, k: PyTree) -> PyTree:
         """h dy/dt at the start less that at the end, where it is asked for."""
         return k[0] - k[-1] if self.across or self.passes else None
+
+    def _compares(self, tau: Array, y: Array, args: Any) -> bool:
+        """Whether there are comparisons in what is declared; nothing is computed for that."""
+        found: Any = jax.eval_shape(lambda: self._branches(tau, y, args))
+        return found is not None
 
     def _branches(self, tau: Array, y: Array, args: Any) -> Array | None:
         """Outcomes of the comparisons in what is declared."""
