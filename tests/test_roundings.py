@@ -83,10 +83,19 @@ def rod(t, q, params):
 
 
 ROD = jl.Holonomic(rod, "rod")
+
+
+def like(q, x):
+    """Time is double, whatever the state is."""
+    return jnp.asarray(x, q.dtype)
+
+
 VOID = {
-    "holonomic": jl.Holonomic(lambda t, q, p: identity(q) + p * t**2, "void"),
-    "led": jl.Holonomic(lambda t, q, p: (1.0 + t) * identity(q) + p, "void"),
-    "Pfaffian": jl.Pfaffian(lambda t, q, v, p: identity(q[:1].repeat(2)) * v[1] + p, "void"),
+    "holonomic": jl.Holonomic(lambda t, q, p: identity(q) + like(q, p) * like(q, t) ** 2, "void"),
+    "led": jl.Holonomic(lambda t, q, p: like(q, 1.0 + t) * identity(q) + like(q, p), "void"),
+    "Pfaffian": jl.Pfaffian(
+        lambda t, q, v, p: identity(q[:1].repeat(2)) * v[1] + like(q, p), "void"
+    ),
 }
 START = np.array([0.6, -0.8]), np.array([0.24, 0.18])
 SHORT = {"dt": 0.02, "method": "tsit5", "throw": False}
