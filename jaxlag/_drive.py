@@ -34,7 +34,7 @@ class _Place(NamedTuple):
     y: PyTree
     memory: Any  # the solver's own state
     jump: Array | None  # whether the field jumps there; None where nothing ever does
-    volumes: Array | None  # see `Scheme.volumes`
+    determinants: Array | None  # see `Scheme.determinants`
 
 
 class _Rows(NamedTuple):
@@ -136,8 +136,8 @@ def drive(
         memory, h, control = scheme.begin(t0, times.stop, y0, args), first_step, None
         sound = scheme.is_sound(memory)
     jumps = times.knots is not None or not scheme.standard
-    volumes = scheme.volumes(t0, y0, args)
-    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, volumes)
+    determinants = scheme.determinants(t0, y0, args)
+    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
@@ -254,9 +254,9 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     y1, estimate, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
     finite = all_finite(y1)
     settled, verdict = scheme.settled(t1, y1, args)
-    step = (begin.t, t1, begin.y, settled, args, estimate.turn, begin.volumes)
+    step = (begin.t, t1, begin.y, settled, args, estimate.turn, begin.determinants)
     passage = scheme.passage(*step)
-    regular, share, volumes = (jnp.array(True), None, None) if passage is None else passage
+    regular, share, determinants = (jnp.array(True), None, None) if passage is None else passage
     good = finite & solved & (regular | to_row) & verdict.good
     rest = (estimate, good, lands, share, regular | to_row)
     keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
@@ -308,7 +308,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
     jump = None if c.at.jump is None else jump | lands
-    end = _Place(t1, settled, memory, jump, volumes)
+    end = _Place(t1, settled, memory, jump, determinants)
     at = _select(take, end, c.at)
     kept = None if c.kept is None else _written(loop, c, c.kept, at.t, anchor)
     return _Carry(

@@ -12,11 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag import _params
-from jaxlag._closing import declared
 from jaxlag._constraints import NO_ROWS, Baumgarte, Layout
 from jaxlag._errors import bad
 from jaxlag._forces import sliding
-from jaxlag._input_values import InputValues
 from jaxlag._inputs import (
     all_knots,
     at_interval,
@@ -25,14 +23,12 @@ from jaxlag._inputs import (
     marked,
     reads_state,
 )
-from jaxlag._kinks import outcomes
 from jaxlag._linalg import clearly_definite
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._power import Power
 from jaxlag._projection import Surface
 from jaxlag._quasi import QuasiVelocities
 from jaxlag._rank import Choice, independent_rows, row_sizes
-from jaxlag._signals import AbstractInput, AbstractTable
 from jaxlag._step import Arguments, Gaps, RowChoice
 from jaxlag._system import System
 from jaxlag._terms import Terms
@@ -167,21 +163,6 @@ class Dynamics(eqx.Module):
                 definite = self._definite(t, q, v, params)
                 prepared = prepared._replace(definite=definite, alone=alone)
         return args._replace(prepared=prepared)
-
-    def volumes(self, tau: Array, q: Array, args: Arguments) -> Array | None:
-        """What is 0 or infinite where quasi-velocities are singular; None where nothing ever is.
-
-        Determinants of blocks of dU/dv or dv/du, those left out that do not change.
-        """
-        assert self.quasi is not None
-        terms, t, (params, _) = self.terms, self.clock(tau, args), self.given(args)
-        if isinstance(args.prepared, ScalarPrepared) and args.prepared.volumes is not None:
-            assert isinstance(terms, ScalarTerms)
-            values = self.inputs_at(tau, q, jnp.zeros_like(q), args)
-            found = terms.volumes(t, q, params, values, args.prepared)
-        else:
-            found = self.quasi.volumes(t, q, params) if self.quasi.moves(q, params) else None
-        return None if found is None or not found.size else found
 
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
@@ -425,34 +406,6 @@ class Dynamics(eqx.Module):
         assert self.power is not None
         columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
-
-    def branches(self, tau: Array, y: Array, args: Arguments) -> Array | None:
-        """Outcomes of the comparisons in what is declared, at (tau, y); None where there are none.
-
-        As long as they stay the same, forces are smooth. Tables and functions with knots bend and
-        jump at ends of steps; multipliers that forces read are taken for 0.
-        """
-        t, q, v, params, values = self.at(tau, y, args)
-        _, inputs = self.given(args)
-        inside = {
-            name: x
-            for name, x in inputs.items()
-            if isinstance(x, AbstractInput)
-            and not isinstance(x, AbstractTable)
-            and x.knots() is None
-        }
-        traced, static = _params.halves((params, inside))
-
-        def everything(t: Array, q: Array, v: Array, values: Any, traced: Any) -> Any:
-            params, inside = _params.join(traced, static)
-            found = evaluate(inside, t, q, v, params)
-            return declared(self.system, t, q, v, params, InputValues(values | dict(found)), None)
-
-        moving, rest = (t, q, v, dict(values)), jax.tree.leaves(traced)
-        program = jax.make_jaxpr(everything)(*moving, traced)
-        first = jax.tree.leaves(moving)
-        which = [True] * len(first) + [False] * len(rest)
-        return outcomes(program, [*first, *rest], which)
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Lines of the scalar program for states and arguments like these, where there is one."""

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 from jax import Array
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jaxlag._nested import called
+
 _SMOOTH = "jaxlag smooth"
 smooth = jax.named_scope(_SMOOTH)
 """Decorator of a function that compares, and is smooth all the same."""
 
 # Of a single place, and the order of an elimination, which its results do not depend on.
 _GUARDS = ("eq", "ne", "is_finite", "lu")
-_CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 def outcomes(program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool]) -> Array | None:
@@ -48,7 +49,7 @@ def _run(
     for eqn in jaxpr.eqns:
         given = [x.val if isinstance(x, Literal) else known[x] for x in eqn.invars]
         touched = [not isinstance(x, Literal) and x in moves for x in eqn.invars]
-        inner = _called(eqn)
+        inner = called(eqn)
         if inner is not None:
             looks = found if _SMOOTH not in str(eqn.source_info.name_stack) else []
             results, does = _run(inner, given, touched, looks)
@@ -62,19 +63,6 @@ def _run(
         moves.update(x for x, moved in zip(eqn.outvars, does, strict=True) if moved)
     ends = [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
     return ends, [not isinstance(x, Literal) and x in moves for x in jaxpr.outvars]
-
-
-def _called(eqn: Any) -> ClosedJaxpr | None:
-    """The program of a call; None of a loop, a choice, or an operation."""
-    if eqn.primitive.name in ("scan", "while", "cond"):
-        return None
-    for key in _CALLS:
-        inner = eqn.params.get(key)
-        if inner is None:
-            continue
-        closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-        return closed if len(closed.jaxpr.invars) == len(eqn.invars) else None
-    return None
 
 
 def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:

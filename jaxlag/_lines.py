@@ -3,7 +3,8 @@
 from typing import Any
 
 from jax.extend import source_info_util
-from jax.extend.core import ClosedJaxpr, Jaxpr
+
+from jaxlag._nested import equations
 
 
 def line_of(program: Any, *primitives: str) -> str:
@@ -13,14 +14,7 @@ def line_of(program: Any, *primitives: str) -> str:
         program: traced; programs within it are searched, too.
         primitives: names of operations.
     """
-    jaxpr = program.jaxpr if isinstance(program, ClosedJaxpr) else program
-    for eqn in jaxpr.eqns:
+    for eqn in equations(program):
         if eqn.primitive.name in primitives:
             return source_info_util.summarize(eqn.source_info)
-        for value in eqn.params.values():
-            for inner in value if isinstance(value, tuple) else (value,):
-                if isinstance(inner, ClosedJaxpr | Jaxpr):
-                    found = line_of(inner, *primitives)
-                    if found:
-                        return found
     return ""

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._dynamics import Dynamics
-from jaxlag._step import Arguments
+from jaxlag._lowering import ScalarPrepared, ScalarTerms
+from jaxlag._step import Arguments, midway
 
 PART = 0.5  # of the least of three samples
 SPREAD = 8.0  # of samples within one step
@@ -35,13 +36,13 @@ class Passage(NamedTuple):
 
 def passage(
     dynamics: Dynamics,
+    tolerance: Array | None,
     t0: Array,
     t1: Array,
     y0: Float[Array, " m"],
     y1: Float[Array, " m"],
     args: Arguments,
     turn: Float[Array, " m"] | None,
-    tolerance: Array | None,
     first: Float[Array, " b"],
 ) -> Passage:
     """What becomes of v and u along a step.
@@ -58,24 +59,19 @@ def passage(
 
     Args:
         dynamics: what moves.
+        tolerance: bound on local errors; None with fixed steps.
         t0: start of the step.
         t1: its end.
         y0: state at its start.
         y1: state at its end.
         args: arguments of the step.
         turn: h dy/dt at the start less that at the end; None where it is not known.
-        tolerance: bound on local errors; None with fixed steps.
         first: determinants at its start.
     """
-    assert args.volumes is not None
-    ends = [dynamics.parts(y)[0] for y in (y0, y1)]
-    middle = 0.5 * (ends[0] + ends[1])
-    if turn is not None:
-        middle = middle + 0.125 * dynamics.parts(turn)[0]
-    half = t0 + 0.5 * (t1 - t0)
-    states = ((half, middle), (t1, ends[1]))
-    between, last = (volumes(dynamics, tau, q, args) for tau, q in states)
-    left = jnp.min(opening(dynamics, last) / args.volumes)
+    assert args.usual is not None
+    states = (midway(t0, t1, y0, y1, turn), (t1, y1))
+    between, last = (determinants(dynamics, tau, dynamics.parts(y)[0], args) for tau, y in states)
+    left = jnp.min(opening(dynamics, last) / args.usual)
     eps = float(jnp.finfo(y1.dtype).eps)
     least, share, beside = 64 * eps, jnp.ones_like(left), BESIDE_FIXED
     if tolerance is not None:
@@ -85,18 +81,33 @@ def passage(
     return Passage(resolved(first, between, last, beside) & (left > least), share, last)
 
 
-def volumes(dynamics: Dynamics, tau: Array, q: Array, args: Arguments) -> Float[Array, " b"]:
-    """Determinants that change on the way."""
-    found = dynamics.volumes(tau, q, args)
-    assert found is not None
-    return found
+def determinants(
+    dynamics: Dynamics, tau: Array, q: Float[Array, " n"], args: Arguments
+) -> Float[Array, " b"]:
+    """What is 0 or infinite where quasi-velocities are singular.
+
+    Determinants of the blocks of dU/dv, or of dv/du where that is given, without those that do not
+    change, where there is a scalar program of them.
+    """
+    quasi, terms = dynamics.quasi, dynamics.terms
+    assert quasi is not None
+    t, (params, _) = dynamics.clock(tau, args), dynamics.given(args)
+    if _by_program(args):
+        assert isinstance(terms, ScalarTerms)
+        values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
+        return terms.determinants(t, q, params, values, args.prepared)
+    return quasi.determinant(t, q, params)[None]
 
 
-def opening(dynamics: Dynamics, volumes: Float[Array, " b"]) -> Float[Array, " b"]:
+def _by_program(args: Arguments) -> bool:
+    return isinstance(args.prepared, ScalarPrepared) and args.prepared.determinants is not None
+
+
+def opening(dynamics: Dynamics, found: Float[Array, " b"]) -> Float[Array, " b"]:
     """How large dU/dv is, by its determinants, or by those of its inverse where that is given."""
     quasi = dynamics.quasi
     assert quasi is not None
-    size = jnp.abs(volumes)
+    size = jnp.abs(found)
     if quasi.U is not None:
         return size
     return 1.0 / (size if quasi.size == dynamics.system.size else jnp.sqrt(size))
@@ -107,14 +118,17 @@ def usual(dynamics: Dynamics, tau: Array, q: Float[Array, " n"], args: Arguments
 
     None where its determinants never change.
     """
-    here = dynamics.volumes(tau, q, args)
-    if here is None:
+    assert dynamics.quasi is not None
+    if not _by_program(args) and not dynamics.quasi.moves(q, dynamics.given(args)[0]):
+        return None
+    here = determinants(dynamics, tau, q, args)
+    if not here.size:
         return None
     at = np.arange(q.shape[0])
     ways = float(jnp.finfo(q.dtype).eps) ** 0.25 * np.array([(-1.0) ** at, (-1.0) ** (at // 2)])
     size = own = opening(dynamics, here)
     for way in ways:
-        beside = volumes(dynamics, tau, q + jnp.asarray(way, q.dtype), args)
+        beside = determinants(dynamics, tau, q + jnp.asarray(way, q.dtype), args)
         grown = jnp.abs(opening(dynamics, beside) - own) / float(np.abs(way[0]))
         size = jnp.maximum(size, jnp.where(jnp.isfinite(grown), NEAR * grown, 0.0))
     return size

@@ -118,7 +118,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     start = jnp.zeros_like(args.origin)
     args = dynamics.prepare(start, y0, args)
     if dynamics.quasi is not None:
-        args = args._replace(volumes=usual(dynamics, *still((start, q0, args))))
+        args = args._replace(usual=usual(dynamics, *still((start, q0, args))))
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.rows.size:
         y0, args = still_unless(consistent.ok, (y0, args))
@@ -134,7 +134,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
     how = (dynamics.windows, settle, dynamics.projects, values.longest)
-    passes = args.volumes is not None
+    passes = args.usual is not None
     scheme = Scheme(solver, controller, term, *how, passes=passes)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)

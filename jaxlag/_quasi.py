@@ -198,29 +198,30 @@ class QuasiVelocities(eqx.Module):
     def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
         """Distance of every quasi-velocity's coefficients from the span of those before it.
 
-        Of its column of B, where `kinematics` are given.
+        That of every row of dU/dv, shape (k,), or of every column of B where `kinematics` are
+        given: |R_jj| of Q R = (dU/dv)^T or B.
 
         Args:
             t: time, s.
-            q: coordinates, shape (n,).
+            q: coordinates, shape (n,), m or rad.
             params: as U takes them.
         """
         size, _, R = _factored(self._columns(t, q, params, q.dtype))
         return size * jnp.abs(jnp.diagonal(R))
 
-    def volumes(
+    def determinant(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
-    ) -> Float[Array, " 1"]:
+    ) -> Float[Array, ""]:
         """det dU/dv, or det B, or det B^T B where B is tall: 0 or infinite where it is singular.
 
         Args:
             t: time, s.
-            q: coordinates, shape (n,).
+            q: coordinates, shape (n,), m or rad.
             params: as U takes them.
         """
         columns = self._columns(t, q, params, q.dtype)
         square = columns.shape[0] == columns.shape[1]
-        return jnp.linalg.det(columns if square else columns.T @ columns)[None]
+        return jnp.linalg.det(columns if square else columns.T @ columns)
 
     def moves(self, q: Any, params: Any) -> bool:
         """Whether dU/dv, or B, depends on time or coordinates, as far as its program shows.
@@ -232,10 +233,10 @@ class QuasiVelocities(eqx.Module):
         like = jax.ShapeDtypeStruct(q.shape, q.dtype)
         time = jax.ShapeDtypeStruct((), jnp.result_type(float))
 
-        def volumes(t: Array, q: Array) -> Array:
-            return self.volumes(t, q, params)
+        def determinant(t: Array, q: Array) -> Array:
+            return self.determinant(t, q, params)
 
-        program = jax.make_jaxpr(volumes)(time, like).jaxpr
+        program = jax.make_jaxpr(determinant)(time, like).jaxpr
         (found,) = outputs_depend_on(program, [frozenset("t"), frozenset("q")])
         return bool(found)
 

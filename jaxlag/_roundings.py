@@ -19,6 +19,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
+from jaxlag._nested import called
+
 RUNS = 4
 STRENGTH = 256.0
 """Roundings by which results are changed: so many that the rounding of the runs is none to them."""
@@ -70,21 +72,6 @@ _EXACT = frozenset(
         "squeeze",
         "stop_gradient",
         "transpose",
-    ]
-)
-_INNER = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-_CALLS = frozenset(
-    [
-        "checkpoint",
-        "closed_call",
-        "core_call",
-        "custom_jvp_call",
-        "custom_vjp_call",
-        "custom_vjp_call_jaxpr",
-        "jit",
-        "pjit",
-        "remat",
-        "remat2",
     ]
 )
 
@@ -184,9 +171,8 @@ class _Changed:
 
     def _eqn(self, eqn: Any, exact: list[Any], given: list[Any]) -> tuple[list[Any], list[Any]]:
         name = eqn.primitive.name
-        inner = next((eqn.params[key] for key in _INNER if key in eqn.params), None)
-        if name in _CALLS and inner is not None:
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
+        closed = called(eqn)
+        if closed is not None:
             return self.run(closed, exact, given)
 
         def bind(values: list[Any]) -> list[Any]:

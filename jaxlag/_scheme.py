@@ -13,9 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._passage import Passage, passage, volumes
+from jaxlag._branches import branches
+from jaxlag._first_step import slope_and_step
+from jaxlag._passage import Passage, determinants, passage
+from jaxlag._perturbations import linearized, spectral_size, turning_rate
 from jaxlag._settling import Settling
-from jaxlag._step import Verdict
+from jaxlag._step import Verdict, midway
 from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
@@ -132,11 +135,11 @@ class Scheme(eqx.Module):
         smooth = ~jnp.any(J[y.size :] != 0)
         f, J = f[: y.size], J[: y.size]
         if explicit:
-            rate, power = _rate(J)
+            rate, power = spectral_size(J)
             # In J^16 f only the fastest motions are left: those of half their rate to 1e-5.
             seen = jnp.abs(power @ f)
         else:
-            rate = _turning(J)
+            rate = turning_rate(J)
             seen = jnp.abs(J @ f) / rate
         allowed = _UNSEEN * (controller.atol + controller.rtol * jnp.abs(y))
         unseen = jnp.all(seen < rate * allowed) & jnp.isfinite(rate) & smooth
@@ -197,7 +200,7 @@ class Scheme(eqx.Module):
     def _branches(self, tau: Array, y: Array, args: Any) -> Array | None:
         """Outcomes of the comparisons in what is declared."""
         term: Any = self.term
-        return term.dynamics.branches(tau, y, self.within(args, tau))
+        return branches(term.dynamics, tau, y, self.within(args, tau))
 
     def held_to(
         self,
@@ -228,13 +231,8 @@ class Scheme(eqx.Module):
         controller: Any = self.controller
         allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
         part = _ACROSS * controller.rtol * controller.norm((y1 - y0) / allowed)
-        middle = 0.5 * (y0 + y1)
-        if estimate.turn is not None:
-            middle = middle + 0.125 * estimate.turn
-        half = t0 + 0.5 * (t1 - t0)
-        before, between, after = (
-            self._branches(tau, y, args) for tau, y in ((t0, y0), (half, middle), (t1, y1))
-        )
+        places = (t0, y0), midway(t0, t1, y0, y1, estimate.turn), (t1, y1)
+        before, between, after = (self._branches(tau, y, args) for tau, y in places)
         crossed = jnp.any(before != between) | jnp.any(between != after)
         span = jnp.abs(args.end - args.origin)
         told = (
@@ -258,44 +256,28 @@ class Scheme(eqx.Module):
 
         return jax.tree.reduce(jnp.logical_and, jax.tree.map(small, y0, y1, error))
 
-    def volumes(self, tau: Array, y: Array, args: Any) -> Array | None:
-        """What is 0 or infinite where quasi-velocities are singular; None where nothing ever is."""
+    def determinants(self, tau: Array, y: Array, args: Any) -> Array | None:
+        """What tells singular quasi-velocities; None where they never are."""
         if not self.passes:
             return None
         dynamics = cast(Term, self.term).dynamics
-        return volumes(dynamics, tau, dynamics.parts(y)[0], self.within(args, tau))
+        return determinants(dynamics, tau, dynamics.parts(y)[0], self.within(args, tau))
 
-    def passage(
-        self,
-        t0: Array,
-        t1: Array,
-        y0: Array,
-        y1: Array,
-        args: Any,
-        turn: Array | None,
-        first: Array | None,
-    ) -> Passage | None:
-        """Whether v follows from quasi-velocities all along a step; None where it always does.
+    def passage(self, *step: Any) -> Passage | None:
+        """What becomes of v and u along a step, see `jaxlag._passage.passage`; None where nothing.
 
         Args:
-            t0: start of the step.
-            t1: its end.
-            y0: state at its start.
-            y1: state at its end.
-            args: arguments of the step.
-            turn: h dy/dt at the start less that at the end; None where it is not known.
-            first: `volumes` at its start.
+            step: (t0, t1, y0, y1, args, turn, determinants at its start).
         """
-        if first is None or not self.passes:
+        if not self.passes:
             return None
-        term: Any = self.term
-        controller, tolerance = self.controller, None
+        controller, dtype, tolerance = self.controller, step[3].dtype, None
         if isinstance(controller, diffrax.PIDController):
             bounds: Any = controller.rtol, controller.atol
-            tolerance = jnp.maximum(*(jnp.max(jnp.asarray(x, y1.dtype)) for x in bounds))
+            tolerance = jnp.maximum(*(jnp.max(jnp.asarray(x, dtype)) for x in bounds))
         elif controller is not None:
-            tolerance = jnp.ones((), y1.dtype)
-        return passage(term.dynamics, t0, t1, y0, y1, args, turn, tolerance, first)
+            tolerance = jnp.ones((), dtype)
+        return passage(cast(Term, self.term).dynamics, tolerance, *step)
 
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False
@@ -321,7 +303,7 @@ class Scheme(eqx.Module):
         def field(t: Array, y: Array) -> Array:
             return self.term.vf(t, y, inside)
 
-        slope, h = _slope_and_step(field, t0, y, controller, float(order))
+        slope, h = slope_and_step(field, t0, y, controller, float(order))
         at = jnp.asarray(t0, y.dtype)
         end, state = controller.init(
             self.term, at, t1.astype(y.dtype), y, h, inside, self.solver.func, order
@@ -352,38 +334,6 @@ class Scheme(eqx.Module):
         return jnp.asarray(end, t0.dtype), state
 
 
-def _slope_and_step(
-    field: Callable, t0: Array, y0: Array, controller: Any, order: float
-) -> tuple[Array, Array]:
-    """(dy/dt at the start, length of the first step), in a loop that holds the field once.
-
-    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.4.
-    """
-    size = partial(_scaled_norm, controller, y0)
-
-    def turn(i: Array, carry: tuple) -> tuple:
-        f0, h, t, y = carry
-        f = field(t, y)
-        f0 = jnp.where(i == 0, f, f0)
-        d0, d1 = size(y0), size(f0)
-        tiny = (d0 < 1e-5) | (d1 < 1e-5)
-        trial = jnp.where(tiny, 1e-6, 0.01 * d0 / jnp.where(tiny, 1.0, d1))
-        steepest = jnp.maximum(d1, size(f - f0) / trial)
-        flat = steepest <= 1e-15
-        allowed = (0.01 / jnp.where(flat, 1.0, steepest)) ** (1 / order)
-        allowed = jnp.where(flat, jnp.maximum(1e-6, 1e-3 * trial), allowed)
-        h = jnp.minimum(100.0 * trial, allowed)
-        return f0, h, t0 + trial.astype(t0.dtype), y0 + trial * f0
-
-    begin = (jnp.zeros_like(y0), jnp.zeros((), y0.dtype), t0, y0)
-    f0, h, _, _ = jax.lax.fori_loop(0, 2, turn, begin)
-    return f0, h
-
-
-def _scaled_norm(controller: Any, y0: Array, x: Array) -> Array:
-    return controller.norm(x / (controller.atol + controller.rtol * jnp.abs(y0)))
-
-
 _FINE = 64.0  # resolutions of time
 _ACROSS = 0.01  # of the change that an error across a bend may be, in tolerances
 _UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of perturbations
@@ -398,37 +348,6 @@ def remembers(solver: diffrax.AbstractSolver) -> bool:
     """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
     one_step = diffrax.AbstractRungeKutta | AbstractExplicit | AbstractFixedStep
     return not isinstance(solver, one_step)
-
-
-def linearized(field: Callable, y: Array) -> tuple[Array, Array]:
-    """(f, df/dy) at y by differences: half the digits, and compiled in a fraction of the time."""
-    beside = jnp.sqrt(jnp.finfo(y.dtype).eps) * (1.0 + jnp.abs(y))
-    states = jnp.concatenate([y[None], y[None] + jnp.diag(beside)])
-    f, *others = jax.lax.map(field, states)
-    return f, (jnp.stack(others, 1) - f[:, None]) / beside[None]
-
-
-def _rate(J: Array) -> tuple[Array, Array]:
-    """(rate, J^16 / rate^16): about the spectral radius, the 16th root of the size of that power.
-
-    Units hardly matter to it. Scaled on the way, as the power of a rate may leave the range of
-    numbers.
-    """
-    power, rate = J, jnp.ones((), J.dtype)
-    for k in range(5):
-        power = power if k == 0 else power @ power
-        size = jnp.max(jnp.abs(power))
-        power = power / jnp.where(size > 0, size, 1.0)
-        rate = rate * size ** (0.5**k)
-    return rate, power
-
-
-def _turning(J: Array) -> Array:
-    """The largest eigenvalue in size among those that do not merely decay."""
-    finite = jnp.all(jnp.isfinite(J))
-    values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
-    turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
-    return jnp.where(finite, jnp.max(jnp.where(turning, jnp.abs(values), 0.0)), jnp.nan)
 
 
 def _explicit_tableau(solver: diffrax.AbstractSolver) -> Any:

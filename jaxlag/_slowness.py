@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Int
 from jaxlag import _params
 from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
+from jaxlag._perturbations import linearized
 from jaxlag._projection import turns_needed
-from jaxlag._scheme import linearized
 from jaxlag._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, Status
 from jaxlag._term import term_of
 
@@ -125,8 +125,8 @@ def explain(motion: "Solution") -> str:
         f"method        {motion.method}, {how}, {motion.formulation}",
         f"status        {motion.message()}",
     ]
-    if motion.instead:
-        lines.append(f"formulation   {motion.instead}")
+    if motion.fallback:
+        lines.append(f"formulation   {motion.fallback}")
     h, advice = _mean_step(motion), []
     attempts = accepted + rejected
     lines.append(

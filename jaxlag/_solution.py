@@ -294,7 +294,7 @@ class Solution(eqx.Module):
         status = Status(int(self.status))
         if status is Status.ok:
             said = f"ok at t = {self.last_time}"
-            return f"{said}, {self.instead}" if self._singular is not None else said
+            return f"{said}, {self.fallback}" if self._singular is not None else said
         index = int(self.where)
         labels, more = self.system.coordinates.labels, ""
         if status is Status.kinematics_singular:
@@ -320,7 +320,7 @@ class Solution(eqx.Module):
         )
 
     @property
-    def instead(self) -> str:
+    def fallback(self) -> str:
         """Why formulation "auto" took multipliers in place of quasi-velocities; "" where not."""
         if self._singular is None or self.system.quasi is None:
             return ""

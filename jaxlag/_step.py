@@ -68,7 +68,7 @@ class Arguments(NamedTuple):
     prepared: Any  # what accelerations need of what depends on params alone
     rows: RowChoice | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
-    volumes: Float[Array, " b"] | None = None  # usual ones, where they change on the way
+    usual: Float[Array, " b"] | None = None  # see `jaxlag._passage.usual`
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:
@@ -79,3 +79,17 @@ class Arguments(NamedTuple):
     def reacting(self) -> Choice | None:
         """Rows to solve accelerations with; None for all."""
         return None if self.rows is None else self.rows.reacting
+
+
+def midway(t0: Array, t1: Array, y0: Array, y1: Array, turn: Array | None) -> tuple[Array, Array]:
+    """(time, state) in the middle of a step, by the parabola through it where that is known.
+
+    Args:
+        t0: start of the step.
+        t1: its end.
+        y0: state at its start.
+        y1: state at its end.
+        turn: h dy/dt at the start less that at the end; None where it is not known.
+    """
+    middle = 0.5 * (y0 + y1)
+    return t0 + 0.5 * (t1 - t0), middle if turn is None else middle + 0.125 * turn

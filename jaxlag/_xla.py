@@ -12,7 +12,7 @@ system. There are two ways past that bound:
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -22,6 +22,8 @@ import jaxlib
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+
+from jaxlag._nested import equations
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 BYTES = 10_000_000
@@ -140,16 +142,12 @@ def opaque_one(dtype: Any) -> jax.Array:
 
 def _plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
     """Whether a program holds nothing but operations on numbers that XLA itself emits code for."""
-    for eqn in jaxpr.eqns:
-        name = eqn.primitive.name
-        if name == "dot_general":
-            if not _is_sum(eqn, stages):
-                return False
-        elif name not in _PLAIN:
-            return False
-        if not all(_plain(inner, stages) for inner in _inside(tuple(eqn.params.values()))):
-            return False
-    return True
+    return all(
+        _is_sum(eqn, stages)
+        if eqn.primitive.name == "dot_general"
+        else eqn.primitive.name in _PLAIN
+        for eqn in equations(jaxpr)
+    )
 
 
 def _is_sum(dot: Any, stages: int) -> bool:
@@ -163,16 +161,6 @@ def _is_sum(dot: Any, stages: int) -> bool:
         return True
     rows = [x.aval.size for x in dot.invars if x.aval.ndim == 1]
     return not any(batched) and any(size in (stages - 1, stages) for size in rows)
-
-
-def _inside(values: Any) -> Iterator[Jaxpr]:
-    for value in values:
-        if isinstance(value, tuple | list):
-            yield from _inside(value)
-        elif isinstance(value, ClosedJaxpr):
-            yield value.jaxpr
-        elif isinstance(value, Jaxpr):
-            yield value
 
 
 _PLAIN = frozenset(

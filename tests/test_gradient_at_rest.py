@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 import jaxlag as jl
-from jaxlag._scheme import _rate, _turning
+from jaxlag._perturbations import spectral_size
 
 
 @pytest.mark.full
@@ -106,7 +106,7 @@ def test_what_turns_and_what_decays():
         return np.array([[real, imaginary], [-imaginary, real]])
 
     def fastest(*blocks):
-        return float(_turning(jnp.asarray(block_diag(*blocks), float)))
+        return float(turning_rate(jnp.asarray(block_diag(*blocks), float)))
 
     np.testing.assert_allclose(fastest(block(0, 3), [[-100.0]]), 3.0, rtol=1e-12)
     np.testing.assert_allclose(fastest(block(0, 3), block(-1, 5)), 26**0.5, rtol=1e-12)
@@ -120,6 +120,6 @@ def test_what_turns_and_what_decays():
 def test_the_fastest_rate(rate, dtype):
     """In range though its 16th power is not; within the 16th root of the units' disparity."""
     J = jnp.asarray([[0.0, 1.0, 0.0], [-(rate**2), 0.0, 0.0], [0.0, 0.0, 0.0]], dtype)
-    assert 0.9 * rate <= _rate(J)[0] <= max(rate, 1 / rate) ** (1 / 16) * 1.1 * rate
-    assert _rate(jnp.zeros((2, 2), dtype))[0] == 0.0
-    assert _rate(jnp.asarray([[0.0, 1.0], [0.0, 0.0]], dtype))[0] == 0.0
+    assert 0.9 * rate <= spectral_size(J)[0] <= max(rate, 1 / rate) ** (1 / 16) * 1.1 * rate
+    assert spectral_size(jnp.zeros((2, 2), dtype))[0] == 0.0
+    assert spectral_size(jnp.asarray([[0.0, 1.0], [0.0, 0.0]], dtype))[0] == 0.0

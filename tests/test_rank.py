@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from jaxlag._kkt import units_of
-from jaxlag._lowering._constrained import Sharing, _shared
 from jaxlag._lowering._evaluate import evaluate
 from jaxlag._lowering._graph import Graph
+from jaxlag._lowering._sharing import Sharing, shared
 from jaxlag._rank import independent_rows, least_norm, row_sizes
 
 
@@ -126,7 +126,7 @@ def on_the_graph(A, units, kept, lam):
         for name in ("units", "kept", "there")
     )
     sharing = Sharing(list(range(m)), there)
-    found = _shared(graph, rows, units, kept, sharing, float(np.finfo(float).eps))
+    found = shared(graph, rows, units, kept, sharing, float(np.finfo(float).eps))
     values = {(name, i): float(x) for name, xs in given.items() for i, x in enumerate(xs)}
     flat = [float(x) for x in evaluate([x for row in found for x in row], values)]
     return np.reshape(flat, (m, m)) @ lam

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from jaxlag._lowering._diff import tangents
 from jaxlag._lowering._graph import Graph, Node, dependencies, substitute
 from jaxlag._lowering._ingest import Unsupported
+from jaxlag._lowering._orthonormal import dot, orthonormal, products, without
+from jaxlag._lowering._sharing import Sharing, shared
 from jaxlag._lowering._solve import GREATER, bordered, solve_general
-from jaxlag._rank import ROUNDINGS
 
 
 class Constrained(NamedTuple):
@@ -37,19 +36,7 @@ class Constrained(NamedTuple):
     regular: bool
     reaction: Sequence[Node] | None = None
     lam: Sequence[Node] = ()
-    sharing: "Sharing | None" = None
-
-
-class Sharing(NamedTuple):
-    """Rows whose multipliers are of least norm among themselves where they depend on one another.
-
-    Attributes:
-        chosen: these.
-        there: for every row 1, or 0 where it is no more than rounding.
-    """
-
-    chosen: Sequence[int]
-    there: Sequence[Node]
+    sharing: Sharing | None = None
 
 
 class Rows(NamedTuple):
@@ -142,10 +129,10 @@ def solve_with_reactions(
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
     seen = None
     if kept is not None and sharing is not None:
-        seen = _shared(graph, A, _units(graph, M, A, regular), kept, sharing, eps)
+        seen = shared(graph, A, _units(graph, M, A, regular), kept, sharing, eps)
     if seen is not None:
         of_rows = zip(*seen, strict=True)
-        G = [[_weighted(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
+        G = [[dot(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
     if kept is not None:
         A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
         G = [[graph.mul(kept[k], x) for x in column] for k, column in enumerate(G)]
@@ -159,153 +146,20 @@ def solve_with_reactions(
     ]
     free, *spread = bordered(graph, M, [], [(sides[0][0], []), *((p, []) for p in pushes)], eps)
 
-    def dot(x: Sequence[Node], y: Sequence[Node]) -> list[tuple[Node, float]]:
-        return [(graph.mul(a, b), 1.0) for a, b in zip(x, y, strict=True)]
-
-    S = [[graph.let(graph.sum(dot(A[k], spread[j]))) for j in range(m)] for k in range(m)]
+    S = [[dot(graph, A[k], spread[j]) for j in range(m)] for k in range(m)]
     if kept is not None:
         for k in range(m):
             S[k][k] = graph.sum([(S[k][k], 1.0), (kept[k], -1.0)], 1.0)
-    right = [graph.let(graph.sum([(gamma[k], -1.0), *_less(dot(A[k], free))])) for k in range(m)]
+    right = [
+        graph.let(graph.sum([(gamma[k], -1.0), *_less(products(graph, A[k], free))]))
+        for k in range(m)
+    ]
     lam = solve_general(graph, S, right, eps ** (2 / 3))
     a = []
     for i, x in enumerate(free):
         pushed = [(graph.mul(lam[k], spread[k][i]), 1.0) for k in range(m)]
         a.append(graph.let(graph.sum([(x, 1.0), *pushed])))
-    return a, lam if seen is None else [_weighted(graph, row, lam) for row in seen]
-
-
-def _weighted(graph: Graph, weights: Sequence[Node], x: Sequence[Node]) -> Node:
-    """The sum of weights times x."""
-    terms = [(graph.mul(w, y), 1.0) for w, y in zip(weights, x, strict=True)]
-    return graph.let(graph.sum(terms))
-
-
-def _shared(
-    graph: Graph,
-    A: Sequence[Sequence[Node]],
-    units: Sequence[Node],
-    kept: Sequence[Node],
-    sharing: Sharing,
-    eps: float,
-) -> list[list[Node]]:
-    """What takes multipliers of the rows kept to those that forces see, m rows.
-
-    As `jaxlag._rank.shared`, in whose words these are a_k, C, z and weights.
-    """
-    m, chosen = len(A), sharing.chosen
-    zero, one, places = graph.zero, graph.one, range(len(chosen))
-    A = [[graph.mul(sharing.there[k], x) for x in A[k]] for k in chosen]
-    scaled = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
-
-    def length(x: Sequence[Node]) -> Node:
-        """Of a vector; 1 where it is 0."""
-        square = graph.let(_weighted(graph, x, x))
-        some = graph.let(graph.select(graph.call(GREATER, square, zero), square, one))
-        return graph.let(graph.sqrt(some))
-
-    norms, sizes = [length(row) for row in A], [length(row) for row in scaled]
-    weights = [graph.let(graph.div(*pair)) for pair in zip(norms, sizes, strict=True)]
-    unit = [
-        [graph.let(graph.div(x, size)) for x in row]
-        for row, size in zip(scaled, sizes, strict=True)
-    ]
-    flags = [kept[k] for k in chosen]
-    L, Y = _orthonormal(graph, unit, flags)
-    C, others, rounding = [], [], graph.const((ROUNDINGS * eps) ** 2)
-    for row, flag in zip(unit, flags, strict=True):
-        parts = [_weighted(graph, y, row) for y in Y]
-        rest = _without(graph, row, list(zip(parts, Y, strict=True)))
-        near = graph.call(GREATER, graph.const(eps), _weighted(graph, rest, rest))
-        follows = graph.let(graph.select(near, graph.sum([(flag, -1.0)], 1.0), zero))
-        others.append(follows)
-        # What a row has of another by rounding alone may be much to one of smaller weight.
-        found = [(x, graph.let(graph.power(x, 2))) for x in _backward(graph, L, parts)]
-        found = [graph.select(graph.call(GREATER, s, rounding), x, zero) for x, s in found]
-        C.append([graph.let(graph.mul(follows, x)) for x in found])
-    moved = [
-        [
-            graph.mul(weights[k], graph.sum([(others[j], -1.0)]) if j == k else C[j][k])
-            for k in places
-        ]
-        for j in places
-    ]
-    # In units in which the diagonal is 1: weights may be as unlike as forces and short levers.
-    lengths = [length(x) for x in moved]
-    moved = [[graph.let(graph.div(x, s)) for x in y] for y, s in zip(moved, lengths, strict=True)]
-    square = [[_weighted(graph, x, y) for y in moved] for x in moved]
-    for j in places:
-        square[j][j] = graph.sum([(square[j][j], 1.0), (others[j], -1.0)], 1.0)
-    sides = [[graph.mul(weights[k], flags[k], x[k]) for x in moved] for k in places]
-    columns = bordered(graph, square, [], [(side, []) for side in sides], eps)
-    seen = [[one if i == j else zero for j in range(m)] for i in range(m)]
-    for j, found in enumerate(columns):
-        z = [graph.let(graph.div(x, s)) for x, s in zip(found, lengths, strict=True)]
-        shares = []
-        for i in places:
-            taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
-            own = [(flags[i], 1.0)] if i == j else []
-            shares.append(graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken])))
-        # What all exert together stays what it is.
-        exerted = [graph.mul(flags[j], x) for x in unit[j]]
-        left = _without(graph, exerted, list(zip(shares, unit, strict=True)))
-        more = _backward(graph, L, [_weighted(graph, y, left) for y in Y])
-        for i in places:
-            share = graph.let(graph.add(shares[i], graph.mul(flags[i], more[i])))
-            seen[chosen[i]][chosen[j]] = graph.let(graph.div(graph.mul(share, sizes[j]), sizes[i]))
-    return seen
-
-
-def _orthonormal(
-    graph: Graph,
-    rows: Sequence[Sequence[Node]],
-    kept: Sequence[Node] | None,
-    floor: float = 0.0,
-) -> tuple[list[list[Node]], list[list[Node]]]:
-    """(L, Y) with rows = L Y, each made orthonormal to those before it, twice (Gram-Schmidt).
-
-    Rows that are not kept have 0 in Y and 1 in L; NaN where a square is no more than `floor` of
-    what it was.
-    """
-    Y: list[list[Node]] = []
-    L: list[list[Node]] = []
-    for k, row in enumerate(rows):
-        if kept is not None:
-            row = [graph.mul(kept[k], x) for x in row]
-        first = [_weighted(graph, y, row) for y in Y]
-        rest = _without(graph, row, list(zip(first, Y, strict=True)))
-        second = [_weighted(graph, y, rest) for y in Y]
-        rest = _without(graph, rest, list(zip(second, Y, strict=True)))
-        square = _weighted(graph, rest, rest)
-        bound = graph.scale(_weighted(graph, row, row), floor) if floor else graph.zero
-        square = graph.select(graph.call(GREATER, square, bound), square, graph.const(np.nan))
-        if kept is not None:
-            keep = graph.call(GREATER, kept[k], graph.const(0.5))
-            square = graph.select(keep, square, graph.one)
-        norm = graph.let(graph.sqrt(graph.let(square)))
-        Y.append([x if x is graph.zero else graph.let(graph.div(x, norm)) for x in rest])
-        L.append([graph.add(a, b) for a, b in zip(first, second, strict=True)] + [norm])
-    return L, Y
-
-
-def _without(
-    graph: Graph, x: Sequence[Node], parts: Sequence[tuple[Node, Sequence[Node]]]
-) -> list[Node]:
-    """x less the sum of factors times vectors."""
-    return [
-        graph.let(graph.sum([(a, 1.0), *((graph.mul(f, y[i]), -1.0) for f, y in parts)]))
-        for i, a in enumerate(x)
-    ]
-
-
-def _backward(graph: Graph, L: Sequence[Sequence[Node]], right: Sequence[Node]) -> list[Node]:
-    """The x with L^T x = right."""
-    m = len(right)
-    x: list[Node] = [graph.zero] * m
-    for k in reversed(range(m)):
-        known = [(graph.mul(L[j][k], x[j]), -1.0) for j in range(k + 1, m)]
-        x[k] = graph.let(graph.div(graph.sum([(right[k], 1.0), *known]), L[k][k]))
-    return x
+    return a, lam if seen is None else [dot(graph, row, lam) for row in seen]
 
 
 def _less(terms: list[tuple[Node, float]]) -> list[tuple[Node, float]]:
@@ -387,13 +241,10 @@ def _null_space(
     A = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
     right = [([graph.mul(x, s) for x, s in zip(r, units, strict=True)], c) for r, c in right]
 
-    def dot(x: Sequence[Node], y: Sequence[Node]) -> Node:
-        return graph.let(graph.sum([(graph.mul(a, b), 1.0) for a, b in zip(x, y, strict=True)]))
-
-    L, Y = _orthonormal(graph, A, kept, eps ** (2 / 3))
+    L, Y = orthonormal(graph, A, kept, eps ** (2 / 3))
 
     def tangent(x: Sequence[Node]) -> list[Node]:
-        return _without(graph, x, [(dot(y, x), y) for y in Y])
+        return without(graph, x, [(dot(graph, y, x), y) for y in Y])
 
     size = graph.let(graph.scale(_size(graph, M), 1.0 / n))
     columns = [tangent([M[i][j] for i in range(n)]) for j in range(n)]  # P M
@@ -412,7 +263,7 @@ def _null_space(
             value = c[k] if kept is None else graph.mul(kept[k], c[k])
             top = graph.sum([(value, 1.0), *known])
             z.append(top if top is graph.zero else graph.let(graph.div(top, L[k][k])))
-        offset = _without(graph, [graph.zero] * n, list(zip(z, Y, strict=True)))
+        offset = without(graph, [graph.zero] * n, list(zip(z, Y, strict=True)))
         moved = [
             graph.sum([(r[i], 1.0), *((graph.mul(M[i][j], offset[j]), -1.0) for j in range(n))])
             for i in range(n)

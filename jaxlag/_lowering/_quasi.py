@@ -13,6 +13,7 @@ from jaxlag._lowering._forms import attempt, cost, mass_matrix
 from jaxlag._lowering._general import Inverse
 from jaxlag._lowering._graph import Graph, Node, order, substitute
 from jaxlag._lowering._ingest import Unsupported
+from jaxlag._lowering._orthonormal import products
 from jaxlag._lowering._program import assemble
 from jaxlag._lowering._scene import Equations, Kinematics, Scene
 from jaxlag._lowering._solve import solve
@@ -30,8 +31,8 @@ class _Moved(NamedTuple):
         B: columns dv/du of the free ones.
         s: dv/dt at u' = 0, the bound ones zero.
         healthy: truth values, all of which hold where v follows from u.
-        volumes: what vanishes, or grows beyond bounds, where one of v and u does not follow from
-            the other: determinants of blocks of dU/dv or dV/du. None where they are too long.
+        determinants: of blocks of dU/dv or dV/du, which vanish or grow beyond bounds where one of
+            v and u does not follow from the other. None where they are too long.
     """
 
     V: list[Node]
@@ -39,7 +40,7 @@ class _Moved(NamedTuple):
     B: list[list[Node]]
     s: list[Node]
     healthy: list[Node]
-    volumes: list[Node] | None
+    determinants: list[Node] | None
 
 
 def derive_rates(scene: Scene, eps: float) -> Equations:
@@ -87,9 +88,9 @@ def derive_rates(scene: Scene, eps: float) -> Equations:
         found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), words))
     best = min(found, key=lambda equations: equations.program.cost)
     best = best._replace(velocity=assemble(graph, v))
-    if moved.volumes is not None:
-        moving = [x for x in moved.volumes if not x.fixed]
-        best = best._replace(volumes=assemble(graph, moving))
+    if moved.determinants is not None:
+        moving = [x for x in moved.determinants if not x.fixed]
+        best = best._replace(determinants=assemble(graph, moving))
     bound = scene.constrained
     if bound is None:
         return best
@@ -109,13 +110,13 @@ def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: floa
     graph, healthy = scene.graph, []
     if kinematics.V is not None:
         V = list(kinematics.V)
-        volumes = _volumes(graph, expansion, affine(graph, V, kinematics.u)[0])
+        determinants = _determinants(graph, expansion, affine(graph, V, kinematics.u)[0])
     else:
         assert kinematics.U is not None
         theta, theta_0 = affine(graph, kinematics.U, scene.v)
         inverse = Inverse(graph, expansion, theta, eps)
         right = [graph.sub(*pair) for pair in zip(kinematics.u, theta_0, strict=True)]
-        V, healthy, volumes = inverse(right), inverse.healthy, inverse.determinants
+        V, healthy, determinants = inverse(right), inverse.healthy, inverse.determinants
     short = attempt(partial(expansion.simplified, V))
     if short is not None and cost(graph, [short]) <= cost(graph, [V]):
         V = short
@@ -123,10 +124,10 @@ def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: floa
     v = substitute(graph, V, still)
     B = [tangents(graph, V, {u: graph.one}) for u in kinematics.free]
     s = tangents(graph, v, dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one})
-    return _Moved(V, v, B, s, healthy, volumes)
+    return _Moved(V, v, B, s, healthy, determinants)
 
 
-def _volumes(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[Node] | None:
+def _determinants(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[Node] | None:
     """Determinants of blocks of B, or of B^T B where it is tall; None where they are too long."""
     k = len(B[0])
     try:
@@ -254,4 +255,4 @@ def _short(expansion: Expansion, M: list[list[Node]]) -> list[list[Node]] | None
 
 
 def _dot(graph: Graph, x: Sequence[Node], y: Sequence[Node]) -> Node:
-    return graph.sum([(graph.mul(a, b), 1.0) for a, b in zip(x, y, strict=True)])
+    return graph.sum(products(graph, x, y))

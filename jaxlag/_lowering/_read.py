@@ -11,13 +11,14 @@ from jaxlag._constraints import AbstractConstraint
 from jaxlag._errors import real_scalar
 from jaxlag._forces import reads_lam
 from jaxlag._lowering._array import ArrayTerms
-from jaxlag._lowering._constrained import Constrained, Sharing
+from jaxlag._lowering._constrained import Constrained
 from jaxlag._lowering._graph import Graph, Node
 from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
 from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._rows import layout_of
 from jaxlag._lowering._scene import Kinematics, Scene
+from jaxlag._lowering._sharing import Sharing
 
 
 def read_scene(key: Key) -> Scene:

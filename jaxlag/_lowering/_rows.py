@@ -1,6 +1,6 @@
 """Which rows A v + b there are, and what they contain: read from their program, not from values."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from math import prod
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from jaxlag._lowering._graph import Graph, Node, order, substitute
 from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
 from jaxlag._lowering._nodes import nodes
+from jaxlag._nested import equations
 from jaxlag._quasi import QuasiVelocities
 
 LIMIT = 20_000  # scalar operations: beyond, reading them takes longer than their detail is worth
@@ -105,23 +106,13 @@ def layout_of(
 
 def _check_rules(written: ClosedJaxpr, argument: str) -> None:
     """Raise where a function has a rule for reverse derivatives alone: rates are forward ones."""
-    if any(name.startswith("custom_vjp") for name in _primitives(written.jaxpr)):
+    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(written)):
         raise bad(
             argument,
             "have forward derivatives, by which its rate along the motion is found",
             "a function in it has a rule by jax.custom_vjp",
             "Write that rule by jax.custom_jvp, from which both derivatives follow.",
         )
-
-
-def _primitives(jaxpr: Any) -> Iterator[str]:
-    for eqn in jaxpr.eqns:
-        yield eqn.primitive.name
-        for value in eqn.params.values():
-            for inner in value if isinstance(value, tuple | list) else (value,):
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    yield from _primitives(inner)
 
 
 def _watched(like: _params.Static, speeds: str) -> list[str | None]:

@@ -40,7 +40,7 @@ class ScalarPrepared(NamedTuple):
     kick: Array | None = None
     lam: Array | None = None
     rates: Array | None = None
-    volumes: Array | None = None
+    determinants: Array | None = None
     definite: Bool[Array, ""] | None = None
     alone: "ScalarPrepared | None" = None
 
@@ -108,13 +108,15 @@ class ScalarTerms(Terms):
         solving = (None, None) if reacting is None else reacting
         first = before(equations.program, *solving)
         assert first is not None
-        rates, volumes = before(equations.velocity, kept), before(equations.volumes, None)
+        rates, determinants = before(equations.velocity, kept), before(equations.determinants, None)
         if equations.surface is None:
-            return ScalarPrepared(first, rates=rates, volumes=volumes)
+            return ScalarPrepared(first, rates=rates, determinants=determinants)
         *moving, lam = equations.surface
         others = [before(code, kept) for code in moving]
         reacting_too = before(lam, *solving)
-        return ScalarPrepared(first, *others, lam=reacting_too, rates=rates, volumes=volumes)
+        return ScalarPrepared(
+            first, *others, lam=reacting_too, rates=rates, determinants=determinants
+        )
 
     def acceleration(
         self,
@@ -163,17 +165,15 @@ class ScalarTerms(Terms):
         """v at (q, u) of quasi-velocities."""
         return self._run("rates", t, q, u, params, inputs, prepared)
 
-    def volumes(
+    def determinants(
         self, t: Array, q: Array, params: Any, inputs: Mapping[str, Any], prepared: ScalarPrepared
-    ) -> Array | None:
-        """What vanishes where quasi-velocities are singular; None where there is no program."""
-        if prepared.volumes is None:
-            return None
-        code = self._equations(q, params, inputs).volumes
+    ) -> Array:
+        """What vanishes where quasi-velocities are singular, without what never changes."""
+        code = self._equations(q, params, inputs).determinants
         assert code is not None
         if not code.results:
             return jnp.zeros((0,), q.dtype)
-        return self._run("volumes", t, q, q, params, inputs, prepared)  # no speed is read
+        return self._run("determinants", t, q, q, params, inputs, prepared)  # no speed is read
 
     def _run(
         self,

@@ -59,7 +59,7 @@ class Equations(NamedTuple):
         surface: their projection.
         lam: multipliers, where forces depend on them.
         velocity: code for v alone, where the state is made of quasi-velocities.
-        volumes: code for what vanishes where these are singular, without what never does; None
+        determinants: code for what vanishes where these are singular, without what never does; None
             where that is too long.
     """
 
@@ -73,9 +73,13 @@ class Equations(NamedTuple):
     surface: Surface | None = None
     lam: list[Node] | None = None
     velocity: Program | None = None
-    volumes: Program | None = None
+    determinants: Program | None = None
 
     def code(self, name: str) -> Program | None:
         """The code whose prelude has this name in `ScalarPrepared`."""
-        own = {"acceleration": self.program, "rates": self.velocity, "volumes": self.volumes}
+        own = {
+            "acceleration": self.program,
+            "rates": self.velocity,
+            "determinants": self.determinants,
+        }
         return own[name] if name in own else getattr(self.surface, name)
