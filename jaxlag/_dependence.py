@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -16,7 +17,12 @@ _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpo
 }
 
 
-def outputs_depend_on(jaxpr: Jaxpr, given: list[Names]) -> list[Names]:
+Seen = Callable[[Any, list[Names]], None]
+
+
+def outputs_depend_on(
+    jaxpr: Jaxpr, given: list[Names], seen: Seen | None = None, continuous: bool = False
+) -> list[Names]:
     """Names that each output of a traced program depends on.
 
     A dependence that cancels only algebraically is still listed; one that is not listed is
@@ -25,6 +31,10 @@ def outputs_depend_on(jaxpr: Jaxpr, given: list[Names]) -> list[Names]:
     Args:
         jaxpr: the traced program.
         given: names that each of its inputs stands for; its constants stand for none.
+        seen: called with every operation, and the names of its operands; within calls, but not
+            within loops and branches.
+        continuous: whether integers and truth values, which change in jumps, depend on nothing;
+            but within loops and branches.
     """
     known: dict[Any, Names] = dict(zip(jaxpr.invars, given, strict=True))
     numbers: dict[Any, Any] = {}
@@ -40,10 +50,15 @@ def outputs_depend_on(jaxpr: Jaxpr, given: list[Names]) -> list[Names]:
 
     for eqn in jaxpr.eqns:
         operands = [of(atom) for atom in eqn.invars]
+        if seen is not None:
+            seen(eqn, operands)
         stated = [number(atom) for atom in eqn.invars]
         if eqn.primitive.name == "sub" and all(x is not None for x in stated):
             numbers[eqn.outvars[0]] = stated[0] - stated[1]  # y - 1 in differentiating x**y
-        results = [_NOTHING] if _is_one(eqn, stated) else _results(eqn, operands)
+        results = [_NOTHING] if _is_one(eqn, stated) else _results(eqn, operands, seen, continuous)
+        if continuous:
+            pairs = zip(results, eqn.outvars, strict=True)
+            results = [x if _is_inexact(atom) else _NOTHING for x, atom in pairs]
         known.update(zip(eqn.outvars, results, strict=True))
     return [of(atom) for atom in jaxpr.outvars]
 
@@ -55,10 +70,14 @@ def _is_one(eqn: Any, stated: list[Any]) -> bool:
     return eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0
 
 
-def _results(eqn: Any, operands: list[Names]) -> list[Names]:
+def _is_inexact(atom: Any) -> bool:
+    return jnp.issubdtype(atom.aval.dtype, jnp.inexact)
+
+
+def _results(eqn: Any, operands: list[Names], seen: Seen | None, continuous: bool) -> list[Names]:
     inner = _inner(eqn)
     if inner is not None:
-        return outputs_depend_on(inner, operands)
+        return outputs_depend_on(inner, operands, seen, continuous)
     follow = _CONTROL_FLOW.get(eqn.primitive.name)
     if follow is not None:
         return follow(eqn.params, operands)

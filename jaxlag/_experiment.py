@@ -1,13 +1,14 @@
 """Experiments: what was measured, when, how well, and what drove it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, final
 
 import equinox as eqx
 import numpy as np
 
-from jaxlag._errors import bad
+from jaxlag._captured import Captured, captured
+from jaxlag._errors import bad, require_arity
 from jaxlag._inputs import check_inputs, check_range
 
 
@@ -24,6 +25,8 @@ class Experiment(eqx.Module):
         inputs: as for `jl.simulate`; tables must reach from ts[0] to ts[-1]. Experiments that are
             fitted together have the same names; under each, tables of one kind in all, of any
             length, or any functions and constants. Those that another one has are computed beside.
+            Or a function of the params to such a dict, where times or values of tables, or knots,
+            depend on them: a delay, the time of a switch. Functions of time in it take (t, params).
         sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
             (s, k). Of channels that are left out it is estimated from the residuals.
         q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.
@@ -38,11 +41,22 @@ class Experiment(eqx.Module):
     Raises:
         ValueError: times that do not increase, shapes that do not fit, a channel without a single
             number, a sigma that is not positive, a start that is said to be known and not given.
+
+    Example:
+        A push that ends at a time which is to be found:
+
+        >>> import jaxlag as jl, numpy as np
+        >>> def inputs(params):
+        ...     return {"push": jl.ZeroOrderHold([0.0, params["end"], 3.0], [1.0, 0.0, 0.0])}
+        >>> ts = np.linspace(0.0, 3.0, 31)
+        >>> data = jl.Experiment(ts, {"x": np.sin(ts)}, inputs=inputs)
+        >>> data.inputs_at({"end": 0.5})["push"].times.tolist()
+        [0.0, 0.5, 3.0]
     """
 
     ts: np.ndarray
     channels: dict[str, np.ndarray]
-    inputs: dict[str, Any]
+    inputs: dict[str, Any] | Captured
     sigma: dict[str, np.ndarray]
     q0: np.ndarray | None
     v0: np.ndarray | None
@@ -54,7 +68,7 @@ class Experiment(eqx.Module):
         ts: Any,
         channels: Mapping[str, Any],
         *,
-        inputs: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]] | None = None,
         sigma: Mapping[str, Any] | None = None,
         q0: Any = None,
         v0: Any = None,
@@ -67,8 +81,12 @@ class Experiment(eqx.Module):
         if not isinstance(channels, Mapping) or not channels:
             raise bad(f"{name}: channels", "be a dict with one channel or more", f"was {channels}")
         self.channels = {key: _channel(name, key, x, count) for key, x in channels.items()}
-        self.inputs = check_inputs(inputs)
-        check_range(self.inputs, self.ts, f"ts of {name}")
+        if callable(inputs):
+            require_arity(f"{name}: inputs", inputs, ("params",))
+            self.inputs = captured(inputs)
+        else:
+            self.inputs = check_inputs(inputs)
+            check_range(self.inputs, self.ts, f"ts of {name}")
         self.sigma = {}
         for key, x in (sigma or {}).items():
             if key not in self.channels:
@@ -95,6 +113,18 @@ class Experiment(eqx.Module):
             if not np.all(self.start_sigma >= 0):
                 was = f"it was {start_sigma}"
                 raise bad(f"{name}: start_sigma", "be zero or positive, or None", was)
+
+    def inputs_at(self, params: Any) -> dict[str, Any]:
+        """The inputs by name, of these params.
+
+        Raises:
+            ValueError: they are no inputs, or tables do not reach from ts[0] to ts[-1].
+        """
+        if not isinstance(self.inputs, Captured):
+            return self.inputs
+        found = check_inputs(self.inputs.function(params))
+        check_range(found, self.ts, f"ts of {self.name}")
+        return found
 
     def part(self, rows: slice | np.ndarray, name: str | None = None) -> "Experiment":
         """Some of its rows, as an experiment whose start is free unless it is the same start."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,8 +16,9 @@ from jaxlag._descent import Descent, descend
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._fit_result import FitResult, summarised
-from jaxlag._free import NO_PRIOR, Unknowns, prior_rows, unknowns
+from jaxlag._free import NO_PRIOR, Unknowns, paths, prior_rows, unknowns
 from jaxlag._initial_states import start_freedom
+from jaxlag._jumps import Jump, Jumps, names_of, warn
 from jaxlag._losses import LOSSES, squares
 from jaxlag._params import check_keys
 from jaxlag._problem import (
@@ -142,6 +144,7 @@ def fit(
     if optimiser is None:
         _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
     _warn_before(experiments, unknown)
+    compared = _compared(system, experiments, unknown)
     problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
     costs = np.zeros(0)
     if optimiser is None:
@@ -158,7 +161,8 @@ def fit(
             problem = with_noise(problem, where, noise)
         linear = len(unknown.u0) <= LARGEST_COVARIANCE
         found = _judged(problem, guess, optimiser, costs, linear)
-    result = summarised(problem, found, experiments, where, noise, own, costs, solves)
+    told = (where, noise, own, costs, solves, compared)
+    result = summarised(problem, found, experiments, *told)
     _warn_after(result)
     return result
 
@@ -195,6 +199,21 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
             if np.all(np.nanmax(x, axis=0) == np.nanmin(x, axis=0)):
                 text = f"channel {name!r} of {each.name} is constant: it may be disconnected."
                 warnings.warn(text, stacklevel=3)
+
+
+def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns) -> dict[str, str]:
+    """Names of leaves that a jump depends on, and lines; warns where it is a jump in time."""
+    names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
+    moving = {name for name, own in names.items() if own in {leaf.name for leaf in free.leaves}}
+    found: dict[str, str] = {}
+    told: set[Jump] = set()
+    for each in {jax.tree.structure(x.inputs_at(free.params0)): x for x in experiments}.values():
+        inputs = each.inputs_at(free.params0)
+        jumps = Jumps(system, free.params0, jnp.zeros(system.size), inputs)
+        found |= {names[x.leaf]: x.line for x in jumps.of_leaves() if x.leaf in names}
+        told |= set(jumps.in_time(moving, jnp.asarray(each.ts)))
+    warn(sorted(told))
+    return found
 
 
 def _stages(
@@ -349,6 +368,11 @@ def _warn_after(result: FitResult) -> None:
         warnings.warn(f"{text} wrong. Look for a square root or a norm at zero.", stacklevel=3)
     for name in result.unused:
         warnings.warn(f"nothing measured depends on {name}: it keeps its value.", stacklevel=3)
+    for name, line in result.jumps.items():
+        text = f"{name} is compared at {line}, and moves nothing but where the equations jump: no "
+        text += "derivative shows it, it keeps its value, and other estimates may be wrong by it. "
+        text += "Make the time of the jump a knot of a table, inputs=function of the params, or "
+        warnings.warn(f"{text}smooth the jump.", stacklevel=3)
     for name in result.on_bound:
         at = result.values[result.names.index(name)]
         text = f"{name} ended on its bound, {at:g}: widen the bound, or leave the parameter out."

@@ -59,6 +59,8 @@ class FitResult(eqx.Module):
         unidentifiable: null directions, in words: which numbers change together without a trace.
         determined: what is known of those: "g/l".
         unused: numbers that nothing measured depends on.
+        jumps: numbers that nothing shows but where a force or a row jumps, which derivatives do not
+            see, and the line where each is compared: no fit moves them.
         on_bound: numbers that ended on a bound of their transform; the covariance of the others is
             that with these held there.
         noise: channel -> standard deviation of its noise, where it was estimated.
@@ -89,6 +91,7 @@ class FitResult(eqx.Module):
     unidentifiable: tuple[str, ...]
     determined: tuple[str, ...]
     unused: tuple[str, ...]
+    jumps: dict[str, str]
     on_bound: tuple[str, ...]
     noise: dict[str, float]
     residuals: tuple[dict[str, np.ndarray], ...]
@@ -192,6 +195,7 @@ def summarised(
     own: Mapping[str, Reader],
     costs: Float[np.ndarray, " epochs"],
     solves: int,
+    compared: Mapping[str, str],
 ) -> FitResult:
     """The result of a search.
 
@@ -204,12 +208,16 @@ def summarised(
         own: channels of the caller.
         costs: of the epochs of a descent.
         solves: what it took.
+        compared: names of leaves that a jump depends on, and the line where each is compared.
     """
     z = found.guess.z
     params, values = _at(problem.free, z)
     firsts = np.flatnonzero(where.first == 0)
     status = np.asarray(found.seen.status)
     known = _uncertainty(problem, found, np.asarray(values))
+    leaves = [leaf for leaf in problem.free.leaves for _ in leaf.indices]
+    named = zip(problem.free.names, leaves, strict=True)
+    jumps = {name: compared[leaf.name] for name, leaf in named if leaf.name in compared}
     alive = bool(np.any(status == Status.ok)) and bool(np.isfinite(found.cost))
     return FitResult(
         jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, params),
@@ -220,7 +228,8 @@ def summarised(
         known.singular_values,
         known.unidentifiable,
         known.determined,
-        known.unused,
+        tuple(name for name in known.unused if name not in jumps),
+        {name: jumps[name] for name in known.unused if name in jumps},
         known.on_bound,
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
@@ -291,8 +300,8 @@ def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
     """The status of a segment that failed, or the channel that is not finite."""
     segment = jax.tree.map(lambda x: x[k], problem.segments)
     start = jnp.asarray(found.starts)[k]
-    inputs = segment.inputs.by_name
-    motion = problem.motion(problem.free.params(z), start, segment.ts, inputs)
+    params = problem.free.params(z)
+    motion = problem.motion(params, start, segment.ts, segment.inputs.at(params, segment.ts))
     if motion.ok:
         for name, show in problem.channels:
             if not np.all(np.isfinite(np.asarray(show(motion)))):

@@ -150,7 +150,7 @@ def _simulated(
     elif np.isnan(v0).any():
         fix = f"Pass {experiment.name} a v0."
         raise bad("velocities", "follow from the channels or v0", "some did not", fix)
-    ts, inputs = experiment.ts, experiment.inputs
+    ts, inputs = experiment.ts, experiment.inputs_at(params)
     return simulate(
         system, q0, ts=ts, params=params, inputs=inputs, throw=False, **start, **options
     )

@@ -23,7 +23,9 @@ smooth = jax.named_scope(_SMOOTH)
 _GUARDS = ("eq", "ne", "is_finite", "lu")
 
 
-def outcomes(program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool]) -> Array | None:
+def outcomes(
+    program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool], only: Any = None
+) -> Array | None:
     """How the comparisons of what moves come out, as numbers in a row; None where there are none.
 
     A comparison with == or != is taken for the guard of a single place, and not listed.
@@ -32,14 +34,15 @@ def outcomes(program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool]
         program: the traced program.
         args: its arguments.
         moving: which of these move.
+        only: the equation that is looked at; None for all.
     """
     found: list[Array] = []
-    _run(program, list(args), list(moving), found)
+    _run(program, list(args), list(moving), found, only)
     return jnp.concatenate(found) if found else None
 
 
 def _run(
-    program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array]
+    program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array], only: Any
 ) -> tuple[list[Any], list[bool]]:
     """(results, which of them move); outcomes of comparisons are added to `found`."""
     jaxpr = program.jaxpr
@@ -52,12 +55,13 @@ def _run(
         inner = called(eqn)
         if inner is not None:
             looks = found if _SMOOTH not in str(eqn.source_info.name_stack) else []
-            results, does = _run(inner, given, touched, looks)
+            results, does = _run(inner, given, touched, looks, only)
         else:
             results = eqn.primitive.bind(*given, **eqn.params)
             results = results if eqn.primitive.multiple_results else [results]
             does = [any(touched)] * len(results)
-            if any(touched) and _SMOOTH not in str(eqn.source_info.name_stack):
+            looks = _SMOOTH not in str(eqn.source_info.name_stack) and only in (None, eqn)
+            if any(touched) and looks:
                 found.extend(_outcomes(eqn, given, results))
         known.update(zip(eqn.outvars, results, strict=True))
         moves.update(x for x, moved in zip(eqn.outvars, does, strict=True) if moved)

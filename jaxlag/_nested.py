@@ -12,8 +12,13 @@ def equations(program: Any) -> Iterator[Any]:
     """All equations of a program, each before those of the programs within it."""
     for eqn in getattr(program, "jaxpr", program).eqns:
         yield eqn
-        for inner in _among(eqn.params.values()):
-            yield from equations(inner)
+        yield from within(eqn)
+
+
+def within(eqn: Any) -> Iterator[Any]:
+    """All equations of the programs within an operation."""
+    for inner in _among(eqn.params.values()):
+        yield from equations(inner)
 
 
 def _among(values: Any) -> Iterator[Any]:

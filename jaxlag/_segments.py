@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
 from jaxlag._signals import Linear, ZeroOrderHold
-from jaxlag._stacked_inputs import StackedInputs, stacked
+from jaxlag._stacked_inputs import AbstractStackedInputs, computed, stacked
 from jaxlag._system import System
 
 
@@ -35,7 +35,7 @@ class Segments(NamedTuple):
     values: Float[Array, "k s m"]
     weights: Float[Array, "k s m"]
     follows: Bool[Array, " k"]
-    inputs: StackedInputs
+    inputs: AbstractStackedInputs
     guess: Float[Array, "k d"]
     held: Float[Array, "k d"]
 
@@ -127,19 +127,25 @@ def pack(
         if a == 0 and experiment.start_sigma is not None:
             held[k] = experiment.start_sigma
         inputs.append(_inputs_between(experiment.inputs, ts[k, 0], ts[k, -1]))
+    ends = ts[:, -1].tolist()
     return Segments(
         jnp.asarray(ts),
         jnp.asarray(values),
         jnp.asarray(weights),
         jnp.asarray(where.follows),
-        stacked(inputs, ts[:, -1].tolist()),
+        computed(inputs, ends) if any(map(callable, inputs)) else stacked(inputs, ends),
         jnp.asarray(guess),
         jnp.asarray(held),
     )
 
 
-def _inputs_between(inputs: dict[str, Any], start: float, end: float) -> dict[str, Any]:
-    """The inputs with only those rows of their tables that are read from start to end."""
+def _inputs_between(inputs: Any, start: float, end: float) -> Any:
+    """The inputs with only those rows of their tables that are read from start to end.
+
+    All of those that depend on params.
+    """
+    if callable(inputs):
+        return inputs
 
     def cut(signal: Any) -> Any:
         if not isinstance(signal, Linear | ZeroOrderHold):

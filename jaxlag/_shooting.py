@@ -133,7 +133,9 @@ class Shooting(eqx.Module):
     ) -> tuple[Array, Array, Array]:
         """(residuals (s, m) before the loss, end less start, status) of one segment."""
         start = self.start(x, segment)
-        motion = self.motion(self.free.params(z), start, segment.ts, segment.inputs.by_name)
+        params = self.free.params(z)
+        inputs = segment.inputs.at(params, segment.ts)
+        motion = self.motion(params, start, segment.ts, inputs)
         shown = read(dict(self.channels), self.widths, motion)
         measured = segment.weights > 0
         known = jnp.all(jnp.isfinite(shown) | ~measured)

@@ -129,10 +129,11 @@ class ZeroOrderHold(AbstractTable):
     values: Array
 
     def __init__(self, times: Any, values: Any) -> None:
-        intervals = np.size(times) - 1
-        if intervals > 0 and np.shape(values)[:1] == (intervals,):
+        times, values = _inexact(times), _inexact(values)
+        intervals = times.size - 1
+        if intervals > 0 and values.shape[:1] == (intervals,):
             last = np.arange(intervals + 1).clip(max=intervals - 1)
-            values = np.asarray(values)[last] if concrete(values) else jnp.asarray(values)[last]
+            values = np.asarray(values)[last] if concrete(values) else values[last]
         self.times, self.values = _table("ZeroOrderHold", times, values)
 
     def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:

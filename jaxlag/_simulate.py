@@ -30,6 +30,7 @@ from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
 from jaxlag._gradient import choose_gradient
 from jaxlag._inputs import all_knots, check_inputs, check_range
+from jaxlag._jumps import Jumps, warned
 from jaxlag._kkt import FORMULATIONS
 from jaxlag._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._patience import timed
@@ -95,7 +96,8 @@ def simulate(
     otherwise, as far as `max_steps` lets them. A first derivative is then about as good as the
     motion. It leaves out how the time moves at which a force itself jumps (sign(v), where between
     two values), and a second one what every bend adds, as JAX's own derivatives of such functions
-    do: smooth the force (tanh, softplus) where that matters.
+    do: smooth the force (tanh, softplus) where that matters. Where the time of a jump is told by
+    params, a warning names these; knots of inputs that depend on them give the whole derivative.
 
     Args:
         system: what moves.
@@ -215,6 +217,9 @@ def simulate(
     params = closing(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    if not _params.concrete(params_traced, inputs_traced):
+        jumps = Jumps(system, params, q0, inputs)
+        params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     scheme = choose(method, dt is None, rtol, atol)
     if isinstance(scheme[0], AbstractPartitioned) and isinstance(project, Baumgarte):
         must = f"be left out for {type(scheme[0]).__name__}, whose steps hold the constraints"

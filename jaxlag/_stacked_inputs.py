@@ -1,6 +1,7 @@
 """The inputs of many experiments as those of one batch: what differs is told by an index."""
 
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,12 +11,25 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
+from jaxlag._captured import Captured, captured
 from jaxlag._errors import bad
+from jaxlag._inputs import check_inputs
 from jaxlag._signals import AbstractInput, AbstractTable, Feedback, Function, Linear, ZeroOrderHold
 
+JUST_AFTER = 1e-9
+"""Of the length of a segment."""
 
-class StackedInputs(eqx.Module):
-    """Inputs by name, every array with an axis of experiments in front.
+
+class AbstractStackedInputs(eqx.Module):
+    """Inputs by name of many experiments; every array has an axis of them in front."""
+
+    @abstractmethod
+    def at(self, params: Any, ts: Array) -> dict[str, Any]:
+        """Of one experiment, at these params, as for `jl.simulate` at times ts."""
+
+
+class StackedInputs(AbstractStackedInputs):
+    """Those that are given.
 
     A leaf of a batch may be no function: what is no array stands apart.
     """
@@ -23,10 +37,47 @@ class StackedInputs(eqx.Module):
     arrays: Any
     rest: _params.Static = eqx.field(static=True)
 
-    @property
-    def by_name(self) -> dict[str, Any]:
-        """As for `jl.simulate`."""
+    def at(self, params: Any, ts: Array) -> dict[str, Any]:
+        """As they are given."""
+        del params, ts
         return eqx.combine(self.arrays, self.rest.tree)
+
+
+class ComputedInputs(AbstractStackedInputs):
+    """Those that depend on params: all are computed, and each experiment takes its own.
+
+    Attributes:
+        which: of the functions, by experiment.
+        functions: of the params.
+        ends: last times, s, of the experiments that have the functions.
+    """
+
+    which: Int[Array, " k"]
+    functions: tuple[Captured, ...] = eqx.field(static=True)
+    ends: tuple[float, ...] = eqx.field(static=True)
+
+    def at(self, params: Any, ts: Array) -> dict[str, Any]:
+        """Of one function."""
+        together = stacked([check_inputs(f(params)) for f in self.functions], self.ends)
+        own = jax.tree.map(lambda x: x[self.which], together.arrays)
+        inputs = StackedInputs(own, together.rest).at(params, ts)
+        return {name: _after(signal, ts) for name, signal in inputs.items()}
+
+
+def _after(signal: Any, ts: Array) -> Any:
+    """The same signal; a knot at the first time lies just after it.
+
+    Else nothing would show that it moves where one segment ends and the next begins.
+    """
+    if not isinstance(signal, AbstractInput) or not signal.rowed:
+        return signal
+    field = signal.rowed[0]
+    times = getattr(signal, field)
+    if times is None:
+        return signal
+    inside = jnp.zeros(len(times), bool).at[1:-1].set(True)
+    moved = times + JUST_AFTER * jnp.where(inside & (times == ts[0]), ts[-1] - ts[0], 0.0)
+    return eqx.tree_at(lambda x: getattr(x, field), signal, moved)
 
 
 class _OfTime(eqx.Module):
@@ -67,6 +118,30 @@ def _chosen(
         was = f"they had {sorted(shapes)}"
         raise bad(f"inputs[{choice.name!r}]", "have one shape in all experiments", was)
     return jax.lax.select_n(choice.which, *values)
+
+
+def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:
+    """The inputs of segments, where those of some are a function of the params.
+
+    Args:
+        inputs: of each segment, by name, or a function.
+        ends: its last time, s.
+    """
+    functions: dict[Any, Captured] = {}
+    last: dict[Any, float] = {}
+    for each, end in zip(inputs, ends, strict=True):
+        key = each if callable(each) else id(each)
+        if key not in functions:
+            functions[key] = each if callable(each) else captured(_constant(each))
+        last[key] = max(end, last.get(key, end))
+    keys = list(functions)
+    which = [keys.index(each if callable(each) else id(each)) for each in inputs]
+    found = jnp.asarray(which, jnp.int32), tuple(functions.values()), tuple(last.values())
+    return ComputedInputs(*found)
+
+
+def _constant(inputs: dict[str, Any]) -> Callable[[Any], dict[str, Any]]:
+    return lambda params: inputs
 
 
 def stacked(inputs: Sequence[dict[str, Any]], ends: Sequence[float]) -> StackedInputs:
@@ -149,20 +224,24 @@ def _different(signals: list[Any]) -> list[Any]:
     return found
 
 
-def _later(times: Array | None, count: int, end: float) -> Float[np.ndarray, " k"]:
+def _later(
+    times: Array | None, count: int, end: float
+) -> Float[np.ndarray, " k"] | Float[Array, " k"]:
     """As many knots: those that are missing lie where nobody looks."""
-    own = np.zeros(0) if times is None else np.asarray(times, float)
-    last = max([end, *own])
-    return np.concatenate([own, last + 1.0 + np.arange(count - len(own))])
+    xp = np if _params.concrete(times) else jnp
+    own = np.zeros(0) if times is None else xp.asarray(times, float)
+    last = xp.max(xp.append(own, end))
+    return xp.concatenate([own, last + 1.0 + np.arange(count - len(own))])
 
 
 def _filled(table: Any, length: int) -> AbstractInput:
     """A table that goes on with its last value."""
-    times, values = np.asarray(table.times), np.asarray(table.values)
+    xp = np if _params.concrete(table) else jnp
+    times, values = xp.asarray(table.times), xp.asarray(table.values)
     missing = length - len(times)
     if not missing:
         return table
     step = times[-1] - times[-2]
     later = times[-1] + step * np.arange(1, missing + 1)
-    held = np.broadcast_to(values[-1], (missing, *values.shape[1:]))
-    return type(table)(np.concatenate([times, later]), np.concatenate([values, held]))
+    held = xp.broadcast_to(values[-1], (missing, *values.shape[1:]))
+    return type(table)(xp.concatenate([times, later]), xp.concatenate([values, held]))

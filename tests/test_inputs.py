@@ -406,3 +406,17 @@ def test_a_function_for_an_input_is_told_how_to_be_wrapped():
 def test_a_bad_type_is_refused(make, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         make()
+
+
+def test_tables_may_be_written_as_lists_of_traced_numbers():
+    @jax.jit
+    def read(end, value):
+        table = jl.ZeroOrderHold([0.0, end, 3.0], [value, 0.0])
+        line = jl.Linear([0.0, end], [value, 0.0])
+        knots = jl.Function(lambda t: t, knots=[end]).knots()
+        return table.times, table.values, line.times, line.values, knots
+
+    found = read(1.0, 2.0)
+    expected = [0.0, 1.0, 3.0], [2.0, 0.0, 0.0], [0.0, 1.0], [2.0, 0.0], [1.0]
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(x, y)

@@ -68,7 +68,7 @@ def test_every_row_is_the_signal_of_its_experiment(name):
     def values(inputs):
         return evaluate(inputs, t, q, v, params)["u"]
 
-    found = jax.vmap(lambda row: values(row.by_name))(batch)
+    found = jax.vmap(lambda row: values(row.at({"m": 1.5}, jnp.asarray(TS))))(batch)
     expected = [values({"u": signal}) for signal in signals]
     np.testing.assert_allclose(found, expected, rtol=1e-15)
 
@@ -76,7 +76,7 @@ def test_every_row_is_the_signal_of_its_experiment(name):
 def test_knots_that_an_experiment_lacks_lie_beyond_its_end():
     signals = ALIKE["knots"]
     batch = stacked([{"u": signal} for signal in signals], [1.0, 1.0, 2.0, 3.0])
-    knots = batch.by_name["u"].ends[:, 1:-1]
+    knots = batch.at({"m": 1.5}, jnp.asarray(TS))["u"].ends[:, 1:-1]
     np.testing.assert_array_equal(knots, [[0.5, 2.0], [0.3, 0.6], [3.0, 4.0], [4.0, 5.0]])
 
 
@@ -99,7 +99,7 @@ def test_what_no_batch_can_be_made_of_is_named(inputs, message):
 
 def test_shapes_that_differ_are_named():
     row = stacked([{"u": jl.Function(ramp)}, {"u": jnp.ones(2)}], [1.0, 1.0])
-    one = jax.tree.map(lambda x: x[0], row).by_name
+    one = jax.tree.map(lambda x: x[0], row).at({"m": 1.5}, jnp.asarray(TS))
     with pytest.raises(ValueError, match=r"inputs\['u'\] .* one shape .* had \[\(\), \(2,\)\]"):
         evaluate(one, jnp.array(0.5), jnp.ones(1), jnp.ones(1), {})
 
