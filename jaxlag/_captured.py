@@ -22,6 +22,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxlag import _params
 from jaxlag._closed import Closed, plain
 from jaxlag._custom_jvp import with_rules_kept
+from jaxlag._custom_vjp import with_forward_derivatives
 from jaxlag._errors import bad
 from jaxlag._home import of_library
 from jaxlag._input_values import InputValues
@@ -162,7 +163,7 @@ class Captured:
             return found
 
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
-        code = with_rules_kept(owned(code))
+        code = with_rules_kept(with_forward_derivatives(owned(code)))
         return _Program(code, form, static_part, frozenset(read))
 
     def _warn_of_counts(self, kind: Any) -> None:

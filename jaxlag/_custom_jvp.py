@@ -69,7 +69,7 @@ class CustomJVP:
             return self.function(*args)
         with jax.disable_jit(False):
             traced = self._traced.trace(*args)
-        results = _bind(list(map(jnp.asarray, leaves)), traced.jaxpr, _Flat(self, tree))
+        results = bind_rule(list(map(jnp.asarray, leaves)), traced.jaxpr, _Flat(self, tree))
         return jax.tree.unflatten(jax.tree.structure(traced.out_info), results)
 
     def derivative(self, args: tuple, dots: tuple) -> tuple[Any, Any]:
@@ -176,7 +176,12 @@ def with_rule_kept(eqn: Any) -> Any:
     """The same equation; the rule of one by `jax.custom_jvp` stays with it."""
     if eqn.primitive.name != NAME or eqn.primitive is _custom_jvp:
         return eqn
-    params = {"call_jaxpr": eqn.params["call_jaxpr"], "rule": _Users(eqn)}
+    return with_rule(eqn, eqn.params["call_jaxpr"], _Users(eqn))
+
+
+def with_rule(eqn: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> Any:
+    """An equation of this program and this rule in the place of another."""
+    params = {"call_jaxpr": call_jaxpr, "rule": rule}
     return eqn.replace(primitive=_custom_jvp, params=params)
 
 
@@ -195,7 +200,8 @@ _custom_jvp = Primitive(NAME)
 _custom_jvp.multiple_results = True
 
 
-def _bind(args: Leaves, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
+def bind_rule(args: Leaves, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
+    """The results of a program that has this rule."""
     return _custom_jvp.bind(*args, call_jaxpr=call_jaxpr, rule=rule)
 
 
@@ -238,7 +244,7 @@ def _batched(args: Leaves, axes: Leaves, *, call_jaxpr: ClosedJaxpr, rule: Abstr
     args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]
     over = tuple(None if i is None else 0 for i in axes)
     function = jax.vmap(jaxpr_as_fun(call_jaxpr), over, axis_size=size)
-    results = _bind(args, jax.make_jaxpr(function)(*args), _Rows(rule, over, size))
+    results = bind_rule(args, jax.make_jaxpr(function)(*args), _Rows(rule, over, size))
     return results, [0] * len(results)
 
 

@@ -113,8 +113,6 @@ class Ladder:
         modes, self.omitted = [FORWARD, REVERSE, TWICE], ""
         if self.program.contains("while", "custom_vmap_call"):
             modes, self.omitted = [FORWARD], "no reverse derivatives: a while loop or custom_vmap"
-        elif self.program.contains("custom_vjp_call", "custom_vjp_call_jaxpr"):
-            modes, self.omitted = [REVERSE, TWICE], "no purely forward derivatives: a custom_vjp"
         orders = range(1, function.order + 1)
         self.steps = [(VALUE, 0)]
         self.steps += [(m, k) for k in orders for m in modes if m != TWICE or k > 1]

@@ -56,7 +56,7 @@ class Experiment(eqx.Module):
 
     ts: np.ndarray
     channels: dict[str, np.ndarray]
-    inputs: dict[str, Any] | Captured
+    inputs: Any  # by name, or a function of the params to these
     sigma: dict[str, np.ndarray]
     q0: np.ndarray | None
     v0: np.ndarray | None

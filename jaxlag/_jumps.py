@@ -79,7 +79,11 @@ class Jumps:
         self._traced, self._static = _params.halves((params, inside))
         t = jax.ShapeDtypeStruct((), jnp.result_type(float))
         shape = jax.ShapeDtypeStruct(q.shape, q.dtype)
-        values = jax.eval_shape(lambda *at: dict(evaluate(outside, *at, params)), t, shape, shape)
+
+        def values_at(t: Array, q: Array, v: Array) -> dict[str, Any]:
+            return dict(evaluate(outside, t, q, v, params))
+
+        values = jax.eval_shape(values_at, t, shape, shape)
         self._moving = t, shape, shape, values
         moving = [_TIME, _STATE, _STATE, *[_TIME] * len(jax.tree.leaves(values))]
         names = [frozenset({name}) for name in (*moving, *names_of(*self._traced))]

@@ -132,7 +132,7 @@ def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:
     for each, end in zip(inputs, ends, strict=True):
         key = each if callable(each) else id(each)
         if key not in functions:
-            functions[key] = each if callable(each) else captured(_constant(each))
+            functions[key] = captured(each if callable(each) else _constant(each))
         last[key] = max(end, last.get(key, end))
     keys = list(functions)
     which = [keys.index(each if callable(each) else id(each)) for each in inputs]

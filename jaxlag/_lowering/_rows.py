@@ -20,7 +20,6 @@ from jaxlag._lowering._graph import Graph, Node, order, substitute
 from jaxlag._lowering._indices import check_indices
 from jaxlag._lowering._ingest import Unsupported, read
 from jaxlag._lowering._nodes import nodes
-from jaxlag._nested import equations
 from jaxlag._quasi import QuasiVelocities
 
 LIMIT = 20_000  # scalar operations: beyond, reading them takes longer than their detail is worth
@@ -84,7 +83,6 @@ def layout_of(
         t = jax.ShapeDtypeStruct((), jnp.result_type(float))
         q = jax.ShapeDtypeStruct((n,), dtype)
         argument = f"constraint {constraint.names!r}"
-        _check_rules(jax.make_jaxpr(residual)(t, q, q, like.tree), argument)
         (count,) = jax.eval_shape(of_v, t, q, q, like.tree).shape
         written = jax.make_jaxpr(raw)(t, q, q, like.tree)
         check_indices(written, _watched(like, "v"), argument)
@@ -102,17 +100,6 @@ def layout_of(
         driven += [row.driven for row in contents]
         sure += [row.sure for row in contents]
     return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven), tuple(sure))
-
-
-def _check_rules(written: ClosedJaxpr, argument: str) -> None:
-    """Raise where a function has a rule for reverse derivatives alone: rates are forward ones."""
-    if any(eqn.primitive.name.startswith("custom_vjp") for eqn in equations(written)):
-        raise bad(
-            argument,
-            "have forward derivatives, by which its rate along the motion is found",
-            "a function in it has a rule by jax.custom_vjp",
-            "Write that rule by jax.custom_jvp, from which both derivatives follow.",
-        )
 
 
 def _watched(like: _params.Static, speeds: str) -> list[str | None]:
@@ -176,7 +163,6 @@ def _checked(
 
     closed = jax.make_jaxpr(written)(t, q, at, like.tree)
     check_indices(closed, _watched(like, speeds), "QuasiVelocities")
-    _check_rules(closed, "QuasiVelocities")
     if quasi.U is None:
         rows = examine(quasi.velocities, None, like, static, n, dtype, quasi.size)
         bent = [str(i) for i, row in enumerate(rows) if not row.affine]
