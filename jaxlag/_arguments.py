@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -146,8 +147,11 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
         raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number("ts", "be one row of times", ts, jnp.result_type(float))
-    if ts.ndim != 1 or ts.shape[0] < 2:
-        raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}")
+    if ts.ndim != 1 or not _known_at_least(ts.shape[0], 2):
+        fix = ""
+        if ts.ndim == 1 and not isinstance(ts.shape[0], int):
+            fix = f'Write jax.export.symbolic_shape("k", constraints=["{ts.shape[0]} >= 2"]).'
+        raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}", fix)
     if not concrete(ts):
         return ts, None
     if not np.all(np.isfinite(ts)):
@@ -163,6 +167,14 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
             "Sort the times and drop repeated ones.",
         )
     return ts, direction
+
+
+def _known_at_least(count: Any, least: int) -> bool:
+    """Whether a number of rows, which may be a symbol of `jax.export`, is no smaller."""
+    try:
+        return bool(count >= least)
+    except jax.errors.InconclusiveDimensionOperation:
+        return False
 
 
 def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:

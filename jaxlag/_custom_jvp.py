@@ -142,7 +142,7 @@ class _Rows(AbstractRule):
 
     rule: AbstractRule
     axes: tuple[int | None, ...]
-    size: int
+    size: Any
 
     def __call__(self, primals: Leaves, dots: Leaves) -> tuple[Leaves, Leaves]:
         axes = list(self.axes)

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._lanes import at_most
 from jaxlag._put import put
 from jaxlag._record import Outcome, Record, Times
 from jaxlag._scheme import Estimate, Scheme, all_finite, resolution
@@ -90,7 +91,7 @@ def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
 
 
-def _buffer(size: int, like: PyTree, fill: float | int) -> PyTree:
+def _buffer(size: Any, like: PyTree, fill: float | int) -> PyTree:
     return jax.tree.map(lambda x: jnp.full((size, *jnp.shape(x)), fill, jnp.result_type(x)), like)
 
 
@@ -141,7 +142,7 @@ def drive(
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
-    if count > 2:
+    if not at_most(count, 2):
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = _buffer(count - 1, y0, jnp.nan)
         rows = _Rows(start, zero, zero, values, places, zero)

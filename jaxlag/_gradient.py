@@ -2,7 +2,7 @@
 
 import math
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxlag._errors import bad
 
@@ -40,7 +40,7 @@ def choose_gradient(
     mode: str,
     memory: int | float | None,
     max_steps: int,
-    rows: int,
+    rows: Any,
     state: int,
     itemsize: int,
     knots: bool = False,
@@ -51,28 +51,33 @@ def choose_gradient(
         mode: as asked for.
         memory: bytes that one trajectory may keep; None for no bound.
         max_steps: bound on the steps.
-        rows: saved.
+        rows: saved; a number, or a symbol of `jax.export`.
         state: numbers in a state.
         itemsize: bytes of a number.
         knots: whether inputs have some.
     """
-    turns = max_steps + rows - 2  # at most, of lanes together
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
+    if memory is None:
+        return Keep(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
+    if not isinstance(rows, int):
+        was = f"it was {memory} for {rows} times"
+        raise bad("gradient_memory", "be left out where the number of times is a symbol", was)
+    turns = max_steps + rows - 2  # at most, of lanes together
     needs = {
         name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])
     }
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
-        if memory is None or needed(room, turns, state, itemsize, knots) <= memory:
+        if needed(room, turns, state, itemsize, knots) <= memory:
             return Keep(mode, room)
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
             return Keep(mode, rooms[fitting[0]])
         must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
         raise bad("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
-    if memory is not None and needs[mode] > memory:
+    if needs[mode] > memory:
         fits = [f"{name!r} ({need} bytes)" for name, need in needs.items() if need <= memory]
         fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
         must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"

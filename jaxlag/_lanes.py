@@ -59,7 +59,7 @@ def in_lanes(
         return single(*args)
 
     @batched.def_vmap
-    def _(size: int, mapped: list, args: tuple) -> tuple:
+    def _(size: Any, mapped: list, args: tuple) -> tuple:
         own, shared = eqx.partition(args, mapped[0])
         results = _batch(vmapped, size, at_once, even)(own, shared)
         return results, jax.tree.map(lambda _: True, results)
@@ -67,7 +67,7 @@ def in_lanes(
     return constant(args)
 
 
-def _batch(vmapped: Callable, size: int, at_once: int, even: bool) -> Callable:
+def _batch(vmapped: Callable, size: Any, at_once: int, even: bool) -> Callable:
     """(own, shared) -> results of `size` trajectories; own leaves have one row for each.
 
     A further vmap makes more rows.
@@ -81,7 +81,7 @@ def _batch(vmapped: Callable, size: int, at_once: int, even: bool) -> Callable:
         return in_batches(one, own, size, at_once, even)
 
     @rows.def_vmap
-    def _(outer: int, mapped: list, own: PyTree, shared: PyTree) -> tuple:
+    def _(outer: Any, mapped: list, own: PyTree, shared: PyTree) -> tuple:
         def flat(leaf: Any, is_mapped: bool) -> Any:
             leaf = leaf if is_mapped else jnp.broadcast_to(leaf, (outer, *leaf.shape))
             return leaf.reshape(outer * size, *leaf.shape[2:])
@@ -99,7 +99,7 @@ def _batch(vmapped: Callable, size: int, at_once: int, even: bool) -> Callable:
 
 
 def in_batches(
-    function: Callable, rows: PyTree, count: int, at_once: int, even: bool = True
+    function: Callable, rows: PyTree, count: Any, at_once: int, even: bool = True
 ) -> PyTree:
     """The vmapped function over `count` rows, up to `at_once` at a time.
 
@@ -108,14 +108,22 @@ def in_batches(
         rows: leaves (count, ...).
         count: number of rows.
         at_once: the largest batch.
-        even: whether batches may be smaller to be equal; else all have `at_once` rows. The last
-            row fills the last batch up.
+        even: whether batches may be smaller to be equal; else, and where their number is a symbol
+            of `jax.export`, all have `at_once` rows. The last row fills the last batch up.
     """
-    if count <= at_once:
+    if at_most(count, at_once):
         return jax.vmap(function)(rows)
     batches = -(-count // at_once)
-    size = -(-count // batches) if even else at_once
+    size = -(-count // batches) if even and isinstance(count, int) else at_once
     filled = jnp.minimum(jnp.arange(batches * size), count - 1)
     parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), rows)
     results = lax.map(jax.vmap(function), parts)
     return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
+
+
+def at_most(count: Any, most: int) -> bool:
+    """Whether a number of rows, which may be a symbol, is no larger."""
+    try:
+        return bool(count <= most)
+    except jax.errors.InconclusiveDimensionOperation:
+        return False

@@ -147,13 +147,13 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
     )
 
 
-def _batched(form: LinearMap, size: int, mapped: tuple[bool, ...]) -> LinearMap:
+def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
     """The map for `size` rows of x, y and the leaves of r that are mapped."""
     in_lanes = form.in_lanes
     if any(mapped) and in_lanes is not None:
         form, in_lanes = in_lanes, None
 
-    def rows(function: Callable | None, at_once: int) -> Any:
+    def rows(function: Callable | None, at_once: Any) -> Any:
         if function is None:
             return None
 

@@ -6,6 +6,7 @@ pendulums, microseconds each: with 11 rows 214 | 50, 101 rows 307 | 72, 1001 row
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
 from jaxlag._custom_jvp import CustomJVP
-from jaxlag._lanes import LANES
+from jaxlag._lanes import LANES, at_most
 
 
 def put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
@@ -50,14 +51,14 @@ def _place(buffer: Array, row: Array, index: Array) -> Array:
 
 
 @_place.def_vmap
-def _(size: int, mapped: list, buffer: Array, row: Array, index: Array) -> tuple[Array, bool]:
+def _(size: Any, mapped: list, buffer: Array, row: Array, index: Array) -> tuple[Array, bool]:
     buffer, row = _each(size, mapped, buffer, row)
     if mapped[2]:
         return _places(0)(buffer, row, index), True
     return _places(1)(buffer[None], row[None], index[None])[0], True
 
 
-def _each(size: int, mapped: list, *arrays: Array) -> list[Array]:
+def _each(size: Any, mapped: list, *arrays: Array) -> list[Array]:
     """The arrays with a row for each of `size`."""
     pairs = zip(arrays, mapped, strict=False)
     return [x if has else jnp.broadcast_to(x, (size, *x.shape)) for x, has in pairs]
@@ -79,7 +80,7 @@ def _places(shared: int) -> Callable:
         count = indices.shape[0]
         if count == 1:
             return one(buffers[0], rows[0], indices[0])[None]
-        if count > LANES or jax.default_backend() != "cpu":
+        if not at_most(count, LANES) or jax.default_backend() != "cpu":
             return jax.vmap(one)(buffers, rows, indices)
 
         def write(k: Array, buffers: Array) -> Array:
@@ -88,7 +89,7 @@ def _places(shared: int) -> Callable:
         return lax.fori_loop(0, count, write, buffers)
 
     @place.def_vmap
-    def _(size: int, mapped: list, *args: Array) -> tuple[Array, bool]:
+    def _(size: Any, mapped: list, *args: Array) -> tuple[Array, bool]:
         buffers, rows, indices = args
         count = indices.shape[-1]
         buffers, rows = _each(size, mapped, buffers, rows)

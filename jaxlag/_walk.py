@@ -17,6 +17,7 @@ equations); Griewank, Walther, Evaluating Derivatives, ch. 12 (checkpoints).
 from collections.abc import Callable
 from functools import partial
 from math import ceil, log2
+from typing import Any
 
 import equinox.internal as eqxi
 import jax
@@ -32,7 +33,7 @@ def _add(a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(jnp.add, a, b)
 
 
-def _zeros(state: PyTree, size: int) -> PyTree:
+def _zeros(state: PyTree, size: Any) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
 
 
@@ -124,7 +125,7 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     clock, record = path.clock, path.clock.record
     anchors, dues = clock.times.anchors(), clock.times.dues()
     assert record.points is not None
-    between = None if record.row_turn is None else jax.tree.map(lambda x: x[1:-1], wanted.rows)
+    between = None if record.row_turn is None else jax.tree.map(lambda x: x[1:], wanted.rows)
     moves = change.anchors is not None
     zero = jnp.zeros((), jnp.int32)
     reached = arrived(path, anchors)
@@ -202,7 +203,10 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     # Lanes that were recorded together have one stride; all have points at those of the longest.
     stride = eqxi.unvmap_max(record.stride)
     room = jax.tree.leaves(record.points)[0].shape[0] - 1
-    longest = 2 ** ceil(log2(record.offsets.shape[0] / room))
+    turns = record.offsets.shape[0]
+    longest = 2 * -(-turns // room)  # or more; of a symbol of jax.export that will do
+    if isinstance(turns, int):
+        longest = 2 ** ceil(log2(turns / room))
 
     def segment(carry: tuple) -> tuple:
         """All turns since the last point before turn k; all there are, where each has a point."""
