@@ -147,8 +147,8 @@ class Equilibrium(eqx.Module):
             f"{status.name}: no equilibrium was found. After {int(self.iterations)} steps the "
             f"nearest point was q = {self.q}; the force on {labels[worst]!r} left there is "
             f"{self.residual[worst]:.6g}, {relative[worst]:.1e} of its scale "
-            f"{self.scale[worst]:.3g}. Damped motion{on} from q0 and places around it did not end in "
-            "one either. Start nearer to it, or see whether the forces can balance."
+            f"{self.scale[worst]:.3g}. Damped motion{on} from q0 and places around it "
+            "did not end in one either. Start nearer to it, or see whether the forces can balance."
         )
 
 
