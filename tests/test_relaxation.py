@@ -63,7 +63,7 @@ def unbalanced(q, params):
 
 
 def test_four_bars_come_to_rest_from_any_configuration():
-    """Of 24 the search for a root of the forces alone fails on 7, in minima of their size."""
+    """Of 24 the search for a root of the forces alone fails on 4, in minima of their size."""
     params, q0 = four_bars(24)
     found = rest_of(params, q0)
     np.testing.assert_array_equal(found.status, 0)
@@ -79,7 +79,7 @@ def test_four_bars_come_to_rest_in_single_precision():
     assert found.q.dtype == jnp.float32
     np.testing.assert_array_equal(found.status, 0)
     _, gap = jax.vmap(unbalanced)(found.q, params)
-    np.testing.assert_allclose(gap, 0, atol=16 * np.finfo(np.float32).eps)
+    np.testing.assert_allclose(gap, 0, atol=16 * float(np.finfo(np.float32).eps))
 
 
 @pytest.mark.full
