@@ -145,7 +145,7 @@ def relax(
     zero, no = jnp.zeros((), q0.dtype), jnp.zeros((), bool)
     q, lam = jnp.zeros_like(q0), jnp.zeros_like(phi(q0))
     A, K = jnp.outer(lam, q), jnp.outer(q, q)
-    nowhere = Point(q0, q, A, K, A[..., None] * q)
+    nowhere = Point(q0, q, A, K, jnp.zeros((*A.shape, *q.shape), q.dtype))
     begin = _State(nowhere, _Step(q, lam, q + 1, zero), q0, no, zero, no, jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(lambda s: ~s.ended & (s.count < max_steps), body, begin)
     return end.base.q, end.count
