@@ -23,6 +23,7 @@ from bench import (
     _long_runs,
     _places,
     _redundant,
+    _rests,
     _single_precision,
     _walls,
 )
@@ -41,6 +42,7 @@ PARTS = (
     _walls,
     _crossings,
     _redundant,
+    _rests,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
 LEAST = 25  # rows that must end in success
@@ -72,6 +74,7 @@ QUICK = {
     "singular quasi-velocities: cos(y) x', crossed",
     "reactions beside redundant rows, levers to 10 nm",
     "rows that are 0 = 0 but for rounding",
+    "rest of closed linkages: four-bars in angles",
 }
 
 

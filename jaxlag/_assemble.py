@@ -98,12 +98,17 @@ def assemble(
     weights: Any = None,
     throw: bool = True,
 ) -> Assembly:
-    """Consistent state nearest to (q, v): phi(t, q) = 0 first, then A v + b = 0.
+    """Consistent state near (q, v), a nearest one: phi(t, q) = 0 first, then A v + b = 0.
 
     Minimises (q* - q)^T W (q* - q) over phi(t, q*) = 0, then (v* - v)^T W (v* - v) over
     A(t, q*) v* + b(t, q*) = 0; W = M at the guess, or the diagonal given. Newton's method on the
-    conditions of a minimum, steps shortened so that they lead downhill. The derivative is that of
-    the implicit function, in every mode and order.
+    conditions of a minimum, steps shortened so that they lead downhill. What is found for q is a
+    local minimum: nearer than all consistent states around it. Another branch of them, as of a
+    linkage that can be assembled in two ways, may be nearer where the guess is far from all of
+    them; then give a better guess. Of 200 random four-bars none had a nearer one for guesses with
+    angles off by 0.5 rad (standard deviation), 14 for 1 rad. v is the nearest of all.
+
+    The derivative is that of the implicit function, in every mode and order.
 
     Args:
         system: whose state it is, n coordinates.

@@ -202,12 +202,16 @@ def solve_tangent(linear: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 class Balance(NamedTuple):
-    """What is known about a point that a search has led to; `scale` as in `Equilibrium`."""
+    """What is known about a point that a search has led to; `scale` as in `Equilibrium`.
+
+    `units` are those of the coordinates in which K is about 1.
+    """
 
     found: Bool[Array, ""]
     finite: Bool[Array, ""]
     scale: Float[Array, " n"]
     variation: Float[Array, "n n"]
+    units: Float[Array, " n"]
 
 
 def judge(
@@ -260,9 +264,8 @@ def judge(
         & ~drifted
     )
     finite = jnp.all(jnp.isfinite(here.F)) & jnp.all(jnp.isfinite(here.J))
-    return Balance(
-        found & finite, finite, scale, _variation(forces, here, present, rounding, q, reach)
-    )
+    variation = _variation(forces, here, present, rounding, q, reach)
+    return Balance(found & finite, finite, scale, variation, here.c)
 
 
 def _variation(

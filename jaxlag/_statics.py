@@ -17,17 +17,12 @@ from jaxlag._closing import closing
 from jaxlag._constraints import Layout
 from jaxlag._custom_jvp import keeping_rules
 from jaxlag._dynamics import still
-from jaxlag._equilibrium_search import (
-    differentiable_if,
-    judge,
-    newton,
-    search,
-    solve_tangent,
-)
+from jaxlag._equilibrium_search import differentiable_if, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._rank import least_norm, row_sizes, without_rounding
+from jaxlag._rest import find_rest
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, of_state, vector
@@ -55,7 +50,7 @@ class Equilibrium(eqx.Module):
         multipliers: lam, (m,), with Q - h + A^T lam = 0; see `lam` for parts by name. Where rows
             depend on one another those of least norm sum_k (|A_k| lam_k)^2.
         status: int32, see `Status`: ok, implicit_solve_failed or nonfinite.
-        iterations: int32, steps of the search.
+        iterations: int32, steps of the search that led to q, with those of its relaxation.
     """
 
     system: System
@@ -147,11 +142,13 @@ class Equilibrium(eqx.Module):
         with np.errstate(invalid="ignore"):
             relative = np.divide(left, scale, out=np.zeros_like(left), where=left != 0)
         worst = int(np.argmax(np.where(np.isfinite(relative), relative, np.inf)))
+        on = " on the constraints" if self.rows.shape[-2] else ""
         return (
             f"{status.name}: no equilibrium was found. After {int(self.iterations)} steps the "
             f"nearest point was q = {self.q}; the force on {labels[worst]!r} left there is "
             f"{self.residual[worst]:.6g}, {relative[worst]:.1e} of its scale "
-            f"{self.scale[worst]:.3g}. Start nearer to it, or see whether the forces can balance."
+            f"{self.scale[worst]:.3g}. Damped motion{on} from q0 and places around it "
+            "did not end in one either. Start nearer to it, or see whether the forces can balance."
         )
 
 
@@ -176,6 +173,13 @@ def equilibrium(
     instant t, not a motion. A root is told from forces that only die away by the Newton step
     K^-1 (Q - h) left at q.
 
+    The search takes what is near, be it stable or not: from about upright a pendulum is found
+    upright. Only where it fails, as in a minimum of |Q - h| that is no root, the system is led
+    onto its constraints and relaxed: damped motion (q' = Q - h + A^T lam) by implicit Euler steps.
+    Where the forces have a potential each of these leads downhill, to a minimum of V on the
+    constraints, in general. Another search makes its end exact. If that fails, too, the system is
+    relaxed from up to three places around q0, as far from it as has been searched.
+
     The derivative is that of the implicit function, dq/dp = K^-1 d(Q - h)/dp, in every mode and
     order. Where K is singular up to rounding it is the one of least norm, in the same units: zero
     along coordinates on which nothing depends. It is NaN where the status is not ok.
@@ -189,7 +193,8 @@ def equilibrium(
         tol: Newton steps must be below tol (|q_j| + |q_j - q0_j|), or below tol times the
             length over which K changes; less than 1, by default 1e-10 in float64, 1e-4 in
             float32.
-        max_steps: bound on the steps of the search.
+        max_steps: bound on the steps of the first search. What follows it is begun only while it
+            has taken fewer together.
         throw: raise where a concrete result has a status other than ok.
 
     Raises:
@@ -201,7 +206,7 @@ def equilibrium(
 
     Source: Pila, eqs. 3.24, 3.25 (virtual work); Nocedal, Wright, Numerical Optimization,
     sec. 10.3 (Levenberg-Marquardt); Deuflhard, Newton Methods for Nonlinear Problems, ch. 2
-    (what a Newton step tells).
+    (what a Newton step tells); Kelley, Keyes, SIAM J. Numer. Anal. 35 (1998) 508 (relaxation).
 
     Example:
         A mass hanging on a spring stretches it by m g / k:
@@ -276,8 +281,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
     idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else jnp.zeros((0,), bool)
 
-    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any]:
-        """(triple of Q, h and A, Q - h + A^T lam, the same and phi of z) at (q, v)."""
+    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """(triple of Q, h and A; Q - h + A^T lam at (q, v); phi at q; all equations at z)."""
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
         check_declaration(system, params, inputs, t, q0, rest)
@@ -292,57 +297,59 @@ def _search(key: Any, values: Any) -> Equilibrium:
             Q, h, A = parts(q, v)
             return Q - h + lam @ A if rows.size else Q - h
 
+        def phi(q: Array) -> Array:
+            return jnp.where(idle, 0.0, system.terms.position(t, q, params))
+
         def whole(z: Array) -> Array:
             q, lam = z[:n], z[n:]
             if not rows.size:
                 return unbalanced(q, rest, lam)
-            phi = jnp.where(idle, lam, system.terms.position(t, q, params))
-            return jnp.concatenate([unbalanced(q, rest, lam), phi])
+            closed = phi(q) + jnp.where(idle, lam, 0.0)
+            return jnp.concatenate([unbalanced(q, rest, lam), closed])
 
-        return parts, unbalanced, whole
+        return parts, unbalanced, phi if rows.size else lambda _: q0[:0], whole
 
-    parts, unbalanced, whole = forces(t, *given)
-    z0 = q0
-    if rows.size:
-        Q, h, A = jax.lax.stop_gradient(parts(q0, rest))
-        z0 = jnp.concatenate([q0, jnp.linalg.lstsq(A.T, h - Q)[0]])
+    still, still_t, still_tol, *still_given = jax.lax.stop_gradient((q0, t, tol, *given))
+    still_parts, _, still_phi, still_whole = forces(still_t, *still_given)
+
+    def at_rest(q: Array) -> tuple[tuple[Array, Array], Array]:
+        Q, h, A = still_parts(q, rest)
+        return (Q, h), A
+
+    found = find_rest(at_rest, still_phi, still_whole, still, still_tol, max_steps)
+    z, balance, steps = jax.lax.stop_gradient(found)
+    parts, unbalanced, _, whole = forces(t, *given)
 
     @keeping_rules
-    def root(z0: Array) -> tuple[Array, Array]:
-        solve = partial(search, max_steps)
-        return jax.lax.custom_root(whole, z0, solve, solve_tangent, has_aux=True)
+    def root(z: Array) -> Array:
+        return jax.lax.custom_root(whole, z, lambda _, z: z, solve_tangent)
 
-    z, steps = root(z0)
+    z = root(z)
     if rows.size:
         # Of multipliers of dependent rows the search finds those nearest to where it began.
         q, lam = z[:n], z[n:]
-        softness = jax.lax.stop_gradient(newton(whole, z).c)[:n]
-        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam, units=softness)])
-
-    still, start, t, tol, *given = jax.lax.stop_gradient((z, z0, t, tol, *given))
-    still_parts, _, fixed = forces(t, *given)
-    Q, h, A = still_parts(still[:n], rest)
-    present = jnp.abs(Q) + jnp.abs(h)
-    if rows.size:
-        present = present + jnp.abs(still[n:]) @ jnp.abs(A)
-        present = jnp.concatenate([present, jnp.zeros_like(still[n:])])
-    balance = judge(fixed, present, still, start, tol)
-
+        z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam, units=balance.units[:n])])
     z = differentiable_if(balance.found, z)
     q, lam = z[:n], z[n:]
+
+    def unbalanced_at(state: Array) -> tuple[Array, Array]:
+        residual = unbalanced(state[:n], state[n:], lam)
+        return residual, residual
+
+    slopes, residual = jax.jacfwd(unbalanced_at, has_aux=True)(jnp.concatenate([q, rest]))
     failure = jnp.where(balance.finite, int(Status.implicit_solve_failed), int(Status.nonfinite))
     return Equilibrium(
         system,
         q,
-        residual=unbalanced(q, rest, lam),
+        residual=residual,
         scale=balance.scale[:n],
-        stiffness=-jax.jacfwd(unbalanced)(q, rest, lam),
-        damping=-jax.jacfwd(unbalanced, argnums=1)(q, rest, lam),
+        stiffness=-slopes[:, :n],
+        damping=-slopes[:, n:],
         variation=balance.variation[:n, :n],
         rows=parts(q, rest)[2],
         multipliers=lam,
         status=jnp.where(balance.found, int(Status.ok), failure).astype(jnp.int32),
-        iterations=steps.astype(jnp.int32),
+        iterations=steps,
         _layout=rows,
     )
 

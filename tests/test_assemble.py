@@ -181,6 +181,34 @@ def test_a_velocity_that_cannot_be_held_is_named():
         jl.assemble(skate, [0, 0, 0.3], [1.0, 0.0, 0.0], SKATE, hold=("x'", "y'"))
 
 
+@pytest.mark.full
+def test_nearer_than_all_consistent_states_around_it():
+    """Four-bars from guesses far off: conditions of first and second order of a local minimum."""
+    rng = np.random.default_rng(3)
+    guesses = four_bar_start(0.7) + rng.standard_normal((100, 3))
+
+    @jax.jit
+    @jax.vmap
+    def conditions(guess):
+        weights = jnp.ones_like(guess)
+        state = jl.assemble(four_bar, guess, 0 * guess, FOUR_BAR, weights=weights, throw=False)
+
+        def phi(q):
+            return four_bar.terms.position(jnp.array(0.0), q, FOUR_BAR)
+
+        A, moved = jax.jacobian(phi)(state.q), state.q - guess
+        tangent = jnp.linalg.svd(A)[2][A.shape[0] :]
+        lam = jnp.linalg.lstsq(A.T, moved)[0]
+        hessian = jnp.eye(len(guess)) - jnp.tensordot(lam, jax.hessian(phi)(state.q), 1)
+        curvature = jnp.linalg.eigvalsh(tangent @ hessian @ tangent.T)[0]
+        return state.status, jnp.linalg.norm(tangent @ moved), curvature
+
+    status, slope, curvature = conditions(guesses)
+    np.testing.assert_array_equal(status, 0)
+    np.testing.assert_allclose(slope, 0, atol=1e-12)
+    assert np.all(curvature > 0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [
