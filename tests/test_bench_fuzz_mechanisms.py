@@ -276,5 +276,5 @@ def test_motions_are_compared_by_their_ends_and_statuses(monkeypatch):
     monkeypatch.setitem(_mechanism_motions.NAMED, "contradictory", {"nonfinite"})
     found = _mechanism_motions.compared(BENT)
     assert (found.kind, found.worst) == ("differs", np.inf)
-    monkeypatch.setattr(_mechanism_motions, "LOCAL", 0.0)
+    monkeypatch.setattr(_mechanism_motions, "LOCAL", 1e-9)
     assert _mechanism_motions.compared(DOUBLED).kind == "differs"
