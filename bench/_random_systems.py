@@ -1,6 +1,6 @@
 """Lagrangians at random, as source text: what the fuzzer tries, and what it leaves behind."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -128,15 +128,28 @@ class Drawn(NamedTuple):
         return f"{self.scale!r} * ({' + '.join(parts)} - ({text(self.potential)}))"
 
     @property
+    def written(self) -> str:
+        """All of it as source."""
+        source = [f"L = {self.lagrangian}", f"Q = [{', '.join(map(text, self.force))}]"]
+        source += [f"{name} = {getattr(self, name)!r}" for name in ("params", "units", "dtype")]
+        return "; ".join(source)
+
+    @property
+    def push(self) -> Callable:
+        """The generalized force as a function."""
+        rows = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
+        return function("t, q, v, params", f"jnp.stack([{rows}])".replace("p[", "params["))
+
+    @property
+    def forces(self) -> tuple[jl.GeneralizedForce, ...]:
+        """The generalized force as it is declared."""
+        return (jl.GeneralizedForce(self.push, "push"),) if self.force else ()
+
+    @property
     def system(self) -> jl.System:
         """The declared system."""
-        L = _function("t, q, v, p", self.lagrangian)
-        forces = []
-        if self.force:
-            rows = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
-            Q = _function("t, q, v, params", f"jnp.stack([{rows}])".replace("p[", "params["))
-            forces.append(jl.GeneralizedForce(Q, "push"))
-        return jl.System(L, {"q": (self.n,)}, forces=forces)
+        L = function("t, q, v, p", self.lagrangian)
+        return jl.System(L, {"q": (self.n,)}, forces=self.forces)
 
 
 def text(tree: Tree) -> str:
@@ -145,10 +158,87 @@ def text(tree: Tree) -> str:
     return template.format(*map(text, below)) if below else template
 
 
-def _function(arguments: str, body: str) -> Any:
+def function(arguments: str, body: str) -> Any:
+    """The function of this source."""
     space = {"jnp": jnp, "jax": jax, "lax": lax, "smooth": smooth}
     space["MATRIX"] = np.array([[0.5, -1.0], [2.0, 0.25]])
     return eval(f"lambda {arguments}: {body}", space)
+
+
+class Trees:
+    """Expressions at random, in coordinates over their units.
+
+    Attributes:
+        rng: where they come from.
+        units: of the coordinates.
+        time: a leaf that depends on time, or stands for one.
+        one, two: templates of one and of two operands.
+        among: coordinates that they may depend on; None for all.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        units: tuple[float, ...],
+        time: str,
+        one: tuple[str, ...] = ONE,
+        two: tuple[str, ...] = TWO,
+        among: tuple[int, ...] | None = None,
+    ) -> None:
+        self.rng, self.units, self.time, self.one, self.two = rng, units, time, one, two
+        self.among = tuple(range(len(units))) if among is None else among
+
+    def over(self, name: str, i: int) -> str:
+        """A coordinate or a velocity in its unit."""
+        unit = self.units[i]
+        return f"{name}[{i}]" if unit == 1.0 else f"{name}[{i}] / {unit!r}"
+
+    def leaf(self, speeds: bool = False) -> Tree:
+        """A coordinate, a velocity where there may be some, a parameter, time, or a number."""
+        rng = self.rng
+        kind = rng.random()
+        i = self.among[int(rng.integers(len(self.among)))]
+        if kind < 0.55:
+            return (self.over("q", i),)
+        if speeds and kind < 0.7:
+            return (self.over("v", i),)
+        if kind < 0.75:
+            return (f'p["a"][{int(rng.integers(3))}]',)
+        if kind < 0.82:
+            return (str(rng.choice(['p["b"]', 'p["k"]'])),)
+        if kind < 0.88:
+            return (self.time,)
+        return (repr(float(rng.choice([0.0, 1.0, -1.0, 2.0, 0.5, -0.3, 1e-8, 1e3]))),)
+
+    def grow(self, depth: int, speeds: bool = False) -> Tree:
+        """A tree of at most so many operations one above the other."""
+        rng = self.rng
+        if depth == 0 or rng.random() < 0.15:
+            return self.leaf(speeds)
+        if rng.random() < 0.5:
+            return (str(rng.choice(self.one)), self.grow(depth - 1, speeds))
+        return (
+            str(rng.choice(self.two)),
+            self.grow(depth - 1, speeds),
+            self.grow(depth - 1, speeds),
+        )
+
+    def square(self, name: str = "v", without: int | None = None) -> Tree:
+        """(sum of c_i(q) v_i)^2 with a positive factor: keeps M positive definite.
+
+        Args:
+            name: of the velocities.
+            without: one that must not be among them.
+        """
+        rng, n = self.rng, len(self.units)
+        terms = []
+        for i in rng.choice(n, size=int(rng.integers(1, min(n, 3) + 1)), replace=False):
+            if i != without:
+                terms.append((f"({{0}}) * {name}[{i}] / {self.units[i]!r}", self.grow(2)))
+        if not terms:
+            return ("0.0",)
+        whole = " + ".join(f"{{{k}}}" for k in range(len(terms)))
+        return (f"0.5 * ({whole}) ** 2", *terms)
 
 
 def draw(seed: int) -> Drawn:
@@ -156,42 +246,9 @@ def draw(seed: int) -> Drawn:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 6))
     single = bool(rng.random() < 0.3)
-    reach = 3.0 if single else 12.0
-    spread = rng.random() < 0.5  # of magnitudes
-    units = 10.0 ** rng.uniform(-reach / 2, reach / 2, n) if spread else np.ones(n)
-    scale = float(10.0 ** rng.uniform(-reach, reach)) if rng.random() < 0.5 else 1.0
-    units = tuple(float(f"{u:.3g}") for u in units)
-    scale = float(f"{scale:.3g}")
-
-    def leaf(speeds: bool) -> Tree:
-        kind = rng.random()
-        i = int(rng.integers(n))
-        if kind < 0.55:
-            return (f"q[{i}]" if units[i] == 1.0 else f"q[{i}] / {units[i]!r}",)
-        if speeds and kind < 0.7:
-            return (f"v[{i}]" if units[i] == 1.0 else f"v[{i}] / {units[i]!r}",)
-        if kind < 0.75:
-            return (f'p["a"][{int(rng.integers(3))}]',)
-        if kind < 0.82:
-            return (str(rng.choice(['p["b"]', 'p["k"]'])),)
-        if kind < 0.88:
-            return ("0.7" if single else "jnp.sin(t)",)
-        return (repr(float(rng.choice([0.0, 1.0, -1.0, 2.0, 0.5, -0.3, 1e-8, 1e3]))),)
-
-    def grow(depth: int, speeds: bool = False) -> Tree:
-        if depth == 0 or rng.random() < 0.15:
-            return leaf(speeds)
-        if rng.random() < 0.5:
-            return (str(rng.choice(ONE)), grow(depth - 1, speeds))
-        return (str(rng.choice(TWO)), grow(depth - 1, speeds), grow(depth - 1, speeds))
-
-    def square() -> Tree:
-        """(sum of c_i(q) v_i)^2 with a positive factor: keeps M positive definite."""
-        terms = []
-        for i in rng.choice(n, size=int(rng.integers(1, min(n, 3) + 1)), replace=False):
-            terms.append((f"({{0}}) * v[{i}] / {units[i]!r}", grow(2)))
-        whole = " + ".join(f"{{{k}}}" for k in range(len(terms)))
-        return (f"0.5 * ({whole}) ** 2", *terms)
+    units, scale = sizes(rng, n, 3.0 if single else 12.0)
+    trees = Trees(rng, units, "0.7" if single else "jnp.sin(t)")
+    grow, square = trees.grow, trees.square
 
     kinetic = [square() for _ in range(int(rng.integers(0, 3)))]
     if rng.random() < 0.4:  # gyroscopic
@@ -204,11 +261,7 @@ def draw(seed: int) -> Drawn:
     masses = rng.uniform(0.5, 2.0, n) / np.array(units) ** 2
     force = [grow(2, True) for _ in range(n)] if rng.random() < 0.3 else []
     dtype = "float32" if single else "float64"
-    params = {
-        "a": [float(f"{x:.3g}") for x in rng.uniform(-1.5, 1.5, 3)],
-        "b": float(f"{10.0 ** rng.uniform(-2, 2):.3g}"),
-        "k": float(f"{rng.uniform(0.5, 1.5):.3g}"),
-    }
+    params = numbers(rng)
     potential = grow(int(rng.integers(1, 5)))
     return Drawn(
         n,
@@ -222,6 +275,23 @@ def draw(seed: int) -> Drawn:
         dtype,
         seed % 4 == 0,
     )
+
+
+def sizes(rng: np.random.Generator, n: int, reach: float) -> tuple[tuple[float, ...], float]:
+    """(Units of the coordinates, scale of the energies), of so many decades, or 1."""
+    spread = rng.random() < 0.5
+    units = 10.0 ** rng.uniform(-reach / 2, reach / 2, n) if spread else np.ones(n)
+    scale = float(10.0 ** rng.uniform(-reach, reach)) if rng.random() < 0.5 else 1.0
+    return tuple(float(f"{u:.3g}") for u in units), float(f"{scale:.3g}")
+
+
+def numbers(rng: np.random.Generator) -> dict[str, Any]:
+    """Params."""
+    return {
+        "a": [float(f"{x:.3g}") for x in rng.uniform(-1.5, 1.5, 3)],
+        "b": float(f"{10.0 ** rng.uniform(-2, 2):.3g}"),
+        "k": float(f"{rng.uniform(0.5, 1.5):.3g}"),
+    }
 
 
 def smaller(drawn: Drawn) -> Iterator[Drawn]:

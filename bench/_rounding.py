@@ -188,6 +188,8 @@ def _run(jaxpr: Any, consts: Any, args: Any, eps: float, rng: Any) -> list[Any]:
             outs = evaluated(eqn.params["branches"][int(which)], given, eps, rng)
         elif name == "scan" and eqn.params["length"]:
             outs = _scanned(eqn, given, eps, rng)
+        elif name == "custom_linear_solve":
+            outs = _solved(eqn.params, given, eps, rng)
         else:
             outs = _operation(eqn, given)
             if rng is not None and name not in EXACT:
@@ -207,6 +209,14 @@ def _scanned(eqn: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
         written.append(found[carries:])
     written = written[:: -1 if p["reverse"] else 1]
     return [*carry, *(np.stack(column) for column in zip(*written, strict=True))]
+
+
+def _solved(p: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
+    """By the program that solves; the others serve derivatives."""
+    sizes = p["const_lengths"]
+    before = sizes.matvec + sizes.vecmat
+    consts, right = given[before : before + sizes.solve], given[sum(sizes) :]
+    return evaluated(p["jaxprs"].solve, [*consts, *right], eps, rng)
 
 
 def _operation(eqn: Any, given: list[Any]) -> list[Any]:

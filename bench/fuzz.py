@@ -1,49 +1,110 @@
-"""Lagrangians at random: the scalar program against the array program, derivatives included.
+"""Systems at random: every program of the library against another way to the same numbers.
 
-Systems of 1 to 5 coordinates with every kind of operation, energies of 1e-12 to 1e12 times the
-usual size, coordinates in units of 1e-6 to 1e6, float32 and float64. Accelerations, their
-derivatives in q, v and params, and second derivatives in q are compared at random states, near
-zero and with equal coordinates. The scalar program may differ by what other roundings of the
-arguments and of every operation of the array program change (`_rounding.py`). What differs more is
-made smaller and written down as source. Both are computed operation by operation: it is the
-programs that are compared, not what compilers make of them.
+Lagrangians of 1 to 5 coordinates with every kind of operation, energies of 1e-12 to 1e12 times the
+usual size, coordinates in units of 1e-6 to 1e6, float32 and float64. Of ten systems
+
+- four are free: the scalar program against the array program (`_system_programs.py`);
+- three are constrained, holonomic, rheonomic and Pfaffian rows at random, some of which follow from
+  others, say nothing, or lose rank at the state, residuals in units of 1e-6 to 1e6, coordinates
+  without inertia: accelerations, multipliers and their derivatives by arrays, scalars and null
+  spaces against Gaussian elimination in extended precision (`_mechanism_programs.py`,
+  `_reference.py`);
+- two are in quasi-velocities, by U or by kinematics, L in v or in u, with rows or without,
+  singular at the state by chance: against the same equations solved with multipliers;
+- one is differentiated twice through a loop: against the same unrolled (`_loops.py`).
+
+What has no solution must have no number. Of some of the constrained ones, and of those in
+quasi-velocities, short motions by two formulations are compared, and their statuses, and of some
+loops the steps are motions (`_mechanism_motions.py`). Differences are allowed up to what other
+roundings change. What differs more is made smaller and written down as source. All but the motions
+is computed operation by operation: it is the programs that are compared, not what compilers make of
+them.
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
+from bench import (
+    _loops,
+    _mechanism_motions,
+    _mechanism_programs,
+    _random_mechanisms,
+    _random_quasi,
+    _random_systems,
+    _system_programs,
+)
+from bench._compared import DIFFERS, EQUAL, Compared
 from bench._harness import Report, Target
-from bench._random_systems import Drawn, draw, smaller, text
-from bench._rounding import evaluated
-from jaxlag._lowering import ArrayTerms, ScalarTerms
 
-SYSTEMS = 2000  # compared: an hour
+SYSTEMS = 2000  # compared: an hour and a half
 QUICK = 20.0  # seconds of a quick run
-SLACK = 100.0  # times what other roundings change, or roundings of the result
-NUDGES = 4  # runs with other roundings
-MORE = 60  # where they differ by those: a floor may turn at one rounding in ten
-STATES = 4
 TOGETHER = 200  # systems, after which what is compiled is dropped
 SMALLEST = 60  # attempts to make a find smaller
+MOVING = 4.0  # decades of units of what moves: tolerances bound no more
 
 
-class Compared(NamedTuple):
-    """How one system compares.
+class Kind(NamedTuple):
+    """What is drawn, and how it is looked at.
 
     Attributes:
-        kind: "equal", "differs", or why there is nothing to compare.
-        worst: the largest difference over what is allowed.
-        what: which derivative it is in.
+        name: in the rows of the report.
+        draw: from a seed.
+        compared: how it compares.
+        smaller: others with something left out.
     """
 
-    kind: str
-    worst: float = 0.0
-    what: str = ""
+    name: str
+    draw: Callable[[int], Any]
+    compared: Callable[[Any], Compared]
+    smaller: Callable[[Any], Iterator[Any]]
+
+
+def _none(_: Any) -> Iterator[Any]:
+    return iter(())
+
+
+FREE = Kind("free", _random_systems.draw, _system_programs.compared, _random_systems.smaller)
+CONSTRAINED, QUASI = (
+    Kind(name, module.draw, _mechanism_programs.compared, _random_mechanisms.smaller)
+    for name, module in (("constrained", _random_mechanisms), ("quasi", _random_quasi))
+)
+CONSTRAINED_MOTION, QUASI_MOTION = (
+    Kind(
+        f"{kind.name}, moving",
+        lambda seed, kind=kind: kind.draw(seed, MOVING, True),  # type: ignore[call-arg]
+        _mechanism_motions.compared,
+        _random_mechanisms.smaller,
+    )
+    for kind in (CONSTRAINED, QUASI)
+)
+LOOPS = Kind("loops", _loops.draw, _loops.compared, _none)
+LOOPED_MOTION = LOOPS._replace(name="loops of motions", draw=lambda seed: _loops.draw(seed, True))
+KINDS = (
+    FREE,
+    CONSTRAINED,
+    QUASI,
+    LOOPS,
+    CONSTRAINED_MOTION,
+    QUASI_MOTION,
+    LOOPED_MOTION,
+)
+
+
+def kind_of(seed: int) -> Kind:
+    """What a seed stands for: free, constrained, quasi or loops, in ten 4, 3, 2 and 1."""
+    tens, ones = divmod(seed, 10)
+    if ones == 5 and tens % 5 == 3:
+        return CONSTRAINED_MOTION
+    if ones == 7 and tens % 10 == 4:
+        return QUASI_MOTION
+    if ones == 9 and tens % 40 == 6:
+        return LOOPED_MOTION
+    turns = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
+    return turns[ones]
 
 
 def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
@@ -51,156 +112,46 @@ def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
     if seconds is None:
         seconds = QUICK if quick else float("inf")
     end = perf_counter() + seconds
-    kinds: Counter[str] = Counter()
+    found_kinds: Counter[str] = Counter()
+    of_kind: Counter[str] = Counter()
     finds, seed, worst = [], first, 0.0
-    while perf_counter() < end and kinds["equal"] < SYSTEMS:
-        drawn = draw(seed)
-        found = compared(drawn)
-        kinds[found.kind] += 1
-        if found.kind == "differs":
-            finds.append(_written_down(seed, *_smallest(drawn, found)))
+    while perf_counter() < end and found_kinds[EQUAL] < SYSTEMS:
+        kind = kind_of(seed)
+        drawn = kind.draw(seed)
+        found = kind.compared(drawn)
+        found_kinds[found.kind] += 1
+        if found.kind == DIFFERS:
+            finds.append(_written_down(seed, *_smallest(kind, drawn, found)))
         else:
+            of_kind[kind.name] += found.kind == EQUAL
             worst = max(worst, found.worst)
         seed += 1
         if seed % TOGETHER == 0:
             jax.clear_caches()
-    rows = [_row(kind, number) for kind, number in kinds.most_common()]
+    rows = [_row(kind, number) for kind, number in found_kinds.most_common()]
+    rows += [_row(f"equal, {kind}", number) for kind, number in of_kind.most_common()]
     rows.append(_row("worst of the equal, over the bound", worst))
     targets = [
-        Target("systems that differ", float(kinds["differs"]), "<=", 0.0),
-        Target("systems compared", float(kinds["equal"]), ">=", 0.0 if quick else SYSTEMS),
+        Target("systems that differ", float(found_kinds[DIFFERS]), "<=", 0.0),
+        Target("systems compared", float(found_kinds[EQUAL]), ">=", 0.0 if quick else SYSTEMS),
     ]
     return Report(rows + finds, targets, [], rows)
 
 
-def compared(drawn: Drawn) -> Compared:
-    """The scalar program of a system beside the array program."""
-    system = drawn.system
-    dtype = jnp.dtype(drawn.dtype)
-    leaves = {
-        "a": jnp.asarray(drawn.params["a"], dtype),
-        "b": jnp.asarray(drawn.params["b"], dtype),
-    }
-    params = leaves | {"k": _number(drawn)}
-    arrays = ArrayTerms(system.lagrangian, system.forces)
-    scalars = ScalarTerms(arrays, 1500)
-    try:
-        like = jax.ShapeDtypeStruct((drawn.n,), dtype)
-        system.check_traceable(params, dtype, {})
-    except (TypeError, ValueError):
-        return Compared("no Lagrangian")
-    lowered = scalars.lowered(like, params, {})
-    if lowered.equations is None:
-        return Compared(_reason(lowered.reason))
-    found = _judged(drawn, arrays, scalars, leaves, NUDGES)
-    return found if found.kind == "equal" else _judged(drawn, arrays, scalars, leaves, MORE)
-
-
-def _number(drawn: Drawn) -> Any:
-    """A number of Python's is double precision in a scalar program."""
-    k = drawn.params["k"]
-    return k if drawn.dtype == "float64" else jnp.asarray(k, drawn.dtype)
-
-
-def _reason(said: str) -> str:
-    for known in ("random states to compare", "operations", "weighted sums"):
-        if known in said:
-            return f"not used: {known}"
-    if said.startswith("differs"):
-        return "not used: differs where it was compared"
-    return f"not used: {said.split(' at ')[0]}"
-
-
-def _judged(
-    drawn: Drawn, arrays: Any, scalars: Any, leaves: dict[str, Any], nudges: int
-) -> Compared:
-    dtype, n = jnp.dtype(drawn.dtype), drawn.n
-    eps = float(jnp.finfo(dtype).eps)
-    rng = np.random.default_rng(1)
-    units = np.array(drawn.units).astype(dtype)
-    parts = {"da/dq": slice(0, n), "da/dv": slice(n, 2 * n), "da/dparams": slice(2 * n, None)}
-
-    def everything(terms: Any) -> Any:
-        def a(x: Any) -> Any:
-            """The acceleration in units, as a function of state in units and params in one row."""
-            params = {"a": x[2 * n : -1], "b": x[-1], "k": _number(drawn)}
-            q, v = units * x[:n], units * x[n : 2 * n]
-            return terms.acceleration(jnp.asarray(0.3), q, v, params, {}) / units
-
-        def of(x: Any) -> dict[str, Any]:
-            value, push = jax.linearize(a, x)
-            slopes = jax.vmap(push, out_axes=1)(jnp.eye(x.size, dtype=dtype))
-            found = {"a": value} | {name: slopes[:, part] for name, part in parts.items()}
-            if drawn.second:
-                along = jnp.zeros_like(x).at[:n].set(jnp.linspace(0.5, 1.0, n, dtype=dtype))
-                bent = jax.jacfwd(lambda x: jax.jvp(a, (x,), (along,))[1])(x)
-                found["d2a/dq2"] = bent[:, :n]
-            return found
-
-        return jax.vmap(of)
-
-    q = rng.uniform(-1.5, 1.5, (STATES, n))
-    v = rng.uniform(-1.5, 1.5, (STATES, n))
-    q[-2] *= 1e-5  # near zero
-    q[-1] = q[-1, 0]  # equal to one another
-    known = np.concatenate([leaves["a"], leaves["b"][None]])
-    exact = np.concatenate([q, v, np.tile(known, (STATES, 1))], axis=1).astype(dtype)
-    written, shapes = jax.make_jaxpr(everything(arrays), return_shape=True)(exact)
-    right = [evaluated(written, [exact])]
-    for _ in range(nudges):
-        nudged = exact * (1.0 + eps * rng.uniform(-1.0, 1.0, exact.shape))
-        right.append(evaluated(written, [nudged.astype(dtype)], eps, rng))
-    found = evaluated(jax.make_jaxpr(everything(scalars))(exact), [exact])
-    several = [[np.asarray(x, float).reshape(STATES, -1) for x in run] for run in right]
-    worst, what = 0.0, ""
-    for k, name in enumerate(shapes):
-        y = np.asarray(found[k], float).reshape(STATES, -1)
-        off = _off(np.stack([x[k] for x in several]), y, several[0][0], eps)
-        if off > worst:
-            worst, what = off, name
-    return Compared("differs" if worst > 1.0 else "equal", worst, what)
-
-
-def _off(right: np.ndarray, found: np.ndarray, a: np.ndarray, eps: float) -> float:
-    """The largest difference over what is allowed.
-
-    Roundings of the acceleration count in its derivatives, too, which are per unit of a coordinate:
-    of those nothing closer is asked.
-
-    Args:
-        right: from the array program, shape (1 + nudges, STATES, entries): as it is, then nudged.
-        found: from the scalar program, (STATES, entries).
-        a: the acceleration, (STATES, n).
-        eps: of the numbers.
-    """
-    worst = 0.0
-    for k, y in enumerate(found):
-        x = right[:, k]
-        if not np.isfinite(x[0]).all() or not np.isfinite(y).all():
-            # Where the array program overflows, or is undefined, the other need not be.
-            worst = max(worst, np.inf if np.isfinite(x).all() else 0.0)
-            continue
-        spread = np.nanmax(np.abs(x[1:] - x[0]), initial=0.0)
-        size = max(np.max(np.abs(x[0]), initial=0.0), np.nanmax(np.abs(a[k]), initial=0.0))
-        allowed = SLACK * (spread + eps * size) + np.finfo(float).tiny
-        worst = max(worst, float(np.max(np.abs(y - x[0]), initial=0.0) / allowed))
-    return worst
-
-
-def _smallest(drawn: Drawn, found: Compared) -> tuple[Drawn, Compared]:
+def _smallest(kind: Kind, drawn: Any, found: Compared) -> tuple[Any, Compared]:
     """A system in which the programs still differ, with as much left out as the tries allow."""
     tries, again = 0, True
     while again:
         again = False
-        for other in smaller(drawn):
+        for other in kind.smaller(drawn):
             tries += 1
             if tries > SMALLEST:
                 return drawn, found
             try:
-                now = compared(other)
+                now = kind.compared(other)
             except Exception:  # left too little
                 continue
-            if now.kind == "differs":
+            if now.kind == DIFFERS:
                 drawn, found, again = other, now, True
                 break
     return drawn, found
@@ -210,7 +161,5 @@ def _row(kind: str, number: float, declared: str = "") -> dict[str, Any]:
     return {"kind": kind, "systems": number, "declared": declared}
 
 
-def _written_down(seed: int, drawn: Drawn, found: Compared) -> dict[str, Any]:
-    source = [f"L = {drawn.lagrangian}", f"Q = [{', '.join(map(text, drawn.force))}]"]
-    source += [f"{name} = {getattr(drawn, name)!r}" for name in ("params", "units", "dtype")]
-    return _row(f"seed {seed}: {found.what} differs", found.worst, "; ".join(source))
+def _written_down(seed: int, drawn: Any, found: Compared) -> dict[str, Any]:
+    return _row(f"seed {seed}: {found.what} differs", found.worst, drawn.written)

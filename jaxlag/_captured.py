@@ -280,7 +280,8 @@ def once(function: Any) -> Any:
     """
     if not isinstance(function, eqx.Module):
         return captured(function)
-    _params.check_keys(function, type(function).__name__)
+    if not of_library(function):  # of one, whoever made its parts has asked
+        _params.check_keys(function, type(function).__name__)
     return function
 
 

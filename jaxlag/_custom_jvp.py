@@ -237,6 +237,29 @@ def _no_tangent(x: Any) -> ad.Zero:
 ad.primitive_jvps[_custom_jvp] = _derivative
 
 
+def _transposed(
+    cotangents: Leaves, *args: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule
+) -> list:
+    """Of the function itself, as JAX has it: a rule may call it on what it is linear in."""
+    del rule
+    linear = [i for i, x in enumerate(args) if ad.is_undefined_primal(x)]
+
+    def of(*moving: Any) -> Leaves:
+        whole = list(args)
+        for i, x in zip(linear, moving, strict=True):
+            whole[i] = x
+        return jaxpr_as_fun(call_jaxpr)(*whole)
+
+    like = [jax.ShapeDtypeStruct(args[i].aval.shape, args[i].aval.dtype) for i in linear]
+    pairs = zip(cotangents, call_jaxpr.out_avals, strict=True)
+    given = [jnp.zeros(y.shape, y.dtype) if type(x) is ad.Zero else x for x, y in pairs]
+    found = dict(zip(linear, jax.linear_transpose(of, *like)(given), strict=True))
+    return [found.get(i) for i in range(len(args))]
+
+
+ad.primitive_transposes[_custom_jvp] = _transposed
+
+
 def _batched(args: Leaves, axes: Leaves, *, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> tuple:
     """Rows in front of all results: one program for them whatever their rule returns."""
     pairs = list(zip(args, axes, strict=True))

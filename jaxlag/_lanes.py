@@ -67,7 +67,7 @@ def in_lanes(
     return constant(args)
 
 
-def _batch(vmapped: Callable, size: Any, at_once: int, even: bool) -> Callable:
+def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
     """(own, shared) -> results of `size` trajectories; own leaves have one row for each.
 
     A further vmap makes more rows.
@@ -99,7 +99,7 @@ def _batch(vmapped: Callable, size: Any, at_once: int, even: bool) -> Callable:
 
 
 def in_batches(
-    function: Callable, rows: PyTree, count: Any, at_once: int, even: bool = True
+    function: Callable, rows: PyTree, count: Any, at_once: Any, even: bool = True
 ) -> PyTree:
     """The vmapped function over `count` rows, up to `at_once` at a time.
 

@@ -117,6 +117,8 @@ class QuasiVelocities(eqx.Module):
     ) -> Float[Array, " k"]:
         """u = U(t, q, v), shape (k,), in m/s or rad/s; without U the u with B u + c nearest to v.
 
+        Velocities that B u + c does not reach are compared over the lengths of the rows of B.
+
         Args:
             t: time, s.
             q: coordinates, shape (n,).
@@ -129,8 +131,10 @@ class QuasiVelocities(eqx.Module):
         if self.U is not None:
             return self._checked("U", self.U(t, q, v, params), self.size, v.dtype)
         B, c = self._affine(t, q, v.dtype, params)
-        Q, R = jnp.linalg.qr(B)
-        return solve_triangular(R, Q.T @ (v - c))
+        # Rows of long units would leave nothing but rounding of those of short ones.
+        size = _lengths(B)
+        Q, R = jnp.linalg.qr(B / size[:, None])
+        return solve_triangular(R, Q.T @ ((v - c) / size))
 
     def velocities(
         self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " k"], params: Any
@@ -166,11 +170,20 @@ class QuasiVelocities(eqx.Module):
         one = jnp.eye(n, dtype=u.dtype)
         theta, Q, R = regular(theta, one), regular(Q, one), regular(R, one)
         size = regular(size, jnp.ones_like(size))
+
+        def rows(b: Array) -> Array:
+            return Q @ solve_triangular(R, b / size, trans=1)
+
+        def columns(b: Array) -> Array:
+            return solve_triangular(R, Q.T @ b) / size
+
+        # Refined once: between coordinates of unlike units rows of theta are nearly parallel, and
+        # those of short units would be left with the rounding of the others.
         v = lax.custom_linear_solve(
             lambda v: v @ theta,
             u - theta_0,
-            lambda _, b: Q @ solve_triangular(R, b / size, trans=1),
-            lambda _, b: solve_triangular(R, Q.T @ b) / size,
+            lambda turned, b: _refined(rows, turned, b),
+            lambda turned, b: _refined(columns, turned, b),
         )
         return jnp.where(fine, v, jnp.nan)
 
@@ -359,11 +372,25 @@ def _sines(columns: Float[Array, "n k"]) -> Float[Array, " k"]:
     return jnp.abs(jnp.diagonal(_factored(columns)[2]))
 
 
+def _refined(solve: Callable, product: Callable, b: Array) -> Array:
+    """The x with product(x) = b, with the residual of a first one solved for once more.
+
+    Source: Skeel, Math. Comp. 35 (1980) 817: one step makes elimination stable by components.
+    """
+    x = solve(b)
+    return x + solve(b - product(x))
+
+
+def _lengths(rows: Float[Array, "n k"]) -> Float[Array, " n"]:
+    """Lengths of rows, 1 of those that vanish; without derivatives."""
+    size = jnp.sqrt(jnp.sum(lax.stop_gradient(rows) ** 2, axis=1))
+    return jnp.where(size > 0, size, 1.0)
+
+
 def _factored(columns: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
     """(s, Q, R) with Q R diag(s) the columns, s their lengths; without derivatives."""
     columns = lax.stop_gradient(columns)
-    size = jnp.sqrt(jnp.sum(columns**2, axis=0))
-    size = jnp.where(size > 0, size, 1.0)
+    size = _lengths(columns.T)
     Q, R = jnp.linalg.qr(columns / size[None])
     return size, Q, R
 

@@ -121,25 +121,34 @@ def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
 def rows_hold(
     A: Float[Array, "m n"],
     x: Float[Array, " n"],
-    c: Float[Array, " m"],
-    size: Float[Array, " m"],
-    v: Float[Array, " n"],
+    gamma: Callable[..., Array],
+    state: tuple[Array, Array, Array],
+    sizes: Sizes,
+    force: Float[Array, " n"],
+    units: Float[Array, " n"],
 ) -> Bool[Array, ""]:
-    """Whether A x + c = 0 for all rows, those that were left out included.
+    """Whether A x + gamma = 0 for all rows, those that were left out included.
 
-    Up to what the angle may be below which a row counts as dependent.
+    Up to what the angle may be below which a row counts as dependent, in units of the coordinates,
+    and up to the rounding of gamma and of the accelerations by forces, from which reactions take x.
 
     Args:
         A: rows.
         x: an acceleration that some of them have been solved for.
-        c: gamma.
-        size: of the rows, see `row_sizes`.
-        v: velocities, whose squares make gamma.
+        gamma: of (t, q, v).
+        state: (t, q, v).
+        sizes: of the rows, see `row_sizes`.
+        force: Q - h.
+        units: of the coordinates, in which their inertias are 1.
     """
     eps = float(jnp.finfo(A.dtype).eps)
-    scale = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(c) / size)
-    allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * (1.0 + jnp.sum(v**2))
-    return jnp.all(jnp.abs(A @ x + c) <= allowed * size)
+    c, rounding = with_rounding(gamma, *state)
+    lengths = _lengths(A * units[None])
+    size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
+    scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
+    allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
+    allowed = allowed * size + ROUNDINGS * jnp.nan_to_num(rounding)
+    return jnp.all(jnp.abs(A @ x + c) <= allowed)
 
 
 def independent_rows(

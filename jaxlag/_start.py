@@ -8,7 +8,8 @@ from jaxtyping import Array, Bool, Int
 
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._linalg import closed_to, dependence_floor
-from jaxlag._rank import Sizes, independent_rows, row_sizes, without_rounding
+from jaxlag._rank import ROUNDINGS, Sizes, independent_rows, row_sizes, without_rounding
+from jaxlag._roundings import with_rounding
 from jaxlag._step import Arguments
 
 
@@ -140,7 +141,12 @@ def _rows_consistent(
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
     turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
-    bent = left(gamma) / (floor * jnp.where(turn > 0, turn, 1.0))
+    bent = left(gamma)
+    if dynamics.rows.size > 1:  # terms of gamma that cancel leave rounding, no contradiction
+        _, rounding = with_rounding(lambda t, q, v: terms.gamma(t, q, v, params), t, q, v)
+        rounding = ROUNDINGS * jnp.nan_to_num(rounding)
+        bent = jnp.maximum(bent - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
+    bent = bent / (floor * jnp.where(turn > 0, turn, 1.0))
     bad = jnp.where(near, jnp.maximum(bent, bad), bad)
     return _consistency(off, bad, near, phi, rate)
 

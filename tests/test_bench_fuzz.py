@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from bench import fuzz
+from bench import _system_programs, fuzz
+from bench._compared import Compared
 from bench._random_systems import ONE, TWO, Drawn, draw, smaller, text
 from bench._rounding import CALLS, NUMPY, evaluated
 from jaxlag._lowering import ScalarTerms
@@ -64,8 +65,9 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
         a = right(self, *args, **options)
         return a + 1e-6 * jnp.sin(a)
 
-    monkeypatch.setattr(fuzz, "draw", lambda seed: SMALL)
-    assert fuzz.compared(SMALL).kind == "equal"
+    kind = fuzz.FREE._replace(draw=lambda seed: SMALL)
+    monkeypatch.setattr(fuzz, "kind_of", lambda seed: kind)
+    assert _system_programs.compared(SMALL).kind == "equal"
     monkeypatch.setattr(ScalarTerms, "acceleration", wrong)
     report = fuzz.run(True, seconds=1e-3, first=7)
     find = report.rows[-1]
@@ -77,6 +79,33 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
     assert [target.met for target in report.targets] == [False, True]
 
 
+def test_a_run_draws_every_kind():
+    """Of ten systems four are free, three constrained, two quasi, one a loop; some of them move."""
+    names = [fuzz.kind_of(seed).name for seed in range(400)]
+    assert set(names) == {kind.name for kind in fuzz.KINDS}
+    of = {word: sum(word in name for name in names) for word in ("free", "constrained", "quasi")}
+    assert of == {"free": 160, "constrained": 120, "quasi": 80}
+    assert 0 < sum("mov" in name or "motion" in name for name in names) < 20
+
+
+def test_a_run_counts_what_it_compared(monkeypatch):
+    """Until enough are equal; what cannot be compared counts for nothing."""
+    kind = fuzz.QUASI._replace(
+        draw=lambda seed: seed,
+        compared=lambda seed: Compared("equal" if seed % 2 else "not compared: odd", 0.25),
+    )
+    monkeypatch.setattr(fuzz, "kind_of", lambda seed: kind)
+    monkeypatch.setattr(fuzz, "SYSTEMS", 3)
+    report = fuzz.run(False)
+    assert {row["kind"]: row["systems"] for row in report.rows} == {
+        "equal": 3,
+        "not compared: odd": 3,
+        "equal, quasi": 3,
+        "worst of the equal, over the bound": 0.25,
+    }
+    assert all(target.met for target in report.targets)
+
+
 @pytest.mark.parametrize(
     ("off", "least", "most"),
     [(0.0, 0.0, 0.0), (1e-15, 0.0, 0.1), (1e-9, 1e3, 1e6), (np.nan, np.inf, np.inf)],
@@ -84,9 +113,9 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
 def test_differences_are_measured_by_what_roundings_change(off, least, most):
     right = np.array([[[1.0, 2.0]], [[1.0 + 1e-15, 2.0]]])
     found = right[0] + off
-    assert least <= fuzz._off(right, found, right[0], 2.0**-52) <= most
+    assert least <= _system_programs._off(right, found, right[0], 2.0**-52) <= most
     # Where the array program has no value, anything is right.
-    assert fuzz._off(np.full_like(right, np.nan), found, right[0], 2.0**-52) == 0.0
+    assert _system_programs._off(np.full_like(right, np.nan), found, right[0], 2.0**-52) == 0.0
 
 
 def test_roundings_show_the_digits_that_a_result_has():
@@ -134,6 +163,13 @@ def _functions(x):
     return plain, positive, powers, x.astype(jnp.float32), x.astype(int), WHOLE.astype(float) * x
 
 
+def _solves(x):
+    def solve(b):
+        return lax.custom_linear_solve(lambda y: 2.0 * y, b, lambda _, b: 0.5 * b, symmetric=True)
+
+    return solve(x), jax.jvp(solve, (x,), (x,))[1], jax.vjp(solve, x)[1](x)[0]
+
+
 def _loops(x):
     def step(carry, row):
         return 0.5 * carry + row, carry * row
@@ -159,6 +195,7 @@ CALLED = [
     (_numbers, WHOLE, WHOLE[::-1] + (WHOLE[::-1] == 0)),
     (_functions, X),
     (_loops, X),
+    (_solves, X),
     (lambda x: jax.linearize(jnp.sin, x)[1](x) + lax.iota(float, 3), X[0]),
 ]
 

@@ -81,6 +81,53 @@ def test_rules_survive_loops_within_loops(outer):
     assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
 
 
+@CustomJVP
+def quotient(x, y):
+    return x / y
+
+
+@quotient.defjvp
+def _(primals, tangents):
+    """Calls the function itself on tangents, which it is linear in."""
+    (_, y), (dx, dy) = primals, tangents
+    z = quotient(*primals)
+    return z, quotient(dx - z * dy, y)
+
+
+@pytest.mark.parametrize("loop", ["fori_loop", "jit", "checkpoint", "vmap"])
+@pytest.mark.parametrize("mode", ["grad", "jacrev"])
+def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
+    """Reverse derivatives turn such a call round: of 1 / (1 + x^2), once and twice."""
+
+    def f(x):
+        return quotient(jnp.ones_like(x), 1.0 + x * x)
+
+    looped, s = LOOPS[loop](f), 1.0 + X * X
+    x = jnp.asarray(X)
+    np.testing.assert_allclose(DERIVATIVES[mode](looped)(x), -2.0 * X / s**2, rtol=1e-14)
+    second = (6.0 * X**2 - 2.0) / s**3
+    for pair in ((mode, "grad"), (mode, "jacfwd"), ("jacfwd", mode)):
+        np.testing.assert_allclose(twice(pair, looped)(x), second, rtol=1e-13)
+
+
+def test_reverse_derivatives_of_single_precision_in_loops():
+    """Where the equations divide; as in double precision."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 * (1 + q[0] ** 2) + jnp.cos(p * q[0]), ("x",)
+    )
+
+    def end(p):
+        def step(_, x):
+            a = system.acceleration(p, x[:1], x[1:])
+            return x + 0.01 * jnp.concatenate([x[1:], a])
+
+        return jnp.sum(jax.lax.fori_loop(0, 3, step, jnp.ones(2, p.dtype)))
+
+    for derivative in (jax.grad(end), jax.jacfwd(jax.grad(end)), jax.grad(jax.grad(end))):
+        one, other = (derivative(jnp.asarray(1.3, dtype)) for dtype in (jnp.float32, jnp.float64))
+        assert abs(float(one) - float(other)) <= 32 * float(jnp.finfo(jnp.float32).eps) * 0.02
+
+
 def test_rules_by_jax_are_dropped_by_the_loops_of_jax():
     """Why the rule is a primitive's. Once this fails, on all supported versions, it need not be."""
     found = jax.jvp(jax.grad(LOOPS["scan"](users)), (X,), (1.0,))[1]

@@ -193,3 +193,31 @@ def test_a_closure_in_a_tilted_plane():
     np.testing.assert_array_equal(found.status, int(jl.Status.ok))
     energy = 0.5 * jnp.sum(found.v**2, axis=-1) + 9.81 * found.q[..., 1]
     np.testing.assert_allclose(energy[:, 1], energy[:, 0], atol=1e-6)
+
+
+def test_terms_that_cancel_are_no_contradiction():
+    """gamma is 2e3 (v_z^2 - v_y^2): it is 0 but for the rounding of its terms."""
+
+    def weighted(t, q, params):
+        r = q[0] - 1e3 * q[1] ** 2 + 1e3 * q[2] ** 2
+        return jnp.stack([r, (2.0 + jnp.sin(q[1])) * r + params * (q[0] ** 2)])
+
+    def free(t, q, v, params):
+        return 0.5 * v @ v
+
+    system = jl.System(free, ("x", "y", "z"), constraints=(jl.Holonomic(weighted, "rows"),))
+    for y in (0.3, 0.37, 1.234):
+        state = [0.0, y, y], [0.0, 0.7, 0.7]
+        motion = jl.simulate(system, *state, [0.0, 0.1], 0.0, **SHORT)
+        assert motion.status == jl.Status.ok, motion.message()
+        np.testing.assert_allclose(motion.q[-1], [0.0, y + 0.07, y + 0.07], atol=1e-12)
+    # A row that bends away from the other as the motion goes is told.
+    state = [0.0, 0.3, 0.2], [0.28, 0.7, 0.7]
+    offset = jl.Holonomic(
+        lambda t, q, p: weighted(t, q, p) - jnp.array([-50.0, -50.0 * (2.0 + jnp.sin(q[1]))]),
+        "rows",
+    )
+    system = jl.System(free, ("x", "y", "z"), constraints=(offset,))
+    v = [140.0, 0.7, 0.7]
+    motion = jl.simulate(system, state[0], v, [0.0, 0.1], 1.0, **SHORT)
+    assert motion.status == jl.Status.contradictory_rows

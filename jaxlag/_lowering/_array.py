@@ -286,7 +286,8 @@ class ArrayTerms(Terms):
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
         still = jax.lax.stop_gradient
-        there, void, size = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        there, void, _ = sizes
         if A.shape[0] == 1:
             choice = Choice(~void, ~void)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
@@ -298,8 +299,13 @@ class ArrayTerms(Terms):
             kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
             choice = Choice(kept, there)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
-            lam = shared(A, lam, kept, there, unread, units_of(*still((M, A))))
-            fine = rows_hold(*still((A, a, self.gamma(t, q, v, params), size, v)))
+            units = units_of(*still((M, A)))
+            lam = shared(A, lam, kept, there, unread, units)
+
+            def gamma(t: Array, q: Array, v: Array) -> Array:
+                return self.gamma(t, q, v, params)
+
+            fine = rows_hold(*still((A, a)), gamma, *still(((t, q, v), sizes, right, units)))
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
     def multipliers(

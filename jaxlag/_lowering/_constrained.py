@@ -177,7 +177,11 @@ def _augmented(
     n, m = len(M), len(A)
     weights = _weights(graph, M, A)
     if kept is not None:
-        weights = [graph.mul(w, kept[k]) for k, w in enumerate(weights)]
+        # Chosen, not multiplied: that of a row of rounding alone may be beyond all numbers.
+        half, zero = graph.const(0.5), graph.zero
+        weights = [
+            graph.select(graph.call(GREATER, kept[k], half), w, zero) for k, w in enumerate(weights)
+        ]
     full: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
     for i in range(n):
         for j in range(i, n):

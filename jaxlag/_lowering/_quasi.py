@@ -155,14 +155,19 @@ def affine(
 
 
 def _quasi(scene: Scene, kinematics: Kinematics, expansion: Expansion) -> list[Node]:
-    """U(t, q, v); where it is not given, (B^T B)^-1 B^T (v - c)."""
+    """U(t, q, v); where it is not given, B^-1 (v - c), or (B^T B)^-1 B^T (v - c) of a tall B.
+
+    A square B has digits that its square has not, above all between coordinates of unlike units.
+    """
     graph = scene.graph
     if kinematics.U is not None:
         return list(kinematics.U)
     assert kinematics.V is not None
     B, c = affine(graph, kinematics.V, kinematics.u)
-    gram = _gram(graph, expansion, B)
     rest = [graph.sub(*pair) for pair in zip(scene.v, c, strict=True)]
+    if len(B) == len(B[0]):
+        return Inverse(graph, expansion, B, 0.0)(rest)
+    gram = _gram(graph, expansion, B)
     right = [_dot(graph, column, rest) for column in zip(*B, strict=True)]
     return Inverse(graph, expansion, gram, 0.0)(right)
 

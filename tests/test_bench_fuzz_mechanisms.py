@@ -1,0 +1,287 @@
+"""The fuzzer's constrained systems, quasi-velocities and loops: what it draws, knows and finds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bench import (
+    _loops,
+    _mechanism_motions,
+    _random_mechanisms,
+    _random_quasi,
+)
+from bench._mechanism_programs import compared, prepare
+from bench._random_mechanisms import Mechanism, Quasi, Row, smaller
+from bench._random_systems import Drawn
+from bench._reference import Unclear
+from jaxlag import _captured, _rank
+from jaxlag._lowering import ArrayTerms, _array, _ingest
+from jaxlag._lowering import Moving as Rates
+from jaxlag._lowering._scalar import ScalarTerms
+
+NUMBERS = {"a": [0.1, 0.2, 0.3], "b": 2.0, "k": 1.0}
+
+
+def mechanism(*rows, q, v, masses=None, quasi=None, potential="9.81 * q[1]", **changes):
+    """A mass point, or another with these inertias."""
+    masses = (2.0,) * len(q) if masses is None else masses
+    units = changes.pop("units", (1.0,) * len(q))
+    dtype = changes.pop("dtype", "float64")
+    drawn = Drawn(len(q), (), (potential,), (), masses, NUMBERS, units, 1.0, dtype, False)
+    return Mechanism(drawn, rows, 0.5, tuple(q), tuple(v), quasi=quasi, **changes)
+
+
+ROD = Row("holonomic", "q[0] ** 2 + q[1] ** 2 - 1.0")
+AGAIN = Row("Pfaffian", "3.0 * (q[0] * v[0] + q[1] * v[1])", "dependent")
+VOID = Row("holonomic", "(jnp.sin(q[0]) ** 2 + jnp.cos(q[0]) ** 2 - 1.0) * q[1]", "void")
+AT = {"q": (0.6, -0.8), "v": (0.8, 0.6)}
+DOUBLED = mechanism(ROD, AGAIN, VOID, **AT)
+# At x = 0.6 the second row is the first, and asks for another acceleration.
+BENT = mechanism(ROD, Row("holonomic", f"{ROD.text} + (q[0] - 0.6) ** 2", "bent"), **AT)
+TURNED = Quasi(("q[0] * v[0] + q[1] * v[1]", "q[0] * v[1] - q[1] * v[0]"), None, 2, (0,))
+IN_QUASI = mechanism(quasi=TURNED, **AT)
+
+
+# ---- What is drawn -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", [_random_mechanisms, _random_quasi])
+def test_mechanisms_are_their_own_for_every_seed(module):
+    drawn = [module.draw(seed) for seed in range(40)]
+    assert drawn == [module.draw(seed) for seed in range(40)]
+    assert len({x.written for x in drawn}) == len(drawn)
+    assert {x.drawn.dtype for x in drawn} == {"float32", "float64"}
+
+
+def test_rows_of_every_kind_are_drawn():
+    drawn = [_random_mechanisms.draw(seed) for seed in range(150)]
+    rows = [row for x in drawn for row in x.rows]
+    assert {row.role for row in rows} == {"base", "dependent", "void", "bent"}
+    assert {row.kind for row in rows} == {"holonomic", "Pfaffian"}
+    assert any("sin(t)" in row.text and row.kind == "holonomic" for row in rows)
+    assert any(0.0 in x.drawn.masses for x in drawn)
+    assert any(len(x.rows) > x.drawn.n for x in drawn)
+    units = [u for x in drawn for u in x.drawn.units]
+    assert min(units) < 1e-5
+    assert max(units) > 1e5
+
+
+def test_quasi_velocities_of_every_kind_are_drawn():
+    drawn = [_random_quasi.draw(seed) for seed in range(150)]
+    quasi = [x.quasi for x in drawn]
+    assert {(x.U is None, x.written_in) for x in quasi} == {
+        (True, "v"),
+        (True, "u"),
+        (False, "v"),
+        (False, "u"),
+    }
+    assert any(x.constrained for x in quasi)
+    assert any(x.singular for x in quasi)
+    assert any(x.quasi.size < x.drawn.n for x in drawn)
+    assert any(row.kind == "holonomic" for x in drawn for row in x.rows)
+
+
+def test_smaller_mechanisms_have_something_left_out():
+    drawn = _random_mechanisms.draw(4)
+    found = list(smaller(drawn))
+    assert len(found) > 2
+    assert min(len(x.written) for x in found) < len(drawn.written)
+
+
+# ---- What is known -------------------------------------------------------------------------------
+
+
+def test_the_reference_of_a_pendulum():
+    """Rod of 1 m at 2.5 kg, two rows that share its tension by least norm, and an empty one."""
+    found = prepare(DOUBLED._replace(v=(1.6, 1.2)), 4)
+    units = found.equations.units
+    assert found.equations.outcome == "solution"
+    assert found.equations.base.tolist() in ([0], [1])
+    # Masses are 2: lengths of the rows in units of inertia are |A| / sqrt(2).
+    speed, gravity = 4.0, 9.81 / 2.0
+    tension = speed + gravity * 0.8  # per mass, towards the pivot
+    a = np.array([0.0, -gravity]) - tension * np.array([0.6, -0.8])
+    np.testing.assert_allclose(found.right.a * units, a, rtol=1e-14)
+    lam = found.right.mu / found.equations.lengths
+    # Unit rows share 2 tension equally.
+    np.testing.assert_allclose(lam, [-tension / 2.0, -tension / 3.0, 0.0], rtol=1e-14)
+
+
+def test_derivatives_of_the_reference_are_differences():
+    """Along the direction that keeps to the constraints, of a row weighted by a function, too."""
+    weighted = Row("holonomic", f"(1.5 + jnp.sin(q[0])) * ({ROD.text})", "dependent")
+    whole = mechanism(ROD, weighted, q=(0.6, -0.8, 0.3), v=(0.8, 0.6, -0.4))
+    found = prepare(whole, 1)
+    step, ends = 1e-5, []
+    for sign in (1.0, -1.0):
+        state, dots = found.state, found.direction
+        q = state.q + sign * step * dots.q
+        angle = np.arctan2(q[1], q[0])  # along the circle
+        q = np.array([np.cos(angle), np.sin(angle), q[2]])
+        v = state.v + sign * step * dots.v
+        moved = whole._replace(q=tuple(q), v=tuple(v))
+        end = prepare(moved, 1)
+        equations, right = end.equations, end.right
+        ends.append((right.a * equations.units, right.mu / equations.lengths))
+    units, lengths = found.equations.units, found.equations.lengths
+    rates = found.right.da * units, found.right.dmu / lengths
+    for one, other, rate in zip(*ends, rates, strict=True):
+        np.testing.assert_allclose((one - other) / (2 * step), rate, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("changed", "outcome"),
+    [
+        (BENT, "contradictory"),
+        (BENT._replace(rest=0), "solution"),
+        (mechanism(ROD, **AT, masses=(2.0, 0.0)), "solution"),
+        (mechanism(ROD, q=(0.6, -0.8, 0.1), v=(0.8, 0.6, 0.0), masses=(2.0, 2.0, 0.0)), "singular"),
+    ],
+    ids=["bent", "bent at rest", "a massless link", "a coordinate without inertia"],
+)
+def test_what_has_a_solution(changed, outcome):
+    assert prepare(changed, 1).equations.outcome == outcome
+    assert compared(changed).kind == "equal"
+
+
+def test_what_is_near_to_a_border_is_left_out():
+    near = Row("holonomic", f"{ROD.text} + 1e-6 * (q[0] - 0.6)", "dependent")
+    with pytest.raises(Unclear, match="nearly dependent"):
+        prepare(mechanism(ROD, near, **AT), 1)
+    assert compared(mechanism(ROD, near, **AT)).kind.startswith("not compared: ")
+
+
+# ---- What is found -------------------------------------------------------------------------------
+
+
+def found_in(*kinds):
+    """Which quantities differ, and that something does."""
+    results = [compared(x) for x in kinds]
+    assert all(x.kind == "differs" for x in results), results
+    return [x.what for x in results]
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_sound_programs_are_equal(dtype):
+    for sound in (DOUBLED, BENT, IN_QUASI):
+        found = compared(sound._replace(drawn=sound.drawn._replace(dtype=dtype)))
+        assert found.kind == "equal", found
+        assert found.worst < 0.5
+
+
+def test_multipliers_of_other_than_least_norm_are_found(monkeypatch):
+    monkeypatch.setattr(_array, "shared", lambda A, lam, *_: lam)
+    assert found_in(DOUBLED) == ["arrays: lam"]
+
+
+def test_a_bias_of_the_other_sign_is_found(monkeypatch):
+    right = ArrayTerms.gamma
+    monkeypatch.setattr(ArrayTerms, "gamma", lambda self, *args: -right(self, *args))
+    (what,) = found_in(DOUBLED)
+    assert what.endswith((": a", ": lam", ": da", ": dlam"))
+
+
+def test_a_contradiction_that_is_not_told_is_found(monkeypatch):
+    monkeypatch.setattr(_array, "rows_hold", lambda *_: jnp.array(True))
+    assert found_in(BENT) == ["arrays: a number where rows or masses are contradictory"]
+
+
+def test_a_solution_that_is_refused_is_found(monkeypatch):
+    monkeypatch.setattr(_array, "rows_hold", lambda *_: jnp.array(False))
+    assert found_in(DOUBLED) == ["arrays: a is no number"]
+
+
+def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
+    """Its rounding is solved with, or multipliers are given to it."""
+
+    def all_there(rows, q, A, sure=False):
+        whole = jnp.ones(A.shape[0], bool)
+        return _rank.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
+
+    monkeypatch.setattr(_array, "row_sizes", all_there)
+    found_in(DOUBLED)
+
+
+def test_wrong_scalars_are_found(monkeypatch):
+    right = ScalarTerms.rates
+    monkeypatch.setattr(
+        ScalarTerms, "rates", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
+    )
+    for what in found_in(DOUBLED, IN_QUASI):
+        assert "scalars" in what
+
+
+def test_wrong_rates_of_quasi_velocities_are_found(monkeypatch):
+    """What is left of v' at u' = 0, forgotten."""
+
+    def velocity_rate(self, du):
+        return self._push(du)
+
+    monkeypatch.setattr(Rates, "velocity_rate", velocity_rate)
+    (what,) = found_in(IN_QUASI)
+    assert what.startswith("quasi, arrays: ")
+
+
+def test_singular_kinematics_that_give_numbers_are_found(monkeypatch):
+    rows = ("(q[0] - 0.6) * v[0]", "v[1]")
+    singular = mechanism(quasi=Quasi(rows, None, 2, singular=True), **AT)
+    assert compared(singular).kind == "equal"
+    kind = type(singular.system.quasi)
+    monkeypatch.setattr(kind, "regular", lambda self, *_: jnp.array(True))
+    monkeypatch.setattr(kind, "velocities", lambda self, t, q, u, p: u)
+    assert found_in(singular) == [
+        "quasi, arrays: a number where rows or masses are singular kinematics"
+    ]
+
+
+LOOPED = _loops.Looped(
+    DOUBLED.drawn._replace(potential=("q[0] ** 2",)),
+    *(
+        _loops.having(DOUBLED._replace(rows=()).system, DOUBLED.drawn, f)
+        for f in (_loops.ruled, jnp.tanh)
+    ),
+    0.5,
+    np.array([0.6, -0.8]),
+    np.array([0.8, 0.6]),
+    "scan",
+    "nothing",
+    "grad",
+    "jvp",
+)
+
+
+@pytest.mark.parametrize("loop", _loops.LOOPS)
+def test_loops_are_equal_to_what_is_unrolled(loop):
+    found = _loops.compared(LOOPED._replace(loop=loop, within="checkpoint"))
+    assert (found.kind, found.what) == ("equal", "second derivative")
+    assert found.worst < 0.5
+
+
+def test_a_rule_that_is_dropped_in_a_loop_is_found(monkeypatch):
+    """JAX drops it where a reverse derivative takes the body of a scan apart."""
+    monkeypatch.setattr(_captured, "with_rules_kept", lambda program: program)
+    monkeypatch.setattr(_ingest, "with_rule_kept", lambda eqn: eqn)
+    system = _loops.having(DOUBLED._replace(rows=()).system, DOUBLED.drawn, _loops.ruled)
+    looped = LOOPED._replace(system=system)
+    jax.clear_caches()
+    assert _loops.compared(looped).kind == "differs"
+
+
+@pytest.mark.full
+def test_motions_are_compared_by_their_ends_and_statuses(monkeypatch):
+    assert _mechanism_motions.compared(DOUBLED).kind == "equal"
+    assert _mechanism_motions.compared(BENT).kind == "equal"
+    assert _mechanism_motions.compared(IN_QUASI).kind == "equal"
+    monkeypatch.setitem(_mechanism_motions.NAMED, "contradictory", {"nonfinite"})
+    found = _mechanism_motions.compared(BENT)
+    assert (found.kind, found.worst) == ("differs", np.inf)
+    monkeypatch.setattr(_mechanism_motions, "LOCAL", 1e-9)
+    assert _mechanism_motions.compared(DOUBLED).kind == "differs"
+
+
+def test_the_weight_of_a_row_of_rounding_may_be_beyond_all_numbers():
+    """In float32, 1 over the square of its rounding: what is left out is not multiplied by 0."""
+    drawn = _random_mechanisms.draw(294)
+    assert (drawn.drawn.dtype, drawn.rows[1].role) == ("float32", "void")
+    assert compared(drawn).kind == "equal"

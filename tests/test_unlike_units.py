@@ -1,0 +1,169 @@
+"""Coordinates in units a million times one another: what holds in like ones holds in these."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._lowering import ArrayTerms, ScalarTerms
+
+# ---- Rows ----------------------------------------------------------------------------------------
+
+
+def falling(t, q, v, params):
+    """z has no row, and a large acceleration."""
+    return 0.5 * (v[0] ** 2 + 1e10 * v[1] ** 2 + 1e-6 * v[2] ** 2) - 1e-3 * q[2]
+
+
+def bending(t, q, params):
+    """The second row is the first at y = 1e-5, but asks for another acceleration there."""
+    r = q[0] - 1e5 * q[1]
+    return jnp.stack([r, r + params * (1e5 * q[1] - 1.0) ** 2])
+
+
+def test_a_contradiction_is_told_beside_large_numbers():
+    """The accelerations that two rows ask of y are 2e-5 apart, that of z is 1000."""
+    system = jl.System(falling, ("x", "y", "z"), constraints=(jl.Holonomic(bending, "rows"),))
+    state = [1.0, 1e-5, 0.0], [1.0, 1e-5, 0.0]
+    assert np.all(np.isnan(system.acceleration(1.0, *state)))
+    np.testing.assert_allclose(system.acceleration(0.0, *state), [0.0, 0.0, -1000.0], atol=1e-12)
+
+
+def pressed(t, q, v, params):
+    return 0.5 * (v[0] ** 2 + 1e9 * v[1] ** 2 + 1e-9 * v[2] ** 2) - 0.3 * q[2] + q[0]
+
+
+def led(t, q, params):
+    """As many rows as coordinates: nothing moves, whatever the forces."""
+    return jnp.stack(
+        [q[0] - 1e-5 * q[2] + 9e3 * q[1], 0.7 * q[0] + 1e-5 * q[2], q[1] + 1e-9 * q[2]]
+    )
+
+
+def test_what_rows_hold_still_has_an_acceleration():
+    """Forces of 1e4 in units of inertia leave accelerations their rounding, no contradiction."""
+    system = jl.System(pressed, ("x", "y", "z"), constraints=(jl.Holonomic(led, "rows"),))
+    at_rest = None, np.zeros(3), np.zeros(3)
+    units = np.array([1.0, 1e9, 1e-9]) ** -0.5
+    a = np.asarray(system.acceleration(*at_rest))
+    # Measured 2026-11-26: 2e-16 of the forces 0.3 / 1e-9^(1/2), three orders within the bound.
+    assert np.max(np.abs(a / units)) <= 1e3 * np.finfo(float).eps * 0.3 * units[2]
+    force = np.asarray(system.constraint_force(*at_rest))
+    np.testing.assert_allclose(force * units, [-1.0, 0.0, 0.3 * units[2]], atol=1e-9)
+
+
+# ---- Quasi-velocities ----------------------------------------------------------------------------
+
+
+def crossed(t, q, u, params):
+    """x in units of 1e5, y and b in units of 1e-6."""
+    turn = jnp.cos(q[0] * 1e-5)
+    return jnp.stack([1e5 * (u[0] + 0.3 * turn * 1e6 * u[1]), 1e-6 * (1e6 * u[1] + 0.3 * u[0])])
+
+
+def swinging(t, q, u, params):
+    return 0.5 * (u[0] ** 2 + 2e12 * u[1] ** 2) - jnp.sin(q[0] * 1e-5) - (1e6 * q[1]) ** 2
+
+
+def plainly(q, u):
+    """The same in units of 1: u' from Hamel's equations, and v' = B u' + B' u."""
+    b = np.array([[1.0, 0.3 * np.cos(q[0])], [0.3, 1.0]])
+    v = b @ u
+    turning = np.array([[0.0, -0.3 * np.sin(q[0]) * v[0]], [0.0, 0.0]])  # B'
+    mass, pull = np.diag([1.0, 2.0]), np.array([-np.cos(q[0]), -2.0 * q[1]])
+    theta = np.linalg.inv(b)  # u = theta v, p = mass u
+    p = mass @ u
+    rate = -theta @ turning @ theta
+    # The slopes of theta v in x, at a fixed v: x alone turns B.
+    bent = -theta @ np.array([[0.0, -0.3 * np.sin(q[0])], [0.0, 0.0]]) @ theta @ v
+    bending = np.array([p @ bent, 0.0])
+    effort = pull - rate.T @ p + bending
+    du = np.linalg.solve(mass, b.T @ effort)
+    return b @ du + turning @ u
+
+
+def test_kinematics_of_unlike_units():
+    """u from v, and L written in u: by every program what it is in units of 1."""
+    quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))
+    system = jl.System(swinging, ("x", "y"), quasi=quasi, written_in="u")
+    units, speeds = np.array([1e5, 1e-6]), np.array([1.0, 1e-6])
+    x, y = np.array([0.4, 0.1]), np.array([0.3, -0.7])
+    q, u = x * units, y * speeds
+    right, v = plainly(x, y), system.velocities(None, q, u)
+    np.testing.assert_allclose(system.quasi_velocities(None, q, v), u, rtol=1e-14)
+    # As a function of v, by multipliers, and in u.
+    state = None, q, v
+    for a in (system.acceleration(*state), system.quasi_reactions(*state)["a"]):
+        np.testing.assert_allclose(a / units, right, rtol=1e-13)
+    scalars = ScalarTerms(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system.in_u), None)
+    given = jnp.asarray(q), None, {}
+    rates = scalars.rates(
+        jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.prepare(*given)
+    )
+    np.testing.assert_allclose(rates[:2], v, rtol=1e-14)
+    turning = jax.jvp(
+        lambda q, u: quasi.velocities(jnp.zeros(()), q, u, None),
+        (given[0], jnp.asarray(u)),
+        (rates[:2], rates[2:]),
+    )[1]
+    np.testing.assert_allclose(turning / units, right, rtol=1e-13)
+
+
+@pytest.mark.full
+def test_motions_of_unlike_units():
+    quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))
+    motions = [
+        jl.simulate(
+            jl.System(swinging, ("x", "y"), quasi=quasi, written_in="u", lowering=lowering),
+            [0.4e5, 0.1e-6],
+            ts=[0.0, 0.5],
+            u0=[0.3, -0.7e-6],
+            atol=1e-15,
+            formulation=formulation,
+        )
+        for lowering, formulation in (
+            ("auto", "quasi"),
+            ("array", "quasi"),
+            ("auto", "multipliers"),
+        )
+    ]
+    for motion in motions[1:]:
+        np.testing.assert_allclose(motion.q[-1], motions[0].q[-1], rtol=1e-9)
+
+
+def slanted(t, q, v, params):
+    return jnp.stack([1e-5 * v[0] + jnp.tanh(q[0]) * 1e4 * v[1], 1e4 * v[1]])
+
+
+@pytest.mark.parametrize("derivative", [False, True])
+def test_velocities_from_quasi_velocities_of_unlike_units(derivative):
+    """There and back to rounding, though rows of dU/dv are 1e-9 from parallel."""
+    quasi = jl.QuasiVelocities(slanted, ("a", "b"))
+    q, v = jnp.array([0.4, 0.1]), jnp.array([1.3e5, 0.7e-4])
+
+    def there_and_back(v):
+        return quasi.velocities(jnp.zeros(()), q, quasi.of(jnp.zeros(()), q, v, None), None)
+
+    if derivative:
+        found = jax.jacrev(there_and_back)(v) @ v, jax.jvp(there_and_back, (v,), (v,))[1]
+    else:
+        found = (there_and_back(v),)
+    for x in found:
+        np.testing.assert_allclose(x, v, rtol=1e-14)
+
+
+def test_quasi_velocities_may_read_arrays_from_outside():
+    """As every other function may, those beside constrained names as well."""
+    matrix = np.array([[0.5, -1.0], [2.0, 0.25]])
+
+    def U(t, q, v, params):
+        return jnp.asarray(matrix) @ v
+
+    def energy(t, q, v, params):
+        return 0.5 * v @ v
+
+    system = jl.System(energy, ("x", "y"), quasi=jl.QuasiVelocities(U, ("a", "b"), ("b",)))
+    np.testing.assert_allclose(
+        system.velocities(None, [0.0, 0.0], {"a": 1.0}), np.array([0.25, -2.0]) / 2.125
+    )
