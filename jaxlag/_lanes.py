@@ -121,7 +121,7 @@ def in_batches(
     return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
 
 
-def at_most(count: Any, most: int) -> bool:
+def at_most(count: Any, most: Any) -> bool:
     """Whether a number of rows, which may be a symbol, is no larger."""
     try:
         return bool(count <= most)
