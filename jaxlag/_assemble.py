@@ -17,6 +17,7 @@ from jaxlag._constraints import Layout
 from jaxlag._custom_jvp import keeping_rules
 from jaxlag._dynamics import still
 from jaxlag._errors import AssemblyError, bad
+from jaxlag._geometry import advice_on_rows
 from jaxlag._kkt import augmented, solve_kkt
 from jaxlag._linalg import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
@@ -171,6 +172,9 @@ def assemble(
     if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
         found = still(found)  # under grad its numbers are traced, and have values all the same
         fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
+        where = [t, found.q]
+        if np.ndim(found.status) == 0 and _params.concrete(traced, where):
+            fix = f"{fix} {advice_on_rows(system, params, *where)}".rstrip()
         raise AssemblyError(f"Assembly ended with status {found.message()}{fix}", found)
     return found
 

@@ -49,7 +49,9 @@ def declared(
     terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
     L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
     u = None if system.quasi is None else system.quasi.of(t, q, v, params)
-    rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
+    rows = jnp.zeros(0), jnp.zeros(0)
+    if system.constraints:
+        rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
     if values is None:
         return L, u, rows
     slides = [slide(t, q, v, params) for slide in sliding(system.forces)]

@@ -313,6 +313,7 @@ def _culprits(
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
+        A = jnp.where(jnp.isfinite(A), A, 0.0)  # what is not finite there is no fault of inertia
         M, _ = augmented(M, masked(A, args.kept))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)

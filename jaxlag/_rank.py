@@ -74,14 +74,14 @@ def row_sizes(
         changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A)[None])
         growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
         norms = _lengths(A)
-        there = (norms > 0) & ~(norms <= rounding)
+        there = (norms != 0) & ~(norms <= rounding)
         size = jnp.where(there, norms, growth)
         return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
     found, rounding = jax.vmap(partial(with_rounding, rows))(places)
     rounding, norms = _lengths(rounding), _lengths(A)
     growth = _lengths(found[1:] - jax.lax.stop_gradient(A)[None])
     # What is not known, as derivatives beside the end of a domain, speaks for the row.
-    there = (norms > 0) & ~(norms <= ROUNDINGS * rounding[0])
+    there = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
     void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
     made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
     size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
@@ -113,9 +113,9 @@ def without_rounding(
 
 
 def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
-    """Lengths of rows; derivatives of those that vanish are 0."""
+    """Lengths of rows; derivatives of those that vanish are 0. What is not known stays NaN."""
     square = jnp.sum(A**2, axis=-1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
 def rows_hold(

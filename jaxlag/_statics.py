@@ -20,9 +20,11 @@ from jaxlag._dynamics import still
 from jaxlag._equilibrium_search import differentiable_if, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
+from jaxlag._geometry import advice_on_rows
 from jaxlag._inputs import check_inputs, check_range, evaluate
+from jaxlag._lanes import at_once_implicit, in_lanes
 from jaxlag._rank import least_norm, row_sizes, without_rounding
-from jaxlag._rest import find_rest
+from jaxlag._rest import Rest, find_rest
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._vectors import number, of_state, vector
@@ -253,7 +255,10 @@ def equilibrium(
     found = _search(key, (q0, t, tol, traced, inputs_traced))
     if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
         found = still(found)  # under grad its numbers are traced, and have values all the same
-        raise EquilibriumError(f"Search ended with status {found.message()}", found)
+        more = ""
+        if np.ndim(found.status) == 0 and _params.concrete(traced, t, found.q):
+            more = f" {advice_on_rows(system, params, t, found.q)}".rstrip()
+        raise EquilibriumError(f"Search ended with status {found.message()}{more}", found)
     return found
 
 
@@ -263,7 +268,9 @@ def _search(key: Any, values: Any) -> Equilibrium:
     q0, t, tol, *given = values
     n, rest = q0.shape[0], jnp.zeros_like(q0)
     params = _params.join(given[0], params_static.tree)
+    check_declaration(system, params, eqx.combine(given[1], inputs_static.tree), t, q0, rest)
     rows = system.rows(params, q0.dtype)
+    nothing = jnp.zeros((0,), q0.dtype)
 
     def idle_rows(t: Array, params: Any) -> Array:
         """Rows that are 0 = 0 but for rounding at the start and nearby: their lam is 0."""
@@ -279,18 +286,17 @@ def _search(key: Any, values: Any) -> Equilibrium:
         (here,) = without_rounding(phi, void, size, q0)
         return void & (here == 0.0)
 
-    idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else jnp.zeros((0,), bool)
+    idle = idle_rows(*jax.lax.stop_gradient((t, given[0]))) if rows.size else nothing > 0
 
-    def forces(t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def forces(idle: Array, t: Array, params: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
         """(triple of Q, h and A; Q - h + A^T lam at (q, v); phi at q; all equations at z)."""
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
-        check_declaration(system, params, inputs, t, q0, rest)
 
         def parts(q: Array, v: Array) -> tuple[Array, Array, Array]:
             given = evaluate(inputs, t, q, v, params)
             Q, h = system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
-            A = system.terms.rows(t, q, rest, params)[0]
+            A = system.terms.rows(t, q, jnp.zeros_like(q), params)[0]
             return Q, h, jnp.where(idle[:, None], 0.0, A)
 
         def unbalanced(q: Array, v: Array, lam: Array) -> Array:
@@ -303,22 +309,28 @@ def _search(key: Any, values: Any) -> Equilibrium:
         def whole(z: Array) -> Array:
             q, lam = z[:n], z[n:]
             if not rows.size:
-                return unbalanced(q, rest, lam)
+                return unbalanced(q, jnp.zeros_like(q), lam)
             closed = phi(q) + jnp.where(idle, lam, 0.0)
-            return jnp.concatenate([unbalanced(q, rest, lam), closed])
+            return jnp.concatenate([unbalanced(q, jnp.zeros_like(q), lam), closed])
 
-        return parts, unbalanced, phi if rows.size else lambda _: q0[:0], whole
+        return parts, unbalanced, phi if rows.size else lambda _: jnp.zeros((0,), q0.dtype), whole
 
-    still, still_t, still_tol, *still_given = jax.lax.stop_gradient((q0, t, tol, *given))
-    still_parts, _, still_phi, still_whole = forces(still_t, *still_given)
+    def searched(q0: Array, tol: Array, *given: Any) -> Rest:
+        parts, _, phi, whole = forces(*given)
 
-    def at_rest(q: Array) -> tuple[tuple[Array, Array], Array]:
-        Q, h, A = still_parts(q, rest)
-        return (Q, h), A
+        def at_rest(q: Array) -> tuple[tuple[Array, Array], Array]:
+            Q, h, A = parts(q, jnp.zeros_like(q))
+            return (Q, h), A
 
-    found = find_rest(at_rest, still_phi, still_whole, still, still_tol, max_steps)
+        return find_rest(at_rest, phi, whole, q0, tol, max_steps)
+
+    still = jax.lax.stop_gradient((q0, tol, idle, t, *given))
+    if jax.default_backend() == "cpu":
+        found = in_lanes(searched, searched, *still, at_once=at_once_implicit(n + rows.size))
+    else:
+        found = searched(*still)
     z, balance, steps = jax.lax.stop_gradient(found)
-    parts, unbalanced, _, whole = forces(t, *given)
+    parts, unbalanced, _, whole = forces(idle, t, *given)
 
     @keeping_rules
     def root(z: Array) -> Array:

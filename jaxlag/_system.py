@@ -17,6 +17,7 @@ from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad, require_arity
 from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce, check_forces
+from jaxlag._geometry import vanishing_rows
 from jaxlag._inputs import evaluate
 from jaxlag._kkt import augmented
 from jaxlag._linalg import first_unhealthy
@@ -328,6 +329,12 @@ class System(AbstractReactions):
         if self.constraints:
             self.rows(params, q.dtype)
             M, _ = augmented(M, self.terms.rows(t, q, v, params)[0])
+        vanishing = vanishing_rows(self, params, t, q)
+        if vanishing:
+            must = "have a gradient where it holds"
+            was = "it was 0 there and the same on both sides, as y**2 or a length is"
+            fix = "Write the quantity itself, y; of a length, each component."
+            raise bad(f"constraint {vanishing[0]!r}", must, was, fix)
         index = int(first_unhealthy(M))
         if index >= 0:
             raise bad(

@@ -1,0 +1,88 @@
+"""What is said about rows that are singular at a state: squares, lengths, dead points."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._geometry import advice_on_rows, is_singular, vanishing_rows
+
+VANISHING = {
+    "square": (lambda t, q, params: q[1] ** 2, [0.3, 0.0]),
+    "nearly": (lambda t, q, params: q[1] ** 2, [0.3, 6e-4]),
+    "root of a square": (lambda t, q, params: jnp.sqrt(q[1] ** 2), [0.3, 0.0]),
+    "length": (lambda t, q, params: jl.math.norm(q), [0.0, 0.0]),
+    "cosine": (lambda t, q, params: 1 - jnp.cos(q[1]), [0.3, 0.0]),
+    "negative": (lambda t, q, params: jnp.cos(q[1]) - 1, [0.3, 1e-9]),
+    "fourth power": (lambda t, q, params: (q[1] - q[0]) ** 4, [0.2, 0.2]),
+    "circle squared": (lambda t, q, params: (q @ q - 1.0) ** 2, [0.6, 0.8]),
+}
+REGULAR = {
+    "itself": (lambda t, q, params: q[1], [0.3, 0.0]),
+    "cube": (lambda t, q, params: q[1] ** 3, [0.3, 0.0]),
+    "circle": (lambda t, q, params: q @ q - 1.0, [0.6, 0.8]),
+    "distance": (lambda t, q, params: jl.math.norm(q) - 1.0, [0.6, 0.8]),
+    "lines that cross": (lambda t, q, params: q[0] * q[1], [0.0, 0.0]),
+    "open": (lambda t, q, params: q[1] ** 2 - 1.0, [0.3, 0.0]),
+    "nothing": (lambda t, q, params: 0.0 * q[0], [0.3, 0.0]),
+}
+
+
+def system(row):
+    rod = jl.Holonomic(row, "rod")
+    return jl.System(lambda t, q, v, p: 0.5 * v @ v - q[1], ("x", "y"), constraints=(rod,))
+
+
+@pytest.mark.parametrize("name", VANISHING)
+def test_rows_without_a_gradient_where_they_hold(name):
+    row, q = VANISHING[name]
+    assert vanishing_rows(system(row), None, 0.0, q) == ["rod"]
+
+
+@pytest.mark.parametrize("name", REGULAR)
+def test_other_rows(name):
+    row, q = REGULAR[name]
+    assert vanishing_rows(system(row), None, 0.0, q) == []
+
+
+def folding(t, q, params):
+    """Two links of equal length whose end stands at the origin's height: flat at (0, pi)."""
+    return jnp.stack([jnp.sin(q[0]) + jnp.sin(q[1]), jnp.cos(q[0]) + jnp.cos(q[1])])
+
+
+def test_dead_points_are_singular_and_redundant_rows_are_not():
+    pair = system(folding)
+    assert is_singular(pair, None, 0.0, [0.4, 0.4 + np.pi])
+    assert "a dead point" in advice_on_rows(pair, None, 0.0, [0.4, 0.4 + np.pi])
+    assert not is_singular(pair, None, 0.0, [0.4, 2.0])
+    twice = system(lambda t, q, params: jnp.stack([q[1], 2.0 * q[1]]))
+    assert not is_singular(twice, None, 0.0, [0.3, 0.0])
+    assert advice_on_rows(twice, None, 0.0, [0.3, 0.0]) == ""
+
+
+SAID = r"'rod' vanishes wherever the row holds, as of y\*\*2.* Write the quantity itself, y"
+
+
+def test_whoever_meets_such_a_row_says_so():
+    row, q = VANISHING["square"]
+    given = system(row)
+    with pytest.raises(jl.SimulationError, match=SAID):
+        jl.simulate(given, q, [0.0, 0.0], [0.0, 1.0], dt=0.5, method="bosh3")
+    with pytest.raises(jl.EquilibriumError, match=SAID):
+        jl.equilibrium(given, q)
+    with pytest.raises(ValueError, match=r"constraint 'rod' must have a gradient .* Write the qu"):
+        given.check(None, q, [0.0, 0.0])
+    rooted, q = VANISHING["root of a square"]
+    with pytest.raises(jl.AssemblyError, match=SAID):
+        jl.assemble(system(rooted), q, [0.0, 0.0])
+
+
+def test_a_row_that_is_not_known_is_not_left_out():
+    """The gradient of sqrt(y^2) is NaN at 0: so is what follows from it."""
+    row, q = VANISHING["root of a square"]
+    a = system(row).acceleration(None, q, [0.0, 0.0])
+    assert np.isnan(a).all()
+    motion = jl.simulate(
+        system(row), q, [0.0, 0.0], [0.0, 1.0], dt=0.5, method="bosh3", throw=False
+    )
+    assert motion.status == jl.Status.nonfinite
