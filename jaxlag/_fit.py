@@ -109,7 +109,8 @@ def fit(
     Warns:
         of a parameter that starts or ends on a bound, one that nothing measured depends on, a
         channel that is constant, segments whose solve fails, a search that did not converge, or
-        that stopped where errors of the solver hide what params do, each by name.
+        that stopped where errors of the solver hide what params do, friction that gives energy,
+        each by name.
 
     Source: Bock (1983), see `_shooting`; Schittkowski, Numerical Data Fitting in Dynamical Systems
     (2002).
@@ -373,6 +374,10 @@ def _warn_after(result: FitResult) -> None:
         text += "derivative shows it, it keeps its value, and other estimates may be wrong by it. "
         text += "Make the time of the jump a knot of a table, inputs=function of the params, or "
         warnings.warn(f"{text}smooth the jump.", stacklevel=3)
+    for force, names in result.feeding.items():
+        text = f"At the estimates {force!r} gives energy where it should take some: it depends on "
+        text += f"{', '.join(names)}. Bound these (transforms=), or look for a force that is "
+        warnings.warn(f"{text}missing, or measurements that are not what they seem.", stacklevel=3)
     for name in result.on_bound:
         at = result.values[result.names.index(name)]
         text = f"{name} ended on its bound, {at:g}: widen the bound, or leave the parameter out."

@@ -12,11 +12,13 @@ from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from jaxlag._channels import Reader
+from jaxlag._dissipation import feeding
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
-from jaxlag._free import Unknowns
+from jaxlag._free import Unknowns, paths
 from jaxlag._identifiability import Spectrum, run_off
 from jaxlag._information import distance, linearised
+from jaxlag._jumps import names_of
 from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
 from jaxlag._problem import freedom
 from jaxlag._segments import Layout
@@ -61,6 +63,9 @@ class FitResult(eqx.Module):
         unused: numbers that nothing measured depends on.
         jumps: numbers that nothing shows but where a force or a row jumps, which derivatives do not
             see, and the line where each is compared: no fit moves them.
+        feeding: forces that at the estimates give energy somewhere along what was measured, and
+            should take it, as friction does, each with the numbers that it depends on: `Rayleigh`
+            forces, and others that vanish at rest and give none with the first params.
         on_bound: numbers that ended on a bound of their transform; the covariance of the others is
             that with these held there.
         noise: channel -> standard deviation of its noise, where it was estimated.
@@ -92,6 +97,7 @@ class FitResult(eqx.Module):
     determined: tuple[str, ...]
     unused: tuple[str, ...]
     jumps: dict[str, str]
+    feeding: dict[str, tuple[str, ...]]
     on_bound: tuple[str, ...]
     noise: dict[str, float]
     residuals: tuple[dict[str, np.ndarray], ...]
@@ -177,6 +183,7 @@ class FitResult(eqx.Module):
         lines += [f"and {len(self.names) - SHOWN} more"] * (len(self.names) > SHOWN)
         lines += [f"unknown: {text}" for text in self.unidentifiable]
         lines += [f"known: {text}" for text in self.determined]
+        lines += [f"gives energy: {name}" for name in self.feeding]
         for name in self.channels:
             lines.append(f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name)))
         lines += list(self.failed)
@@ -230,6 +237,7 @@ def summarised(
         known.determined,
         tuple(name for name in known.unused if name not in jumps),
         {name: jumps[name] for name in known.unused if name in jumps},
+        _feeding(problem, params, experiments) if alive else {},
         known.on_bound,
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
@@ -249,6 +257,22 @@ def summarised(
         experiments,
         Model(problem.system, tuple(own.items()), problem.options),
     )
+
+
+def _feeding(
+    problem: Shooting, params: Any, experiments: tuple[Experiment, ...]
+) -> dict[str, tuple[str, ...]]:
+    """Forces that give energy and should not, with the numbers found that they depend on."""
+    free = problem.free
+    given = feeding(problem.system, experiments, free.params0, params, dict(problem.options))
+    names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
+    found = {}
+    for force, reads in given.items():
+        read = {names[leaf] for leaf in reads}
+        leaves = [leaf.name for leaf in free.leaves for _ in leaf.indices]
+        pairs = zip(free.names, leaves, strict=True)
+        found[force] = tuple(name for name, leaf in pairs if leaf in read)
+    return {force: numbers for force, numbers in found.items() if numbers}
 
 
 class _Uncertainty(NamedTuple):

@@ -1,0 +1,41 @@
+"""Friction that a fit finds to give energy is named."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+TS = np.linspace(0.0, 3.0, 61)
+NOISE = 1e-3 * np.random.default_rng(0).normal(size=61)
+
+
+def fitted(force, growth, c0=0.1):
+    """A swing that grows as exp(growth t), fitted with a force that depends on c."""
+    system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 2 * q[0] ** 2, ("x",), forces=(force,))
+    x = 0.3 * np.exp(growth * TS) * np.cos(2 * TS) + NOISE
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = jl.fit(system, jl.Experiment(TS, {"x": x}), {"c": c0}, free=("c",))
+    return found, [str(x.message) for x in told]
+
+
+RAYLEIGH = jl.Rayleigh(lambda t, q, v, p: 0.5 * p["c"] * v[0] ** 2, "friction")
+DRAG = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * v, "drag")
+
+
+@pytest.mark.parametrize(("force", "c0"), [(RAYLEIGH, -0.01), (DRAG, 0.1), (DRAG, 0.0)])
+def test_negative_friction_is_named(force, c0):
+    found, texts = fitted(force, 0.05, c0)
+    # x'' + c x' + 4 x = 0: the amplitude grows by -c/2.
+    assert abs(found.params["c"] + 0.1) < 4 * found.std["c"]
+    assert found.feeding == {force.name: ("c",)}
+    assert any(f"{force.name!r} gives energy where it should take" in x for x in texts)
+    assert f"gives energy: {force.name}" in str(found)
+
+
+def test_friction_and_what_is_meant_to_drive_are_not():
+    assert fitted(RAYLEIGH, -0.05)[0].feeding == {}
+    drive = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * (q**2 - 0.01) * v, "drive")
+    assert fitted(drive, 0.05)[0].feeding == {}
