@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
+from jaxlag._lanes import MOST
+from jaxlag._nested import equations, within
 
 EPS = np.finfo(float).eps
 GRAVITY = 9.81
@@ -140,3 +142,15 @@ def test_what_was_tried_is_said_where_nothing_balances():
     falling = jl.System(lambda t, q, v, params: 0.5 * v @ v + q[0], ("x",))
     with pytest.raises(jl.EquilibriumError, match="Damped motion from q0 and places around it did"):
         jl.equilibrium(falling, [0.3])
+
+
+def test_batches_are_searched_in_chunks():
+    """Loops that solve equations of thousands of systems at once could wait for ever on CPU."""
+    count = 3 * MOST + 1
+    searched = jax.vmap(lambda q: jl.equilibrium(SWIRL, q, throw=False).q)
+    program = jax.make_jaxpr(searched)(jnp.zeros((count, 2)))
+    loops = [eqn for eqn in equations(program) if eqn.primitive.name == "while"]
+    solving = [eqn for eqn in loops if any(x.primitive.name == "lu" for x in within(eqn))]
+    assert solving
+    for eqn in solving:
+        assert all(x.aval.shape[:1] != (count,) for x in eqn.outvars)
