@@ -1,6 +1,6 @@
 """Forces that take energy as they are declared, and give some at other params."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,9 @@ from jaxlag._system import System
 STATES = 32
 """Of each experiment, at which powers are looked at."""
 NEGLIGIBLE = 1e-9
-"""Of the largest power of a force."""
+"""Of what a force would give if it pushed along the velocity, or took."""
+DEVIATIONS = 2.0
+"""Standard deviations of a power, within which it may as well be none."""
 
 
 def feeding(
@@ -28,6 +30,7 @@ def feeding(
     experiments: Iterable[Experiment],
     before: Any,
     params: Any,
+    moved: Sequence[Any],
     options: Mapping[str, Any],
 ) -> dict[str, frozenset[str]]:
     """Forces that give energy somewhere along what was measured, and should take it.
@@ -42,6 +45,7 @@ def feeding(
         experiments: what was measured.
         before: params, of which the system is as it was meant to be.
         params: those that were found.
+        moved: the same, each of the numbers found in turn by its standard deviation.
         options: of `simulate`.
     """
     found: dict[str, frozenset[str]] = {}
@@ -50,16 +54,32 @@ def feeding(
         for force in system.forces:
             if reads_lam(force):
                 continue
-            then, _ = _powers(force, each.inputs_at(before), states, before)
-            now, still = _powers(force, each.inputs_at(params), states, params)
-            meant = isinstance(force, Rayleigh) or not (_gives(then) or np.any(still))
+
+            def powers(
+                given: Any, force: Any = force, each: Any = each, states: Any = states
+            ) -> _Powers:
+                return _powers(force, each.inputs_at(given), states, given)
+
+            then, now = powers(before), powers(params)
+            meant = isinstance(force, Rayleigh) or not (_gives(then) or np.any(now.resting))
             if meant and _gives(now):
-                found[force.name] = _read(force, each.inputs_at(params), states, params)
+                k = int(np.argmax(now.power))
+                spread = np.linalg.norm([powers(x).power[k] - now.power[k] for x in moved])
+                if now.power[k] > DEVIATIONS * spread:
+                    found[force.name] = _read(force, each.inputs_at(params), states, params)
     return found
 
 
-def _gives(powers: np.ndarray) -> bool:
-    return bool(np.any(powers > NEGLIGIBLE * np.max(np.abs(powers), initial=0.0)))
+class _Powers(NamedTuple):
+    """v . Q, |v| . |Q|, and Q with velocities zero, at some states."""
+
+    power: np.ndarray
+    size: np.ndarray
+    resting: np.ndarray
+
+
+def _gives(powers: _Powers) -> bool:
+    return bool(np.any(powers.power > NEGLIGIBLE * np.max(powers.size, initial=0.0)))
 
 
 class _States(NamedTuple):
@@ -84,18 +104,16 @@ def _states(
 
 def _powers(
     force: AbstractForce, inputs: Mapping[str, Any], states: _States, params: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    """v . Q at the states, and Q with velocities zero."""
-
-    def of(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
+) -> _Powers:
+    def of(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
         still = jnp.zeros_like(v)
         moving, resting = (
             force(t, q, x, params, evaluate(inputs, t, q, x, params)) for x in (v, still)
         )
-        return v @ moving, resting
+        return v @ moving, jnp.abs(v) @ jnp.abs(moving), resting
 
-    power, resting = jax.vmap(of)(*states)
-    return np.nan_to_num(np.asarray(power)), np.asarray(resting)
+    found = map(np.asarray, jax.vmap(of)(*states))
+    return _Powers(*(np.where(np.isfinite(x), x, 0.0) for x in found))
 
 
 def _read(

@@ -26,7 +26,7 @@ class Experiment(eqx.Module):
             fitted together have the same names; under each, tables of one kind in all, of any
             length, or any functions and constants. Those that another one has are computed beside.
             Or a function of the params to such a dict, where times or values of tables, or knots,
-            depend on them: a delay, the time of a switch. Functions of time in it take (t, params).
+            depend on them: a delay, the time of a switch.
         sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
             (s, k). Of channels that are left out it is estimated from the residuals.
         q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.

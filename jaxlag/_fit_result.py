@@ -237,7 +237,7 @@ def summarised(
         known.determined,
         tuple(name for name in known.unused if name not in jumps),
         {name: jumps[name] for name in known.unused if name in jumps},
-        _feeding(problem, params, experiments) if alive else {},
+        _feeding(problem, params, known.covariance, experiments) if alive else {},
         known.on_bound,
         noise,
         residuals_of(problem, np.asarray(found.seen.residuals), status, experiments, where),
@@ -260,11 +260,20 @@ def summarised(
 
 
 def _feeding(
-    problem: Shooting, params: Any, experiments: tuple[Experiment, ...]
+    problem: Shooting, params: Any, covariance: np.ndarray, experiments: tuple[Experiment, ...]
 ) -> dict[str, tuple[str, ...]]:
     """Forces that give energy and should not, with the numbers found that they depend on."""
     free = problem.free
-    given = feeding(problem.system, experiments, free.params0, params, dict(problem.options))
+    places = [(leaf.index, at) for leaf in free.leaves for at in leaf.indices]
+    spread = np.sqrt(np.diag(covariance))
+    moved = []
+    for (leaf, at), by in zip(places, spread, strict=True):
+        if np.isfinite(by):
+            leaves, form = jax.tree.flatten(params)
+            leaves[leaf] = np.array(leaves[leaf])
+            leaves[leaf][at] += by
+            moved.append(jax.tree.unflatten(form, leaves))
+    given = feeding(problem.system, experiments, free.params0, params, moved, dict(problem.options))
     names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
     found = {}
     for force, reads in given.items():

@@ -8,7 +8,7 @@ interpolated, derivatives are right.
 """
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from jaxlag._dependence import Names, outputs_depend_on
 from jaxlag._input_values import InputValues
 from jaxlag._inputs import evaluate
 from jaxlag._kinks import outcomes
-from jaxlag._nested import called, within
+from jaxlag._nested import called, equations, within
 from jaxlag._signals import AbstractInput, AbstractTable
 from jaxlag._system import System
 
@@ -35,6 +35,8 @@ _TIME, _STATE = "t", "q, v"
 _GUARDS = ("eq", "ne", "is_finite")  # of a single place
 _STEPS = ("sign", "floor", "ceil", "round", "rem")
 _LOOPS = ("scan", "while", "cond")
+_NOT_RUN = ("pure_callback", "io_callback", "debug_callback", "debug_print", "while")
+_SIZES = (1.0, 0.1, 1e-3)  # of states that are made up: terms may not be finite at the larger ones
 _CLOSED_OVER = "a number that a declared function closes over"
 _TOGETHER = 64  # times at which outcomes are computed side by side
 _SPANS = 32  # of them in a row
@@ -119,16 +121,22 @@ class Jumps:
         """
         among = [x._replace(names=x.names & {_TIME, *leaves}) for x in self._found if _timed(x)]
         among = [x for x in among if x.names - {_TIME}]
-        if among and self._is_known():
-            with jax.ensure_compile_time_eval():
+        if among and self._may_be_run():
+            with jax.ensure_compile_time_eval(), jax.debug_nans(False), jax.debug_infs(False):
                 jump = self._jump([x.eqn for x in among], ts)
             among = [x for x, does in zip(among, jump, strict=True) if does]
         return _told(among)
 
-    def _is_known(self) -> bool:
-        """Whether the program can be run, with numbers that are made up at worst."""
-        numbers = [jnp.issubdtype(x.dtype, np.number) for x in jax.tree.leaves(self._traced)]
-        return all(numbers) and _params.concrete(self._program.consts)
+    def _may_be_run(self) -> bool:
+        """Whether the program may be run with numbers that are made up.
+
+        It may not where that could be seen, nor where a loop might not end.
+        """
+        leaves = jax.tree.leaves(self._traced)
+        numbers = [x for x in leaves if not _params.concrete(x)]
+        known = all(jnp.issubdtype(x.dtype, np.number) or x.dtype == bool for x in numbers)
+        calls = {eqn.primitive.name for eqn in equations(self._program)} & set(_NOT_RUN)
+        return known and not calls and _params.concrete(self._program.consts)
 
     def _jump(self, eqns: Sequence[Any], ts: Any) -> list[bool]:
         """Whether the equations jump where the operations come out otherwise, or may."""
@@ -142,38 +150,62 @@ class Jumps:
             given = [t, *leaves[1:]]
             return [outcomes(self._program, given, moves, only=eqn) for eqn in eqns]
 
-        along, sides = (jax.jit(jax.vmap(f)) for f in (outcome, partial(self._terms, leaves)))
-        spans = [along(jnp.asarray(span)) for span in grid]
-        found = []
-        for i, eqn in enumerate(eqns):
-            if spans[0][i] is None:  # a loop that shows nothing of what it compares
-                found.append(True)
-                continue
-            seen = np.concatenate([np.asarray(span[i]) for span in spans])
-            changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
-            if not len(changed):
-                found.append(not own or eqn.primitive.name in _LOOPS)
-                continue
-            some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
-            places = np.resize(some, _TOGETHER)
-            low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
-            for _ in range(_HALVINGS):
-                middle = (0.5 * (low + high)).astype(low.dtype)
-                same = np.all(np.asarray(along(jnp.asarray(middle))[i]) == seen[places], axis=1)
-                low, high = np.where(same, middle, low), np.where(same, high, middle)
-            found.append(_apart(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near))))
+        along = jax.jit(jax.vmap(outcome))
+        terms = [self._sides(leaves, size) for size in _SIZES]
+
+        def apart(*times: np.ndarray) -> bool:
+            """By terms at a state where they are finite."""
+            for sides in terms:
+                found = [np.asarray(sides(jnp.asarray(x))) for x in times]
+                if np.all(np.isfinite(found)):
+                    return _apart(*found)
+            return True
+
+        try:
+            spans = [along(jnp.asarray(span)) for span in grid]
+            found = []
+            for i, eqn in enumerate(eqns):
+                hidden = spans[0][i] is None
+                if hidden or eqn.primitive.name in _LOOPS:  # what it compares is not seen
+                    found.append(_broken(terms, grid))
+                    continue
+                seen = np.concatenate([np.asarray(span[i]) for span in spans])
+                changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
+                if not len(changed):
+                    found.append(not own)
+                    continue
+                some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
+                places = np.resize(some, _TOGETHER)
+                low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
+                for _ in range(_HALVINGS):
+                    middle = (0.5 * (low + high)).astype(low.dtype)
+                    same = np.asarray(along(jnp.asarray(middle))[i]) == seen[places]
+                    same = np.all(same, axis=1)
+                    low, high = np.where(same, middle, low), np.where(same, high, middle)
+                found.append(apart(low, high, *near))
+        except Exception:  # the user's functions may refuse numbers that are made up
+            return [True] * len(eqns)
         return found
+
+    def _sides(self, leaves: Sequence[Array], size: float) -> Callable:
+        """Terms at many times, states being so large."""
+        t, q, v, *rest = leaves
+        return jax.jit(jax.vmap(partial(self._terms, [t, size * q, size * v, *rest])))
 
     def _numbers(self) -> tuple[list[Array], bool]:
         """(arguments of the program, whether all are given ones): made up where not known."""
         draw = np.random.default_rng(0).uniform
-        values = [_params.known(x) for x in jax.tree.leaves(self._traced)]
-        own = all(x is not None for x in values) and not jax.tree.leaves(self._moving[3])
-        values = [None] * len(jax.tree.leaves(self._moving)) + values
-        like = jax.tree.leaves((*self._moving, self._traced))
-        pairs = zip(values, like, strict=True)
-        made_up = [draw(0.5, 1.5, x.shape) if value is None else value for value, x in pairs]
-        return [jnp.asarray(x, y.dtype) for x, y in zip(made_up, like, strict=True)], own
+        own, found = not jax.tree.leaves(self._moving[3]), []
+        for x in jax.tree.leaves(self._moving):
+            found.append(jnp.asarray(draw(0.5, 1.5, x.shape), x.dtype))
+        for x in jax.tree.leaves(self._traced):
+            value = x if _params.concrete(x) else _params.known(x)
+            own = own and value is not None
+            if value is None:  # in order, as tables are
+                value = np.sort(draw(0.5, 1.5, (1, *x.shape)), axis=-1)[0]
+                value = value > 1.0 if x.dtype == bool else value
+            found.append(jnp.asarray(value, x.dtype))
+        return found, own
 
     def _terms(self, leaves: Sequence[Array], t: Array) -> Array:
         """What the equations of motion are made of, as numbers in a row."""
@@ -273,9 +305,33 @@ def _grid(times: np.ndarray | None, dtype: Any) -> np.ndarray:
     count = _TOGETHER * _SPANS
     if times is not None:
         return np.linspace(np.min(times), np.max(times), count, dtype=dtype).reshape(_SPANS, -1)
-    sizes = np.geomspace(1e-3, 1e4, count // 4, dtype=dtype)
+    largest = min(1e4, 1e-2 / np.sqrt(jnp.finfo(dtype).eps))  # where times are still near enough
+    sizes = np.geomspace(1e-3, largest, count // 4, dtype=dtype)
     near = np.linspace(-10.0, 10.0, count // 2, dtype=dtype)
     return np.sort(np.concatenate([-sizes, near, sizes])).reshape(_SPANS, -1)
+
+
+def _broken(terms: Sequence[Callable], grid: np.ndarray) -> bool:
+    """Whether terms jump anywhere along the grid: looked for where their slope changes most."""
+    for sides in terms:
+        found = np.concatenate([np.asarray(sides(jnp.asarray(span))) for span in grid])
+        if np.all(np.isfinite(found)):
+            break
+    else:
+        return True
+    size = np.max(np.abs(found), axis=0)
+    bend = np.max(np.abs(np.diff(found, 2, axis=0)) / np.where(size > 0, size, 1.0), axis=1)
+    worst = np.argsort(bend)[-_PLACES:]
+    places = np.resize(np.concatenate([worst, worst + 1]), _TOGETHER)
+    low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
+    for _ in range(_HALVINGS):
+        middle = (0.5 * (low + high)).astype(low.dtype)
+        a, b, c = (np.asarray(sides(jnp.asarray(x))) for x in (low, middle, high))
+        first = np.max(np.abs(b - a) / np.where(size > 0, size, 1.0), axis=1)
+        second = np.max(np.abs(c - b) / np.where(size > 0, size, 1.0), axis=1)
+        left = first >= second
+        low, high = np.where(left, low, middle), np.where(left, middle, high)
+    return _apart(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near)))
 
 
 def _apart(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag import _params
 from jaxlag._closed import plain
 from jaxlag._constraints import Baumgarte
+from jaxlag._dynamics import still
 from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
 from jaxlag._geometry import advice_on_rows, is_singular, vanishing_rows
@@ -289,7 +290,8 @@ class Solution(eqx.Module):
         """What to do about the end of one motion: about its rows where these are the cause."""
         ends_so = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
         if status in ends_so and self.system.constraints:
-            at = self.system, self._given, self.last_time, self.last_state[0]
+            at = still((self._given, self.last_time, self.last_state[0]))
+            at = self.system, *at  # under grad its numbers are traced, and have values all the same
             if vanishing_rows(*at) or (status is Status.projection_failed and is_singular(*at)):
                 return advice_on_rows(*at)
         return advice(self, status)

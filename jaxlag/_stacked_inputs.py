@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
-from jaxlag._captured import Captured, captured
+from jaxlag._captured import Captured, captured, functions_of
 from jaxlag._errors import bad
 from jaxlag._inputs import check_inputs
 from jaxlag._signals import AbstractInput, AbstractTable, Feedback, Function, Linear, ZeroOrderHold
@@ -58,7 +58,11 @@ class ComputedInputs(AbstractStackedInputs):
 
     def at(self, params: Any, ts: Array) -> dict[str, Any]:
         """Of one function."""
-        together = stacked([check_inputs(f(params)) for f in self.functions], self.ends)
+        each = [check_inputs(f.function(params)) for f in self.functions]
+        if len(each) > 1:
+            for inputs in each:
+                _check_closures(inputs)
+        together = stacked(each, self.ends)
         own = jax.tree.map(lambda x: x[self.which], together.arrays)
         inputs = StackedInputs(own, together.rest).at(params, ts)
         return {name: _after(signal, ts) for name, signal in inputs.items()}
@@ -118,6 +122,17 @@ def _chosen(
         was = f"they had {sorted(shapes)}"
         raise bad(f"inputs[{choice.name!r}]", "have one shape in all experiments", was)
     return jax.lax.select_n(choice.which, *values)
+
+
+def _check_closures(inputs: dict[str, Any]) -> None:
+    """Raise where a signal closes over params: of several one is chosen, which is an argument."""
+    for name, signal in inputs.items():
+        for function in functions_of(signal):
+            cells = getattr(function.function, "__closure__", None) or ()
+            if not _params.concrete([cell.cell_contents for cell in cells]):
+                must = "take params where experiments have functions of their own"
+                fix = "Write jl.Function(f) of f(t, params), jl.Feedback(f) of f(t, q, v, params)."
+                raise bad(f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix)
 
 
 def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:

@@ -2,6 +2,7 @@
 
 import warnings
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -39,3 +40,19 @@ def test_friction_and_what_is_meant_to_drive_are_not():
     assert fitted(RAYLEIGH, -0.05)[0].feeding == {}
     drive = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * (q**2 - 0.01) * v, "drive")
     assert fitted(drive, 0.05)[0].feeding == {}
+
+
+def test_friction_that_may_be_none_and_forces_without_power_are_not():
+    """Zero within two standard deviations; across the velocity, whose power is rounding."""
+    still, texts = fitted(DRAG, 0.0)
+    assert abs(still.params["c"]) < 2 * still.std["c"]
+    assert still.feeding == {}
+    assert not any("gives energy" in text for text in texts)
+    turn = jl.GeneralizedForce(
+        lambda t, q, v, p: jnp.cross(p["w"] * jnp.array([0.3, -0.7, 1.0]), v), "turn"
+    )
+    spatial = jl.System(lambda t, q, v, p: 0.5 * v @ v - 2 * q @ q, {"x": (3,)}, forces=(turn,))
+    ts = TS[::3]
+    motion = jl.simulate(spatial, [0.3, 0.1, 0.0], [0.0, 0.2, 0.5], ts, {"w": 0.4})
+    data = jl.Experiment(ts, {"x": np.asarray(motion.q)}, sigma={"x": 1e-3})
+    assert jl.fit(spatial, data, {"w": 0.0}, free=("w",)).feeding == {}

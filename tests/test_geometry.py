@@ -1,5 +1,6 @@
 """What is said about rows that are singular at a state: squares, lengths, dead points."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -75,6 +76,19 @@ def test_whoever_meets_such_a_row_says_so():
     rooted, q = VANISHING["root of a square"]
     with pytest.raises(jl.AssemblyError, match=SAID):
         jl.assemble(system(rooted), q, [0.0, 0.0])
+
+
+def test_messages_under_derivatives():
+    row, _ = VANISHING["square"]
+
+    def end(x):
+        start = jnp.stack([x, 0.0 * x])
+        options = {"dt": 0.5, "method": "bosh3", "throw": False}
+        motion = jl.simulate(system(row), start, [0.0, 0.0], [0.0, 1.0], **options)
+        assert "Write the quantity itself" in motion.message()
+        return motion.q[0, 0]
+
+    assert jax.jvp(end, (0.3,), (1.0,))[0] == 0.3
 
 
 def test_a_row_that_is_not_known_is_not_left_out():

@@ -5,6 +5,7 @@ Bends are not named: of interpolated tables and ramps derivatives are right.
 
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +43,11 @@ JUMPING = {
     "within a loop": lambda t, x, b: jax.lax.fori_loop(
         0, 3, lambda i, c: c + jnp.where(t < b * i, 1.0, 0.0), 0.0
     ),
+    "a loop that may not end": lambda t, x, b: jax.lax.while_loop(
+        lambda e: jnp.abs(e - 0.3 * b * jnp.sin(e) - t) > 1e-12,
+        lambda e: e - (e - 0.3 * b * jnp.sin(e) - t) / (1 - 0.3 * b * jnp.cos(e)),
+        t,
+    ),
     "heaviside": lambda t, x, b: jnp.heaviside(t - b, 0.0),
     "under jit": lambda t, x, b: jax.jit(lambda t: jnp.where(b < t, 1.0, 0.0))(t),
     "vmapped": lambda t, x, b: jnp.sum(jax.vmap(lambda c: (t < c * b).astype(float))(TIMES)),
@@ -56,6 +62,10 @@ BENT = {
     "the state": lambda t, x, b: jnp.where(x < b, 1.0, 0.0),
     "nothing": lambda t, x, b: jnp.where(t < b, 1.0, 1.0) + 0.0 * x,
     "a time of its own": lambda t, x, b: jnp.where(t < 1.0, b, 0.0),
+    "ramps in a loop": lambda t, x, b: jax.lax.scan(
+        lambda c, k: (c + jnp.where(t > k * b, t - k * b, 0.0), None), 0.0, TIMES[1:4]
+    )[0],
+    "of a domain": lambda t, x, b: jnp.interp(t - b, TIMES, VALUES) * jnp.sqrt(0.35 - x),
     "a guard": lambda t, x, b: jnp.where(t == b, 1.0, jnp.sinc(t - b)),
 }
 
@@ -147,6 +157,29 @@ def test_jumps_within_inputs():
     assert found == {"inputs['end']"}
 
 
+def test_what_refuses_other_numbers_is_no_error():
+    """What cannot be told counts as a jump; tables, keys and truth values are made up in order."""
+
+    def guarded(t, q, v, params):
+        bent = jnp.interp(t - params["b"], TIMES, VALUES) * q
+        return eqx.error_if(bent, params["l"] < 2.0, "too short")
+
+    force = jl.GeneralizedForce(guarded, "guarded")
+    system = jl.System(spring, ("x",), forces=(force,))
+    assert unknown(system, PARAMS | {"l": 3.0}) == {"params['b']"}
+
+    def table(t, q, v, params):
+        read = jnp.interp(t - params["b"], params["times"], params["values"])
+        return jnp.where(params["on"], read, 0.0)[None]
+
+    system = jl.System(spring, ("x",), forces=(jl.GeneralizedForce(table, "table"),))
+    params = PARAMS | {"times": TIMES, "values": VALUES, "on": jnp.array(True)}
+    names = {"params['b']", "params['times']"}
+    for given in (params, params | {"key": jax.random.key(0)}):
+        assert leaves(system, given, names=names) == set()
+    assert unknown(system, params) == set()
+
+
 def last(b, k=2.0):
     system = SYSTEM
     return jl.simulate(system, Q0, [0.1], TS, {"b": b, "k": k}).q[-1, 0]
@@ -211,6 +244,22 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     assert not any("nothing measured depends on" in text for text in texts)
     assert found.unused == ()
     assert list(found.jumps) == ["b"]
+
+
+def test_signals_may_close_over_params_where_all_have_one_function():
+    ts = np.linspace(0.0, 1.0, 11)
+
+    def turned(params):
+        return {"push": jl.Function(lambda t: jnp.sin(params["w"] * t))}
+
+    x = jl.simulate(DRIVEN, Q0, [0.1], ts, {"w": 1.5, "k": 2.0}, inputs=turned({"w": 1.5})).q
+    channels = {"x": np.asarray(x)}
+    one = jl.Experiment(ts, channels, inputs=turned, sigma={"x": 1e-3})
+    found = jl.fit(DRIVEN, one, {"w": 1.4, "k": 2.0}, free=("w",))
+    assert abs(found.params["w"] - 1.5) < 1e-4
+    other = jl.Experiment(ts, channels, inputs=lambda p: turned(p), sigma={"x": 1e-3})
+    with pytest.raises(ValueError, match=r"inputs\['push'\] must take params .* Write jl.Function"):
+        jl.fit(DRIVEN, [one, other], {"w": 1.4, "k": 2.0}, free=("w",))
 
 
 def nothing():
