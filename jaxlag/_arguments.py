@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -14,6 +13,7 @@ from jaxlag._forces import reads_lam
 from jaxlag._gradient import MODES
 from jaxlag._inputs import evaluate
 from jaxlag._kkt import FORMULATIONS
+from jaxlag._lanes import at_most
 from jaxlag._methods import default_tolerances
 from jaxlag._params import concrete
 from jaxlag._solution import QUANTITIES
@@ -147,7 +147,7 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
         raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number("ts", "be one row of times", ts, jnp.result_type(float))
-    if ts.ndim != 1 or not _known_at_least(ts.shape[0], 2):
+    if ts.ndim != 1 or not at_most(2, ts.shape[0]):
         fix = ""
         if ts.ndim == 1 and not isinstance(ts.shape[0], int):
             fix = f'Write jax.export.symbolic_shape("k", constraints=["{ts.shape[0]} >= 2"]).'
@@ -167,14 +167,6 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
             "Sort the times and drop repeated ones.",
         )
     return ts, direction
-
-
-def _known_at_least(count: Any, least: int) -> bool:
-    """Whether a number of rows, which may be a symbol of `jax.export`, is no smaller."""
-    try:
-        return bool(count >= least)
-    except jax.errors.InconclusiveDimensionOperation:
-        return False
 
 
 def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:

@@ -222,9 +222,8 @@ def summarised(
     firsts = np.flatnonzero(where.first == 0)
     status = np.asarray(found.seen.status)
     known = _uncertainty(problem, found, np.asarray(values))
-    leaves = [leaf for leaf in problem.free.leaves for _ in leaf.indices]
-    named = zip(problem.free.names, leaves, strict=True)
-    jumps = {name: compared[leaf.name] for name, leaf in named if leaf.name in compared}
+    named = zip(problem.free.names, problem.free.places, strict=True)
+    jumps = {name: compared[leaf.name] for name, (leaf, _) in named if leaf.name in compared}
     alive = bool(np.any(status == Status.ok)) and bool(np.isfinite(found.cost))
     return FitResult(
         jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, params),
@@ -264,23 +263,21 @@ def _feeding(
 ) -> dict[str, tuple[str, ...]]:
     """Forces that give energy and should not, with the numbers found that they depend on."""
     free = problem.free
-    places = [(leaf.index, at) for leaf in free.leaves for at in leaf.indices]
     spread = np.sqrt(np.diag(covariance))
     moved = []
-    for (leaf, at), by in zip(places, spread, strict=True):
+    for (leaf, at), by in zip(free.places, spread, strict=True):
         if np.isfinite(by):
             leaves, form = jax.tree.flatten(params)
-            leaves[leaf] = np.array(leaves[leaf])
-            leaves[leaf][at] += by
+            leaves[leaf.index] = np.array(leaves[leaf.index])
+            leaves[leaf.index][at] += by
             moved.append(jax.tree.unflatten(form, leaves))
     given = feeding(problem.system, experiments, free.params0, params, moved, dict(problem.options))
     names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
     found = {}
     for force, reads in given.items():
         read = {names[leaf] for leaf in reads}
-        leaves = [leaf.name for leaf in free.leaves for _ in leaf.indices]
-        pairs = zip(free.names, leaves, strict=True)
-        found[force] = tuple(name for name, leaf in pairs if leaf in read)
+        pairs = zip(free.names, free.places, strict=True)
+        found[force] = tuple(name for name, (leaf, _) in pairs if leaf.name in read)
     return {force: numbers for force, numbers in found.items() if numbers}
 
 

@@ -174,12 +174,16 @@ class Unknowns(eqx.Module):
         return z - near <= self.low, z + near >= self.high
 
     @property
+    def places(self) -> tuple[tuple[Leaf, tuple[int, ...]], ...]:
+        """The leaf of every number, and where it stands in it."""
+        return tuple((leaf, index) for leaf in self.leaves for index in leaf.indices)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the numbers: "m", "I[0,0]"."""
         return tuple(
             leaf.name + (f"[{','.join(map(str, index))}]" if leaf.shape else "")
-            for leaf in self.leaves
-            for index in leaf.indices
+            for leaf, index in self.places
         )
 
 

@@ -17,8 +17,16 @@ NEARBY = 1e-2
 """As far away rows are compared with, over 1 + |q|."""
 
 
-def advice_on_rows(system: Any, params: Any, t: Any, q: Any) -> str:
-    """What is singular about the rows at a state, and what is to be done; "" where nothing is."""
+def advice_on_rows(system: Any, params: Any, t: Any, q: Any, dependent: bool = True) -> str:
+    """What is singular about the rows at a state, and what is to be done; "" where nothing is.
+
+    Args:
+        system: whose rows they are.
+        params: as the Lagrangian takes them.
+        t: time, s.
+        q: coordinates, (n,), m or rad.
+        dependent: whether it is said, too, that rows depend on one another there alone.
+    """
     vanishing = vanishing_rows(system, params, t, q)
     if vanishing:
         return (
@@ -26,7 +34,7 @@ def advice_on_rows(system: Any, params: Any, t: Any, q: Any) -> str:
             "as of y**2, of a length, or of 1 - cos(y): such a row allows no velocity and has no "
             "reaction that were defined. Write the quantity itself, y; of a length, each component."
         )
-    if is_singular(system, params, t, q):
+    if dependent and is_singular(system, params, t, q):
         return (
             "Rows are all but dependent there: a dead point or a change point, where no tolerance "
             "helps and the motion may go on in more than one way. Start beyond it, or add the row "

@@ -9,14 +9,13 @@ interpolated, derivatives are right.
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import source_info_util
-from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from jaxlag import _params
@@ -91,16 +90,13 @@ class Jumps:
         names = [frozenset({name}) for name in (*moving, *names_of(*self._traced))]
         self._found: list[_Found] = []
         self._line = "a place that is not known"
+        self._program = jax.make_jaxpr(self._declared)(*self._moving, self._traced)
         outputs_depend_on(self._program.jaxpr, names, self._look, continuous=True)
 
     def _declared(self, t: Array, q: Array, v: Array, values: Any, traced: Any) -> Any:
         params, inside = _params.join(traced, self._static)
         found = InputValues(values | dict(evaluate(inside, t, q, v, params)))
         return declared(self._system, t, q, v, params, found, None)
-
-    @cached_property
-    def _program(self) -> ClosedJaxpr:
-        return jax.make_jaxpr(self._declared)(*self._moving, self._traced)
 
     def _look(self, eqn: Any, operands: list[Names]) -> None:
         # Operations of JAX's own functions have no line: that of the call counts.
@@ -153,39 +149,19 @@ class Jumps:
         along = jax.jit(jax.vmap(outcome))
         terms = [self._sides(leaves, size) for size in _SIZES]
 
-        def apart(*times: np.ndarray) -> bool:
-            """By terms at a state where they are finite."""
-            for sides in terms:
-                found = [np.asarray(sides(jnp.asarray(x))) for x in times]
-                if np.all(np.isfinite(found)):
-                    return _apart(*found)
-            return True
+        def jumps(i: int, eqn: Any) -> bool:
+            if spans[0][i] is None or eqn.primitive.name in _LOOPS:  # what it compares is not seen
+                return _jumps_anywhere(terms, grid)
+            seen = np.concatenate([np.asarray(span[i]) for span in spans])
+            if np.all(seen[1:] == seen[:-1]):
+                return not own
+            return _jumps_at_changes(lambda t: np.asarray(along(t)[i]), seen, terms, grid)
 
         try:
             spans = [along(jnp.asarray(span)) for span in grid]
-            found = []
-            for i, eqn in enumerate(eqns):
-                hidden = spans[0][i] is None
-                if hidden or eqn.primitive.name in _LOOPS:  # what it compares is not seen
-                    found.append(_broken(terms, grid))
-                    continue
-                seen = np.concatenate([np.asarray(span[i]) for span in spans])
-                changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
-                if not len(changed):
-                    found.append(not own)
-                    continue
-                some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
-                places = np.resize(some, _TOGETHER)
-                low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
-                for _ in range(_HALVINGS):
-                    middle = (0.5 * (low + high)).astype(low.dtype)
-                    same = np.asarray(along(jnp.asarray(middle))[i]) == seen[places]
-                    same = np.all(same, axis=1)
-                    low, high = np.where(same, middle, low), np.where(same, high, middle)
-                found.append(apart(low, high, *near))
+            return [jumps(i, eqn) for i, eqn in enumerate(eqns)]
         except Exception:  # the user's functions may refuse numbers that are made up
             return [True] * len(eqns)
-        return found
 
     def _sides(self, leaves: Sequence[Array], size: float) -> Callable:
         """Terms at many times, states being so large."""
@@ -311,27 +287,51 @@ def _grid(times: np.ndarray | None, dtype: Any) -> np.ndarray:
     return np.sort(np.concatenate([-sizes, near, sizes])).reshape(_SPANS, -1)
 
 
-def _broken(terms: Sequence[Callable], grid: np.ndarray) -> bool:
-    """Whether terms jump anywhere along the grid: looked for where their slope changes most."""
-    for sides in terms:
-        found = np.concatenate([np.asarray(sides(jnp.asarray(span))) for span in grid])
-        if np.all(np.isfinite(found)):
-            break
-    else:
+def _jumps_at_changes(
+    outcome: Callable, seen: np.ndarray, terms: Sequence[Callable], grid: np.ndarray
+) -> bool:
+    """Whether terms jump where an outcome, seen along the grid, changes."""
+    changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
+    some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
+    places = np.resize(some, _TOGETHER)
+    low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
+    for _ in range(_HALVINGS):
+        middle = (0.5 * (low + high)).astype(low.dtype)
+        same = np.all(outcome(jnp.asarray(middle)) == seen[places], axis=1)
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    _, found = _finite(terms, [low, high, *near])
+    return found is None or _apart(*found)
+
+
+def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
+    """Whether terms jump along the grid: looked for where their slope changes most."""
+    sides, found = _finite(terms, list(grid))
+    if found is None:
         return True
+    found = np.concatenate(found)
     size = np.max(np.abs(found), axis=0)
-    bend = np.max(np.abs(np.diff(found, 2, axis=0)) / np.where(size > 0, size, 1.0), axis=1)
+    size = np.where(size > 0, size, 1.0)
+    bend = np.max(np.abs(np.diff(found, 2, axis=0)) / size, axis=1)
     worst = np.argsort(bend)[-_PLACES:]
     places = np.resize(np.concatenate([worst, worst + 1]), _TOGETHER)
     low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
     for _ in range(_HALVINGS):
         middle = (0.5 * (low + high)).astype(low.dtype)
         a, b, c = (np.asarray(sides(jnp.asarray(x))) for x in (low, middle, high))
-        first = np.max(np.abs(b - a) / np.where(size > 0, size, 1.0), axis=1)
-        second = np.max(np.abs(c - b) / np.where(size > 0, size, 1.0), axis=1)
-        left = first >= second
+        left = np.max(np.abs(b - a) / size, axis=1) >= np.max(np.abs(c - b) / size, axis=1)
         low, high = np.where(left, low, middle), np.where(left, middle, high)
     return _apart(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near)))
+
+
+def _finite(
+    terms: Sequence[Callable], times: Sequence[np.ndarray]
+) -> tuple[Callable, list[np.ndarray] | None]:
+    """(terms at the first size of states where they are finite at all times, these terms)."""
+    for sides in terms:
+        found = [np.asarray(sides(jnp.asarray(x))) for x in times]
+        if np.all(np.isfinite(found)):
+            return sides, found
+    return terms[-1], None
 
 
 def _apart(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:

@@ -122,7 +122,7 @@ def in_batches(
 
 
 def at_most(count: Any, most: Any) -> bool:
-    """Whether a number of rows, which may be a symbol, is no larger."""
+    """Whether a number of rows is known to be no larger; either may be a symbol of `jax.export`."""
     try:
         return bool(count <= most)
     except jax.errors.InconclusiveDimensionOperation:

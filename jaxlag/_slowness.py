@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag import _params
+from jaxlag._dynamics import still
 from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
+from jaxlag._geometry import advice_on_rows
 from jaxlag._perturbations import linearized
 from jaxlag._projection import turns_needed
-from jaxlag._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, Status
+from jaxlag._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._term import term_of
 
 if TYPE_CHECKING:
@@ -76,7 +78,15 @@ def _stiffness(motion: "Solution") -> Rates | None:
 
 
 def advice(motion: "Solution", status: Status) -> str:
-    """What to do about the end of a single motion, as far as its status tells."""
+    """What to do about the end of a single motion: about its rows where these are the cause."""
+    of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
+    if status in of_rows and motion.system.constraints:
+        # Under grad its numbers are traced, and have values all the same.
+        at = still((motion._given, motion.last_time, motion.last_state[0]))
+        dependent = status is Status.projection_failed
+        singular = advice_on_rows(motion.system, *at, dependent=dependent)
+        if singular:
+            return singular
     fixed, (accepted, rejected) = motion.tolerances is None, _counts(motion)
     sharp = rejected > UNEVEN * (accepted + rejected)
     special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
@@ -96,11 +106,11 @@ def advice(motion: "Solution", status: Status) -> str:
         labels = motion.system.coordinates.labels
         bounds = np.resize(motion.tolerances[1], state.shape)
         names = (*labels, *(f"{label}'" for label in labels))
-        still = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
-        if still:
+        resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
+        if resting:
             return (
                 f"With atol = 0 no error is small enough where a component is 0, as "
-                f"{', '.join(still)} here: give atol > 0, or start elsewhere."
+                f"{', '.join(resting)} here: give atol > 0, or start elsewhere."
             )
     return said
 

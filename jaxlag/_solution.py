@@ -13,10 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag import _params
 from jaxlag._closed import plain
 from jaxlag._constraints import Baumgarte
-from jaxlag._dynamics import still
 from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
-from jaxlag._geometry import advice_on_rows, is_singular, vanishing_rows
 from jaxlag._methods import METHODS
 from jaxlag._power import in_order
 from jaxlag._slowness import advice, explain
@@ -286,16 +284,6 @@ class Solution(eqx.Module):
             )
         return in_order(self.saved["work"], self.system.forces, self.system.constraints)
 
-    def _advice(self, status: Status) -> str:
-        """What to do about the end of one motion: about its rows where these are the cause."""
-        ends_so = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
-        if status in ends_so and self.system.constraints:
-            at = still((self._given, self.last_time, self.last_state[0]))
-            at = self.system, *at  # under grad its numbers are traced, and have values all the same
-            if vanishing_rows(*at) or (status is Status.projection_failed and is_singular(*at)):
-                return advice_on_rows(*at)
-        return advice(self, status)
-
     def message(self) -> str:
         """How a motion ended, in words, with the coordinate and the likely remedy.
 
@@ -328,7 +316,7 @@ class Solution(eqx.Module):
         return (
             f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
             f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
-            f"{int(self.stats['rejected'])} rejected steps. {self._advice(status)}{more}".rstrip()
+            f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
         )
 
     @property
