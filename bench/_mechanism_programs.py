@@ -173,11 +173,17 @@ def _consistent(mechanism: Mechanism, here: Terms, void: Any, units: Any) -> np.
 def _along(
     mechanism: Mechanism, state: State, here: Terms, run: Any, equations: Equations, rng: Any
 ) -> State:
-    """A direction that keeps A v + b = 0 and phi = 0 of the base."""
+    """A direction that keeps A v + b = 0 and phi = 0 of the base.
+
+    Rows have length 1 in the units that it is drawn in: least squares leave none of them out for
+    being short beside the others.
+    """
     units, n = np.array(mechanism.drawn.units), len(state.q)
     base = equations.base
     holonomic = np.array([mechanism.all_rows[k].kind == "holonomic" for k in base], bool)
-    A = here.A[base] * units / equations.lengths[base, None]
+    A = here.A[base] * units
+    size = np.linalg.norm(A, axis=1)
+    A = A / size[:, None]
     da, db = rng.uniform(-1.0, 1.0, 3), np.asarray(rng.uniform(-1.0, 1.0) * state.b)
     if np.any(holonomic):  # positions hold for these params alone
         da, db = 0.0 * da, 0.0 * db
@@ -186,7 +192,7 @@ def _along(
         x = x - np.linalg.lstsq(A[holonomic], A[holonomic] @ x, rcond=1e-9)[0]
     dots = State(units * x, 0.0 * state.v, da, db)
     _, rates = run(state, dots)
-    moved = (rates.A @ state.v + rates.b)[base] / equations.lengths[base]
+    moved = (rates.A @ state.v + rates.b)[base] / size
     y = rng.uniform(-1.0, 1.0, n)
     if len(base):
         y = y - np.linalg.lstsq(A, A @ y + moved, rcond=1e-9)[0]

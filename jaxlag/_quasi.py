@@ -21,6 +21,11 @@ from jaxlag._vectors import real
 # Least sine of the angle between a row of dU/dv and those before it, in roundings.
 SINE = 64
 
+REFINED = 2
+"""Steps of refinement. Worst errors over |B^-1| (|B| |u| + |v|) eps of 3000 matrices of 2 to 5
+rows, half of their other entries 0, between units of 1e-6 to 1e6: of v by U 3e10 without, 4e5 with
+one, 6 with two; of u by kinematics 7e9, 12, 0.5. The medians are 0.1 with any."""
+
 
 class QuasiVelocities(eqx.Module):
     """Speeds u = U(t, q, v) = Theta^T v + theta_0 in place of v: body rates, slip, and the like.
@@ -133,8 +138,7 @@ class QuasiVelocities(eqx.Module):
         B, c = self._affine(t, q, v.dtype, params)
         # Rows of long units would leave nothing but rounding of those of short ones.
         size = _lengths(B)
-        Q, R = jnp.linalg.qr(B / size[:, None])
-        return solve_triangular(R, Q.T @ ((v - c) / size))
+        return _nearest(B / size[:, None], (v - c) / size)
 
     def velocities(
         self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " k"], params: Any
@@ -163,27 +167,17 @@ class QuasiVelocities(eqx.Module):
         size, Q, R = _factored(theta)
         fine = jnp.all(jnp.abs(jnp.diagonal(R)) > _floor(theta))
 
-        def regular(x: Array, instead: Array) -> Array:
+        def regular(x: Array) -> Array:
             """So that derivatives of what is masked are finite."""
-            return jnp.where(fine, x, instead)
+            return jnp.where(fine, x, jnp.eye(n, dtype=x.dtype))
 
-        one = jnp.eye(n, dtype=u.dtype)
-        theta, Q, R = regular(theta, one), regular(Q, one), regular(R, one)
-        size = regular(size, jnp.ones_like(size))
-
-        def rows(b: Array) -> Array:
-            return Q @ solve_triangular(R, b / size, trans=1)
-
-        def columns(b: Array) -> Array:
-            return solve_triangular(R, Q.T @ b) / size
-
-        # Refined once: between coordinates of unlike units rows of theta are nearly parallel, and
-        # those of short units would be left with the rounding of the others.
+        theta = regular(theta)
+        inverse = _inverse(jnp.where(fine, size, 1.0), regular(Q), regular(R))
         v = lax.custom_linear_solve(
             lambda v: v @ theta,
             u - theta_0,
-            lambda turned, b: _refined(rows, turned, b),
-            lambda turned, b: _refined(columns, turned, b),
+            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
+            lambda turned, b: _refined(lambda b: inverse @ b, turned, b),
         )
         return jnp.where(fine, v, jnp.nan)
 
@@ -372,13 +366,50 @@ def _sines(columns: Float[Array, "n k"]) -> Float[Array, " k"]:
     return jnp.abs(jnp.diagonal(_factored(columns)[2]))
 
 
-def _refined(solve: Callable, product: Callable, b: Array) -> Array:
-    """The x with product(x) = b, with the residual of a first one solved for once more.
+def _nearest(B: Float[Array, "n k"], b: Float[Array, " n"]) -> Float[Array, " k"]:
+    """The x with B x nearest to b; derivatives go through B x = b, not through its factors.
 
-    Source: Skeel, Math. Comp. 35 (1980) 817: one step makes elimination stable by components.
+    Of a B that is taller than wide it is found together with what is left, r = b - B x, B^T r = 0.
+
+    Source: Bjorck, BIT 7 (1967) 257.
+    """
+    n, k = B.shape
+    inverse, fixed = _inverse(*_factored(B)), lax.stop_gradient(B)
+    if n == k:
+        return lax.custom_linear_solve(
+            lambda x: B @ x,
+            b,
+            lambda product, b: _refined(lambda b: inverse @ b, product, b),
+            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
+        )
+
+    def bordered(z: Array) -> Array:
+        return jnp.concatenate([z[:n] + B @ z[n:], z[:n] @ B])
+
+    def solve(right: Array) -> Array:
+        given, out = right[:n], right[n:] @ inverse
+        left = given - fixed @ (inverse @ given) + out
+        return jnp.concatenate([left, inverse @ (given - out)])
+
+    right = jnp.concatenate([b, jnp.zeros((k,), b.dtype)])
+    found = lax.custom_linear_solve(
+        bordered, right, lambda product, b: _refined(solve, product, b), symmetric=True
+    )
+    return found[n:]
+
+
+def _refined(solve: Callable, product: Callable, b: Array) -> Array:
+    """The x with product(x) = b, with the residuals of the first ones solved for, too.
+
+    Between coordinates of unlike units rows are nearly parallel, and those of short units would be
+    left with the rounding of the others.
+
+    Source: Skeel, Math. Comp. 35 (1980) 817.
     """
     x = solve(b)
-    return x + solve(b - product(x))
+    for _ in range(REFINED):
+        x = x + solve(b - product(x))
+    return x
 
 
 def _lengths(rows: Float[Array, "n k"]) -> Float[Array, " n"]:
@@ -393,6 +424,11 @@ def _factored(columns: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
     size = _lengths(columns.T)
     Q, R = jnp.linalg.qr(columns / size[None])
     return size, Q, R
+
+
+def _inverse(size: Array, Q: Array, R: Array) -> Float[Array, "k n"]:
+    """That of Q R diag(size) where it is square; where it is tall, the least-squares one."""
+    return solve_triangular(R, Q.T) / size[:, None]
 
 
 def _floor(columns: Array) -> float:

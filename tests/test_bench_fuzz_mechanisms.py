@@ -145,6 +145,28 @@ def test_what_has_a_solution(changed, outcome):
     assert compared(changed).kind == "equal"
 
 
+def test_directions_keep_to_rows_of_every_size():
+    """One of 1e-9 beside one of 1e9: their residuals do not change along the direction."""
+    rows = (
+        Row("Pfaffian", "1e9 * ((1.6 + 0.4 * jnp.sin(q[1])) * v[0] + 0.3 * v[1])"),
+        Row("Pfaffian", "1e-9 * (v[1] + 0.5 * jnp.cos(q[0]) * v[2])"),
+    )
+    whole = mechanism(*rows, q=(0.3, -0.2, 0.5), v=(0.8, 0.6, -0.4), masses=(1e18, 1.0, 1e-18))
+    found = prepare(whole, 1)
+    moved, v = found.rates.A @ found.state.v, found.state.v
+    left = moved + found.terms.A @ found.direction.v
+    size = np.linalg.norm(found.terms.A, axis=1) * np.linalg.norm(v)
+    assert np.all(np.abs(left) < 1e-14 * size)
+    assert np.linalg.norm(found.direction.v) > 1e-3
+
+
+def test_rows_that_contradict_by_little_are_left_out_in_single_precision():
+    """What they leave open, 1e-3, is far above roundings: a program may solve for either."""
+    bent = Row("holonomic", f"{ROD.text} + 2e-3 * (q[0] - 0.6) ** 2", "bent")
+    with pytest.raises(Unclear, match="nearly contradict"):
+        prepare(mechanism(ROD, bent, **AT, dtype="float32"), 1)
+
+
 def test_what_is_near_to_a_border_is_left_out():
     near = Row("holonomic", f"{ROD.text} + 1e-6 * (q[0] - 0.6)", "dependent")
     with pytest.raises(Unclear, match="nearly dependent"):
