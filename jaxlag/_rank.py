@@ -130,7 +130,8 @@ def rows_hold(
     """Whether A x + gamma = 0 for all rows, those that were left out included.
 
     Up to what the angle may be below which a row counts as dependent, in units of the coordinates,
-    and up to the rounding of gamma and of the accelerations by forces, from which reactions take x.
+    and up to the rounding of gamma, of any row, and of the accelerations by forces, from which
+    reactions take x.
 
     Args:
         A: rows.
@@ -147,7 +148,10 @@ def rows_hold(
     size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
     scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
     allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
-    allowed = allowed * size + ROUNDINGS * jnp.nan_to_num(rounding)
+    # Whatever rounding x has from the rows that it solves for, the others meet in it.
+    rounding = jnp.nan_to_num(rounding)
+    allowed += ROUNDINGS * jnp.max(jnp.where(sizes.there, rounding / size, 0.0))
+    allowed = allowed * size + ROUNDINGS * rounding
     return jnp.all(jnp.abs(A @ x + c) <= allowed)
 
 

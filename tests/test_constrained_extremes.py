@@ -277,6 +277,28 @@ def test_no_acceleration_satisfies_rows_that_contradict():
     assert np.all(np.isnan(a))
 
 
+def once_more(t, q, v, params):
+    """A row twice, once by a factor that turns with x."""
+    row = 0.7 * v[1] + 0.3 * params
+    return jnp.stack([(1.5 + jnp.sin(q[0])) * row, row])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dtype):
+    """The factor's rate times what rounding leaves of the row: the row itself asks for 0."""
+    system = jl.System(free, ("x", "y"), constraints=(jl.Pfaffian(once_more, "rows"),))
+    params = jnp.arange(0.1, 1.2, 0.1, dtype=dtype)
+    q, speed = jnp.asarray([0.3, 0.1], dtype), dtype(2.0)
+
+    def acceleration(p):
+        v = jnp.stack([jnp.asarray(speed), -0.3 * p / 0.7]).astype(dtype)
+        return system.acceleration(p, q, v)
+
+    found = jax.vmap(acceleration)(params)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, np.zeros((11, 2)), atol=16 * np.finfo(dtype).eps)
+
+
 # ---- Starts that cannot be solved with -----------------------------------------------------------
 
 
