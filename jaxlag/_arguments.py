@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxlag._change_points import CHANGE_POINTS
 from jaxlag._constraints import Baumgarte
 from jaxlag._errors import bad
 from jaxlag._forces import reads_lam
@@ -66,6 +67,13 @@ def check_options(
             )
     if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
+
+
+def check_change_points(change_points: Any) -> None:
+    """Raise unless it is one of the words."""
+    if change_points not in CHANGE_POINTS:
+        must = f"be one of {', '.join(map(repr, CHANGE_POINTS))}"
+        raise bad("change_points", must, f"it was {change_points!r}")
 
 
 def check_formulation(

@@ -60,6 +60,7 @@ def states_at(motion: Any, t: Any) -> Any:
         atol=motion.tolerances[1],
         save=tuple(motion.saved),
         project=project,
+        change_points=motion.change_points,
         dt_max=motion.dt_max,
         throw=False,
     )

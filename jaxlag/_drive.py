@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
+from jaxlag._change_points import Crossing, no_crossing
 from jaxlag._lanes import at_most
 from jaxlag._put import put
 from jaxlag._record import Outcome, Record, Times
@@ -36,6 +37,7 @@ class _Place(NamedTuple):
     memory: Any  # the solver's own state
     jump: Array | None  # whether the field jumps there; None where nothing ever does
     determinants: Array | None  # see `Scheme.determinants`
+    crossing: Crossing | None  # what is known of change points; None where none are passed
 
 
 class _Rows(NamedTuple):
@@ -138,7 +140,8 @@ def drive(
         sound = scheme.is_sound(memory)
     jumps = times.knots is not None or not scheme.standard
     determinants = scheme.determinants(t0, y0, args)
-    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants)
+    crossing = None if args.lengths is None else no_crossing(t0, args.lengths.dtype)
+    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
@@ -238,11 +241,12 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     scheme, times, t = loop.scheme, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
     fixed = scheme.controller is None
-    goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + c.h
+    h = c.h if c.at.crossing is None or fixed else c.at.crossing.step(t, c.h, scheme.gap)
+    goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + h
     boundary, boundary_anchor = _next_boundary(times, t)
     slack = jnp.maximum(1e-10 * (goal - t), resolution(boundary))
     lands = goal >= boundary - slack
-    t1 = jnp.where(lands, boundary, goal)
+    t1, cut = jnp.where(lands, boundary, goal), lands | (h < c.h)
 
     begin, to_row, due = c.at, jnp.array(False), None
     if c.rows is not None:
@@ -252,14 +256,19 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         t1 = jnp.where(to_row, due, t1)
     jumped = False if begin.jump is None else begin.jump
     args = scheme.within(loop.args, begin.t)
-    y1, estimate, memory, solved = scheme.step(begin.t, t1, begin.y, args, begin.memory, jumped)
+    step = (begin.t, t1, begin.y, args, begin.memory, jumped, begin.crossing)
+    y1, estimate, memory, solved = scheme.step(*step)
     finite = all_finite(y1)
-    settled, verdict = scheme.settled(t1, y1, args)
-    step = (begin.t, t1, begin.y, settled, args, estimate.turn, begin.determinants)
-    passage = scheme.passage(*step)
+    ends = (begin.t, t1, begin.y, y1, args, estimate, begin.crossing, lands | to_row)
+    settled, verdict, estimate, crossing = scheme.settled_with_error(*ends)
+    step = (begin.t, t1, begin.y, settled, args, estimate.turn)
+    passage = scheme.passage(*step, begin.determinants)
     regular, share, determinants = (jnp.array(True), None, None) if passage is None else passage
-    good = finite & solved & (regular | to_row) & verdict.good
-    rest = (estimate, good, lands, share, regular | to_row)
+    crossable = independent = scheme.same_sense(*step)
+    if crossing is not None:
+        crossable, independent = crossing.passes, ~crossing.depends
+    good = finite & solved & ((regular & crossable) | to_row) & verdict.good
+    rest = (estimate, good, cut, share, regular | to_row)
     keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
 
     active = ~c.done & ~to_row
@@ -275,6 +284,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         (verdict.pressed, Status.no_reaction_solution),
         (regular, Status.kinematics_singular),
         (verdict.closed, Status.rank_change),
+        (crossable & independent, Status.rank_change),
         (verdict.found, Status.projection_failed),
         (solved, Status.implicit_solve_failed),
         (finite, Status.nonfinite),
@@ -309,7 +319,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
     jump = None if c.at.jump is None else jump | lands
-    end = _Place(t1, settled, memory, jump, determinants)
+    end = _Place(t1, settled, memory, jump, determinants, crossing)
     at = _select(take, end, c.at)
     kept = None if c.kept is None else _written(loop, c, c.kept, at.t, anchor)
     return _Carry(
@@ -336,7 +346,7 @@ def _next_step(
     y1: PyTree,
     estimate: Estimate,
     good: Array,
-    lands: Array,
+    cut: Array,
     share: Array | None,
     regular: Array,
 ) -> tuple[Array, Array, Any, Array, Array]:
@@ -364,8 +374,8 @@ def _next_step(
     keep, next0, next1, jump, control, result = proposal
     keep = keep & good
     h = jnp.asarray(next1 - next0, t.dtype)
-    # A step cut short by a boundary says nothing against the length proposed before it.
-    cut = keep & lands
+    # A step cut short says nothing against the length proposed before it.
+    cut = keep & cut
     h = jnp.where(cut, jnp.maximum(h, c.h), h)
     if scheme.standard:
         control = _uncut(scheme.controller, cut, h, c.control, control)

@@ -59,6 +59,7 @@ class Dynamics(eqx.Module):
             the start of a solve alone.
         apart: whether rows whose multipliers forces read are known to be independent.
         onwards: whether the method has stages beyond the end of a step.
+        crossing: whether rows that come to depend on others on the way are left out there.
     """
 
     system: System
@@ -75,6 +76,7 @@ class Dynamics(eqx.Module):
     regular: bool | None = eqx.field(static=True, default=False)
     apart: bool = eqx.field(static=True, default=False)
     onwards: bool = eqx.field(static=True, default=False)
+    crossing: bool = eqx.field(static=True, default=False)
 
     @property
     def terms(self) -> Terms:
@@ -112,7 +114,7 @@ class Dynamics(eqx.Module):
         if not self.rows.size:
             return terms
         baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
-        known = {"regular": bool(self.regular), "apart": self.apart}
+        known = {"regular": bool(self.regular), "apart": self.apart, "crossing": self.crossing}
         return replace(terms, formulation=self.formulation, baumgarte=baumgarte, **known)
 
     @property
@@ -367,7 +369,8 @@ class Dynamics(eqx.Module):
         if self.quasi is not None:
             near = corrections(holonomic)
             return Surface(position, None, lambda c: near @ c, None)
-        K = K_of_position = terms.correction(t, q, v, params, args.prepared, args.kept)
+        K, masses = self.array.corrections(t, q, v, params, args.prepared, args.kept)
+        K_of_position = K
         if 0 < len(holonomic) < self.rows.size:
             K_of_position = corrections(holonomic)
         return Surface(
@@ -375,6 +378,8 @@ class Dynamics(eqx.Module):
             lambda q, v: terms.velocity(t, q, v, params),
             lambda c: K_of_position @ c,
             lambda c: K @ c,
+            K.T,
+            masses,
         )
 
     def _values(self, tau: Array, q: Array, w: Array, args: Arguments) -> Any:

@@ -103,6 +103,7 @@ def factor_kkt(
     A: Float[Array, "m n"],
     kept: Bool[Array, " m"] | None,
     formulation: str,
+    crossing: bool = False,
 ) -> Factor:
     """Factor once, for any number of right-hand sides.
 
@@ -111,17 +112,19 @@ def factor_kkt(
         A: rows.
         kept: rows to solve with; None for all.
         formulation: "multipliers" or "null_space".
+        crossing: whether rows that depend on those before them are left out; else they are not
+            healthy.
     """
     A = masked(A, kept)
     if formulation == "null_space":
-        return _null_space(M, A, kept)
+        return _null_space(M, A, kept, crossing)
     bordered, weights = augmented(M, A)
     mass = factor_mass(bordered)
     spread = jax.vmap(lambda row: eliminate(mass, row))(A)
     S = A @ spread.T
     if kept is not None:
         S = S + jnp.diag((~kept).astype(S.dtype))
-    return Multipliers(mass, weights, spread, factor_mass(S, rank_floor(S.dtype)))
+    return Multipliers(mass, weights, spread, factor_mass(S, rank_floor(S.dtype), crossing))
 
 
 def augmented(
@@ -157,7 +160,7 @@ def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n
 
 
 def _null_space(
-    M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None
+    M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, crossing: bool
 ) -> NullSpace:
     """Rows made orthonormal one after the other, each twice (Gram-Schmidt, "twice is enough")."""
     units = units_of(M, A)
@@ -171,7 +174,10 @@ def _null_space(
         second = Y @ rest
         rest = rest - second @ Y
         norm = jnp.sqrt(jnp.sum(rest**2))
-        fine = norm**2 > rank_floor(A.dtype) * jnp.sum(A[k] ** 2)
+        least = rank_floor(A.dtype) * jnp.sum(A[k] ** 2)
+        if crossing:
+            norm = jnp.where(norm**2 <= least, jnp.inf, norm)
+        fine = norm**2 > least
         if kept is not None:
             norm = jnp.where(kept[k], norm, 1.0)
             fine = fine | ~kept[k]
@@ -199,6 +205,7 @@ def solve_kkt(
     kept: Bool[Array, " m"] | None = None,
     formulation: str = "multipliers",
     factor: Factor | None = None,
+    crossing: bool = False,
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """(x, lam) with M x = r + A^T lam, A x + c = 0; NaN where there is none.
 
@@ -212,9 +219,10 @@ def solve_kkt(
         kept: rows to solve with; None for all.
         formulation: how, "multipliers" or "null_space".
         factor: `factor_kkt` of the same if it exists already.
+        crossing: as `factor_kkt` takes it.
     """
     frozen = jax.lax.stop_gradient((M, A))
-    factor = factor_kkt(*frozen, kept, formulation) if factor is None else factor
+    factor = factor_kkt(*frozen, kept, formulation, crossing) if factor is None else factor
     factor = jax.lax.stop_gradient(factor)
     A, c = masked(A, kept), masked(c, kept)
     rows = jax.lax.stop_gradient(A)

@@ -53,7 +53,9 @@ class MassFactor(NamedTuple):
         return jnp.stack([row[0] for row in self.upper])
 
 
-def factor_mass(M: Float[Array, "n n"], relative: float | None = None) -> MassFactor:
+def factor_mass(
+    M: Float[Array, "n n"], relative: float | None = None, crossing: bool = False
+) -> MassFactor:
     """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.
 
     A pivot below 4 n eps M_ii is what cancellation leaves of a singular matrix, whatever the
@@ -63,18 +65,21 @@ def factor_mass(M: Float[Array, "n n"], relative: float | None = None) -> MassFa
     Args:
         M: symmetric.
         relative: what to multiply M_ii with instead of 4 n eps.
+        crossing: whether a pivot that is too small is taken for infinite, so that its unknown is 0.
     """
     n = M.shape[0]
     floor = _floor(M) if relative is None else relative * jnp.abs(jnp.diagonal(M))
-    if n > LOOP_UP_TO:
+    if n > LOOP_UP_TO and not crossing:
         lower = jnp.linalg.cholesky(M, symmetrize_input=False)
         pivots = jnp.diagonal(lower) ** 2
         return MassFactor(None, lower, pivots > floor)
     if n > UNROLL_UP_TO:
-        eliminated = _eliminated(M)
+        eliminated = _eliminated(M, floor if crossing else None)
         return MassFactor(jnp.triu(eliminated), None, jnp.diagonal(eliminated) > floor)
     rows = [[M[i, j] for j in range(i, n)] for i in range(n)]  # row i holds columns i to n - 1
     for k in range(n):
+        if crossing:
+            rows[k][0] = jnp.where(rows[k][0] <= floor[k], jnp.inf, rows[k][0])
         for i in range(k + 1, n):
             ratio = rows[k][i - k] / rows[k][0]
             for j in range(i, n):
@@ -101,12 +106,19 @@ def first_unhealthy(M: Float[Array, "n n"], factor: MassFactor | None = None) ->
     return jnp.where(jnp.all(factor.healthy), -1, first).astype(jnp.int32)
 
 
-def _eliminated(M: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """U = D L^T on and above the diagonal, by rows; what is below it means nothing."""
+def _eliminated(
+    M: Float[Array, "n n"], floor: Float[Array, " n"] | None = None
+) -> Float[Array, "n n"]:
+    """U = D L^T on and above the diagonal, by rows; what is below it means nothing.
+
+    Pivots that are no more than `floor` are taken for infinite.
+    """
     n = M.shape[0]
     at = jnp.arange(n)
 
     def one(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
+        if floor is not None:
+            M = M.at[k, k].set(jnp.where(M[k, k] <= floor[k], jnp.inf, M[k, k]))
         # XLA would divide again for every entry.
         ratio = jax.lax.optimization_barrier(M[k] / M[k, k])
         return jnp.where((at > k)[:, None], M - ratio[:, None] * M[k][None], M)

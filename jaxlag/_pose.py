@@ -12,6 +12,7 @@ from jaxtyping import Array
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
 from jaxlag._assemble import assembled
+from jaxlag._change_points import lengths_of, may_cross, may_stop
 from jaxlag._constraints import Baumgarte
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._gradient import Keep
@@ -48,6 +49,7 @@ class Plan(NamedTuple):
     regular: bool | None
     apart: bool
     keep: Keep
+    change_points: str
     auto: bool  # whether the method may be chosen by the structure of the system
 
 
@@ -88,6 +90,8 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
     dynamics = replace(dynamics, rows=plan.system.rows(params, values.q0.dtype))
+    crossing = plan.change_points == "pass" and may_cross(dynamics)
+    dynamics = replace(dynamics, crossing=crossing)
     solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
     if plan.auto and controller is None:
         splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
@@ -122,11 +126,16 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.rows.size:
         y0, args = still_unless(consistent.ok, (y0, args))
+    if dynamics.crossing:
+        masses = dynamics.surface(*still((start, y0, args))).masses
+        assert masses is not None
+        args = args._replace(lengths=lengths_of(masses, args.kept))
     if dynamics.projects:
-        moved, _, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
+        moved, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
     if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
-        dynamics = replace(dynamics, stabilization=None)
+        dynamics = replace(dynamics, stabilization=None, crossing=False)
+        args = args._replace(lengths=None)
     solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
     settling = Settling(dynamics)
     settle = settling if settling.settles else None
@@ -135,7 +144,8 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
     how = (dynamics.windows, settle, dynamics.projects, values.longest)
     passes = args.usual is not None
-    scheme = Scheme(solver, controller, term, *how, passes=passes)
+    stops = not dynamics.crossing and may_stop(dynamics)
+    scheme = Scheme(solver, controller, term, *how, passes=passes, stops=stops)
     scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     speeds = values.u0 if values.v0 is None else values.v0
@@ -146,6 +156,8 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
     valid = valid & in_order(inputs)
     finite = start_finite(dynamics, start, y0, args)
+    if args.lengths is not None:  # what depends at the start is not known to be independent nearby
+        finite = finite & jnp.all(args.lengths > 0)
     pressed = settling.pressed(start, y0, args)
     begun = Start(valid, in_range, finite, consistent, pressed)
     setup = Setup(values.step, begun.allowed, scheme_traced)

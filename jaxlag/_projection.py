@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 MAX_TURNS = 12
 SWEEPS = 3
@@ -21,12 +21,16 @@ class Surface(NamedTuple):
         velocity: (q, v) -> A v + b; None where velocities satisfy all rows by themselves.
         shift: c -> M^-1 A^T (A M^-1 A^T)^-1 c over the rows of `position`, at the predicted state.
         kick: the same over all rows; None as `velocity`.
+        columns: of its matrix, 0 for rows that are left out; None as `velocity`.
+        masses: diagonal of (A M^-1 A^T)^-1, 0 for those that are left out; None where nobody asks.
     """
 
     position: Callable | None
     velocity: Callable | None
     shift: Callable
     kick: Callable | None
+    columns: Float[Array, "m n"] | None = None
+    masses: Float[Array, " m"] | None = None
 
 
 def project(
@@ -58,6 +62,28 @@ def project(
         still = _rates_at(frozen, jax.lax.stop_gradient(q))
     v, also = _solved(at_q, v, still)
     return q, v, found & also
+
+
+def tangential(surface: Surface, q: Array, v: Array, dq: Array, dv: Array) -> tuple[Array, Array]:
+    """What is left of an error (dq, dv) when both states, with it and without, are projected.
+
+    What is left is along the constraints, and of second order in the rest, by one turn of Newton's
+    method from (q + dq, v + dv).
+
+    Args:
+        surface: the constraints.
+        q: coordinates, which satisfy them.
+        v: velocities, which satisfy them.
+        dq: error of the coordinates before the projection.
+        dv: error of the velocities.
+
+    Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467 (projected error estimates).
+    """
+    if surface.position is not None:
+        dq = dq - surface.shift(surface.position(q + dq))
+    if surface.velocity is None or surface.kick is None:
+        return dq, dv
+    return dq, dv - surface.kick(surface.velocity(q + dq, v + dv))
 
 
 def turns_needed(surface: Surface, q: Array, v: Array) -> Int[Array, ""]:

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._branches import branches
+from jaxlag._change_points import AGAIN, SHORT, Crossing, same_sense, widest_gap
 from jaxlag._first_step import slope_and_step
 from jaxlag._passage import Passage, determinants, passage
 from jaxlag._perturbations import linearized, spectral_size, turning_rate
@@ -21,6 +23,7 @@ from jaxlag._settling import Settling
 from jaxlag._step import Verdict, midway
 from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
+from jaxlag.solvers._explicit import tableau_of
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
 _SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
@@ -38,6 +41,7 @@ class Estimate(NamedTuple):
     error: PyTree
     unseen: PyTree | None = None
     turn: PyTree | None = None
+    near: Bool[Array, ""] | None = None
 
 
 class Scheme(eqx.Module):
@@ -56,6 +60,8 @@ class Scheme(eqx.Module):
     across: bool = eqx.field(static=True, default=False)
     # whether quasi-velocities may become singular on the way
     passes: bool = eqx.field(static=True, default=False)
+    # whether steps end before places where rows depend on one another
+    stops: bool = eqx.field(static=True, default=False)
 
     @property
     def remembers(self) -> bool:
@@ -66,6 +72,11 @@ class Scheme(eqx.Module):
     def implicit(self) -> bool:
         """Whether equations may be solved in a step."""
         return not isinstance(self.solver, AbstractExplicit | Splitting | diffrax.AbstractERK)
+
+    @property
+    def gap(self) -> float:
+        """Where in a step a change point is far from all stages."""
+        return widest_gap(nodes_of(self.solver))
 
     @property
     def standard(self) -> bool:
@@ -162,6 +173,51 @@ class Scheme(eqx.Module):
         return self.begin(t0, t1, y, args), jnp.array(True)
 
     def step(
+        self,
+        t0: Array,
+        t1: Array,
+        y: PyTree,
+        args: Any,
+        memory: Any,
+        jump: Any,
+        crossing: Crossing | None = None,
+    ) -> tuple[PyTree, Estimate, Any, Bool[Array, "..."]]:
+        """(y1, its error, solver state, whether implicit equations were solved).
+
+        Near a change point stages are moved onto the constraints, too.
+        """
+        step = t0, t1, y, args, memory, jump
+        if args.lengths is None:
+            return self._step(*step)
+        settle = cast(Settling, self.settle)
+        near = settle.apart(t0, y, args) < SHORT if crossing is None else crossing.is_near
+        held = self._held(near)
+        if not isinstance(self.solver, AbstractExplicit) or self.solver.looped:
+            return held._step(*step)
+        # Another copy of every stage would take long to compile.
+        held = replace(held, solver=replace(self.solver, looped=True))
+        plain = self._step(*step)
+
+        def chosen() -> Any:
+            return jax.tree.map(partial(jnp.where, near), held._step(*step), plain)
+
+        return jax.lax.cond(eqxi.unvmap_any(near), chosen, lambda: plain)
+
+    def _held(self, near: Array) -> "Scheme":
+        """The scheme with stages on the constraints in a step that is near a change point."""
+        settle, term = cast(Settling, self.settle), cast(Term, self.term)
+
+        @jax.checkpoint  # what transposes keep of a branch is copied in all steps
+        def closer(t: Array, y: Array, args: Any) -> Array:
+            return jnp.where(near, settle.stage(t, y, args), y)
+
+        def field(t: Any, y: Any, args: Any) -> Array:
+            y = jax.lax.cond(eqxi.unvmap_any(near), closer, lambda t, y, args: y, t, y, args)
+            return term.vf(t, y, args)
+
+        return replace(self, term=Term(field, term.dynamics, term.lines, term.dtype))
+
+    def _step(
         self, t0: Array, t1: Array, y: PyTree, args: Any, memory: Any, jump: Any
     ) -> tuple[PyTree, Estimate, Any, Bool[Array, "..."]]:
         """(y1, its error, solver state, whether implicit equations were solved)."""
@@ -279,6 +335,14 @@ class Scheme(eqx.Module):
             tolerance = jnp.ones((), dtype)
         return passage(cast(Term, self.term).dynamics, tolerance, *step)
 
+    def same_sense(self, *step: Any) -> Bool[Array, ""]:
+        """Whether a step passes no change point, where it is not to.
+
+        Args:
+            step: (t0, t1, y0, y1, args, turn).
+        """
+        return same_sense(cast(Term, self.term).dynamics, *step) if self.stops else jnp.array(True)
+
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False
     ) -> tuple[PyTree, Verdict]:
@@ -287,6 +351,55 @@ class Scheme(eqx.Module):
             true = jnp.array(True)
             return y, Verdict(true, true, true)
         return self.settle(t, y, args, differentiable)
+
+    def settled_with_error(
+        self,
+        t0: Array,
+        t: Array,
+        y0: PyTree,
+        y: PyTree,
+        args: Any,
+        estimate: Estimate,
+        crossing: Crossing | None,
+        bound: Array,
+    ) -> tuple[PyTree, Verdict, Estimate, Crossing | None]:
+        """The same, the error of the state that is kept, and what is known of change points there.
+
+        Rounding of what is projected near such a place is not made less by shorter steps. A step
+        that need not end beside it is taken again, shorter.
+
+        Args:
+            t0: start of the step.
+            t: its end.
+            y0: state at its start.
+            y: state at its end.
+            args: arguments of the step.
+            estimate: the error of y.
+            crossing: what is known at the start of the step.
+            bound: whether it has to end there.
+        """
+        if crossing is None:
+            return *self.settled(t, y, args), estimate, None
+        settle, error = cast(Settling, self.settle), estimate.error
+        if error is None:
+            y, verdict = settle(t, y, args)
+        else:
+            y, verdict, error = settle.with_error(t, y, args, cast(Array, error), crossing.is_near)
+        assert verdict.apart is not None
+        parts = cast(Term, self.term).dynamics.parts
+        (q0, _), (q, _) = parts(y0), parts(y)
+        moved = jnp.max(jnp.abs(q - q0) / (1.0 + jnp.abs(q0)))
+        ends = crossing.onwards(t0, t, verdict.apart, moved)
+        if error is None:
+            return y, verdict, estimate, ends
+        rounding = ends.rounding()[np.where(np.arange(y.size) < q.size, 0, 1)]
+        error = jnp.where(jnp.abs(error) <= rounding * (1.0 + jnp.abs(y)), 0.0, error)
+        controller = self.controller
+        if isinstance(controller, diffrax.PIDController):
+            again = ends.is_beside(crossing) & ~bound
+            least = AGAIN * (controller.atol + controller.rtol * jnp.abs(y))
+            error = jnp.where(again, jnp.maximum(jnp.abs(error), least), error)
+        return y, verdict, estimate._replace(error=error), ends
 
     def start(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
@@ -358,9 +471,18 @@ def _explicit_tableau(solver: diffrax.AbstractSolver) -> Any:
 
 def looks_ahead(solver: diffrax.AbstractSolver) -> bool:
     """Whether a method has stages beyond the end of its steps."""
-    tableau = getattr(solver, "tableau", None)
+    return bool(np.max(nodes_of(solver), initial=0.0) > 1)
+
+
+def nodes_of(solver: diffrax.AbstractSolver) -> list[float]:
+    """Where in a step the stages of a Runge-Kutta method lie; none of other methods."""
+    if isinstance(solver, diffrax.HalfSolver):
+        return [0.5 * (half + c) for half in (0.0, 1.0) for c in (*nodes_of(solver.solver), 1.0)]
+    if isinstance(solver, AbstractExplicit):
+        return [float(c) for c in tableau_of(type(solver)).c]
+    tableau: Any = getattr(solver, "tableau", None)
     tableaus = getattr(tableau, "tableaus", () if tableau is None else (tableau,))
-    return any(np.max(x.c, initial=0.0) > 1 for x in tableaus)
+    return [float(c) for x in tableaus for c in x.c]
 
 
 def with_stages(solver: Any, kind: str) -> Any:

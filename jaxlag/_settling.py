@@ -1,7 +1,7 @@
 """What becomes of a state at the end of a step: constraints, contacts and what slides."""
 
 from functools import reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from jaxlag._change_points import LOST, SHORT, lengths_of
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam, sliding
 from jaxlag._linalg import closed_to
 from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
-from jaxlag._projection import Surface, project
+from jaxlag._projection import Surface, project, tangential
 from jaxlag._step import Arguments, Verdict
 
 
@@ -62,8 +63,7 @@ class Settling(eqx.Module):
         true = jnp.array(True)
         verdict = Verdict(true, true, true)
         if self.dynamics.projects:
-            y, found, closed = self.project(tau, y, args, differentiable)
-            verdict = Verdict(found, closed, true)
+            y, verdict = self.project(tau, y, args, differentiable)
         elif args.rows is not None:
 
             def look() -> Array:
@@ -97,15 +97,93 @@ class Settling(eqx.Module):
 
     def project(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
-    ) -> tuple[Any, Bool[Array, ""], Bool[Array, ""]]:
-        """(state on the constraints nearest to y, whether found, whether all rows hold there)."""
-        frozen = None
+    ) -> tuple[Array, Verdict]:
+        """The state on the constraints nearest to y, and what is to be said about it."""
+        return self._projected(self._near(tau, y, args, differentiable), y, args)
+
+    def with_error(
+        self, tau: Array, y: Array, args: Arguments, error: Array, near: Bool[Array, ""]
+    ) -> tuple[Array, Verdict, Array]:
+        """The same as a call, and the error of the state that is kept.
+
+        It is another near change points alone: elsewhere errors across the rows, which the
+        projection removes, are as small as those along them.
+
+        Args:
+            tau: time.
+            y: state at the end of a step.
+            args: arguments of the step.
+            error: estimate for y.
+            near: whether the step starts near such a place.
+        """
+        around = self._near(tau, y, args)
+        y, verdict = self._projected(around, y, args)
+        assert verdict.apart is not None
+
+        def left() -> Array:
+            parts = self.dynamics.parts
+            return self._joined(*tangential(around.surface, *parts(y), *parts(error)), error)
+
+        error = jax.lax.cond(near | (verdict.apart < SHORT), left, lambda: error)
+        return y, verdict._replace(pressed=self.pressed(tau, y, args)), error
+
+    def stage(self, tau: Array, y: Array, args: Arguments) -> Array:
+        """A state within a step moved towards the constraints, by one turn of Newton's method.
+
+        Its matrix has no derivative: whatever it is, a motion on the constraints stays where it is,
+        with all of its derivatives.
+
+        Args:
+            tau: time of the stage.
+            y: its state.
+            args: arguments of the step.
+        """
+        near = self._near(*still((tau, y, args))).surface
+        surface = self.dynamics.surface(tau, y, args)
+        (q, v), velocity, kick = self.dynamics.parts(y), surface.velocity, near.kick
+        if surface.position is not None:
+            q = q - near.shift(surface.position(q))
+        assert velocity is not None
+        assert kick is not None
+        return self._joined(q, v - kick(velocity(q, v)), y)
+
+    def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
+        """The least length of a row over its length at the start of the motion."""
+        found = self._near(*still((tau, y, args))).apart
+        assert found is not None
+        return found
+
+    def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, Verdict]:
+        q, v, found = project(near.surface, *self.dynamics.parts(y), near.frozen)
+        closed = self._closed(near.surface, q, v, args)
+        return self._joined(q, v, y), Verdict(found, closed, jnp.array(True), near.apart)
+
+    def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
+        """The constraints near a state, without rows that all but depend on one another."""
+        surface, frozen = self.dynamics.surface(tau, y, args), None
         if differentiable:
             frozen = self.dynamics.surface(*still((tau, y, args)))
-        surface, (q, v) = self.dynamics.surface(tau, y, args), self.dynamics.parts(y)
-        q, v, found = project(surface, q, v, frozen)
-        rest = self.dynamics.system.size + self.dynamics.speeds
-        return jnp.concatenate([q, v, y[rest:]]), found, self._closed(surface, q, v, args)
+        if args.lengths is None:
+            return _Near(surface, frozen, None)
+        masses = (surface if frozen is None else frozen).masses
+        assert masses is not None
+        lengths = lengths_of(masses, args.kept)
+        alone, own = lengths > LOST * args.lengths, np.flatnonzero(self.dynamics.rows.holonomic)
+
+        def without(surface: Surface) -> Surface:
+            shift, kick = surface.shift, surface.kick
+            assert kick is not None
+            return surface._replace(
+                shift=lambda c: shift(jnp.where(alone[own], c, 0.0)),
+                kick=lambda c: kick(jnp.where(alone, c, 0.0)),
+            )
+
+        frozen = None if frozen is None else without(frozen)
+        return _Near(without(surface), frozen, jnp.min(lengths / args.lengths))
+
+    def _joined(self, q: Array, v: Array, y: Array) -> Array:
+        """The state y with other coordinates and velocities."""
+        return jnp.concatenate([q, v, y[self.dynamics.system.size + self.dynamics.speeds :]])
 
     def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
         """Whether rows that were left out hold as well.
@@ -132,3 +210,17 @@ class Settling(eqx.Module):
         if surface.position is not None:
             closed = closed & holds(surface.position(q), q, holonomic)
         return closed
+
+
+class _Near(NamedTuple):
+    """The constraints near a state, and how far apart they are there.
+
+    Attributes:
+        surface: the constraints.
+        frozen: the same without derivatives; None where none are taken.
+        apart: see `jaxlag._change_points.Crossing`; None where nobody asks.
+    """
+
+    surface: Surface
+    frozen: Surface | None
+    apart: Array | None

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxlag import _params, _xla
 from jaxlag._arguments import (
+    check_change_points,
     check_formulation,
     check_longest,
     check_method,
@@ -75,6 +76,7 @@ def simulate(
     gradient: str = "auto",
     gradient_memory: int | float | None = None,
     project: bool | Baumgarte = True,
+    change_points: str = "pass",
     assemble: bool = False,
     estimate_error: bool = False,
     throw: bool = True,
@@ -168,6 +170,14 @@ def simulate(
         project: True: accepted steps and saved states are moved onto the constraints, q along
             M^-1 A^T, then v (with quasi-velocities there is nothing to move but q). False: they are
             left to drift. `Baumgarte(alpha, beta)`: residuals are damped instead.
+        change_points: what becomes of a motion where constraint rows that are independent elsewhere
+            depend on one another, as in a linkage that lies flat: there it may go on in more than
+            one way, and reactions may be infinite. "pass": it goes on along the tangent that it
+            came on, as accurate as elsewhere, with its derivatives. Where ways touch that do not
+            cross, one ends in a cusp, nothing is projected, or forces read multipliers, it ends
+            there, in the status rank_change. "stop": it ends just before every such place, at every
+            tolerance; with fixed steps one step before it. Variational methods stop. A time to save
+            that is that of the place, to 1e-9 s, has NaN, in the same status.
         assemble: whether an inconsistent start is moved to the nearest consistent one, as by
             `jl.assemble`; else it ends in the status inconsistent_start.
         estimate_error: whether to solve once more with a tenth of the tolerance and, where there
@@ -199,6 +209,7 @@ def simulate(
         -0.300000 0.090000 ok at t = 1.5707963267948966
     """
     check_options(system, gradient, gradient_memory, project, assemble, save, max_steps)
+    check_change_points(change_points)
     check_method(method, rtol, atol, dt)
     check_estimate(estimate_error, method)
     q0, v0, u0 = check_start(system, q0, v0, u0)
@@ -254,6 +265,7 @@ def simulate(
             q0.dtype.itemsize,
             all_knots(inputs) is not None,
         ),
+        change_points=change_points,
         auto=method == "auto" and "work" not in save,
     )
     start = q0, v0, u0, ts, params_traced, inputs_traced
@@ -384,6 +396,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
         _implicit=scheme.implicit,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
+        change_points=plan.change_points,
         tolerances=None if scheme.controller is None else (values.rtol, values.atol),
         dt_max=values.longest,
     )

@@ -97,6 +97,7 @@ class Solution(eqx.Module):
             between steps.
         tolerances: (rtol, atol) of the step-size control; None with fixed steps.
         dt_max: bound on adaptive steps, s; None where none was given.
+        change_points: whether places where constraint rows depend on one another are passed.
         error: with `estimate_error=True` the errors of (q, v) about to be expected at each row,
             each (s, n), in their units; else None.
     """
@@ -122,6 +123,7 @@ class Solution(eqx.Module):
     _implicit: bool = eqx.field(static=True)
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
     dt_max: Float[Array, "*batch"] | None = None
+    change_points: str = eqx.field(static=True, default="pass")
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
     # (last good time, index of the quasi-velocity) where those end that "auto" went on without
     _singular: tuple[Float[Array, ""], Int[Array, ""]] | None = None

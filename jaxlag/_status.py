@@ -61,9 +61,11 @@ ADVICE = {
     ),
     Status.rank_change: (
         "There this constraint row came to depend on the others, or no longer follows from them: "
-        "a dead point or a change point, where the motion may go on in more than one way. Start "
-        "beyond it, or add the row that decides. Of redundant rows those that are solved with are "
-        "chosen at the start: there, go on from last_state."
+        "a dead point or a change point, where the motion may go on in more than one way. It is "
+        "passed, but with change_points='stop', where ways of moving cross, states are projected "
+        "and forces read no multipliers. Else start beyond it, or add the row that "
+        "decides. Of redundant rows those that are solved with are chosen at the start: there, go "
+        "on from last_state."
     ),
     Status.no_reaction_solution: (
         "No reaction goes with the forces that depend on it: the contact lifts off, its sliding "

@@ -44,15 +44,17 @@ class Verdict(NamedTuple):
         found: the projection was found.
         closed: rows that were left out hold, too.
         pressed: contacts press and slide as their friction takes them to.
+        apart: see `jaxlag._change_points.Crossing`; None where nobody asks.
     """
 
     found: Bool[Array, ""]
     closed: Bool[Array, ""]
     pressed: Bool[Array, ""]
+    apart: Float[Array, ""] | None = None
 
     @property
     def good(self) -> Bool[Array, ""]:
-        """Whether all is well."""
+        """Whether all is well; where rows depend on one another a motion may still go on."""
         return self.found & self.closed & self.pressed
 
 
@@ -69,6 +71,7 @@ class Arguments(NamedTuple):
     rows: RowChoice | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     usual: Float[Array, " b"] | None = None  # see `jaxlag._passage.usual`
+    lengths: Float[Array, " m"] | None = None  # of rows at the start, see `jaxlag._change_points`
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:

@@ -328,16 +328,37 @@ def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
     found = jl.simulate(
         slider_crank, q0, v0, np.linspace(0, 3, 31), equal, formulation="null_space", **options
     )
-    if found.status != jl.Status.ok:  # where its steps happen to end
-        assert found.status == jl.Status.rank_change
-    params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}  # a + d = b + c
-    start = jl.assemble(
-        four_bar, four_bar_start(1.0, params), [5.0, 0.0, 0.0], params, hold=("crank'",)
-    )
-    found = jl.simulate(four_bar, start.q, start.v, [0.0, 3.0], params, **options)
-    assert found.status == jl.Status.rank_change
-    assert "('pin[0]')" in found.message()
-    np.testing.assert_allclose(found.last_state[0], [np.pi, 0.0, 0.0], atol=1e-6)
+    assert found.status == jl.Status.ok
+    q0, v0, params = change_point_start()
+    stopped = jl.simulate(four_bar, q0, v0, [0.0, 3.0], params, change_points="stop", **options)
+    assert stopped.status == jl.Status.rank_change
+    assert "('pin[" in stopped.message()
+    np.testing.assert_allclose(stopped.last_state[0], [np.pi, 0.0, 0.0], atol=1e-4)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-12])
+def test_a_fast_four_bar_passes_its_change_point(rtol):
+    """Three times; with its energy, and back to where it started."""
+    q0, v0, params = change_point_start()
+    options = {"throw": False, "rtol": rtol, "atol": rtol}
+    there = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
+    assert there.status == jl.Status.ok
+    # Measured: 2e-5, 1.3e-9, 3e-13 of 15 J; 4e-5, 6e-9, 1.4e-12.
+    energy = {1e-6: 1e-4, 1e-9: 1e-8, 1e-12: 5e-12}[rtol]
+    np.testing.assert_allclose(there.energy, there.energy[0], atol=energy)
+    q1, v1 = there.last_state
+    back = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
+    assert back.status == jl.Status.ok
+    np.testing.assert_allclose(back.q[-1], q0, atol=10 * energy)
+
+
+def change_point_start():
+    """(q, v, params) of a four-bar with a + d = b + c, which lies flat once in a turn."""
+    params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}
+    q0 = four_bar_start(1.0, params)
+    start = jl.assemble(four_bar, q0, [5.0, 0.0, 0.0], params, hold=("crank'",))
+    return start.q, start.v, params
 
 
 @pytest.mark.full

@@ -63,6 +63,7 @@ class ArrayTerms(Terms):
         apart: whether rows whose multipliers forces read are known to be independent.
         quasi: quasi-velocities, where the state is (q, u) with those that are not constrained.
         in_u: L as a function of (t, q, u, params), where it was written so.
+        crossing: whether rows that come to depend on others are left out there; else all is NaN.
     """
 
     lagrangian: Callable = eqx.field(static=True)
@@ -74,6 +75,7 @@ class ArrayTerms(Terms):
     apart: bool = eqx.field(static=True, default=False)
     quasi: QuasiVelocities | None = None
     in_u: Callable | None = eqx.field(static=True, default=None)
+    crossing: bool = eqx.field(static=True, default=False)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -338,7 +340,7 @@ class ArrayTerms(Terms):
         (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
         kept = None if reacting is None else reacting.kept
         if not any(map(reads_lam, self.forces)):
-            return solve_kkt(M, A, right, gamma, kept, self.formulation)
+            return solve_kkt(M, A, right, gamma, kept, self.formulation, crossing=self.crossing)
         read = self.rows_read(t, q, v, params, inputs)
 
         def seen(lam: Array) -> Array:
@@ -369,6 +371,19 @@ class ArrayTerms(Terms):
 
         Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
         """
+        return self.corrections(t, q, v, params, prepared, kept, chosen)[0]
+
+    def corrections(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+        chosen: Sequence[int] | None = None,
+    ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
+        """The same, and the diagonal of (A M^-1 A^T)^-1."""
         M = self.mass(t, q, v, params) if getattr(prepared, "mass", None) is None else prepared.mass
         A, b = self.rows(t, q, v, params)
         if chosen is not None:
@@ -376,12 +391,15 @@ class ArrayTerms(Terms):
                 M, _ = augmented(M, masked(A, kept))
             rows = np.array(chosen)
             A, b, kept = A[rows], b[rows], None if kept is None else kept[rows]
-        factor = factor_kkt(*jax.lax.stop_gradient((M, A)), kept, self.formulation)
+        how = kept, self.formulation
+        factor = factor_kkt(*jax.lax.stop_gradient((M, A)), *how, self.crossing)
 
-        def column(c: Array) -> Array:
-            return -solve_kkt(M, A, jnp.zeros_like(q), c, kept, self.formulation, factor)[0]
+        def column(c: Array) -> tuple[Array, Array]:
+            x, lam = solve_kkt(M, A, jnp.zeros_like(q), c, *how, factor)
+            return -x, -lam
 
-        return jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
+        K, masses = jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
+        return K, jnp.diagonal(masses)
 
     def _balance(
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], prepared: Any

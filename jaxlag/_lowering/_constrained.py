@@ -25,6 +25,7 @@ class Constrained(NamedTuple):
         reaction: the forces that depend on multipliers; None without.
         lam: the multipliers that they depend on.
         sharing: how rows that depend on one another share what forces read; None where none do.
+        crossing: whether rows that come to depend on others are left out there; else all is NaN.
     """
 
     velocity: Sequence[Node]
@@ -37,6 +38,7 @@ class Constrained(NamedTuple):
     reaction: Sequence[Node] | None = None
     lam: Sequence[Node] = ()
     sharing: Sharing | None = None
+    crossing: bool = False
 
 
 class Rows(NamedTuple):
@@ -78,13 +80,15 @@ def solve_with_rows(
     kept: Sequence[Node] | None,
     formulation: str,
     regular: bool,
+    crossing: bool,
 ) -> list[list[Node]]:
     """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0."""
     if formulation == "null_space":
-        return _null_space(graph, M, A, right, eps, kept)
+        return _null_space(graph, M, A, right, eps, kept, crossing)
     if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
         M, right = _augmented(graph, M, A, right, kept)
-    return bordered(graph, M, A, right, eps, kept, checked=True)
+    found = bordered(graph, M, A, right, eps, kept, checked=True, crossing=crossing)
+    return [x[: len(M)] for x in found]
 
 
 class Reaction(NamedTuple):
@@ -237,6 +241,7 @@ def _null_space(
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
     kept: Sequence[Node] | None,
+    crossing: bool,
 ) -> list[list[Node]]:
     """As `jaxlag._kkt.NullSpace`: rows made orthonormal, M on what they leave free."""
     n, m = len(M), len(A)
@@ -245,7 +250,7 @@ def _null_space(
     A = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
     right = [([graph.mul(x, s) for x, s in zip(r, units, strict=True)], c) for r, c in right]
 
-    L, Y = orthonormal(graph, A, kept, eps ** (2 / 3))
+    L, Y = orthonormal(graph, A, kept, eps ** (2 / 3), crossing)
 
     def tangent(x: Sequence[Node]) -> list[Node]:
         return without(graph, x, [(dot(graph, y, x), y) for y in Y])
@@ -307,8 +312,11 @@ def correction(
     kept: Sequence[Node] | None,
     regular: bool,
     chosen: Sequence[int],
-) -> list[list[Node]]:
+    crossing: bool,
+) -> tuple[list[list[Node]], list[Node]]:
     """Columns of M^-1 A^T (A M^-1 A^T)^-1, one for each of the chosen rows, solved by themselves.
+
+    And, when `crossing`, the diagonal of (A M^-1 A^T)^-1.
 
     An M that may be singular is augmented by all rows: on the chosen ones alone it need not be
     positive definite.
@@ -320,5 +328,6 @@ def correction(
     n, m = len(M), len(A)
     nothing = [graph.zero] * n
     sides = [(nothing, [graph.one if j == k else graph.zero for j in range(m)]) for k in range(m)]
-    found = bordered(graph, M, A, sides, eps, kept)
-    return [[graph.scale(x, -1.0) for x in column] for column in found]
+    found = bordered(graph, M, A, sides, eps, kept, crossing=crossing)
+    columns = [[graph.scale(x, -1.0) for x in column[:n]] for column in found]
+    return columns, [side[n + k] for k, side in enumerate(found)] if crossing else []

@@ -98,7 +98,7 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
             a, lam = solve_with_reactions(graph, mass, found_rows, right, felt, eps, *how)
         else:
             sides = [(right, found_rows.gamma)]
-            how = bound.kept, bound.formulation, bound.regular
+            how = bound.kept, bound.formulation, bound.regular, bound.crossing
             (a,) = solve_with_rows(graph, mass, found_rows.A, sides, eps, *how)
         program = assemble(graph, a)
         found.append(Equations(written[-1], mass, h, a, program, words, found_rows, lam=lam))

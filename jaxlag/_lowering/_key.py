@@ -32,6 +32,7 @@ class Key(NamedTuple):
     apart: bool
     quasi: QuasiVelocities | None
     in_u: Callable | None
+    crossing: bool
 
 
 def key_of(terms: ArrayTerms, q: Any, params: Any, inputs: Mapping[str, Any], limit: Any) -> Key:
@@ -57,6 +58,7 @@ def key_of(terms: ArrayTerms, q: Any, params: Any, inputs: Mapping[str, Any], li
         terms.apart,
         terms.quasi,
         terms.in_u,
+        terms.crossing,
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxlag._lowering._graph import Graph, Node
-from jaxlag._lowering._solve import GREATER
+from jaxlag._lowering._solve import GREATER, NO_LESS
 
 
 def products(graph: Graph, x: Sequence[Node], y: Sequence[Node]) -> list[tuple[Node, float]]:
@@ -23,11 +23,12 @@ def orthonormal(
     rows: Sequence[Sequence[Node]],
     kept: Sequence[Node] | None,
     floor: float = 0.0,
+    crossing: bool = False,
 ) -> tuple[list[list[Node]], list[list[Node]]]:
     """(L, Y) with rows = L Y, each made orthonormal to those before it, twice (Gram-Schmidt).
 
-    Rows that are not kept have 0 in Y and 1 in L; NaN where a square is no more than `floor` of
-    what it was.
+    Rows that are not kept have 0 in Y and 1 in L. Where a square is no more than `floor` of what it
+    was, there is NaN, or, when `crossing`, 0 in Y and infinity in L.
     """
     Y: list[list[Node]] = []
     L: list[list[Node]] = []
@@ -40,7 +41,11 @@ def orthonormal(
         rest = without(graph, rest, list(zip(second, Y, strict=True)))
         square = dot(graph, rest, rest)
         bound = graph.scale(dot(graph, row, row), floor) if floor else graph.zero
-        square = graph.select(graph.call(GREATER, square, bound), square, graph.const(np.nan))
+        if crossing:
+            dependent = graph.call(NO_LESS, bound, square)
+            square = graph.select(dependent, graph.const(np.inf), square)
+        else:
+            square = graph.select(graph.call(GREATER, square, bound), square, graph.const(np.nan))
         if kept is not None:
             keep = graph.call(GREATER, kept[k], graph.const(0.5))
             square = graph.select(keep, square, graph.one)

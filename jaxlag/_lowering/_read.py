@@ -119,6 +119,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         reaction,
         lam,
         sharing,
+        key.crossing,
     )
 
 

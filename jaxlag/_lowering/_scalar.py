@@ -227,19 +227,23 @@ class ScalarTerms(Terms):
         def run(name: str, q: Array, v: Array) -> Array:
             return self._run(name, t, q, v, params, inputs, prepared)
 
-        def columns(name: str) -> Callable:
-            K = run(name, q, v).reshape(-1, q.shape[0])
+        n = q.shape[0]
+
+        def times(K: Array) -> Callable:
             return lambda c: jnp.sum(c[:, None] * K, axis=0)
 
         def position(q: Array) -> Array:
             return run("position", q, v)
 
-        shift = columns("shift")
+        shift = run("shift", q, v)
         if self.array.quasi is not None:
-            return Surface(position, None, shift, None)
-        kick = shift if code.kick is None else columns("kick")
+            return Surface(position, None, times(shift.reshape(-1, n)), None)
+        kick = shift if code.kick is None else run("kick", q, v)
+        own, every = (len(c.results) for c in (code.position, code.velocity))
+        shift, masses = shift[: own * n], kick[every * n :]
+        shift, kick = shift.reshape(-1, n), kick[: every * n].reshape(-1, n)
         held = position if code.position.results else None
-        return Surface(held, partial(run, "velocity"), shift, kick)
+        return Surface(held, partial(run, "velocity"), times(shift), times(kick), kick, masses)
 
     def multipliers(
         self,

@@ -8,6 +8,7 @@ from jaxlag._lowering._graph import Graph, Node, named
 
 DOUBLE = 1e-12  # eps of double precision lies below, that of single precision above
 GREATER = named("gt")
+NO_LESS = named("ge")
 _ABS = named("abs")
 
 
@@ -59,13 +60,14 @@ def bordered(
     eps: float,
     kept: Sequence[Node] | None = None,
     checked: bool = False,
+    crossing: bool = False,
 ) -> list[list[Node]]:
     """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0.
 
     The same elimination of [M, A^T; A, 0] with the unknowns (x, -lam), whose pivots are positive
     for coordinates and negative for rows: a row comes after the coordinates that it contains. Its
     pivot must exceed eps^(2/3) times what the coordinates alone made it, as in
-    `jaxlag._kkt.factor_kkt`, or it is left out.
+    `jaxlag._kkt.factor_kkt`.
 
     Args:
         graph: of all nodes.
@@ -76,22 +78,23 @@ def bordered(
         kept: for every row 1, or 0 where it is left out; None for all 1.
         checked: whether an x that is 0 whatever M is, as nothing pushes there, is NaN as well where
             a pivot of coordinates is too small.
+        crossing: whether a row whose pivot is too small is left out; else x is NaN. Then -lam comes
+            after x.
     """
     n, m = len(M), len(A)
     whole = [[*M[i], *(row[i] for row in A)] for i in range(n)]
     whole += [[*row, *([graph.zero] * m)] for row in A]
     sides = [[*r, *(graph.scale(x, -1.0) for x in c)] for r, c in right]
-    out: list[list[Node]] = [[graph.zero] * n for _ in right]
+    out: list[list[Node]] = [[graph.zero] * (n + m) for _ in right]
     for block in blocks(whole, graph.zero):
-        elimination = _Elimination(graph, whole, sides, block, n, eps, kept)
+        elimination = _Elimination(graph, whole, sides, block, n, eps, kept, crossing)
         found = elimination.solve()
         if checked:
             found = [[elimination.checked(x) for x in values] for values in found]
         for i, values in zip(block, found, strict=True):
-            if i < n:
-                for side, x in zip(out, values, strict=True):
-                    side[i] = x
-    return out
+            for side, x in zip(out, values, strict=True):
+                side[i] = x
+    return out if crossing else [side[:n] for side in out]
 
 
 def solve_general(
@@ -131,8 +134,10 @@ class _Elimination:
         coordinates: int,
         eps: float,
         kept: Sequence[Node] | None,
+        crossing: bool,
     ) -> None:
         self.graph, self.block, self.coordinates, self.kept = graph, block, coordinates, kept
+        self.crossing = crossing
         self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
         # Products of two entries of M leave the range of single precision in common units.
         self.cramer = eps < DOUBLE
@@ -196,12 +201,16 @@ class _Elimination:
         if i < self.coordinates:
             healthy = self.sound[i] = graph.call(GREATER, pivot, self._bound(i))
             return graph.let(graph.select(healthy, pivot, nan))
-        bound = graph.scale(self.diagonal[i], self.row_floor)
-        pivot = graph.let(graph.select(graph.call(GREATER, bound, pivot), pivot, nan))
+        bound, left_out = graph.scale(self.diagonal[i], self.row_floor), graph.const(-np.inf)
+        if self.crossing:
+            dependent = graph.call(NO_LESS, pivot, bound)
+            pivot = graph.let(graph.select(dependent, left_out, pivot))
+        else:
+            pivot = graph.let(graph.select(graph.call(GREATER, bound, pivot), pivot, nan))
         if self.kept is None:
             return pivot
         keep = graph.call(GREATER, self.kept[i - self.coordinates], graph.const(0.5))
-        return graph.let(graph.select(keep, pivot, graph.const(-np.inf)))
+        return graph.let(graph.select(keep, pivot, left_out))
 
     def _bound(self, i: int) -> Node:
         """What cancellation may leave of a pivot that is zero; nothing was taken off the first."""

@@ -16,6 +16,7 @@ class Surface(NamedTuple):
         velocity: A v + b.
         shift: columns that take phi to a change of q.
         kick: columns that take A v + b to a change of v; None where they are those of `shift`.
+            Those of all rows come before the diagonal of (A M^-1 A^T)^-1 where that is asked for.
         lam: multipliers; None where no force depends on them.
     """
 
@@ -39,8 +40,10 @@ def surface(
     mixed = 0 < len(own) < len(A)
 
     def columns(chosen: Sequence[int]) -> Program:
-        found = correction(graph, M, A, eps, bound.kept, bound.regular, chosen)
-        return assemble(graph, [x for column in found for x in column])
+        how = bound.kept, bound.regular, chosen, bound.crossing
+        found, masses = correction(graph, M, A, eps, *how)
+        masses = masses if len(chosen) == len(A) else []
+        return assemble(graph, [*(x for column in found for x in column), *masses])
 
     every = columns(range(len(A)))
     return Surface(

@@ -1,0 +1,224 @@
+"""Places on the way where constraint rows that are independent elsewhere depend on one another.
+
+As where a parallelogram linkage lies flat: ways of moving meet there, and rows do not tell one from
+another. The motion that comes along one of them goes on along its tangent, and is as smooth as
+elsewhere. Beside the ways it is not: with x across them and T the time to the place
+
+    x'' = -2 x' / T,
+
+so that stages of a Runge-Kutta method, which are across the ways by errors of lower order, disturb
+those that follow (what is across at the start of a step leaves it 2 times as large in "tsit5", 400
+times in "dopri8"). So near the place
+
+- every stage is moved onto the constraints, so that methods keep their order;
+- the error of a step is that of the state after the projection, by what is left of it along the
+  constraints;
+- steps pass it with the stages on either side, as far from it as they can be, and do not end
+  beside it: rounding is eps / T^2 in accelerations, and more in their derivatives (Hessians along
+  1,000 motions of a parallelogram at a tolerance of 1e-12: off by 5e-11 at most, and by up to 2e-2
+  with stages as they come);
+- what rounding makes of a projected state is accepted: shorter steps do not improve it.
+
+That is so where ways cross. Where they touch, or one ends in a cusp, rows depend for longer than a
+way of NEARBY: there the motion stops.
+
+Where the place lies is told by s = 1 / sqrt(effective mass), the length of what a row has apart
+from all others in the metric of M^-1: it goes through 0 there, as a straight line.
+
+A state that lies at the place but for LOST is not moved along the row, as rounding of positions
+would become 1 / s times as much of velocities, and once more as positions turn these. Its error
+across is moved back with the next state. Where even accelerations are nothing but rounding, where
+the sine of the angle between rows is less than eps^(1/3), the row that depends on those before it
+is left out. That leaves out the force that holds the motion on its way, for a time tau, and is off
+by tau^2 / 2 times what the force would have accelerated.
+
+Sources: Khatib, IEEE J. Robotics Autom. 3 (1987) 43 (effective mass); Wampler, Sommese, Acta
+Numerica 20 (2011) 469 (where ways of moving meet); Eich, SIAM J. Numer. Anal. 30 (1993) 1467
+(errors of projected states).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._dynamics import Dynamics
+from jaxlag._forces import reads_lam
+from jaxlag._kkt import solve_general
+from jaxlag._step import Arguments, midway
+
+CHANGE_POINTS = ("pass", "stop")
+
+GAP = 0.35
+"""Of a step: stages before it are of low order, and are the more disturbed the nearer they are."""
+
+AT_HAND = 0.02
+"""Of a step: a place that is nearer to its start has no stages on either side."""
+
+ROOM = 0.9
+"""Of the length of steps: what that of the step across is to be."""
+
+BESIDE = 0.05
+"""Of the length of a row at the start of a step: not to end with less, if it can be helped."""
+
+AGAIN = 4.0
+"""Times what is allowed, that a step is taken to be off by which is taken again, shorter."""
+
+SHORT = 0.1
+"""Of the length of a row at the start of a motion: below it a place is near."""
+
+LOST = 1e-3
+"""Of the same: below it states are not moved along the row."""
+
+ROUNDINGS = 8
+"""Of a position that a length of 1 leaves."""
+
+NEARBY = 1e-2
+"""Change of coordinates, over 1 + |q|, for which rows may depend where ways cross."""
+
+
+class Crossing(NamedTuple):
+    """What is known of change points where a step starts.
+
+    Attributes:
+        apart: the least length of a row over its length at the start of the motion.
+        within: how far coordinates moved, over 1 + |q|, in steps that started where rows depend.
+        time: when the next place is to be expected; infinite where none is.
+    """
+
+    apart: Float[Array, ""]
+    within: Float[Array, ""]
+    time: Float[Array, ""]
+
+    def onwards(
+        self,
+        t0: Float[Array, ""],
+        t1: Float[Array, ""],
+        apart: Float[Array, ""],
+        moved: Float[Array, ""],
+    ) -> "Crossing":
+        """What is known at the end of a step, in which coordinates moved so far."""
+        lost = self.apart - apart
+        nearer = (apart > 0) & (apart < SHORT) & (lost > 0)
+        left = jnp.where(nearer, apart / jnp.where(nearer, lost, 1.0), jnp.inf).astype(t1.dtype)
+        within = jnp.where(self.depends, self.within + moved, 0.0)
+        return Crossing(apart, within, t1 + (t1 - t0) * left)
+
+    @property
+    def depends(self) -> Bool[Array, ""]:
+        """Whether rows depend on one another but for LOST."""
+        return self.apart <= LOST
+
+    @property
+    def passes(self) -> Bool[Array, ""]:
+        """Whether they did so for as short a way as where ways cross."""
+        return self.within <= NEARBY
+
+    @property
+    def is_near(self) -> Bool[Array, ""]:
+        """Whether a row has little apart from all others."""
+        return self.apart < SHORT
+
+    def is_beside(self, before: "Crossing") -> Bool[Array, ""]:
+        """Whether it is all but at the place, and the step before started away from it."""
+        return (self.apart < BESIDE * before.apart) & ~before.depends
+
+    def rounding(self) -> Float[Array, " 2"]:
+        """What rounding makes of coordinates and velocities of size 1 that are projected here."""
+        eps = float(jnp.finfo(self.apart.dtype).eps)
+        apart = jnp.maximum(self.apart, eps ** (1 / 3))
+        least = ROUNDINGS * eps / apart
+        return jnp.where(self.is_near, jnp.stack([least, least / apart]), 0.0)
+
+    def step(self, t: Float[Array, ""], h: Float[Array, ""], gap: float) -> Float[Array, ""]:
+        """A step no longer than h that has the place ahead between its stages, or leads up to it.
+
+        Args:
+            t: where it starts.
+            h: its length as proposed.
+            gap: see `widest_gap`.
+        """
+        left = self.time - t
+        near = (left > AT_HAND * h) & (left < h / AT_HAND)
+        left = jnp.where(near, left, h).astype(h.dtype)
+        across, approach = left / gap, jnp.minimum(left - ROOM * gap * h, h)
+        return jnp.where(near, jnp.where(across <= h, across, approach), h)
+
+
+def no_crossing(time: Float[Array, ""], dtype: Any) -> Crossing:
+    """What is known where a motion starts; times are of the dtype of `time`."""
+    far = jnp.full_like(time, jnp.inf)
+    return Crossing(jnp.ones((), dtype), jnp.zeros((), dtype), far)
+
+
+def widest_gap(nodes: Sequence[float]) -> float:
+    """The middle of the longest part of a step in which no stage lies."""
+    places = np.unique(np.clip([0.0, *nodes, 1.0], 0.0, 1.0))
+    middles, widths = 0.5 * (places[1:] + places[:-1]), np.diff(places)
+    return float(middles[np.argmax(np.where(middles >= GAP, widths, 0.0))])
+
+
+def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Float[Array, " m"]:
+    """1 / sqrt of effective masses: what rows have apart from all others, in the metric of M^-1.
+
+    0 of rows that were left out as they depend on others, 1 of those that are not kept.
+    """
+    masses = jax.lax.stop_gradient(masses)
+    lengths = jnp.where(masses > 0, jax.lax.rsqrt(jnp.where(masses > 0, masses, 1.0)), 0.0)
+    lengths = jnp.where(jnp.isnan(masses), jnp.nan, lengths)
+    return lengths if kept is None else jnp.where(kept, lengths, 1.0)
+
+
+def may_cross(dynamics: Dynamics) -> bool:
+    """Whether there are rows of which one may be left out for a moment.
+
+    Beyond the place the state is moved back onto all of them. A force that reads multipliers is not
+    known where these are not.
+    """
+    reads = any(map(reads_lam, dynamics.system.forces))
+    return dynamics.projects and may_stop(dynamics) and not reads
+
+
+def may_stop(dynamics: Dynamics) -> bool:
+    """Whether there are rows that accelerations are solved with."""
+    return dynamics.quasi is None and dynamics.rows.size > 0
+
+
+def same_sense(
+    dynamics: Dynamics,
+    t0: Array,
+    t1: Array,
+    y0: Array,
+    y1: Array,
+    args: Arguments,
+    turn: Array | None,
+) -> Bool[Array, ""]:
+    """Whether a step passes no change point: pivots of A(t) M^-1 A(t0)^T keep their signs.
+
+    Looked at in the middle and at the end of the step, over what they are at its start, where that
+    makes 1 of all of them. Ways that meet at one place change one sign each.
+
+    Args:
+        dynamics: what moves.
+        t0: start of the step.
+        t1: its end.
+        y0: state at its start.
+        y1: state at its end.
+        args: arguments of the step.
+        turn: h dy/dt at the start less that at the end; None where it is not known.
+    """
+    columns, m = dynamics.surface(t0, y0, args).columns, dynamics.rows.size
+    assert columns is not None
+    fine = jnp.array(True)
+    for tau, y in (midway(t0, t1, y0, y1, turn), (t1, y1)):
+        t, (q, v), (params, _) = dynamics.clock(tau, args), dynamics.parts(y), dynamics.given(args)
+        A, _ = dynamics.array.rows(t, q, v, params)
+        turned = A @ columns.T
+        if args.kept is not None:
+            both = args.kept[:, None] & args.kept[None]
+            turned = jnp.where(both, turned, jnp.eye(m, dtype=A.dtype))
+        fine = fine & solve_general(turned, jnp.zeros((m,), A.dtype), 0.0)[1]
+    return fine

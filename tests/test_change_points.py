@@ -1,0 +1,277 @@
+"""Change points: places where ways of moving meet are passed along the tangent, or stopped before.
+
+The windows benchmark of multibody dynamics (IFToMM A02): rods of length 1 in parallelograms, which
+lie flat twice in every turn. The motion on the parallelogram is that of one pendulum.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _families import mostly_full
+
+import jaxlag as jl
+from jaxlag._change_points import BESIDE, ROOM, SHORT, no_crossing, widest_gap
+from jaxlag._kkt import FORMULATIONS, solve_kkt
+from jaxlag._methods import METHODS
+from jaxlag._scheme import nodes_of
+
+EPS = np.finfo(float).eps
+SIDE = jnp.array([0.0, 1.0])  # where the fixed ends are
+SPEEDS = jnp.linspace(0.9, 1.5, 24)
+Q0 = jnp.array([0.0, 1.0, 1.0, 1.0])
+ENERGY = 1.5 * 9.81
+
+
+def rods(t, q, params):
+    """Both sides and the rod between them."""
+    ends = q.reshape(2, 2)
+    side, top = ends - jnp.stack([SIDE, jnp.zeros(2)], 1), ends[1] - ends[0]
+    return jnp.concatenate([jnp.sum(side**2, 1), jnp.sum(top**2)[None]]) - 1.0
+
+
+def window(t, q, v, params):
+    (a, b), heights = v.reshape(2, 2), q.reshape(2, 2)[:, 1]
+    T = (a @ a + b @ b) / 6 + (a @ a + b @ b + a @ b) / 6
+    return T - 9.81 * jnp.sum(heights)
+
+
+def parallelogram(lowering="auto"):
+    rows = (jl.Holonomic(rods, "rods"),)
+    return jl.System(window, ("x0", "y0", "x1", "y1"), constraints=rows, lowering=lowering)
+
+
+WINDOW = parallelogram()
+PENDULUM = jl.System(lambda t, q, v, p: 5 / 6 * v[0] ** 2 - 2 * 9.81 * jnp.cos(q[0]), ("theta",))
+
+
+def moved(speed, ts, rtol, system=WINDOW, **options):
+    """The motion from upright, with the tops at this speed."""
+    v0 = jnp.stack([speed, 0.0 * speed, speed, 0.0 * speed])
+    return jl.simulate(system, Q0, v0, ts, rtol=rtol, atol=rtol, throw=False, **options)
+
+
+def exact(speed, ts):
+    """x of the tops."""
+    tight = {"rtol": 1e-13, "atol": 1e-13, "throw": False}
+    return jnp.sin(jl.simulate(PENDULUM, jnp.zeros(1), speed[None], ts, **tight).q[:, 0])
+
+
+def test_flat_places_are_passed_at_every_tolerance():
+    """Three turns, with rows all along the way, near the places too."""
+    ts = jnp.linspace(0.0, 4.0, 161)
+    run = jax.jit(jax.vmap(moved, in_axes=(0, None, None)))
+    expected = jax.vmap(exact, in_axes=(0, None))(SPEEDS, ts)
+    # Measured: 1.3e-2, 2.7e-6, 1.3e-9, 9e-12 (of the pendulum itself 8e-4, 6e-6, 2e-9, 2e-11).
+    for rtol, off in ((1e-4, 5e-2), (1e-7, 1e-5), (1e-10, 5e-9), (1e-12, 4e-11)):
+        found = run(SPEEDS, ts, rtol)
+        assert (found.status == jl.Status.ok).all()
+        np.testing.assert_allclose(found.q[..., 0], expected, atol=off)
+        # On the branch that it came on: the top stays level.
+        np.testing.assert_allclose(found.q[..., 3], found.q[..., 1], atol=1e-12)
+
+
+def test_it_stops_before_them_where_told_to():
+    """At every tolerance, by its name; far from them nothing is different."""
+    run = jax.jit(jax.vmap(lambda s, e: moved(s, jnp.linspace(0, 2, 3), e, change_points="stop")))
+    tolerances = jnp.array([1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
+    found = run(jnp.ones(5), tolerances)
+    assert (found.status == jl.Status.rank_change).all()
+    assert found.change_points == "stop"
+    # Where the sine of the angle between rows is eps^(1/3); measured: 8e-7, 7e-8, 5e-10, 3e-12.
+    assert (jnp.abs(found.last_time - 0.70844878654) <= 1e-10 + tolerances).all()
+    np.testing.assert_allclose(found.last_state[0][:, 0], 1.0, atol=1e-10)
+
+
+@pytest.mark.full
+def test_the_row_is_named():
+    found = moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="stop")
+    assert "rank_change ('rods[" in found.message()
+    assert "change_points='stop'" in found.message()
+
+
+def test_another_word_is_an_error():
+    with pytest.raises(ValueError, match=r"change_points must be one of 'pass', 'stop'.*'go'"):
+        moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="go")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("lowering", ["auto", "array"])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("method", ["auto", "tsit5", "kvaerno5"])
+def test_all_forms_pass(lowering, formulation, method):
+    ts = jnp.linspace(0.0, 4.0, 41)
+    how = {"method": method, "formulation": formulation}
+    found = moved(jnp.ones(()), ts, 1e-9, parallelogram(lowering), **how)
+    assert found.status == jl.Status.ok
+    # Measured: 1.2e-8, 7e-8, 1.8e-6.
+    allowed = {"auto": 5e-8, "tsit5": 3e-7, "kvaerno5": 1e-5}[method]
+    np.testing.assert_allclose(found.q[:, 0], exact(jnp.ones(()), ts), atol=allowed)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("project", [False, jl.Baumgarte(5.0, 5.0)])
+def test_without_a_projection_it_stops(project):
+    """Beyond the place nothing would move the state back to the way that it came on."""
+    for rtol in (1e-6, 1e-9, 1e-12):
+        found = moved(jnp.ones(()), [0.0, 1.0], rtol, project=project)
+        assert found.status == jl.Status.rank_change
+        assert abs(found.last_time - 0.7084487865) < 1e-6
+
+
+@pytest.mark.full
+def test_fixed_steps_keep_their_order():
+    """Across the place, wherever in a step it lies; without constraints the slope is 8.2."""
+    ts = jnp.array([0.0, 0.6, 1.2])
+
+    @jax.jit
+    def off(dt):
+        v0 = jnp.array([1.0, 0.0, 1.0, 0.0])
+        found = jl.simulate(WINDOW, Q0, v0, ts, dt=dt, method="dopri8", throw=False)
+        return jnp.abs(found.q[-1, 0] - exact(jnp.ones(()), ts)[-1])
+
+    sizes = np.array([1 / 15, 1 / 20, 1 / 30])
+    slope = np.polyfit(np.log(sizes), np.log([float(off(h)) for h in sizes]), 1)[0]
+    assert 7.9 <= slope <= 8.8  # measured: 8.4, as the place lies nearer to the middle of steps
+
+
+@pytest.mark.full
+def test_derivatives_across():
+    """First ones forwards and backwards, and second ones, against those of the pendulum."""
+    ts = jnp.linspace(0.0, 3.0, 31)
+
+    def all_of(end):
+        slope = lambda s: jax.jvp(end, (s,), (1.0,))[1]  # noqa: E731
+        each = lambda s: (end(s), slope(s), jax.grad(end)(s), jax.jvp(slope, (s,), (1.0,))[1])  # noqa: E731
+        return jax.jit(jax.vmap(each))(SPEEDS)
+
+    found = all_of(lambda s: moved(s, ts, 1e-12).q[-1, 0])
+    expected = all_of(lambda s: exact(s, ts)[-1])
+    # Of 1,000 starts the worst: 1e-12, 2e-11, 1e-11, 5e-11.
+    for value, right in zip(found, expected, strict=True):
+        np.testing.assert_allclose(value, right, rtol=2e-10, atol=2e-12)
+
+
+def free(t, q, v, params):
+    return 0.5 * (v @ v)
+
+
+def along(curve, q0, v0, rtol):
+    """A bead along a curve, by nothing but its speed."""
+    system = jl.System(free, ("x", "y"), constraints=(jl.Holonomic(curve, "wire"),))
+    ts = jnp.linspace(0.0, 4.0, 9)
+    run = jax.vmap(lambda e: jl.simulate(system, q0, v0, ts, rtol=e, atol=e, throw=False))
+    return run(rtol)
+
+
+TOLERANCES = jnp.array([1e-4, 1e-6, 1e-9, 1e-12])
+
+
+def test_where_ways_cross_a_bead_goes_straight_on():
+    """A figure of eight, of which a quarter is 1.311 long: through its node, and once more."""
+    eight = lambda t, q, p: (q @ q) ** 2 - q[0] ** 2 + q[1] ** 2  # noqa: E731
+    found = along(eight, [1.0, 0.0], [0.0, 1.0], TOLERANCES)
+    assert (found.status == jl.Status.ok).all()
+    s = 4.0 - 3 * 1.3110287771460600  # beyond it
+    r = s - s**5 / 10  # the lemniscate's sine, to 5e-13
+    angle = np.pi / 4 - np.arcsin(r**2) / 2
+    off = np.linalg.norm(found.q[:, -1] - r * np.array([np.cos(angle), -np.sin(angle)]), axis=1)
+    # Measured: 1e-4, 8e-7, 5e-10, 1e-12.
+    assert (off <= np.array([1e-3, 1e-5, 1e-8, 2e-11])).all()
+    assert (found.q[:, 3] < 0).all()
+
+
+CURVES = {
+    "cusp": (lambda q: q[0] ** 2 - q[1] ** 3, [1.0, 1.0], [-1.5, -1.0]),
+    "osculating": (lambda q: q[1] ** 2 - q[0] ** 6, [-1.0, -1.0], [1.0, 3.0]),
+    "touching": (
+        lambda q: (q @ q - 2 * q[1]) * (q @ q + 2 * q[1]),
+        [1.0, 1.0],
+        [0.0, -1.0],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", mostly_full(list(CURVES), "cusp"))
+def test_where_ways_do_not_cross_a_bead_stops(name):
+    """At a cusp, and where two curves touch: at every tolerance, a little way before the place."""
+    curve, q0, v0 = CURVES[name]
+    found = along(lambda t, q, p: curve(q), q0, v0, TOLERANCES)
+    assert (found.status == jl.Status.rank_change).all()
+    np.testing.assert_allclose(found.last_time, found.last_time[-1], rtol=0.03)
+    off = np.abs(np.linalg.norm(found.last_state[1], axis=1) / np.linalg.norm(v0) - 1.0)
+    # Measured, the worst: 1.2e-2 (the last state is 3 mm beyond the cusp), 3e-7, 2e-10, 5e-13.
+    assert (off <= np.array([5e-2, 2e-6, 1e-9, 5e-12])).all()
+
+
+# ---- Steps that have the place ahead -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["dopri8", "tsit5", "prince9", "kvaerno5"])
+def test_no_stage_is_near_the_place(method):
+    """The step across is no longer than proposed, and its stages are as far as they can be."""
+    nodes = np.array([0.0, *nodes_of(METHODS[method]()), 1.0])
+    gap = widest_gap(nodes.tolist())
+    apart = np.min(np.abs(nodes - gap))
+    assert apart > 0.03
+    t, h = jnp.array(2.0), jnp.array(0.3)
+    for left in (0.05, 0.1, 0.25, 0.5, 0.8):
+        known = no_crossing(t, float)._replace(time=t + left * h)
+        step = float(known.step(t, h, gap))
+        assert step <= h
+        if left < gap:
+            np.testing.assert_allclose(left * h / step, gap, rtol=1e-12)
+        else:  # the next one does, and is about as long as proposed
+            across = float(known.step(t + step, h, gap))
+            np.testing.assert_allclose((left * 0.3 - step) / across, gap, rtol=1e-12)
+            np.testing.assert_allclose(across, ROOM * h, rtol=1e-12)
+
+
+def test_where_the_place_is_to_be_expected():
+    """A length that goes through zero as a straight line; none where it grows, or is long."""
+    t0, t1, t2 = jnp.array(0.0), jnp.array(1.0), jnp.array(1.5)
+    begin = no_crossing(t0, float)
+    moved = jnp.array(0.006)
+    first = begin.onwards(t0, t1, jnp.array(0.08), moved)
+    second = first.onwards(t1, t2, jnp.array(0.04), moved)
+    np.testing.assert_allclose(second.time, 2.0, rtol=1e-12)
+    assert second.is_near
+    assert jnp.isinf(second.onwards(t2, jnp.array(2.5), jnp.array(0.08), moved).time)
+    assert jnp.isinf(begin.onwards(t0, t1, jnp.array(2 * SHORT), moved).time)
+    assert second._replace(apart=jnp.array(BESIDE * 0.03)).is_beside(second)
+    assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
+    third = second.onwards(t2, jnp.array(2.0), jnp.array(0.0), 10 * moved)
+    assert third.depends
+    assert third.passes
+    fourth = third.onwards(jnp.array(2.0), jnp.array(2.1), jnp.array(0.0), moved)
+    assert fourth.passes
+    assert not fourth.onwards(jnp.array(2.1), jnp.array(2.2), jnp.array(0.2), moved).passes
+
+
+# ---- Rows that are left out ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize(("n", "m"), mostly_full([(3, 2), (6, 4), (12, 9)], (6, 4)))
+def test_a_row_that_depends_on_those_before_it_is_left_out(formulation, n, m):
+    """As if it were not there, and with no multiplier; else nothing is changed."""
+    rng = np.random.default_rng(n)
+    half = rng.normal(size=(n, n))
+    M, A, r = half @ half.T + np.eye(n), rng.normal(size=(m, n)), rng.normal(size=n)
+    mix, c = rng.normal(size=m - 1), rng.normal(size=m)
+    A[-1], c[-1] = mix @ A[:-1], mix @ c[:-1]
+
+    def solved(rows=slice(None), **options):
+        given = (jnp.asarray(x) for x in (M, A[rows], r, c[rows]))
+        return solve_kkt(*given, formulation=formulation, **options)
+
+    x, lam = solved(crossing=True)
+    expected, of_others = solved(slice(m - 1))
+    allowed = 100 * EPS * np.linalg.cond(M)
+    np.testing.assert_allclose(x, expected, atol=allowed * np.abs(expected).max())
+    np.testing.assert_allclose(lam[:-1], of_others, atol=allowed * np.abs(of_others).max())
+    assert lam[-1] == 0
+    assert np.isnan(solved()[0]).all()
+    A[-1] = rng.normal(size=n)
+    for one, other in zip(solved(crossing=True), solved(), strict=True):
+        np.testing.assert_array_equal(one, other)
