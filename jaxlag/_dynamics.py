@@ -360,19 +360,19 @@ class Dynamics(eqx.Module):
         v = self.velocities(t, q, v, params)
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
 
-        def corrections(chosen: list[int] | None) -> Array:
-            return self.array.correction(t, q, v, params, args.prepared, args.kept, chosen)
+        def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
+            return self.array.corrections(t, q, v, params, args.prepared, args.kept, chosen)
 
         def position(q: Array) -> Array:
             return terms.position(t, q, params)
 
         if self.quasi is not None:
-            near = corrections(holonomic)
+            near, _ = corrections(holonomic)
             return Surface(position, None, lambda c: near @ c, None)
-        K, masses = self.array.corrections(t, q, v, params, args.prepared, args.kept)
+        K, masses = corrections(None)
         K_of_position = K
         if 0 < len(holonomic) < self.rows.size:
-            K_of_position = corrections(holonomic)
+            K_of_position, _ = corrections(holonomic)
         return Surface(
             position if holonomic else None,
             lambda q, v: terms.velocity(t, q, v, params),

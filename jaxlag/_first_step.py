@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 
 def slope_and_step(
@@ -39,3 +39,42 @@ def slope_and_step(
 
 def _scaled_norm(controller: Any, y0: Array, x: Array) -> Array:
     return controller.norm(x / (controller.atol + controller.rtol * jnp.abs(y0)))
+
+
+def first_step(
+    solver: Any,
+    controller: Any,
+    term: Any,
+    t0: Array,
+    t1: Array,
+    y: PyTree,
+    args: Any,
+    guess: Array | None,
+) -> tuple[Array, Any]:
+    """(first adaptive step, the controller's state), by the controller's own estimate.
+
+    Args:
+        solver: the method.
+        controller: what chooses its steps.
+        term: vector field.
+        t0: start.
+        t1: end of the motion.
+        y: state at the start.
+        args: arguments of a step from there.
+        guess: the step; None where it is to be estimated.
+    """
+    order = solver.error_order(term)
+    dtype = jnp.result_type(*jax.tree.leaves(y))
+    if dtype == t0.dtype:
+        end, state = controller.init(term, t0, t1, y, guess, args, solver.func, order)
+        return jnp.asarray(end - t0), state
+
+    # diffrax estimates a first step only where time and state share a dtype: count from t0.
+    def func(term: Any, elapsed: Any, y: PyTree, args: Any) -> PyTree:
+        return solver.func(term, t0 + jnp.asarray(elapsed, t0.dtype), y, args)
+
+    guess = None if guess is None else guess.astype(dtype)
+    zero = jnp.zeros_like(t0, dtype)
+    span = (t1 - t0).astype(dtype)
+    end, state = controller.init(term, zero, span, y, guess, args, func, order)
+    return jnp.asarray(end, t0.dtype), state

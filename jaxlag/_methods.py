@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from jaxlag import _params
 from jaxlag._errors import bad
-from jaxlag._scheme import with_stages
+from jaxlag._tableaus import with_stages
 from jaxlag.solvers import (
     AbstractFixedStep,
     Dopri5,

@@ -22,11 +22,12 @@ from jaxlag._passage import usual
 from jaxlag._record import Times
 from jaxlag._replay import Problem, Setup
 from jaxlag._requirements import check_requirements, splits
-from jaxlag._scheme import Scheme, looks_ahead
+from jaxlag._scheme import Scheme
 from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
 from jaxlag._system import System
+from jaxlag._tableaus import looks_ahead
 from jaxlag._term import term_of
 from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages

@@ -16,14 +16,14 @@ from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._branches import branches
 from jaxlag._change_points import AGAIN, SHORT, Crossing, same_sense, widest_gap
-from jaxlag._first_step import slope_and_step
+from jaxlag._first_step import first_step, slope_and_step
 from jaxlag._passage import Passage, determinants, passage
 from jaxlag._perturbations import linearized, spectral_size, turning_rate
 from jaxlag._settling import Settling
 from jaxlag._step import Verdict, midway
+from jaxlag._tableaus import explicit_tableau, nodes_of, remembers
 from jaxlag._term import Term
-from jaxlag.solvers import AbstractExplicit, AbstractFixedStep, Splitting
-from jaxlag.solvers._explicit import tableau_of
+from jaxlag.solvers import AbstractExplicit, Splitting
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
 _SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
@@ -237,7 +237,7 @@ class Scheme(eqx.Module):
             self.term, t0, t1, y, args, memory, jump
         )
         solved = result == diffrax.RESULTS.successful
-        tableau = _explicit_tableau(self.solver)
+        tableau = explicit_tableau(self.solver)
         if self.controller is None or tableau is None:
             return y1, Estimate(error), memory, solved
         stages = unweighted_stages(tableau.b_sol, tableau.b_error)
@@ -410,7 +410,11 @@ class Scheme(eqx.Module):
         estimated = guess is None and type(controller) is diffrax.PIDController
         if not estimated or not isinstance(self.solver, AbstractExplicit):
             memory = self.begin(t0, t1, y, args)
-            return memory, self.is_sound(memory), *self._first_step(t0, t1, y, inside, guess)
+            return (
+                memory,
+                self.is_sound(memory),
+                *first_step(self.solver, controller, self.term, t0, t1, y, inside, guess),
+            )
         order = controller.error_order or self.solver.error_order(self.term)
 
         def field(t: Array, y: Array) -> Array:
@@ -424,28 +428,6 @@ class Scheme(eqx.Module):
         memory = slope if self.solver.shares_stages else None
         return memory, all_finite(slope), jnp.asarray(end - at, t0.dtype), state
 
-    def _first_step(
-        self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None
-    ) -> tuple[Array, Any]:
-        assert self.controller is not None
-        order = self.solver.error_order(self.term)
-        dtype = jnp.result_type(*jax.tree.leaves(y))
-        if dtype == t0.dtype:
-            end, state = self.controller.init(
-                self.term, t0, t1, y, guess, args, self.solver.func, order
-            )
-            return jnp.asarray(end - t0), state
-
-        # diffrax estimates a first step only where time and state share a dtype: count from t0.
-        def func(term: Any, elapsed: Any, y: PyTree, args: Any) -> PyTree:
-            return self.solver.func(term, t0 + jnp.asarray(elapsed, t0.dtype), y, args)
-
-        guess = None if guess is None else guess.astype(dtype)
-        zero = jnp.zeros_like(t0, dtype)
-        span = (t1 - t0).astype(dtype)
-        end, state = self.controller.init(self.term, zero, span, y, guess, args, func, order)
-        return jnp.asarray(end, t0.dtype), state
-
 
 _FINE = 64.0  # resolutions of time
 _ACROSS = 0.01  # of the change that an error across a bend may be, in tolerances
@@ -455,48 +437,6 @@ _UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of
 def all_finite(y: PyTree) -> Bool[Array, ""]:
     """Whether all numbers of a state are finite."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]))
-
-
-def remembers(solver: diffrax.AbstractSolver) -> bool:
-    """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
-    one_step = diffrax.AbstractRungeKutta | AbstractExplicit | AbstractFixedStep
-    return not isinstance(solver, one_step)
-
-
-def _explicit_tableau(solver: diffrax.AbstractSolver) -> Any:
-    """The coefficients of an explicit Runge-Kutta method; None of others, wrapped ones included."""
-    explicit = isinstance(solver, diffrax.AbstractERK)
-    return getattr(solver, "tableau", None) if explicit else None
-
-
-def looks_ahead(solver: diffrax.AbstractSolver) -> bool:
-    """Whether a method has stages beyond the end of its steps."""
-    return bool(np.max(nodes_of(solver), initial=0.0) > 1)
-
-
-def nodes_of(solver: diffrax.AbstractSolver) -> list[float]:
-    """Where in a step the stages of a Runge-Kutta method lie; none of other methods."""
-    if isinstance(solver, diffrax.HalfSolver):
-        return [0.5 * (half + c) for half in (0.0, 1.0) for c in (*nodes_of(solver.solver), 1.0)]
-    if isinstance(solver, AbstractExplicit):
-        return [float(c) for c in tableau_of(type(solver)).c]
-    tableau: Any = getattr(solver, "tableau", None)
-    tableaus = getattr(tableau, "tableaus", () if tableau is None else (tableau,))
-    return [float(c) for x in tableaus for c in x.c]
-
-
-def with_stages(solver: Any, kind: str) -> Any:
-    """A Runge-Kutta solver, wrapped or not, with its loop over stages of the given kind.
-
-    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying.
-    """
-    if isinstance(solver, diffrax.HalfSolver):
-        return eqx.tree_at(lambda s: s.solver, solver, with_stages(solver.solver, kind))
-    if isinstance(solver, AbstractExplicit):
-        return solver if kind == "lax" else replace(solver, looped=True)
-    if not isinstance(solver, diffrax.AbstractRungeKutta):
-        return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def resolution(t: Array) -> Array:

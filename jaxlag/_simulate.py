@@ -38,12 +38,13 @@ from jaxlag._patience import timed
 from jaxlag._placement import check_placement
 from jaxlag._pose import Plan, Values, pose, velocities_at
 from jaxlag._replay import solve
-from jaxlag._scheme import Scheme, remembers
+from jaxlag._scheme import Scheme
 from jaxlag._slowness import is_stiff
 from jaxlag._solution import Solution, over_rows
 from jaxlag._start import rows_hold
 from jaxlag._status import Status
 from jaxlag._system import System
+from jaxlag._tableaus import remembers
 from jaxlag.solvers import AbstractPartitioned
 
 MAX_STEPS = 16384

@@ -15,7 +15,8 @@ from jaxlag._lanes import LANES, in_batches
 from jaxlag._linear import LinearMap, linear
 from jaxlag._path import Change, Clock, Path, Walk
 from jaxlag._record import Outcome, Record, Times
-from jaxlag._scheme import Scheme, with_stages
+from jaxlag._scheme import Scheme
+from jaxlag._tableaus import with_stages
 from jaxlag._walk import backwards, forwards
 
 

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _families import mostly_full
+from mechanisms import four_bar, four_bar_start
 
 import jaxlag as jl
 from jaxlag._change_points import BESIDE, ROOM, SHORT, no_crossing, widest_gap
 from jaxlag._kkt import FORMULATIONS, solve_kkt
 from jaxlag._methods import METHODS
-from jaxlag._scheme import nodes_of
+from jaxlag._tableaus import nodes_of
+from systems._catalogue import ENTRIES
 
 EPS = np.finfo(float).eps
 SIDE = jnp.array([0.0, 1.0])  # where the fixed ends are
@@ -93,6 +95,56 @@ def test_the_row_is_named():
 def test_another_word_is_an_error():
     with pytest.raises(ValueError, match=r"change_points must be one of 'pass', 'stop'.*'go'"):
         moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="go")
+
+
+@pytest.mark.parametrize("rtol", mostly_full([1e-6, 1e-9, 1e-12], 1e-12))
+def test_a_fast_four_bar_passes_its_change_point(rtol):
+    """Three times; with its energy, and back to where it started."""
+    q0, v0, params = change_point_start()
+    options = {"throw": False, "rtol": rtol, "atol": rtol}
+    there = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
+    assert there.status == jl.Status.ok
+    # Measured: 2e-5, 1.3e-9, 3e-13 of 15 J; 4e-5, 6e-9, 1.4e-12.
+    energy = {1e-6: 1e-4, 1e-9: 1e-8, 1e-12: 5e-12}[rtol]
+    np.testing.assert_allclose(there.energy, there.energy[0], atol=energy)
+    q1, v1 = there.last_state
+    back = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
+    assert back.status == jl.Status.ok
+    np.testing.assert_allclose(back.q[-1], q0, atol=10 * energy)
+
+
+def change_point_start():
+    """(q, v, params) of a four-bar with a + d = b + c, which lies flat once in a turn."""
+    params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}
+    q0 = four_bar_start(1.0, params)
+    start = jl.assemble(four_bar, q0, [5.0, 0.0, 0.0], params, hold=("crank'",))
+    return start.q, start.v, params
+
+
+@pytest.mark.full
+def test_a_four_bar_stops_before_its_change_point():
+    q0, v0, params = change_point_start()
+    options = {"throw": False, "rtol": 1e-9, "atol": 1e-9}
+    stopped = jl.simulate(four_bar, q0, v0, [0.0, 3.0], params, change_points="stop", **options)
+    assert stopped.status == jl.Status.rank_change
+    assert "('pin[" in stopped.message()
+    np.testing.assert_allclose(stopped.last_state[0], [np.pi, 0.0, 0.0], atol=1e-4)
+
+
+@pytest.mark.full
+def test_a_row_at_a_change_point_is_none():
+    """A parallelogram folded flat at t = 2: steps pass by, and velocities there are anything."""
+    entry = ENTRIES["four_bar"]
+    params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
+    q0, ts = np.array([2.0, 0.0, 2.0 - np.pi]), np.linspace(0.0, 4.0, 41)
+    found = jl.simulate(entry.system, q0, [-1.0, 0.0, -1.0], ts, params, throw=False)
+    expected = q0 - ts[:, None] * np.array([1.0, 0.0, 1.0])
+    assert found.status in (jl.Status.rank_change, jl.Status.projection_failed)
+    told = np.isfinite(np.asarray(found.q)).all(axis=1)
+    assert told[:20].all()
+    assert not told[20]
+    np.testing.assert_allclose(found.q[told], expected[told], atol=1e-9)
+    np.testing.assert_allclose(found.v[told], expected[told] * 0 + [-1.0, 0.0, -1.0], atol=1e-8)
 
 
 @pytest.mark.full

@@ -15,8 +15,6 @@ from mechanisms import (
     bobs,
     cartesian,
     double_pendulum,
-    four_bar,
-    four_bar_start,
     led_pendulum,
     led_start,
     minimal,
@@ -28,7 +26,6 @@ from mechanisms import (
 )
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
 
 EPS = np.finfo(float).eps
 TS = np.linspace(0.0, 1.5, 7)
@@ -320,8 +317,8 @@ def test_a_start_at_a_dead_point():
 
 
 @pytest.mark.full
-def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
-    """Fast, by null spaces, and at the change point of a four-bar, where two branches meet."""
+def test_a_dead_point_is_passed_fast():
+    """Fast, by null spaces."""
     equal = {**SLIDER, "r": 1.0}
     q0, v0 = slider_start(0.5, 10.0, equal)
     options = {"throw": False, "rtol": 1e-9, "atol": 1e-9}
@@ -329,52 +326,6 @@ def test_a_dead_point_that_stops_a_motion_is_called_by_its_name():
         slider_crank, q0, v0, np.linspace(0, 3, 31), equal, formulation="null_space", **options
     )
     assert found.status == jl.Status.ok
-    q0, v0, params = change_point_start()
-    stopped = jl.simulate(four_bar, q0, v0, [0.0, 3.0], params, change_points="stop", **options)
-    assert stopped.status == jl.Status.rank_change
-    assert "('pin[" in stopped.message()
-    np.testing.assert_allclose(stopped.last_state[0], [np.pi, 0.0, 0.0], atol=1e-4)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("rtol", [1e-6, 1e-9, 1e-12])
-def test_a_fast_four_bar_passes_its_change_point(rtol):
-    """Three times; with its energy, and back to where it started."""
-    q0, v0, params = change_point_start()
-    options = {"throw": False, "rtol": rtol, "atol": rtol}
-    there = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
-    assert there.status == jl.Status.ok
-    # Measured: 2e-5, 1.3e-9, 3e-13 of 15 J; 4e-5, 6e-9, 1.4e-12.
-    energy = {1e-6: 1e-4, 1e-9: 1e-8, 1e-12: 5e-12}[rtol]
-    np.testing.assert_allclose(there.energy, there.energy[0], atol=energy)
-    q1, v1 = there.last_state
-    back = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
-    assert back.status == jl.Status.ok
-    np.testing.assert_allclose(back.q[-1], q0, atol=10 * energy)
-
-
-def change_point_start():
-    """(q, v, params) of a four-bar with a + d = b + c, which lies flat once in a turn."""
-    params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}
-    q0 = four_bar_start(1.0, params)
-    start = jl.assemble(four_bar, q0, [5.0, 0.0, 0.0], params, hold=("crank'",))
-    return start.q, start.v, params
-
-
-@pytest.mark.full
-def test_a_row_at_a_change_point_is_none():
-    """A parallelogram folded flat at t = 2: steps pass by, and velocities there are anything."""
-    entry = ENTRIES["four_bar"]
-    params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
-    q0, ts = np.array([2.0, 0.0, 2.0 - np.pi]), np.linspace(0.0, 4.0, 41)
-    found = jl.simulate(entry.system, q0, [-1.0, 0.0, -1.0], ts, params, throw=False)
-    expected = q0 - ts[:, None] * np.array([1.0, 0.0, 1.0])
-    assert found.status in (jl.Status.rank_change, jl.Status.projection_failed)
-    told = np.isfinite(np.asarray(found.q)).all(axis=1)
-    assert told[:20].all()
-    assert not told[20]
-    np.testing.assert_allclose(found.q[told], expected[told], atol=1e-9)
-    np.testing.assert_allclose(found.v[told], expected[told] * 0 + [-1.0, 0.0, -1.0], atol=1e-8)
 
 
 # ---- Links without mass --------------------------------------------------------------------------

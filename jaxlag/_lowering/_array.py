@@ -365,13 +365,9 @@ class ArrayTerms(Terms):
         params: Any,
         prepared: Any = None,
         kept: Bool[Array, " m"] | None = None,
-        chosen: Sequence[int] | None = None,
-    ) -> Float[Array, "n k"]:
-        """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero.
-
-        Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
-        """
-        return self.corrections(t, q, v, params, prepared, kept, chosen)[0]
+    ) -> Float[Array, "n m"]:
+        """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero."""
+        return self.corrections(t, q, v, params, prepared, kept)[0]
 
     def corrections(
         self,
@@ -383,7 +379,10 @@ class ArrayTerms(Terms):
         kept: Bool[Array, " m"] | None = None,
         chosen: Sequence[int] | None = None,
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
-        """The same, and the diagonal of (A M^-1 A^T)^-1."""
+        """The same, and the diagonal of (A M^-1 A^T)^-1.
+
+        Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
+        """
         M = self.mass(t, q, v, params) if getattr(prepared, "mass", None) is None else prepared.mass
         A, b = self.rows(t, q, v, params)
         if chosen is not None:
