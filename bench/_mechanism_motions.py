@@ -45,7 +45,10 @@ def compared(mechanism: Mechanism) -> Compared:
         singular = quasi is not None and quasi.singular and way == "quasi"
         due = "kinematics" if singular and outcome == "solution" else outcome
         if due in NAMED:
-            wrong = status not in NAMED[due] | (NAMED["kinematics"] if singular else set())
+            right = NAMED[due] | (NAMED["kinematics"] if singular else set())
+            if due == "contradictory" and not _holds(mechanism, prepared):
+                right = right | {"inconsistent_start"}
+            wrong = status not in right
             found[f"{way}: {status} where rows or masses are {due}"] = np.inf if wrong else 0.0
         elif status == "ok":
             ends[way] = _end(mechanism, motion)
@@ -82,6 +85,15 @@ def _motion(mechanism: Mechanism, prepared: Prepared, way: str, tolerance: float
         max_steps=2000,
         throw=False,
     )
+
+
+def _holds(mechanism: Mechanism, prepared: Prepared) -> bool:
+    """Whether velocities satisfy the rows that say something; where these contradict, none do."""
+    A, b, v = prepared.terms.A, prepared.terms.b, prepared.state.v
+    void = np.array([row.role == "void" for row in mechanism.all_rows], bool)
+    size = np.abs(A) @ np.abs(v) + np.abs(b)
+    eps = float(jnp.finfo(mechanism.drawn.dtype).eps)
+    return bool(np.all((np.abs(A @ v + b) <= eps**0.5 * size)[~void]))
 
 
 def _end(mechanism: Mechanism, motion: jl.Solution) -> np.ndarray:
