@@ -19,11 +19,10 @@ times in "dopri8"). So near the place
   with stages as they come);
 - what rounding makes of a projected state is accepted: shorter steps do not improve it.
 
-That is so where ways cross. Where they touch, or one ends in a cusp, rows depend for longer than a
-way of NEARBY: there the motion stops.
-
 Where the place lies is told by s = 1 / sqrt(effective mass), the length of what a row has apart
-from all others in the metric of M^-1: it goes through 0 there, as a straight line.
+from all others in the metric of M^-1: it goes through 0 there, as a straight line. Where ways
+touch, or one ends in a cusp, it does so as a higher power of the way to the place, so that rows
+depend for LONGER than that line says: there the motion stops.
 
 A state that lies at the place but for LOST is not moved along the row, as rounding of positions
 would become 1 / s times as much of velocities, and once more as positions turn these. Its error
@@ -47,7 +46,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._dynamics import Dynamics
 from jaxlag._forces import reads_lam
-from jaxlag._kkt import solve_general
+from jaxlag._kkt import solve_general, units_of
 from jaxlag._step import Arguments, midway
 
 CHANGE_POINTS = ("pass", "stop")
@@ -76,8 +75,9 @@ LOST = 1e-3
 ROUNDINGS = 8
 """Of a position that a length of 1 leaves."""
 
-NEARBY = 1e-2
-"""Change of coordinates, over 1 + |q|, for which rows may depend where ways cross."""
+LONGER = 2.5
+"""Times the way that rows depend for where ways cross. It is 7 at cusps x^2 = y^3, 20 where ways
+touch."""
 
 
 class Crossing(NamedTuple):
@@ -85,12 +85,15 @@ class Crossing(NamedTuple):
 
     Attributes:
         apart: the least length of a row over its length at the start of the motion.
-        within: how far coordinates moved, over 1 + |q|, in steps that started where rows depend.
+        within: the way that was covered where rows depend; as `span`, in kg^1/2 m.
+        span: the change of coordinates in which the row would lose all of its length, as the step
+            tells it that came nearer; infinite where none did.
         time: when the next place is to be expected; infinite where none is.
     """
 
     apart: Float[Array, ""]
     within: Float[Array, ""]
+    span: Float[Array, " n"]
     time: Float[Array, ""]
 
     def onwards(
@@ -98,14 +101,27 @@ class Crossing(NamedTuple):
         t0: Float[Array, ""],
         t1: Float[Array, ""],
         apart: Float[Array, ""],
-        moved: Float[Array, ""],
+        moved: Float[Array, " n"],
     ) -> "Crossing":
-        """What is known at the end of a step, in which coordinates moved so far."""
+        """What is known at the end of a step, in which coordinates moved so far.
+
+        Args:
+            t0: start of the step.
+            t1: its end.
+            apart: see `Crossing`, at its end.
+            moved: change of coordinates, in units in which their inertias are 1.
+        """
         lost = self.apart - apart
-        nearer = (apart > 0) & (apart < SHORT) & (lost > 0)
+        falls = lost > 0
+        nearer = (apart > 0) & (apart < SHORT) & falls
         left = jnp.where(nearer, apart / jnp.where(nearer, lost, 1.0), jnp.inf).astype(t1.dtype)
-        within = jnp.where(self.depends, self.within + moved, 0.0)
-        return Crossing(apart, within, t1 + (t1 - t0) * left)
+        fresh = jnp.where(falls, jnp.abs(moved) / jnp.where(falls, lost, 1.0), jnp.inf)
+        # Rows that vanish as a power of the way do so the slower the nearer they are.
+        stays = self.depends | (self.is_near & (jnp.sum(self.span) < jnp.sum(fresh)))
+        span = jnp.where(stays, self.span, fresh)
+        part = jnp.where(apart > 2 * LOST, 2 * LOST / jnp.where(apart > 0, apart, 1.0), 1.0)
+        within = jnp.where(self.depends, self.within + part * jnp.linalg.norm(moved), 0.0)
+        return Crossing(apart, within, span, t1 + (t1 - t0) * left)
 
     @property
     def depends(self) -> Bool[Array, ""]:
@@ -115,7 +131,7 @@ class Crossing(NamedTuple):
     @property
     def passes(self) -> Bool[Array, ""]:
         """Whether they did so for as short a way as where ways cross."""
-        return self.within <= NEARBY
+        return self.within <= LONGER * 2 * LOST * jnp.linalg.norm(self.span)
 
     @property
     def is_near(self) -> Bool[Array, ""]:
@@ -126,12 +142,26 @@ class Crossing(NamedTuple):
         """Whether it is all but at the place, and the step before started away from it."""
         return (self.apart < BESIDE * before.apart) & ~before.depends
 
-    def rounding(self) -> Float[Array, " 2"]:
-        """What rounding makes of coordinates and velocities of size 1 that are projected here."""
+    def rounding(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], units: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """What rounding makes of coordinates and velocities that are projected here; else 0.
+
+        Args:
+            q: coordinates.
+            v: velocities.
+            units: of the coordinates, in which their inertias are 1.
+        """
         eps = float(jnp.finfo(self.apart.dtype).eps)
         apart = jnp.maximum(self.apart, eps ** (1 / 3))
         least = ROUNDINGS * eps / apart
-        return jnp.where(self.is_near, jnp.stack([least, least / apart]), 0.0)
+        span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
+        extent = units * span
+        length = jnp.linalg.norm(span)
+        rate = jnp.linalg.norm(v / units) / jnp.where(length > 0, length, 1.0)
+        positions, velocities = jnp.abs(q) + extent, (jnp.abs(v) + rate * extent) / apart
+        near = jnp.where(self.is_near, least, 0.0)
+        return near * positions, near * velocities
 
     def step(self, t: Float[Array, ""], h: Float[Array, ""], gap: float) -> Float[Array, ""]:
         """A step no longer than h that has the place ahead between its stages, or leads up to it.
@@ -148,10 +178,10 @@ class Crossing(NamedTuple):
         return jnp.where(near, jnp.where(across <= h, across, approach), h)
 
 
-def no_crossing(time: Float[Array, ""], dtype: Any) -> Crossing:
-    """What is known where a motion starts; times are of the dtype of `time`."""
-    far = jnp.full_like(time, jnp.inf)
-    return Crossing(jnp.ones((), dtype), jnp.zeros((), dtype), far)
+def no_crossing(time: Float[Array, ""], n: int, dtype: Any) -> Crossing:
+    """What is known where a motion of n coordinates starts; times are of the dtype of `time`."""
+    one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
+    return Crossing(one, zero, jnp.full((n,), jnp.inf, dtype), jnp.full_like(time, jnp.inf))
 
 
 def widest_gap(nodes: Sequence[float]) -> float:
@@ -170,6 +200,12 @@ def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Fl
     lengths = jnp.where(masses > 0, jax.lax.rsqrt(jnp.where(masses > 0, masses, 1.0)), 0.0)
     lengths = jnp.where(jnp.isnan(masses), jnp.nan, lengths)
     return lengths if kept is None else jnp.where(kept, lengths, 1.0)
+
+
+def units_at(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Float[Array, " n"]:
+    """Units of the coordinates in which their inertias at a state are 1."""
+    t, q, v, params = dynamics.state(tau, y, args)
+    return units_of(dynamics.mass(tau, y, args), dynamics.terms.rows(t, q, v, params)[0])
 
 
 def may_cross(dynamics: Dynamics) -> bool:

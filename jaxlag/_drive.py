@@ -140,7 +140,7 @@ def drive(
         sound = scheme.is_sound(memory)
     jumps = times.knots is not None or not scheme.standard
     determinants = scheme.determinants(t0, y0, args)
-    crossing = None if args.lengths is None else no_crossing(t0, args.lengths.dtype)
+    crossing = None if args.lengths is None else no_crossing(t0, args.units.size, args.units.dtype)
     start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))

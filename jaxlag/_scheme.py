@@ -11,7 +11,6 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._branches import branches
@@ -387,13 +386,12 @@ class Scheme(eqx.Module):
             y, verdict, error = settle.with_error(t, y, args, cast(Array, error), crossing.is_near)
         assert verdict.apart is not None
         parts = cast(Term, self.term).dynamics.parts
-        (q0, _), (q, _) = parts(y0), parts(y)
-        moved = jnp.max(jnp.abs(q - q0) / (1.0 + jnp.abs(q0)))
-        ends = crossing.onwards(t0, t, verdict.apart, moved)
+        (q0, _), (q, v) = parts(y0), parts(y)
+        ends = crossing.onwards(t0, t, verdict.apart, (q - q0) / args.units)
         if error is None:
             return y, verdict, estimate, ends
-        rounding = ends.rounding()[np.where(np.arange(y.size) < q.size, 0, 1)]
-        error = jnp.where(jnp.abs(error) <= rounding * (1.0 + jnp.abs(y)), 0.0, error)
+        rounding = jnp.concatenate([*ends.rounding(q, v, args.units), 0.0 * y[2 * q.size :]])
+        error = jnp.where(jnp.abs(error) <= rounding, 0.0, error)
         controller = self.controller
         if isinstance(controller, diffrax.PIDController):
             again = ends.is_beside(crossing) & ~bound

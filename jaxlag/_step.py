@@ -72,6 +72,7 @@ class Arguments(NamedTuple):
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     usual: Float[Array, " b"] | None = None  # see `jaxlag._passage.usual`
     lengths: Float[Array, " m"] | None = None  # of rows at the start, see `jaxlag._change_points`
+    units: Float[Array, " n"] | None = None  # of coordinates, with inertias of 1 at the start
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:
