@@ -282,12 +282,9 @@ def contradictory(quick: bool) -> Found:
     return must_end(run(system, [0.0, 0.0], [0.0, 0.0], [0.0, 1.0], {}))
 
 
-FOLDED = ("rank_change", "projection_failed", "step_below_resolution", "max_steps", "nonfinite")
-
-
-@rows.row("parallelogram through its folded position", "change of H, J", 1e-6, FOLDED)
+@rows.row("parallelogram through its folded position", "change of H, J", 1e-6)
 def folded(quick: bool) -> Found:
-    """All links on one line, where the mechanism may go on in two ways."""
+    """All links on one line, where the mechanism may go on in two ways, and a state is saved."""
     entry = four_bar.entry
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
     crank = 2.0

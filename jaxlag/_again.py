@@ -21,6 +21,8 @@ class _Slots(NamedTuple):
     used: Array
     to_row: Array
     jumps: Array | None
+    reaches: Array | None
+    turn_ends: Array | None
 
 
 def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Array | None]:
@@ -29,10 +31,11 @@ def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Arr
     index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
     ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
     begins = jnp.concatenate([anchors[:1], ends[:-1]])
-    used = (index < record.turns) & (ends > begins)
+    used, reaches = (index < record.turns) & (ends > begins), clock.reach(ends, anchors)
     if record.row_turn is None:
         still = jnp.zeros_like(used)
-        return _Slots(begins, ends, used, still, record.jumps), index, None
+        whole = (None, None) if reaches is None else (reaches, ends)
+        return _Slots(begins, ends, used, still, record.jumps, *whole), index, None
     turn = record.row_turn[:-1]
     count = turn.shape[0]
     reached = turn < record.turns
@@ -47,12 +50,17 @@ def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Arr
         return out.at[place].set(rows, mode="drop")
 
     safe = jnp.where(reached, turn, 0)
+    whole = (None, None)
+    if reaches is not None:
+        assert record.row_reach is not None
+        whole = merged(reaches, record.row_reach[:-1]), merged(ends, ends[safe])
     slots = _Slots(
         merged(begins, begins[safe]),
         merged(ends, saves[1:-1]),
         merged(used, reached),
         merged(jnp.zeros_like(used), reached),
         None if record.jumps is None else merged(record.jumps, record.jumps[safe]),
+        *whole,
     )
     return slots, of_turn, of_row
 
@@ -76,13 +84,17 @@ def again(
     begins = jnp.where(slots.used, slots.begins, slots.begins[first])
     ends = jnp.where(slots.used, slots.ends, slots.ends[first])
     slots = slots._replace(begins=begins, ends=ends)
+    if slots.turn_ends is not None:
+        turn_ends = jnp.where(slots.used, slots.turn_ends, slots.turn_ends[first])
+        slots = slots._replace(turn_ends=turn_ends)
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def step(t: Array, end: Array, y: PyTree, jump: Array | None) -> PyTree:
-        return path.ahead(path.with_args(moved), t, end, jump, y)
+    def step(slot: _Slots, y: PyTree) -> PyTree:
+        args, jump, rest = path.with_args(moved), slot.jumps, (slot.reaches, slot.turn_ends)
+        return path.ahead(args, slot.begins, slot.ends, jump, y, *rest)
 
     def one(y: PyTree, slot: _Slots) -> tuple[PyTree, tuple[PyTree, PyTree]]:
-        new = step(slot.begins, slot.ends, pick(slot.used, y, start), slot.jumps)
+        new = step(slot, pick(slot.used, y, start))
         return pick(slot.used & ~slot.to_row, new, y), (y, new)
 
     def chunk(y: PyTree, slots: _Slots) -> tuple[PyTree, PyTree]:

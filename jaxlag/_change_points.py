@@ -17,7 +17,11 @@ times in "dopri8"). So near the place
   beside it: rounding is eps / T^2 in accelerations, and more in their derivatives (Hessians along
   1,000 motions of a parallelogram at a tolerance of 1e-12: off by 5e-11 at most, and by up to 2e-2
   with stages as they come);
-- what rounding makes of a projected state is accepted: shorter steps do not improve it.
+- what rounding makes of a projected state is accepted: shorter steps do not improve it;
+- a step of which a stage meets the place is not taken;
+- what is saved in a step across is interpolated where a step to it would have a stage at the place:
+  by the polynomial of degree 5 through the ends of that step, which is a short one. A motion that
+  ends at the place does so by that through the ends of a step half the way there.
 
 Where the place lies is told by s = 1 / sqrt(effective mass), the length of what a row has apart
 from all others in the metric of M^-1: it goes through 0 there, as a straight line. Where ways
@@ -62,6 +66,19 @@ ROOM = 0.9
 
 BESIDE = 0.05
 """Of the length of a row at the start of a step: not to end with less, if it can be helped."""
+
+NARROW = 0.015
+"""Of the length of a row at the start of a motion: where a step across begins in which states are
+saved, or in which the motion ends. A polynomial through its ends is off by 1e-12."""
+
+CLOSE = 0.005
+"""Of the same: what is nearer to the place is interpolated."""
+
+AHEAD = 0.5
+"""Of the same: below it a place is looked out for."""
+
+UNLIKE = 10.0
+"""Tolerances that a step to what is saved is off by where one of its stages meets a place."""
 
 AGAIN = 4.0
 """Times what is allowed, that a step is taken to be off by which is taken again, shorter."""
@@ -113,7 +130,7 @@ class Crossing(NamedTuple):
         """
         lost = self.apart - apart
         falls = lost > 0
-        nearer = (apart > 0) & (apart < SHORT) & falls
+        nearer = (apart > 0) & (apart < AHEAD) & falls
         left = jnp.where(nearer, apart / jnp.where(nearer, lost, 1.0), jnp.inf).astype(t1.dtype)
         fresh = jnp.where(falls, jnp.abs(moved) / jnp.where(falls, lost, 1.0), jnp.inf)
         # Rows that vanish as a power of the way do so the slower the nearer they are.
@@ -127,6 +144,11 @@ class Crossing(NamedTuple):
     def depends(self) -> Bool[Array, ""]:
         """Whether rows depend on one another but for LOST."""
         return self.apart <= LOST
+
+    @property
+    def stands(self) -> Bool[Array, ""]:
+        """Whether it is at the place, as accelerations and velocities tell it."""
+        return self.apart <= unknown_below(self.apart.dtype)
 
     @property
     def passes(self) -> Bool[Array, ""]:
@@ -143,45 +165,128 @@ class Crossing(NamedTuple):
         return (self.apart < BESIDE * before.apart) & ~before.depends
 
     def rounding(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], units: Float[Array, " n"]
+        self,
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        columns: Float[Array, "m n"],
+        args: Arguments,
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """What rounding makes of coordinates and velocities that are projected here; else 0.
+
+        A row is wrong by roundings of what it reads, and the projection moves coordinates by as
+        much over what it has apart from others; velocities by that over the time to the place.
 
         Args:
             q: coordinates.
             v: velocities.
-            units: of the coordinates, in which their inertias are 1.
+            columns: of the matrix of the projection.
+            args: arguments of the step.
         """
-        eps = float(jnp.finfo(self.apart.dtype).eps)
-        apart = jnp.maximum(self.apart, eps ** (1 / 3))
-        least = ROUNDINGS * eps / apart
+        assert args.units is not None
+        assert args.slopes is not None
+        least = ROUNDINGS * float(jnp.finfo(self.apart.dtype).eps)
         span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
-        extent = units * span
         length = jnp.linalg.norm(span)
-        rate = jnp.linalg.norm(v / units) / jnp.where(length > 0, length, 1.0)
-        positions, velocities = jnp.abs(q) + extent, (jnp.abs(v) + rate * extent) / apart
+        rate = jnp.linalg.norm(v / args.units) / jnp.where(length > 0, length, 1.0)
+        spread = jnp.abs(columns).T @ args.slopes
+        positions = jnp.abs(q) + spread @ (jnp.abs(q) + args.units * span)
+        soon = rate / jnp.maximum(self.apart, float(jnp.finfo(self.apart.dtype).eps) ** (1 / 3))
+        velocities = jnp.abs(v) + spread @ jnp.abs(v) + soon * positions
         near = jnp.where(self.is_near, least, 0.0)
         return near * positions, near * velocities
 
-    def step(self, t: Float[Array, ""], h: Float[Array, ""], gap: float) -> Float[Array, ""]:
+    def noise(
+        self, v: Float[Array, " n"], args: Arguments
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """What single stages may differ by in changes of coordinates and of velocities; else 0.
+
+        Those across the ways are not of the motion, and the projection removes what they do.
+
+        Args:
+            v: velocities.
+            args: arguments of the step.
+        """
+        assert args.units is not None
+        part = jnp.where(self.is_near, float(jnp.finfo(self.apart.dtype).eps) ** (1 / 3), 0.0)
+        span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
+        speed = jnp.linalg.norm(v / args.units)
+        return part * args.units * jnp.linalg.norm(span), part * args.units * speed
+
+    def step(
+        self,
+        t: Float[Array, ""],
+        h: Float[Array, ""],
+        gap: float,
+        stop: Float[Array, ""] | float = np.inf,
+        due: Float[Array, ""] | float = np.inf,
+    ) -> Float[Array, ""]:
         """A step no longer than h that has the place ahead between its stages, or leads up to it.
+
+        What is saved within a step across is interpolated: that step is a short one. So is the
+        last one of a motion that ends at the place. One that ends beyond it has its start where
+        the place is between its stages.
 
         Args:
             t: where it starts.
             h: its length as proposed.
             gap: see `widest_gap`.
+            stop: where the motion ends.
+            due: the next save time.
         """
-        left = self.time - t
-        near = (left > AT_HAND * h) & (left < h / AT_HAND)
-        left = jnp.where(near, left, h).astype(h.dtype)
-        across, approach = left / gap, jnp.minimum(left - ROOM * gap * h, h)
-        return jnp.where(near, jnp.where(across <= h, across, approach), h)
+        left = jnp.asarray(self.time - t, h.dtype)
+        ahead = (left > 0) & (left < h / AT_HAND)
+        left = jnp.where(ahead, left, h)
+        across, approach = left / gap, left - ROOM * gap * h
+        near = ahead & self.is_near & (left > AT_HAND * h)
+        found = jnp.where(near & (across > h), approach, jnp.where(near, across, h))
+        # To a last step that has the place at `gap`, and to a short one.
+        lead = left - gap / (1 - gap) * jnp.asarray(stop - self.time, h.dtype)
+        cut = near & (stop > self.time) & (stop < t + across) & (lead > AT_HAND * left)
+        found = jnp.where(cut, lead, found)
+        saved, ends = ahead & (due < t + jnp.maximum(across, h)), self.is_at(t, stop)
+        found = jnp.where(ends, h, jnp.where(saved & ~cut, across, found))
+        part = 1.0 - jnp.maximum(NARROW / jnp.where(ahead, self.apart, 1.0), 0.1)
+        found = jnp.where((saved | ends) & (part > AT_HAND), part * left, found)
+        return jnp.minimum(found, h)
+
+    def is_at(self, t: Float[Array, ""], time: Float[Array, ""] | float) -> Bool[Array, ""]:
+        """Whether a time is that of the place ahead, but for CLOSE.
+
+        Args:
+            t: now.
+            time: the other one.
+        """
+        pace = (self.time - t) / self.apart
+        return jnp.isfinite(self.time) & (pace > 0) & (jnp.abs(self.time - time) <= CLOSE * pace)
+
+
+def unknown_below(dtype: Any) -> float:
+    """Where so little of a row is left, over what there is at the start, rounding is the rest."""
+    return 2 * float(jnp.finfo(dtype).eps) ** (1 / 3)
 
 
 def no_crossing(time: Float[Array, ""], n: int, dtype: Any) -> Crossing:
     """What is known where a motion of n coordinates starts; times are of the dtype of `time`."""
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     return Crossing(one, zero, jnp.full((n,), jnp.inf, dtype), jnp.full_like(time, jnp.inf))
+
+
+def is_across(
+    begin: Crossing, end: Crossing, saved: Crossing, sound: Bool[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether what is saved within a step is to be interpolated.
+
+    Where the step to it met a place, or where it lies at one, in a short step also near one.
+
+    Args:
+        begin: what is known at the start of the step.
+        end: at its end.
+        saved: at the end of a step to what is saved.
+        sound: whether that went well.
+    """
+    at_it = saved.stands | (saved.depends & (begin.apart < 2 * NARROW))
+    apart = jnp.minimum(jnp.minimum(begin.apart, end.apart), saved.apart)
+    return (at_it | ~sound) & ~(apart >= AHEAD)  # NaN where a stage met it
 
 
 def widest_gap(nodes: Sequence[float]) -> float:
@@ -202,10 +307,13 @@ def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Fl
     return lengths if kept is None else jnp.where(kept, lengths, 1.0)
 
 
-def units_at(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Float[Array, " n"]:
-    """Units of the coordinates in which their inertias at a state are 1."""
+def scales_at(
+    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+) -> tuple[Float[Array, " n"], Float[Array, "m n"]]:
+    """Units of the coordinates in which their inertias at a state are 1, and |A| there."""
     t, q, v, params = dynamics.state(tau, y, args)
-    return units_of(dynamics.mass(tau, y, args), dynamics.terms.rows(t, q, v, params)[0])
+    A = dynamics.terms.rows(t, q, v, params)[0]
+    return units_of(dynamics.mass(tau, y, args), A), jnp.abs(A)
 
 
 def may_cross(dynamics: Dynamics) -> bool:

@@ -9,7 +9,7 @@ solver; its interpolant need not be. So the program holds one step.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._change_points import Crossing, no_crossing
+from jaxlag._change_points import AHEAD, UNLIKE, Crossing, is_across, no_crossing
 from jaxlag._lanes import at_most
 from jaxlag._put import put
-from jaxlag._record import Outcome, Record, Times
-from jaxlag._scheme import Estimate, Scheme, all_finite, resolution
+from jaxlag._record import Outcome, Reach, Record, Times, step_end
+from jaxlag._scheme import SINGULAR, Estimate, Scheme, all_finite, resolution
 from jaxlag._status import Status
 
 # The record is a whole number of chunks of this many turns.
@@ -48,6 +48,7 @@ class _Rows(NamedTuple):
     next: Array  # index of the row that is due next
     values: PyTree  # one more for what is not kept
     turns: Array | None  # `Record.row_turn`
+    reaches: Array | None  # `Record.row_reach`
     missed: Array
 
 
@@ -75,6 +76,7 @@ class _Carry(NamedTuple):
     turn: Array  # number of those in which any lane took a step
     rows: _Rows | None
     kept: _Kept | None
+    reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
 
 
 class _Loop(NamedTuple):
@@ -141,6 +143,7 @@ def drive(
     jumps = times.knots is not None or not scheme.standard
     determinants = scheme.determinants(t0, y0, args)
     crossing = None if args.lengths is None else no_crossing(t0, args.units.size, args.units.dtype)
+    reaches_beyond = crossing is not None and scheme.controller is not None
     start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
@@ -148,7 +151,8 @@ def drive(
     if not at_most(count, 2):
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = _buffer(count - 1, y0, jnp.nan)
-        rows = _Rows(start, zero, zero, values, places, zero)
+        reaches = jnp.zeros_like(places) if reaches_beyond and places is not None else None
+        rows = _Rows(start, zero, zero, values, places, reaches, zero)
     if record:
         kept = _Kept(
             offsets=_buffer(size, t0, 0.0),
@@ -171,6 +175,7 @@ def drive(
         turn=zero,
         rows=rows,
         kept=kept,
+        reach=zero if reaches_beyond else None,
     )
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
@@ -206,7 +211,8 @@ def _outcome(c: _Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     record = None
     if c.kept is not None:
         row_turn = None if c.rows is None else c.rows.turns
-        record = Record(*c.kept, c.turn, row_turn)
+        row_reach = None if c.rows is None else c.rows.reaches
+        record = Record(*c.kept, c.turn, row_turn, row_reach, c.reach)
     ends = (c.status, c.at.t, c.at.y, c.tried, c.accepted, c.attempted)
     missed = jnp.zeros((), jnp.int32) if c.rows is None else c.rows.missed
     return Outcome(*ends, rows, missed, record, jnp.zeros((), jnp.int32))
@@ -241,7 +247,10 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     scheme, times, t = loop.scheme, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
     fixed = scheme.controller is None
-    h = c.h if c.at.crossing is None or fixed else c.at.crossing.step(t, c.h, scheme.gap)
+    h = c.h
+    if c.at.crossing is not None and not fixed:
+        following = jnp.inf if c.rows is None else loop.dues[c.rows.next]
+        h = c.at.crossing.step(t, c.h, scheme.gap, times.stop, following)
     goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + h
     boundary, boundary_anchor = _next_boundary(times, t)
     slack = jnp.maximum(1e-10 * (goal - t), resolution(boundary))
@@ -254,22 +263,43 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         to_row = _is_due(loop, c)
         begin = _select(to_row, c.rows.base, c.at)
         t1 = jnp.where(to_row, due, t1)
+    end, reach = t1, None  # of the step, and how the state at t1 follows from it
+    if c.reach is not None:
+        # A motion may end at such a place: rows of its last step are then reached alike.
+        assert begin.crossing is not None
+        there = (t1 >= times.stop) & begin.crossing.is_at(begin.t, t1)
+        beyond = jnp.where(to_row, c.reach == Reach.beyond, there)
+        reach = jnp.where(beyond, int(Reach.beyond), int(Reach.step))
+        end = step_end(reach, begin.t, t1, t1)
     jumped = False if begin.jump is None else begin.jump
     args = scheme.within(loop.args, begin.t)
-    step = (begin.t, t1, begin.y, args, begin.memory, jumped, begin.crossing)
+    step = (begin.t, end, begin.y, args, begin.memory, jumped, begin.crossing)
     y1, estimate, memory, solved = scheme.step(*step)
     finite = all_finite(y1)
-    ends = (begin.t, t1, begin.y, y1, args, estimate, begin.crossing, lands | to_row)
+    ends = (begin.t, end, begin.y, y1, args, estimate, begin.crossing, lands | to_row)
     settled, verdict, estimate, crossing = scheme.settled_with_error(*ends)
-    step = (begin.t, t1, begin.y, settled, args, estimate.turn)
+    step = (begin.t, end, begin.y, settled, args, estimate.turn)
     passage = scheme.passage(*step, begin.determinants)
     regular, share, determinants = (jnp.array(True), None, None) if passage is None else passage
     crossable = independent = scheme.same_sense(*step)
+    met = jnp.array(False)  # a change point, by a stage
     if crossing is not None:
-        crossable, independent = crossing.passes, ~crossing.depends
+        # A step from such a place, or one of equal steps to it, has a stage there.
+        assert begin.crossing is not None
+        stands = begin.crossing.stands | (crossing.stands if fixed else False)
+        met = (begin.crossing.apart < AHEAD) & ~finite
+        crossable, independent = crossing.passes & ~stands & ~met, ~crossing.depends
     good = finite & solved & ((regular & crossable) | to_row) & verdict.good
     rest = (estimate, good, cut, share, regular | to_row)
     keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
+    across = jnp.array(False)
+    if reach is not None:
+        sound = good & scheme.is_small(begin.y, y1, estimate.error, UNLIKE)
+        known = cast(tuple[Crossing, Crossing, Crossing], (begin.crossing, c.at.crossing, crossing))
+        across = to_row & (reach == Reach.step) & is_across(*known, sound)
+        reach = jnp.where(across, int(Reach.within), reach)
+        end, last = jnp.where(across, c.at.t, end), _select(across, c.at.y, settled)
+        settled = scheme.reached(begin.t, begin.y, end, last, t1, reach != Reach.step, args)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -278,16 +308,16 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     failure = jnp.full((), int(Status.step_below_resolution))
     smooth = jnp.array(True)
     if c.rows is not None:
-        smooth = ~to_row | scheme.is_smooth(begin.y, y1, estimate)
+        smooth = ~to_row | across | scheme.is_small(begin.y, y1, estimate.error, SINGULAR)
     for right, kind in (
         (smooth | (not scheme.moves), Status.projection_failed),
         (verdict.pressed, Status.no_reaction_solution),
         (regular, Status.kinematics_singular),
         (verdict.closed, Status.rank_change),
         (crossable & independent, Status.rank_change),
-        (verdict.found, Status.projection_failed),
-        (solved, Status.implicit_solve_failed),
-        (finite, Status.nonfinite),
+        (verdict.found | met, Status.projection_failed),
+        (solved | met, Status.implicit_solve_failed),
+        (finite | met, Status.nonfinite),
     ):
         failure = jnp.where(right, failure, int(kind))
     exhausted = active & ~stuck & ~arrived & (attempted >= loop.max_steps)
@@ -300,8 +330,12 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         if rows.turns is None:  # for derivatives a row must move with its own time
             to_row = to_row | (take & (jnp.abs(due - t1) <= resolution(t1)))
         slot = jnp.where(to_row, rows.next, times.saves.shape[0] - 2)
-        value = jax.tree.map(lambda y: jnp.where(good & smooth, y, jnp.nan), settled)
-        turns = rows.turns
+        known = (good & smooth) | across
+        value = jax.tree.map(lambda y: jnp.where(known, y, jnp.nan), settled)
+        turns, reaches = rows.turns, rows.reaches
+        if reaches is not None:
+            assert reach is not None
+            reaches = put(reaches, slot, jnp.where(to_row, reach, 0))
         if turns is not None:
             # The slot after the last row is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
@@ -312,7 +346,8 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
             next=rows.next + to_row.astype(jnp.int32),
             values=put(rows.values, slot, value),
             turns=turns,
-            missed=jnp.where(to_row & ~(good & smooth), failure, rows.missed).astype(jnp.int32),
+            reaches=reaches,
+            missed=jnp.where(to_row & ~known, failure, rows.missed).astype(jnp.int32),
         )
 
     passed = t1 >= goal - slack
@@ -336,6 +371,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         turn=c.turn + eqxi.unvmap_any(take).astype(jnp.int32),
         rows=rows,
         kept=kept,
+        reach=None if reach is None else _select(take, reach, c.reach),
     )
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag import _xla
-from jaxlag._record import Record, Times
+from jaxlag._record import Record, Times, step_end
 
 
 class Walk(NamedTuple):
@@ -67,6 +67,25 @@ class Clock(NamedTuple):
         """Whether the vector field jumps where turn k starts."""
         return None if self.record.jumps is None else at(self.record.jumps, k)
 
+    def reach(
+        self, end: Array, anchors: Array, row: Array | None = None, r: Array | None = None
+    ) -> Array | None:
+        """How the end of a turn is reached, or row r between the first and the last.
+
+        Args:
+            end: time after the turn.
+            anchors: of `Times.anchors`.
+            row: whether it is a row.
+            r: its index.
+        """
+        if self.record.last_reach is None:
+            return None
+        reach = jnp.where(end >= anchors[1], self.record.last_reach, 0)
+        if row is None:
+            return reach
+        assert r is not None
+        return jnp.where(row, at(self.record.row_reach, r), reach)
+
     @property
     def last(self) -> Array:
         """The last turn."""
@@ -77,7 +96,7 @@ class Path(NamedTuple):
     """A recorded motion: what was given to the loop and what it kept.
 
     Attributes:
-        step: (args, t0, t1, state, jump) -> state.
+        step: (args, t0, t1, state, jump, time) -> the state at a time, of a step from t0 to t1.
         start: the state before the first step, as the step takes it.
         args: leaves of the arguments.
         tree: of the arguments.
@@ -112,13 +131,29 @@ class Path(NamedTuple):
             leaves[i] = leaf
         return jax.tree.unflatten(self.tree, leaves)
 
-    def ahead(self, args: Any, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
-        """The state one step on."""
-        return self.step(args, t, end, state, jnp.array(False) if jump is None else jump)
+    def ahead(
+        self,
+        args: Any,
+        t: Array,
+        end: Array,
+        jump: Array | None,
+        state: PyTree,
+        reach: Array | None = None,
+        turn_end: Array | None = None,
+    ) -> PyTree:
+        """The state at `end`, one step on from t, or within the step that ends at `turn_end`."""
+        jump = jnp.array(False) if jump is None else jump
+        if reach is None:
+            return self.step(args, t, end, state, jump, end)
+        assert turn_end is not None
+        return self.step(args, t, step_end(reach, t, end, turn_end), state, jump, end)
 
-    def found(self, t: Array, end: Array, jump: Array | None, state: PyTree) -> PyTree:
-        """The same with the arguments as they are."""
-        return self.ahead(self.with_args(self.moved()), t, end, jump, state)
+    def found(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
+        """The state after turn k, with the arguments as they are."""
+        t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
+        reach = self.clock.reach(end, anchors)
+        args = self.with_args(self.moved())
+        return self.ahead(args, t, end, self.clock.jump(k), state, reach, end)
 
     def moved(self) -> list[Array]:
         """The leaves of the arguments that may move."""

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from jaxlag import _params
 from jaxlag._arguments import check_declaration
 from jaxlag._assemble import assembled
-from jaxlag._change_points import lengths_of, may_cross, may_stop, units_at
+from jaxlag._change_points import lengths_of, may_cross, may_stop, scales_at
 from jaxlag._constraints import Baumgarte
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._gradient import Keep
@@ -130,14 +130,15 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     if dynamics.crossing:
         masses = dynamics.surface(*still((start, y0, args))).masses
         assert masses is not None
-        units = units_at(dynamics, *still((start, y0, args)))
-        args = args._replace(lengths=lengths_of(masses, args.kept), units=units)
+        units, slopes = scales_at(dynamics, *still((start, y0, args)))
+        lengths = lengths_of(masses, args.kept)
+        args = args._replace(lengths=lengths, units=units, slopes=slopes)
     if dynamics.projects:
         moved, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
     if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
         dynamics = replace(dynamics, stabilization=None, crossing=False)
-        args = args._replace(lengths=None, units=None)
+        args = args._replace(lengths=None, units=None, slopes=None)
     solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
     settling = Settling(dynamics)
     settle = settling if settling.settles else None

@@ -1,5 +1,6 @@
 """Where the steps of a motion go, and what a loop of steps tells of where it went."""
 
+import enum
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -30,6 +31,30 @@ class Times(NamedTuple):
         return jnp.concatenate([self.saves[1:-1], never])
 
 
+class Reach(enum.IntEnum):
+    """How a state is reached from the start of a step: see `jaxlag._change_points`."""
+
+    step = 0
+    """By a step to it."""
+    within = 1
+    """By the polynomial through the ends of the step that it lies in."""
+    beyond = 2
+    """By that through the ends of a step half the way to it."""
+
+
+def step_end(reach: Array, t0: Array, t1: Array, end: Array) -> Array:
+    """Where the step ends by which t1 is reached from t0.
+
+    Args:
+        reach: a `Reach`.
+        t0: where the step starts.
+        t1: time of the state that is wanted.
+        end: of the accepted step that t1 lies in.
+    """
+    half = jnp.where(reach == Reach.beyond, t0 + 0.5 * (t1 - t0), t1)
+    return jnp.where(reach == Reach.within, end, half)
+
+
 class Record(NamedTuple):
     """What a loop did, turn by turn: enough to go the same way again without step-size control.
 
@@ -46,6 +71,8 @@ class Record(NamedTuple):
         row_turn: row i + 1 is reached from the state before this turn; beyond all of them for rows
             that were not reached and after the last. None where there are no rows between the
             first and the last.
+        row_reach: how, see `Reach`; None where no change points are passed.
+        last_reach: the same of the last turn.
     """
 
     offsets: Float[Array, " N"]
@@ -55,6 +82,8 @@ class Record(NamedTuple):
     stride: Int[Array, ""]
     turns: Int[Array, ""]
     row_turn: Int[Array, " r"] | None
+    row_reach: Int[Array, " r"] | None = None
+    last_reach: Int[Array, ""] | None = None
 
 
 class Outcome(NamedTuple):

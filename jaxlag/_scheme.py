@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._branches import branches
-from jaxlag._change_points import AGAIN, SHORT, Crossing, same_sense, widest_gap
+from jaxlag._change_points import AGAIN, AHEAD, SHORT, Crossing, same_sense, widest_gap
 from jaxlag._first_step import first_step, slope_and_step
+from jaxlag._hermite import hermite
 from jaxlag._passage import Passage, determinants, passage
 from jaxlag._perturbations import linearized, spectral_size, turning_rate
 from jaxlag._settling import Settling
@@ -25,7 +26,7 @@ from jaxlag._term import Term
 from jaxlag.solvers import AbstractExplicit, Splitting
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
-_SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
+SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
 
 
 class Estimate(NamedTuple):
@@ -189,7 +190,8 @@ class Scheme(eqx.Module):
         if args.lengths is None:
             return self._step(*step)
         settle = cast(Settling, self.settle)
-        near = settle.apart(t0, y, args) < SHORT if crossing is None else crossing.is_near
+        apart = settle.apart(t0, y, args) if crossing is None else crossing.apart
+        near = apart < (AHEAD if self.controller is None else SHORT)
         held = self._held(near)
         if not isinstance(self.solver, AbstractExplicit) or self.solver.looped:
             return held._step(*step)
@@ -208,7 +210,7 @@ class Scheme(eqx.Module):
 
         @jax.checkpoint  # what transposes keep of a branch is copied in all steps
         def closer(t: Array, y: Array, args: Any) -> Array:
-            return jnp.where(near, settle.stage(t, y, args), y)
+            return jnp.where(near, settle.stage(t, y, args, self.implicit), y)
 
         def field(t: Any, y: Any, args: Any) -> Array:
             y = jax.lax.cond(eqxi.unvmap_any(near), closer, lambda t, y, args: y, t, y, args)
@@ -295,21 +297,38 @@ class Scheme(eqx.Module):
         )
         return error / jnp.where(told, jnp.minimum(part, 1.0), 1.0)
 
-    def is_smooth(self, y0: PyTree, y1: PyTree, estimate: Estimate) -> Bool[Array, ""]:
-        """Whether a step that no control rejects, to a row, went through a smooth field.
+    def is_small(
+        self, y0: PyTree, y1: PyTree, error: PyTree | None, tolerances: float
+    ) -> Bool[Array, ""]:
+        """Whether the error of a step that no control rejects, to a row, is below so many.
 
-        It is part of one that was accepted: an error estimate of a thousand times what is allowed
+        It is part of one that was accepted: an error estimate of `SINGULAR` times what is allowed
         is that of a field which is singular, or jumps, where the row lies.
         """
-        controller, error = self.controller, estimate.error
+        controller = self.controller
         if error is None or not isinstance(controller, diffrax.PIDController):
             return jnp.array(True)
 
         def small(y0: Array, y1: Array, error: Array) -> Array:
             allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
-            return jnp.all(jnp.abs(error) <= _SINGULAR * allowed)
+            return jnp.all(jnp.abs(error) <= tolerances * allowed)
 
         return jax.tree.reduce(jnp.logical_and, jax.tree.map(small, y0, y1, error))
+
+    def through(self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, args: Any) -> Array:
+        """The state at t by a polynomial through two others."""
+        ends = jnp.stack([t0, t1]), jnp.stack([y0, y1])
+        # A loop, as another copy of the vector field would take long to compile.
+        f0, f1 = jax.lax.map(lambda end: cast(Array, self.term.vf(end[0], end[1], args)), ends)
+        n = cast(Term, self.term).dynamics.system.size
+        return hermite(t0, y0, f0, t1, y1, f1, t, n)
+
+    def reached(
+        self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, far: Array, args: Any
+    ) -> Array:
+        """The state at t, by a step from t0 to t1, where that is `far`: else the one at t1."""
+        through = lambda: jnp.where(far, self.through(t0, y0, t1, y1, t, args), y1)  # noqa: E731
+        return jax.lax.cond(eqxi.unvmap_any(far), through, lambda: y1)
 
     def determinants(self, tau: Array, y: Array, args: Any) -> Array | None:
         """What tells singular quasi-velocities; None where they never are."""
@@ -379,7 +398,7 @@ class Scheme(eqx.Module):
         """
         if crossing is None:
             return *self.settled(t, y, args), estimate, None
-        settle, error = cast(Settling, self.settle), estimate.error
+        settle, error, unseen = cast(Settling, self.settle), estimate.error, estimate.unseen
         if error is None:
             y, verdict = settle(t, y, args)
         else:
@@ -390,14 +409,19 @@ class Scheme(eqx.Module):
         ends = crossing.onwards(t0, t, verdict.apart, (q - q0) / args.units)
         if error is None:
             return y, verdict, estimate, ends
-        rounding = jnp.concatenate([*ends.rounding(q, v, args.units), 0.0 * y[2 * q.size :]])
+        assert verdict.columns is not None
+        beyond = jnp.zeros_like(y[2 * q.size :])
+        rounding = jnp.concatenate([*ends.rounding(q, v, verdict.columns, args), beyond])
         error = jnp.where(jnp.abs(error) <= rounding, 0.0, error)
+        if unseen is not None:
+            noise = jnp.concatenate([*ends.noise(v, args), beyond])
+            unseen = jnp.where(unseen <= noise, 0.0, unseen)
         controller = self.controller
         if isinstance(controller, diffrax.PIDController):
             again = ends.is_beside(crossing) & ~bound
             least = AGAIN * (controller.atol + controller.rtol * jnp.abs(y))
             error = jnp.where(again, jnp.maximum(jnp.abs(error), least), error)
-        return y, verdict, estimate._replace(error=error), ends
+        return y, verdict, estimate._replace(error=error, unseen=unseen), ends
 
     def start(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None

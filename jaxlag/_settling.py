@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxlag._change_points import LOST, SHORT, lengths_of
+from jaxlag._change_points import LOST, SHORT, lengths_of, unknown_below
 from jaxlag._dynamics import Dynamics, still
 from jaxlag._forces import reads_lam, sliding
 from jaxlag._linalg import closed_to
@@ -127,7 +127,7 @@ class Settling(eqx.Module):
         error = jax.lax.cond(near | (verdict.apart < SHORT), left, lambda: error)
         return y, verdict._replace(pressed=self.pressed(tau, y, args)), error
 
-    def stage(self, tau: Array, y: Array, args: Arguments) -> Array:
+    def stage(self, tau: Array, y: Array, args: Arguments, free: bool) -> Array:
         """A state within a step moved towards the constraints, by one turn of Newton's method.
 
         Its matrix has no derivative: whatever it is, a motion on the constraints stays where it is,
@@ -137,15 +137,20 @@ class Settling(eqx.Module):
             tau: time of the stage.
             y: its state.
             args: arguments of the step.
+            free: whether it is looked for by iteration. One that is not is NaN at a change point,
+                so that the step is not taken.
         """
-        near = self._near(*still((tau, y, args))).surface
+        around = self._near(*still((tau, y, args)))
+        near, apart = around.surface, around.apart
+        assert apart is not None
         surface = self.dynamics.surface(tau, y, args)
         (q, v), velocity, kick = self.dynamics.parts(y), surface.velocity, near.kick
         if surface.position is not None:
             q = q - near.shift(surface.position(q))
         assert velocity is not None
         assert kick is not None
-        return self._joined(q, v - kick(velocity(q, v)), y)
+        moved = self._joined(q, v - kick(velocity(q, v)), y)
+        return moved if free else jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan)
 
     def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
         """The least length of a row over its length at the start of the motion."""
@@ -156,7 +161,9 @@ class Settling(eqx.Module):
     def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, Verdict]:
         q, v, found = project(near.surface, *self.dynamics.parts(y), near.frozen)
         closed = self._closed(near.surface, q, v, args)
-        return self._joined(q, v, y), Verdict(found, closed, jnp.array(True), near.apart)
+        return self._joined(q, v, y), Verdict(
+            found, closed, jnp.array(True), near.apart, near.surface.columns
+        )
 
     def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
         """The constraints near a state, without rows that all but depend on one another."""

@@ -177,8 +177,10 @@ def simulate(
             came on, as accurate as elsewhere, with its derivatives. Where ways touch that do not
             cross, one ends in a cusp, nothing is projected, or forces read multipliers, it ends
             there, in the status rank_change. "stop": it ends just before every such place, at every
-            tolerance; with fixed steps one step before it. Variational methods stop. A time to save
-            that is that of the place, to 1e-9 s, has NaN, in the same status.
+            tolerance; with fixed steps one step before it. Variational methods stop, and so do
+            equal steps of which one meets the place with an end or a stage, to 1e-5 of a step.
+            States are saved there, too, and a motion may end there: by a polynomial through both
+            ends of a short step, with velocities to 1e-9 at best.
         assemble: whether an inconsistent start is moved to the nearest consistent one, as by
             `jl.assemble`; else it ends in the status inconsistent_start.
         estimate_error: whether to solve once more with a tenth of the tolerance and, where there

@@ -45,12 +45,14 @@ class Verdict(NamedTuple):
         closed: rows that were left out hold, too.
         pressed: contacts press and slide as their friction takes them to.
         apart: see `jaxlag._change_points.Crossing`; None where nobody asks.
+        columns: of the matrix of the projection; None likewise.
     """
 
     found: Bool[Array, ""]
     closed: Bool[Array, ""]
     pressed: Bool[Array, ""]
     apart: Float[Array, ""] | None = None
+    columns: Float[Array, "m n"] | None = None
 
     @property
     def good(self) -> Bool[Array, ""]:
@@ -73,6 +75,7 @@ class Arguments(NamedTuple):
     usual: Float[Array, " b"] | None = None  # see `jaxlag._passage.usual`
     lengths: Float[Array, " m"] | None = None  # of rows at the start, see `jaxlag._change_points`
     units: Float[Array, " n"] | None = None  # of coordinates, with inertias of 1 at the start
+    slopes: Float[Array, "m n"] | None = None  # |A| at the start
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:

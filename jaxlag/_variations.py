@@ -172,8 +172,8 @@ def path_of(
     """
     looped = in_loops(scheme if fast is None else fast)
 
-    def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array) -> PyTree:
-        return one_step(looped, args, t0, t1, state, jump, True)[0]
+    def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array, wanted: Array) -> PyTree:
+        return one_step(looped, args, t0, t1, state, jump, True, wanted)[0]
 
     zero = jnp.zeros_like(times.stop)
     memory = scheme.begin(zero, times.stop, y0, args) if scheme.remembers else None
@@ -197,13 +197,19 @@ def one_step(
     state: PyTree,
     jump: Array,
     differentiable: bool,
+    wanted: Array | None = None,
 ) -> tuple[PyTree, Bool[Array, ""]]:
-    """One step from (y, memory), and whether it was solved; without memory it starts afresh."""
-    y, memory = state
+    """One step from (y, memory), and whether it was solved; without memory it starts afresh.
+
+    Near change points the state may be `wanted` at another time than that of its end.
+    """
+    y0, memory = y, _ = state
     args = scheme.within(args, t0)
     jumped: Any = jump
     if not scheme.remembers:
         memory, jumped = scheme.afresh(t0, t1, y, args)
     y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jumped)
     y, verdict = scheme.settled(t1, y, args, differentiable)
+    if wanted is not None and args.lengths is not None:
+        y = scheme.reached(t0, y0, t1, y, wanted, wanted != t1, args)
     return (y, memory if scheme.remembers else None), solved & verdict.good

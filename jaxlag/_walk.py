@@ -62,8 +62,9 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
     def turn(carry: tuple) -> tuple:
         """One step, or a row where a lane takes none or must not go on without."""
         k, r, y, dy, base, rows, kept = carry
-        t, end = clock.time(k - 1, anchors), clock.time(k, anchors)
-        use, to_row, row, i = (k < record.turns) & (end > t), jnp.array(False), jnp.array(False), k
+        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, end = (k < record.turns) & (turn_end > t), turn_end
+        to_row, row, i = jnp.array(False), jnp.array(False), k
         if points:
             at_point = (k < record.turns) & (k % record.stride == 0)
             kept = put(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
@@ -74,7 +75,9 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
             to_row = eqxi.unvmap_any(left & use)
             use, row = use & ~to_row, left & (~use | to_row)
             i, before = jnp.where(row, j, k), pick(row, base, before)
-            t, end = clock.time(i - 1, anchors), jnp.where(row, dues[r], clock.time(i, anchors))
+            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            end = jnp.where(row, dues[r], turn_end)
+        reach = clock.reach(turn_end, anchors, *(() if rows is None else (row, r)))
         jump, end_dot = clock.jump(i), None
         if change.anchors is not None:
             end_dot = change.anchors[clock.anchor(i)]
@@ -82,16 +85,18 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
                 assert dues_dot is not None
                 end_dot = jnp.where(row, dues_dot[r], end_dot)
         if end_dot is None:
-            step = lambda y, moved: path.ahead(path.with_args(moved), t, end, jump, y)  # noqa: E731
+            step = lambda y, moved: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, turn_end
+            )
             y1, dy1 = jax.jvp(step, (before[0], path.moved()), (before[1], change.args))
         else:
             assert change.anchors is not None
-            step = lambda y, moved, t, end: path.ahead(  # noqa: E731
-                path.with_args(moved), t, end, jump, y
+            step = lambda y, moved, t, end, turn_end: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, turn_end
             )
-            t_dot = change.anchors[clock.anchor(i - 1)]
-            given = (before[0], path.moved(), t, end)
-            y1, dy1 = jax.jvp(step, given, (before[1], change.args, t_dot, end_dot))
+            t_dot, turn_dot = (change.anchors[clock.anchor(j)] for j in (i - 1, i))
+            given = (before[0], path.moved(), t, end, turn_end)
+            y1, dy1 = jax.jvp(step, given, (before[1], change.args, t_dot, end_dot, turn_dot))
         if rows is not None:
             assert record.row_turn is not None
             rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
@@ -153,27 +158,32 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         here = j == k
         to_row = eqxi.unvmap_any(here)
         k = jnp.where(to_row, k, k - 1)
-        t, end = clock.time(k - 1, anchors), clock.time(k, anchors)
-        use, row, i, given = (k < record.turns) & (end > t) & ~to_row, here, k, bar
+        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, row, i, given = (k < record.turns) & (turn_end > t) & ~to_row, here, k, bar
+        end, reached = turn_end, clock.reach(turn_end, anchors)
         if between is not None:
             row = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
             i = jnp.where(row, j, k)
-            t, end = clock.time(i - 1, anchors), jnp.where(row, dues[r - 1], end)
+            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            end = jnp.where(row, dues[r - 1], end)
+            reached = clock.reach(turn_end, anchors, row, r - 1)
             given = pick(row, at(between, r - 1), bar)
         y, jump, takes = state_before(i), clock.jump(i), use | row
         with_moved, moved, starts = path.local(t)
         if not moves:
-            step = lambda y, moved: path.ahead(with_moved(moved), t, end, jump, y)  # noqa: E731
+            step = lambda y, moved: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, turn_end
+            )
             before, more = jax.vjp(step, y, moved)[1](given)
         else:
-            step = lambda y, moved, t, end: path.ahead(  # noqa: E731
-                with_moved(moved), t, end, jump, y
+            step = lambda y, moved, t, end, turn_end: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, turn_end
             )
-            before, more, t_bar, end_bar = jax.vjp(step, y, moved, t, end)[1](given)
-            t_bar, end_bar = (jnp.where(takes, x, 0.0) for x in (t_bar, end_bar))
+            before, more, *times_bar = jax.vjp(step, y, moved, t, end, turn_end)[1](given)
+            t_bar, end_bar, turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
             at_row = jnp.where(row, end_bar, 0.0)
             anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(i), end_bar - at_row)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i), end_bar - at_row + turn_bar)
             if between is not None:
                 dues_bar = _added_at(dues_bar, r - 1, at_row)
         more = [jnp.where(takes, x, 0.0) for x in more]
@@ -219,7 +229,7 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
             use = (j < record.turns) & (end > t)
-            y = pick(use, path.found(t, end, clock.jump(j), y), y)
+            y = pick(use, path.found(j, anchors, y), y)
             return j + 1, y, put(states, j + 1 - first, y)
 
         begin = (first, y, states)

@@ -14,7 +14,17 @@ from _families import mostly_full
 from mechanisms import four_bar, four_bar_start
 
 import jaxlag as jl
-from jaxlag._change_points import BESIDE, LOST, ROOM, SHORT, no_crossing, widest_gap
+from jaxlag._change_points import (
+    AHEAD,
+    BESIDE,
+    CLOSE,
+    LOST,
+    NARROW,
+    ROOM,
+    SHORT,
+    no_crossing,
+    widest_gap,
+)
 from jaxlag._kkt import FORMULATIONS, solve_kkt
 from jaxlag._methods import METHODS
 from jaxlag._tableaus import nodes_of
@@ -133,20 +143,108 @@ def test_a_four_bar_stops_before_its_change_point():
     np.testing.assert_allclose(stopped.last_state[0], [np.pi, 0.0, 0.0], atol=1e-4)
 
 
+def flat_at(speed):
+    """When the windows first lie flat, by the integral of dtheta / theta'."""
+    x, w = np.polynomial.legendre.leggauss(40)
+    angle = np.pi / 4 * (1 + x)
+    rate = lambda a: np.sqrt(speed**2 + 2.4 * 9.81 * (1 - np.cos(a)))  # noqa: E731
+    return np.pi / 4 * np.sum(w / rate(angle))
+
+
+@pytest.mark.parametrize("method", mostly_full(["auto", "tsit5"], "auto"))
+def test_states_at_the_place_and_beside_it(method):
+    """Saved there, and at the end of a motion there: at every tolerance."""
+    when = np.array([flat_at(speed) for speed in SPEEDS[::4].tolist()])
+    beside = np.array([-1e-2, -1e-4, -1e-7, 0.0, 1e-7, 1e-4, 1e-2])
+    exact_state = lambda s, t: jl.simulate(  # noqa: E731
+        PENDULUM, jnp.zeros(1), s[None], t, rtol=1e-13, atol=1e-13, throw=False
+    )
+    run = jax.jit(jax.vmap(lambda s, ts, e: moved(s, ts, e, method=method), in_axes=(0, 0, None)))
+    saved = jnp.asarray([[0.0, *(t + beside), 1.2] for t in when])
+    last = jnp.asarray([[0.0, *(t + beside[:4])] for t in when])
+    ended = jnp.asarray([[0.0, t] for t in when])
+    for rtol in (1e-6, 1e-9, 1e-12):
+        for ts in (saved, last, ended):
+            found = run(SPEEDS[::4], ts, rtol)
+            assert (found.status == jl.Status.ok).all()
+            right = jax.vmap(exact_state)(SPEEDS[::4], ts)
+            angle, rate = right.q[..., 0], right.v[..., 0]
+            off = np.max(np.abs(found.q[..., 0] - jnp.sin(angle)))
+            too_fast = np.max(np.abs(jnp.hypot(found.v[..., 0], found.v[..., 1]) - jnp.abs(rate)))
+            # Measured at most: 1e-5, 1.3e-9, 1e-12 and 2e-4, 5e-7, 1e-9.
+            assert off < 100 * rtol
+            assert too_fast < 1000 * rtol + 1e-8
+
+
+def angles_of_a_parallelogram(speeds, starts, ts, rtol):
+    """Its links' angles to one line: that of the coupler stays 0, whatever rounding makes of it."""
+    entry = ENTRIES["four_bar"]
+    params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 3.0}
+    at_once = {"rtol": rtol, "atol": rtol, "throw": False}
+
+    def both(speed, start):
+        whole = lambda x: jnp.stack([x, 0 * x, x])  # noqa: E731
+        folded = lambda x: whole(x) - jnp.array([0.0, 0.0, jnp.pi])  # noqa: E731
+        reduced = jl.System(
+            lambda t, q, v, p: entry.system.lagrangian(t, folded(q[0]), whole(v[0]), p), ("angle",)
+        )
+        q0 = folded(start)
+        found = jl.simulate(entry.system, q0, whole(speed), ts, params, **at_once)
+        right = jl.simulate(
+            reduced, start[None], speed[None], ts, params, rtol=1e-13, atol=1e-13, throw=False
+        )
+        return found.status, found.q[:, 0] - right.q[:, 0], found.stats["accepted"]
+
+    return jax.vmap(both)(speeds, starts)
+
+
+@pytest.mark.parametrize("rtol", mostly_full([1e-6, 1e-9, 1e-11, 1e-12, 1e-13], 1e-12))
+def test_rounding_does_not_shorten_the_steps(rtol):
+    """Where a coordinate is nothing but the rounding of the others: 0, as its velocity."""
+    rng = np.random.default_rng(5)
+    starts, speeds = jnp.asarray(rng.uniform(0.3, 2.8, 40)), jnp.asarray(-rng.uniform(2.5, 5, 40))
+    status, off, steps = angles_of_a_parallelogram(speeds, starts, jnp.linspace(0, 2, 5), rtol)
+    assert (status == jl.Status.ok).all()
+    # Measured: 9e-6, 5e-9, 4e-11, 4e-12, 2e-12 in 12, 27, 50, 62, 78 steps.
+    assert np.max(np.abs(off)) < 50 * rtol + 1e-11
+    assert np.max(steps) < 120
+
+
 @pytest.mark.full
-def test_a_row_at_a_change_point_is_none():
-    """A parallelogram folded flat at t = 2: steps pass by, and velocities there are anything."""
+def test_equal_steps_that_meet_the_place_say_so():
+    """By an end, or by a stage of the method: and those that do not keep their accuracy."""
+    when = flat_at(1.0)
+    nodes = np.unique(nodes_of(METHODS["dopri8"]()))
+    steps = when / (20 + np.array([0.0, *nodes[(nodes > 0.2) & (nodes < 1)], 1.0]))
+
+    def run(dt):
+        v0 = jnp.array([1.0, 0.0, 1.0, 0.0])
+        return jl.simulate(
+            WINDOW, Q0, v0, 0.8 * jnp.arange(2.0), dt=dt, method="dopri8", throw=False
+        )
+
+    found = jax.vmap(run)(jnp.asarray(steps))
+    assert (found.status == jl.Status.rank_change).all()
+    apart = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
+    assert (apart.status == jl.Status.ok).all()
+    expected = exact(jnp.ones(()), jnp.array([0.0, 0.8]))[-1]
+    np.testing.assert_allclose(apart.q[:, -1, 0], expected + 0 * steps, atol=1e-8)
+
+
+@pytest.mark.full
+def test_a_crank_at_constant_speed_is_saved_where_it_is_folded():
+    """A parallelogram folded flat at t = 2, of which a save time is one."""
     entry = ENTRIES["four_bar"]
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
     q0, ts = np.array([2.0, 0.0, 2.0 - np.pi]), np.linspace(0.0, 4.0, 41)
-    found = jl.simulate(entry.system, q0, [-1.0, 0.0, -1.0], ts, params, throw=False)
-    expected = q0 - ts[:, None] * np.array([1.0, 0.0, 1.0])
-    assert found.status in (jl.Status.rank_change, jl.Status.projection_failed)
-    told = np.isfinite(np.asarray(found.q)).all(axis=1)
-    assert told[:20].all()
-    assert not told[20]
-    np.testing.assert_allclose(found.q[told], expected[told], atol=1e-9)
-    np.testing.assert_allclose(found.v[told], expected[told] * 0 + [-1.0, 0.0, -1.0], atol=1e-8)
+    for rtol in (1e-6, 1e-9, 1e-12):
+        found = jl.simulate(
+            entry.system, q0, [-1.0, 0.0, -1.0], ts, params, rtol=rtol, atol=rtol, throw=False
+        )
+        assert found.status == jl.Status.ok
+        expected = q0 - ts[:, None] * np.array([1.0, 0.0, 1.0])
+        np.testing.assert_allclose(found.q, expected, atol=1e-11)
+        np.testing.assert_allclose(found.v, expected * 0 + [-1.0, 0.0, -1.0], atol=1e-11)
 
 
 @pytest.mark.full
@@ -204,6 +302,32 @@ def test_derivatives_across():
     # Of 1,000 starts the worst: 1e-12, 2e-11, 1e-11, 5e-11.
     for value, right in zip(found, expected, strict=True):
         np.testing.assert_allclose(value, right, rtol=2e-10, atol=2e-12)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("stop", [False, True])
+def test_derivatives_of_what_is_saved_there(stop):
+    """In the start and in the times themselves, forwards and backwards, alone and in lanes."""
+    speeds = SPEEDS[:3]
+    when = jnp.asarray([flat_at(speed) for speed in speeds.tolist()])
+    ts = when[:, None] + jnp.array([-0.1, -1e-3, 0.0] if stop else [-0.1, 0.0, 1e-3, 0.1])
+    ts = jnp.concatenate([jnp.zeros((3, 1)), ts], axis=1)
+
+    def of(motion):
+        forward, back = (jax.jit(jax.vmap(d(motion, (0, 1)))) for d in (jax.jacfwd, jax.jacrev))
+        return (
+            forward(speeds, ts),
+            back(speeds, ts),
+            jax.jit(jax.jacrev(motion, 1))(speeds[0], ts[0]),
+        )
+
+    there, back, alone = of(lambda s, ts: moved(s, ts, 1e-12).q[:, 0])
+    expected = of(exact)[0]
+    # Measured: 2e-9 of 0.8, 3e-8 of 5.
+    for found in (there, back):
+        np.testing.assert_allclose(found[0], expected[0], atol=2e-8)
+        np.testing.assert_allclose(found[1], expected[1], atol=3e-7)
+    np.testing.assert_allclose(alone, expected[1][0], atol=3e-7)
 
 
 def free(t, q, v, units):
@@ -278,7 +402,7 @@ def test_no_stage_is_near_the_place(method):
     assert apart > 0.03
     t, h = jnp.array(2.0), jnp.array(0.3)
     for left in (0.05, 0.1, 0.25, 0.5, 0.8):
-        known = no_crossing(t, 1, float)._replace(time=t + left * h)
+        known = ahead_of(t, left * h, 0.5 * SHORT)
         step = float(known.step(t, h, gap))
         assert step <= h
         if left < gap:
@@ -287,6 +411,42 @@ def test_no_stage_is_near_the_place(method):
             across = float(known.step(t + step, h, gap))
             np.testing.assert_allclose((left * 0.3 - step) / across, gap, rtol=1e-12)
             np.testing.assert_allclose(across, ROOM * h, rtol=1e-12)
+
+
+def ahead_of(t, left, apart):
+    """Known of a place `left` ahead of t."""
+    return no_crossing(t, 1, float)._replace(time=t + left, apart=jnp.array(apart))
+
+
+def test_what_is_saved_across_shortens_the_step():
+    """It leads up to NARROW of a row's length, by a tenth of what is left at most; then across."""
+    t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
+    for apart, without in ((0.9 * AHEAD, h), (0.9 * SHORT, 0.1 / gap), (2 * NARROW, 0.1 / gap)):
+        known = ahead_of(t, 0.1, apart)
+        np.testing.assert_allclose(known.step(t, h, gap, due=jnp.array(2.4)), without, rtol=1e-12)
+        lead = 0.1 * (1 - max(NARROW / apart, 0.1))
+        np.testing.assert_allclose(known.step(t, h, gap, due=jnp.array(2.25)), lead, rtol=1e-12)
+    near = ahead_of(t, 0.1, NARROW)
+    np.testing.assert_allclose(near.step(t, h, gap, due=jnp.array(2.25)), 0.1 / gap, rtol=1e-12)
+    # A place so near that no stage would lie before it, too.
+    beside = ahead_of(t, 0.001, 0.5 * NARROW)
+    assert float(beside.step(t, h, gap)) == 0.3
+    np.testing.assert_allclose(beside.step(t, h, gap, due=jnp.array(2.25)), 0.001 / gap, rtol=1e-12)
+
+
+def test_a_motion_that_ends_at_the_place_or_beyond_it():
+    """The last step is a short one, or has the place where no stage is."""
+    t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
+    far, near = ahead_of(t, 0.1, SHORT), ahead_of(t, 0.1, NARROW)
+    at = jnp.array(2.1 + 0.04 * CLOSE * 0.1 / SHORT)
+    assert far.is_at(t, at)
+    assert not far.is_at(t, 2.1 + 1.01 * CLOSE * 0.1 / SHORT)
+    assert not far.is_at(t, 2.1 - 1.01 * CLOSE * 0.1 / SHORT)
+    np.testing.assert_allclose(far.step(t, h, gap, at), 0.1 * (1 - NARROW / SHORT), rtol=1e-12)
+    assert float(near.step(t, h, gap, jnp.array(2.1))) == 0.3  # cut where the motion ends
+    beyond = jnp.array(2.11)
+    lead = float(far._replace(apart=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
+    np.testing.assert_allclose((0.1 - lead) / (0.11 - lead), gap, rtol=1e-9)
 
 
 def test_where_the_place_is_to_be_expected():
@@ -300,7 +460,7 @@ def test_where_the_place_is_to_be_expected():
     np.testing.assert_allclose(second.span, 100 * moved, rtol=1e-12)
     assert second.is_near
     assert jnp.isinf(second.onwards(t2, jnp.array(2.5), jnp.array(0.08), moved).time)
-    assert jnp.isinf(begin.onwards(t0, t1, jnp.array(2 * SHORT), moved).time)
+    assert jnp.isinf(begin.onwards(t0, t1, jnp.array(1.1 * AHEAD), moved).time)
     assert second._replace(apart=jnp.array(BESIDE * 0.03)).is_beside(second)
     assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
 
