@@ -67,13 +67,6 @@ ROOM = 0.9
 BESIDE = 0.05
 """Of the length of a row at the start of a step: not to end with less, if it can be helped."""
 
-NARROW = 0.015
-"""Of the length of a row at the start of a motion: where a step across begins in which states are
-saved, or in which the motion ends. A polynomial through its ends is off by 1e-12."""
-
-CLOSE = 0.005
-"""Of the same: what is nearer to the place is interpolated."""
-
 AHEAD = 0.5
 """Of the same: below it a place is looked out for."""
 
@@ -243,26 +236,37 @@ class Crossing(NamedTuple):
         lead = left - gap / (1 - gap) * jnp.asarray(stop - self.time, h.dtype)
         cut = near & (stop > self.time) & (stop < t + across) & (lead > AT_HAND * left)
         found = jnp.where(cut, lead, found)
-        saved, ends = ahead & (due < t + jnp.maximum(across, h)), self.is_at(t, stop)
+        least, ends = narrow(self.apart.dtype), self.is_at(t, stop)
+        # In float32 steps are as short as need be: shorter ones add rounding.
+        saved = ahead & (due < t + jnp.maximum(across, h)) & (least < SHORT)
         found = jnp.where(ends, h, jnp.where(saved & ~cut, across, found))
-        part = 1.0 - jnp.maximum(NARROW / jnp.where(ahead, self.apart, 1.0), 0.1)
+        part = 1.0 - jnp.maximum(least / jnp.where(ahead, self.apart, 1.0), 0.1)
         found = jnp.where((saved | ends) & (part > AT_HAND), part * left, found)
         return jnp.minimum(found, h)
 
     def is_at(self, t: Float[Array, ""], time: Float[Array, ""] | float) -> Bool[Array, ""]:
-        """Whether a time is that of the place ahead, but for CLOSE.
+        """Whether a time is that of the place ahead, but for a third of a narrow step.
 
         Args:
             t: now.
             time: the other one.
         """
-        pace = (self.time - t) / self.apart
-        return jnp.isfinite(self.time) & (pace > 0) & (jnp.abs(self.time - time) <= CLOSE * pace)
+        pace, close = (self.time - t) / self.apart, narrow(self.apart.dtype) / 3
+        return jnp.isfinite(self.time) & (pace > 0) & (jnp.abs(self.time - time) <= close * pace)
 
 
 def unknown_below(dtype: Any) -> float:
     """Where so little of a row is left, over what there is at the start, rounding is the rest."""
-    return 2 * float(jnp.finfo(dtype).eps) ** (1 / 3)
+    return min(2 * float(jnp.finfo(dtype).eps) ** (1 / 3), LOST)
+
+
+def narrow(dtype: Any) -> float:
+    """Of the same: where a step across begins in which states are saved, or the motion ends.
+
+    A polynomial through its ends is off by its length to the power of 6, and rounding by eps over
+    its square: 0.015 in float64, where both are 1e-12, and 0.1 in float32.
+    """
+    return min(1.35 * float(jnp.finfo(dtype).eps) ** (1 / 8), SHORT)
 
 
 def no_crossing(time: Float[Array, ""], n: int, dtype: Any) -> Crossing:
@@ -284,7 +288,7 @@ def is_across(
         saved: at the end of a step to what is saved.
         sound: whether that went well.
     """
-    at_it = saved.stands | (saved.depends & (begin.apart < 2 * NARROW))
+    at_it = saved.stands | (saved.depends & (begin.apart < 2 * narrow(begin.apart.dtype)))
     apart = jnp.minimum(jnp.minimum(begin.apart, end.apart), saved.apart)
     return (at_it | ~sound) & ~(apart >= AHEAD)  # NaN where a stage met it
 

@@ -17,11 +17,10 @@ import jaxlag as jl
 from jaxlag._change_points import (
     AHEAD,
     BESIDE,
-    CLOSE,
     LOST,
-    NARROW,
     ROOM,
     SHORT,
+    narrow,
     no_crossing,
     widest_gap,
 )
@@ -31,7 +30,8 @@ from jaxlag._tableaus import nodes_of
 from systems._catalogue import ENTRIES
 
 EPS = np.finfo(float).eps
-SIDE = jnp.array([0.0, 1.0])  # where the fixed ends are
+NARROW, CLOSE = narrow(float), narrow(float) / 3
+SIDE = (0.0, 1.0)  # where the fixed ends are
 SPEEDS = jnp.linspace(0.9, 1.5, 24)
 Q0 = jnp.array([0.0, 1.0, 1.0, 1.0])
 ENERGY = 1.5 * 9.81
@@ -40,7 +40,7 @@ ENERGY = 1.5 * 9.81
 def rods(t, q, params):
     """Both sides and the rod between them."""
     ends = q.reshape(2, 2)
-    side, top = ends - jnp.stack([SIDE, jnp.zeros(2)], 1), ends[1] - ends[0]
+    side, top = ends - jnp.array([SIDE, (0.0, 0.0)], q.dtype).T, ends[1] - ends[0]
     return jnp.concatenate([jnp.sum(side**2, 1), jnp.sum(top**2)[None]]) - 1.0
 
 
@@ -83,6 +83,25 @@ def test_flat_places_are_passed_at_every_tolerance():
         np.testing.assert_allclose(found.q[..., 0], expected, atol=off)
         # On the branch that it came on: the top stays level.
         np.testing.assert_allclose(found.q[..., 3], found.q[..., 1], atol=1e-12)
+
+
+@pytest.mark.full
+def test_flat_places_are_passed_in_float32():
+    ts = jnp.linspace(0.0, 2.0, 41)
+    expected = jax.vmap(exact, in_axes=(0, None))(SPEEDS, ts)
+    single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+
+    def run(speed, rtol):
+        v0 = jnp.stack([speed, 0 * speed, speed, 0 * speed])
+        at_once = {"rtol": rtol, "atol": rtol, "throw": False}
+        return jl.simulate(WINDOW, single(Q0), v0, single(ts), **at_once)
+
+    # Measured: 1.3e-3, 1.1e-4.
+    for rtol, off in ((1e-4, 5e-3), (1e-5, 5e-4)):
+        found = jax.jit(jax.vmap(run, in_axes=(0, None)))(single(SPEEDS), rtol)
+        assert found.q.dtype == jnp.float32
+        assert (found.status == jl.Status.ok).all()
+        np.testing.assert_allclose(found.q[..., 0], expected, atol=off)
 
 
 def test_it_stops_before_them_where_told_to():
