@@ -240,7 +240,7 @@ class Crossing(NamedTuple):
         # In float32 steps are as short as need be: shorter ones add rounding.
         saved = ahead & (due < t + jnp.maximum(across, h)) & (least < SHORT)
         found = jnp.where(ends, h, jnp.where(saved & ~cut, across, found))
-        part = 1.0 - jnp.maximum(least / jnp.where(ahead, self.apart, 1.0), 0.1)
+        part = 1.0 - jnp.maximum(least / jnp.where(ahead, self.apart.astype(h.dtype), 1.0), 0.1)
         found = jnp.where((saved | ends) & (part > AT_HAND), part * left, found)
         return jnp.minimum(found, h)
 
@@ -251,7 +251,8 @@ class Crossing(NamedTuple):
             t: now.
             time: the other one.
         """
-        pace, close = (self.time - t) / self.apart, narrow(self.apart.dtype) / 3
+        pace = (self.time - t) / self.apart.astype(self.time.dtype)
+        close = narrow(self.apart.dtype) / 3
         return jnp.isfinite(self.time) & (pace > 0) & (jnp.abs(self.time - time) <= close * pace)
 
 
