@@ -181,10 +181,15 @@ class Crossing(NamedTuple):
         span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
         length = jnp.linalg.norm(span)
         rate = jnp.linalg.norm(v / args.units) / jnp.where(length > 0, length, 1.0)
-        spread = jnp.abs(columns).T @ args.slopes
-        positions = jnp.abs(q) + spread @ (jnp.abs(q) + args.units * span)
+        slopes = args.slopes
+
+        def spread(size: Array) -> Array:  # by sums: a step has no matrix products
+            rows = jnp.sum(slopes * size, axis=1)
+            return jnp.sum(jnp.abs(columns) * rows[:, None], axis=0)
+
+        positions = jnp.abs(q) + spread(jnp.abs(q) + args.units * span)
         soon = rate / jnp.maximum(self.apart, float(jnp.finfo(self.apart.dtype).eps) ** (1 / 3))
-        velocities = jnp.abs(v) + spread @ jnp.abs(v) + soon * positions
+        velocities = jnp.abs(v) + spread(jnp.abs(v)) + soon * positions
         near = jnp.where(self.is_near, least, 0.0)
         return near * positions, near * velocities
 
