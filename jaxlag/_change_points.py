@@ -18,7 +18,7 @@ times in "dopri8"). So near the place
   1,000 motions of a parallelogram at a tolerance of 1e-12: off by 5e-11 at most, and by up to 2e-2
   with stages as they come);
 - what rounding makes of a projected state is accepted: shorter steps do not improve it;
-- a step of which a stage meets the place is not taken;
+- an equal step of which a stage meets the place is not taken, as no estimate tells what it is off;
 - what is saved in a step across is interpolated where a step to it would have a stage at the place:
   by the polynomial of degree 5 through the ends of that step, which is a short one. A motion that
   ends at the place does so by that through the ends of a step half the way there.
@@ -296,7 +296,7 @@ def is_across(
     """
     at_it = saved.stands | (saved.depends & (begin.apart < 2 * narrow(begin.apart.dtype)))
     apart = jnp.minimum(jnp.minimum(begin.apart, end.apart), saved.apart)
-    return (at_it | ~sound) & ~(apart >= AHEAD)  # NaN where a stage met it
+    return at_it | (~sound & (apart < AHEAD))
 
 
 def widest_gap(nodes: Sequence[float]) -> float:

@@ -9,7 +9,7 @@ solver; its interpolant need not be. So the program holds one step.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from jaxlag._change_points import AHEAD, UNLIKE, Crossing, is_across, no_crossing
+from jaxlag._carry import Carry, Kept, Loop, Place, Rows, buffer, is_full, select, thinned, written
+from jaxlag._change_points import UNLIKE, Crossing, is_across, no_crossing
 from jaxlag._lanes import at_most
 from jaxlag._put import put
 from jaxlag._record import Outcome, Reach, Record, Times, step_end
@@ -27,76 +28,6 @@ from jaxlag._status import Status
 
 # The record is a whole number of chunks of this many turns.
 CHUNK = 64
-
-
-class _Place(NamedTuple):
-    """Where a step starts."""
-
-    t: Array
-    y: PyTree
-    memory: Any  # the solver's own state
-    jump: Array | None  # whether the field jumps there; None where nothing ever does
-    determinants: Array | None  # see `Scheme.determinants`
-    crossing: Crossing | None  # what is known of change points; None where none are passed
-
-
-class _Rows(NamedTuple):
-    """Rows between the first and the last."""
-
-    base: _Place  # where the last accepted step started
-    turn: Array  # that took it
-    next: Array  # index of the row that is due next
-    values: PyTree  # one more for what is not kept
-    turns: Array | None  # `Record.row_turn`
-    reaches: Array | None  # `Record.row_reach`
-    missed: Array
-
-
-class _Kept(NamedTuple):
-    """The record on the way."""
-
-    offsets: Array
-    anchors: Array | None
-    jumps: Array | None
-    points: PyTree | None
-    stride: Array
-
-
-class _Carry(NamedTuple):
-    at: _Place
-    h: Array
-    control: Any  # the controller's own state
-    mark: Array  # number of marks of the fixed grid passed
-    anchor: Array
-    status: Array
-    done: Array
-    tried: Array
-    accepted: Array
-    attempted: Array
-    turn: Array  # number of those in which any lane took a step
-    rows: _Rows | None
-    kept: _Kept | None
-    reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
-
-
-class _Loop(NamedTuple):
-    """What stays the same from turn to turn."""
-
-    scheme: Scheme
-    args: Any
-    times: Times
-    anchors: Array
-    dues: Array
-    dt: Array
-    max_steps: int
-
-
-def _select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
-    return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
-
-
-def _buffer(size: Any, like: PyTree, fill: float | int) -> PyTree:
-    return jax.tree.map(lambda x: jnp.full((size, *jnp.shape(x)), fill, jnp.result_type(x)), like)
 
 
 def drive(
@@ -144,24 +75,24 @@ def drive(
     determinants = scheme.determinants(t0, y0, args)
     crossing = None if args.lengths is None else no_crossing(t0, args.units.size, args.units.dtype)
     reaches_beyond = crossing is not None and scheme.controller is not None
-    start = _Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
+    start = Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
     if not at_most(count, 2):
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
-        values = _buffer(count - 1, y0, jnp.nan)
+        values = buffer(count - 1, y0, jnp.nan)
         reaches = jnp.zeros_like(places) if reaches_beyond and places is not None else None
-        rows = _Rows(start, zero, zero, values, places, reaches, zero)
+        rows = Rows(start, zero, zero, values, places, reaches, zero)
     if record:
-        kept = _Kept(
-            offsets=_buffer(size, t0, 0.0),
-            anchors=None if times.knots is None else _buffer(size, zero, 0),
-            jumps=_buffer(size, zero > 0, 0) if jumps else None,
-            points=_buffer(room + 1, (y0, None), 0.0) if room else None,
+        kept = Kept(
+            offsets=buffer(size, t0, 0.0),
+            anchors=None if times.knots is None else buffer(size, zero, 0),
+            jumps=buffer(size, zero > 0, 0) if jumps else None,
+            points=buffer(room + 1, (y0, None), 0.0) if room else None,
             stride=jnp.ones((), jnp.int32),
         )
-    carry = _Carry(
+    carry = Carry(
         at=start,
         h=jnp.asarray(h, t0.dtype),
         control=control,
@@ -180,7 +111,7 @@ def drive(
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
     fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps)
-    loop = _Loop(scheme, args, *fixed)
+    loop = Loop(scheme, args, *fixed)
 
     def turn(dynamic: Any) -> Any:
         c = _turn(loop, eqx.combine(dynamic, static))
@@ -192,15 +123,15 @@ def drive(
     def turns(dynamic: Any) -> Any:
         if room in (0, size):
             return jax.lax.while_loop(goes_on, turn, dynamic)
-        until_full = lambda c: goes_on(c) & ~eqxi.unvmap_any(_is_full(c, room))  # noqa: E731
+        until_full = lambda c: goes_on(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
-        return jax.lax.while_loop(goes_on, lambda c: fill(_thinned(c, room)), dynamic)
+        return jax.lax.while_loop(goes_on, lambda c: fill(thinned(c, room)), dynamic)
 
     final = turns(dynamic) if native is None else native(turns, dynamic)
     return _outcome(eqx.combine(final, static), times, y0, allowed)
 
 
-def _outcome(c: _Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
+def _outcome(c: Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     arrived = allowed & (times.saves[-1] <= c.at.t)
     last = jax.tree.map(lambda y: jnp.where(arrived, y, jnp.nan), c.at.y)
     parts = [jax.tree.map(lambda y: y[None], y0)]
@@ -218,31 +149,14 @@ def _outcome(c: _Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     return Outcome(*ends, rows, missed, record, jnp.zeros((), jnp.int32))
 
 
-def _is_due(loop: _Loop, c: Any) -> Array:
+def _is_due(loop: Loop, c: Any) -> Array:
     """Whether a row lies inside the last accepted step."""
     if c.rows is None:
         return jnp.array(False)
     return (loop.dues[c.rows.next] <= c.at.t) & (c.accepted > 0)
 
 
-def _is_full(c: Any, room: int) -> Array:
-    """Whether there is no room for the point that the next step starts from."""
-    return (c.turn >= room * c.kept.stride) & ~c.done
-
-
-def _thinned(c: Any, room: int) -> Any:
-    """Every other point dropped, if they are full."""
-
-    def halved(leaf: Array) -> Array:
-        return leaf.at[: room // 2].set(leaf[:room:2])
-
-    def thin(kept: Any) -> Any:
-        return kept._replace(points=jax.tree.map(halved, kept.points), stride=2 * kept.stride)
-
-    return c._replace(kept=jax.lax.cond(_is_full(c, room), thin, lambda kept: kept, c.kept))
-
-
-def _turn(loop: _Loop, c: _Carry) -> _Carry:
+def _turn(loop: Loop, c: Carry) -> Carry:
     """One attempted step, or one that reaches a row."""
     scheme, times, t = loop.scheme, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
@@ -261,7 +175,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     if c.rows is not None:
         due = loop.dues[c.rows.next]
         to_row = _is_due(loop, c)
-        begin = _select(to_row, c.rows.base, c.at)
+        begin = select(to_row, c.rows.base, c.at)
         t1 = jnp.where(to_row, due, t1)
     end, reach = t1, None  # of the step, and how the state at t1 follows from it
     if c.reach is not None:
@@ -287,7 +201,7 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         # A step from such a place, or one of equal steps to it, has a stage there.
         assert begin.crossing is not None
         stands = begin.crossing.stands | (crossing.stands if fixed else False)
-        met = (begin.crossing.apart < AHEAD) & ~finite
+        met = fixed & ~finite & (begin.crossing.time < t1 + (t1 - begin.t))
         crossable, independent = crossing.passes & ~stands & ~met, ~crossing.depends
     good = finite & solved & ((regular & crossable) | to_row) & verdict.good
     rest = (estimate, good, cut, share, regular | to_row)
@@ -296,9 +210,9 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     if reach is not None:
         sound = good & scheme.is_small(begin.y, y1, estimate.error, UNLIKE)
         known = cast(tuple[Crossing, Crossing, Crossing], (begin.crossing, c.at.crossing, crossing))
-        across = to_row & (reach == Reach.step) & is_across(*known, sound)
+        across = to_row & (reach == Reach.step) & is_across(*known, sound) & finite
         reach = jnp.where(across, int(Reach.within), reach)
-        end, last = jnp.where(across, c.at.t, end), _select(across, c.at.y, settled)
+        end, last = jnp.where(across, c.at.t, end), select(across, c.at.y, settled)
         settled = scheme.reached(begin.t, begin.y, end, last, t1, reach != Reach.step, args)
 
     active = ~c.done & ~to_row
@@ -340,8 +254,8 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
             # The slot after the last row is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
             turns = put(turns, slot, jnp.where(to_row, rows.turn, beyond))
-        rows = _Rows(
-            base=_select(take, c.at, rows.base),
+        rows = Rows(
+            base=select(take, c.at, rows.base),
             turn=jnp.where(take, c.turn, rows.turn),
             next=rows.next + to_row.astype(jnp.int32),
             values=put(rows.values, slot, value),
@@ -354,13 +268,13 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
     own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
     jump = None if c.at.jump is None else jump | lands
-    end = _Place(t1, settled, memory, jump, determinants, crossing)
-    at = _select(take, end, c.at)
-    kept = None if c.kept is None else _written(loop, c, c.kept, at.t, anchor)
-    return _Carry(
+    end = Place(t1, settled, memory, jump, determinants, crossing)
+    at = select(take, end, c.at)
+    kept = None if c.kept is None else written(loop, c, c.kept, at.t, anchor)
+    return Carry(
         at=at,
         h=jnp.where(active, h, c.h),
-        control=_select(active, control, c.control),
+        control=select(active, control, c.control),
         mark=c.mark + (take & passed).astype(jnp.int32),
         anchor=anchor,
         status=status,
@@ -371,13 +285,13 @@ def _turn(loop: _Loop, c: _Carry) -> _Carry:
         turn=c.turn + eqxi.unvmap_any(take).astype(jnp.int32),
         rows=rows,
         kept=kept,
-        reach=None if reach is None else _select(take, reach, c.reach),
+        reach=None if reach is None else select(take, reach, c.reach),
     )
 
 
 def _next_step(
-    loop: _Loop,
-    c: _Carry,
+    loop: Loop,
+    c: Carry,
     t1: Array,
     y1: PyTree,
     estimate: Estimate,
@@ -403,7 +317,7 @@ def _next_step(
     if share is not None:
         error = jax.tree.map(lambda e: e / share, error)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
-    y1 = _select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
+    y1 = select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
     proposal: Any = scheme.controller.adapt_step_size(
         t, t1, y, y1, loop.args, error, order, c.control
     )
@@ -432,28 +346,11 @@ def _uncut(controller: Any, cut: Array, h: Array, before: Any, after: Any) -> An
 
     Its last part says that the step proposed is the least there is, and to be kept as it comes.
     """
-    control = _select(cut, before, after)
+    control = select(cut, before, after)
     if controller.dtmin is None:
         return control
     *errors, at_least = control
     return (*errors, at_least & (~cut | (h <= controller.dtmin)))
-
-
-def _written(loop: _Loop, c: _Carry, kept: _Kept, t: Array, anchor: Array) -> _Kept:
-    """The record with this turn."""
-    anchors, jumps, points = kept.anchors, kept.jumps, kept.points
-    if anchors is None:
-        offset = jnp.where(anchor == 1, -1.0, t)
-    else:
-        anchors = put(anchors, c.turn, anchor)
-        offset = t - loop.anchors[anchor]
-    offsets = put(kept.offsets, c.turn, offset)
-    jumps = None if jumps is None else put(jumps, c.turn, c.at.jump)
-    if points is not None:
-        spare = jax.tree.leaves(points)[0].shape[0] - 1
-        slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
-        points = put(points, slot, (c.at.y, None))
-    return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)
 
 
 def _next_boundary(times: Times, t: Array) -> tuple[Array, Array]:

@@ -1,6 +1,5 @@
 """How one step is taken, settled and followed by the next."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,7 @@ from jaxlag._change_points import AGAIN, AHEAD, SHORT, Crossing, same_sense, wid
 from jaxlag._first_step import first_step, slope_and_step
 from jaxlag._hermite import hermite
 from jaxlag._passage import Passage, determinants, passage
-from jaxlag._perturbations import linearized, spectral_size, turning_rate
+from jaxlag._perturbations import longest_step
 from jaxlag._settling import Settling
 from jaxlag._step import Verdict, midway
 from jaxlag._tableaus import explicit_tableau, nodes_of, remembers
@@ -141,24 +140,9 @@ class Scheme(eqx.Module):
             outcomes = self._branches(zero, y, args) if self.across else None
             return rates if outcomes is None else jnp.append(rates, outcomes.astype(rates.dtype))
 
-        f, J = linearized(field, y)
-        # Differences across a jump or a bend say nothing.
-        smooth = ~jnp.any(J[y.size :] != 0)
-        f, J = f[: y.size], J[: y.size]
-        if explicit:
-            rate, power = spectral_size(J)
-            # In J^16 f only the fastest motions are left: those of half their rate to 1e-5.
-            seen = jnp.abs(power @ f)
-        else:
-            rate = turning_rate(J)
-            seen = jnp.abs(J @ f) / rate
-        allowed = _UNSEEN * (controller.atol + controller.rtol * jnp.abs(y))
-        unseen = jnp.all(seen < rate * allowed) & jnp.isfinite(rate) & smooth
         solver: Any = self.solver
         order = float(solver.error_order(self.term))
-        eps = jnp.finfo(y.dtype).eps
-        part = (jnp.maximum(controller.rtol, eps) * math.gamma(order + 1)) ** (1 / order)
-        longest = jnp.where(unseen, part / rate, jnp.inf).astype(zero.dtype)
+        longest = longest_step(field, y, controller, order, explicit).astype(zero.dtype)
         longest = longest if self.longest is None else jnp.minimum(longest, self.longest)
         return replace(self, longest=longest)
 
@@ -207,10 +191,11 @@ class Scheme(eqx.Module):
     def _held(self, near: Array) -> "Scheme":
         """The scheme with stages on the constraints in a step that is near a change point."""
         settle, term = cast(Settling, self.settle), cast(Term, self.term)
+        refuses = self.controller is None and not self.implicit
 
         @jax.checkpoint  # what transposes keep of a branch is copied in all steps
         def closer(t: Array, y: Array, args: Any) -> Array:
-            return jnp.where(near, settle.stage(t, y, args, self.implicit), y)
+            return jnp.where(near, settle.stage(t, y, args, refuses), y)
 
         def field(t: Any, y: Any, args: Any) -> Array:
             y = jax.lax.cond(eqxi.unvmap_any(near), closer, lambda t, y, args: y, t, y, args)
@@ -453,7 +438,6 @@ class Scheme(eqx.Module):
 
 _FINE = 64.0  # resolutions of time
 _ACROSS = 0.01  # of the change that an error across a bend may be, in tolerances
-_UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of perturbations
 
 
 def all_finite(y: PyTree) -> Bool[Array, ""]:

@@ -127,7 +127,7 @@ class Settling(eqx.Module):
         error = jax.lax.cond(near | (verdict.apart < SHORT), left, lambda: error)
         return y, verdict._replace(pressed=self.pressed(tau, y, args)), error
 
-    def stage(self, tau: Array, y: Array, args: Arguments, free: bool) -> Array:
+    def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
         """A state within a step moved towards the constraints, by one turn of Newton's method.
 
         Its matrix has no derivative: whatever it is, a motion on the constraints stays where it is,
@@ -137,8 +137,8 @@ class Settling(eqx.Module):
             tau: time of the stage.
             y: its state.
             args: arguments of the step.
-            free: whether it is looked for by iteration. One that is not is NaN at a change point,
-                so that the step is not taken.
+            refuses: whether it is NaN at a change point, so that the step is not taken. It is to be
+                where no estimate tells that the step is off.
         """
         around = self._near(*still((tau, y, args)))
         near, apart = around.surface, around.apart
@@ -150,7 +150,7 @@ class Settling(eqx.Module):
         assert velocity is not None
         assert kick is not None
         moved = self._joined(q, v - kick(velocity(q, v)), y)
-        return moved if free else jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan)
+        return jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan) if refuses else moved
 
     def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
         """The least length of a row over its length at the start of the motion."""

@@ -180,7 +180,9 @@ def simulate(
             tolerance; with fixed steps one step before it. Variational methods stop, and so do
             equal steps of which one meets the place with an end or a stage, to 1e-5 of a step.
             States are saved there, too, and a motion may end there: by a polynomial through both
-            ends of a short step, with velocities to 1e-9 at best.
+            ends of a short step, with velocities to 1e-9 at best, at loose tolerances to some
+            hundred of them. In float32 rounding shows there: 1e-2 at worst of 384 linkages that
+            pass two such places, 3e-5 in the median.
         assemble: whether an inconsistent start is moved to the nearest consistent one, as by
             `jl.assemble`; else it ends in the status inconsistent_start.
         estimate_error: whether to solve once more with a tenth of the tolerance and, where there

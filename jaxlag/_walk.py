@@ -91,12 +91,14 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
             y1, dy1 = jax.jvp(step, (before[0], path.moved()), (before[1], change.args))
         else:
             assert change.anchors is not None
-            step = lambda y, moved, t, end, turn_end: path.ahead(  # noqa: E731
-                path.with_args(moved), t, end, jump, y, reach, turn_end
+            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, *turn_end
             )
-            t_dot, turn_dot = (change.anchors[clock.anchor(j)] for j in (i - 1, i))
-            given = (before[0], path.moved(), t, end, turn_end)
-            y1, dy1 = jax.jvp(step, given, (before[1], change.args, t_dot, end_dot, turn_dot))
+            given = (before[0], path.moved(), t, end)
+            dots = (before[1], change.args, change.anchors[clock.anchor(i - 1)], end_dot)
+            if reach is not None:
+                given, dots = (*given, turn_end), (*dots, change.anchors[clock.anchor(i)])
+            y1, dy1 = jax.jvp(step, given, dots)
         if rows is not None:
             assert record.row_turn is not None
             rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
@@ -176,14 +178,15 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             )
             before, more = jax.vjp(step, y, moved)[1](given)
         else:
-            step = lambda y, moved, t, end, turn_end: path.ahead(  # noqa: E731
-                with_moved(moved), t, end, jump, y, reached, turn_end
+            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, *turn_end
             )
-            before, more, *times_bar = jax.vjp(step, y, moved, t, end, turn_end)[1](given)
-            t_bar, end_bar, turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
+            times = (t, end) if reached is None else (t, end, turn_end)
+            before, more, *times_bar = jax.vjp(step, y, moved, *times)[1](given)
+            t_bar, end_bar, *turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
             at_row = jnp.where(row, end_bar, 0.0)
             anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(i), end_bar - at_row + turn_bar)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i), sum(turn_bar, end_bar - at_row))
             if between is not None:
                 dues_bar = _added_at(dues_bar, r - 1, at_row)
         more = [jnp.where(takes, x, 0.0) for x in more]

@@ -4,8 +4,6 @@ The windows benchmark of multibody dynamics (IFToMM A02): rods of length 1 in pa
 lie flat twice in every turn. The motion on the parallelogram is that of one pendulum.
 """
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,23 +12,11 @@ from _families import mostly_full
 from mechanisms import four_bar, four_bar_start
 
 import jaxlag as jl
-from jaxlag._change_points import (
-    AHEAD,
-    BESIDE,
-    LOST,
-    ROOM,
-    SHORT,
-    narrow,
-    no_crossing,
-    widest_gap,
-)
-from jaxlag._kkt import FORMULATIONS, solve_kkt
+from jaxlag._kkt import FORMULATIONS
 from jaxlag._methods import METHODS
 from jaxlag._tableaus import nodes_of
 from systems._catalogue import ENTRIES
 
-EPS = np.finfo(float).eps
-NARROW, CLOSE = narrow(float), narrow(float) / 3
 SIDE = (0.0, 1.0)  # where the fixed ends are
 SPEEDS = jnp.linspace(0.9, 1.5, 24)
 Q0 = jnp.array([0.0, 1.0, 1.0, 1.0])
@@ -96,13 +82,14 @@ def test_flat_places_in_float32_are_passed_or_named():
         at_once = {"rtol": rtol, "atol": rtol, "throw": False}
         return jl.simulate(WINDOW, single(Q0), v0, single(ts), **at_once)
 
-    # Measured: 22 and 20 of 24 motions pass, off by 9e-4 and 1e-4. Others end there and say so.
-    for rtol, off in ((1e-4, 5e-3), (1e-5, 5e-4)):
+    # Measured: 24 and 23 of 24 motions pass, off by 1e-3 and 9e-4. Others end there and say so.
+    # Of 384 motions 376 and 370, off by 1e-2 at most and by 3e-5 in the median at 1e-5: rounding.
+    for rtol in (1e-4, 1e-5):
         found = jax.jit(jax.vmap(run, in_axes=(0, None)))(single(SPEEDS), rtol)
         assert found.q.dtype == jnp.float32
         passed = found.status == jl.Status.ok
-        assert jnp.sum(passed) >= 16
-        np.testing.assert_allclose(found.q[passed, :, 0], expected[passed], atol=off)
+        assert jnp.sum(passed) >= 22
+        np.testing.assert_allclose(found.q[passed, :, 0], expected[passed], atol=5e-3)
 
 
 def test_it_stops_before_them_where_told_to():
@@ -234,8 +221,8 @@ def test_rounding_does_not_shorten_the_steps(rtol):
 def test_equal_steps_that_meet_the_place_say_so():
     """By an end, or by a stage of the method: and those that do not keep their accuracy."""
     when = flat_at(1.0)
-    nodes = np.unique(nodes_of(METHODS["dopri8"]()))
-    steps = when / (20 + np.array([0.0, *nodes[(nodes > 0.2) & (nodes < 1)], 1.0]))
+    nodes = np.clip(np.unique(nodes_of(METHODS["dopri8"]())), 0.0, 1.0)
+    steps = when / (20 + np.unique([0.0, *nodes, 1.0]))
 
     def run(dt):
         v0 = jnp.array([1.0, 0.0, 1.0, 0.0])
@@ -244,11 +231,26 @@ def test_equal_steps_that_meet_the_place_say_so():
         )
 
     found = jax.vmap(run)(jnp.asarray(steps))
-    assert (found.status == jl.Status.rank_change).all()
+    passed = found.status == jl.Status.ok
+    assert ((found.status == jl.Status.rank_change) | passed).all()
+    assert jnp.sum(passed) <= 1  # measured: by the first stage after the start, right to 5e-13
     apart = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
     assert (apart.status == jl.Status.ok).all()
     expected = exact(jnp.ones(()), jnp.array([0.0, 0.8]))[-1]
-    np.testing.assert_allclose(apart.q[:, -1, 0], expected + 0 * steps, atol=1e-8)
+    for end in (*found.q[passed, -1, 0], *apart.q[:, -1, 0]):
+        np.testing.assert_allclose(end, expected, atol=1e-8)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("how", [{"rtol": 1e-9, "atol": 1e-9}, {"dt": 0.02, "method": "dopri8"}])
+def test_a_force_that_is_nan_before_the_place_is_not_taken_for_it(how):
+    """At x0 = 0.95, where rows have a third of their length left: none at x0 = 1."""
+    wrong = lambda t, q, v, p: jnp.where(q[0] > p, jnp.nan, 0.0) * jnp.ones(4)  # noqa: E731
+    force, rows = jl.GeneralizedForce(wrong, "wrong"), jl.Holonomic(rods, "rods")
+    system = jl.System(window, ("x0", "y0", "x1", "y1"), forces=[force], constraints=[rows])
+    found = jl.simulate(system, Q0, [1.0, 0, 1.0, 0], [0.0, 2.0], 0.95, throw=False, **how)
+    assert found.status == jl.Status.nonfinite
+    assert 0.92 < found.last_state[0][0] < 0.9501
 
 
 @pytest.mark.full
@@ -408,129 +410,3 @@ def test_where_ways_do_not_cross_a_bead_stops(name):
     off = np.abs(np.linalg.norm(v, axis=-1) / np.linalg.norm(v0) - 1.0)
     # Measured, the worst: 1.7e-2 (the last state is 3 mm beyond the cusp), 3e-7, 2e-10, 4e-12.
     assert (np.max(off, axis=1) <= np.array([5e-2, 2e-6, 1e-9, 2e-11])).all()
-
-
-# ---- Steps that have the place ahead -------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", ["dopri8", "tsit5", "prince9", "kvaerno5"])
-def test_no_stage_is_near_the_place(method):
-    """The step across is no longer than proposed, and its stages are as far as they can be."""
-    nodes = np.array([0.0, *nodes_of(METHODS[method]()), 1.0])
-    gap = widest_gap(nodes.tolist())
-    apart = np.min(np.abs(nodes - gap))
-    assert apart > 0.03
-    t, h = jnp.array(2.0), jnp.array(0.3)
-    for left in (0.05, 0.1, 0.25, 0.5, 0.8):
-        known = ahead_of(t, left * h, 0.5 * SHORT)
-        step = float(known.step(t, h, gap))
-        assert step <= h
-        if left < gap:
-            np.testing.assert_allclose(left * h / step, gap, rtol=1e-12)
-        else:  # the next one does, and is about as long as proposed
-            across = float(known.step(t + step, h, gap))
-            np.testing.assert_allclose((left * 0.3 - step) / across, gap, rtol=1e-12)
-            np.testing.assert_allclose(across, ROOM * h, rtol=1e-12)
-
-
-def ahead_of(t, left, apart):
-    """Known of a place `left` ahead of t."""
-    return no_crossing(t, 1, float)._replace(time=t + left, apart=jnp.array(apart))
-
-
-def test_what_is_saved_across_shortens_the_step():
-    """It leads up to NARROW of a row's length, by a tenth of what is left at most; then across."""
-    t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
-    for apart, without in ((0.9 * AHEAD, h), (0.9 * SHORT, 0.1 / gap), (2 * NARROW, 0.1 / gap)):
-        known = ahead_of(t, 0.1, apart)
-        np.testing.assert_allclose(known.step(t, h, gap, due=jnp.array(2.4)), without, rtol=1e-12)
-        lead = 0.1 * (1 - max(NARROW / apart, 0.1))
-        np.testing.assert_allclose(known.step(t, h, gap, due=jnp.array(2.25)), lead, rtol=1e-12)
-    near = ahead_of(t, 0.1, NARROW)
-    np.testing.assert_allclose(near.step(t, h, gap, due=jnp.array(2.25)), 0.1 / gap, rtol=1e-12)
-    # A place so near that no stage would lie before it, too.
-    beside = ahead_of(t, 0.001, 0.5 * NARROW)
-    assert float(beside.step(t, h, gap)) == 0.3
-    np.testing.assert_allclose(beside.step(t, h, gap, due=jnp.array(2.25)), 0.001 / gap, rtol=1e-12)
-
-
-def test_a_motion_that_ends_at_the_place_or_beyond_it():
-    """The last step is a short one, or has the place where no stage is."""
-    t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
-    far, near = ahead_of(t, 0.1, SHORT), ahead_of(t, 0.1, NARROW)
-    at = jnp.array(2.1 + 0.04 * CLOSE * 0.1 / SHORT)
-    assert far.is_at(t, at)
-    assert not far.is_at(t, 2.1 + 1.01 * CLOSE * 0.1 / SHORT)
-    assert not far.is_at(t, 2.1 - 1.01 * CLOSE * 0.1 / SHORT)
-    np.testing.assert_allclose(far.step(t, h, gap, at), 0.1 * (1 - NARROW / SHORT), rtol=1e-12)
-    assert float(near.step(t, h, gap, jnp.array(2.1))) == 0.3  # cut where the motion ends
-    beyond = jnp.array(2.11)
-    lead = float(far._replace(apart=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
-    np.testing.assert_allclose((0.1 - lead) / (0.11 - lead), gap, rtol=1e-9)
-
-
-def test_where_the_place_is_to_be_expected():
-    """A length that goes through zero as a straight line; none where it grows, or is long."""
-    t0, t1, t2 = jnp.array(0.0), jnp.array(1.0), jnp.array(1.5)
-    begin = no_crossing(t0, 2, float)
-    moved = jnp.array([0.006, 0.008])
-    first = begin.onwards(t0, t1, jnp.array(0.08), 92 * moved)  # 0.92 of a length of 1
-    second = first.onwards(t1, t2, jnp.array(0.04), 4 * moved)
-    np.testing.assert_allclose(second.time, 2.0, rtol=1e-12)
-    np.testing.assert_allclose(second.span, 100 * moved, rtol=1e-12)
-    assert second.is_near
-    assert jnp.isinf(second.onwards(t2, jnp.array(2.5), jnp.array(0.08), moved).time)
-    assert jnp.isinf(begin.onwards(t0, t1, jnp.array(1.1 * AHEAD), moved).time)
-    assert second._replace(apart=jnp.array(BESIDE * 0.03)).is_beside(second)
-    assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
-
-
-def test_for_how_long_rows_may_depend():
-    """Twice as long as the line says by which rows became shorter; over no such way at a cusp."""
-    t0, t1 = jnp.array(0.0), jnp.array(1.0)
-    moved = jnp.array([0.6, 0.8])
-    begin = no_crossing(t0, 2, float).onwards(t0, t1, jnp.array(0.05), 0.95 * moved)
-    begin = begin.onwards(t0, t1, jnp.array(0.0), 0.05 * moved)
-    assert begin.depends
-    assert begin.passes
-    way = 2 * LOST
-    across = begin.onwards(t0, t1, jnp.array(0.9 * LOST), 0.95 * way * moved)
-    assert across.passes
-    assert across.onwards(t0, t1, jnp.array(0.1), 0.1 * moved).passes  # of which little is within
-    assert not across.onwards(t0, t1, jnp.array(LOST), 2 * way * moved).passes
-    # s = d^(3/2), a step at a time from 1 to the end of the place
-    ends = np.geomspace(1.0, LOST ** (2 / 3), 30)
-    cusp = no_crossing(t0, 2, float)
-    for d0, d1 in itertools.pairwise(ends):
-        cusp = cusp.onwards(t0, t1, jnp.array(d1**1.5 * (1 - EPS)), (d0 - d1) * moved)
-    assert cusp.depends
-    assert not cusp.onwards(t0, t1, jnp.array(0.5 * LOST), ends[-1] * moved).passes
-
-
-# ---- Rows that are left out ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize(("n", "m"), mostly_full([(3, 2), (6, 4), (12, 9)], (6, 4)))
-def test_a_row_that_depends_on_those_before_it_is_left_out(formulation, n, m):
-    """As if it were not there, and with no multiplier; else nothing is changed."""
-    rng = np.random.default_rng(n)
-    half = rng.normal(size=(n, n))
-    M, A, r = half @ half.T + np.eye(n), rng.normal(size=(m, n)), rng.normal(size=n)
-    mix, c = rng.normal(size=m - 1), rng.normal(size=m)
-    A[-1], c[-1] = mix @ A[:-1], mix @ c[:-1]
-
-    def solved(rows=slice(None), **options):
-        given = (jnp.asarray(x) for x in (M, A[rows], r, c[rows]))
-        return solve_kkt(*given, formulation=formulation, **options)
-
-    x, lam = solved(crossing=True)
-    expected, of_others = solved(slice(m - 1))
-    allowed = 100 * EPS * np.linalg.cond(M)
-    np.testing.assert_allclose(x, expected, atol=allowed * np.abs(expected).max())
-    np.testing.assert_allclose(lam[:-1], of_others, atol=allowed * np.abs(of_others).max())
-    assert lam[-1] == 0
-    assert np.isnan(solved()[0]).all()
-    A[-1] = rng.normal(size=n)
-    for one, other in zip(solved(crossing=True), solved(), strict=True):
-        np.testing.assert_array_equal(one, other)

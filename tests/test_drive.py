@@ -94,9 +94,9 @@ def step_ends(options):
         return _replay._recorded(inexact, rest, setup, static).record
 
     kept = record(values)
-    # A turn that was not accepted ends where the last one did.
+    # A turn that was not accepted ends where the last one did; a negative one at the stop.
     ends = np.asarray(kept.offsets)[: int(kept.turns)]
-    return np.unique([0.0, *np.where(np.isinf(ends), 4.0, ends)])
+    return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
 
 
 def _stop():
