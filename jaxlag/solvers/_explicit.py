@@ -94,6 +94,11 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
         """Whether the last stage of a step is the first one of the next."""
         return tableau_of(type(self)).fsal
 
+    @property
+    def steps_as_declared(self) -> bool:
+        """Whether a step is that of the coefficients, and no subclass takes another."""
+        return type(self).step is AbstractExplicit.step
+
     def order(self, terms: Any) -> int:
         """Order of the step."""
         order = self.stock.order(terms)
