@@ -9,17 +9,16 @@ from jaxtyping import Array
 
 from jaxlag._change_points import CHANGE_POINTS
 from jaxlag._constraints import Baumgarte
+from jaxlag._coordinates import vector
+from jaxlag._derived import QUANTITIES
 from jaxlag._errors import bad
 from jaxlag._forces import reads_lam
 from jaxlag._gradient import MODES
-from jaxlag._inputs import evaluate
 from jaxlag._kkt import FORMULATIONS
 from jaxlag._lanes import at_most
 from jaxlag._methods import default_tolerances
-from jaxlag._params import concrete
-from jaxlag._solution import QUANTITIES
 from jaxlag._system import System
-from jaxlag._vectors import of_state, vector
+from jaxlag._vectors import concrete, of_state
 
 
 def check_options(
@@ -258,19 +257,3 @@ def _positive(name: str, step: Any) -> Any:
     if concrete(step) and not (np.isfinite(step) and step > 0):
         raise bad(name, "be positive, whichever way time runs", f"it was {step}")
     return step
-
-
-def check_declaration(
-    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
-) -> None:
-    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
-    values = evaluate(inputs, t, q, v, params)
-    system.check_traceable(params, q.dtype, values)
-    for name in inputs:
-        if name not in values.read:
-            raise bad(
-                "inputs",
-                "hold only signals that a force reads",
-                f"no force read {name!r}",
-                "Drop it, or read inputs[name] in a GeneralizedForce.",
-            )

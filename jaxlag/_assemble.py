@@ -14,8 +14,8 @@ from jaxlag import _params
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import check_params, closing
 from jaxlag._constraints import Layout
+from jaxlag._coordinates import state_vectors
 from jaxlag._custom_jvp import keeping_rules
-from jaxlag._dynamics import still
 from jaxlag._errors import AssemblyError, bad
 from jaxlag._geometry import advice_on_rows
 from jaxlag._kkt import augmented, solve_kkt
@@ -24,7 +24,7 @@ from jaxlag._lowering import ArrayTerms
 from jaxlag._rank import independent_rows, row_sizes, without_rounding
 from jaxlag._status import Status
 from jaxlag._system import System
-from jaxlag._vectors import number, real, state_vectors
+from jaxlag._vectors import concrete, number, real, still
 
 MAX_TURNS = 200
 NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out on the way, where they
@@ -159,7 +159,7 @@ def assemble(
         if diagonal.shape != q.shape:
             must = f"have shape {q.shape}"
             raise bad("assemble: weights", must, f"its shape was {diagonal.shape}")
-        if _params.concrete(diagonal):
+        if concrete(diagonal):
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
                 raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
@@ -169,11 +169,11 @@ def assemble(
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held
     found = _run(key, (q, v, traced, t, diagonal))
-    if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
+    if throw and concrete(found.status) and int(found.status) != int(Status.ok):
         found = still(found)  # under grad its numbers are traced, and have values all the same
         fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
         where = [t, found.q]
-        if np.ndim(found.status) == 0 and _params.concrete(traced, where):
+        if np.ndim(found.status) == 0 and concrete(traced, where):
             fix = f"{fix} {advice_on_rows(system, params, *where)}".rstrip()
         raise AssemblyError(f"Assembly ended with status {found.message()}{fix}", found)
     return found
@@ -433,5 +433,5 @@ def _what_to_release(key: Any, values: Any) -> str:
 
 
 def _check_finite(argument: str, x: Array) -> None:
-    if _params.concrete(x) and not np.all(np.isfinite(x)):
+    if concrete(x) and not np.all(np.isfinite(x)):
         raise bad(f"assemble: {argument}", "be finite", f"it was {x}")

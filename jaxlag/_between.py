@@ -1,5 +1,6 @@
 """States of a motion between its rows."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,20 +8,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlag import _params
+from jaxlag._abstract_solution import AbstractSolution
 from jaxlag._errors import bad
-from jaxlag._simulate import simulate
-from jaxlag._vectors import real
+from jaxlag._vectors import concrete, real
 
 _ASK = "Ask for it as a row: ts=jnp.linspace(0, 10, 501)."
 
 
-def states_at(motion: Any, t: Any) -> Any:
-    """See `Solution.at`."""
+def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
+    """See `Solution.at`.
+
+    Args:
+        motion: a Solution.
+        t: times.
+        solve: `simulate`.
+    """
     if motion.ts.ndim != 1:
         was = f"it was one of a batch {motion.ts.shape[:-1]}"
         raise bad("at: motion", "be a single one", was, "Take one of them, as batch[3].")
-    if not _params.concrete(motion.ts, motion.q, t):
+    if not concrete(motion.ts, motion.q, t):
         raise bad("at", "be asked outside of jit, vmap and derivatives", "it was traced", _ASK)
     if motion.tolerances is None:
         must = "be that of a motion with adaptive steps"
@@ -47,7 +53,7 @@ def states_at(motion: Any, t: Any) -> Any:
     if project == "projection" or not motion.system.constraints:
         project = True
     plain = not motion.system.constraints and motion.system.quasi is None
-    further = simulate(
+    further = solve(
         motion.system,
         motion.q[row],
         motion.v[row],

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._dynamics import Dynamics, still
-from jaxlag._errors import gradient
+from jaxlag._dynamics import Dynamics
 from jaxlag._kkt import augmented, masked
 from jaxlag._linalg import factor_mass
+from jaxlag._signature import gradient
 from jaxlag._step import Arguments
+from jaxlag._vectors import still
 
 
 class Canonical(eqx.Module):

@@ -29,6 +29,7 @@ from jaxlag._input_values import InputValues
 from jaxlag._mishaps import said
 from jaxlag._outside import outside
 from jaxlag._owned import owned
+from jaxlag._vectors import concrete
 from jaxlag._watched import Outside, changes
 
 
@@ -120,7 +121,7 @@ class Captured:
             program = self._trace(kind, leaves)
             # Without the tracers, which programs in a cache would keep alive.
             reads = [_Traced(id(x)) if id(x) in instead else x for x in program.code.consts]
-            if not _params.concrete(reads):
+            if not concrete(reads):
                 return program
             made[self, kind] = program._replace(code=ClosedJaxpr(program.code.jaxpr, reads))
         program = made[self, kind]
@@ -132,7 +133,7 @@ class Captured:
         read = outside(self.function) if self._outside is None else {}
         tree, static, _, named, _ = kind
         program = self._traced(tree, static, leaves, named)
-        if not _params.concrete(*program.code.consts):
+        if not concrete(*program.code.consts):
             return program
         if not self._programs:
             _count(self.function)

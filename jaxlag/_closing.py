@@ -12,11 +12,13 @@ from jaxlag import _params
 from jaxlag._captured import functions_of
 from jaxlag._closed import Closed
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import bad, real_scalar
+from jaxlag._errors import bad
 from jaxlag._forces import sliding
 from jaxlag._inputs import evaluate
 from jaxlag._lowering import ArrayTerms
+from jaxlag._signature import real_scalar
 from jaxlag._system import System
+from jaxlag._vectors import concrete
 
 
 def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> Any:
@@ -28,7 +30,7 @@ def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
     declared = (system.lagrangian, system.constraints, system.quasi)
     if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
         return params
-    tracers = [x for x in _consts(system, params, q, inputs) if not _params.concrete(x)]
+    tracers = [x for x in _consts(system, params, q, inputs) if not concrete(x)]
     return Closed(params, tracers, tuple(map(id, tracers))) if tracers else params
 
 

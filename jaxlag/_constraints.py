@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._captured import captured, once
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad
 from jaxlag._forces import EXPLICIT_TIME, AbstractForce, reads_lam
+from jaxlag._signature import require_arity
 
 
 class AbstractConstraint(eqx.Module):

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._errors import bad
+from jaxlag._vectors import of_state
 
 
 class Coordinates:
@@ -113,3 +114,34 @@ class Coordinates:
 
 def _is_count(x: Any) -> bool:
     return isinstance(x, int) and not isinstance(x, bool) and x > 0
+
+
+def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
+    """`x` as an inexact array of shape (n,); raises naming `argument` if it cannot be one.
+
+    A number will do for a single coordinate.
+    """
+    n = coordinates.size
+    fix = f"Give one entry per coordinate, in the order {list(coordinates.labels)}."
+    if isinstance(x, Mapping):
+        x = coordinates.flatten(x, argument)
+    try:
+        x = jnp.asarray(x)
+    except (TypeError, ValueError) as error:
+        raise bad(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
+    if n == 1 and x.shape == ():
+        x = x[None]
+    if x.shape != (n,):
+        raise bad(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
+    if jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def state_vectors(coordinates: Coordinates, q: Any, v: Any) -> tuple[Array, Any]:
+    """(q, v) as flat vectors of one dtype, the result type of both; v may be None."""
+    q = vector(coordinates, "q", q)
+    if v is None:
+        return of_state("q", q)[0], None
+    q, v = of_state("q and v", q, vector(coordinates, "v", v))
+    return q, v

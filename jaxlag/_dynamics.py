@@ -32,6 +32,7 @@ from jaxlag._rank import Choice, independent_rows, row_sizes
 from jaxlag._step import Arguments, Gaps, RowChoice
 from jaxlag._system import System
 from jaxlag._terms import Terms
+from jaxlag._vectors import still
 
 
 class Dynamics(eqx.Module):
@@ -420,8 +421,3 @@ class Dynamics(eqx.Module):
             return None
         equations = terms.lowered(q, params, values).equations
         return None if equations is None else len(equations.program.body)
-
-
-def still(tree: Any) -> Any:
-    """Without derivatives: a status has none, and differentiating its making would cost."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
-from jaxlag._dynamics import Dynamics, still
+from jaxlag._dynamics import Dynamics
 from jaxlag._forces import reads_lam
 from jaxlag._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked
 from jaxlag._linalg import factor_mass, first_unhealthy, solve_mass
@@ -21,6 +21,7 @@ from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals
 from jaxlag._status import Status
 from jaxlag._step import Arguments
+from jaxlag._vectors import concrete, still
 
 
 class Ending(NamedTuple):
@@ -85,7 +86,7 @@ def ended(
 
 def is_open(ending: Ending) -> bool:
     """Whether `explained` may say more of one of these endings; True where they are traced."""
-    if not _params.concrete(ending.status):
+    if not concrete(ending.status):
         return True
     return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
 

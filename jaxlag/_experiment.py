@@ -8,8 +8,9 @@ import equinox as eqx
 import numpy as np
 
 from jaxlag._captured import Captured, captured
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad
 from jaxlag._inputs import check_inputs, check_range
+from jaxlag._signature import require_arity
 
 
 @final

@@ -1,7 +1,6 @@
 """The text of `System.explain`."""
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import jax
 
@@ -10,11 +9,9 @@ from jaxlag._constraints import Layout
 from jaxlag._lanes import LANES, MOST
 from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO
 from jaxlag._lowering import Equations, Lowered, Program, Structure, find
+from jaxlag._quantities import AbstractQuantities
 from jaxlag.solvers import Dopri8
 from jaxlag.solvers._explicit import WRITTEN_OUT, in_loop_over_stages
-
-if TYPE_CHECKING:
-    from jaxlag._system import System
 
 
 def _list(names: frozenset[str]) -> str:
@@ -22,7 +19,9 @@ def _list(names: frozenset[str]) -> str:
     return ", ".join(order) if order else "nothing"
 
 
-def explain(system: "System", structure: Structure, lowered: Lowered | None, rows: Layout) -> str:
+def explain(
+    system: AbstractQuantities, structure: Structure, lowered: Lowered | None, rows: Layout
+) -> str:
     """What was found in `system` and what follows for the compiled program.
 
     Args:
@@ -50,7 +49,7 @@ def explain(system: "System", structure: Structure, lowered: Lowered | None, row
     return "\n".join([*lines, f"small loops   {_xla.report()}"])
 
 
-def _quasi(system: "System") -> list[str]:
+def _quasi(system: AbstractQuantities) -> list[str]:
     quasi = system.quasi
     if quasi is None:
         return []
@@ -76,7 +75,7 @@ def _constraints(rows: Layout, quasi: bool) -> list[str]:
     ]
 
 
-def _scalar(system: "System", lowered: Lowered, equations: Equations) -> list[str]:
+def _scalar(system: AbstractQuantities, lowered: Lowered, equations: Equations) -> list[str]:
     program, labels = equations.program, system.coordinates.labels
     assert lowered.scene is not None
     if lowered.scene.kinematics is not None:
@@ -173,7 +172,7 @@ def _factorisation(n: int) -> str:
     return f"by library Cholesky (n > {LOOP_UP_TO})"
 
 
-def _array(system: "System", structure: Structure, reason: str) -> list[str]:
+def _array(system: AbstractQuantities, structure: Structure, reason: str) -> list[str]:
     often = "once per solve" if structure.mass_constant else "per evaluation"
     ways = ["M by batched forward-over-reverse columns"]
     if not structure.bias_zero:

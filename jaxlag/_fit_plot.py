@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
-from jaxlag._prediction import channels_of, rms_of
+from jaxlag._residuals import channels_of, rms_of
 
 MOST = 4
 """Experiments in a figure."""

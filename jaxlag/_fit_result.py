@@ -15,12 +15,14 @@ from jaxlag._channels import Reader
 from jaxlag._dissipation import feeding
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
+from jaxlag._fit_plot import plotted
 from jaxlag._free import Unknowns, paths
 from jaxlag._identifiability import Spectrum, run_off
 from jaxlag._information import distance, linearised
 from jaxlag._jumps import names_of
-from jaxlag._prediction import Prediction, channels_of, predict, residuals_of, rms_of
+from jaxlag._prediction import Prediction, predict, residuals_of
 from jaxlag._problem import freedom
+from jaxlag._residuals import channels_of, rms_of
 from jaxlag._segments import Layout
 from jaxlag._shooting import Found, Shooting
 from jaxlag._status import Status
@@ -140,8 +142,6 @@ class FitResult(eqx.Module):
         Returns:
             A `matplotlib.figure.Figure`.
         """
-        from jaxlag._fit_plot import plotted
-
         return plotted(self.experiments, self.residuals)
 
     @property

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from jaxlag._captured import captured
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import accepts, bad, gradient, require_arity, wants
+from jaxlag._errors import bad
+from jaxlag._signature import accepts, gradient, require_arity, wants
 
 EXPLICIT_TIME = "explicit time"
 """Name of the power -dL/dt at fixed (q, v), which no force may bear."""

@@ -23,7 +23,7 @@ from jaxlag._methods import default_tolerances
 from jaxlag._solution import Solution
 from jaxlag._status import ADVICE, Status
 from jaxlag._system import System
-from jaxlag._vectors import number
+from jaxlag._vectors import concrete, number
 
 SEGMENTS_AT_ONCE = 64  # beside one another in one loop, at most
 # Bytes of their stages from which XLA (0.10) splits operations between threads, for which it has
@@ -203,7 +203,7 @@ def grad_growth(
         must, was = "have at least 3 save times", f"it had {motion.ts.shape[-1]}"
         fix = "Simulate it with ts=jnp.linspace(t0, t1, 101)."
         raise bad("grad_growth: motion", must, was, fix)
-    single = motion.ts.ndim == 1 and _params.concrete(motion.status)
+    single = motion.ts.ndim == 1 and concrete(motion.status)
     if single and int(motion.status) != int(Status.ok):
         was = f"it ended with status {motion.message()}"
         raise bad("grad_growth: motion", "have reached its last time", was)
@@ -227,7 +227,7 @@ def grad_growth(
         status = Status(int(statuses[i]))
         was = f"from t = {motion.ts[i]} to {motion.ts[i + 1]} the status was {status.name}"
         raise bad("grad_growth: motion", "be solvable from each of its rows", was, _fix(status))
-    if _params.concrete(growth.horizon):
+    if concrete(growth.horizon):
         _warn_beyond(growth)
     return growth
 
@@ -260,7 +260,7 @@ def _warn_beyond(growth: GradientGrowth) -> None:
 def _not_negative(name: str, x: Any, default: float, dtype: Any, zero: bool = True) -> Array:
     must = "be a number that is not negative" if zero else "be a positive number"
     x = number(f"grad_growth: {name}", must, default if x is None else x, dtype)
-    if _params.concrete(x) and not (x >= 0 if zero else x > 0):
+    if concrete(x) and not (x >= 0 if zero else x > 0):
         raise bad(f"grad_growth: {name}", must, f"it was {x}")
     return x
 

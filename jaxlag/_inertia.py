@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._errors import bad
-from jaxlag._params import concrete
-from jaxlag._vectors import common, real
+from jaxlag._vectors import common, concrete, real
 
 
 def stated(*values: Any) -> AbstractContextManager:

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._errors import bad
 from jaxlag._input_values import InputValues
-from jaxlag._params import concrete
 from jaxlag._signals import AbstractInput, AbstractTable, Feedback, Function, interval_at
+from jaxlag._vectors import concrete
 
 
 def check_inputs(inputs: Any) -> dict[str, Any]:

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag import _params
-from jaxlag._arguments import check_declaration
 from jaxlag._captured import warn_of_changes
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad
 from jaxlag._forces import reads_lam
 from jaxlag._inputs import check_inputs, check_range, evaluate
-from jaxlag._system import System
-from jaxlag._vectors import of_state, real
+from jaxlag._signature import require_arity
+from jaxlag._system import System, check_declaration
+from jaxlag._vectors import concrete, of_state, real
 
 
 def inverse_dynamics(
@@ -153,7 +153,7 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
     t = real("inverse_dynamics: t", t)
     if t.shape not in ((), rows):
         raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
-    if _params.concrete(t) and not np.all(np.isfinite(t)):
+    if concrete(t) and not np.all(np.isfinite(t)):
         raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
     q, v, a = of_state("q, v and a", *vectors)
     return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
@@ -161,7 +161,7 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
 
 def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
     """Raise unless a vector or rows of them with values are finite."""
-    if not _params.concrete(x) or np.all(np.isfinite(x)):
+    if not concrete(x) or np.all(np.isfinite(x)):
         return
     values = np.asarray(x)
     *row, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])

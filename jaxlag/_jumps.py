@@ -29,6 +29,7 @@ from jaxlag._kinks import outcomes
 from jaxlag._nested import called, equations, within
 from jaxlag._signals import AbstractInput, AbstractTable
 from jaxlag._system import System
+from jaxlag._vectors import concrete
 
 _TIME, _STATE = "t", "q, v"
 _GUARDS = ("eq", "ne", "is_finite")  # of a single place
@@ -129,10 +130,10 @@ class Jumps:
         It may not where that could be seen, nor where a loop might not end.
         """
         leaves = jax.tree.leaves(self._traced)
-        numbers = [x for x in leaves if not _params.concrete(x)]
+        numbers = [x for x in leaves if not concrete(x)]
         known = all(jnp.issubdtype(x.dtype, np.number) or x.dtype == bool for x in numbers)
         calls = {eqn.primitive.name for eqn in equations(self._program)} & set(_NOT_RUN)
-        return known and not calls and _params.concrete(self._program.consts)
+        return known and not calls and concrete(self._program.consts)
 
     def _jump(self, eqns: Sequence[Any], ts: Any) -> list[bool]:
         """Whether the equations jump where the operations come out otherwise, or may."""
@@ -175,7 +176,7 @@ class Jumps:
         for x in jax.tree.leaves(self._moving):
             found.append(jnp.asarray(draw(0.5, 1.5, x.shape), x.dtype))
         for x in jax.tree.leaves(self._traced):
-            value = x if _params.concrete(x) else _params.known(x)
+            value = x if concrete(x) else _params.known(x)
             own = own and value is not None
             if value is None:  # in order, as tables are
                 value = np.sort(draw(0.5, 1.5, (1, *x.shape)), axis=-1)[0]

@@ -13,9 +13,9 @@ import numpy as np
 import optimistix
 from jaxtyping import Array
 
-from jaxlag import _params
 from jaxlag._errors import bad
 from jaxlag._tableaus import with_stages
+from jaxlag._vectors import concrete
 from jaxlag.solvers import (
     AbstractFixedStep,
     Dopri5,
@@ -108,7 +108,7 @@ def choose(
                 "Give dt= for fixed steps.",
             )
     # rtol has no unit; atol has those of the coordinates.
-    known = adaptive and _params.concrete((rtol, atol))
+    known = adaptive and concrete((rtol, atol))
     solver = _solver(method, (rtol if rtol > 0 else np.min(atol)) if known else None)
     if adaptive and isinstance(solver, AbstractFixedStep):
         raise bad(
@@ -215,7 +215,7 @@ def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
     """
     dtype = jnp.result_type(rtol)
     least = 10 * float(jnp.finfo(dtype).eps)
-    known = _params.concrete((rtol, atol))  # numpy: no dispatch
+    known = concrete((rtol, atol))  # numpy: no dispatch
     larger = (lambda x: np.asarray(np.maximum(x, least), dtype)) if known else None
     bounds: Any = [
         larger(0.1 * x) if larger else jnp.maximum(0.1 * x, least).astype(dtype)

@@ -19,7 +19,7 @@ from jax._src import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from jaxlag._dependence import scan_sizes
-from jaxlag._lowering._interpret import equation
+from jaxlag._interpret import equation
 
 _LABEL = re.compile(r"jaxlag equation (\d+)\.")
 _NOT_THE_USERS = tuple(

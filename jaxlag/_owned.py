@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-from jaxlag import _params
 from jaxlag._rewritten import rewritten
+from jaxlag._vectors import concrete
 
 
 def owned(code: ClosedJaxpr) -> ClosedJaxpr:
@@ -29,7 +29,7 @@ def _atom(atom: Any) -> Any:
 
 
 def _copied(x: Any) -> Any:
-    if not _params.concrete(x):
+    if not concrete(x):
         return x
     if isinstance(x, np.ndarray):
         return x.copy()

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxlag._alike import types_in, types_of
 from jaxlag._closed import plain
 from jaxlag._immutable import check_nodes, is_fixed, refusal
+from jaxlag._vectors import concrete
 
 _TRACED = {float: True, int: False, bool: False, str: False}  # of plain leaves
 
@@ -36,11 +37,6 @@ class _Frozen:
 def is_array(leaf: Any) -> bool:
     """Whether a leaf is a numpy or JAX array, a tracer included."""
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray)
-
-
-def concrete(*arrays: Any) -> bool:
-    """Whether all of these have values, rather than being traced by a transform."""
-    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
 def known(x: Any) -> np.ndarray | None:

@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from jaxlag import _params
 from jaxlag._lowering import ScalarTerms
 from jaxlag._system import System
+from jaxlag._vectors import concrete
 
 LONG = 5.0  # s
 
@@ -33,7 +33,7 @@ def timed(
         clock: seconds.
     """
     compiled = getattr(program, "_cache_size", None)  # JAX's own count
-    if compiled is None or not _params.concrete(values):
+    if compiled is None or not concrete(values):
         return program(key, values)
     count, start = compiled(), clock()
     results = program(key, values)

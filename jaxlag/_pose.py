@@ -10,11 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag import _params
-from jaxlag._arguments import check_declaration
 from jaxlag._assemble import assembled
 from jaxlag._change_points import lengths_of, may_cross, may_stop, scales_at
 from jaxlag._constraints import Baumgarte
-from jaxlag._dynamics import Dynamics, still
+from jaxlag._dynamics import Dynamics
 from jaxlag._gradient import Keep
 from jaxlag._inputs import all_knots, common_range, in_order
 from jaxlag._methods import for_state
@@ -26,9 +25,10 @@ from jaxlag._scheme import Scheme
 from jaxlag._settling import Settling
 from jaxlag._start import Start, residuals, start_consistent, start_finite, values_allowed
 from jaxlag._step import Arguments
-from jaxlag._system import System
+from jaxlag._system import System, check_declaration
 from jaxlag._tableaus import looks_ahead
 from jaxlag._term import term_of
+from jaxlag._vectors import still
 from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._constraints import AbstractConstraint, Layout
-from jaxlag._errors import gradient
 from jaxlag._forces import EXPLICIT_TIME, AbstractForce, components, reads_lam
+from jaxlag._signature import gradient
 from jaxlag._terms import Terms
 
 

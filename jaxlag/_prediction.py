@@ -13,11 +13,13 @@ from jaxlag._captured import warn_of_changes
 from jaxlag._channels import Reader
 from jaxlag._errors import bad
 from jaxlag._experiment import Experiment
+from jaxlag._fit_plot import plotted
 from jaxlag._free import NO_PRIOR, unknowns
 from jaxlag._initial_states import start_freedom
 from jaxlag._losses import squares
 from jaxlag._params import check_keys
 from jaxlag._problem import check_search, experiments_of, plain_options, pose, readers_of
+from jaxlag._residuals import channels_of, rms_of
 from jaxlag._segments import Layout, layout
 from jaxlag._shooting import Guess, Shooting, moved, search
 from jaxlag._status import Status
@@ -59,8 +61,6 @@ class Prediction(eqx.Module):
 
     def plot(self) -> Any:
         """A figure as `FitResult.plot`, a dotted line where predictions begin."""
-        from jaxlag._fit_plot import plotted
-
         return plotted(self.experiments, self.residuals, self.predicted)
 
     def __str__(self) -> str:
@@ -69,26 +69,6 @@ class Prediction(eqx.Module):
             for name in self.channels
         ]
         return "\n".join([*lines, *self.failed])
-
-
-def channels_of(residuals: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, ...]:
-    """Names of all channels."""
-    return tuple(dict.fromkeys(name for each in residuals for name in each))
-
-
-def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float[np.ndarray, " k"]:
-    """Root mean square of a channel over all rows that have a number; NaN where none has.
-
-    Raises:
-        ValueError: a channel that nobody measured.
-    """
-    known = channels_of(residuals)
-    if channel not in known:
-        raise bad("channel", f"be one of {list(known)}", f"it was {channel!r}")
-    rows = np.concatenate([each[channel] for each in residuals if channel in each])
-    count = np.count_nonzero(np.isfinite(rows), axis=0)
-    total = np.nansum(rows**2, axis=0)
-    return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
 def predict(

@@ -12,16 +12,17 @@ from jaxtyping import Array, Float
 from jaxlag import _params
 from jaxlag._captured import warn_of_changes
 from jaxlag._constraints import AbstractConstraint, Layout
-from jaxlag._coordinates import Coordinates
-from jaxlag._errors import bad, real_scalar
+from jaxlag._coordinates import Coordinates, state_vectors
+from jaxlag._errors import bad
 from jaxlag._forces import AbstractForce
 from jaxlag._input_values import InputValues
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._lowering import ArrayTerms, Structure
 from jaxlag._power import Power
 from jaxlag._quasi import QuasiVelocities
+from jaxlag._signature import real_scalar
 from jaxlag._terms import Terms
-from jaxlag._vectors import common, state_vectors
+from jaxlag._vectors import common
 
 
 class AbstractQuantities(eqx.Module):
@@ -46,6 +47,11 @@ class AbstractQuantities(eqx.Module):
     in_u: eqx.AbstractVar[Callable | None]
     _kinetic: eqx.AbstractVar[Callable | None]
     _potential: eqx.AbstractVar[Callable | None]
+
+    @property
+    def size(self) -> int:
+        """Number n of scalar coordinates."""
+        return self.coordinates.size
 
     @property
     @abstractmethod

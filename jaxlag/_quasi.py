@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._captured import captured
 from jaxlag._constraints import Pfaffian
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad
 from jaxlag._rank import row_sizes
+from jaxlag._signature import require_arity
 from jaxlag._vectors import real
 
 # Least sine of the angle between a row of dU/dv and those before it, in roundings.

@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxlag._change_points import LOST, SHORT, lengths_of, unknown_below
-from jaxlag._dynamics import Dynamics, still
+from jaxlag._dynamics import Dynamics
 from jaxlag._forces import reads_lam, sliding
 from jaxlag._linalg import closed_to
 from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
 from jaxlag._projection import Surface, project, tangential
 from jaxlag._step import Arguments, Verdict
+from jaxlag._vectors import still
 
 
 class Settling(eqx.Module):

@@ -139,7 +139,7 @@ class Shooting(eqx.Module):
         shown = read(dict(self.channels), self.widths, motion)
         measured = segment.weights > 0
         known = jnp.all(jnp.isfinite(shown) | ~measured)
-        ended = motion._ending.status
+        ended = motion.raw_status
         status = jnp.where((ended == Status.ok) & ~known, Status.nonfinite, ended)
         ok = status == Status.ok
         residuals = segment.weights * (shown - segment.values)

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxlag._captured import Captured, once
 from jaxlag._closed import plain
-from jaxlag._errors import accepts, bad, require_arity, wants
-from jaxlag._params import concrete
+from jaxlag._errors import bad
+from jaxlag._signature import accepts, require_arity, wants
+from jaxlag._vectors import concrete
 
 
 class AbstractInput(eqx.Module):

@@ -25,7 +25,7 @@ from jaxlag._arguments import (
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import check_params, closing
 from jaxlag._constraints import Baumgarte
-from jaxlag._dynamics import still
+from jaxlag._derived import over_rows
 from jaxlag._ending import ended
 from jaxlag._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._errors import SimulationError, bad
@@ -40,11 +40,12 @@ from jaxlag._pose import Plan, Values, pose, velocities_at
 from jaxlag._replay import solve
 from jaxlag._scheme import Scheme
 from jaxlag._slowness import is_stiff
-from jaxlag._solution import Solution, over_rows
+from jaxlag._solution import Solution
 from jaxlag._start import rows_hold
 from jaxlag._status import Status
 from jaxlag._system import System
 from jaxlag._tableaus import remembers
+from jaxlag._vectors import concrete, still
 from jaxlag.solvers import AbstractPartitioned
 
 MAX_STEPS = 16384
@@ -233,7 +234,7 @@ def simulate(
     params = closing(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
-    if not _params.concrete(params_traced, inputs_traced):
+    if not concrete(params_traced, inputs_traced):
         jumps = Jumps(system, params, q0, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     scheme = choose(method, dt is None, rtol, atol)
@@ -298,7 +299,7 @@ def simulate(
         better = method if dt is not None else FINER.get(name_of(scheme[0]), method)
         beside = _simulate(*_with_method(room, values, better, *steps, fixed=dt is not None))
         motion = with_error(motion, beside, 1.0 if better is method else LEFT)
-    if throw and _params.concrete(motion._ending.status):
+    if throw and concrete(motion.raw_status):
         _raise_unless_ok(motion)
     return motion
 
@@ -324,8 +325,8 @@ def _past_singular(plan: Plan, values: Values, motion: Solution) -> tuple[Plan, 
 
     One motion, with values, and where it gets further so.
     """
-    status = motion._ending.status
-    single = np.ndim(status) == 0 and _params.concrete(status, motion.q)
+    status = motion.raw_status
+    single = np.ndim(status) == 0 and concrete(status, motion.q)
     if plan.formulation != "quasi" or not single or int(status) not in _MAY_BE_SINGULAR:
         return plan, motion
     if int(motion.status) != int(Status.kinematics_singular) or int(motion.where) < 0:
@@ -340,8 +341,8 @@ def _past_singular(plan: Plan, values: Values, motion: Solution) -> tuple[Plan, 
 
 def _ran_out(motion: Solution) -> bool:
     """Whether one motion, with values, took more steps than it may."""
-    status = motion._ending.status
-    single = np.ndim(status) == 0 and _params.concrete(status, motion.q)
+    status = motion.raw_status
+    single = np.ndim(status) == 0 and concrete(status, motion.q)
     return single and int(status) == int(Status.max_steps)
 
 
@@ -400,6 +401,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         _ending=ending,
         _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
         _implicit=scheme.implicit,
+        _solve=simulate,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
         change_points=plan.change_points,
         tolerances=None if scheme.controller is None else (values.rtol, values.atol),
@@ -408,7 +410,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
 
 
 def _raise_unless_ok(motion: Solution) -> None:
-    status = motion._ending.status
+    status = motion.raw_status
     if np.ndim(status) == 0 and int(status) != int(Status.ok):
         motion = still(motion)  # under grad its numbers are traced, and have values all the same
         raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

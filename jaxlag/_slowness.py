@@ -2,7 +2,7 @@
 
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlag import _params
-from jaxlag._dynamics import still
+from jaxlag._abstract_solution import AbstractSolution
 from jaxlag._ending import Scene, dynamics_of
 from jaxlag._errors import bad
 from jaxlag._geometry import advice_on_rows
@@ -19,9 +18,7 @@ from jaxlag._perturbations import linearized
 from jaxlag._projection import turns_needed
 from jaxlag._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._term import term_of
-
-if TYPE_CHECKING:
-    from jaxlag._solution import Solution
+from jaxlag._vectors import concrete, still
 
 ROWS = 8  # states looked at, evenly along the motion
 STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
@@ -61,12 +58,12 @@ class Rates(NamedTuple):
     kind: str
 
 
-def is_stiff(motion: "Solution") -> bool:
+def is_stiff(motion: AbstractSolution) -> bool:
     """Whether explicit steps are about as long as the fastest decay lets them be stable."""
     return _stiffness(motion) is not None
 
 
-def _stiffness(motion: "Solution") -> Rates | None:
+def _stiffness(motion: AbstractSolution) -> Rates | None:
     """The decay that explicit steps are as short as they must be for; None where it is not so."""
     h = _mean_step(motion)
     if h is None or motion.scene.implicit:
@@ -77,7 +74,7 @@ def _stiffness(motion: "Solution") -> Rates | None:
     return rates
 
 
-def advice(motion: "Solution", status: Status) -> str:
+def advice(motion: AbstractSolution, status: Status) -> str:
     """What to do about the end of a single motion: about its rows where these are the cause."""
     of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
     if status in of_rows and motion.system.constraints:
@@ -115,7 +112,7 @@ def advice(motion: "Solution", status: Status) -> str:
     return said
 
 
-def explain(motion: "Solution") -> str:
+def explain(motion: AbstractSolution) -> str:
     """What the steps of one motion were, what held them short, and what would change it.
 
     Raises:
@@ -123,7 +120,7 @@ def explain(motion: "Solution") -> str:
     """
     if motion.ts.ndim != 1:
         raise bad("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
-    if not _params.concrete(motion.status, motion.q, motion.last_time, motion.ts):
+    if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
         raise bad("explain", "be asked outside jit and vmap", "the motion is traced")
     accepted, rejected = _counts(motion)
     how = "fixed steps"
@@ -181,18 +178,18 @@ def explain(motion: "Solution") -> str:
     return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
 
 
-def _counts(motion: "Solution") -> tuple[int, int]:
+def _counts(motion: AbstractSolution) -> tuple[int, int]:
     """Steps (accepted, rejected)."""
     return int(motion.stats["accepted"]), int(motion.stats["rejected"])
 
 
-def _mean_step(motion: "Solution") -> float | None:
+def _mean_step(motion: AbstractSolution) -> float | None:
     accepted = int(motion.stats["accepted"])
     elapsed = abs(float(motion.last_time - motion.ts[0]))
     return elapsed / accepted if accepted and elapsed > 0 else None
 
 
-def _about_time(motion: "Solution") -> str:
+def _about_time(motion: AbstractSolution) -> str:
     """Of times so far from 0 that what depends on them is rougher than the tolerance."""
     h = _mean_step(motion)
     if h is None or motion.tolerances is None:
@@ -211,7 +208,9 @@ def _within(x: float, bounds: tuple[float, float]) -> bool:
     return bounds[0] < x < bounds[1]
 
 
-def _about_rates(motion: "Solution", h: float, rates: Rates | None, advice: list[str]) -> list[str]:
+def _about_rates(
+    motion: AbstractSolution, h: float, rates: Rates | None, advice: list[str]
+) -> list[str]:
     if rates is None or rates.fastest == 0:
         return []
     product, time = h * rates.fastest, 1 / rates.fastest
@@ -236,7 +235,7 @@ def _about_rates(motion: "Solution", h: float, rates: Rates | None, advice: list
     ]
 
 
-def _about_errors(motion: "Solution", looks: Look) -> list[str]:
+def _about_errors(motion: AbstractSolution, looks: Look) -> list[str]:
     error = np.asarray(looks.error)
     sound = np.all(np.isfinite(error), axis=1) & (np.max(error, axis=1) > 0)
     if not sound.any():
@@ -251,7 +250,7 @@ def _about_errors(motion: "Solution", looks: Look) -> list[str]:
     return [f"error         largest, beside its tolerance, in {names[index]} ({share})"]
 
 
-def _about_mass(motion: "Solution", looks: Look, advice: list[str]) -> list[str]:
+def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
     """Of M with its diagonal scaled to 1: units cost no digits."""
     worst, label = 1.0, ""
     for M in np.asarray(looks.mass):
@@ -277,7 +276,7 @@ def _about_mass(motion: "Solution", looks: Look, advice: list[str]) -> list[str]
     return [f"mass matrix   cond(M) up to {worst:.2g} with its diagonal scaled to 1"]
 
 
-def _about_projection(motion: "Solution", looks: Look, advice: list[str]) -> list[str]:
+def _about_projection(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
     most = int(np.max(looks.turns))
     if most == 0:
         return []
@@ -306,7 +305,7 @@ def _rates(looks: Look) -> Rates | None:
     return Rates(float(np.max(size)), kind)
 
 
-def _look(motion: "Solution", h: float, last: bool = False) -> Look:
+def _look(motion: AbstractSolution, h: float, last: bool = False) -> Look:
     reached = np.flatnonzero(np.all(np.isfinite(np.asarray(motion.q)), axis=1))
     rows = reached[np.unique(np.linspace(0, len(reached) - 1, ROWS).round().astype(int))]
     ts, q, v = (np.asarray(x)[rows] for x in (motion.ts, motion.q, motion.v))

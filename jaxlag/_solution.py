@@ -6,13 +6,15 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
+from jaxlag._abstract_solution import AbstractSolution
+from jaxlag._between import states_at
 from jaxlag._closed import plain
 from jaxlag._constraints import Baumgarte
+from jaxlag._derived import over_rows
 from jaxlag._ending import Ending, Scene, explained, is_open
 from jaxlag._errors import bad
 from jaxlag._methods import METHODS
@@ -20,62 +22,11 @@ from jaxlag._power import in_order
 from jaxlag._slowness import advice, explain
 from jaxlag._status import CONCERNS_ROW, Status
 from jaxlag._system import System
+from jaxlag._vectors import concrete
 from jaxlag._views import as_dataset, as_dict, counted, described, plotted
 
-# Quantities of one state, by the name `save=` and the Solution know them under.
-QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Any]] = {
-    "a": lambda system, t, q, v, params, inputs: system.acceleration(params, q, v, t, inputs),
-    "u": lambda system, t, q, v, params, inputs: system.quasi_velocities(params, q, v, t),
-    "p": lambda system, t, q, v, params, inputs: system.momentum(params, q, v, t),
-    "energy": lambda system, t, q, v, params, inputs: system.energy(params, q, v, t),
-    "kinetic": lambda system, t, q, v, params, inputs: system.kinetic(params, q, v, t),
-    "potential": lambda system, t, q, v, params, inputs: system.potential(params, q, v, t),
-    "power": lambda system, t, q, v, params, inputs: system.power(params, q, v, t, inputs),
-    "lam": lambda system, t, q, v, params, inputs: system.multipliers(params, q, v, t, inputs),
-    "constraint_force": lambda system, t, q, v, params, inputs: system.constraint_force(
-        params, q, v, t, inputs
-    ),
-    "Q": lambda system, t, q, v, params, inputs: system.generalized_force(params, q, v, t, inputs),
-}
 
-
-# The same without multipliers solved for, from the equations in quasi-velocities.
-_BY_QUASI = {
-    name: lambda system, t, q, v, params, inputs, name=name: system.quasi_reactions(
-        params, q, v, t, inputs
-    )[name]
-    for name in ("a", "lam", "constraint_force")
-}
-
-
-def over_rows(
-    name: str,
-    system: System,
-    formulation: str,
-    ts: Array,
-    q: Array,
-    v: Array,
-    params: Any,
-    inputs: Any,
-) -> Any:
-    """A quantity at every row of one motion; NaN where the motion did not get."""
-    reached = jnp.isfinite(q[:, 0])
-    quantity = QUANTITIES[name]
-    if formulation == "quasi":
-        quantity = _BY_QUASI.get(name, quantity)
-
-    def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
-        # Rows not reached are NaN: evaluate at the start instead, so that derivatives stay finite.
-        unknown = q[0]  # NaN there, with NaN for its derivatives
-        q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
-        value = quantity(system, t, q, v, params, inputs)
-        return jax.tree.map(lambda x: jnp.where(reached, x, unknown.astype(x.dtype)), value)
-
-    t0, q0, v0 = ts[0], q[0], v[0]
-    return jax.vmap(at)(ts, q, v, reached)
-
-
-class Solution(eqx.Module):
+class Solution(AbstractSolution):
     """A motion at the requested times, and how it ended.
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
@@ -121,6 +72,7 @@ class Solution(eqx.Module):
     _ending: Ending
     _kinematic: bool = eqx.field(static=True)
     _implicit: bool = eqx.field(static=True)
+    _solve: Callable = eqx.field(static=True)  # `simulate`, which made it
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
     dt_max: Float[Array, "*batch"] | None = None
     change_points: str = eqx.field(static=True, default="pass")
@@ -140,7 +92,12 @@ class Solution(eqx.Module):
     @property
     def ok(self) -> Bool[Array, "*batch"]:
         """Whether the motion reached ts[-1]. Unlike the status it costs nothing inside jit."""
-        return self._ending.status == int(Status.ok)
+        return self.raw_status == int(Status.ok)
+
+    @property
+    def raw_status(self) -> Int[Array, "*batch"]:
+        """How the loop ended: the status before the states around the end are looked at."""
+        return self._ending.status
 
     @property
     def where(self) -> Int[Array, "*batch"]:
@@ -166,7 +123,7 @@ class Solution(eqx.Module):
         """Name of the method that was used; of its class, where it is none of the named ones."""
         if self._solver:
             return self._solver
-        if not _params.concrete(self._method):
+        if not concrete(self._method):
             raise bad("method", "be asked for outside jit and vmap", "the motion is traced")
         return list(METHODS)[int(np.ravel(self._method)[0])]
 
@@ -375,9 +332,7 @@ class Solution(eqx.Module):
             ValueError: times outside of the motion; a batch, fixed steps or a method without a
                 name: there rows have to be asked for when simulating.
         """
-        from jaxlag._between import states_at  # which simulates, and makes solutions
-
-        return states_at(self, t)
+        return states_at(self, t, self._solve)
 
     def _rows(self, rows: list[int]) -> "Solution":
         """The same with these rows only, in this order."""

@@ -15,6 +15,7 @@ from jaxlag._captured import Captured, captured, functions_of
 from jaxlag._errors import bad
 from jaxlag._inputs import check_inputs
 from jaxlag._signals import AbstractInput, AbstractTable, Feedback, Function, Linear, ZeroOrderHold
+from jaxlag._vectors import concrete
 
 JUST_AFTER = 1e-9
 """Of the length of a segment."""
@@ -129,7 +130,7 @@ def _check_closures(inputs: dict[str, Any]) -> None:
     for name, signal in inputs.items():
         for function in functions_of(signal):
             cells = getattr(function.function, "__closure__", None) or ()
-            if not _params.concrete([cell.cell_contents for cell in cells]):
+            if not concrete([cell.cell_contents for cell in cells]):
                 must = "take params where experiments have functions of their own"
                 fix = "Write jl.Function(f) of f(t, params), jl.Feedback(f) of f(t, q, v, params)."
                 raise bad(f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix)
@@ -243,7 +244,7 @@ def _later(
     times: Array | None, count: int, end: float
 ) -> Float[np.ndarray, " k"] | Float[Array, " k"]:
     """As many knots: those that are missing lie where nobody looks."""
-    xp = np if _params.concrete(times) else jnp
+    xp = np if concrete(times) else jnp
     own = np.zeros(0) if times is None else xp.asarray(times, float)
     last = xp.max(xp.append(own, end))
     return xp.concatenate([own, last + 1.0 + np.arange(count - len(own))])
@@ -251,7 +252,7 @@ def _later(
 
 def _filled(table: Any, length: int) -> AbstractInput:
     """A table that goes on with its last value."""
-    xp = np if _params.concrete(table) else jnp
+    xp = np if concrete(table) else jnp
     times, values = xp.asarray(table.times), xp.asarray(table.values)
     missing = length - len(times)
     if not missing:

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxlag._dynamics import Dynamics, still
+from jaxlag._dynamics import Dynamics
 from jaxlag._linalg import closed_to, dependence_floor
 from jaxlag._rank import ROUNDINGS, Sizes, independent_rows, row_sizes, without_rounding
 from jaxlag._roundings import with_rounding
 from jaxlag._step import Arguments
+from jaxlag._vectors import still
 
 
 class Start(NamedTuple):

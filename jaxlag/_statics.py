@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag import _params
-from jaxlag._arguments import check_declaration
 from jaxlag._captured import warn_of_changes
 from jaxlag._closing import closing
 from jaxlag._constraints import Layout
+from jaxlag._coordinates import vector
 from jaxlag._custom_jvp import keeping_rules
-from jaxlag._dynamics import still
 from jaxlag._equilibrium_search import differentiable_if, solve_tangent
 from jaxlag._errors import EquilibriumError, bad
 from jaxlag._forces import reads_lam
@@ -26,8 +25,8 @@ from jaxlag._lanes import at_once_implicit, in_lanes
 from jaxlag._rank import least_norm, row_sizes, without_rounding
 from jaxlag._rest import Rest, find_rest
 from jaxlag._status import Status
-from jaxlag._system import System
-from jaxlag._vectors import number, of_state, vector
+from jaxlag._system import System, check_declaration
+from jaxlag._vectors import concrete, number, of_state, still
 
 
 class Equilibrium(eqx.Module):
@@ -234,16 +233,16 @@ def equilibrium(
             "Under these it may be at rest in more than isolated states: declare it without them.",
         )
     (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
-    if _params.concrete(q0) and not np.all(np.isfinite(q0)):
+    if concrete(q0) and not np.all(np.isfinite(q0)):
         raise bad("q0", "be finite", f"it was {q0}")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
         raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
     if tol is None:
         tol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
     tol = number("tol", "be a positive number", tol, q0.dtype)
-    if _params.concrete(tol) and not tol > 0:
+    if concrete(tol) and not tol > 0:
         raise bad("tol", "be a positive number", f"it was {tol}")
-    if _params.concrete(tol) and not tol < 1:
+    if concrete(tol) and not tol < 1:
         raise bad("tol", "be less than 1", f"it was {tol}")
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
@@ -253,10 +252,10 @@ def equilibrium(
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
     found = _search(key, (q0, t, tol, traced, inputs_traced))
-    if throw and _params.concrete(found.status) and int(found.status) != int(Status.ok):
+    if throw and concrete(found.status) and int(found.status) != int(Status.ok):
         found = still(found)  # under grad its numbers are traced, and have values all the same
         more = ""
-        if np.ndim(found.status) == 0 and _params.concrete(traced, t, found.q):
+        if np.ndim(found.status) == 0 and concrete(traced, t, found.q):
             more = f" {advice_on_rows(system, params, t, found.q)}".rstrip()
         raise EquilibriumError(f"Search ended with status {found.message()}{more}", found)
     return found

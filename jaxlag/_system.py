@@ -14,7 +14,7 @@ from jaxlag import _params
 from jaxlag._captured import as_written, captured
 from jaxlag._constraints import AbstractConstraint, Layout, check_constraints, check_reactions
 from jaxlag._coordinates import Coordinates
-from jaxlag._errors import bad, require_arity
+from jaxlag._errors import bad
 from jaxlag._explain import explain
 from jaxlag._forces import AbstractForce, check_forces
 from jaxlag._geometry import vanishing_rows
@@ -26,13 +26,15 @@ from jaxlag._lowering import (
     ArrayTerms,
     ScalarTerms,
     Structure,
-    check_indices,
     check_kinematics,
     layout,
 )
+from jaxlag._lowering._indices import check_indices
 from jaxlag._quasi import InQuasiVelocities, QuasiVelocities, check_quasi
 from jaxlag._reactions import AbstractReactions
+from jaxlag._signature import require_arity
 from jaxlag._terms import Terms
+from jaxlag._vectors import concrete
 
 
 class _Difference(eqx.Module):
@@ -209,11 +211,6 @@ class System(AbstractReactions):
             check_quasi(self.quasi, self.size, taken)
         return eqx.tree_at(lambda s: s.forces, self, both, is_leaf=lambda x: x is self.forces)
 
-    @property
-    def size(self) -> int:
-        """Number n of scalar coordinates."""
-        return self.coordinates.size
-
     def unflatten(self, q: Array) -> dict[str, Array]:
         """Named parts of q (or v, a, p), shape (..., n)."""
         return self.coordinates.unflatten(q)
@@ -232,12 +229,12 @@ class System(AbstractReactions):
         """
         if not self.constraints:
             return False
-        if not _params.concrete(params):
+        if not concrete(params):
             return None
         n = self.size
         states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
         v = jnp.zeros_like(q) if v is None else v
-        if _params.concrete((t, q, v)):
+        if concrete((t, q, v)):
             states.append((t, q, v))
         elif self.structure(params, q.dtype).mass & {"t", "q", "v"}:
             states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
@@ -247,7 +244,7 @@ class System(AbstractReactions):
                 traced, static = _params.split(params)
                 at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
                 M = _mass(self, _params.Static(static), *at, traced)
-            if not _params.concrete(M):
+            if not concrete(M):
                 return None  # the Lagrangian closes over a traced value
             M = np.asarray(M, np.float64)
             units = np.sqrt(np.abs(np.diagonal(M)))
@@ -265,7 +262,7 @@ class System(AbstractReactions):
         In the given state, where all has values; else False.
         """
         v = jnp.zeros_like(q) if v is None else v
-        if not self.constraints or not _params.concrete(params, t, q, v, inputs):
+        if not self.constraints or not concrete(params, t, q, v, inputs):
             return False
         array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
         t = jnp.asarray(t, float)
@@ -411,3 +408,19 @@ def _mass(
     system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
 ) -> Array:
     return system.terms.mass(t, q, v, _params.join(traced, static.tree))
+
+
+def check_declaration(
+    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
+) -> None:
+    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
+    values = evaluate(inputs, t, q, v, params)
+    system.check_traceable(params, q.dtype, values)
+    for name in inputs:
+        if name not in values.read:
+            raise bad(
+                "inputs",
+                "hold only signals that a force reads",
+                f"no force read {name!r}",
+                "Drop it, or read inputs[name] in a GeneralizedForce.",
+            )

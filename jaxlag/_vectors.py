@@ -1,16 +1,25 @@
-"""Numbers given by the user: lists, arrays or dicts by name, as real arrays of one precision."""
+"""Arrays: of numbers given by the user, in one precision; whether they are traced."""
 
-from collections.abc import Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxlag._coordinates import Coordinates
 from jaxlag._errors import bad
-from jaxlag._params import concrete
+
+
+def concrete(*arrays: Any) -> bool:
+    """Whether all of these have values, rather than being traced by a transform."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
+
+
+def still(tree: Any) -> Any:
+    """Without derivatives: a status has none, and differentiating its making would cost."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def real(argument: str, x: Any) -> Array:
@@ -78,32 +87,9 @@ def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
     return common(*arrays)
 
 
-def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
-    """`x` as an inexact array of shape (n,); raises naming `argument` if it cannot be one.
-
-    A number will do for a single coordinate.
-    """
-    n = coordinates.size
-    fix = f"Give one entry per coordinate, in the order {list(coordinates.labels)}."
-    if isinstance(x, Mapping):
-        x = coordinates.flatten(x, argument)
-    try:
-        x = jnp.asarray(x)
-    except (TypeError, ValueError) as error:
-        raise bad(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
-    if n == 1 and x.shape == ():
-        x = x[None]
-    if x.shape != (n,):
-        raise bad(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
-    if jnp.issubdtype(x.dtype, jnp.complexfloating):
-        raise bad(argument, "be real", f"its dtype was {x.dtype}")
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
-
-
-def state_vectors(coordinates: Coordinates, q: Any, v: Any) -> tuple[Array, Any]:
-    """(q, v) as flat vectors of one dtype, the result type of both; v may be None."""
-    q = vector(coordinates, "q", q)
-    if v is None:
-        return of_state("q", q)[0], None
-    q, v = of_state("q and v", q, vector(coordinates, "v", v))
-    return q, v
+def elements(array: Array) -> list[Array]:
+    """All elements of an array in one row, by static slices."""
+    flat = jnp.reshape(array, (-1,))
+    return [
+        jax.lax.squeeze(jax.lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])
+    ]

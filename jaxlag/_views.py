@@ -5,27 +5,28 @@ from typing import Any
 
 import numpy as np
 
-from jaxlag import _params
+from jaxlag._abstract_solution import AbstractSolution
 from jaxlag._errors import bad
 from jaxlag._status import Status
+from jaxlag._vectors import concrete
 
 LINES = 16
 """Motions of a batch that a figure shows."""
 
 
-def described(motion: Any) -> str:
+def described(motion: AbstractSolution) -> str:
     """A motion, or a batch of them, in one line."""
     system, (*batch, rows) = motion.system, motion.ts.shape
     names = ", ".join(system.coordinates.names)
     times, many = f"{rows} times", f"batch {tuple(batch)} of " if batch else ""
-    if not _params.concrete(motion.ts, motion._ending.status):
+    if not concrete(motion.ts, motion.raw_status):
         return f"Solution({names}: {many}{times}, traced)"
     if not batch:
         times += f" from {float(motion.ts[0]):g} to {float(motion.ts[-1]):g} s"
     return f"Solution({names}: {many}{times}, {_counts(motion)})"
 
 
-def _counts(motion: Any) -> str:
+def _counts(motion: AbstractSolution) -> str:
     statuses = np.ravel(np.asarray(motion.status))
     found = Counter(Status(int(status)).name for status in statuses)
     if np.ndim(motion.status) == 0:
@@ -38,7 +39,7 @@ def _ok_first(item: tuple[str, int]) -> tuple[bool, int]:
     return name != Status.ok.name, -count
 
 
-def counted(motion: Any) -> str:
+def counted(motion: AbstractSolution) -> str:
     """How the motions of a batch ended: counts by status, and of each but "ok" the first one."""
     status = np.asarray(motion.status)
     lines = [f"{status.size} motions: {_counts(motion)}"]
@@ -48,7 +49,7 @@ def counted(motion: Any) -> str:
     return "\n".join(lines)
 
 
-def columns(motion: Any) -> dict[str, Any]:
+def columns(motion: AbstractSolution) -> dict[str, Any]:
     """Name -> what was moved through, without the times: coordinates, velocities, speeds."""
     system = motion.system
     found = {}
@@ -60,7 +61,7 @@ def columns(motion: Any) -> dict[str, Any]:
     return found
 
 
-def as_dict(motion: Any) -> dict[str, np.ndarray]:
+def as_dict(motion: AbstractSolution) -> dict[str, np.ndarray]:
     """See `Solution.to_dict`."""
     saved = {
         f"{name} {key}".strip(): value
@@ -71,7 +72,7 @@ def as_dict(motion: Any) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in found.items()}
 
 
-def as_dataset(motion: Any) -> Any:
+def as_dataset(motion: AbstractSolution) -> Any:
     """See `Solution.to_xarray`."""
     try:
         import xarray
@@ -95,7 +96,7 @@ def as_dataset(motion: Any) -> Any:
     return xarray.Dataset(variables, {"t": time})
 
 
-def plotted(motion: Any) -> Any:
+def plotted(motion: AbstractSolution) -> Any:
     """See `Solution.plot`."""
     try:
         from matplotlib.figure import Figure

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag import _inertia, math, rotation
-from jaxlag._errors import bad, require_arity
-from jaxlag._params import concrete
-from jaxlag._vectors import common, real, reals
+from jaxlag._errors import bad
+from jaxlag._signature import require_arity
+from jaxlag._vectors import common, concrete, real, reals
 
 Pose = Callable[[Any, Any, Any], tuple[Any, Any]]
 """`pose(t, q, params)` -> (R, r_O): rotation (3, 3) of the body axes and origin O (3,), m."""

@@ -12,12 +12,12 @@ from jax import Array
 
 from jaxlag import _declared
 from jaxlag import _derivative_check as _check
+from jaxlag._coordinates import state_vectors
 from jaxlag._errors import bad
 from jaxlag._inputs import check_inputs, check_range, evaluate
 from jaxlag._origins import Origin
-from jaxlag._params import concrete
 from jaxlag._system import System
-from jaxlag._vectors import number, state_vectors
+from jaxlag._vectors import concrete, number
 
 STATES = _declared.STATES
 """States at which `check_derivatives` looks."""

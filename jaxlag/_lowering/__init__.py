@@ -2,10 +2,7 @@
 
 from jaxlag._lowering._array import ArrayTerms as ArrayTerms
 from jaxlag._lowering._array import Prepared as Prepared
-from jaxlag._lowering._emit import elements as elements
-from jaxlag._lowering._findings import Findings as Findings
 from jaxlag._lowering._findings import find as find
-from jaxlag._lowering._indices import check_indices as check_indices
 from jaxlag._lowering._lower import OPERATIONS as OPERATIONS
 from jaxlag._lowering._lower import Lowered as Lowered
 from jaxlag._lowering._program import Program as Program

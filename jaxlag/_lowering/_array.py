@@ -19,7 +19,6 @@ from jaxlag._constraints import (
     velocity_rows,
 )
 from jaxlag._dependence import outputs_depend_on
-from jaxlag._errors import gradient
 from jaxlag._forces import AbstractForce, components, reads_lam
 from jaxlag._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
 from jaxlag._linalg import MassFactor, factor_mass, solve_mass
@@ -27,6 +26,7 @@ from jaxlag._lowering._rows import layout
 from jaxlag._lowering._structure import Structure, find_structure
 from jaxlag._quasi import QuasiVelocities
 from jaxlag._rank import Choice, independent_rows, row_sizes, rows_hold, shared
+from jaxlag._signature import gradient
 from jaxlag._terms import Terms
 
 

@@ -17,7 +17,8 @@ from jaxtyping import Array
 from jaxlag._custom_jvp import CustomJVP
 from jaxlag._linear import LinearMap, linear
 from jaxlag._lowering._program import Program
-from jaxlag._lowering._straight import Pairs, elements, is_trig, stacked, straight
+from jaxlag._lowering._straight import Pairs, is_trig, stacked, straight
+from jaxlag._vectors import elements
 from jaxlag._xla import not_inlined
 
 Row = tuple[Array, Array]  # (what does not change during a solve, state and inputs)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.linalg import norm
 
 from jaxlag._forces import reads_lam
+from jaxlag._interpret import interpret
 from jaxlag._kkt import augmented
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._evaluate import evaluate
-from jaxlag._lowering._interpret import interpret
 from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._read import rows_read
 from jaxlag._lowering._rows import layout_of

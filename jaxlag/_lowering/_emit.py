@@ -12,7 +12,8 @@ from jaxlag import _params
 from jaxlag._lowering._called import called
 from jaxlag._lowering._graph import FIXED
 from jaxlag._lowering._program import Program
-from jaxlag._lowering._straight import elements, leaves, numbers, run, stacked, straight
+from jaxlag._lowering._straight import leaves, numbers, run, stacked, straight
+from jaxlag._vectors import elements
 from jaxlag._xla import opaque_one
 
 # Code of more lines is one function that XLA does not inline: copied into every stage of a solver

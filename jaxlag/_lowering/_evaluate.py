@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxlag._interpret import interpret
 from jaxlag._lowering._graph import Node, order
-from jaxlag._lowering._interpret import interpret
 
 
 def evaluate(roots: Sequence[Node], values: Mapping[tuple[str, int], Any]) -> list:

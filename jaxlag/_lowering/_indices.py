@@ -9,8 +9,8 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxlag._errors import complaint
-from jaxlag._lowering._interpret import NUMPY, equation
-from jaxlag._params import concrete
+from jaxlag._interpret import NUMPY, equation
+from jaxlag._vectors import concrete
 
 
 class OutOfRange(ValueError):

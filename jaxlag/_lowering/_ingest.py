@@ -14,14 +14,14 @@ import numpy as np
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from jaxlag import _params
 from jaxlag._custom_jvp import with_rule_kept
 from jaxlag._dependence import scan_sizes
+from jaxlag._interpret import NUMPY, held
 from jaxlag._lowering._elementwise import ELEMENTWISE, elementwise
 from jaxlag._lowering._graph import Graph, Node, named
-from jaxlag._lowering._interpret import NUMPY, held
 from jaxlag._lowering._moves import MOVES, SHIFTS, WHOLE, move
 from jaxlag._lowering._nodes import Missing, broadcast, nodes
+from jaxlag._vectors import concrete
 
 LIMIT = 50_000  # nodes of a graph: far beyond what a scalar program is good for
 TURNS = 10_000  # of a loop that is unrolled
@@ -89,7 +89,7 @@ def read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarra
     Raises:
         Unsupported: an operation that has no scalar form, with its place in the user's source.
     """
-    if not _params.concrete(*closed.consts):
+    if not concrete(*closed.consts):
         raise Unsupported("a value traced by a transform comes from outside the arguments")
     try:
         return _read(graph, closed, *args)

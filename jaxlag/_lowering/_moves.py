@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlag._interpret import NUMPY
 from jaxlag._lowering._graph import LARGEST, SMALLEST, Graph, Node, Primitive, named
-from jaxlag._lowering._interpret import NUMPY
 from jaxlag._lowering._nodes import Missing, broadcast, nodes, scalar, take
 
 # ---- Moving elements -------------------------------------------------------------------------

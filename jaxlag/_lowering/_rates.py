@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._errors import gradient
 from jaxlag._kkt import masked, units_of
 from jaxlag._linalg import factor_mass, solve_mass
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._rank import independent_rows, least_norm, row_sizes
+from jaxlag._signature import gradient
 
 
 class Moving:

@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxlag import _params
 from jaxlag._constraints import AbstractConstraint
-from jaxlag._errors import real_scalar
 from jaxlag._forces import reads_lam
 from jaxlag._lowering._array import ArrayTerms
 from jaxlag._lowering._constrained import Constrained
@@ -19,6 +18,7 @@ from jaxlag._lowering._key import Key, traced
 from jaxlag._lowering._rows import layout_of
 from jaxlag._lowering._scene import Kinematics, Scene
 from jaxlag._lowering._sharing import Sharing
+from jaxlag._signature import real_scalar
 
 
 def read_scene(key: Key) -> Scene:

@@ -14,6 +14,7 @@ from jaxlag._lowering._graph import FIXED
 from jaxlag._lowering._ingest import Rule
 from jaxlag._lowering._program import Line, Program
 from jaxlag._lowering._trig import recalled, sincos
+from jaxlag._vectors import elements
 
 # From this many lines on, sines and cosines are kept by a division by 1: XLA's CPU backend would
 # compute them anew for every result that they lead to, but never does so with a division. In short
@@ -136,12 +137,6 @@ def numbers(program: Program, dtype: Any) -> dict[int, Any]:
         slot: np.asarray(value, np.bool_ if isinstance(value, bool) else dtype)
         for slot, value in program.numbers.items()
     }
-
-
-def elements(array: Array) -> list[Array]:
-    """All elements of an array in one row, by static slices."""
-    flat = jnp.reshape(array, (-1,))
-    return [lax.squeeze(lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])]
 
 
 def stacked(numbers: Sequence[Array], dtype: Any) -> Array:

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlag import _params
 from jaxlag._dependence import outputs_depend_on
+from jaxlag._vectors import concrete
 
 
 class Structure(NamedTuple):
@@ -70,7 +70,7 @@ def _vanishes(function: Any, state: tuple, params: Any) -> bool:
     with jax.ensure_compile_time_eval():
         state, params = jax.tree.map(_ones, (state, params))
         anything = jnp.any(function(*state, params))
-        return _params.concrete(anything) and not bool(anything)
+        return concrete(anything) and not bool(anything)
 
 
 def _ones(like: jax.ShapeDtypeStruct) -> Any:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxlag._lowering._straight import elements
+from jaxlag._vectors import elements
 from jaxlag._xla import opaque_one
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
