@@ -18,13 +18,13 @@ from jax import Array
 import jaxlag as jl
 from bench._fit_part import Figure, Part
 from bench._harness import Reference, Target
-from jaxlag._fit import last_gap
-from jaxlag._free import NO_PRIOR, unknowns
-from jaxlag._information import linearised
-from jaxlag._losses import squares
-from jaxlag._problem import pose, readers_of
-from jaxlag._segments import layout
-from jaxlag._shooting import Guess, Shooting, search
+from jaxlag._fit._fit import last_gap
+from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
+from jaxlag._fit._information import linearised
+from jaxlag._fit._losses import squares
+from jaxlag._fit._multiple_shooting import Guess, Shooting, search
+from jaxlag._fit._segments import layout
+from jaxlag._fit._setup import pose, readers_of
 
 TRUE = {"l1": 1.0, "l2": 0.8, "m2": 0.7, "m1": 1.0, "g": 9.81}
 FREE = ("l1", "l2", "m2")

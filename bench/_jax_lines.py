@@ -20,7 +20,7 @@ from bench._explicit import functions
 from bench._harness import build
 from bench._motions import Motion
 from bench._sweep import Line, Solved, steps, tolerances
-from jaxlag._methods import METHODS
+from jaxlag._simulation._methods import METHODS
 from jaxlag.solvers import AbstractFixedStep
 
 ORDER = 5  # of diffrax's own methods from which on they get a line

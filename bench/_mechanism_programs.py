@@ -15,8 +15,8 @@ from bench._compared import SLACK, Compared, worst
 from bench._random_mechanisms import Mechanism, values
 from bench._reference import Equations, Solved, Terms, Unclear, terms_of
 from bench._rounding import evaluated
+from jaxlag._linalg._independent_rows import Choice
 from jaxlag._lowering import ArrayTerms, Moving, ScalarTerms
-from jaxlag._rank import Choice
 
 NUDGES = 4
 NEARBY = 2  # to tell a contradiction from roundings

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from bench._harness import Report
-from jaxlag import _xla
+from jaxlag._core import _xla
 
 FOLDER = Path(__file__).parent / "results"
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy", "jaxlag")

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlag._dependence import scan_sizes
+from jaxlag._tracing._dependence import scan_sizes
 
 # Exact in floating point: a number moved, chosen or of another sign.
 _CHOSEN = ("abs", "neg", "sign", "max", "min", "clamp", "floor", "round", "select_n", "sort")

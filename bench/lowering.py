@@ -34,7 +34,7 @@ from bench._rk4 import Equations
 from bench._scenes import SCENES, Scene, links
 from bench._verdict import OPERATIONS, verdict
 from bench._workers import Worker
-from jaxlag import _xla
+from jaxlag._core import _xla
 
 STEPS = 10_000
 AGREEMENT = 1e-10  # relative

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from bench import _double_pendulum as pendulum
 from bench._harness import Call, Reference, Report, Target, build, spread
 from bench._workers import Worker
-from jaxlag import _xla
+from jaxlag._core import _xla
 
 SAVES = 501
 SETTINGS = {"on": {_xla.SWITCH: "1"}, "off": {_xla.SWITCH: "0"}}

@@ -25,7 +25,7 @@ from bench._harness import Call, Reference, Report, spread
 from bench._motions import MOTIONS, Motion
 from bench._sweep import Line, built, swept
 from bench._workers import Worker
-from jaxlag import _xla
+from jaxlag._core import _xla
 
 KIND, SYSTEM = "BENCH_KIND", "BENCH_SYSTEM"  # environment of a worker
 ROUNDS, QUICK_ROUNDS = 4, 2

@@ -21,10 +21,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag import _inertia, math, rotation
-from jaxlag._errors import bad
-from jaxlag._signature import require_arity
-from jaxlag._vectors import common, concrete, real, reals
+from jaxlag import math, rotation
+from jaxlag._core._arrays import common, concrete, real, reals
+from jaxlag._core._errors import bad
+from jaxlag._model import _inertia
+from jaxlag._tracing._signature import require_arity
 
 Pose = Callable[[Any, Any, Any], tuple[Any, Any]]
 """`pose(t, q, params)` -> (R, r_O): rotation (3, 3) of the body axes and origin O (3,), m."""

@@ -37,9 +37,9 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from jaxlag._custom_jvp import CustomJVP
-from jaxlag._errors import bad
-from jaxlag._kinks import smooth
+from jaxlag._core._custom_jvp import CustomJVP
+from jaxlag._core._errors import bad
+from jaxlag._tracing._nonsmooth_points import smooth
 
 # Of the Taylor series of sin(x)/x in z = x^2. Up to |z| = 4 the first term left out is below EPSEPS
 # of the sum, in each of its first three derivatives too; beyond, the quotient loses few digits.

@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
-from jaxlag._errors import bad
-from jaxlag._vectors import reals
+from jaxlag._core._arrays import reals
+from jaxlag._core._errors import bad
 
 
 def _times(A: Array, B: Array) -> Array:

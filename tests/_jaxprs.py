@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from jaxlag._lowering._trig import by_polynomials
+from jaxlag._lowering._emit._sincos import by_polynomials
 
 
 class Operation(NamedTuple):

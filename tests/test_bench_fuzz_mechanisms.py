@@ -15,10 +15,12 @@ from bench._mechanism_programs import compared, prepare
 from bench._random_mechanisms import Mechanism, Quasi, Row, smaller
 from bench._random_systems import Drawn
 from bench._reference import Unclear
-from jaxlag import _captured, _rank
-from jaxlag._lowering import ArrayTerms, _array, _ingest
+from jaxlag._linalg import _independent_rows
+from jaxlag._lowering import ArrayTerms, _array_terms
 from jaxlag._lowering import Moving as Rates
-from jaxlag._lowering._scalar import ScalarTerms
+from jaxlag._lowering._jaxpr import _from_jaxpr
+from jaxlag._lowering._scalar_terms import ScalarTerms
+from jaxlag._tracing import _traced_function
 
 NUMBERS = {"a": [0.1, 0.2, 0.3], "b": 2.0, "k": 1.0}
 
@@ -193,7 +195,7 @@ def test_sound_programs_are_equal(dtype):
 
 
 def test_multipliers_of_other_than_least_norm_are_found(monkeypatch):
-    monkeypatch.setattr(_array, "shared", lambda A, lam, *_: lam)
+    monkeypatch.setattr(_array_terms, "shared", lambda A, lam, *_: lam)
     assert found_in(DOUBLED) == ["arrays: lam"]
 
 
@@ -205,12 +207,12 @@ def test_a_bias_of_the_other_sign_is_found(monkeypatch):
 
 
 def test_a_contradiction_that_is_not_told_is_found(monkeypatch):
-    monkeypatch.setattr(_array, "rows_hold", lambda *_: jnp.array(True))
+    monkeypatch.setattr(_array_terms, "rows_hold", lambda *_: jnp.array(True))
     assert found_in(BENT) == ["arrays: a number where rows or masses are contradictory"]
 
 
 def test_a_solution_that_is_refused_is_found(monkeypatch):
-    monkeypatch.setattr(_array, "rows_hold", lambda *_: jnp.array(False))
+    monkeypatch.setattr(_array_terms, "rows_hold", lambda *_: jnp.array(False))
     assert found_in(DOUBLED) == ["arrays: a is no number"]
 
 
@@ -219,9 +221,9 @@ def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
 
     def all_there(rows, q, A, sure=False):
         whole = jnp.ones(A.shape[0], bool)
-        return _rank.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
+        return _independent_rows.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
 
-    monkeypatch.setattr(_array, "row_sizes", all_there)
+    monkeypatch.setattr(_array_terms, "row_sizes", all_there)
     found_in(DOUBLED)
 
 
@@ -282,8 +284,8 @@ def test_loops_are_equal_to_what_is_unrolled(loop):
 
 def test_a_rule_that_is_dropped_in_a_loop_is_found(monkeypatch):
     """JAX drops it where a reverse derivative takes the body of a scan apart."""
-    monkeypatch.setattr(_captured, "with_rules_kept", lambda program: program)
-    monkeypatch.setattr(_ingest, "with_rule_kept", lambda eqn: eqn)
+    monkeypatch.setattr(_traced_function, "with_rules_kept", lambda program: program)
+    monkeypatch.setattr(_from_jaxpr, "with_rule_kept", lambda eqn: eqn)
     system = _loops.having(DOUBLED._replace(rows=()).system, DOUBLED.drawn, _loops.ruled)
     looped = LOOPED._replace(system=system)
     jax.clear_caches()

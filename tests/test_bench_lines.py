@@ -140,7 +140,7 @@ def test_tolerances_and_steps_go_from_loose_to_tight():
 
 
 def test_every_solver_of_ours_has_a_line():
-    from jaxlag._methods import METHODS
+    from jaxlag._simulation._methods import METHODS
     from jaxlag.solvers import AbstractFixedStep
 
     single = _jax_lines.methods(MOTIONS["double pendulum, regular"]())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from jaxlag._box import box_least_squares
+from jaxlag._fit._bounded_least_squares import box_least_squares
 
 EPS = np.finfo(float).eps
 SOLVE = jax.jit(box_least_squares)

@@ -10,8 +10,8 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import jaxlag as jl
-from jaxlag._captured import captured
-from jaxlag._owned import owned
+from jaxlag._tracing._program_constants import owned
+from jaxlag._tracing._traced_function import captured
 
 TS = jnp.array([0.0, 0.5, 1.0])
 GRAVITY = 2.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from _families import mostly_full
 
-from jaxlag._change_points import (
+from jaxlag._integration._change_points import (
     AHEAD,
     BESIDE,
     LOST,
@@ -17,9 +17,9 @@ from jaxlag._change_points import (
     no_crossing,
     widest_gap,
 )
-from jaxlag._kkt import FORMULATIONS, solve_kkt
-from jaxlag._methods import METHODS
-from jaxlag._tableaus import nodes_of
+from jaxlag._integration._tableaus import nodes_of
+from jaxlag._linalg._kkt import FORMULATIONS, solve_kkt
+from jaxlag._simulation._methods import METHODS
 
 EPS = np.finfo(float).eps
 NARROW, CLOSE = narrow(float), narrow(float) / 3

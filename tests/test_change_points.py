@@ -12,9 +12,9 @@ from _families import mostly_full
 from mechanisms import four_bar, four_bar_start
 
 import jaxlag as jl
-from jaxlag._kkt import FORMULATIONS
-from jaxlag._methods import METHODS
-from jaxlag._tableaus import nodes_of
+from jaxlag._integration._tableaus import nodes_of
+from jaxlag._linalg._kkt import FORMULATIONS
+from jaxlag._simulation._methods import METHODS
 from systems._catalogue import ENTRIES
 
 SIDE = (0.0, 1.0)  # where the fixed ends are

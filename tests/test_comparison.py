@@ -8,7 +8,7 @@ import pytest
 from _measured import OPTIONS, TRUE, TS, angles
 
 import jaxlag as jl
-from jaxlag._comparison import Ranked, _estimates
+from jaxlag._fit._compare import Ranked, _estimates
 
 
 def lagrangian(t, q, v, p):

@@ -23,7 +23,7 @@ from mechanisms import (
 )
 
 import jaxlag as jl
-from jaxlag._lowering._rows import layout
+from jaxlag._lowering._row_layout import layout
 
 EPS = np.finfo(float).eps
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from _user import unchecked  # noqa: F401
 
-from jaxlag._coordinates import Coordinates, state_vectors, vector
+from jaxlag._model._coordinates import Coordinates, state_vectors, vector
 
 PLAIN = Coordinates(("x", "theta"))
 MIXED = Coordinates({"x": (2, 3), "theta": (), "w": (1,)})

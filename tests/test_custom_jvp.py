@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._custom_jvp import CustomJVP, keeping_rules
+from jaxlag._core._custom_jvp import CustomJVP, keeping_rules
 
 X = 0.3
 LOOPS = {

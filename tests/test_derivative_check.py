@@ -8,7 +8,7 @@ from _checked import Q, check, file_of, here, line_of, places, right, rule_of
 from jax import lax
 
 import jaxlag as jl
-from jaxlag._derivative_check import _quotient, step
+from jaxlag.testing._compare_modes import _quotient, step
 from tests._user import unchecked  # noqa: F401
 
 

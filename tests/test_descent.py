@@ -10,12 +10,12 @@ from _measured import NOISE, OPTIONS, TRUE, angles, experiment, pendulum
 from _silence import no_warning
 
 import jaxlag as jl
-from jaxlag._descent import cost_of
-from jaxlag._free import NO_PRIOR, unknowns
-from jaxlag._losses import squares
-from jaxlag._problem import pose, readers_of
-from jaxlag._segments import layout
-from jaxlag._shooting import Guess
+from jaxlag._fit._descent import cost_of
+from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
+from jaxlag._fit._losses import squares
+from jaxlag._fit._multiple_shooting import Guess
+from jaxlag._fit._segments import layout
+from jaxlag._fit._setup import pose, readers_of
 
 
 @pytest.mark.full

@@ -75,7 +75,8 @@ def test_rows_are_as_accurate_as_step_ends(reference, method):
 
 def step_ends(options):
     """Times of the accepted steps of an adaptive solve, from its recorded grid."""
-    from jaxlag import _replay, _simulate
+    from jaxlag._gradient import _solve
+    from jaxlag._simulation import _simulate
 
     caught = []
     original = _simulate._simulate
@@ -90,8 +91,8 @@ def step_ends(options):
 
     @jax.jit
     def record(values):
-        inexact, rest, setup, static = _replay.halves(_simulate.pose(plan, values)[2])
-        return _replay._recorded(inexact, rest, setup, static).record
+        inexact, rest, setup, static = _solve.halves(_simulate.pose(plan, values)[2])
+        return _solve._recorded(inexact, rest, setup, static).record
 
     kept = record(values)
     # A turn that was not accepted ends where the last one did; a negative one at the stop.

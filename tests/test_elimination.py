@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from jax.scipy.linalg import solve_triangular
 
-from jaxlag._elimination import Rows, condense, eliminate, sizes_of, states_of
+from jaxlag._fit._linear_least_squares import Rows, condense, eliminate, sizes_of, states_of
 
 EPS = np.finfo(float).eps
 SEGMENTS, ROWS, STATES, PARAMS, DAMPING = 7, 9, 4, 3, 0.3

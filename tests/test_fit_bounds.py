@@ -6,7 +6,7 @@ from _measured import NOISE, TRUE, TS, experiment, fit, pendulum, within
 from _silence import no_warning
 
 import jaxlag as jl
-from jaxlag import _shooting
+from jaxlag._fit import _multiple_shooting
 
 
 @pytest.mark.full
@@ -50,7 +50,7 @@ def test_without_bounds_no_box_is_compiled(monkeypatch):
     def box(*_):
         raise AssertionError("a box")
 
-    monkeypatch.setattr(_shooting, "box_least_squares", box)
+    monkeypatch.setattr(_multiple_shooting, "box_least_squares", box)
     data = experiment().part(slice(0, 77))  # of a shape that no other test has compiled
     fit(data)
     with pytest.raises(AssertionError, match="a box"):

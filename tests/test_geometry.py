@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._geometry import advice_on_rows, is_singular, vanishing_rows
+from jaxlag._system._row_advice import advice_on_rows, is_singular, vanishing_rows
 
 VANISHING = {
     "square": (lambda t, q, params: q[1] ** 2, [0.3, 0.0]),

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 import jaxlag as jl
-from jaxlag._perturbations import spectral_size, turning_rate
+from jaxlag._integration._linearized_rates import spectral_size, turning_rate
 
 
 @pytest.mark.full

@@ -10,7 +10,7 @@ import pytest
 from test_gradients import direction, dot
 
 import jaxlag as jl
-from jaxlag._gradient import choose_gradient, needed
+from jaxlag._gradient._modes import choose_gradient, needed
 from systems._catalogue import find
 
 # Seconds that each runs for. Starts are assembled where they have to stay on constraints.

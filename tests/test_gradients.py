@@ -11,7 +11,8 @@ from problems import MOTIONS, Motion
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
-from jaxlag import _replay, _simulate, _variations
+from jaxlag._gradient import _solve, _tangent_map
+from jaxlag._simulation import _simulate
 
 NAMES = mostly_full(MOTIONS, "driven_pendulum")
 
@@ -112,10 +113,10 @@ def recorded(motion: Motion, x):
             params=x["params"],
             inputs=base.inputs if x["inputs"] is None else x["inputs"],
         )
-        inexact, rest, setup, static = _replay.halves(_simulate.pose(plan, values)[2])
+        inexact, rest, setup, static = _solve.halves(_simulate.pose(plan, values)[2])
         if outcome is None:
-            return _replay._recorded(inexact, rest, setup, static)
-        rows = _replay._replay(rest, setup, static, outcome, inexact)
+            return _solve._recorded(inexact, rest, setup, static)
+        rows = _solve._replay(rest, setup, static, outcome, inexact)
         n = motion.system.size
         return jnp.concatenate([rows.saved[-1], rows.saved[1, :n]])
 
@@ -366,8 +367,8 @@ def test_unreached_rows_keep_the_gradient_finite():
 def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
     """The comparisons above fail when the tangent rule is wrong in sign."""
     _, x, dx, (_, dy, _, _) = derivatives("central_motion")
-    right = _replay.changes
-    monkeypatch.setattr(_replay, "changes", lambda *args: jax.tree.map(jnp.negative, right(*args)))
+    right = _solve.changes
+    monkeypatch.setattr(_solve, "changes", lambda *args: jax.tree.map(jnp.negative, right(*args)))
     state, _ = end(MOTIONS["central_motion"], max_steps=4097)  # another program: nothing cached
     _, wrong = jax.jit(lambda x, dx: jax.jvp(state, (x,), (dx,)))(x, dx)
     np.testing.assert_allclose(wrong, -dy, rtol=1e-9)
@@ -384,9 +385,9 @@ def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
 def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
     """The comparison of forward with reverse fails when the transposed map is wrong in sign."""
     _, x, dx, (_, dy, weights, _) = derivatives("central_motion")
-    right = _variations.backwards
+    right = _tangent_map.backwards
     monkeypatch.setattr(
-        _variations, "backwards", lambda *args: jax.tree.map(jnp.negative, right(*args))
+        _tangent_map, "backwards", lambda *args: jax.tree.map(jnp.negative, right(*args))
     )
     state, _ = end(MOTIONS["central_motion"], max_steps=4098)  # another program: nothing cached
     pulled = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlag._hermite import hermite
-from jaxlag._record import Reach, step_end
+from jaxlag._integration._quintic_hermite import hermite
+from jaxlag._integration._record import Reach, step_end
 
 EPS = np.finfo(float).eps
 

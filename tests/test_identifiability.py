@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlag._identifiability import Spectrum, combination, run_off
+from jaxlag._fit._identifiability import Spectrum, combination, run_off
 
 
 def spectrum(names, values, *known):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._params import check_keys
+from jaxlag._tracing._params import check_keys
 
 TABLE = {"k": 2.0}
 STIFFNESS = 2.0

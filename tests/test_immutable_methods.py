@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import pytest
 
 import jaxlag as jl
-from jaxlag._captured import captured
-from jaxlag._params import check_keys
+from jaxlag._tracing._params import check_keys
+from jaxlag._tracing._traced_function import captured
 
 TABLE = {"k": 2.0}
 STIFFNESS = 2.0

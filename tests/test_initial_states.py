@@ -6,7 +6,7 @@ import pytest
 from _measured import TRUE, TS, angles, experiment, pendulum
 
 import jaxlag as jl
-from jaxlag._initial_states import initial_states, start_freedom, start_size
+from jaxlag._fit._initial_guess import initial_states, start_freedom, start_size
 
 TURN = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
 turned = jl.System(

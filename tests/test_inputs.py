@@ -11,7 +11,14 @@ import pytest
 from _user import unchecked  # noqa: F401
 
 import jaxlag as jl
-from jaxlag._inputs import all_knots, at_interval, check_inputs, common_range, evaluate, locate
+from jaxlag._model._inputs import (
+    all_knots,
+    at_interval,
+    check_inputs,
+    common_range,
+    evaluate,
+    locate,
+)
 
 EPS = np.finfo(float).eps
 TIMES = [0.0, 0.5, 2.0, 2.25]

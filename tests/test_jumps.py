@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._jumps import Jumps
+from jaxlag._simulation._jump_times import Jumps
 
 TS = jnp.linspace(0.0, 3.0, 4)
 TIMES, VALUES = jnp.linspace(0.0, 5.0, 21), jnp.sin(3 * jnp.linspace(0.0, 5.0, 21))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._kinks import outcomes
+from jaxlag._tracing._nonsmooth_points import outcomes
 
 G = 9.81
 A, B = jnp.array([0.3, -0.2, 0.6]), jnp.array([-0.3, 1.9, 1.7])  # every comparison differs

@@ -7,9 +7,9 @@ import pytest
 from _families import mostly_full
 from numpy.linalg import norm
 
-from jaxlag._kkt import FORMULATIONS, factor_kkt, solve_kkt, solve_reactions
-from jaxlag._linalg import rank_floor
-from jaxlag._rank import independent_rows, least_norm
+from jaxlag._linalg._independent_rows import independent_rows, least_norm
+from jaxlag._linalg._kkt import FORMULATIONS, factor_kkt, solve_kkt, solve_reactions
+from jaxlag._linalg._mass_solve import rank_floor
 
 EPS = np.finfo(float).eps
 SIZES = [(1, 1), (3, 1), (4, 2), (6, 4), (11, 3)]

@@ -7,8 +7,8 @@ import pytest
 from _jaxprs import operations
 
 import jaxlag as jl
-from jaxlag import _lanes
-from jaxlag._put import put
+from jaxlag._core import _batching
+from jaxlag._core._buffer_entries import put
 from systems import double_pendulum
 
 EPS = np.finfo(float).eps
@@ -113,7 +113,7 @@ def test_chunks_are_what_is_compiled(lowering):
     if lowering == "auto":
         assert any(o.inside[-2:] and "scan" in o.inside and "while" in o.inside for o in program)
         assert rows
-        assert all(shape[0] == _lanes.LANES for shape in rows)
+        assert all(shape[0] == _batching.LANES for shape in rows)
         # Rows are written by each lane at a place of its own.
         assert not [o for o in program if "while" in o.inside and "scatter" in o.name]
     else:
@@ -130,7 +130,7 @@ def test_chunks_of_implicit_methods():
     assert all(shape[0] == 44 for shape in rows if len(shape) > 2)
 
 
-@pytest.mark.parametrize("lanes", [3, _lanes.LANES + 1])
+@pytest.mark.parametrize("lanes", [3, _batching.LANES + 1])
 @pytest.mark.parametrize("dtype", [float, np.int32])
 def test_rows_are_put_where_each_lane_says(lanes, dtype):
     rng = np.random.default_rng(0)

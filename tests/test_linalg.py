@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 from numpy.linalg import norm
 
-from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, first_unhealthy, solve_mass
+from jaxlag._linalg._mass_solve import (
+    LOOP_UP_TO,
+    UNROLL_UP_TO,
+    factor_mass,
+    first_unhealthy,
+    solve_mass,
+)
 
 EPS = np.finfo(float).eps
 SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 16, 17, 18)

@@ -16,7 +16,7 @@ from _families import mostly_full
 from _ladders import EPS, ONE_EACH, close, each, ladder, of_pair
 from numpy.testing import assert_allclose, assert_array_equal
 
-import jaxlag._coordinates
+import jaxlag._model._coordinates
 from jaxlag import math
 
 ELEMENTWISE = ("sqrt", "acos", "asin", "sinc", "sinc_sqrt", "one_minus_cos", "cosc", "cosc_sqrt")
@@ -404,5 +404,5 @@ def test_wrong_vectors_are_refused():
 
 def test_the_name_hides_nothing():
     """Siblings that import math get the standard library's."""
-    assert jaxlag._coordinates.math is stdlib
+    assert jaxlag._model._coordinates.math is stdlib
     assert stdlib is not math

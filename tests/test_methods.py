@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._methods import METHODS, choose, name_of
+from jaxlag._simulation._methods import METHODS, choose, name_of
 from systems._catalogue import ENTRIES
 
 TS = np.linspace(0.0, 1.0, 3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._mishaps import said
+from jaxlag._tracing._user_errors import said
 
 PARAMS = {"m": 1.0, "k": 2.0}
 

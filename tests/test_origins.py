@@ -22,7 +22,7 @@ from jax import lax
 
 import jaxlag as jl
 from jaxlag import testing
-from jaxlag._origins import Program
+from jaxlag.testing._nan_origins import Program
 from tests._user import unchecked  # noqa: F401
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._params import Static, join, split
+from jaxlag._tracing._params import Static, join, split
 
 
 class Spring(eqx.Module):

@@ -10,10 +10,10 @@ from _families import mostly_full
 from _jaxprs import loop, operations
 
 import jaxlag as jl
-from jaxlag import _pose
-from jaxlag._errors import SimulationError
-from jaxlag._passage import resolved
-from jaxlag._status import Status
+from jaxlag._core._errors import SimulationError
+from jaxlag._core._status import Status
+from jaxlag._integration._quasi_singularities import resolved
+from jaxlag._simulation import _problem
 
 SINGULAR = int(Status.kinematics_singular)
 DRAG = 0.1
@@ -326,5 +326,5 @@ def test_determinants_that_never_change_are_not_computed(U, lowering, looked_at,
         return [(o.name, o.shapes) for o in loop(program)]
 
     asked = steps()
-    monkeypatch.setattr(_pose, "usual", lambda *_: None)
+    monkeypatch.setattr(_problem, "usual", lambda *_: None)
     assert (asked != steps()) == looked_at

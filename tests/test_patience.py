@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxlag as jl
-from jaxlag import _patience, _simulate
+from jaxlag._simulation import _compile_log, _simulate
 
 PAIR = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * q @ q, ("x", "y"))
 
@@ -17,7 +17,7 @@ PAIR = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * q @ q, ("x", "y"))
 def called(patch, seconds, system=PAIR, **options):
     """A simulation whose every look at the clock is so many seconds after the last."""
     clock = partial(next, itertools.count(0.0, seconds))
-    patch.setattr(_simulate, "timed", partial(_patience.timed, clock=clock))
+    patch.setattr(_simulate, "timed", partial(_compile_log.timed, clock=clock))
     return jl.simulate(system, [0.1, 0.2], [0.0, 0.0], [0.0, 1.0], {"k": 2.0}, **options)
 
 

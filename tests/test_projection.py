@@ -7,8 +7,8 @@ import pytest
 from mechanisms import BOBS, OMEGA, THETA, cartesian, double_pendulum, minimal, to_cartesian
 
 import jaxlag as jl
-from jaxlag import _projection
-from jaxlag._projection import Surface, project
+from jaxlag._linalg import _projection
+from jaxlag._linalg._projection import Surface, project
 
 
 @pytest.mark.full

@@ -10,7 +10,7 @@ from _user import unchecked  # noqa: F401
 from numpy.linalg import cond, norm
 
 import jaxlag as jl
-from jaxlag._status import Status
+from jaxlag._core._status import Status
 
 EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import jaxlag as jl
 from jaxlag import rotation
-from jaxlag._errors import SimulationError
+from jaxlag._core._errors import SimulationError
 
 EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}

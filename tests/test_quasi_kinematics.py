@@ -7,8 +7,8 @@ from _quasi_systems import BLADE, TALL, sleigh, sleighs
 from _user import unchecked  # noqa: F401
 
 import jaxlag as jl
-from jaxlag._errors import SimulationError
-from jaxlag._status import Status
+from jaxlag._core._errors import SimulationError
+from jaxlag._core._status import Status
 
 EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}

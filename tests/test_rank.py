@@ -6,11 +6,11 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlag._kkt import units_of
-from jaxlag._lowering._evaluate import evaluate
-from jaxlag._lowering._graph import Graph
-from jaxlag._lowering._sharing import Sharing, shared
-from jaxlag._rank import independent_rows, least_norm, row_sizes
+from jaxlag._linalg._independent_rows import independent_rows, least_norm, row_sizes
+from jaxlag._linalg._kkt import units_of
+from jaxlag._lowering._graph._expression import Graph
+from jaxlag._lowering._symbolic._evaluate import evaluate
+from jaxlag._lowering._symbolic._shared_reactions import Sharing, shared
 
 
 def test_which_rows_are_left_out():

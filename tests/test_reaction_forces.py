@@ -8,11 +8,11 @@ from _families import mostly_full
 from numpy import cos, sin
 
 import jaxlag as jl
-from jaxlag._kkt import solve_general as on_arrays
-from jaxlag._lowering._evaluate import evaluate
-from jaxlag._lowering._graph import Graph
-from jaxlag._lowering._solve import solve_general as on_graph
-from jaxlag._status import Status
+from jaxlag._core._status import Status
+from jaxlag._linalg._kkt import solve_general as on_arrays
+from jaxlag._lowering._graph._eliminate import solve_general as on_graph
+from jaxlag._lowering._graph._expression import Graph
+from jaxlag._lowering._symbolic._evaluate import evaluate
 from systems import falling_stick_friction
 
 G = 9.81

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._lanes import MOST
-from jaxlag._nested import equations, within
+from jaxlag._core._batching import MOST
+from jaxlag._core._nested_programs import equations, within
 
 EPS = np.finfo(float).eps
 GRAVITY = 9.81

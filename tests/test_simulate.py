@@ -8,7 +8,7 @@ from problems import MOTIONS, driven, steps
 
 import jaxlag as jl
 from jaxlag import SimulationError, Status
-from jaxlag._simulate import _simulate
+from jaxlag._simulation._simulate import _simulate
 
 PENDULUM = MOTIONS["double_pendulum"]
 

@@ -8,8 +8,8 @@ import optax
 import pytest
 
 import jaxlag as jl
-from jaxlag._inputs import evaluate
-from jaxlag._stacked_inputs import stacked
+from jaxlag._fit._stacked_inputs import stacked
+from jaxlag._model._inputs import evaluate
 
 TS = np.linspace(0.0, 1.0, 6)
 PUSH = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * jnp.ones(1), "push")

@@ -8,8 +8,8 @@ from _families import mostly_full
 from _mechanics import GENERAL, chain
 
 import jaxlag as jl
-from jaxlag._dependence import outputs_depend_on
 from jaxlag._lowering import find_structure
+from jaxlag._tracing._dependence import outputs_depend_on
 from systems._catalogue import ENTRIES
 
 PAIR = ("x", "y")

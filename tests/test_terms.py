@@ -15,7 +15,7 @@ from _mechanics import CHAIN_PARAMS, chain_lagrangian
 from _mechanics import chain as any_chain
 
 import jaxlag as jl
-from jaxlag._linalg import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
+from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
 from systems._catalogue import ENTRIES
 
 SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2

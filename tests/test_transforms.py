@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._transforms import Free
+from jaxlag._fit._transforms import Free
 
 SPD = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 1.0]])
 BODY = np.array([2.0, 0.2, -0.1, 0.4, 1.1, 1.3, 0.9, 0.05, -0.02, 0.03])

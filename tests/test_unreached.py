@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._unreached import unreached
+from jaxlag._gradient._unreached_saves import unreached
 
 # V = p/x: repelled for p > 0, drawn into the centre for p < 0, which no motion survives.
 central = jl.System(lambda t, q, v, p: 0.5 * v @ v - p / q[0], ("x",))

@@ -11,7 +11,7 @@ import jaxlib
 import numpy as np
 import pytest
 
-from jaxlag import _xla
+from jaxlag._core import _xla
 from systems import double_pendulum
 
 SOLVE = """

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlag._dependence import outputs_depend_on
-from jaxlag._vectors import concrete
+from jaxlag._core._arrays import concrete
+from jaxlag._tracing._dependence import outputs_depend_on
 
 
 class Structure(NamedTuple):

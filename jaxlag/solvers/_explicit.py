@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxlag._vectors import elements
-from jaxlag._xla import opaque_one
+from jaxlag._core._arrays import elements
+from jaxlag._core._xla import opaque_one
 from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
 
 # Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of

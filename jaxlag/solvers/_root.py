@@ -10,7 +10,7 @@ from jax import Array
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import PyTree
 
-from jaxlag._custom_jvp import CustomJVP
+from jaxlag._core._custom_jvp import CustomJVP
 
 MOST, EACH = 8, 12  # derivatives taken anew, iterations with each
 MEMORY = 3  # iterations in which increments halve while they fall

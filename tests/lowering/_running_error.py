@@ -11,7 +11,7 @@ from typing import NamedTuple
 import mpmath
 import numpy as np
 
-from jaxlag._lowering._graph import order
+from jaxlag._lowering._graph._expression import order
 
 U = 2.0**-53
 DIGITS = 50

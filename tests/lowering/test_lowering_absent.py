@@ -19,8 +19,8 @@ from test_lowering_skipped import (
 )
 
 import jaxlag as jl
+from jaxlag._integration._step_end import Settling
 from jaxlag._lowering import ArrayTerms
-from jaxlag._settling import Settling
 
 # ---- A constant mass matrix ----------------------------------------------------------------------
 

@@ -11,11 +11,11 @@ from _running_error import U, carried, rounded
 import jaxlag as jl
 from bench._scenes import SCENES
 from jaxlag._lowering import ArrayTerms
-from jaxlag._lowering._derive import derive
-from jaxlag._lowering._forms import mass_matrix, momentum_form
-from jaxlag._lowering._key import key_of
-from jaxlag._lowering._read import read_scene
-from jaxlag._lowering._solve import solve
+from jaxlag._lowering._graph._eliminate import solve
+from jaxlag._lowering._symbolic._bias_forms import mass_matrix, momentum_form
+from jaxlag._lowering._symbolic._derive import derive
+from jaxlag._lowering._symbolic._program_key import key_of
+from jaxlag._lowering._symbolic._read_system import read_scene
 from systems._catalogue import ENTRIES
 
 WORSE = 4.0  # the bound of the program may be so many times that of L as it is written

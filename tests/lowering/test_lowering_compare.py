@@ -9,7 +9,7 @@ from test_lowering_scalar import case
 
 import jaxlag as jl
 from bench._scenes import SCENES, links
-from jaxlag._lowering import _lower
+from jaxlag._lowering._symbolic import _lower
 from systems import lamina_on_parabola, rigid_aircraft
 
 EPS = np.finfo(float).eps

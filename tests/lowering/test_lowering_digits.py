@@ -7,7 +7,7 @@ import pytest
 from _lowered import lowered
 
 import jaxlag as jl
-from jaxlag._lowering._evaluate import evaluate
+from jaxlag._lowering._symbolic._evaluate import evaluate
 
 EPS = np.finfo(float).eps
 

@@ -10,11 +10,11 @@ from _families import mostly_full
 from _probes import FALLBACKS, PROBES
 
 import jaxlag as jl
-from jaxlag._lowering._diff import gradient, tangents
-from jaxlag._lowering._evaluate import evaluate
-from jaxlag._lowering._expand import Expansion
-from jaxlag._lowering._graph import Graph
-from jaxlag._lowering._ingest import Unsupported, read
+from jaxlag._lowering._graph._expression import Graph
+from jaxlag._lowering._graph._simplify import Expansion
+from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
+from jaxlag._lowering._symbolic._evaluate import evaluate
 
 EPS = np.finfo(float).eps
 POINTS = np.array([[0.3, -0.4, 0.8], [-0.6, 0.2, 0.1], [1.2, 0.9, -0.7], [0.6, 0.7, 1.4]])

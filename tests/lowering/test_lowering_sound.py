@@ -10,11 +10,11 @@ import pytest
 from _lowered import lowered
 
 import jaxlag as jl
-from jaxlag._interpret import NUMPY, interpret
-from jaxlag._lowering import _lower
-from jaxlag._lowering._evaluate import evaluate
-from jaxlag._lowering._forms import degree
-from jaxlag._lowering._graph import Graph
+from jaxlag._lowering._graph._expression import Graph
+from jaxlag._lowering._symbolic import _lower
+from jaxlag._lowering._symbolic._bias_forms import degree
+from jaxlag._lowering._symbolic._evaluate import evaluate
+from jaxlag._tracing._interpret import NUMPY, interpret
 
 EPS = np.finfo(float).eps
 KEY, OLD_KEY = jax.random.key(0), jax.random.PRNGKey(0)
@@ -229,7 +229,7 @@ def test_degrees():
 
 
 def _sine(x):
-    from jaxlag._lowering._graph import SIN
+    from jaxlag._lowering._graph._expression import SIN
 
     return SIN, x
 

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlag._lowering._trig import _COSINE, _SINE, by_polynomials, sincos
+from jaxlag._lowering._emit._sincos import _COSINE, _SINE, by_polynomials, sincos
 
 EPS = np.finfo(float).eps
 RNG = np.random.default_rng(0)

@@ -10,7 +10,7 @@ from _files import harmonic, recorded
 from _paths import REFERENCE
 
 import jaxlag as jl
-from jaxlag import _simulate
+from jaxlag._simulation import _simulate
 from systems import _check
 from systems.__main__ import main
 from systems._catalogue import ENTRIES

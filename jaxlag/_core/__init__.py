@@ -1,0 +1,1 @@
+"""What every other package stands on: errors, arrays, batching, maps with derivatives."""

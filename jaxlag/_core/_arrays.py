@@ -1,0 +1,95 @@
+"""Arrays: of numbers given by the user, in one precision; whether they are traced."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from jaxlag._core._errors import bad
+
+
+def concrete(*arrays: Any) -> bool:
+    """Whether all of these have values, rather than being traced by a transform."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
+
+
+def still(tree: Any) -> Any:
+    """Without derivatives: a status has none, and differentiating its making would cost."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def real(argument: str, x: Any) -> Array:
+    """`x` as a real inexact array of any shape; raises naming `argument` if it cannot be one."""
+    try:
+        # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
+        x = jnp.asarray(float(x) if isinstance(x, int) else x)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise bad(argument, "be real numbers", f"it was {x!r}") from error
+    if jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
+    """`x` as a scalar of this dtype, finite where its value is known; raises if it cannot be one.
+
+    Args:
+        argument: as errors name it.
+        must: what it is to be, in words.
+        x: anything.
+        dtype: of the result.
+    """
+    try:
+        x = jnp.asarray(x, dtype)
+    except (TypeError, ValueError) as error:
+        raise bad(argument, must, f"it was {x!r}") from error
+    if x.ndim != 0:
+        raise bad(argument, must, f"its shape was {x.shape}")
+    if concrete(x) and not np.isfinite(x):
+        raise bad(argument, "be finite", f"it was {x}")
+    return x
+
+
+def common(*arrays: Array) -> list[Array]:
+    """Arrays of one dtype, the result type of all, whatever the promotion JAX is set to."""
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(*arrays)
+    return [x.astype(dtype) for x in arrays]
+
+
+def of_state(argument: str, *arrays: Array) -> list[Array]:
+    """Arrays of one dtype, that of a state; raises where it has less than 32 bits.
+
+    Of a motion in half precision whole percents are rounding, whatever the steps are.
+    """
+    state = common(*arrays)
+    dtype = state[0].dtype
+    if jnp.finfo(dtype).bits < 32:
+        was = f"in {dtype.name} equations keep {jnp.finfo(dtype).precision} digits at most"
+        fix = f"Write {argument.replace(',', ' ').split()[0]}.astype(float)."
+        raise bad(argument, "be float32 or float64", was, fix)
+    return state
+
+
+def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
+    """Real arrays of one dtype from (argument, value, shape); raises naming the argument."""
+    arrays = []
+    for argument, x, shape in given:
+        x = real(argument, x)
+        if x.shape != shape:
+            fix = "Use jax.vmap for batches." if x.ndim > len(shape) else ""
+            raise bad(argument, f"have shape {shape}", f"its shape was {x.shape}", fix)
+        arrays.append(x)
+    return common(*arrays)
+
+
+def elements(array: Array) -> list[Array]:
+    """All elements of an array in one row, by static slices."""
+    flat = jnp.reshape(array, (-1,))
+    return [
+        jax.lax.squeeze(jax.lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])
+    ]

@@ -1,0 +1,274 @@
+"""Functions with a derivative rule of their own, which no transform drops.
+
+`jax.custom_jvp` means the same. But a reverse derivative of a scan splits its body into what is
+known and what is linear, and there JAX goes on with the function and forgets its rule (0.10): the
+second derivative of a loop is that of the body then. The rule of a primitive stays with it.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import update_wrapper
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+from jaxlag._core._program_rewrite import rewritten
+
+Leaves = Sequence[Any]
+NAME = "custom_jvp_call"
+
+
+class AbstractRule(ABC):
+    """The derivative of a function from a list of arrays to another."""
+
+    @abstractmethod
+    def __call__(self, primals: Leaves, dots: Leaves, /) -> tuple[Leaves, Leaves]:
+        """(results, their tangents), at the arguments and tangents; None for one that is zero."""
+
+    @property
+    @abstractmethod
+    def key(self) -> Any:
+        """The same for rules that are the same."""
+
+
+class CustomJVP:
+    """A function of pytrees of arrays, with a rule for its derivatives.
+
+    Used as `jax.custom_jvp` is, but for this: neither the function nor its rule may close over a
+    traced value, and tangents that are zero are None to a rule with `symbolic_zeros`, and may be
+    None in what any rule returns, all of them at once too.
+
+    Attributes:
+        function: of arrays.
+    """
+
+    function: Callable
+
+    def __init__(self, function: Callable) -> None:
+        self.function = function
+        self._traced = jax.jit(function)
+        self._rule: Callable | None = None
+        self._symbolic_zeros = False
+        update_wrapper(self, function)
+
+    def defjvp(self, rule: Callable, symbolic_zeros: bool = False) -> Callable:
+        """Set the rule (arguments, tangents) -> (results, tangents)."""
+        self._rule, self._symbolic_zeros = rule, symbolic_zeros
+        return rule
+
+    def __call__(self, *args: Any) -> Any:
+        """The results of the function."""
+        leaves, tree = jax.tree.flatten(args)
+        if not any(isinstance(x, Tracer) for x in leaves):  # there is nothing to differentiate
+            return self.function(*args)
+        with jax.disable_jit(False):
+            traced = self._traced.trace(*args)
+        results = bind_rule(list(map(jnp.asarray, leaves)), traced.jaxpr, _Flat(self, tree))
+        return jax.tree.unflatten(jax.tree.structure(traced.out_info), results)
+
+    def derivative(self, args: tuple, dots: tuple) -> tuple[Any, Any]:
+        """(results, their tangents); None for a tangent that is zero."""
+        assert self._rule is not None
+        if not self._symbolic_zeros:
+            leaves, tree = jax.tree.flatten(args)
+            pairs = zip(leaves, tree.flatten_up_to(dots), strict=True)
+            dots = tree.unflatten([_zero(x) if dot is None else dot for x, dot in pairs])
+        return self._rule(args, dots)
+
+
+@dataclass(frozen=True)
+class _Flat(AbstractRule):
+    """The rule of a function between lists of leaves; `tree` is that of its arguments."""
+
+    custom: CustomJVP
+    tree: Any
+
+    def __call__(self, primals: Leaves, dots: Leaves) -> tuple[Leaves, Leaves]:
+        args, tangents = (jax.tree.unflatten(self.tree, x) for x in (primals, dots))
+        results, result_dots = self.custom.derivative(args, tangents)
+        leaves, tree = jax.tree.flatten(results)
+        if result_dots is None:
+            return leaves, [None] * len(leaves)
+        return leaves, [None if _is_float0(x) else x for x in tree.flatten_up_to(result_dots)]
+
+    @property
+    def key(self) -> Any:
+        """The function, and how its arguments are given."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class _Users(AbstractRule):
+    """The rule of an equation that `jax.custom_jvp` made.
+
+    Its program is traced, so that rules within it are kept, too.
+    """
+
+    eqn: Any
+
+    def __call__(self, primals: Leaves, dots: Leaves) -> tuple[Leaves, Leaves]:
+        moving = [i for i, dot in enumerate(dots) if dot is not None]
+
+        def both(primals: list, moved: list) -> tuple[Any, Any]:
+            def along(*moving_ones: Any) -> Any:
+                args = list(primals)
+                for i, x in zip(moving, moving_ones, strict=True):
+                    args[i] = x
+                params = self.eqn.primitive.get_bind_params(self.eqn.params)
+                return self.eqn.primitive.bind(*args, **params)
+
+            results, found = jax.jvp(along, [primals[i] for i in moving], moved)
+            return results, [None if _is_float0(x) else x for x in found]
+
+        given = list(primals), [dots[i] for i in moving]
+        return keeping_rules(both)(*given)
+
+    @property
+    def key(self) -> Any:
+        """The user's function."""
+        rule = self.eqn.params["jvp_jaxpr_fun"]
+        return id(getattr(rule, "f", rule))
+
+
+@dataclass(frozen=True)
+class _Rows(AbstractRule):
+    """The rule of the function over rows of those arguments whose axis is 0, not None."""
+
+    rule: AbstractRule
+    axes: tuple[int | None, ...]
+    size: Any
+
+    def __call__(self, primals: Leaves, dots: Leaves) -> tuple[Leaves, Leaves]:
+        axes = list(self.axes)
+        moving = [None if dot is None else axis for axis, dot in zip(axes, dots, strict=True)]
+        over = jax.vmap(self.rule, (axes, moving), axis_size=self.size)
+        return over(list(primals), list(dots))
+
+    @property
+    def key(self) -> Any:
+        """The rule, and which arguments have rows."""
+        return self.rule.key, self.axes, self.size
+
+
+def with_rules_kept(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program; rules by `jax.custom_jvp` stay with their functions from here on."""
+    return rewritten(program, with_rule_kept)
+
+
+def keeping_rules(function: Callable) -> Callable:
+    """The same function of pytrees of arrays, as `with_rules_kept` has it; traced by every call."""
+
+    def kept(*args: Any) -> Any:
+        program, like = jax.make_jaxpr(function, return_shape=True)(*args)
+        found = jaxpr_as_fun(with_rules_kept(program))(*jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(like), found)
+
+    return kept
+
+
+def with_rule_kept(eqn: Any) -> Any:
+    """The same equation; the rule of one by `jax.custom_jvp` stays with it."""
+    if eqn.primitive.name != NAME or eqn.primitive is _custom_jvp:
+        return eqn
+    return with_rule(eqn, eqn.params["call_jaxpr"], _Users(eqn))
+
+
+def with_rule(eqn: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> Any:
+    """An equation of this program and this rule in the place of another."""
+    params = {"call_jaxpr": call_jaxpr, "rule": rule}
+    return eqn.replace(primitive=_custom_jvp, params=params)
+
+
+def _zero(x: Any) -> Any:
+    """The tangent of what does not move."""
+    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(jnp.shape(x), jax.dtypes.float0)
+
+
+def _is_float0(x: Any) -> bool:
+    return getattr(x, "dtype", None) == jax.dtypes.float0
+
+
+_custom_jvp = Primitive(NAME)
+_custom_jvp.multiple_results = True
+
+
+def bind_rule(args: Leaves, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
+    """The results of a program that has this rule."""
+    return _custom_jvp.bind(*args, call_jaxpr=call_jaxpr, rule=rule)
+
+
+def _evaluate(*args: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
+    del rule
+    return jaxpr_as_fun(call_jaxpr)(*args)
+
+
+_custom_jvp.def_impl(_evaluate)
+mlir.register_lowering(_custom_jvp, mlir.lower_fun(_evaluate, multiple_results=True))
+
+
+@_custom_jvp.def_effectful_abstract_eval
+def _shapes(*_: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> tuple[list[ShapedArray], Any]:
+    del rule
+    return list(call_jaxpr.out_avals), call_jaxpr.effects
+
+
+def _derivative(
+    primals: Leaves, tangents: Leaves, *, call_jaxpr: ClosedJaxpr, rule: AbstractRule
+) -> tuple[list, list]:
+    del call_jaxpr
+    dots = [None if type(dot) is ad.Zero else dot for dot in tangents]
+    results, found = rule(list(map(jnp.asarray, primals)), dots)
+    pairs = zip(results, found, strict=True)
+    return list(results), [_no_tangent(x) if d is None else d for x, d in pairs]
+
+
+def _no_tangent(x: Any) -> ad.Zero:
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+ad.primitive_jvps[_custom_jvp] = _derivative
+
+
+def _transposed(
+    cotangents: Leaves, *args: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule
+) -> list:
+    """Of the function itself, as JAX has it: a rule may call it on what it is linear in."""
+    del rule
+    linear = [i for i, x in enumerate(args) if ad.is_undefined_primal(x)]
+
+    def of(*moving: Any) -> Leaves:
+        whole = list(args)
+        for i, x in zip(linear, moving, strict=True):
+            whole[i] = x
+        return jaxpr_as_fun(call_jaxpr)(*whole)
+
+    like = [jax.ShapeDtypeStruct(args[i].aval.shape, args[i].aval.dtype) for i in linear]
+    pairs = zip(cotangents, call_jaxpr.out_avals, strict=True)
+    given = [jnp.zeros(y.shape, y.dtype) if type(x) is ad.Zero else x for x, y in pairs]
+    found = dict(zip(linear, jax.linear_transpose(of, *like)(given), strict=True))
+    return [found.get(i) for i in range(len(args))]
+
+
+ad.primitive_transposes[_custom_jvp] = _transposed
+
+
+def _batched(args: Leaves, axes: Leaves, *, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> tuple:
+    """Rows in front of all results: one program for them whatever their rule returns."""
+    pairs = list(zip(args, axes, strict=True))
+    (size, *_) = (x.shape[i] for x, i in pairs if i is not None)
+    args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]
+    over = tuple(None if i is None else 0 for i in axes)
+    function = jax.vmap(jaxpr_as_fun(call_jaxpr), over, axis_size=size)
+    results = bind_rule(args, jax.make_jaxpr(function)(*args), _Rows(rule, over, size))
+    return results, [0] * len(results)
+
+
+batching.primitive_batchers[_custom_jvp] = _batched

@@ -1,0 +1,250 @@
+"""Linear maps with a fast form of their own for every direction.
+
+y = A(r) x. JAX derives the transpose of a program by turning it round operation by operation,
+which it cannot do with a loop that ends by itself, and does at the price of a record of everything
+in one of known length. Where both A(r) x and A(r)^T y are known as programs, neither is needed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
+
+from jaxlag._core._batching import LANES, in_batches
+
+Leaves = Sequence[Any]
+
+
+_TWICE = (
+    "Reverse derivatives of reverse derivatives must be taken through explicit methods: JAX does "
+    "not transpose the loops in which implicit ones solve their equations. Take second derivatives "
+    "forward over reverse, jax.hessian(f) or jax.jacfwd(jax.grad(f)), which all methods have."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMap:
+    """x -> A(r) x in four programs of (r, x) or (r, y), which close over no traced value.
+
+    Attributes:
+        forward: A(r) x. May hold loops of any kind.
+        backward: A(r)^T y. The same.
+        plain: A(r) x by a program that JAX differentiates in any mode and to any order.
+        plain_backward: A(r)^T y in the same way; None for the transpose of `plain`.
+        in_lanes: the same map in the form to be vmapped over r; None for this one.
+        at_once: rows of a vmap that are taken together; None for all.
+    """
+
+    forward: Callable[[PyTree, PyTree], PyTree]
+    backward: Callable[[PyTree, PyTree], PyTree]
+    plain: Callable[[PyTree, PyTree], PyTree]
+    plain_backward: Callable[[PyTree, PyTree], PyTree] | None = None
+    in_lanes: "LinearMap | None" = None
+    at_once: int | None = LANES
+
+
+def linear(form: LinearMap, r: PyTree, x: PyTree) -> PyTree:
+    """A(r) x, differentiable in both to any order.
+
+    Forward derivatives in r are those of `forward` and `backward`, reverse ones those of `plain`.
+    """
+    r_leaves, r_tree = jax.tree.flatten(r)
+    x_leaves, x_tree = jax.tree.flatten(x)
+    y_tree = jax.tree.structure(jax.eval_shape(form.forward, r, x))
+    flat = _flat(form, r_tree, x_tree, y_tree)
+    return jax.tree.unflatten(y_tree, _bind(flat, r_leaves, x_leaves))
+
+
+def _flat(form: LinearMap, r_tree: Any, x_tree: Any, y_tree: Any) -> LinearMap:
+    """The map between lists of leaves."""
+
+    def between(function: Callable | None, tree: Any) -> Any:
+        if function is None:
+            return None
+
+        def of(r: Leaves, x: Leaves) -> list:
+            results = function(jax.tree.unflatten(r_tree, r), jax.tree.unflatten(tree, x))
+            return jax.tree.leaves(results)
+
+        return of
+
+    return LinearMap(
+        between(form.forward, x_tree),
+        between(form.backward, y_tree),
+        between(form.plain, x_tree),
+        between(form.plain_backward, y_tree),
+        None if form.in_lanes is None else _flat(form.in_lanes, r_tree, x_tree, y_tree),
+        form.at_once,
+    )
+
+
+def _turned(form: LinearMap, like: Leaves) -> LinearMap:
+    """The transposed map; `like` are the shapes of x."""
+
+    def plain(r: Leaves, y: Leaves) -> list:
+        zeros = [jnp.zeros(x.shape, x.dtype) for x in like]
+        return list(jax.vjp(lambda *x: form.plain(r, x), *zeros)[1](y))
+
+    return LinearMap(
+        form.backward,
+        form.forward,
+        form.plain_backward or plain,
+        form.plain,
+        None if form.in_lanes is None else _turned(form.in_lanes, like),
+        form.at_once,
+    )
+
+
+def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -> LinearMap:
+    """The derivative of A(r) x as a map with (r, x) for its r.
+
+    It maps the directions of the leaves `moving` of r, and with `both` those of x.
+    """
+
+    def at(function: Callable, residual: Leaves) -> tuple[Callable, list]:
+        r, x = list(residual[:count]), list(residual[count:])
+
+        def of(*moved: Any) -> list:
+            for i, leaf in zip(moving, moved, strict=False):
+                r[i] = leaf
+            return list(function(r, list(moved[len(moving) :]) if both else x))
+
+        return of, [r[i] for i in moving] + (x if both else [])
+
+    def forward(function: Callable, residual: Leaves, dots: Leaves) -> list:
+        of, start = at(function, residual)
+        return jax.jvp(of, start, list(dots))[1]
+
+    def plain_backward(residual: Leaves, y: Leaves) -> list:
+        of, start = at(form.plain, residual)
+        return list(jax.vjp(of, *start)[1](list(y)))
+
+    def backward(residual: Leaves, y: Leaves) -> list:
+        of, start = at(form.plain, residual)
+        moved, x = start[: len(moving)], start[len(moving) :]
+        try:
+            bars = list(jax.vjp(lambda *moved: of(*moved, *x), *moved)[1](list(y)))
+        except ValueError as error:
+            if "Reverse-mode differentiation does not work" in str(error):
+                raise ValueError(_TWICE) from error
+            raise
+        return bars + (list(form.backward(list(residual[:count]), y)) if both else [])
+
+    return LinearMap(
+        partial(forward, form.forward),
+        backward,
+        partial(forward, form.plain),
+        plain_backward,
+        None if form.in_lanes is None else _derived(form.in_lanes, count, moving, both),
+        form.at_once,
+    )
+
+
+def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
+    """The map for `size` rows of x, y and the leaves of r that are mapped."""
+    in_lanes = form.in_lanes
+    if any(mapped) and in_lanes is not None:
+        form, in_lanes = in_lanes, None
+
+    def rows(function: Callable | None, at_once: Any) -> Any:
+        if function is None:
+            return None
+
+        def of(r: Leaves, x: Leaves) -> list:
+            own = [leaf for leaf, is_mapped in zip(r, mapped, strict=True) if is_mapped]
+
+            def one(row: tuple) -> list:
+                mine = iter(row[0])
+                pairs = zip(r, mapped, strict=True)
+                merged = [next(mine) if is_mapped else leaf for leaf, is_mapped in pairs]
+                return list(function(merged, row[1]))
+
+            return in_batches(one, (own, list(x)), size, at_once, even=not any(mapped))
+
+        return of
+
+    at_once = form.at_once or size
+    return LinearMap(
+        rows(form.forward, at_once),
+        rows(form.backward, at_once),
+        rows(form.plain, size),
+        rows(form.plain_backward, size),
+        None if in_lanes is None else _batched(in_lanes, size, mapped),
+        form.at_once,
+    )
+
+
+_linear_map = Primitive("linear_map")
+_linear_map.multiple_results = True
+
+
+def _bind(form: LinearMap, r: Leaves, x: Leaves) -> list:
+    return _linear_map.bind(*r, *x, form=form, count=len(r))
+
+
+@_linear_map.def_impl
+def _evaluate(*args: Any, form: LinearMap, count: int) -> list:
+    return jax.jit(form.forward)(args[:count], args[count:])
+
+
+@_linear_map.def_abstract_eval
+def _shapes(*args: Any, form: LinearMap, count: int) -> list:
+    like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args]
+    results = jax.eval_shape(form.forward, like[:count], like[count:])
+    return [ShapedArray(x.shape, x.dtype) for x in results]
+
+
+def _lowered(*args: Any, form: LinearMap, count: int) -> list:
+    return form.forward(args[:count], args[count:])
+
+
+mlir.register_lowering(_linear_map, mlir.lower_fun(_lowered, multiple_results=True))
+
+
+def _jvp(primals: Leaves, tangents: Leaves, *, form: LinearMap, count: int) -> tuple:
+    r, x = list(primals[:count]), list(primals[count:])
+    results = _bind(form, r, x)
+    moving = tuple(i for i in range(count) if type(tangents[i]) is not ad.Zero)
+    both = any(type(dot) is not ad.Zero for dot in tangents[count:])
+    dots = [ad.instantiate_zeros(dot) for dot in tangents[count:]] if both else []
+    if not moving:
+        return results, _bind(form, r, dots)
+    derived = _derived(form, count, moving, both)
+    return results, _bind(derived, [*r, *x], [*(tangents[i] for i in moving), *dots])
+
+
+ad.primitive_jvps[_linear_map] = _jvp
+
+
+def _transpose(cotangents: Leaves, *args: Any, form: LinearMap, count: int) -> list:
+    r, x = args[:count], args[count:]
+    like = [leaf.aval for leaf in x]
+    y = [ad.instantiate_zeros(ct) for ct in cotangents]
+    return [None] * count + _bind(_turned(form, like), r, y)
+
+
+ad.primitive_transposes[_linear_map] = _transpose
+
+
+def _rows(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
+    sizes = [x.shape[i] for x, i in zip(args, axes, strict=True) if i is not None]
+    pairs = zip(args, axes, strict=True)
+    args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]
+    mapped = [i is not None for i in axes]
+    # Rows of x for all: the sum over them that a shared x has as its cotangent is JAX's then.
+    x = [
+        leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *leaf.shape))
+        for leaf, is_mapped in zip(args[count:], mapped[count:], strict=True)
+    ]
+    results = _bind(_batched(form, sizes[0], tuple(mapped[:count])), args[:count], x)
+    return results, [0] * len(results)
+
+
+batching.primitive_batchers[_linear_map] = _rows

@@ -1,0 +1,207 @@
+"""How XLA's CPU backend is told to compile a loop to one native function.
+
+Before jax 0.12 it runs the body of a while loop operation by operation unless the loop handles
+less than about a kilobyte; the dispatch then costs ten times the arithmetic of a small mechanical
+system. There are two ways past that bound:
+
+* the one global setting, which XLA reads once, before the first compilation;
+* where that came too late or is switched off, attributes on the call of a function that holds the
+  loop. They are internal to XLA, so they are used on the versions that the tests run on and
+  around loops of operations that XLA emits code for itself.
+"""
+
+import os
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+
+from jaxlag._core._nested_programs import equations
+
+OPTION = "xla_cpu_small_while_loop_byte_threshold"
+BYTES = 10_000_000
+SWITCH = "JAXLAG_XLA_FLAGS"
+ATTRIBUTE_SWITCH = "JAXLAG_XLA_ATTRIBUTES"
+ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+TESTED = ("0.10.2",)  # versions of jaxlib
+EXTRA = "--xla_backend_extra_options="
+
+
+def needed() -> bool:
+    """Whether this jax keeps the old bound; 0.12 raised it itself."""
+    return tuple(int(part) for part in jax.__version__.split(".")[:2]) < (0, 12)
+
+
+def merged(flags: str) -> str:
+    """XLA_FLAGS with the bound merged into the extra backend options, whatever else they hold.
+
+    A bound that the user has set stays.
+    """
+    if OPTION in flags:
+        return flags
+    words = flags.split()
+    for i, word in enumerate(words):
+        if word.startswith(EXTRA):
+            present = word.removeprefix(EXTRA)
+            options = [present] if present else []
+            words[i] = EXTRA + ",".join([*options, f"{OPTION}={BYTES}"])
+            return " ".join(words)
+    return " ".join([*words, f"{EXTRA}{OPTION}={BYTES}"])
+
+
+def configure() -> None:
+    """Set the bound, unless JAXLAG_XLA_FLAGS=0 or jax has raised it itself."""
+    if needed() and os.environ.get(SWITCH) != "0":
+        os.environ["XLA_FLAGS"] = merged(os.environ.get("XLA_FLAGS", ""))
+
+
+@lru_cache(maxsize=1)
+def in_force() -> bool:
+    """Whether loops past the old bound do compile to one function: asked of XLA itself."""
+
+    def loop(x: jax.Array) -> jax.Array:
+        turn = lambda c: (c[0] + 1, c[1] * c[1][::-1])  # noqa: E731
+        return jax.lax.while_loop(lambda c: c[0] < 3, turn, (0, x))[1]
+
+    compiled = jax.jit(loop).lower(jax.ShapeDtypeStruct((1000,), jnp.float32)).compile()
+    return "small_call" in (compiled.as_text() or "")
+
+
+def by_attribute() -> bool:
+    """Whether loops past the bound compile to one function by attributes of their calls."""
+    return (
+        jax.default_backend() == "cpu"
+        and os.environ.get(ATTRIBUTE_SWITCH) != "0"
+        and jaxlib.__version__ in TESTED
+        and not in_force()
+    )
+
+
+def native(function: Callable, *args: Any, stages: int = 0) -> Any:
+    """function(*args), a loop, compiled to one native function where XLA can be told to.
+
+    Args:
+        function: of arrays and pytrees of them, without side effects.
+        args: what it is called with.
+        stages: of a method whose weighted sums of stages are products with a vector.
+    """
+    if not by_attribute():
+        return function(*args)
+    flat, tree = jax.tree.flatten(args)
+    program, shape = jax.make_jaxpr(
+        lambda *flat: function(*jax.tree.unflatten(tree, flat)), return_shape=True
+    )(*flat)
+    if not _plain(program.jaxpr, stages):
+        return function(*args)
+    # A parameter that has lost its uses inside, being known at the call or of no consequence, ends
+    # the process: the emitter of marked calls looks for a buffer that is not there. So what the
+    # function closes over becomes a parameter, none is known, and of each a number is returned.
+    given = jax.lax.optimization_barrier((list(program.consts), flat))
+
+    def run(consts: list, flat: list) -> Any:
+        used = [x.reshape(-1)[:1] for x in map(jnp.asarray, (*consts, *flat))]
+        return jaxpr_as_fun(ClosedJaxpr(program.jaxpr, consts))(*flat), used
+
+    results, _ = not_inlined(run, ATTRIBUTES)(*given)
+    return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+
+def not_inlined(function: Callable, attributes: Any = None) -> Callable:
+    """The function, compiled apart from its callers."""
+    attributes = attributes or {"inlineable": "false"}
+
+    def body(*args: Any) -> Any:
+        # The attributes are for the call, not for what is called.
+        with set_xla_metadata(**dict.fromkeys(attributes)):
+            return function(*args)
+
+    compiled = jax.jit(body)
+
+    def call(*args: Any) -> Any:
+        with set_xla_metadata(**attributes):
+            return compiled(*args)
+
+    return call
+
+
+def opaque_one(dtype: Any) -> jax.Array:
+    """1, in a way that XLA does not see through: it computes what is divided by it once.
+
+    What it takes for cheap, all but divisions, roots and the like, it computes anew wherever that
+    is read.
+    """
+    return jax.lax.optimization_barrier(jnp.ones((), dtype))
+
+
+def _plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
+    """Whether a program holds nothing but operations on numbers that XLA itself emits code for."""
+    return all(
+        _is_sum(eqn, stages)
+        if eqn.primitive.name == "dot_general"
+        else eqn.primitive.name in _PLAIN
+        for eqn in equations(jaxpr)
+    )
+
+
+def _is_sum(dot: Any, stages: int) -> bool:
+    """Whether a product is one of numbers, or of the row of a method with its stages.
+
+    Products of matrices call a library, and a vmap makes one of any other product.
+    """
+    contracted, batched = dot.params["dimension_numbers"]
+    operand = dot.invars[0].aval
+    if np.prod([operand.shape[i] for i in contracted[0]]) <= 1:
+        return True
+    rows = [x.aval.size for x in dot.invars if x.aval.ndim == 1]
+    return not any(batched) and any(size in (stages - 1, stages) for size in rows)
+
+
+_PLAIN = frozenset(
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type
+    broadcast_in_dim cbrt ceil checkpoint clamp closed_call concatenate cond
+    convert_element_type copy copy_p cos cosh cummax cumsum custom_jvp_call custom_vjp_call
+    custom_vmap_call div dynamic_slice dynamic_update_slice empty2 eq erf exp exp2 expand_dims
+    expm1 floor gather ge gt integer_pow iota is_finite jit largest le le_to linear_map log log1p
+    logistic lt lt_to max maybe_set min mul ne neg nextafter nonbatchable nondifferentiable not
+    one_minus_square optimization_barrier or pad pjit polynomial pow reduce_and reduce_max
+    reduce_min reduce_or reduce_prod reduce_sum rem remat remat2 reshape rev round rsqrt scan
+    scatter scatter-add scatter_add select_and_gather_add select_n shift_left sign sin sinh
+    slice smallest split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh
+    transpose unstack unvmap_all unvmap_any unvmap_max while xor""".split()  # noqa: SIM905
+)
+
+
+def report() -> str:
+    """One line for `System.explain`."""
+    if jax.default_backend() != "cpu":
+        return f"the CPU setting does not apply on {jax.default_backend()}"
+    if in_force():
+        return "solver loops compile to one native function"
+    if by_attribute():
+        return "solver loops compile to one native function, by attributes of their calls"
+    if os.environ.get(SWITCH) == "0":
+        other = f" and {ATTRIBUTE_SWITCH}=0" if os.environ.get(ATTRIBUTE_SWITCH) == "0" else ""
+        return f"run operation by operation: {SWITCH}=0{other}"
+    return "run operation by operation: " + _LATE
+
+
+_LATE = (
+    "XLA had compiled something before jaxlag was imported, so its loop setting came too late. "
+    "Import jaxlag before the first jax computation."
+)
+
+
+@lru_cache(maxsize=1)
+def warn_if_late() -> None:
+    """Say once per process that the setting came too late."""
+    if jax.default_backend() != "cpu" or not needed() or os.environ.get(SWITCH) == "0":
+        return
+    if not in_force() and not by_attribute():
+        warnings.warn(f"Solves will be several times slower: {_LATE}", stacklevel=4)

@@ -1,0 +1,1 @@
+"""Params from measurements: multiple shooting, its statistics, predictions."""

@@ -1,0 +1,274 @@
+"""Models compared: which forces does a system need to predict what it was not fitted to?"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxlag._core._errors import bad
+from jaxlag._fit._experiment import Experiment
+from jaxlag._fit._fit import fit
+from jaxlag._fit._fit_result import FitResult
+from jaxlag._fit._free_parameters import Prior
+from jaxlag._fit._predict import Prediction
+from jaxlag._fit._setup import experiments_of, spreads
+from jaxlag._fit._transforms import AbstractTransform
+from jaxlag._model._forces import AbstractForce
+from jaxlag._system._system import System
+
+
+@final
+class Candidate(eqx.Module):
+    """A term that a system may need: one force or more, and the params that come with it.
+
+    Args:
+        forces: `Rayleigh`, `GeneralizedForce`, `PointForce`, `Couple`.
+        params0: entries for the dict of params; all are found.
+        transforms: as for `jl.fit`, of these entries.
+        priors: likewise.
+
+    Raises:
+        ValueError: no force, or something that is none.
+    """
+
+    forces: tuple[AbstractForce, ...]
+    params0: dict[str, Any]
+    transforms: dict[str, Any]
+    priors: dict[str, Prior]
+
+    def __init__(
+        self,
+        *forces: Any,
+        params0: Mapping[str, Any] | None = None,
+        transforms: Mapping[str, Any] | None = None,
+        priors: Mapping[str, Any] | None = None,
+    ) -> None:
+        if not forces or not all(isinstance(x, AbstractForce) for x in forces):
+            fix = 'Write jl.Candidate(jl.Rayleigh(R, "friction"), params0={"k": 0.1}).'
+            raise bad("Candidate: forces", "be one force or more", f"they were {forces!r}", fix)
+        self.forces = forces
+        self.params0 = dict(params0 or {})
+        self.transforms, self.priors = dict(transforms or {}), dict(priors or {})
+
+
+class Ranked(NamedTuple):
+    """One model of a comparison.
+
+    Attributes:
+        name: of its terms, "none" or "viscous + Coulomb".
+        error: root mean square over all channels of what it mispredicts, each over how far that
+            channel ranges in the data held out; inf where a motion failed, or the search for a
+            start.
+        fit: to the experiments.
+        prediction: of those held out.
+    """
+
+    name: str
+    error: float
+    fit: FitResult
+    prediction: Prediction
+
+
+@final
+class Comparison(eqx.Module):
+    """Models, the best first: by what they predict of experiments that were held out.
+
+    Attributes:
+        models: ranked.
+    """
+
+    models: tuple[Ranked, ...]
+
+    @property
+    def best(self) -> Ranked:
+        """The model of the smallest error."""
+        return self.models[0]
+
+    def __getitem__(self, name: str) -> Ranked:
+        for model in self.models:
+            if model.name == name:
+                return model
+        names = [model.name for model in self.models]
+        raise bad("model", f"be one of {names}", f"it was {name!r}")
+
+    def __str__(self) -> str:
+        channels = self.best.prediction.channels
+        head = ["model", "params", "error", *(f"rms of {name}" for name in channels)]
+        rows = [head]
+        for model in self.models:
+            shown = [_numbers(model.prediction.rms(name)) for name in channels]
+            rows.append([model.name, str(len(model.fit.names)), f"{model.error:.4g}", *shown])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+        return "\n".join(lines)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ", ".join(f"{x:.3g}" for x in values)
+
+
+def compare(
+    system: System,
+    experiments: Any,
+    params0: Mapping[str, Any],
+    candidates: Mapping[str, Any],
+    *,
+    held_out: Any,
+    free: Sequence[str],
+    most: int = 1,
+    settle: float | int | None = None,
+    transforms: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Comparison:
+    """Fit a system with and without candidate terms, and rank them by what they predict.
+
+    Every combination of up to `most` candidates is added to the system and fitted to the
+    experiments; the error is that of its predictions of experiments held out, whose starts alone
+    are fitted (`jl.predict`). More terms always fit better; they need not predict better.
+
+    Where candidates share params, or are combined, the search for those of one begins at the
+    estimates of an earlier model that has most of them: name the simple candidates first.
+
+    Args:
+        system: without the candidates.
+        experiments: to fit to.
+        params0: of the system, a dict.
+        candidates: name -> `Candidate`.
+        held_out: experiments to predict.
+        free: as for `jl.fit`; the candidates' params are free beside these.
+        most: of the candidates in one model.
+        settle: s, as for `jl.predict`.
+        transforms: as for `jl.fit`.
+        priors: as for `jl.fit`.
+        options: of `jl.fit`.
+
+    Raises:
+        ValueError: an argument of wrong form or value, named; params of a candidate that the system
+            has, or another candidate that it may stand beside.
+
+    Warns:
+        as `jl.fit` and `jl.predict` do, and where no model predicts all that was held out.
+
+    Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.2.
+    """
+    experiments, held_out = experiments_of(experiments), experiments_of(held_out)
+    _check(system, params0, candidates, most, free)
+    models = []
+    for count in range(most + 1):
+        for names in combinations(candidates, count):
+            terms = [candidates[name] for name in names]
+            params, transform, prior = dict(params0), dict(transforms or {}), dict(priors or {})
+            for term in terms:
+                params |= term.params0
+                transform |= term.transforms
+                prior |= term.priors
+            found = fit(
+                system.with_forces(*(force for term in terms for force in term.forces)),
+                experiments,
+                params | _estimates(params, set(params0), models, transform),
+                free=(*free, *(name for term in terms for name in term.params0)),
+                transforms=transform,
+                priors=prior,
+                **options,
+            )
+            predicted = found.predict(held_out, settle)
+            error = _error(predicted, held_out)
+            models.append(Ranked(" + ".join(names) or "none", error, found, predicted))
+    ranked = tuple(sorted(models, key=lambda model: model.error))
+    if np.isinf(ranked[0].error):
+        text = "No model predicts all that was held out: motions or searches for starts failed."
+        warnings.warn(f"{text} See `prediction.failed` of each.", stacklevel=2)
+    return Comparison(ranked)
+
+
+def _estimates(
+    params: Mapping[str, Any],
+    common: set[str],
+    models: Sequence[Ranked],
+    transforms: Mapping[str, AbstractTransform],
+) -> dict[str, Any]:
+    """Those of the model that has most of these params, of several of that which fits best.
+
+    Nothing where none has more than the params that are common to all: they may be far off there;
+    and nothing of another form, or that a transform does not allow.
+    """
+    able = [model for model in models if model.error < float("inf") and model.fit.converged]
+    shared = [len(params.keys() & model.fit.params.keys()) for model in able]
+    if max(shared, default=0) <= len(common):
+        return {}
+    near = min(
+        zip(able, shared, strict=True),
+        key=lambda x: (-x[1], _error(x[0].fit, x[0].fit.experiments)),
+    )[0].fit
+    # A logarithm that has run off finds no way back.
+    held = {name.partition("[")[0].partition(".")[0] for name in near.on_bound}
+    return {
+        name: near.params[name]
+        for name in params.keys() & near.params.keys() - held
+        if _alike(near.params[name], params[name])
+        and _allowed(transforms.get(name), name, near.params[name])
+    }
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two params have one structure and shapes."""
+    (a, of_a), (b, of_b) = jax.tree.flatten(one), jax.tree.flatten(other)
+    return of_a == of_b and all(np.shape(x) == np.shape(y) for x, y in zip(a, b, strict=True))
+
+
+def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool:
+    """Whether a search may begin there."""
+    if transform is None:
+        return True
+    try:
+        _, on_bound = transform.start(name, np.asarray(value))
+    except ValueError:
+        return False
+    return not on_bound
+
+
+def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
+    if isinstance(free, str):
+        raise bad("free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},).")
+    if not isinstance(system, System):
+        raise bad("system", "be a jl.System", f"it was {system!r}")
+    if not isinstance(params0, Mapping):
+        must = "be a dict, to which candidates add their own"
+        raise bad("params0", must, f"it was {type(params0).__name__}")
+    if not isinstance(candidates, Mapping) or not candidates:
+        raise bad("candidates", "be a dict of jl.Candidate by name", f"it was {candidates!r}")
+    taken = dict.fromkeys(params0, "the system")
+    for name, candidate in candidates.items():
+        if not isinstance(candidate, Candidate):
+            raise bad(f"candidates[{name!r}]", "be a jl.Candidate", f"it was {candidate!r}")
+        for key in candidate.params0:
+            if key in taken:
+                must = "bring params under names of its own"
+                raise bad(f"candidates[{name!r}]", must, f"{taken[key]} has {key!r}, too")
+            if most != 1:  # else candidates never meet
+                taken[key] = f"candidate {name!r}"
+    if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= len(candidates):
+        must = f"be an integer from 1 to the {len(candidates)} candidates"
+        raise bad("most", must, f"it was {most!r}")
+
+
+def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:
+    """Of all channels, each over how far it ranges; inf where a motion or a start failed."""
+    if predicted.failed or not predicted.converged:
+        return float("inf")
+    shares = []
+    for name in predicted.channels:
+        rows = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
+        shares.append(predicted.rms(name) / spreads(rows))
+    # A channel may have no number in the rows that were predicted.
+    known = np.concatenate(shares)
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")

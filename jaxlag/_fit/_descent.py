@@ -1,0 +1,132 @@
+"""Fits of many numbers by gradients of few segments at a time, with any optimiser of optax."""
+
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxlag._core._errors import bad
+from jaxlag._fit._multiple_shooting import Guess, Seen, Shooting
+
+
+@final
+class Descent(eqx.Module):
+    """How `jl.fit` goes downhill where there are too many numbers for least squares.
+
+    In every step the gradient is taken of a part of the segments, drawn anew in every epoch; starts
+    of segments move with the params. It costs a few solves whatever the number of params is, where
+    least squares takes a derivative in the direction of each.
+
+    Args:
+        optimiser: of optax, such as `optax.adam(1e-3)`. It moves a leaf of params in units of the
+            root mean square that it starts with (of 1 where that is 0, and for logarithms), starts
+            of segments in units of how far states range.
+        epochs: how often all segments are used.
+        batch: segments per step; all of them where there are fewer.
+        seed: of the order of segments.
+        gap: standard deviation of the gaps between joined segments, over how far states range.
+
+    Raises:
+        ValueError: an optimiser without `init` and `update`, numbers that are not positive.
+    """
+
+    optimiser: Any
+    epochs: int = eqx.field(static=True)
+    batch: int = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    gap: float = eqx.field(static=True)
+
+    def __init__(
+        self,
+        optimiser: Any,
+        *,
+        epochs: Any = 100,
+        batch: Any = 16,
+        seed: int = 0,
+        gap: float | int = 1e-2,
+    ) -> None:
+        if not callable(getattr(optimiser, "init", None)) or not callable(
+            getattr(optimiser, "update", None)
+        ):
+            must = "have init and update, as the optimisers of optax"
+            raise bad("Descent: optimiser", must, f"it was {optimiser!r}", "Try optax.adam(1e-3).")
+        for name, value in (("epochs", epochs), ("batch", batch)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise bad(f"Descent: {name}", "be a positive integer", f"it was {value!r}")
+        if not gap > 0:
+            raise bad("Descent: gap", "be positive", f"it was {gap!r}")
+        self.optimiser, self.epochs, self.batch = optimiser, epochs, batch
+        self.seed, self.gap = seed, float(gap)
+
+    def steps(self, segments: int) -> tuple[int, int]:
+        """(steps in an epoch, segments in each)."""
+        batch = min(self.batch, segments)
+        return segments // batch, batch
+
+    def solves(self, segments: int) -> int:
+        """Motions of segments whose gradient is taken in all."""
+        steps, batch = self.steps(segments)
+        return self.epochs * steps * batch
+
+
+@eqx.filter_jit
+def descend(
+    shooting: Shooting, guess: Guess, descent: Descent
+) -> tuple[Guess, Float[Array, " epochs"], Int[Array, ""]]:
+    """(where the descent ends, mean cost of the steps of each epoch, unsound steps).
+
+    Unsound are steps some of whose derivatives were not finite; they move nothing by those.
+    """
+    # An extra: whoever has one of its optimisers has it.
+    from optax import with_extra_args_support
+
+    update = with_extra_args_support(descent.optimiser).update
+    count = guess.x.shape[0]
+    steps, batch = descent.steps(count)
+    join = jnp.asarray(descent.gap)
+
+    def step(carry: tuple[Guess, Any], which: Int[Array, " b"]) -> tuple[Any, tuple[Array, Array]]:
+        guess, state = carry
+
+        def value(guess: Guess) -> Array:
+            return cost_of(guess, shooting, which, join)
+
+        cost, slope = jax.value_and_grad(value)(guess)
+        sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in slope]))
+        slope = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), slope)
+        # Optimisers count their steps in integers and mix them with floats.
+        with jax.numpy_dtype_promotion("standard"):
+            # Line searches ask for the last three.
+            updates, state = update(slope, state, guess, value=cost, grad=slope, value_fn=value)
+        z, x = eqx.apply_updates(guess, updates)
+        held = jnp.clip(z, shooting.free.low, shooting.free.high)
+        return (Guess(held, x), state), (cost, ~sound)
+
+    def epoch(carry: tuple[Guess, Any], key: Array) -> tuple[Any, tuple[Array, Array]]:
+        order = jax.random.permutation(key, count)[: steps * batch]
+        carry, (costs, unsound) = jax.lax.scan(step, carry, order.reshape(steps, batch))
+        return carry, (jnp.mean(costs), jnp.sum(unsound))
+
+    keys = jax.random.split(jax.random.key(descent.seed), descent.epochs)
+    begin = guess, descent.optimiser.init(guess)
+    (guess, _), (costs, unsound) = jax.lax.scan(epoch, begin, keys)
+    return guess, costs, jnp.sum(unsound)
+
+
+def cost_of(
+    guess: Guess, shooting: Shooting, which: Int[Array, " b"], join: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Half the sum of squares over all segments, guessed from some of them; and of the priors."""
+    segments = jax.tree.map(lambda x: x[which], shooting.segments)
+    seen = Seen(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
+    rows = shooting.weighed(guess.x[which], segments, seen.residuals)
+    total = jnp.sum(rows**2)
+    if shooting.chained:
+        after = (which + 1) % guess.x.shape[0]
+        following = jax.tree.map(lambda x: x[after], shooting.segments)
+        begins = jax.vmap(shooting.start)(guess.x[after], following)
+        total += jnp.sum(shooting.gaps(segments, seen, begins, join) ** 2)
+    share = which.shape[0] / guess.x.shape[0]
+    return 0.5 * (total / share + jnp.sum(shooting.known(guess.z) ** 2))

@@ -1,0 +1,131 @@
+"""Forces that take energy as they are declared, and give some at other params."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._fit._experiment import Experiment
+from jaxlag._fit._initial_guess import initial_states
+from jaxlag._model._forces import AbstractForce, Rayleigh, reads_lam
+from jaxlag._model._inputs import evaluate
+from jaxlag._simulation._jump_times import names_of
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._dependence import outputs_depend_on
+
+STATES = 32
+"""Of each experiment, at which powers are looked at."""
+NEGLIGIBLE = 1e-9
+"""Of what a force would give if it pushed along the velocity, or took."""
+DEVIATIONS = 2.0
+"""Standard deviations of a power, within which it may as well be none."""
+
+
+def feeding(
+    system: System,
+    experiments: Iterable[Experiment],
+    before: Any,
+    params: Any,
+    moved: Sequence[Any],
+    options: Mapping[str, Any],
+) -> dict[str, frozenset[str]]:
+    """Forces that give energy somewhere along what was measured, and should take it.
+
+    By name, with the paths of the params that each reads.
+
+    These are `Rayleigh` forces, and others that take energy, or none, everywhere there with the
+    params before, and are zero where nothing moves.
+
+    Args:
+        system: what moves.
+        experiments: what was measured.
+        before: params, of which the system is as it was meant to be.
+        params: those that were found.
+        moved: the same, each of the numbers found in turn by its standard deviation.
+        options: of `simulate`.
+    """
+    found: dict[str, frozenset[str]] = {}
+    for each in experiments:
+        states = _states(system, each, params, options)
+        for force in system.forces:
+            if reads_lam(force):
+                continue
+
+            def powers(
+                given: Any, force: Any = force, each: Any = each, states: Any = states
+            ) -> _Powers:
+                return _powers(force, each.inputs_at(given), states, given)
+
+            then, now = powers(before), powers(params)
+            meant = isinstance(force, Rayleigh) or not (_gives(then) or np.any(now.resting))
+            if meant and _gives(now):
+                k = int(np.argmax(now.power))
+                spread = np.linalg.norm([powers(x).power[k] - now.power[k] for x in moved])
+                if now.power[k] > DEVIATIONS * spread:
+                    found[force.name] = _read(force, each.inputs_at(params), states, params)
+    return found
+
+
+class _Powers(NamedTuple):
+    """v . Q, |v| . |Q|, and Q with velocities zero, at some states."""
+
+    power: np.ndarray
+    size: np.ndarray
+    resting: np.ndarray
+
+
+def _gives(powers: _Powers) -> bool:
+    return bool(np.any(powers.power > NEGLIGIBLE * np.max(powers.size, initial=0.0)))
+
+
+class _States(NamedTuple):
+    t: Array
+    q: Array
+    v: Array
+
+
+def _states(
+    system: System, experiment: Experiment, params: Any, options: Mapping[str, Any]
+) -> _States:
+    """About where the system was."""
+    rows = np.unique(np.linspace(0, len(experiment.ts) - 1, STATES).astype(int)).tolist()
+    state = jnp.asarray(initial_states(system, experiment, rows, params, dict(options)))
+    t, n = jnp.asarray(experiment.ts[rows]), system.size
+    q, w = state[:, :n], state[:, n:]
+    if system.quasi is None:
+        return _States(t, q, w)
+    u = jnp.zeros((len(t), system.quasi.size)).at[:, np.asarray(system.quasi.free)].set(w)
+    return _States(t, q, jax.vmap(lambda t, q, u: system.velocities(params, q, u, t))(t, q, u))
+
+
+def _powers(
+    force: AbstractForce, inputs: Mapping[str, Any], states: _States, params: Any
+) -> _Powers:
+    def of(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        still = jnp.zeros_like(v)
+        moving, resting = (
+            force(t, q, x, params, evaluate(inputs, t, q, x, params)) for x in (v, still)
+        )
+        return v @ moving, jnp.abs(v) @ jnp.abs(moving), resting
+
+    found = map(np.asarray, jax.vmap(of)(*states))
+    return _Powers(*(np.where(np.isfinite(x), x, 0.0) for x in found))
+
+
+def _read(
+    force: AbstractForce, inputs: Mapping[str, Any], states: _States, params: Any
+) -> frozenset[str]:
+    """Leaves of the params that the force depends on."""
+    traced, static = _params.halves(params)
+
+    def of(traced: Any) -> Array:
+        params, (t, q, v) = _params.join(traced, static), (x[0] for x in states)
+        return force(t, q, v, params, evaluate(inputs, t, q, v, params))
+
+    names = [frozenset({name}) for name in names_of(traced)]
+    program = jax.make_jaxpr(of)(traced)
+    return frozenset().union(*outputs_depend_on(program.jaxpr, names))

@@ -1,0 +1,211 @@
+"""Experiments: what was measured, when, how well, and what drove it."""
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any, final
+
+import equinox as eqx
+import numpy as np
+
+from jaxlag._core._errors import bad
+from jaxlag._model._inputs import check_inputs, check_range
+from jaxlag._tracing._signature import require_arity
+from jaxlag._tracing._traced_function import Captured, captured
+
+
+@final
+class Experiment(eqx.Module):
+    """One recording: channels measured at times, from an unknown, known or roughly known start.
+
+    Args:
+        ts: (s,) times, s, strictly increasing, s >= 2. Spacing may vary.
+        channels: name -> measured values, (s,) or (s, k), in the unit of what they measure; NaN
+            where nothing was measured. A name is that of a coordinate ("theta"), of a velocity
+            ("theta'"), an acceleration ("theta''"), a quasi-velocity, a constraint row (its
+            multiplier), or one of the `channels` given to `jl.fit`.
+        inputs: as for `jl.simulate`; tables must reach from ts[0] to ts[-1]. Experiments that are
+            fitted together have the same names; under each, tables of one kind in all, of any
+            length, or any functions and constants. Those that another one has are computed beside.
+            Or a function of the params to such a dict, where times or values of tables, or knots,
+            depend on them: a delay, the time of a switch.
+        sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
+            (s, k). Of channels that are left out it is estimated from the residuals.
+        q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.
+            Where it is left out, the coordinates must be among the channels.
+        v0: velocities, (n,) or (s, n), of systems that have quasi-velocities those, one for each
+            name, m/s or rad/s; left out, they are slopes of the measured coordinates.
+        start_sigma: how well q0 and v0 are known: None, not at all, the state at ts[0] is free;
+            0, exactly; standard deviations, m, rad, m/s, rad/s: a number, or one for each of the
+            coordinates and of the velocities that no constraint takes.
+        name: what messages call it.
+
+    Raises:
+        ValueError: times that do not increase, shapes that do not fit, a channel without a single
+            number, a sigma that is not positive, a start that is said to be known and not given.
+
+    Example:
+        A push that ends at a time which is to be found:
+
+        >>> import jaxlag as jl, numpy as np
+        >>> def inputs(params):
+        ...     return {"push": jl.ZeroOrderHold([0.0, params["end"], 3.0], [1.0, 0.0, 0.0])}
+        >>> ts = np.linspace(0.0, 3.0, 31)
+        >>> data = jl.Experiment(ts, {"x": np.sin(ts)}, inputs=inputs)
+        >>> data.inputs_at({"end": 0.5})["push"].times.tolist()
+        [0.0, 0.5, 3.0]
+    """
+
+    ts: np.ndarray
+    channels: dict[str, np.ndarray]
+    inputs: Any  # by name, or a function of the params to these
+    sigma: dict[str, np.ndarray]
+    q0: np.ndarray | None
+    v0: np.ndarray | None
+    start_sigma: np.ndarray | None
+    name: str
+
+    def __init__(
+        self,
+        ts: Any,
+        channels: Mapping[str, Any],
+        *,
+        inputs: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]] | None = None,
+        sigma: Mapping[str, Any] | None = None,
+        q0: Any = None,
+        v0: Any = None,
+        start_sigma: Any = None,
+        name: str = "experiment",
+    ) -> None:
+        self.name = name
+        self.ts = _times(name, ts)
+        count = len(self.ts)
+        if not isinstance(channels, Mapping) or not channels:
+            raise bad(f"{name}: channels", "be a dict with one channel or more", f"was {channels}")
+        self.channels = {key: _channel(name, key, x, count) for key, x in channels.items()}
+        if callable(inputs):
+            require_arity(f"{name}: inputs", inputs, ("params",))
+            self.inputs = captured(inputs)
+        else:
+            self.inputs = check_inputs(inputs)
+            check_range(self.inputs, self.ts, f"ts of {name}")
+        self.sigma = {}
+        for key, x in (sigma or {}).items():
+            if key not in self.channels:
+                known = sorted(self.channels)
+                raise bad(f"{name}: sigma", f"name channels among {known}", f"one was {key!r}")
+            x, shape = np.asarray(x, float), self.channels[key].shape
+            given = x.shape
+            try:
+                x = np.broadcast_to(x[:, None] if x.ndim == 1 else x, shape)
+            except ValueError:
+                must = f"be a number, {shape[0]} of them, or of shape {shape}"
+                raise bad(f"{name}: sigma[{key!r}]", must, f"its shape was {given}") from None
+            if not np.all((x > 0) & (x < np.inf)):
+                fix = "Write NaN into the channel where it does not count."
+                was = f"its least was {np.min(x):g}, its largest {np.max(x):g}"
+                raise bad(f"{name}: sigma[{key!r}]", "be positive and finite", was, fix)
+            self.sigma[key] = x
+        self.q0, self.v0 = _guess(name, "q0", q0, count), _guess(name, "v0", v0, count)
+        self.start_sigma = None if start_sigma is None else np.asarray(start_sigma, float)
+        if self.start_sigma is not None:
+            if self.q0 is None or self.v0 is None:
+                was = "q0 and v0 were not both given"
+                raise bad(f"{name}: start_sigma", "come with the start it is about", was)
+            if not np.all(self.start_sigma >= 0):
+                was = f"it was {start_sigma}"
+                raise bad(f"{name}: start_sigma", "be zero or positive, or None", was)
+
+    def inputs_at(self, params: Any) -> dict[str, Any]:
+        """The inputs by name, of these params.
+
+        Raises:
+            ValueError: they are no inputs, or tables do not reach from ts[0] to ts[-1].
+        """
+        if not isinstance(self.inputs, Captured):
+            return self.inputs
+        found = check_inputs(self.inputs.function(params))
+        check_range(found, self.ts, f"ts of {self.name}")
+        return found
+
+    def part(self, rows: slice | np.ndarray, name: str | None = None) -> "Experiment":
+        """Some of its rows, as an experiment whose start is free unless it is the same start."""
+        indices = np.arange(len(self.ts))[rows]
+
+        def of(x: np.ndarray | None) -> np.ndarray | None:
+            if x is None or (x.ndim == 1 and indices[0] > 0):
+                return None
+            return x if x.ndim == 1 else x[indices]
+
+        return Experiment(
+            self.ts[indices],
+            {key: x[indices] for key, x in self.channels.items()},
+            inputs=self.inputs,
+            sigma={key: x[indices] for key, x in self.sigma.items()},
+            q0=of(self.q0),
+            v0=of(self.v0),
+            start_sigma=self.start_sigma if indices[0] == 0 else None,
+            name=self.name if name is None else name,
+        )
+
+    def windows(self, seconds: float | int) -> tuple["Experiment", ...]:
+        """Pieces of equal length side by side, each with a start of its own.
+
+        A remainder that is shorter is left out, and so are pieces in gaps, of less than two rows.
+
+        Raises:
+            ValueError: the recording is shorter than that, or a piece would have one row.
+        """
+        if not 0 < seconds < np.inf:
+            raise bad("seconds", "be a positive number", f"it was {seconds!r}")
+        per_row = np.median(np.diff(self.ts))
+        count = int(np.floor((self.ts[-1] - self.ts[0] + per_row) / seconds * (1 + 1e-9)))
+        if count < 1:
+            length = self.ts[-1] - self.ts[0]
+            must = f"be at most the {length + per_row:g} s of {self.name}"
+            raise bad("seconds", must, f"it was {seconds:g}")
+        edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_row
+        rows = np.searchsorted(self.ts, edges)
+        if seconds < 2 * per_row:
+            raise bad("seconds", "be two samples or more", f"it was {seconds:g}")
+        return tuple(
+            self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
+            for a, b in pairwise(rows)
+            if b - a >= 2  # none where the recording has a gap
+        )
+
+
+def _times(name: str, ts: Any) -> np.ndarray:
+    ts = np.asarray(ts, float)
+    if ts.ndim != 1 or len(ts) < 2:
+        raise bad(f"{name}: ts", "be one row of two times or more", f"its shape was {ts.shape}")
+    if not np.all(np.isfinite(ts)):
+        raise bad(f"{name}: ts", "be finite", "some were nan or inf")
+    if not np.all(np.diff(ts) > 0):
+        i = int(np.argmin(np.diff(ts) > 0))
+        was = f"ts[{i}] = {ts[i]:g} and ts[{i + 1}] = {ts[i + 1]:g}"
+        raise bad(f"{name}: ts", "increase strictly", was, "Sort the rows, drop repeated ones.")
+    return ts
+
+
+def _channel(name: str, key: str, x: Any, count: int) -> np.ndarray:
+    x = np.asarray(x, float)
+    if x.ndim not in (1, 2) or x.shape[0] != count:
+        must = f"have one row per time, {count}"
+        raise bad(f"{name}: channels[{key!r}]", must, f"its shape was {x.shape}")
+    if not np.any(np.isfinite(x)):
+        fix = "Leave the channel out."
+        raise bad(f"{name}: channels[{key!r}]", "hold some numbers", "all were NaN", fix)
+    if np.any(np.isinf(x)):
+        must = "be finite, or NaN where nothing was measured"
+        raise bad(f"{name}: channels[{key!r}]", must, "some were inf")
+    return x[:, None] if x.ndim == 1 else x
+
+
+def _guess(name: str, which: str, x: Any, count: int) -> np.ndarray | None:
+    if x is None:
+        return None
+    x = np.asarray(x, float)
+    if x.ndim not in (1, 2) or (x.ndim == 2 and x.shape[0] != count):
+        must = f"be (n,) numbers at ts[0] or ({count}, n) along ts"
+        raise bad(f"{name}: {which}", must, f"its shape was {x.shape}")
+    return x

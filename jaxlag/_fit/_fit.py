@@ -1,0 +1,386 @@
+"""Parameters from measurements: least squares over motions, by multiple shooting."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlag._core._errors import bad
+from jaxlag._fit._channels import Reader
+from jaxlag._fit._descent import Descent, descend
+from jaxlag._fit._experiment import Experiment
+from jaxlag._fit._fit_result import FitResult, summarised
+from jaxlag._fit._free_parameters import NO_PRIOR, Unknowns, paths, prior_rows, unknowns
+from jaxlag._fit._initial_guess import start_freedom
+from jaxlag._fit._losses import LOSSES, squares
+from jaxlag._fit._multiple_shooting import Found, Guess, Shooting, judged, search
+from jaxlag._fit._segments import Layout, layout
+from jaxlag._fit._setup import (
+    check_search,
+    estimated_noise,
+    experiments_of,
+    plain_options,
+    pose,
+    readers_of,
+    with_noise,
+)
+from jaxlag._simulation._jump_times import Jump, Jumps, names_of, warn
+from jaxlag._system._system import System
+from jaxlag._tracing._params import check_keys
+from jaxlag._tracing._traced_function import warn_of_changes
+
+GAPS = (1e-1, 1e-2, 1e-3, 1e-5, 1e-7, 1e-9)
+"""Standard deviations of the gaps between segments, stage by stage, over the states' ranges."""
+TIGHT = 1e-2
+"""The last of them, over what all measurements together tell of a state."""
+TIGHTEST = 1e-11
+"""Below it, gaps are rounding."""
+UNITS = 3
+"""Searches of one stage, with units that fit better each time."""
+FAR_OFF = 1e3
+"""By which an unknown's unit may be wrong."""
+ASTRAY = 0.3
+"""Standard deviations, within which estimates are to be where their derivatives lead."""
+LARGEST_COVARIANCE = 200
+"""Numbers, beyond which a covariance costs more than the descent that found them."""
+NOISE_ROUNDS = 3
+"""How often noise that was not given is estimated, and the fit repeated with it."""
+
+
+def fit(
+    system: System,
+    experiments: Any,
+    params0: Any,
+    *,
+    free: Sequence[str],
+    channels: Mapping[str, Reader] | None = None,
+    segments: int = 1,
+    transforms: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    loss: str = "squares",
+    optimiser: Any = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 100,
+    **options: Any,
+) -> FitResult:
+    r"""Params, and starts of experiments, for which motions come closest to what was measured.
+
+        min  sum (g(y_i) - m_i)^2 / sigma_i^2 + sum (theta - mean)^2 / sigma^2
+
+    over params theta and starts; y_i is the motion at the times of the measurements, g what a
+    channel shows of it. With `segments` above 1, each experiment is cut into so many, whose starts
+    are unknown, too, and which are joined in the same least squares, ever more tightly: from a poor
+    guess, and over many Lyapunov times, that converges where the one long motion does not. Segments
+    are lanes of one batch, and the linear algebra is linear in their number.
+
+    A segment whose solve fails counts as far off, does not move the params, and is named at the
+    end. Noise that no experiment states is estimated from the residuals, and the fit repeated.
+
+    Args:
+        system: what moves.
+        experiments: one `Experiment` or more, of any lengths and rates; those of pieces that are
+            not joined, too (`Experiment.windows`).
+        params0: all params; where the search starts.
+        free: names of leaves to be found: "m", "link.mass", "links[0].mass"; a branch stands for
+            all leaves below it.
+        channels: name -> function of a `Solution` to what was measured at its rows, (s,) or (s, k);
+            beside those that names mean by themselves.
+        segments: per experiment; 1 is single shooting.
+        transforms: name -> transform of a free leaf.
+        priors: name -> `Prior` of a free leaf, in its own unit.
+        loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less: residuals beyond
+            about one sigma. The covariance is that of least squares with weights that fall with the
+            residuals; of Gaussian noise it is too large by up to a third (cauchy, soft_l1).
+        optimiser: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
+            There may then be more of them than measurements; no covariance is computed of more than
+            200.
+        tolerance: relative and absolute, of unknowns and residuals, both of order one.
+        max_iterations: of Levenberg and Marquardt's method, in each stage.
+        options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
+
+    Raises:
+        ValueError: an argument of wrong form or value, named; fewer measurements than unknowns.
+
+    Warns:
+        of a parameter that starts or ends on a bound, one that nothing measured depends on, a
+        channel that is constant, segments whose solve fails, a search that did not converge, or
+        that stopped where errors of the solver hide what params do, friction that gives energy,
+        each by name.
+
+    Source: Bock (1983), see `_shooting`; Schittkowski, Numerical Data Fitting in Dynamical Systems
+    (2002).
+
+    Example:
+        A mass on a spring: how it swings tells k/m alone.
+
+        >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * params["m"] * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2
+        >>> spring = jl.System(lagrangian, coordinates=("x",))
+        >>> ts = np.linspace(0.0, 3.0, 31)
+        >>> noise = 1e-3 * np.sin(1e3 * ts)
+        >>> data = jl.Experiment(ts, {"x": 0.3 * np.cos(2.0 * ts) + noise})
+        >>> found = jl.fit(spring, data, {"m": 1.0, "k": 3.0}, free=("k",))
+        >>> print(f"{found.params['k']:.2f} {found.converged}")
+        4.00 True
+    """
+    experiments = experiments_of(experiments)
+    _check(system, segments, loss, optimiser)
+    check_search(tolerance, max_iterations)
+    options = plain_options(options, "jl.fit")
+    unknown = unknowns(params0, free, dict(transforms or {}))
+    own = dict(channels or {})
+    check_keys(params0)
+    check_keys(own, "channels")
+    warn_of_changes(system, *(each.inputs for each in experiments))
+    shown = readers_of(system, experiments, own, params0)
+    where = layout(experiments, segments)
+    prior = prior_rows(unknown, dict(priors or {}))
+    if optimiser is None:
+        _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
+    _warn_before(experiments, unknown)
+    compared = _compared(system, experiments, unknown)
+    problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
+    costs = np.zeros(0)
+    if optimiser is None:
+        problem, found, turns = _stages(problem, tolerance, max_iterations)
+        problem, noise, found, more = _with_its_noise(
+            problem, noise, found, where, tolerance, max_iterations
+        )
+        solves = (turns + more) * len(where.owner)
+    else:
+        guess, costs, solves = _downhill(problem, optimiser, max_iterations)
+        if noise:
+            seen = _judged(problem, guess, optimiser, costs, linear=False)
+            noise = estimated_noise(seen, problem, where, noise)
+            problem = with_noise(problem, where, noise)
+        linear = len(unknown.u0) <= LARGEST_COVARIANCE
+        found = _judged(problem, guess, optimiser, costs, linear)
+    told = (where, noise, own, costs, solves, compared)
+    result = summarised(problem, found, experiments, *told)
+    _warn_after(result)
+    return result
+
+
+def _check(system: Any, segments: Any, loss: Any, optimiser: Any) -> None:
+    if not isinstance(system, System):
+        raise bad("system", "be a jl.System", f"it was {system!r}")
+    if not isinstance(segments, int | np.integer) or segments < 1:
+        raise bad("segments", "be a positive integer", f"it was {segments!r}")
+    if optimiser is not None and not isinstance(optimiser, Descent):
+        fix = "Write jl.Descent(optax.adam(1e-3))."
+        raise bad("optimiser", "be None or a jl.Descent", f"it was {optimiser!r}", fix)
+    if loss not in LOSSES:
+        raise bad("loss", f"be one of {list(LOSSES)}", f"it was {loss!r}")
+
+
+def _count(experiments: Sequence[Experiment], params: int, priors: int, start: int) -> None:
+    """Raise where there is less to be known from than is to be known."""
+    numbers = sum(int(np.isfinite(x).sum()) for each in experiments for x in each.channels.values())
+    unknown = params + start * sum(each.start_sigma is None for each in experiments)
+    if numbers + priors < unknown:
+        must = f"hold at least as many numbers as there are unknowns, {unknown}"
+        was = f"they held {numbers}"
+        raise bad("experiments", must, was, "Measure more, or free fewer parameters.")
+
+
+def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
+    for name in free.on_bound:
+        text = f"{name} starts on its bound."
+        warnings.warn(text, stacklevel=3)
+    for each in experiments:
+        for name, x in each.channels.items():
+            x = x[:, np.isfinite(x).any(axis=0)]
+            if np.all(np.nanmax(x, axis=0) == np.nanmin(x, axis=0)):
+                text = f"channel {name!r} of {each.name} is constant: it may be disconnected."
+                warnings.warn(text, stacklevel=3)
+
+
+def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns) -> dict[str, str]:
+    """Names of leaves that a jump depends on, and lines; warns where it is a jump in time."""
+    names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
+    moving = {name for name, own in names.items() if own in {leaf.name for leaf in free.leaves}}
+    found: dict[str, str] = {}
+    told: set[Jump] = set()
+    for each in {jax.tree.structure(x.inputs_at(free.params0)): x for x in experiments}.values():
+        inputs = each.inputs_at(free.params0)
+        jumps = Jumps(system, free.params0, jnp.zeros(system.size), inputs)
+        found |= {names[x.leaf]: x.line for x in jumps.of_leaves() if x.leaf in names}
+        told |= set(jumps.in_time(moving, jnp.asarray(each.ts)))
+    warn(sorted(told))
+    return found
+
+
+def _stages(
+    problem: Shooting, tolerance: float, max_iterations: int
+) -> tuple[Shooting, Found, int]:
+    """(the problem in units that fit, what is found from loosely joined segments on, all steps).
+
+    By squares first, whatever the loss: losses that count outliers for less have minima wherever
+    everything is an outlier.
+    """
+    turns = 0
+    guess = Guess(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
+    by_squares, loss = replace(problem, loss=squares), problem.loss
+    last = last_gap(problem)
+    gaps = (*(gap for gap in GAPS if gap > last), last) if problem.chained else (last,)
+    for gap in gaps:
+        final = gap == last and loss is squares
+        rough = jnp.asarray(tolerance if final else max(tolerance, 1e-4))
+        for again in range(UNITS):
+            found = search(by_squares, guess, jnp.asarray(gap), rough, max_iterations)
+            guess, turns = found.guess, turns + int(found.steps)
+            scale = _units(by_squares, found)
+            if np.array_equal(scale, by_squares.free.scale) or again == UNITS - 1:
+                break
+            guess = guess._replace(z=guess.z * (by_squares.free.scale / scale))
+            by_squares = replace(by_squares, free=by_squares.free.rescaled(scale))
+    problem = replace(by_squares, loss=loss)
+    if loss is not squares:
+        found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerance), max_iterations)
+        turns += int(found.steps)
+    return problem, found, turns
+
+
+def _units(problem: Shooting, found: Found) -> Float[np.ndarray, " p"]:
+    """Scales of the unknowns: as they are, but for those that are far from what they measure.
+
+    An unknown is of order one where its unit is as large as it is; or, where it is about 0, as what
+    moves the residuals by their own size. The size that a search begins at says little: it may be
+    0, or a billionth of the truth.
+    """
+    free, rows = problem.free, found.rows
+    assert rows is not None
+    p = len(free.u0)
+    columns = np.asarray(rows.measured).reshape(-1, rows.measured.shape[-1])
+    moved = np.hypot(
+        np.linalg.norm(columns[:, -p - 1 : -1], axis=0),
+        np.linalg.norm(np.asarray(rows.prior)[:, :p], axis=0),
+    )
+    left = np.sqrt(2.0 * float(found.cost))
+    numbers = np.abs(free.u0 + free.scale * np.asarray(found.guess.z))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = free.scale * left / moved
+        wanted = np.where(numbers > least, numbers, np.maximum(free.scale, least))
+        off = np.abs(np.log(wanted / free.scale)) > np.log(FAR_OFF)
+    return np.where(np.isinf(free.reach) & np.isfinite(wanted) & off, wanted, free.scale)
+
+
+def last_gap(problem: Shooting) -> float:
+    """Of segments that are one motion, as far as measurements can see."""
+    if not problem.chained:
+        return 1.0
+    weights = np.asarray(problem.segments.weights)
+    precision = float(np.max(weights * np.asarray(problem.ranges)))
+    known = TIGHT / max(1.0, precision * np.sqrt(np.count_nonzero(weights)))
+    return float(max(TIGHTEST, min(GAPS[3], known)))
+
+
+def _with_its_noise(
+    problem: Shooting,
+    noise: dict[str, float],
+    found: Found,
+    where: Layout,
+    tolerance: float,
+    max_iterations: int,
+) -> tuple[Shooting, dict[str, float], Found, int]:
+    """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
+    turns = 0
+    for _ in range(NOISE_ROUNDS if noise else 0):
+        changed = estimated_noise(found, problem, where, noise)
+        settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
+        noise, problem = changed, with_noise(problem, where, changed)
+        join, own = jnp.asarray(last_gap(problem)), jnp.asarray(tolerance)
+        found = search(problem, found.guess, join, own, max_iterations)
+        turns += int(found.steps)
+        if settled:
+            break
+    return problem, noise, found, turns
+
+
+def _downhill(
+    problem: Shooting, descent: Descent, max_iterations: int
+) -> tuple[Guess, Float[np.ndarray, " epochs"], int]:
+    """(where a descent ends, its costs, solves); starts by least squares before and after it."""
+    z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
+    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_iterations)
+    guess, costs, unsound = descend(problem, Guess(z, before.guess.x), descent)
+    if int(unsound):
+        text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
+        warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
+    after = _starts(problem, guess.z, guess.x, join, max_iterations)
+    count = len(guess.x)
+    solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
+    return Guess(guess.z, after.guess.x), np.asarray(costs), solves
+
+
+def _join(problem: Shooting, descent: Descent) -> Float[Array, ""]:
+    return jnp.asarray(descent.gap if problem.chained else 1.0)
+
+
+def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_iterations: int) -> Found:
+    """Starts by least squares, params as they are at z."""
+    held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
+    return search(held, Guess(jnp.zeros(0), x), join, jnp.asarray(1e-4), max_iterations)
+
+
+def _judged(
+    problem: Shooting,
+    guess: Guess,
+    descent: Descent,
+    costs: Float[np.ndarray, " epochs"],
+    linear: bool,
+) -> Found:
+    """All that is known where a descent ended, with derivatives or without."""
+    cost, rows, seen, starts = judged(problem, guess, _join(problem, descent), linear)
+    fell = bool(np.all(np.isfinite(costs)) and costs[-1] <= costs[0])
+    return Found(guess, jnp.asarray(fell), jnp.asarray(len(costs)), cost, rows, seen, starts)
+
+
+def _warn_after(result: FitResult) -> None:
+    if not result.converged:
+        text = f"The search did not converge in {result.iterations} iterations: raise "
+        text += "max_iterations, take more segments, or start closer."
+        if not result.freedom:
+            text = "No segment has a solution at the estimates: start closer."
+        elif result.costs.size:
+            text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
+            text += f"{result.costs[-1]:.3g}: take a lower learning rate."
+        warnings.warn(text, stacklevel=3)
+    if result.converged and result.distance > ASTRAY:
+        text = (
+            f"The search stopped {result.distance:.2g} standard deviations from where derivatives"
+        )
+        fix = "lower rtol and atol, or take fixed steps (dt)"
+        if result.costs.size:
+            fix = "take more epochs"
+        warnings.warn(f"{text} lead: {fix}.", stacklevel=3)
+    few = len(result.names) <= LARGEST_COVARIANCE
+    if few and np.isnan(result.singular_values).any():
+        text = (
+            "Derivatives at the estimates are not finite: there is no covariance, and they may be"
+        )
+        warnings.warn(f"{text} wrong. Look for a square root or a norm at zero.", stacklevel=3)
+    for name in result.unused:
+        warnings.warn(f"nothing measured depends on {name}: it keeps its value.", stacklevel=3)
+    for name, line in result.jumps.items():
+        text = f"{name} is compared at {line}, and moves nothing but where the equations jump: no "
+        text += "derivative shows it, it keeps its value, and other estimates may be wrong by it. "
+        text += "Make the time of the jump a knot of a table, inputs=function of the params, or "
+        warnings.warn(f"{text}smooth the jump.", stacklevel=3)
+    for force, names in result.feeding.items():
+        text = f"At the estimates {force!r} gives energy where it should take some: it depends on "
+        text += f"{', '.join(names)}. Bound these (transforms=), or look for a force that is "
+        warnings.warn(f"{text}missing, or measurements that are not what they seem.", stacklevel=3)
+    for name in result.on_bound:
+        at = result.values[result.names.index(name)]
+        text = f"{name} ended on its bound, {at:g}: widen the bound, or leave the parameter out."
+        warnings.warn(text, stacklevel=3)
+    for text in result.failed:
+        warnings.warn(f"{text}: it does not count.", stacklevel=3)

@@ -1,0 +1,207 @@
+"""Predictions: motions from starts that the first measurements tell, against the later ones."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxlag._core._errors import bad
+from jaxlag._core._status import Status
+from jaxlag._fit._channels import Reader
+from jaxlag._fit._experiment import Experiment
+from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
+from jaxlag._fit._initial_guess import start_freedom
+from jaxlag._fit._losses import squares
+from jaxlag._fit._multiple_shooting import Guess, Shooting, moved, search
+from jaxlag._fit._plot import plotted
+from jaxlag._fit._residuals import channels_of, rms_of
+from jaxlag._fit._segments import Layout, layout
+from jaxlag._fit._setup import check_search, experiments_of, plain_options, pose, readers_of
+from jaxlag._system._system import System
+from jaxlag._tracing._params import check_keys
+from jaxlag._tracing._traced_function import warn_of_changes
+
+
+@final
+class Prediction(eqx.Module):
+    """What was predicted of experiments, beside what was measured.
+
+    Attributes:
+        residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
+            NaN where nothing was measured or the motion failed.
+        predicted: of each experiment, (s,): rows that the start was not fitted to; all of them
+            where it was fitted to all.
+        starts: of each experiment, (q, v) or (q, u) at its first time.
+        failed: experiments whose motion failed, each with its status.
+        converged: whether the search for starts met its tolerance.
+        experiments: what was measured.
+    """
+
+    residuals: tuple[dict[str, np.ndarray], ...]
+    predicted: tuple[np.ndarray, ...]
+    starts: tuple[np.ndarray, ...]
+    failed: tuple[str, ...]
+    converged: bool
+    experiments: tuple[Experiment, ...]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels."""
+        return channels_of(self.residuals)
+
+    def rms(self, channel: str) -> Float[np.ndarray, " k"]:
+        """Root mean square of a channel over all rows that were predicted, in its own unit."""
+        own = zip(self.residuals, self.predicted, strict=True)
+        parts = [{name: x[rows] for name, x in each.items()} for each, rows in own]
+        return rms_of(parts, channel)
+
+    def plot(self) -> Any:
+        """A figure as `FitResult.plot`, a dotted line where predictions begin."""
+        return plotted(self.experiments, self.residuals, self.predicted)
+
+    def __str__(self) -> str:
+        lines = [
+            f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name))
+            for name in self.channels
+        ]
+        return "\n".join([*lines, *self.failed])
+
+
+def predict(
+    system: System,
+    experiments: Any,
+    params: Any,
+    *,
+    settle: float | int | None = None,
+    channels: Mapping[str, Reader] | None = None,
+    noise: Mapping[str, float] | None = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 100,
+    **options: Any,
+) -> Prediction:
+    """How well params predict experiments, of which none need have been used to find them.
+
+    The start of each experiment is fitted to its first `settle` seconds, params as they are; the
+    motion from there is compared with all that was measured.
+
+    Args:
+        system: what moves.
+        experiments: one `Experiment` or more.
+        params: all params.
+        settle: s, from the first time of each experiment; None fits its start to all of it.
+        channels: as for `jl.fit`.
+        noise: channel -> standard deviation, where the experiments state none: by which channels
+            are weighed when starts are fitted.
+        tolerance: of the starts, over how far states range.
+        max_iterations: of the optimiser.
+        options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
+
+    Raises:
+        ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
+            measurements than a start has numbers.
+
+    Warns:
+        where the search for the starts did not converge, and of each motion that failed: its rows
+        do not count.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2
+        >>> spring = jl.System(lagrangian, coordinates=("x",))
+        >>> ts = np.linspace(0.0, 3.0, 31)
+        >>> data = jl.Experiment(ts, {"x": 0.3 * np.cos(2.0 * ts)})
+        >>> good, bad = (jl.predict(spring, data, {"k": k}, settle=0.5) for k in (4.0, 4.4))
+        >>> print(f"{good.rms('x')[0]:.3f} {bad.rms('x')[0]:.3f}")
+        0.000 0.031
+    """
+    experiments = experiments_of(experiments)
+    options = plain_options(options, "jl.predict")
+    check_search(tolerance, max_iterations)
+    own = dict(channels or {})
+    check_keys(params)
+    check_keys(own, "channels")
+    warn_of_changes(system, *(each.inputs for each in experiments))
+    fewest = start_freedom(system, params)
+    early = tuple(_first(fewest, each, settle) for each in experiments)
+    fixed = unknowns(params, (), {})
+    shown = readers_of(system, experiments, own, params)
+
+    def posed(these: tuple[Experiment, ...]) -> tuple[Shooting, Layout]:
+        where = layout(these, 1)
+        problem, _ = pose(system, these, where, fixed, shown, NO_PRIOR, squares, options, noise)
+        return problem, where
+
+    whole, where = posed(early)
+    nowhere = Guess(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
+    found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray(tolerance), max_iterations)
+    if not found.converged:
+        text = f"The search for starts did not converge in {int(found.steps)} iterations: raise "
+        warnings.warn(text + "max_iterations, or make settle longer.", stacklevel=2)
+    seen = found.seen
+    if settle is not None:
+        whole, where = posed(experiments)
+        whole = eqx.tree_at(lambda p: p.segments.guess, whole, found.starts)
+        seen = moved(whole, nowhere)
+    status = np.asarray(seen.status)
+    failed = tuple(
+        f"the motion of {experiments[k].name} ended with {Status(int(status[k])).name}"
+        for k in map(int, np.flatnonzero(status != Status.ok))
+    )
+    for text in failed:
+        warnings.warn(f"{text}: it does not count.", stacklevel=2)
+    rows = tuple(
+        np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)
+        for each, first in zip(experiments, early, strict=True)
+    )
+    return Prediction(
+        residuals_of(whole, np.asarray(seen.residuals), status, experiments, where),
+        rows,
+        tuple(np.asarray(found.starts)),
+        failed,
+        bool(found.converged),
+        experiments,
+    )
+
+
+def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> Experiment:
+    """The rows that a start is fitted to."""
+    if settle is None:
+        return experiment
+    if not settle > 0:
+        raise bad("settle", "be a positive number of seconds, or None", f"it was {settle!r}")
+    rows = int(np.searchsorted(experiment.ts, experiment.ts[0] + settle, side="right"))
+    if rows >= len(experiment.ts):
+        was = f"it was {settle:g} s of {experiment.ts[-1] - experiment.ts[0]:g} s"
+        raise bad("settle", f"leave rows of {experiment.name} to be predicted", was)
+    known = experiment.start_sigma is not None
+    numbers = sum(int(np.isfinite(x[:rows]).sum()) for x in experiment.channels.values())
+    if rows < 2 or (not known and numbers < fewest):
+        must = f"hold {fewest} numbers or more of {experiment.name}, as many as a start"
+        raise bad("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
+    return experiment.part(slice(0, rows))
+
+
+def residuals_of(
+    problem: Shooting,
+    weighted: np.ndarray,
+    status: np.ndarray,
+    experiments: Sequence[Experiment],
+    where: Layout,
+) -> tuple[dict[str, np.ndarray], ...]:
+    """Of each experiment by channel, in the channels' units; NaN where a segment failed."""
+    weights = np.asarray(problem.segments.weights)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        raw = np.where(weights > 0, weighted / weights, np.nan)
+    raw[status != Status.ok] = np.nan
+    found = []
+    for i, each in enumerate(experiments):
+        own = np.flatnonzero(where.owner == i)
+        rows = np.concatenate([raw[k, where.places[k]] for k in own])
+        found.append({name: rows[:, where.columns[name]] for name in each.channels})
+    return tuple(found)

@@ -1,0 +1,202 @@
+"""The least squares of a fit: experiments cut into segments, their noise, where a search starts."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from statistics import NormalDist
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._core._errors import bad
+from jaxlag._core._status import Status
+from jaxlag._fit._channels import Reader, readers
+from jaxlag._fit._experiment import Experiment
+from jaxlag._fit._free_parameters import Unknowns
+from jaxlag._fit._information import spent
+from jaxlag._fit._initial_guess import initial_states, typical
+from jaxlag._fit._losses import squares
+from jaxlag._fit._multiple_shooting import Found, Shooting
+from jaxlag._fit._segments import Layout, pack
+from jaxlag._system._system import System
+
+OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
+"""Arguments of `simulate` that a fit gives itself."""
+STATES_FOR_RANGE = 32
+"""States of each experiment, by whose spread those of the problem are measured."""
+MEDIAN = NormalDist().inv_cdf(0.75)
+"""Of the sizes of Gaussian numbers, over their standard deviation."""
+ASSUMED_NOISE = 1e-2
+"""Of what a channel ranges over, where neither a sigma nor an estimate is at hand."""
+
+
+def experiments_of(given: Any) -> tuple[Experiment, ...]:
+    """What was given as one experiment or several, as a tuple."""
+    if not isinstance(given, Experiment | Iterable):
+        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
+    found = (given,) if isinstance(given, Experiment) else tuple(given)
+    if not found or not all(isinstance(x, Experiment) for x in found):
+        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
+    return found
+
+
+def check_search(tolerance: Any, max_iterations: Any) -> None:
+    """Raise where an optimiser could not work with these."""
+    if not isinstance(tolerance, int | float | np.number) or not 0 < tolerance < 1:
+        raise bad("tolerance", "be a number between 0 and 1", f"it was {tolerance!r}")
+    if not isinstance(max_iterations, int | np.integer) or max_iterations < 1:
+        raise bad("max_iterations", "be a positive integer", f"it was {max_iterations!r}")
+
+
+def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
+    """Options of `jl.simulate` by which compiled programs are keyed, numbers as Python's.
+
+    Raises:
+        ValueError: one that the caller decides, or that holds an array.
+    """
+    found = {}
+    for name, value in options.items():
+        if name in OURS:
+            raise bad(name, f"be left to {by}", "it was given")
+        if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
+            if np.ndim(value):
+                must, was = "be one number, a name or an object without arrays", f"it was {value!r}"
+                raise bad(name, must, was)
+            value = value.item()
+        found[name] = value
+    return found
+
+
+def readers_of(
+    system: System, experiments: Sequence[Experiment], own: Mapping[str, Reader], params: Any
+) -> dict[str, Reader]:
+    """name -> function of a motion, of every channel that was measured."""
+    names = tuple(dict.fromkeys(name for each in experiments for name in each.channels))
+    for name, shape in system.coordinates.shapes.items():
+        size = int(np.prod(shape))
+        for each in experiments:
+            for key in {name, f"{name}'", f"{name}''"} & each.channels.keys() - own.keys():
+                if each.channels[key].shape[1] != size:
+                    must = f"have {size} columns, as many as the coordinate has numbers"
+                    was = f"it had {each.channels[key].shape[1]}"
+                    fix = "Fill columns that were not measured with NaN."
+                    raise bad(f"{each.name}: channels[{key!r}]", must, was, fix)
+    rows = tuple(system.rows(params, jnp.dtype(float)).labels) if system.constraints else ()
+    return readers(system, names, own, rows)
+
+
+def _unstated(experiments: Sequence[Experiment]) -> set[str]:
+    """Channels whose noise one experiment or more does not state."""
+    without = {name for each in experiments for name in each.channels if name not in each.sigma}
+    for name in without & {name for each in experiments for name in each.sigma}:
+        was = f"that of {name!r} was given in some"
+        raise bad("sigma", "be given in all experiments that measure a channel, or in none", was)
+    return without
+
+
+def pose(
+    system: System,
+    experiments: Sequence[Experiment],
+    where: Layout,
+    free: Unknowns,
+    shown: Mapping[str, Reader],
+    prior: tuple[np.ndarray, np.ndarray, np.ndarray],
+    loss: Callable[[Array], Array],
+    options: Mapping[str, Any],
+    known_noise: Mapping[str, float] | None = None,
+) -> tuple[Shooting, dict[str, float]]:
+    """The problem, and the noise assumed of channels whose noise is not stated.
+
+    Args:
+        system: what moves.
+        experiments: what was measured.
+        where: their segments.
+        free: what is to be found beside the starts of segments.
+        shown: name -> what a motion shows of a channel.
+        prior: (which numbers, means, sigmas).
+        loss: one of `LOSSES`.
+        options: of `simulate`.
+        known_noise: of channels, from an earlier fit.
+    """
+    if system.constraints:
+        options = {"assemble": True} | dict(options)
+    ranges = {
+        name: np.concatenate([x.channels[name] for x in experiments if name in x.channels])
+        for name in where.columns
+    }
+    ranges = {name: spreads(x) for name, x in ranges.items()}
+    noise = {name: ASSUMED_NOISE * float(np.max(ranges[name])) for name in _unstated(experiments)}
+    noise |= {name: x for name, x in (known_noise or {}).items() if name in noise}
+    guesses, spread = [], []
+    params = free.params0
+    for i, each in enumerate(experiments):
+        rows = where.first[where.owner == i].tolist()
+        some = np.linspace(0, len(each.ts) - 1, STATES_FOR_RANGE).astype(int).tolist()
+        states = initial_states(system, each, rows + some, params, dict(options))
+        guesses.append(states[: len(rows)])
+        spread.append(states[len(rows) :])
+    segments = pack(system, experiments, where, noise, np.concatenate(guesses))
+    problem = Shooting(
+        system,
+        tuple(sorted(options.items())),
+        tuple(shown.items()),
+        tuple(int(where.columns[name].stop - where.columns[name].start) for name in shown),
+        loss,
+        bool(np.any(segments.follows)),
+        free,
+        segments,
+        jnp.asarray(typical(np.concatenate(spread))),
+        jnp.asarray(np.concatenate([ranges[name] for name in where.columns])),
+        prior,
+    )
+    return problem, noise
+
+
+def freedom(found: Found, problem: Shooting) -> float:
+    """How many more numbers were measured than went into unknowns; segments that failed aside."""
+    ok = (np.asarray(found.seen.status) == Status.ok)[:, None, None]
+    measured = np.count_nonzero((np.asarray(problem.segments.weights) > 0) & ok)
+    return measured - spent(problem, found)
+
+
+def estimated_noise(
+    found: Found, problem: Shooting, where: Layout, noise: Mapping[str, float]
+) -> dict[str, float]:
+    """Standard deviations of the channels' residuals, m, rad or what they are measured in.
+
+    Where a loss counts outliers for less, from the median of what residuals are in size: outliers
+    are not noise.
+    """
+    ok = (np.asarray(found.seen.status) == Status.ok)[:, None, None]
+    measured = (np.asarray(problem.segments.weights) > 0) & ok
+    share = freedom(found, problem) / max(1, np.count_nonzero(measured))
+    if share <= 0:  # nothing is left to judge by, as with a network: as if none had been fitted
+        share = 1.0
+    residuals, changed = np.asarray(found.seen.residuals), dict(noise)
+    for name, sigma in noise.items():
+        part = where.columns[name]
+        own = residuals[:, :, part][measured[:, :, part]]
+        if own.size:
+            plain = problem.loss is squares
+            size = np.sqrt(np.mean(own**2)) if plain else np.median(np.abs(own)) / MEDIAN
+            # Measurements without noise: what is left then is the solver's.
+            changed[name] = sigma * max(float(size / np.sqrt(share)), 1e-9)
+    return changed
+
+
+def spreads(x: np.ndarray) -> np.ndarray:
+    """How far each column ranges: its standard deviation, 1 where it has none."""
+    some = np.isfinite(x).any(axis=0)
+    found = np.ones(x.shape[1])
+    found[some] = np.nanstd(x[:, some], axis=0)
+    return np.where(found > 0, found, 1.0)
+
+
+def with_noise(problem: Shooting, where: Layout, noise: Mapping[str, float]) -> Shooting:
+    """The problem with other weights of these channels."""
+    weights = problem.segments.weights
+    for name, sigma in noise.items():
+        part = where.columns[name]
+        weights = weights.at[:, :, part].set(jnp.where(weights[:, :, part] > 0, 1 / sigma, 0.0))
+    return eqx.tree_at(lambda p: p.segments.weights, problem, weights)

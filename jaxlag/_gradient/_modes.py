@@ -1,0 +1,94 @@
+"""What a derivative keeps of the steps: the choice, its memory, its name."""
+
+import math
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from jaxlag._core._errors import bad
+
+MODES = ("auto", "forward", "recorded", "checkpoints")
+# States that "auto" keeps: as many steps go backwards without any taken again, and what they
+# take fits into the caches of a processor for 16 lanes at once.
+ROOM = 512
+
+
+class GradientMode(IntEnum):
+    """How reverse derivatives go through the steps, stored as int32 in `stats["gradient"]`.
+
+    `none` is that of a motion of which no derivative is taken.
+    """
+
+    none = 0
+    forward = 1
+    recorded = 2
+    checkpoints = 3
+
+
+class Keep(NamedTuple):
+    """What is kept for derivatives.
+
+    Attributes:
+        mode: one of `MODES`.
+        room: for states on the way; 0 in forward mode.
+    """
+
+    mode: str
+    room: int
+
+
+def choose_gradient(
+    mode: str,
+    memory: int | float | None,
+    max_steps: int,
+    rows: Any,
+    state: int,
+    itemsize: int,
+    knots: bool = False,
+) -> Keep:
+    """What to keep of `max_steps` steps.
+
+    Args:
+        mode: as asked for.
+        memory: bytes that one trajectory may keep; None for no bound.
+        max_steps: bound on the steps.
+        rows: saved; a number, or a symbol of `jax.export`.
+        state: numbers in a state.
+        itemsize: bytes of a number.
+        knots: whether inputs have some.
+    """
+    least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
+    rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
+    if memory is None:
+        return Keep(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
+    if not isinstance(rows, int):
+        was = f"it was {memory} for {rows} times"
+        raise bad("gradient_memory", "be left out where the number of times is a symbol", was)
+    turns = max_steps + rows - 2  # at most, of lanes together
+    needs = {
+        name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
+        for name, room in sorted(rooms.items(), key=lambda item: -item[1])
+    }
+    if mode == "auto":
+        room = min(ROOM, rooms["recorded"])
+        if needed(room, turns, state, itemsize, knots) <= memory:
+            return Keep(mode, room)
+        fitting = [name for name, need in needs.items() if need <= memory]
+        if fitting:
+            return Keep(mode, rooms[fitting[0]])
+        must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
+        raise bad("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
+    if needs[mode] > memory:
+        fits = [f"{name!r} ({need} bytes)" for name, need in needs.items() if need <= memory]
+        fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
+        must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"
+        raise bad("gradient_memory", must, f"it was {memory}", fix)
+    return Keep(mode, rooms[mode])
+
+
+def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:
+    """Bytes kept of one trajectory: times of all turns, states at points and between two.
+
+    With knots, of every turn the knot that it is counted from, and whether it begins with a jump.
+    """
+    states = room + 1 + math.ceil(turns / room) if room else 0
+    return turns * (8 + 5 * knots) + states * state * itemsize

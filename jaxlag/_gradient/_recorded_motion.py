@@ -1,0 +1,202 @@
+"""A recorded motion, as its derivatives are taken along it."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxlag._core import _xla
+from jaxlag._integration._record import Record, Times, step_end
+
+
+class Walk(NamedTuple):
+    """What is wanted of a motion or of its derivative.
+
+    Attributes:
+        last: state after the last step.
+        time: of it.
+        rows: the rows, (s, ...).
+        points: states at the points of the record; None where nobody asks.
+    """
+
+    last: PyTree
+    time: Array
+    rows: PyTree
+    points: PyTree | None
+
+
+class Change(NamedTuple):
+    """A direction of what a motion depends on; None for what does not move.
+
+    Attributes:
+        y0: of the start, an array.
+        args: of some leaves of the arguments.
+        anchors: of `Times.anchors`.
+        saves: of `Times.saves`; moves where the anchors do.
+    """
+
+    y0: Array | None
+    args: list[Array]
+    anchors: Array | None
+    saves: Array | None
+
+
+class Clock(NamedTuple):
+    """When the turns of a recorded motion ended; time -1 is that of the start."""
+
+    times: Times
+    record: Record
+
+    def time(self, k: Array, anchors: Array) -> Array:
+        """Time after turn k."""
+        offset, anchor = at(self.record.offsets, k), self.anchor(k)
+        if self.record.anchors is None:
+            offset = jnp.maximum(offset, 0.0)
+        return jnp.where(k < 0, anchors[0], anchors[anchor] + offset)
+
+    def anchor(self, k: Array) -> Array:
+        """The anchor that it moves with."""
+        if self.record.anchors is not None:
+            return jnp.where(k < 0, 0, at(self.record.anchors, k))
+        return ((k >= 0) & (at(self.record.offsets, k) < 0)).astype(jnp.int32)
+
+    def jump(self, k: Array) -> Array | None:
+        """Whether the vector field jumps where turn k starts."""
+        return None if self.record.jumps is None else at(self.record.jumps, k)
+
+    def reach(
+        self, end: Array, anchors: Array, row: Array | None = None, r: Array | None = None
+    ) -> Array | None:
+        """How the end of a turn is reached, or row r between the first and the last.
+
+        Args:
+            end: time after the turn.
+            anchors: of `Times.anchors`.
+            row: whether it is a row.
+            r: its index.
+        """
+        if self.record.last_reach is None:
+            return None
+        reach = jnp.where(end >= anchors[1], self.record.last_reach, 0)
+        if row is None:
+            return reach
+        assert r is not None
+        return jnp.where(row, at(self.record.row_reach, r), reach)
+
+    @property
+    def last(self) -> Array:
+        """The last turn."""
+        return self.record.turns - 1
+
+
+class Path(NamedTuple):
+    """A recorded motion: what was given to the loop and what it kept.
+
+    Attributes:
+        step: (args, t0, t1, state, jump, time) -> the state at a time, of a step from t0 to t1.
+        start: the state before the first step, as the step takes it.
+        args: leaves of the arguments.
+        tree: of the arguments.
+        moving: indices of the leaves that may move.
+        windows: (args, t0) -> (args as a step from t0 reads them: of each table two rows; where
+            these rows start in the leaves that may move, None for those that are no tables).
+        clock: times of the steps.
+        stages: number of them in a step, 0 where it has none.
+        plain: whether loops along it are of plain operations alone, which lanes that read rows at
+            places of their own are not: what such an operation costs is taken for that of reading
+            the whole buffer, and it is shared among cores.
+    """
+
+    step: Callable
+    start: PyTree
+    args: list
+    tree: Any
+    moving: tuple[int, ...]
+    windows: Callable
+    clock: Clock
+    stages: int
+    plain: bool
+
+    def native(self, loop: Callable, *args: Any) -> Any:
+        """loop(*args), compiled to one native function where that can be done."""
+        return _xla.native(loop, *args, stages=self.stages) if self.plain else loop(*args)
+
+    def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
+        """The arguments with other values of the leaves that may move."""
+        leaves = list(self.args if leaves is None else leaves)
+        for i, leaf in zip(self.moving, moved, strict=True):
+            leaves[i] = leaf
+        return jax.tree.unflatten(self.tree, leaves)
+
+    def ahead(
+        self,
+        args: Any,
+        t: Array,
+        end: Array,
+        jump: Array | None,
+        state: PyTree,
+        reach: Array | None = None,
+        turn_end: Array | None = None,
+    ) -> PyTree:
+        """The state at `end`, one step on from t, or within the step that ends at `turn_end`."""
+        jump = jnp.array(False) if jump is None else jump
+        if reach is None:
+            return self.step(args, t, end, state, jump, end)
+        assert turn_end is not None
+        return self.step(args, t, step_end(reach, t, end, turn_end), state, jump, end)
+
+    def found(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
+        """The state after turn k, with the arguments as they are."""
+        t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
+        reach = self.clock.reach(end, anchors)
+        args = self.with_args(self.moved())
+        return self.ahead(args, t, end, self.clock.jump(k), state, reach, end)
+
+    def moved(self) -> list[Array]:
+        """The leaves of the arguments that may move."""
+        return [self.args[i] for i in self.moving]
+
+    def local(self, t: Array) -> tuple[Callable, list[Array], list[Array | None]]:
+        """What a step from t reads of the arguments.
+
+        Returns:
+            moved -> arguments, what moves of them (of tables two rows), where these rows start.
+        """
+        args, starts = self.windows(self.with_args(self.moved()), t)
+        leaves = jax.tree.leaves(args, is_leaf=lambda x: x is None)
+        moved = [leaves[i] for i in self.moving]
+        return partial(self.with_args, leaves=leaves), moved, [starts[i] for i in self.moving]
+
+
+def at(buffer: PyTree, k: Array) -> PyTree:
+    """Row k of a buffer, the first one below 0."""
+    index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
+    return jax.tree.map(index, buffer)
+
+
+def pick(use: Array, new: PyTree, old: PyTree) -> PyTree:
+    """One of two states."""
+    return jax.tree.map(lambda a, b: jnp.where(use, a, b), new, old)
+
+
+def all_rows(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -> PyTree:
+    """All rows, from those between the first and the last; zero where there was none."""
+
+    def of(a: Array, between: Array | None, b: Array) -> Array:
+        parts = [a[None], jnp.where(reached, b, 0.0)[None]]
+        if between is not None:
+            parts.insert(1, between[:-1])
+        return jnp.concatenate(parts)
+
+    if rows is None:
+        return jax.tree.map(lambda a, b: of(a, None, b), first, last)
+    return jax.tree.map(of, first, rows, last)
+
+
+def arrived(path: Path, anchors: Array) -> Array:
+    """Whether the last row was reached."""
+    clock = path.clock
+    return clock.time(clock.last, anchors) >= clock.times.saves[-1]

@@ -1,0 +1,136 @@
+"""A recorded motion taken again by a scan, which JAX differentiates in any mode, to any order."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxlag._gradient._recorded_motion import Path, Walk, all_rows, arrived, pick
+from jaxlag._integration._loop import CHUNK
+
+
+class _Slots(NamedTuple):
+    """Steps and rows in one sequence, a row before the step that it lies in."""
+
+    begins: Array
+    ends: Array
+    used: Array
+    to_row: Array
+    jumps: Array | None
+    reaches: Array | None
+    turn_ends: Array | None
+
+
+def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Array | None]:
+    """The sequence, and the places of turns and of rows in it."""
+    clock, record = path.clock, path.clock.record
+    index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
+    ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
+    begins = jnp.concatenate([anchors[:1], ends[:-1]])
+    used, reaches = (index < record.turns) & (ends > begins), clock.reach(ends, anchors)
+    if record.row_turn is None:
+        still = jnp.zeros_like(used)
+        whole = (None, None) if reaches is None else (reaches, ends)
+        return _Slots(begins, ends, used, still, record.jumps, *whole), index, None
+    turn = record.row_turn[:-1]
+    count = turn.shape[0]
+    reached = turn < record.turns
+    before = jnp.searchsorted(turn, index, side="right").astype(jnp.int32)
+    of_turn = index + before
+    of_row = jnp.where(reached, turn + jnp.arange(count, dtype=jnp.int32), 0)
+    size = -(-(index.shape[0] + count) // CHUNK) * CHUNK
+
+    def merged(steps: Array, rows: Array) -> Array:
+        place = jnp.where(reached, of_row, size)
+        out = jnp.zeros((size,), steps.dtype).at[of_turn].set(steps)
+        return out.at[place].set(rows, mode="drop")
+
+    safe = jnp.where(reached, turn, 0)
+    whole = (None, None)
+    if reaches is not None:
+        assert record.row_reach is not None
+        whole = merged(reaches, record.row_reach[:-1]), merged(ends, ends[safe])
+    slots = _Slots(
+        merged(begins, begins[safe]),
+        merged(ends, saves[1:-1]),
+        merged(used, reached),
+        merged(jnp.zeros_like(used), reached),
+        None if record.jumps is None else merged(record.jumps, record.jumps[safe]),
+        *whole,
+    )
+    return slots, of_turn, of_row
+
+
+def again(
+    path: Path,
+    start: PyTree,
+    moved: Sequence[Array],
+    anchors: Array,
+    saves: Array,
+    points: bool,
+) -> Walk:
+    """The motion itself by a scan, which JAX differentiates in any mode and to any order.
+
+    The scan skips whole chunks that no lane of a vmapped solve needs. Turns that are not wanted
+    repeat the first step and drop its result, so that no derivative meets a state out of reach.
+    """
+    clock, record = path.clock, path.clock.record
+    slots, of_turn, of_row = _slots(path, anchors, saves)
+    first = jnp.argmax(slots.used)
+    begins = jnp.where(slots.used, slots.begins, slots.begins[first])
+    ends = jnp.where(slots.used, slots.ends, slots.ends[first])
+    slots = slots._replace(begins=begins, ends=ends)
+    if slots.turn_ends is not None:
+        turn_ends = jnp.where(slots.used, slots.turn_ends, slots.turn_ends[first])
+        slots = slots._replace(turn_ends=turn_ends)
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def step(slot: _Slots, y: PyTree) -> PyTree:
+        args, jump, rest = path.with_args(moved), slot.jumps, (slot.reaches, slot.turn_ends)
+        return path.ahead(args, slot.begins, slot.ends, jump, y, *rest)
+
+    def one(y: PyTree, slot: _Slots) -> tuple[PyTree, tuple[PyTree, PyTree]]:
+        new = step(slot, pick(slot.used, y, start))
+        return pick(slot.used & ~slot.to_row, new, y), (y, new)
+
+    def chunk(y: PyTree, slots: _Slots) -> tuple[PyTree, PyTree]:
+        def skip(y: PyTree) -> tuple[PyTree, PyTree]:
+            same = jax.tree.map(lambda x: jnp.broadcast_to(x, (CHUNK, *x.shape)), y)
+            return y, (same, same)
+
+        def take(y: PyTree) -> tuple[PyTree, PyTree]:
+            return jax.lax.scan(one, y, slots)
+
+        return jax.lax.cond(eqxi.unvmap_any(slots.used), take, skip, y)
+
+    parts = jax.tree.map(lambda x: x.reshape(-1, CHUNK), slots)
+    last, found = path.native(partial(jax.lax.scan, chunk), start, parts)
+    befores, afters = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+    rows = point_states = None
+    if of_row is not None:
+        assert record.row_turn is not None
+        reached = record.row_turn[:-1] < record.turns
+
+        def gathered(x: Array) -> Array:
+            wide = reached.reshape(reached.shape + (1,) * (x.ndim - 1))
+            found = jnp.where(wide, x[of_row], 0.0)
+            return jnp.concatenate([found, jnp.zeros_like(x[:1])])
+
+        rows = jax.tree.map(gathered, afters)
+    if points:
+        count = jax.tree.leaves(record.points)[0].shape[0]
+        at = jnp.arange(count, dtype=jnp.int32) * record.stride
+        inside = (at < record.turns) & (at // record.stride < count - 1)
+        at = of_turn[jnp.where(inside, at, 0)]
+
+        def kept(x: Array) -> Array:
+            wide = inside.reshape(inside.shape + (1,) * (x.ndim - 1))
+            return jnp.where(wide, x[at], 0.0)
+
+        point_states = jax.tree.map(kept, befores)
+    time = clock.time(clock.last, anchors)
+    return Walk(last, time, all_rows(start, rows, last, arrived(path, anchors)), point_states)

@@ -1,0 +1,279 @@
+"""Along a recorded motion and back: derivatives of states and rows, in loops that end where it did.
+
+With y_{k+1} = step(y_k, args, t_k, t_{k+1}) at recorded times the derivative is
+
+    dy_{k+1} = J_k dy_k + B_k dargs + c_k dt_k + e_k dt_{k+1},
+
+and the same for a row, which is a step from y_k to its own time: a linear map from (dy_0, dargs,
+danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the rows. Forwards dy is carried
+beside y. Backwards the transposed steps are taken from the last to the first, at the recorded
+points, or at states found anew from them where points are further apart than a step. Neither
+depends on the step-size control, whose error estimates round differently in another program.
+
+Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.6 (variational
+equations); Griewank, Walther, Evaluating Derivatives, ch. 12 (checkpoints).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from math import ceil, log2
+from typing import Any
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxlag._core._buffer_entries import put
+from jaxlag._gradient._recorded_motion import Change, Path, Walk, all_rows, arrived, at, pick
+from jaxlag._integration._record import Record
+
+
+def _add(a: PyTree, b: PyTree) -> PyTree:
+    return jax.tree.map(jnp.add, a, b)
+
+
+def _zeros(state: PyTree, size: Any) -> PyTree:
+    return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
+
+
+def _turn_of_row(record: Record, r: Array) -> Array:
+    """The turn of row r between the first and the last; none beyond these."""
+    assert record.row_turn is not None
+    return jnp.where(r < 0, -1, at(record.row_turn, r))
+
+
+def forwards(path: Path, change: Change, points: bool) -> Walk:
+    """The derivative in one direction."""
+    clock, record = path.clock, path.clock.record
+    anchors, dues = clock.times.anchors(), clock.times.dues()
+    dues_dot = None
+    if change.saves is not None:
+        dues_dot = jnp.concatenate([change.saves[1:-1], jnp.zeros_like(change.saves[:1])])
+    start = path.start
+    dy0 = jax.tree.map(jnp.zeros_like, start) if change.y0 is None else (change.y0, None)
+    count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
+    zero = jnp.zeros((), jnp.int32)
+    rows = None if record.row_turn is None else _zeros(start, record.row_turn.shape[0])
+    # Rows are reached from the state before the last step, with dy there.
+    base = None if rows is None else (start, dy0)
+    begin = (zero, zero, start, dy0, base, rows, _zeros(start, count) if points else None)
+
+    def turn(carry: tuple) -> tuple:
+        """One step, or a row where a lane takes none or must not go on without."""
+        k, r, y, dy, base, rows, kept = carry
+        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, end = (k < record.turns) & (turn_end > t), turn_end
+        to_row, row, i = jnp.array(False), jnp.array(False), k
+        if points:
+            at_point = (k < record.turns) & (k % record.stride == 0)
+            kept = put(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
+        before = (y, dy)
+        if rows is not None:
+            j = _turn_of_row(record, r)
+            left = (j < k) & (j < record.turns)
+            to_row = eqxi.unvmap_any(left & use)
+            use, row = use & ~to_row, left & (~use | to_row)
+            i, before = jnp.where(row, j, k), pick(row, base, before)
+            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            end = jnp.where(row, dues[r], turn_end)
+        reach = clock.reach(turn_end, anchors, *(() if rows is None else (row, r)))
+        jump, end_dot = clock.jump(i), None
+        if change.anchors is not None:
+            end_dot = change.anchors[clock.anchor(i)]
+            if rows is not None:
+                assert dues_dot is not None
+                end_dot = jnp.where(row, dues_dot[r], end_dot)
+        if end_dot is None:
+            step = lambda y, moved: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, turn_end
+            )
+            y1, dy1 = jax.jvp(step, (before[0], path.moved()), (before[1], change.args))
+        else:
+            assert change.anchors is not None
+            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, *turn_end
+            )
+            given = (before[0], path.moved(), t, end)
+            dots = (before[1], change.args, change.anchors[clock.anchor(i - 1)], end_dot)
+            if reach is not None:
+                given, dots = (*given, turn_end), (*dots, change.anchors[clock.anchor(i)])
+            y1, dy1 = jax.jvp(step, given, dots)
+        if rows is not None:
+            assert record.row_turn is not None
+            rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
+            r, base = r + row.astype(jnp.int32), pick(use, (y, dy), base)
+        y, dy = pick(use, (y1, dy1), (y, dy))
+        return k + (~to_row).astype(jnp.int32), r, y, dy, base, rows, kept
+
+    def goes_on(carry: tuple) -> Array:
+        k, r, *_ = carry
+        left = k < record.turns
+        if rows is not None:
+            left = left | (_turn_of_row(record, r) < record.turns)
+        return eqxi.unvmap_any(left)
+
+    loop = partial(jax.lax.while_loop, goes_on, turn)
+    *_, dy, _, rows, kept = path.native(loop, begin)
+    time = jnp.zeros_like(clock.times.stop)
+    if change.anchors is not None:
+        time = change.anchors[clock.anchor(clock.last)]
+    return Walk(dy, time, all_rows(dy0, rows, dy, arrived(path, anchors)), kept)
+
+
+def backwards(path: Path, change: Change, wanted: Walk) -> Change:
+    """The transposed map.
+
+    Args:
+        path: the motion.
+        change: which parts of `Change` there are.
+        wanted: cotangents.
+    """
+    clock, record = path.clock, path.clock.record
+    anchors, dues = clock.times.anchors(), clock.times.dues()
+    assert record.points is not None
+    between = None if record.row_turn is None else jax.tree.map(lambda x: x[1:], wanted.rows)
+    moves = change.anchors is not None
+    zero = jnp.zeros((), jnp.int32)
+    reached = arrived(path, anchors)
+    end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.rows)
+    bars = (
+        [jnp.zeros_like(x) for x in path.moved()],
+        _added_at(jnp.zeros_like(anchors), clock.anchor(clock.last), wanted.time)
+        if moves
+        else None,
+        jnp.zeros_like(dues) if moves else None,
+    )
+
+    def row_left(r: Array) -> Array:
+        """The turn of the last row that is left."""
+        return jnp.array(-1) if between is None else _turn_of_row(record, r - 1)
+
+    def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
+        """One turn back: turn k - 1, or rows reached from the state before turn k.
+
+        The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
+        a row reached from the state before its last step; `owed` is what that adds there.
+        """
+        k, r, bar, owed, (args_bar, anchors_bar, dues_bar) = carry
+        j, now = row_left(r), clock.time(k - 1, anchors)
+        here = j == k
+        to_row = eqxi.unvmap_any(here)
+        k = jnp.where(to_row, k, k - 1)
+        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, row, i, given = (k < record.turns) & (turn_end > t) & ~to_row, here, k, bar
+        end, reached = turn_end, clock.reach(turn_end, anchors)
+        if between is not None:
+            row = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
+            i = jnp.where(row, j, k)
+            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            end = jnp.where(row, dues[r - 1], end)
+            reached = clock.reach(turn_end, anchors, row, r - 1)
+            given = pick(row, at(between, r - 1), bar)
+        y, jump, takes = state_before(i), clock.jump(i), use | row
+        with_moved, moved, starts = path.local(t)
+        if not moves:
+            step = lambda y, moved: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, turn_end
+            )
+            before, more = jax.vjp(step, y, moved)[1](given)
+        else:
+            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, *turn_end
+            )
+            times = (t, end) if reached is None else (t, end, turn_end)
+            before, more, *times_bar = jax.vjp(step, y, moved, *times)[1](given)
+            t_bar, end_bar, *turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
+            at_row = jnp.where(row, end_bar, 0.0)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i), sum(turn_bar, end_bar - at_row))
+            if between is not None:
+                dues_bar = _added_at(dues_bar, r - 1, at_row)
+        more = [jnp.where(takes, x, 0.0) for x in more]
+        args_bar = [_added(*pair) for pair in zip(args_bar, more, starts, strict=True)]
+        if between is None:
+            bar = pick(use, before, bar)
+        else:
+            zeros = jax.tree.map(jnp.zeros_like, bar)
+            summed = _add(before, pick(here, bar, owed))
+            bar = pick(use | here, summed, bar)
+            owed = pick(use, zeros, pick(row & ~here, summed, owed))
+            r = r - row.astype(jnp.int32)
+        if wanted.points is not None:
+            at_point = ~to_row & (k % record.stride == 0) & (k < record.turns)
+            bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
+        return k, r, bar, owed, (args_bar, anchors_bar, dues_bar)
+
+    def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
+        """All turns after the first, that one and its rows."""
+
+        def left(carry: tuple) -> Array:
+            k, r, *_ = carry
+            return (k > first) | eqxi.unvmap_any(row_left(r) == k)
+
+        return jax.lax.while_loop(left, partial(turn, first, state_before), carry)
+
+    # Lanes that were recorded together have one stride; all have points at those of the longest.
+    stride = eqxi.unvmap_max(record.stride)
+    room = jax.tree.leaves(record.points)[0].shape[0] - 1
+    turns = record.offsets.shape[0]
+    longest = 2 * -(-turns // room)  # or more; of a symbol of jax.export that will do
+    if isinstance(turns, int):
+        longest = 2 ** ceil(log2(turns / room))
+
+    def segment(carry: tuple) -> tuple:
+        """All turns since the last point before turn k; all there are, where each has a point."""
+        k = carry[0]
+        first = jnp.where(stride == 1, 0, (k - 1) // stride * stride)
+        y = at(record.points, first // record.stride)
+        states = put(_zeros(y, longest), zero, y)
+
+        def ahead(carry: tuple) -> tuple:
+            j, y, states = carry
+            t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
+            use = (j < record.turns) & (end > t)
+            y = pick(use, path.found(j, anchors, y), y)
+            return j + 1, y, put(states, j + 1 - first, y)
+
+        begin = (first, y, states)
+        missing = lambda c: (stride > 1) & (c[0] < k - 1)  # noqa: E731
+        states = jax.lax.while_loop(missing, ahead, begin)[2]
+
+        def state_before(j: Array) -> PyTree:
+            return pick(stride == 1, at(record.points, j), at(states, j - first))
+
+        return back(first, state_before, carry)
+
+    def all_back(carry: tuple) -> tuple:
+        if longest == 1:
+            return back(zero, partial(at, record.points), carry)
+        return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
+
+    most = eqxi.unvmap_max(record.turns)  # shared by lanes
+    rows_left = zero
+    if record.row_turn is not None:
+        rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
+    bar = _add(wanted.last, end_bar)
+    owed = None if between is None else jax.tree.map(jnp.zeros_like, bar)
+    ended = path.native(all_back, (most, rows_left, bar, owed, bars))
+    _, _, bar, _, (args_bar, anchors_bar, dues_bar) = ended
+    bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
+    saves_bar = None
+    if moves:
+        ends = jnp.zeros_like(clock.times.saves[:1])
+        saves_bar = jnp.concatenate([ends, dues_bar[:-1], ends])
+    return Change(None if change.y0 is None else bar[0], args_bar, anchors_bar, saves_bar)
+
+
+def _added(bar: Array, more: Array, start: Array | None) -> Array:
+    """The cotangent of a leaf with more of it, of two rows of a table at their place."""
+    if start is None:
+        return bar + more
+    for k in range(more.shape[0]):
+        bar = _added_at(bar, start + k, more[k])
+    return bar
+
+
+def _added_at(bar: Array, index: Array, more: Array) -> Array:
+    """One entry with more of it."""
+    return put(bar, index, at(bar, index) + more)

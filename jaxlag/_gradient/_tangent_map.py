@@ -1,0 +1,215 @@
+"""The derivative of the states on the way of a solve, as one linear map."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, PyTree
+
+from jaxlag._core._batching import LANES, in_batches
+from jaxlag._core._linear_map import LinearMap, linear
+from jaxlag._gradient._recorded_motion import Change, Clock, Path, Walk
+from jaxlag._gradient._rescan import again
+from jaxlag._gradient._sweeps import backwards, forwards
+from jaxlag._integration._record import Outcome, Record, Times
+from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._tableaus import with_stages
+
+
+class Setup(NamedTuple):
+    """What a solve needs and no derivative is taken of."""
+
+    first_step: Array | None
+    allowed: Bool[Array, ""]
+    scheme: Any  # traced half of the Scheme
+
+
+def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
+    """(start, arguments, times, scheme, bound on the steps) from the halves of a problem."""
+    static_problem, static_scheme, max_steps, _ = static
+    y0, args, times = eqx.combine(inexact, rest, static_problem)
+    return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
+
+
+def changes(tangents: Any, outcome: Outcome) -> Any:
+    """The directions of what moves, None still for what does not.
+
+    A trajectory that took no step depends on nothing but its start: its derivatives, which may
+    not be finite, are kept out.
+    """
+    moved = outcome.accepted > 0
+    return jax.tree.map(lambda dot: jnp.where(moved, dot, 0.0), tangents)
+
+
+def filled(change: Any, like: Any) -> Any:
+    """The directions with zeros for what does not move."""
+
+    def fill(x: Any, dot: Any) -> Any:
+        return jnp.zeros_like(x) if dot is None and x is not None else dot
+
+    return jax.tree.map(fill, like, change, is_leaf=lambda x: x is None)
+
+
+def changed(
+    inexact: Any,
+    rest: Any,
+    setup: Setup,
+    static: Any,
+    record: Record,
+    change: Any,
+    points: bool = False,
+) -> Walk:
+    """The derivative of the states on the way, at the points of the record too if asked for."""
+    y0_dot, args_dot, times_dot = change
+    dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
+    moving = tuple(i for i, dot in enumerate(dots) if dot is not None)
+    times, anchors_dot, saves_dot = eqx.combine(inexact, rest, static[0])[2], None, None
+    if jax.tree.leaves(times_dot):
+        whole = filled(times_dot, times)
+        anchors_dot, saves_dot = jax.jvp(Times.anchors, (times,), (whole,))[1], whole.saves
+    x = Change(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
+    kind = _Kind(static, moving, y0_dot is not None, anchors_dot is not None, points)
+    return linear(_map(kind), (inexact, rest, setup, record), x)
+
+
+class _Kind(NamedTuple):
+    """What moves, and what is wanted to move with it."""
+
+    static: Any
+    moving: tuple[int, ...]
+    start: bool
+    times: bool
+    points: bool
+
+
+def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
+    """The variational equations as a linear map."""
+
+    def path(r: Any) -> tuple[Path, Any]:
+        inexact, rest, setup, record = r
+        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
+        fast = scheme.on_scalars(lanes)
+        return path_of(scheme, y0, args, times, record, kind.moving, fast, lanes), y0
+
+    def forward(r: Any, x: Change) -> Walk:
+        return forwards(path(r)[0], x, kind.points)
+
+    def like(r: Any) -> tuple[Path, Change]:
+        way, y0 = path(r)
+        times = way.clock.times
+        moves = (times.anchors(), times.saves) if kind.times else (None, None)
+        return way, Change(y0 if kind.start else None, way.moved(), *moves)
+
+    def backward(r: Any, y: Walk) -> Change:
+        way, change = like(r)
+        return backwards(way, change, y)
+
+    def by_directions(r: Any, y: Walk) -> Change:
+        """The same from `forward`, one direction of x after another."""
+        return _transposed(partial(forward, r), like(r)[1], y)
+
+    def plain(r: Any, x: Change) -> Walk:
+        inexact, rest, setup, record = r
+        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
+        way = path_of(scheme, y0, args, times, record, kind.moving)
+
+        def motion(y0: Array, moved: list, anchors: Array, saves: Array) -> Walk:
+            return again(way, (y0, None), moved, anchors, saves, kind.points)
+
+        given = (y0, way.moved(), times.anchors(), times.saves)
+        dots = (
+            jnp.zeros_like(at) if dot is None else dot
+            for at, dot in zip((y0, *given[2:]), (x.y0, x.anchors, x.saves), strict=True)
+        )
+        y0_dot, *times_dot = dots
+        return jax.jvp(motion, given, (y0_dot, list(x.args), *times_dot))[1]
+
+    in_lanes = None if lanes else _map(kind, lanes=True)
+    reverse = backward if kind.static[3].room else by_directions
+    return LinearMap(forward, reverse, plain, in_lanes=in_lanes)
+
+
+def _transposed(function: Callable, like: Any, y: Any) -> Any:
+    """A^T y of a linear function from its values in the directions of all numbers of x."""
+    leaves, tree = jax.tree.flatten(like)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: dtype.itemsize)
+
+    def split(row: Array) -> Any:
+        parts = jnp.split(row, ends[:-1])
+        pairs = zip(parts, leaves, strict=True)
+        shaped = [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in pairs]
+        return jax.tree.unflatten(tree, shaped)
+
+    def component(row: Array) -> Array:
+        pairs = zip(jax.tree.leaves(function(split(row))), jax.tree.leaves(y), strict=True)
+        parts = [jnp.sum(a * b).astype(widest) for a, b in pairs]
+        return jnp.sum(jnp.stack(parts))
+
+    count = int(ends[-1])
+    return split(in_batches(component, jnp.eye(count, dtype=widest), count, LANES))
+
+
+def path_of(
+    scheme: Scheme,
+    y0: Array,
+    args: Any,
+    times: Times,
+    record: Record,
+    moving: tuple[int, ...],
+    fast: Scheme | None = None,
+    lanes: bool = False,
+) -> Path:
+    """The recorded motion, by steps with loops over stages.
+
+    Written out, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
+    pendulum: a gradient 5.3 | 2.3 s, a Hessian 22 | 4.5 s, a gradient of lanes 15 | 4.5 s) and
+    run 0.9 to 1.4 times as fast.
+    """
+    looped = in_loops(scheme if fast is None else fast)
+
+    def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array, wanted: Array) -> PyTree:
+        return one_step(looped, args, t0, t1, state, jump, True, wanted)[0]
+
+    zero = jnp.zeros_like(times.stop)
+    memory = scheme.begin(zero, times.stop, y0, args) if scheme.remembers else None
+    leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
+    stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
+    clock, start = Clock(times, record), (y0, memory)
+    plain = not (lanes and record.row_turn is not None)
+    return Path(step, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
+
+
+def in_loops(scheme: Scheme) -> Scheme:
+    """The form with loops over stages that JAX differentiates in any mode."""
+    return eqx.tree_at(lambda s: s.solver, scheme, with_stages(scheme.solver, "bounded"))
+
+
+def one_step(
+    scheme: Scheme,
+    args: Any,
+    t0: Array,
+    t1: Array,
+    state: PyTree,
+    jump: Array,
+    differentiable: bool,
+    wanted: Array | None = None,
+) -> tuple[PyTree, Bool[Array, ""]]:
+    """One step from (y, memory), and whether it was solved; without memory it starts afresh.
+
+    Near change points the state may be `wanted` at another time than that of its end.
+    """
+    y0, memory = y, _ = state
+    args = scheme.within(args, t0)
+    jumped: Any = jump
+    if not scheme.remembers:
+        memory, jumped = scheme.afresh(t0, t1, y, args)
+    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jumped)
+    y, verdict = scheme.settled(t1, y, args, differentiable)
+    if wanted is not None and args.lengths is not None:
+        y = scheme.reached(t0, y0, t1, y, wanted, wanted != t1, args)
+    return (y, memory if scheme.remembers else None), solved & verdict.good

@@ -1,0 +1,224 @@
+"""Whether a trajectory may start, inside the compiled program."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxlag._core._arrays import still
+from jaxlag._integration._step_arguments import Arguments
+from jaxlag._integration._vector_field import Dynamics
+from jaxlag._linalg._independent_rows import (
+    ROUNDINGS,
+    Sizes,
+    independent_rows,
+    row_sizes,
+    without_rounding,
+)
+from jaxlag._linalg._mass_solve import closed_to, dependence_floor
+from jaxlag._linalg._rounding_bounds import with_rounding
+
+
+class Start(NamedTuple):
+    """Whether a trajectory may start, and if not, why."""
+
+    valid: Array  # all values are allowed
+    in_range: Array  # the inputs are defined there
+    finite: Array  # L and the residuals are finite there
+    consistent: "Consistency"
+    pressed: Array  # contacts press and slide as their friction takes them to
+
+    @property
+    def allowed(self) -> Bool[Array, ""]:
+        """Whether all is well."""
+        return self.valid & self.in_range & self.finite & self.consistent.ok & self.pressed
+
+
+class Consistency(NamedTuple):
+    """Whether a start satisfies its constraints.
+
+    Attributes:
+        ok: all residuals are small, and the rows do not contradict one another.
+        contradictory: no motion near satisfies all rows.
+        row: the row concerned.
+        complete: the state's quasi-velocities stand for all motions that the rows leave.
+    """
+
+    ok: Bool[Array, ""]
+    contradictory: Bool[Array, ""]
+    row: Int[Array, ""]
+    complete: Bool[Array, ""]
+
+
+def values_allowed(
+    y0: Array, saves: Array, rtol: Any, atol: Any, step: Any, longest: Any
+) -> Bool[Array, ""]:
+    """What concrete values have raised about already, for values that are traced."""
+    floor = 10 * jnp.finfo(y0.dtype).eps
+    checks = [
+        jnp.all(jnp.isfinite(y0)),
+        jnp.all(jnp.isfinite(saves)) & jnp.all(saves[1:] > saves[:-1]),
+        jnp.isfinite(rtol) & jnp.isfinite(atol),
+        (rtol >= 0) & (atol >= 0) & (rtol + atol > 0) & ((rtol == 0) | (rtol >= floor)),
+    ]
+    checks += [jnp.isfinite(x) & (x > 0) for x in (step, longest) if x is not None]
+    return jnp.all(jnp.stack([jnp.all(jnp.asarray(check)) for check in checks]))
+
+
+def start_finite(dynamics: Dynamics, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
+    """Whether L and the residuals are finite there; of accelerations the first step tells."""
+    at = dynamics.state(*still((tau, y0, args)))
+    finite = jnp.isfinite(dynamics.system.lagrangian(*at))
+    for residual in residuals(dynamics, *at):
+        finite = finite & jnp.all(jnp.isfinite(residual))
+    return finite
+
+
+def residuals(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> tuple[Array, ...]:
+    """(phi for every row, A v + b), none without constraints."""
+    if not dynamics.rows.size:
+        return ()
+    phi = dynamics.rows.of_all(dynamics.terms.position(t, q, params))
+    return phi, dynamics.terms.velocity(t, q, v, params)
+
+
+def start_consistent(
+    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
+) -> Consistency:
+    """Whether a state satisfies the constraints, and its quasi-velocities stand for velocities."""
+    found = _rows_consistent(dynamics, t, q, v, params, args)
+    if dynamics.quasi is None:
+        return found
+    regular = dynamics.quasi.regular(*still((t, q, params)))
+    return found._replace(ok=found.ok & regular, complete=found.complete & regular)
+
+
+def _rows_consistent(
+    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
+) -> Consistency:
+    """Whether residuals are below sqrt(eps) of the state, and no row contradicts the others.
+
+    A row contradicts where it is left open by solving for the independent ones: phi, A v + b, or
+    A a + gamma; with quasi-velocities where these do not satisfy it by themselves.
+    """
+    if not dynamics.rows.size:
+        true = jnp.array(True)
+        return Consistency(true, ~true, jnp.full((), -1, jnp.int32), true)
+    t, q, v, params, args = still((t, q, v, params, args))
+    terms = dynamics.terms
+    A, _ = terms.rows(t, q, v, params)
+    sure = all(dynamics.rows.sure)
+    if args.rows is not None:
+        void, unit = args.rows.void, args.rows.size
+    elif sure:
+        unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+        void, unit = unit < 0, jnp.where(unit > 0, unit, 1.0)
+    else:
+        _, void, unit = _sizes(dynamics, t, q, v, params)
+    floor = dependence_floor(q.dtype)
+
+    def everything(q: Array, v: Array) -> tuple[Array, ...]:
+        return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
+
+    if sure:
+        phi, rate, gamma = everything(q, v)
+    else:
+        phi, rate, gamma = without_rounding(everything, void, unit, q, v)
+    if dynamics.quasi is not None:
+        off = jnp.zeros_like(unit)
+        for c, x in ((phi, q), (rate, v)):
+            off = jnp.maximum(off, jnp.abs(c) / unit / (floor * (1.0 + jnp.max(jnp.abs(x)))))
+        near = jnp.all(off <= 1.0)
+        bad, complete = _fitting(dynamics, t, q, v, params, A, void, unit)
+        bad = jnp.where(near, bad / floor, 0.0)
+        found = _consistency(off, bad, near, phi, rate)
+        return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
+    K = terms.correction(t, q, v, params, args.prepared, args.kept)
+
+    def left(c: Array) -> Array:
+        return jnp.abs(c - A @ (K @ c)) / unit
+
+    off, bad = jnp.zeros_like(unit), jnp.zeros_like(unit)
+    for c, x in ((phi, q), (rate, v)):
+        size = jnp.abs(c) / unit / (1.0 + jnp.max(jnp.abs(x)))
+        off = jnp.maximum(off, size / floor)
+        # A contradiction is not just what the linearised rows leave open.
+        ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
+        bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
+    near = jnp.all(off <= 1.0)
+    turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
+    bent = left(gamma)
+    if dynamics.rows.size > 1:  # terms of gamma that cancel leave rounding, no contradiction
+        _, rounding = with_rounding(lambda t, q, v: terms.gamma(t, q, v, params), t, q, v)
+        rounding = ROUNDINGS * jnp.nan_to_num(rounding)
+        bent = jnp.maximum(bent - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
+    bent = bent / (floor * jnp.where(turn > 0, turn, 1.0))
+    bad = jnp.where(near, jnp.maximum(bent, bad), bad)
+    return _consistency(off, bad, near, phi, rate)
+
+
+def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Sizes:
+    """Of every row, see `row_sizes`."""
+
+    def rows(q: Array) -> Array:
+        return dynamics.terms.rows(t, q, v, params)[0]
+
+    return row_sizes(rows, q, rows(q))
+
+
+def _fitting(
+    dynamics: Dynamics,
+    t: Array,
+    q: Array,
+    v: Array,
+    params: Any,
+    A: Array,
+    void: Bool[Array, " m"],
+    unit: Array,
+) -> tuple[Array, Bool[Array, ""]]:
+    """How far off A B = 0 every row is, as a sine; whether B and A leave no velocity out."""
+    quasi = dynamics.quasi
+    assert quasi is not None
+    u = quasi.of(t, q, v, params)
+    B = jax.jacfwd(lambda w: dynamics.velocities(t, q, w, params))(u[quasi.free])
+    size = jnp.sqrt(jnp.sum(B**2, axis=0))
+    B = B / jnp.where(size > 0, size, 1.0)[None]
+    sines = jnp.abs(A @ B) / unit[:, None]
+    rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
+    # Singular kinematics, as at gimbal lock, are a fault of their own.
+    sound = jnp.all(jnp.isfinite(rows))
+    rows = jnp.where(sound, rows, jnp.eye(*rows.shape, dtype=q.dtype))
+    rank = jnp.sum(independent_rows(jnp.eye(q.shape[0], dtype=q.dtype), rows))
+    return jnp.max(jnp.where(jnp.isfinite(sines), sines, 0.0), axis=1), rank == q.shape[0]
+
+
+def rows_hold(
+    dynamics: Dynamics, ts: Array, q: Array, v: Array, params: Any
+) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Whether velocities that kinematics give satisfy the rows at all saved times; else which not.
+
+    With U the rows are satisfied by themselves, and projection sees to them without
+    quasi-velocities.
+    """
+    quasi = dynamics.quasi
+    if quasi is None or quasi.U is not None or not dynamics.rows.size:
+        return jnp.array(True), jnp.full((), -1, jnp.int32)
+    ts, q, v, params = still((ts, q, v, params))
+    rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
+    A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
+    first = _sizes(dynamics, ts[0], q[0], v[0], params).size
+    unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
+    speed = 1.0 + jnp.max(jnp.abs(v), axis=1)[:, None]
+    off = jnp.abs(rates) / unit / speed / dependence_floor(q.dtype)
+    off = jnp.max(jnp.where(jnp.isfinite(off), off, 0.0), axis=0)
+    return jnp.all(off <= 1.0), jnp.argmax(off).astype(jnp.int32)
+
+
+def _consistency(off: Array, bad: Array, near: Array, phi: Array, rate: Array) -> Consistency:
+    contradictory = jnp.any(bad > 1.0)
+    row = jnp.where(contradictory, jnp.argmax(bad), jnp.argmax(off))
+    # Residuals that are not finite are another fault.
+    ok = (near & ~contradictory) | ~jnp.all(jnp.isfinite(phi) & jnp.isfinite(rate))
+    row = jnp.where(ok, -1, row).astype(jnp.int32)
+    return Consistency(ok, contradictory, row, jnp.array(True))

@@ -1,0 +1,117 @@
+"""What a loop of steps carries from turn to turn, and its record on the way."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxlag._core._buffer_entries import put
+from jaxlag._integration._change_points import Crossing
+from jaxlag._integration._record import Times
+from jaxlag._integration._stepper import Scheme
+
+
+class Place(NamedTuple):
+    """Where a step starts."""
+
+    t: Array
+    y: PyTree
+    memory: Any  # the solver's own state
+    jump: Array | None  # whether the field jumps there; None where nothing ever does
+    determinants: Array | None  # see `Scheme.determinants`
+    crossing: Crossing | None  # what is known of change points; None where none are passed
+
+
+class Rows(NamedTuple):
+    """Rows between the first and the last."""
+
+    base: Place  # where the last accepted step started
+    turn: Array  # that took it
+    next: Array  # index of the row that is due next
+    values: PyTree  # one more for what is not kept
+    turns: Array | None  # `Record.row_turn`
+    reaches: Array | None  # `Record.row_reach`
+    missed: Array
+
+
+class Kept(NamedTuple):
+    """The record on the way."""
+
+    offsets: Array
+    anchors: Array | None
+    jumps: Array | None
+    points: PyTree | None
+    stride: Array
+
+
+class Carry(NamedTuple):
+    at: Place
+    h: Array
+    control: Any  # the controller's own state
+    mark: Array  # number of marks of the fixed grid passed
+    anchor: Array
+    status: Array
+    done: Array
+    tried: Array
+    accepted: Array
+    attempted: Array
+    turn: Array  # number of those in which any lane took a step
+    rows: Rows | None
+    kept: Kept | None
+    reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
+
+
+class Loop(NamedTuple):
+    """What stays the same from turn to turn."""
+
+    scheme: Scheme
+    args: Any
+    times: Times
+    anchors: Array
+    dues: Array
+    dt: Array
+    max_steps: int
+
+
+def select(pick: Array, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(pick, a, b) if eqx.is_array_like(a) else a, new, old)
+
+
+def buffer(size: Any, like: PyTree, fill: float | int) -> PyTree:
+    return jax.tree.map(lambda x: jnp.full((size, *jnp.shape(x)), fill, jnp.result_type(x)), like)
+
+
+def is_full(c: Any, room: int) -> Array:
+    """Whether there is no room for the point that the next step starts from."""
+    return (c.turn >= room * c.kept.stride) & ~c.done
+
+
+def thinned(c: Any, room: int) -> Any:
+    """Every other point dropped, if they are full."""
+
+    def halved(leaf: Array) -> Array:
+        return leaf.at[: room // 2].set(leaf[:room:2])
+
+    def thin(kept: Any) -> Any:
+        return kept._replace(points=jax.tree.map(halved, kept.points), stride=2 * kept.stride)
+
+    return c._replace(kept=jax.lax.cond(is_full(c, room), thin, lambda kept: kept, c.kept))
+
+
+def written(loop: Loop, c: Carry, kept: Kept, t: Array, anchor: Array) -> Kept:
+    """The record with this turn."""
+    anchors, jumps, points = kept.anchors, kept.jumps, kept.points
+    if anchors is None:
+        offset = jnp.where(anchor == 1, -1.0, t)
+    else:
+        anchors = put(anchors, c.turn, anchor)
+        offset = t - loop.anchors[anchor]
+    offsets = put(kept.offsets, c.turn, offset)
+    jumps = None if jumps is None else put(jumps, c.turn, c.at.jump)
+    if points is not None:
+        spare = jax.tree.leaves(points)[0].shape[0] - 1
+        slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
+        points = put(points, slot, (c.at.y, None))
+    return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)

@@ -1,0 +1,234 @@
+"""What becomes of a state at the end of a step: constraints, contacts and what slides."""
+
+from functools import reduce
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxlag._core._arrays import still
+from jaxlag._integration._change_points import LOST, SHORT, lengths_of, unknown_below
+from jaxlag._integration._step_arguments import Arguments, Verdict
+from jaxlag._integration._vector_field import Dynamics
+from jaxlag._linalg._mass_solve import closed_to
+from jaxlag._linalg._projection import Surface, project, tangential
+from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
+from jaxlag._model._forces import reads_lam, sliding
+
+
+class Settling(eqx.Module):
+    """Moves the end of a step onto the constraints, and looks whether what was assumed holds.
+
+    Attributes:
+        dynamics: what moves.
+    """
+
+    dynamics: Dynamics
+
+    @property
+    def _slides(self) -> tuple[Any, ...]:
+        """Velocities of contact points that must not change their sign."""
+        return sliding(self.dynamics.system.forces)
+
+    @property
+    def _contacts(self) -> list[int]:
+        """Rows whose multipliers must not become negative."""
+        names = {f.contact for f in filter(reads_lam, self.dynamics.system.forces)}
+        rows, start = [], 0
+        for name, shape in self.dynamics.rows.shapes:
+            stop = start + int(np.prod(shape))
+            rows += range(start, stop) if name in names else ()
+            start = stop
+        return rows
+
+    @property
+    def contact_row(self) -> int:
+        """The first row that friction depends on, as far as it is declared; else row 0."""
+        return self._contacts[0] if self._contacts else 0
+
+    @property
+    def settles(self) -> bool:
+        """Whether a step's end is moved, or looked at beyond its being finite."""
+        if self.dynamics.quasi is not None:
+            return self.dynamics.projects
+        chosen = self.dynamics.rows.chooses  # then some may have been left out
+        return self.dynamics.projects or chosen or bool(self._contacts) or bool(self._slides)
+
+    def __call__(
+        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
+    ) -> tuple[Array, Verdict]:
+        """The state at the end of a step as it is kept, and what is to be said about it."""
+        true = jnp.array(True)
+        verdict = Verdict(true, true, true)
+        if self.dynamics.projects:
+            y, verdict = self.project(tau, y, args, differentiable)
+        elif args.rows is not None:
+
+            def look() -> Array:
+                surface = self.dynamics.surface(*still((tau, y, args)))
+                return self._closed(surface, *self.dynamics.parts(still(y)), args)
+
+            one = self.dynamics.rows.size == 1
+            hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
+            verdict = Verdict(true, hold, true)
+        return y, verdict._replace(pressed=self.pressed(tau, y, args))
+
+    def pressed(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
+        """Whether contacts press and slide as their friction takes them to."""
+        if not self._contacts and not self._slides:
+            return jnp.array(True)
+        tau, y, args = still((tau, y, args))
+        t, q, v, params, values = self.dynamics.at(tau, y, args)
+        right, terms = [], self.dynamics.terms
+        if self._contacts:
+            if isinstance(args.prepared, ScalarPrepared) and isinstance(terms, ScalarTerms):
+                lam = terms.multipliers(t, q, v, params, values, args.prepared)
+            else:
+                array, prepared = self.dynamics.array, args.prepared
+                assert isinstance(prepared, Prepared)
+                lam = array.multipliers(t, q, v, params, values, prepared, args.reacting)
+            right += [lam[row] >= 0 for row in self._contacts]
+        for k, slide in enumerate(self._slides):
+            assert args.senses is not None
+            right.append(slide(t, q, v, params) * args.senses[k] > 0)
+        return jnp.all(jnp.stack(right))
+
+    def project(
+        self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
+    ) -> tuple[Array, Verdict]:
+        """The state on the constraints nearest to y, and what is to be said about it."""
+        return self._projected(self._near(tau, y, args, differentiable), y, args)
+
+    def with_error(
+        self, tau: Array, y: Array, args: Arguments, error: Array, near: Bool[Array, ""]
+    ) -> tuple[Array, Verdict, Array]:
+        """The same as a call, and the error of the state that is kept.
+
+        It is another near change points alone: elsewhere errors across the rows, which the
+        projection removes, are as small as those along them.
+
+        Args:
+            tau: time.
+            y: state at the end of a step.
+            args: arguments of the step.
+            error: estimate for y.
+            near: whether the step starts near such a place.
+        """
+        around = self._near(tau, y, args)
+        y, verdict = self._projected(around, y, args)
+        assert verdict.apart is not None
+
+        def left() -> Array:
+            parts = self.dynamics.parts
+            return self._joined(*tangential(around.surface, *parts(y), *parts(error)), error)
+
+        error = jax.lax.cond(near | (verdict.apart < SHORT), left, lambda: error)
+        return y, verdict._replace(pressed=self.pressed(tau, y, args)), error
+
+    def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
+        """A state within a step moved towards the constraints, by one turn of Newton's method.
+
+        Its matrix has no derivative: whatever it is, a motion on the constraints stays where it is,
+        with all of its derivatives.
+
+        Args:
+            tau: time of the stage.
+            y: its state.
+            args: arguments of the step.
+            refuses: whether it is NaN at a change point, so that the step is not taken. It is to be
+                where no estimate tells that the step is off.
+        """
+        around = self._near(*still((tau, y, args)))
+        near, apart = around.surface, around.apart
+        assert apart is not None
+        surface = self.dynamics.surface(tau, y, args)
+        (q, v), velocity, kick = self.dynamics.parts(y), surface.velocity, near.kick
+        if surface.position is not None:
+            q = q - near.shift(surface.position(q))
+        assert velocity is not None
+        assert kick is not None
+        moved = self._joined(q, v - kick(velocity(q, v)), y)
+        return jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan) if refuses else moved
+
+    def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
+        """The least length of a row over its length at the start of the motion."""
+        found = self._near(*still((tau, y, args))).apart
+        assert found is not None
+        return found
+
+    def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, Verdict]:
+        q, v, found = project(near.surface, *self.dynamics.parts(y), near.frozen)
+        closed = self._closed(near.surface, q, v, args)
+        return self._joined(q, v, y), Verdict(
+            found, closed, jnp.array(True), near.apart, near.surface.columns
+        )
+
+    def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
+        """The constraints near a state, without rows that all but depend on one another."""
+        surface, frozen = self.dynamics.surface(tau, y, args), None
+        if differentiable:
+            frozen = self.dynamics.surface(*still((tau, y, args)))
+        if args.lengths is None:
+            return _Near(surface, frozen, None)
+        masses = (surface if frozen is None else frozen).masses
+        assert masses is not None
+        lengths = lengths_of(masses, args.kept)
+        alone, own = lengths > LOST * args.lengths, np.flatnonzero(self.dynamics.rows.holonomic)
+
+        def without(surface: Surface) -> Surface:
+            shift, kick = surface.shift, surface.kick
+            assert kick is not None
+            return surface._replace(
+                shift=lambda c: shift(jnp.where(alone[own], c, 0.0)),
+                kick=lambda c: kick(jnp.where(alone, c, 0.0)),
+            )
+
+        frozen = None if frozen is None else without(frozen)
+        return _Near(without(surface), frozen, jnp.min(lengths / args.lengths))
+
+    def _joined(self, q: Array, v: Array, y: Array) -> Array:
+        """The state y with other coordinates and velocities."""
+        return jnp.concatenate([q, v, y[self.dynamics.system.size + self.dynamics.speeds :]])
+
+    def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
+        """Whether rows that were left out hold as well.
+
+        Where nothing holds the others, these may drift as they do.
+        """
+        if args.rows is None:
+            return jnp.array(True)
+        kept, size = args.rows.kept, args.rows.size
+        holonomic = np.flatnonzero(self.dynamics.rows.holonomic).tolist()
+        floor = closed_to(q.dtype)
+
+        def holds(c: Array, x: Array, rows: list[int]) -> Array:
+            largest = jnp.max(jnp.abs(x))
+            off = [jnp.abs(c[i]) / size[row] for i, row in enumerate(rows)]
+            drift = [jnp.where(kept[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
+            allowed = floor * (1.0 + largest) + 100.0 * reduce(jnp.maximum, drift)
+            found = [kept[row] | (x <= allowed) for row, x in zip(rows, off, strict=True)]
+            return jnp.all(jnp.stack(found))
+
+        closed = jnp.array(True)
+        if surface.velocity is not None:
+            closed = holds(surface.velocity(q, v), v, list(range(self.dynamics.rows.size)))
+        if surface.position is not None:
+            closed = closed & holds(surface.position(q), q, holonomic)
+        return closed
+
+
+class _Near(NamedTuple):
+    """The constraints near a state, and how far apart they are there.
+
+    Attributes:
+        surface: the constraints.
+        frozen: the same without derivatives; None where none are taken.
+        apart: see `_change_points.Crossing`; None where nobody asks.
+    """
+
+    surface: Surface
+    frozen: Surface | None
+    apart: Array | None

@@ -1,0 +1,77 @@
+"""The vector field as diffrax takes it."""
+
+from dataclasses import replace
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag._integration._canonical import Canonical
+from jaxlag._integration._step_arguments import Arguments
+from jaxlag._integration._vector_field import Dynamics
+
+
+class Term(diffrax.ODETerm):
+    """A vector field whose increments keep the state's dtype where time has another.
+
+    Attributes:
+        dynamics: what it is the vector field of.
+        lines: of the scalar program for the accelerations; None where there is none.
+        dtype: of the state.
+    """
+
+    dynamics: Dynamics
+    lines: int | None = eqx.field(static=True)
+    dtype: Any = eqx.field(static=True)
+
+    def compiled_for(self, lanes: bool, in_loop: bool) -> "Term":
+        """The same, written for where it is going to be evaluated, as told to `Dynamics`."""
+        dynamics = replace(self.dynamics, lanes=lanes, in_loop=in_loop)
+        field: Any = dynamics.__call__
+        return Term(field, dynamics, self.lines, self.dtype)
+
+    @property
+    def works(self) -> bool:
+        """Whether the state has work besides q and v."""
+        return self.dynamics.power is not None and bool(self.dynamics.power.names)
+
+    @property
+    def in_lanes(self) -> bool:
+        """Whether it is written to be vmapped over a few trajectories."""
+        return self.dynamics.lanes
+
+    @property
+    def second_order(self) -> bool:
+        """Whether the state is (q, v): dq/dtau = sigma v, dv/dtau = sigma a."""
+        return self.dynamics.quasi is None and not self.works
+
+    def turned(self, x: Any, args: Arguments) -> Any:
+        """Sigma x, of a tree."""
+        return jax.tree.map(lambda x: self.dynamics.turned(x, args), x)
+
+    def sections(self, y: Any) -> tuple[Any, Any, Any]:
+        """(q, v, work) of a state or of its rates."""
+        n, rest = self.dynamics.system.size, self.dynamics.system.size + self.dynamics.speeds
+        return y[:n], y[n:rest], y[rest:]
+
+    def canonical(self, args: Arguments) -> Canonical:
+        """Momenta and forces within a step."""
+        return Canonical(self.dynamics, args)
+
+    def joined(self, q: Any, v: Any, work: Any) -> Any:
+        """The inverse of `sections`."""
+        return jnp.concatenate([q, v, work])
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return (t1 - t0).astype(self.dtype)
+
+
+def term_of(
+    dynamics: Dynamics, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+) -> Term:
+    """The vector field of `dynamics`, for states and arguments like these."""
+    field: Any = dynamics.__call__
+    return Term(field, dynamics, dynamics.lines(tau, y, args), y.dtype)

@@ -1,0 +1,423 @@
+"""The equations of motion in first-order form, as solvers see them."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._core._arrays import still
+from jaxlag._core._errors import bad
+from jaxlag._integration._step_arguments import Arguments, Gaps, RowChoice
+from jaxlag._linalg._independent_rows import Choice, independent_rows, row_sizes
+from jaxlag._linalg._mass_solve import clearly_definite
+from jaxlag._linalg._projection import Surface
+from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
+from jaxlag._lowering._terms import Terms
+from jaxlag._model._constraints import NO_ROWS, Baumgarte, Layout
+from jaxlag._model._forces import sliding
+from jaxlag._model._inputs import (
+    all_knots,
+    at_interval,
+    counted_from,
+    evaluate,
+    marked,
+    reads_state,
+)
+from jaxlag._model._quasi_velocities import QuasiVelocities
+from jaxlag._system._power import Power
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+
+
+class Dynamics(eqx.Module):
+    """dy/dtau = sigma (v, a), y = (q, v), M a + h = Q + A^T lam, A a + gamma = 0.
+
+    tau = sigma (t - t0) with t0 the start and sigma the direction of time.
+
+    In the quasi-velocity formulation y = (q, w) and dy/dtau = sigma (v, w') with w the free
+    quasi-velocities. Where work is asked for, y has one more component for each term of dH/dt.
+
+    Attributes:
+        system: what moves.
+        params: static half of the params.
+        inputs: static half of the inputs.
+        direction: sigma, +1 or -1, where known while tracing; else None.
+        power: terms of dH/dt to integrate along; None for none.
+        sample: values of the params, where known.
+        lanes: whether all this is vmapped, so that elements are rows of numbers.
+        in_loop: whether it is evaluated in a loop over one trajectory or a few lanes.
+        rows: the constraint rows.
+        formulation: how accelerations are solved for under constraints; "quasi" for a state of
+            quasi-velocities.
+        stabilization: "projection", a `Baumgarte`, or None.
+        regular: whether M is positive definite without the constraints; None where that shows at
+            the start of a solve alone.
+        apart: whether rows whose multipliers forces read are known to be independent.
+        onwards: whether the method has stages beyond the end of a step.
+        crossing: whether rows that come to depend on others on the way are left out there.
+    """
+
+    system: System
+    params: _params.Static = eqx.field(static=True)
+    inputs: _params.Static = eqx.field(static=True)
+    direction: int | None = eqx.field(static=True)
+    power: Power | None
+    sample: _params.Sample = eqx.field(static=True)
+    lanes: bool = eqx.field(static=True, default=False)
+    in_loop: bool = eqx.field(static=True, default=False)
+    rows: Layout = eqx.field(static=True, default=NO_ROWS)
+    formulation: str = eqx.field(static=True, default="multipliers")
+    stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
+    regular: bool | None = eqx.field(static=True, default=False)
+    apart: bool = eqx.field(static=True, default=False)
+    onwards: bool = eqx.field(static=True, default=False)
+    crossing: bool = eqx.field(static=True, default=False)
+
+    @property
+    def terms(self) -> Terms:
+        """The lowered terms of the system."""
+        terms = self.system.terms
+        if isinstance(terms, ScalarTerms):
+            array = self._solved(terms.array)
+            return replace(terms, array=array, lanes=self.lanes, in_loop=self.in_loop)
+        assert isinstance(terms, ArrayTerms)
+        return self._solved(terms)
+
+    @property
+    def array(self) -> ArrayTerms:
+        """The array program."""
+        terms = self.terms
+        array = terms.array if isinstance(terms, ScalarTerms) else terms
+        assert isinstance(array, ArrayTerms)
+        return array
+
+    @property
+    def quasi(self) -> QuasiVelocities | None:
+        """The quasi-velocities that the state is made of, if any."""
+        return self.system.quasi if self.formulation == "quasi" else None
+
+    @property
+    def speeds(self) -> int:
+        """Number of velocities, or of quasi-velocities, in the state."""
+        return self.system.size if self.quasi is None else len(self.quasi.free)
+
+    def _solved(self, terms: ArrayTerms) -> ArrayTerms:
+        """The terms with constraints solved for as asked."""
+        if self.quasi is not None:
+            in_u = self.system.in_u
+            return replace(terms, quasi=self.quasi, in_u=in_u, regular=bool(self.regular))
+        if not self.rows.size:
+            return terms
+        baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
+        known = {"regular": bool(self.regular), "apart": self.apart, "crossing": self.crossing}
+        return replace(terms, formulation=self.formulation, baumgarte=baumgarte, **known)
+
+    @property
+    def projects(self) -> bool:
+        """Whether states are projected onto constraints."""
+        rows = self.rows.size if self.quasi is None else sum(self.rows.holonomic)
+        return rows > 0 and self.stabilization == "projection"
+
+    def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
+        """Arguments outside any step, from the traced halves of params and inputs."""
+        sigma = None
+        if self.direction is None:
+            sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
+        args = Arguments(params, inputs, sigma, ts[0], ts[-1], None, None)
+        knots = all_knots(eqx.combine(inputs, self.inputs.tree))
+        if knots is None:
+            return args
+        # They say which rows are read, and no derivative passes through that.
+        knots = jnp.sort(jax.lax.stop_gradient(knots.astype(ts.dtype)))
+        never = jnp.full((1,), jnp.finfo(ts.dtype).min, ts.dtype)
+        ahead = Gaps(self.tau(knots, args), jnp.concatenate([never, knots]))
+        back = Gaps(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
+        onwards = self.turned(jnp.ones_like(ts[0]), args) > 0
+        gaps = jax.tree.map(partial(jnp.where, onwards), ahead, back)
+        return args._replace(gaps=still(gaps))
+
+    def _traced(self, inputs: Any) -> Any:
+        return eqx.filter(inputs, _params.is_array)
+
+    def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
+        """The arguments with all that accelerations need of what depends on params alone."""
+        t, q, v, params, values = self.at(tau, y, args)
+        args = args._replace(rows=self._choice(t, q, v, params, values))
+        if slides := sliding(self.system.forces):
+            speeds = [slide(t, q, v, params) for slide in slides]
+            senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
+            args = args._replace(senses=jax.lax.stop_gradient(senses))
+        sense = self.turned(jnp.ones_like(tau), args)
+        rows = args.kept, args.reacting
+        given = q, params, values, self.sample, *rows, sense
+        prepared = self.terms.prepare(*given)
+        either = self.regular is None and self.formulation != "null_space"
+        if either and isinstance(prepared, ScalarPrepared):
+            terms = self.terms
+            assert isinstance(terms, ScalarTerms)
+            alone = terms.regular().prepare(*given)
+            if isinstance(alone, ScalarPrepared):
+                definite = self._definite(t, q, v, params)
+                prepared = prepared._replace(definite=definite, alone=alone)
+        return args._replace(prepared=prepared)
+
+    def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
+        """Whether M is positive definite without the constraints, in all lanes.
+
+        Looked at as by `System.mass_regular`; a lane without values is none to be careful for.
+        """
+        t, q, v, params = still((t, q, v, params))
+        elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
+        found = []
+        for at, rates in ((q, v), tuple(jnp.asarray(elsewhere, q.dtype))):
+            M = self.terms.mass(t, at, rates, params)
+            found.append(clearly_definite(M) | ~jnp.all(jnp.isfinite(M)))
+        return eqxi.unvmap_all(jnp.stack(found))
+
+    def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
+        """The rows to solve with; None where that is no question."""
+        if not self.rows.chooses or (self.quasi is not None and not self.projects):
+            return None
+        t, q, v, params, values = still((t, q, v, params, values))
+        M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
+        sure = all(self.rows.sure)
+        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
+        if self.rows.size == 1:  # one that vanishes here alone is not to be done without
+            return RowChoice(~void, size, void, Choice(~void, ~void))
+        velocity = np.array(self.rows.velocity)
+        unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
+        # Where multipliers are read, what is left out is told by those that are kept.
+        reads = not np.all(unread)
+        kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
+        if not np.any(velocity & ~unread):  # then those that are read come first already
+            return RowChoice(kept, size, void, Choice(kept, there))
+        if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
+            label = self.rows.labels[int(np.argmax(velocity & ~unread))]
+            raise bad(
+                "project",
+                "be True where forces read multipliers of Pfaffian rows beside holonomic ones, "
+                "whose phi would not be damped if they follow from these",
+                f"it was {self.stabilization!r}, and a force reads {label!r}",
+            )
+        reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
+        return RowChoice(kept, size, void, Choice(reacting, there))
+
+    def clock(self, tau: Array, args: Arguments) -> Array:
+        """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
+        t, end = args.origin + self.turned(tau, args), args.end
+        if self.direction is not None:
+            bounded = (jnp.minimum if self.direction == 1 else jnp.maximum)(t, end)
+        else:
+            bounded = jnp.clip(t, *(f(args.origin, end) for f in (jnp.minimum, jnp.maximum)))
+        if not self.onwards:
+            return bounded
+        rounding = 4 * jnp.finfo(t.dtype).eps * (jnp.abs(args.origin) + jnp.abs(end))
+        return jnp.where(jnp.abs(t - end) > rounding, t, bounded)
+
+    def tau(self, t: Array, args: Arguments) -> Array:
+        """Tau = sigma (t - t0)."""
+        return self.turned(t - args.origin, args)
+
+    def turned(self, x: Array, args: Arguments) -> Array:
+        """Sigma x."""
+        if self.direction == 1:
+            return x
+        return -x if args.sigma is None else x * args.sigma.astype(x.dtype)
+
+    def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
+        """(params, inputs) as the user passed them; within a step of each table two rows."""
+        return (
+            _params.join(args.params, self.params.tree),
+            eqx.combine(args.inputs, self.inputs.tree),
+        )
+
+    def within(self, args: Arguments, tau: Float[Array, ""]) -> Arguments:
+        """Arguments for a step that starts at tau: of every table the rows of one interval."""
+        return self.windows(args, tau)[0]
+
+    def windows(
+        self, args: Arguments, tau: Float[Array, ""]
+    ) -> tuple[Arguments, list[Array | None]]:
+        """The same, and for each leaf of the arguments where its rows start, None for all."""
+        _, inputs = self.given(args)
+        starts: dict[str, Array] = {}
+        located = args
+        if args.gaps is not None and args.gaps.knots.size:
+            gap = jnp.searchsorted(args.gaps.knots, tau, side="right")
+            inputs, starts = at_interval(inputs, args.gaps.lower[gap])
+            none = Gaps(args.gaps.knots[:0], args.gaps.lower[:0])
+            located = args._replace(inputs=self._traced(inputs), gaps=none)
+
+        nowhere = jax.tree.map(lambda _: None, args)
+        here = {name: marked(args.inputs[name], start) for name, start in starts.items()}
+        marks = nowhere._replace(inputs=nowhere.inputs | here)
+        return located, jax.tree.leaves(marks, is_leaf=lambda x: x is None)
+
+    def acceleration(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, " n"]:
+        """Acceleration a, or w' of quasi-velocities, at (tau, y)."""
+        if self.quasi is not None:
+            return self._quasi_rates(tau, y, args)[self.system.size :]
+        t, q, v, params, values = self.at(tau, y, args)
+        return self.terms.acceleration(t, q, v, params, values, args.prepared, args.reacting)
+
+    def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
+        """(v, w') of a state of quasi-velocities."""
+        terms, (q, w) = self.terms, self.parts(y)
+        if isinstance(terms, ScalarTerms):
+            if isinstance(args.prepared, ScalarPrepared):
+                t, (params, _) = self.clock(tau, args), self.given(args)
+                values = self._values(tau, q, w, args)
+                return terms.rates(t, q, w, params, values, args.prepared)
+            terms = terms.array
+        assert isinstance(terms, ArrayTerms)
+        t, q, _, params, values = self.at(tau, y, args)
+        moving = Moving(terms, t, q, w, params, values)
+        return jnp.concatenate([moving.v, moving.accelerations()])
+
+    def effort(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, " n"]:
+        """Q - h at (tau, y): what M a is equal to."""
+        t, q, v, params, values = self.at(tau, y, args)
+        terms = self.terms
+        return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
+
+    def state_of(self, t: Array, q: Array, v: Array, params: Any) -> Array:
+        """The state of a motion in terms of (q, v), no work done yet."""
+        w = v if self.quasi is None else self.quasi.of(t, q, v, params)[self.quasi.free]
+        return self.start(q, w)
+
+    def state(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any]:
+        """(t, q, v, params) at (tau, y)."""
+        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
+        return t, q, self.velocities(t, q, w, params), params
+
+    def velocities(self, t: Array, q: Array, w: Array, params: Any) -> Array:
+        """The velocities of a state."""
+        if self.quasi is None:
+            return w
+        return self.quasi.velocities(t, q, self.quasi.full(w), params)
+
+    def velocities_of(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
+        """The same, by the scalar program where there is one."""
+        if self.quasi is None or not isinstance(args.prepared, ScalarPrepared):
+            return self.velocities(t, q, w, self.given(args)[0])
+        return self._by_program(t, q, w, args)
+
+    def _by_program(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
+        """Velocities of a state of quasi-velocities, which no input changes."""
+        terms, (params, _) = self.terms, self.given(args)
+        assert isinstance(terms, ScalarTerms)
+        values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
+        return terms.velocities(t, q, w, params, values, args.prepared)
+
+    def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
+        """(t, q, v, params, values of the inputs) at (tau, y)."""
+        t, q, v, params = self.state(tau, y, args)
+        return t, q, v, params, self.inputs_at(tau, q, v, args)
+
+    def inputs_at(self, tau: Array, q: Array, v: Array, args: Arguments) -> Any:
+        """Values of the inputs within a step; else in the interval that starts at tau."""
+        args = self.within(args, tau)
+        (params, inputs), since = self.given(args), self.turned(tau, args)
+        first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
+        return evaluate(inputs, self.clock(tau, args), q, v, params, first, since, self.onwards)
+
+    def mass(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, "n n"]:
+        """M at (tau, y)."""
+        return self.terms.mass(*self.state(tau, y, args))
+
+    def __call__(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Float[Array, " m"]:
+        """dy/dtau."""
+        if self.quasi is not None:
+            rates = [self._quasi_rates(tau, y, args)]
+        else:
+            rates = [self.parts(y)[1], self.acceleration(tau, y, args)]
+        if self.power is not None and self.power.names:
+            t, q, v, params, values = self.at(tau, y, args)
+            rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
+        return self.turned(jnp.concatenate(rates), args)
+
+    def surface(self, tau: Array, y: Array, args: Arguments) -> Surface:
+        """The constraints near a predicted state."""
+        t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
+        params, _ = self.given(args)
+        if isinstance(args.prepared, ScalarPrepared):
+            assert isinstance(terms, ScalarTerms)
+            values = self._values(tau, q, v, args)
+            return terms.surface(t, q, v, params, values, args.prepared)
+        v = self.velocities(t, q, v, params)
+        holonomic = np.flatnonzero(self.rows.holonomic).tolist()
+
+        def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
+            return self.array.corrections(t, q, v, params, args.prepared, args.kept, chosen)
+
+        def position(q: Array) -> Array:
+            return terms.position(t, q, params)
+
+        if self.quasi is not None:
+            near, _ = corrections(holonomic)
+            return Surface(position, None, lambda c: near @ c, None)
+        K, masses = corrections(None)
+        K_of_position = K
+        if 0 < len(holonomic) < self.rows.size:
+            K_of_position, _ = corrections(holonomic)
+        return Surface(
+            position if holonomic else None,
+            lambda q, v: terms.velocity(t, q, v, params),
+            lambda c: K_of_position @ c,
+            lambda c: K @ c,
+            K.T,
+            masses,
+        )
+
+    def _values(self, tau: Array, q: Array, w: Array, args: Arguments) -> Any:
+        """Values of the inputs at a state."""
+        if self.quasi is None:
+            v = w
+        elif reads_state(self.given(args)[1]):
+            v = self._by_program(self.clock(tau, args), q, w, args)
+        else:
+            v = jnp.zeros_like(q)
+        return self.inputs_at(tau, q, v, args)
+
+    def parts(self, y: Any) -> tuple[Any, Any]:
+        """(q, v), or (q, w), of y, (..., m)."""
+        n, rest = self.system.size, self.system.size + self.speeds
+        return y[..., :n], y[..., n:rest]
+
+    def start(self, q0: Float[Array, " n"], w0: Float[Array, " k"]) -> Float[Array, " m"]:
+        """y at the start, no work done yet."""
+        terms = 0 if self.power is None else len(self.power.names)
+        return jnp.concatenate([q0, w0, jnp.zeros((terms,), q0.dtype)])
+
+    def idle(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
+        """y without the work done."""
+        return y[..., : self.system.size + self.speeds]
+
+    def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
+        """Work done since the start by every term of dH/dt, by name."""
+        assert self.power is not None
+        columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
+        return dict(zip(self.power.names, columns, strict=True))
+
+    def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
+        """Lines of the scalar program for states and arguments like these, where there is one."""
+        _, q, _, params, values = self.at(tau, y, args)
+        terms = self.terms
+        if not isinstance(terms, ScalarTerms) or self.power is not None:
+            return None
+        equations = terms.lowered(q, params, values).equations
+        return None if equations is None else len(equations.program.body)

@@ -1,0 +1,1 @@
+"""Linear algebra of mechanics: the mass matrix, constraint rows, projections."""

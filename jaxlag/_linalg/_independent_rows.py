@@ -1,0 +1,307 @@
+"""Which constraint rows are independent, and how rows that are not share what they exert."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._linalg._kkt import augmented
+from jaxlag._linalg._mass_solve import eliminate, factor_mass, rank_floor
+from jaxlag._linalg._rounding_bounds import with_rounding, with_scatter
+
+ROUNDINGS = 16
+"""Of what a row is made of: if that is all of it, it is none."""
+
+ALIKE = 0.01
+"""Pivots above this part of the largest one are as good as it."""
+
+
+class Choice(NamedTuple):
+    """Rows to solve with.
+
+    Attributes:
+        kept: a largest set of independent ones; the others follow from them.
+        there: those that are more than rounding.
+    """
+
+    kept: Bool[Array, " m"]
+    there: Bool[Array, " m"]
+
+
+class Sizes(NamedTuple):
+    """How large rows are.
+
+    Attributes:
+        there: those that are more than rounding.
+        void: those that are rounding here and nearby: 0 = 0, whatever the motion.
+        size: their lengths; of those that are rounding how fast they grow, or what they are made
+            of if that is more.
+    """
+
+    there: Bool[Array, " m"]
+    void: Bool[Array, " m"]
+    size: Float[Array, " m"]
+
+
+def row_sizes(
+    rows: Callable[[Array], Array],
+    q: Float[Array, " n"],
+    A: Float[Array, "m n"],
+    sure: bool = False,
+) -> Sizes:
+    """Which rows are more than rounding, and how large.
+
+    At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever: what
+    a few roundings of the coordinates, and of all that is computed from them, change.
+
+    Args:
+        rows: A as a function of q.
+        q: coordinates.
+        A: rows(q).
+        sure: whether none is known to be void, so that roundings of the coordinates tell enough.
+    """
+    eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
+    small = eps**0.25
+    signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
+    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q[None] + small * signs]))
+    if sure:
+        places = jnp.concatenate([places, q[None] + ROUNDINGS * eps * signs * jnp.abs(places[:1])])
+        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A)[None])
+        growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
+        norms = _lengths(A)
+        there = (norms != 0) & ~(norms <= rounding)
+        size = jnp.where(there, norms, growth)
+        return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
+    found, rounding = jax.vmap(partial(with_rounding, rows))(places)
+    rounding, norms = _lengths(rounding), _lengths(A)
+    growth = _lengths(found[1:] - jax.lax.stop_gradient(A)[None])
+    # What is not known, as derivatives beside the end of a domain, speaks for the row.
+    there = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
+    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
+    made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
+    size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
+    return Sizes(there, void, jnp.where(size > 0, size, 1.0))
+
+
+def without_rounding(
+    residuals: Callable[..., tuple[Array, ...]],
+    void: Bool[Array, " m"],
+    size: Float[Array, " m"],
+    *args: Array,
+) -> tuple[Array, ...]:
+    """Residuals of rows; of those that are void 0 if they are no more than rounding.
+
+    Of such a row a residual does not depend on the state: what changes beside it is rounding.
+
+    Args:
+        residuals: of all rows, of coordinates and what else they are taken to be functions of.
+        void: rows, see `row_sizes`.
+        size: of the rows.
+        args: coordinates, velocities.
+    """
+    found, scatter = with_scatter(residuals, *args)
+    least = float(jnp.finfo(size.dtype).eps) * size
+    return tuple(
+        jnp.where(void & (jnp.abs(c) <= ROUNDINGS * jnp.maximum(less, least)), 0.0, c)
+        for c, less in zip(found, scatter, strict=True)
+    )
+
+
+def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
+    """Lengths of rows; derivatives of those that vanish are 0. What is not known stays NaN."""
+    square = jnp.sum(A**2, axis=-1)
+    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
+
+
+def rows_hold(
+    A: Float[Array, "m n"],
+    x: Float[Array, " n"],
+    gamma: Callable[..., Array],
+    state: tuple[Array, Array, Array],
+    sizes: Sizes,
+    force: Float[Array, " n"],
+    units: Float[Array, " n"],
+) -> Bool[Array, ""]:
+    """Whether A x + gamma = 0 for all rows, those that were left out included.
+
+    Up to what the angle may be below which a row counts as dependent, in units of the coordinates,
+    and up to the rounding of gamma, of any row, and of the accelerations by forces, from which
+    reactions take x.
+
+    Args:
+        A: rows.
+        x: an acceleration that some of them have been solved for.
+        gamma: of (t, q, v).
+        state: (t, q, v).
+        sizes: of the rows, see `row_sizes`.
+        force: Q - h.
+        units: of the coordinates, in which their inertias are 1.
+    """
+    eps = float(jnp.finfo(A.dtype).eps)
+    c, rounding = with_rounding(gamma, *state)
+    lengths = _lengths(A * units[None])
+    size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
+    scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
+    allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
+    # Whatever rounding x has from the rows that it solves for, the others meet in it.
+    rounding = jnp.nan_to_num(rounding)
+    allowed += ROUNDINGS * jnp.max(jnp.where(sizes.there, rounding / size, 0.0))
+    allowed = allowed * size + ROUNDINGS * rounding
+    return jnp.all(jnp.abs(A @ x + c) <= allowed)
+
+
+def independent_rows(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    turn: Sequence[int] | np.ndarray | None = None,
+    floor: float | None = None,
+    there: Bool[Array, " m"] | None = None,
+    mobile_first: bool = False,
+) -> Bool[Array, " m"]:
+    """A largest set of rows that are independent of one another, found greedily.
+
+    Cholesky with the largest pivot first of A (M + A^T W A)^-1 A^T, rows scaled to 1: a pivot is
+    the squared sine of the angle between a row and those chosen before it. Of equal ones the
+    first is taken.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        turn: for every row, when it is to be taken: before all rows of a higher number; None for
+            all at once.
+        floor: least pivot; by default `rank_floor`.
+        there: rows that are not taken for zero; by default those that are not.
+        mobile_first: of rows whose pivots are much alike take that along which a force of the same
+            size moves most. By it `least_norm` tells well what the others take.
+
+    Source: Golub, Van Loan, Matrix Computations, sec. 4.2.8.
+    """
+    m = A.shape[0]
+    norms = jnp.sqrt(jnp.sum(A**2, axis=1))
+    floor = rank_floor(A.dtype) if floor is None else floor
+    nonzero = norms > 0
+    usable = nonzero if there is None else nonzero & there
+    if m == 1:  # nothing to depend on
+        return usable
+    A = jnp.where(usable[:, None], A, 0.0) / jnp.where(usable, norms, 1.0)[:, None]
+    mass = factor_mass(augmented(M, A)[0])
+    S = A @ jax.vmap(lambda row: eliminate(mass, row))(A).T
+    pivots = jnp.diagonal(S)
+    usable = usable & (pivots > 0)
+    scale = jax.lax.rsqrt(jnp.where(usable, pivots, 1.0))
+    S = scale[:, None] * S * scale[None]
+    turns = np.zeros(m, int) if turn is None else np.asarray(turn, int)
+
+    def choose(_: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
+        S, kept = state
+        left = jnp.where(kept | ~usable, -1.0, jnp.diagonal(S))
+        now = jnp.min(jnp.where(left > floor, turns, np.max(turns, initial=0)))
+        left = jnp.where(turns > now, -1.0, left)
+        if mobile_first:
+            left = jnp.where(left > ALIKE * jnp.max(left), left * pivots, -1.0)
+        k = jnp.argmax(left > 0.999 * jnp.max(left))  # the first of nearly equal ones
+        take = ~kept[k] & usable[k] & (S[k, k] > floor)
+        reduced = S - jnp.outer(S[:, k], S[k]) / jnp.where(take, S[k, k], 1.0)
+        return jnp.where(take, reduced, S), kept.at[k].set(kept[k] | take)
+
+    return jax.lax.fori_loop(0, m, choose, (S, jnp.zeros((m,), bool)))[1]
+
+
+def least_norm(
+    A: Float[Array, "m n"],
+    lam: Float[Array, " m"],
+    kept: Bool[Array, " m"] | None = None,
+    there: Bool[Array, " m"] | None = None,
+    units: Float[Array, " n"] | None = None,
+) -> Float[Array, " m"]:
+    """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
+
+    |A_k lam_k| is the generalized force of row k alone, so that the choice does not depend on
+    how a residual is scaled. Rows are compared in units of the coordinates, for short levers make
+    rows alike that are not: with unit rows a_k there, those that are left out are a_j = C_j a_kept,
+    and what they take, z_j, the kept ones give, mu_kept - C^T z. Of all z the least norm is a
+    problem of least squares; A^T lam stays what it is, however well that is solved. Rows that do
+    not follow from those that are kept have none. Derivatives are those at constant rank of A.
+
+    Args:
+        A: rows.
+        lam: multipliers with that A^T lam.
+        kept: a largest set of independent rows; by default it is looked for.
+        there: rows that are more than rounding, see `row_sizes`; by default those that are not 0.
+        units: of the coordinates, in which rows are compared; by default 1.
+
+    Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
+    """
+    m, n = A.shape
+    if there is not None:
+        A = jnp.where(there[:, None], A, 0.0)
+    if m == 1:
+        return lam if there is None else jnp.where(there, lam, 0.0)
+    units = jnp.ones((n,), A.dtype) if units is None else jax.lax.stop_gradient(units)
+    if kept is None:
+        metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
+        kept = independent_rows(metric, fixed, there=there, mobile_first=True)
+    norms, sizes = _lengths(A), _lengths(A * units[None])
+    norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
+    unit = A * units[None] / sizes[:, None]
+    C = _least_squares(unit.T, unit.T, kept).T
+    apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
+    follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))
+    # What a row has of another by rounding alone may be much to one of smaller weight.
+    rounding = jnp.abs(C) <= ROUNDINGS * float(jnp.finfo(A.dtype).eps)
+    C = C - jax.lax.stop_gradient(jnp.where(rounding, C, 0.0))
+    C = jnp.where(follows[:, None], C, 0.0)
+    mu, weights = sizes * lam, norms / sizes
+    of_kept = jnp.where(kept, mu + mu @ C, 0.0)
+    # Normal equations, in units in which their diagonal is 1: weights may be as unlike as forces
+    # and moments of short levers, and rows of small ones are kept, so that they are no worse.
+    moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
+    lengths = _lengths(moved.T)
+    lengths = jnp.where(lengths > 0, lengths, 1.0)
+    square = (moved.T @ moved) / jnp.outer(lengths, lengths)
+    square = square + jnp.diag((~follows).astype(A.dtype))
+    z = jnp.linalg.solve(square, (weights * of_kept) @ moved / lengths) / lengths
+    found = jnp.where(kept, of_kept - z @ C, z)
+    left = (jnp.where(kept | follows, mu, 0.0) - found) @ unit
+    return (found + _least_squares(unit.T, left[:, None], kept)[:, 0]) / sizes
+
+
+def _least_squares(
+    X: Float[Array, "r m"], Y: Float[Array, "r k"], columns: Bool[Array, " m"]
+) -> Float[Array, "m k"]:
+    """The x that minimise |X x - Y| over these columns of X, 0 in the others; by Q R."""
+    m = X.shape[1]
+    spare = jnp.diag((~columns).astype(X.dtype))
+    Q, R = jnp.linalg.qr(jnp.concatenate([jnp.where(columns, X, 0.0), spare]))
+    right = jnp.concatenate([Y, jnp.zeros((m, Y.shape[1]), Y.dtype)])
+    return jnp.where(columns[:, None], solve_triangular(R, Q.T @ right), 0.0)
+
+
+def shared(
+    A: Float[Array, "m n"],
+    lam: Float[Array, " m"],
+    kept: Bool[Array, " m"],
+    there: Bool[Array, " m"],
+    group: Sequence[bool] | np.ndarray,
+    units: Float[Array, " n"] | None = None,
+) -> Float[Array, " m"]:
+    """The multipliers with those of a group of rows of least norm among themselves.
+
+    Args:
+        A: rows.
+        lam: multipliers with that A^T lam, 0 where rows are not kept.
+        kept: a largest set of independent rows, first of those of the group.
+        there: rows that are more than rounding.
+        group: for every row, whether it belongs to the group.
+        units: of the coordinates, in which rows are compared.
+    """
+    chosen = np.flatnonzero(group)
+    if len(chosen) < 2:
+        return lam
+    found = least_norm(A[chosen], lam[chosen], kept[chosen], there[chosen], units)
+    return lam.at[chosen].set(found)

@@ -1,0 +1,337 @@
+"""Solves with M bordered by constraint rows: M x - A^T lam = r, A x + c = 0.
+
+M may be singular, but is positive definite on the tangent space A x = 0. Rows that depend on
+others are left out by a mask `kept`; their lam is 0.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._linalg._mass_solve import (
+    MassFactor,
+    dependence_floor,
+    eliminate,
+    factor_mass,
+    rank_floor,
+    solve_mass,
+)
+
+FORMULATIONS = ("multipliers", "null_space")
+
+
+class Multipliers(NamedTuple):
+    """M + A^T W A and the Schur complement S = A (M + A^T W A)^-1 A^T, each factored once."""
+
+    mass: MassFactor
+    weights: Float[Array, " m"]
+    spread: Float[Array, "m n"]  # (M + A^T W A)^-1 A^T, transposed
+    schur: MassFactor
+
+    def solve(
+        self, A: Float[Array, "m n"], r: Float[Array, " n"], c: Float[Array, " m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(x, lam); A^T W (A x + c) = 0 is added to the first equation."""
+        free = eliminate(self.mass, r - (self.weights * c) @ A)
+        lam = -eliminate(self.schur, c + A @ free)
+        return free + lam @ self.spread, lam
+
+    @property
+    def healthy(self) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
+        """Pivots of coordinates and of rows that are positive to working precision."""
+        return self.mass.healthy, self.schur.healthy
+
+
+class NullSpace(NamedTuple):
+    """A = L Y with orthonormal rows Y, and P M P + s (1 - P) factored, P = 1 - Y^T Y.
+
+    Acceleration without multipliers: x = P y - Y^T L^-1 c (Siciliano et al., Robotics, sec. 9.4).
+    All in units of coordinates in which their inertias are 1.
+    """
+
+    units: Float[Array, " n"]
+    mass: MassFactor
+    M: Float[Array, "n n"]
+    L: tuple[tuple[Array, ...], ...]
+    Y: Float[Array, "m n"]
+    rows_healthy: Bool[Array, " m"]
+
+    def solve(
+        self, A: Float[Array, "m n"], r: Float[Array, " n"], c: Float[Array, " m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(x, lam)."""
+        M, Y, r = self.M, self.Y, self.units * r
+        given = -(jnp.stack(self._forward(c)) @ Y)
+        y = eliminate(self.mass, self._tangent(r - M @ given))
+        x = given + self._tangent(y)
+        return self.units * x, jnp.stack(self._backward(Y @ (M @ x - r)))
+
+    def _tangent(self, x: Array) -> Array:
+        """P x."""
+        return x - (self.Y @ x) @ self.Y
+
+    def _forward(self, c: Array) -> list[Array]:
+        """L^-1 c."""
+        z: list[Array] = []
+        for k, row in enumerate(self.L):
+            z.append((c[k] - sum(row[j] * z[j] for j in range(k))) / row[k])
+        return z
+
+    def _backward(self, y: Array) -> list[Array]:
+        """L^-T y."""
+        m = len(self.L)
+        z: list[Array] = [jnp.zeros((), y.dtype)] * m
+        for k in reversed(range(m)):
+            known = sum(self.L[j][k] * z[j] for j in range(k + 1, m))
+            z[k] = (y[k] - known) / self.L[k][k]
+        return z
+
+    @property
+    def healthy(self) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
+        """Pivots of coordinates and of rows that are positive to working precision."""
+        return self.mass.healthy, self.rows_healthy
+
+
+Factor = Multipliers | NullSpace
+
+
+def factor_kkt(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    kept: Bool[Array, " m"] | None,
+    formulation: str,
+    crossing: bool = False,
+) -> Factor:
+    """Factor once, for any number of right-hand sides.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        kept: rows to solve with; None for all.
+        formulation: "multipliers" or "null_space".
+        crossing: whether rows that depend on those before them are left out; else they are not
+            healthy.
+    """
+    A = masked(A, kept)
+    if formulation == "null_space":
+        return _null_space(M, A, kept, crossing)
+    bordered, weights = augmented(M, A)
+    mass = factor_mass(bordered)
+    spread = jax.vmap(lambda row: eliminate(mass, row))(A)
+    S = A @ spread.T
+    if kept is not None:
+        S = S + jnp.diag((~kept).astype(S.dtype))
+    return Multipliers(mass, weights, spread, factor_mass(S, rank_floor(S.dtype), crossing))
+
+
+def augmented(
+    M: Float[Array, "n n"], A: Float[Array, "m n"]
+) -> tuple[Float[Array, "n n"], Float[Array, " m"]]:
+    """(M + A^T W A, W): positive definite if M is semidefinite, and definite on A x = 0.
+
+    W is diagonal, 1 / sum_i A_ki^2 / M_ii over the coordinates with inertia: what a row adds is
+    as large as the inertia that it meets, however different inertias are.
+    """
+    inertias = jnp.diagonal(M)
+    there = inertias > 0
+    mobility = jnp.sum(jnp.where(there, A**2 / jnp.where(there, inertias, 1.0)[None], 0.0), axis=1)
+    square = jnp.sum(A**2, axis=1)
+    some = mobility > 0
+    alone = _size(M) / jnp.where(square > 0, square, 1.0)
+    weights = jnp.where(some, 1.0 / jnp.where(some, mobility, 1.0), alone)
+    weights = jnp.where(square > 0, weights, 0.0)
+    return M + (A.T * weights[None]) @ A, weights
+
+
+def _size(M: Array) -> Array:
+    """The trace of M; 1 where there is no inertia at all, as in a motion led throughout."""
+    trace = jnp.trace(M)
+    return jnp.where(trace > 0, trace, jnp.ones_like(trace))
+
+
+def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
+    inertias = jnp.diagonal(M)
+    inertias = jnp.where(inertias > 0, inertias, jnp.diagonal(augmented(M, A)[0]))
+    return jax.lax.rsqrt(jnp.where(inertias > 0, inertias, 1.0))
+
+
+def _null_space(
+    M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, crossing: bool
+) -> NullSpace:
+    """Rows made orthonormal one after the other, each twice (Gram-Schmidt, "twice is enough")."""
+    units = units_of(M, A)
+    M, A = units[:, None] * M * units[None], A * units[None]
+    m, n = A.shape
+    Y = jnp.zeros((m, n), A.dtype)
+    L, healthy = [], []
+    for k in range(m):
+        first = Y @ A[k]
+        rest = A[k] - first @ Y
+        second = Y @ rest
+        rest = rest - second @ Y
+        norm = jnp.sqrt(jnp.sum(rest**2))
+        least = rank_floor(A.dtype) * jnp.sum(A[k] ** 2)
+        if crossing:
+            norm = jnp.where(norm**2 <= least, jnp.inf, norm)
+        fine = norm**2 > least
+        if kept is not None:
+            norm = jnp.where(kept[k], norm, 1.0)
+            fine = fine | ~kept[k]
+        healthy.append(fine)
+        L.append((*(first + second)[:k], norm))
+        Y = Y.at[k].set(rest / norm)
+    P = jnp.eye(n, dtype=M.dtype) - Y.T @ Y
+    size = _size(M) / n
+    mass = factor_mass(P @ M @ P + size * (Y.T @ Y))
+    return NullSpace(units, mass, M, tuple(L), Y, jnp.stack(healthy))
+
+
+def masked(A: Array, kept: Bool[Array, " m"] | None) -> Array:
+    """A, or entries of c, with rows that are not kept set to zero."""
+    if kept is None:
+        return A
+    return jnp.where(kept if A.ndim == 1 else kept[:, None], A, jnp.zeros_like(A))
+
+
+def solve_kkt(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    r: Float[Array, " n"],
+    c: Float[Array, " m"],
+    kept: Bool[Array, " m"] | None = None,
+    formulation: str = "multipliers",
+    factor: Factor | None = None,
+    crossing: bool = False,
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """(x, lam) with M x = r + A^T lam, A x + c = 0; NaN where there is none.
+
+    Derivatives reuse the factor; the set of rows kept is constant under them.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        r: right-hand side.
+        c: right-hand side of the rows.
+        kept: rows to solve with; None for all.
+        formulation: how, "multipliers" or "null_space".
+        factor: `factor_kkt` of the same if it exists already.
+        crossing: as `factor_kkt` takes it.
+    """
+    frozen = jax.lax.stop_gradient((M, A))
+    factor = factor_kkt(*frozen, kept, formulation, crossing) if factor is None else factor
+    factor = jax.lax.stop_gradient(factor)
+    A, c = masked(A, kept), masked(c, kept)
+    rows = jax.lax.stop_gradient(A)
+
+    n = M.shape[0]
+
+    def bordered(z: Array) -> Array:
+        x, lam = z[:n], z[n:]
+        below = -(A @ x)
+        below = below if kept is None else jnp.where(kept, below, -lam)
+        return jnp.concatenate([M @ x - lam @ A, below])
+
+    def solve(_: object, right: Array) -> Array:
+        return jnp.concatenate(factor.solve(rows, right[:n], right[n:]))
+
+    # One vector: pairs meet symbolic zeros that JAX's rule does not take.
+    z = jax.lax.custom_linear_solve(bordered, jnp.concatenate([r, c]), solve, symmetric=True)
+    x, lam = z[:n], z[n:]
+    fine = jnp.all(jnp.concatenate(factor.healthy))
+    return jnp.where(fine, x, jnp.nan), jnp.where(fine, lam, jnp.nan)
+
+
+def solve_reactions(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    r: Float[Array, " n"],
+    push: Callable,
+    c: Float[Array, " m"],
+    kept: Bool[Array, " m"] | None,
+    affine: bool,
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """(x, lam) with M x = r + push(lam) + A^T lam, A x + c = 0; NaN where there is none.
+
+    Newton's method on lam, one step of it where push is affine. Each takes the unsymmetric
+    A (M + A^T W A)^-1 (A^T + d push/d lam), by L U without exchanges: a pivot that is not positive
+    means that reaction forces have turned the sense of rows (Painleve), and that there is no
+    solution, or more than one.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        r: right-hand side.
+        push: lam -> a force, (n,).
+        c: right-hand side of the rows.
+        kept: rows to solve with; None for all.
+        affine: whether push is affine.
+    """
+    A, c = masked(A, kept), masked(c, kept)
+    full, weights = augmented(M, A)
+    factor = factor_mass(jax.lax.stop_gradient(full))
+    frozen = jax.lax.stop_gradient
+    spare = None if kept is None else jnp.diag((~kept).astype(M.dtype))
+
+    def newton(lam: Array) -> tuple[Array, Array, Array]:
+        G = jax.jacfwd(push)(lam)
+        if kept is not None:
+            G = jnp.where(kept, G, 0.0)
+        rest = r + push(lam) - G @ lam - (weights * c) @ A
+        sides = jnp.concatenate([(A.T + G).T, rest[None]])
+        found = jax.vmap(lambda b: solve_mass(full, b, factor))(sides)
+        spread, free = found[:-1], found[-1]
+        S = A @ spread.T
+        if spare is not None:
+            S = S + spare
+        lam, fine = solve_general(S, -(c + A @ free), rank_floor(S.dtype))
+        return free + lam @ spread, lam, fine
+
+    start = jnp.zeros_like(c)
+    if not affine:
+        start = frozen(_iterated(newton, start))
+        start = newton(start)[1]
+    x, lam, fine = newton(start)
+    if not affine:
+        left = jnp.max(jnp.abs(lam - start) / (1.0 + jnp.abs(lam)))
+        fine = fine & (left <= dependence_floor(M.dtype))
+    fine = fine & jnp.all(factor.healthy)
+    return jnp.where(fine, x, jnp.nan), jnp.where(fine, lam, jnp.nan)
+
+
+def solve_general(
+    S: Float[Array, "m m"], right: Float[Array, " m"], relative: float
+) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    """(the x with S x = right, whether every pivot exceeds relative |S_kk|), S not symmetric."""
+    m, fine = S.shape[0], jnp.array(True)
+    least, rows = relative * jnp.abs(jnp.diagonal(S)), jnp.concatenate([S, right[:, None]], axis=1)
+    for k in range(m):
+        fine = fine & (rows[k, k] > least[k])
+        below = (jnp.arange(m) > k)[:, None]
+        rows = jnp.where(below, rows - jnp.outer(rows[:, k] / rows[k, k], rows[k]), rows)
+    x = jnp.zeros_like(right)
+    for k in reversed(range(m)):
+        x = x.at[k].set((rows[k, m] - rows[k, :m] @ x) / rows[k, k])
+    return x, fine
+
+
+MAX_NEWTON = 50
+
+
+def _iterated(newton: Callable, lam: Array) -> Array:
+    """The lam that Newton's method settles at, or after MAX_NEWTON steps."""
+    eps = float(jnp.finfo(lam.dtype).eps)
+
+    def turn(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        lam, _, count = state
+        found = newton(lam)[1]
+        return found, jnp.max(jnp.abs(found - lam) / (1.0 + jnp.abs(found))), count + 1
+
+    def goes_on(state: tuple[Array, Array, Array]) -> Array:
+        return (state[1] > 8 * eps) & (state[2] < MAX_NEWTON)
+
+    begin = (lam, jnp.full((), jnp.inf, lam.dtype), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(goes_on, turn, begin)[0]

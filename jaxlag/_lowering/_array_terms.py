@@ -1,0 +1,425 @@
+"""The array program: terms by automatic differentiation of L on whole arrays."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._linalg._independent_rows import Choice, independent_rows, row_sizes, rows_hold, shared
+from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
+from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
+from jaxlag._lowering._row_layout import layout
+from jaxlag._lowering._structure import Structure, find_structure
+from jaxlag._lowering._terms import Terms
+from jaxlag._model._constraints import (
+    AbstractConstraint,
+    Baumgarte,
+    position_or_zero,
+    position_rows,
+    velocity_rows,
+)
+from jaxlag._model._forces import AbstractForce, components, reads_lam
+from jaxlag._model._quasi_velocities import QuasiVelocities
+from jaxlag._tracing import _params
+from jaxlag._tracing._dependence import outputs_depend_on
+from jaxlag._tracing._signature import gradient
+
+
+class Prepared(eqx.Module):
+    """What the array program computes once per solve, and what it leaves out.
+
+    Attributes:
+        mass: M where it depends on params alone, else None.
+        factor: its factor.
+        bias_zero: whether h = 0 in every state.
+        sense: -1 where time runs backwards.
+    """
+
+    mass: Float[Array, "n n"] | None
+    factor: MassFactor | None
+    bias_zero: bool = eqx.field(static=True)
+    sense: Array | float = 1.0
+
+
+class ArrayTerms(Terms):
+    """Terms of a system from its Lagrangian: works for any L that JAX differentiates twice.
+
+    M takes n forward-over-reverse columns in one batch, h a single forward derivative of the
+    reverse pass, so the number of evaluations of L in h does not grow with n.
+
+    Attributes:
+        lagrangian: L.
+        forces: applied forces.
+        constraints: constraints.
+        formulation: how accelerations are solved for under constraints.
+        baumgarte: stabilisation added to gamma.
+        regular: whether M is known to be positive definite by itself, which the scalar program
+            makes use of.
+        apart: whether rows whose multipliers forces read are known to be independent.
+        quasi: quasi-velocities, where the state is (q, u) with those that are not constrained.
+        in_u: L as a function of (t, q, u, params), where it was written so.
+        crossing: whether rows that come to depend on others are left out there; else all is NaN.
+    """
+
+    lagrangian: Callable = eqx.field(static=True)
+    forces: tuple[AbstractForce, ...]
+    constraints: tuple[AbstractConstraint, ...] = ()
+    formulation: str = eqx.field(static=True, default="multipliers")
+    baumgarte: Baumgarte | None = eqx.field(static=True, default=None)
+    regular: bool = eqx.field(static=True, default=False)
+    apart: bool = eqx.field(static=True, default=False)
+    quasi: QuasiVelocities | None = None
+    in_u: Callable | None = eqx.field(static=True, default=None)
+    crossing: bool = eqx.field(static=True, default=False)
+
+    def momentum(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """Momentum p = dL/dv by one reverse pass."""
+        return gradient("lagrangian", self.lagrangian, 2)(t, q, v, params)
+
+    def mass(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, "n n"]:
+        """M = dp/dv: one derivative of p along each unit velocity, batched."""
+
+        def column(e: Float[Array, " n"]) -> Float[Array, " n"]:
+            return jax.jvp(lambda v: self.momentum(t, q, v, params), (v,), (e,))[1]
+
+        return jax.vmap(column)(jnp.eye(v.shape[0], dtype=v.dtype))
+
+    def bias(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """Bias h = dp/dt - dL/dq at a = 0: one derivative of (dL/dq, p) along (t', q') = (1, v)."""
+        gradients_of = gradient("lagrangian", self.lagrangian, (1, 2))
+
+        def gradients(t: Array, q: Array) -> tuple[Array, Array]:
+            return gradients_of(t, q, v, params)
+
+        (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q), (jnp.ones_like(t), v))
+        return p_dot - dL_dq
+
+    def euler_lagrange(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        a: Float[Array, " n"],
+        params: Any,
+    ) -> Float[Array, " n"]:
+        """The same derivative as in h, along (t', q', v') = (1, v, a)."""
+        gradients_of = gradient("lagrangian", self.lagrangian, (1, 2))
+
+        def gradients(t: Array, q: Array, v: Array) -> tuple[Array, Array]:
+            return gradients_of(t, q, v, params)
+
+        (dL_dq, _), (_, p_dot) = jax.jvp(gradients, (t, q, v), (jnp.ones_like(t), v, a))
+        return p_dot - dL_dq
+
+    def force(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        lam: Float[Array, " m"] | None = None,
+    ) -> Float[Array, " n"]:
+        """Q, summed over the declared forces; those that read lam only where it is given."""
+        total = jnp.zeros_like(q)
+        for force in self.forces:
+            if not reads_lam(force):
+                total = total + components(force, t, q, v, params, inputs)
+        return total if lam is None else total + self.reactive(t, q, v, params, inputs, lam)
+
+    def reactive(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        lam: Float[Array, " m"],
+    ) -> Float[Array, " n"]:
+        """The sum of the forces that depend on multipliers."""
+        named = layout(self.constraints, params, q.shape[0], q.dtype).unflatten(lam)
+        return self._reactive(t, q, v, params, inputs, named)
+
+    def _reactive(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Any, named: Mapping[str, Array]
+    ) -> Array:
+        total = jnp.zeros_like(q)
+        for force in filter(reads_lam, self.forces):
+            total = total + components(force, t, q, v, params, inputs, named)
+        return total
+
+    def rows_read(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any]
+    ) -> tuple[bool, ...]:
+        """For every row, whether a force depends on the multipliers of its name."""
+        if not any(map(reads_lam, self.forces)):
+            return (False,) * layout(self.constraints, params, q.shape[0], q.dtype).size
+        rows = layout(self.constraints, params, q.shape[0], q.dtype)
+        named = rows.unflatten(jnp.zeros((rows.size,), q.dtype))
+
+        def push(parts: list[Array]) -> Array:
+            return self._reactive(t, q, v, params, inputs, dict(zip(named, parts, strict=True)))
+
+        program = jax.make_jaxpr(push)(list(named.values())).jaxpr
+        (reached,) = outputs_depend_on(program, [frozenset({name}) for name in named])
+        reached |= {force.contact for force in self.forces if reads_lam(force) and force.contact}
+        return tuple(name in reached for name in rows.names)
+
+    def position(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, " k"]:
+        """phi(t, q) of the holonomic rows."""
+        return position_rows(self.constraints, t, q, params)
+
+    def velocity(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """A v + b."""
+        return velocity_rows(self.constraints, t, q, v, params)
+
+    def rows(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+        """A by one reverse derivative per row, b as what is left at rest."""
+
+        def along(v: Array) -> Array:
+            return self.velocity(t, q, v, params)
+
+        rest = jnp.zeros_like(v)
+        b, pull = jax.vjp(along, rest)
+        return jax.vmap(lambda e: pull(e)[0])(jnp.eye(b.shape[0], dtype=q.dtype)), b
+
+    def gamma(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        sense: Array | float = 1.0,
+    ) -> Float[Array, " m"]:
+        """One derivative of A v + b along (t', q') = (1, v), and Baumgarte's terms if asked for.
+
+        Residuals are to decay where time runs backwards, too: alpha has the sense of time.
+        """
+
+        def along(t: Array, q: Array) -> Array:
+            return self.velocity(t, q, v, params)
+
+        residual, gamma = jax.jvp(along, (t, q), (jnp.ones_like(t), v))
+        if self.baumgarte is None:
+            return gamma
+        sense = jnp.asarray(sense, residual.dtype)
+        gamma = gamma + 2.0 * self.baumgarte.alpha * sense * residual
+        phi = position_or_zero(self.constraints, t, q, params)
+        return gamma + self.baumgarte.beta**2 * phi
+
+    def structure(self, params: Any, size: int, dtype: Any) -> Structure:
+        """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes).
+
+        Args:
+            params: as the Lagrangian takes them.
+            size: number n of coordinates.
+            dtype: of the state.
+        """
+        traced, static = _params.split(params)
+        avals = _params.shapes(traced)
+        keys = _params.Static(avals), _params.Static(static)
+        return _structure(self.lagrangian, *keys, size, jnp.dtype(dtype))
+
+    def prepare(
+        self,
+        q: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample = _params.UNKNOWN,
+        kept: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
+        sense: Array | float = 1.0,
+    ) -> Prepared:
+        """M and its factor where M depends on params alone."""
+        structure = self.structure(params, q.shape[0], q.dtype)
+        if not structure.mass_constant:
+            return Prepared(None, None, structure.bias_zero, sense)
+        anywhere = jnp.ones(q.shape, q.dtype)
+        M = self.mass(jnp.zeros((), jnp.result_type(float)), anywhere, anywhere, params)
+        # Derivatives with respect to params go through M, never through the elimination.
+        factor = None if self.constraints else factor_mass(jax.lax.stop_gradient(M))
+        return Prepared(M, factor, structure.bias_zero, sense)
+
+    def acceleration(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: Any = None,
+        reacting: Choice | None = None,
+    ) -> Float[Array, " n"]:
+        """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
+        prepared = self.prepare(q, params, inputs) if prepared is None else prepared
+        M, right = self._balance(t, q, v, params, inputs, prepared)
+        if not self.constraints:
+            return solve_mass(M, right, prepared.factor)
+        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[0]
+
+    def reactions(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(a, lam), of least norm where rows depend on one another; NaN where rows contradict."""
+        M, right = self._balance(t, q, v, params, inputs, self.prepare(q, params, inputs))
+        if not self.constraints:
+            return solve_mass(M, right), jnp.zeros((0,), q.dtype)
+        A, _ = self.rows(t, q, v, params)
+        still = jax.lax.stop_gradient
+        sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
+        there, void, _ = sizes
+        if A.shape[0] == 1:
+            choice = Choice(~void, ~void)
+            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            lam = jnp.where(void, 0.0, lam)
+            fine = (there | void)[0]
+        else:
+            read = self.rows_read(t, q, v, params, inputs)
+            unread = np.logical_not(read)
+            kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
+            choice = Choice(kept, there)
+            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            units = units_of(*still((M, A)))
+            lam = shared(A, lam, kept, there, unread, units)
+
+            def gamma(t: Array, q: Array, v: Array) -> Array:
+                return self.gamma(t, q, v, params)
+
+            fine = rows_hold(*still((A, a)), gamma, *still(((t, q, v), sizes, right, units)))
+        return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
+
+    def multipliers(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: Prepared,
+        reacting: Choice | None,
+    ) -> Float[Array, " m"]:
+        """The multipliers as forces see them, solved with these rows."""
+        M, right = self._balance(t, q, v, params, inputs, prepared)
+        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[1]
+
+    def _solved(
+        self,
+        M: Array,
+        right: Array,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        reacting: Choice | None,
+        sense: Array | float = 1.0,
+    ) -> tuple[Array, Array]:
+        """(a, lam) under constraints; lam as forces read it where some do."""
+        (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
+        kept = None if reacting is None else reacting.kept
+        if not any(map(reads_lam, self.forces)):
+            return solve_kkt(M, A, right, gamma, kept, self.formulation, crossing=self.crossing)
+        read = self.rows_read(t, q, v, params, inputs)
+
+        def seen(lam: Array) -> Array:
+            if reacting is None or self.apart:
+                return lam
+            return shared(A, lam, *reacting, read, units_of(M, A))
+
+        def push(lam: Array) -> Array:
+            return self.reactive(t, q, v, params, inputs, lam)
+
+        slopes = jax.make_jaxpr(jax.jacfwd(push))(gamma).jaxpr
+        (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
+        felt = lambda lam: push(seen(lam))  # noqa: E731
+        a, lam = solve_reactions(M, A, right, felt, gamma, kept, affine=not reached)
+        return a, seen(lam)
+
+    def correction(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+    ) -> Float[Array, "n m"]:
+        """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero."""
+        return self.corrections(t, q, v, params, prepared, kept)[0]
+
+    def corrections(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+        chosen: Sequence[int] | None = None,
+    ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
+        """The same, and the diagonal of (A M^-1 A^T)^-1.
+
+        Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
+        """
+        M = self.mass(t, q, v, params) if getattr(prepared, "mass", None) is None else prepared.mass
+        A, b = self.rows(t, q, v, params)
+        if chosen is not None:
+            if not self.regular:
+                M, _ = augmented(M, masked(A, kept))
+            rows = np.array(chosen)
+            A, b, kept = A[rows], b[rows], None if kept is None else kept[rows]
+        how = kept, self.formulation
+        factor = factor_kkt(*jax.lax.stop_gradient((M, A)), *how, self.crossing)
+
+        def column(c: Array) -> tuple[Array, Array]:
+            x, lam = solve_kkt(M, A, jnp.zeros_like(q), c, *how, factor)
+            return -x, -lam
+
+        K, masses = jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
+        return K, jnp.diagonal(masses)
+
+    def _balance(
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], prepared: Any
+    ) -> tuple[Array, Array]:
+        """(M, Q - h)."""
+        M = self.mass(t, q, v, params) if prepared.mass is None else prepared.mass
+        right = jnp.zeros_like(q) if prepared.bias_zero else -self.bias(t, q, v, params)
+        if self.forces:
+            right = self.force(t, q, v, params, inputs) + right
+        return M, right
+
+
+@lru_cache(maxsize=256)
+def _structure(
+    lagrangian: Callable, avals: _params.Static, static: _params.Static, size: int, dtype: Any
+) -> Structure:
+    def with_params(function: Callable) -> Callable:
+        return lambda t, q, v, traced: function(t, q, v, _params.join(traced, static.tree))
+
+    terms = ArrayTerms(lagrangian, ())
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    q = jax.ShapeDtypeStruct((size,), dtype)
+    mass, bias, L = map(with_params, (terms.mass, terms.bias, lagrangian))
+    return find_structure(mass, bias, L, (t, q, q), avals.tree)

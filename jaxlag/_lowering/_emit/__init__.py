@@ -1,0 +1,1 @@
+"""From expressions back to programs of JAX."""

@@ -1,0 +1,102 @@
+"""Straight-line code as JAX operations on scalars."""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag._core._arrays import elements
+from jaxlag._core._xla import opaque_one
+from jaxlag._lowering._emit._execute import leaves, numbers, run, stacked, straight
+from jaxlag._lowering._emit._outlined import called
+from jaxlag._lowering._graph._expression import FIXED
+from jaxlag._lowering._graph._straight_line import Program
+from jaxlag._tracing import _params
+
+# Code of more lines is one function that XLA does not inline: copied into every stage of a solver
+# it compiles in many times the time, and XLA's fusion computes shared lines anew in each use.
+INLINE_UP_TO = 60
+# In a loop over one trajectory or a few lanes. On wider rows XLA may want to split the work of a
+# function among threads, which it cannot do inside a loop that is one native function.
+INLINE_IN_LOOP = 14
+
+
+def prelude(
+    program: Program,
+    params: Any,
+    dtype: Any,
+    kept: Array | None = None,
+    there: Array | None = None,
+    sense: Array | float = 1.0,
+) -> Float[Array, " k"]:
+    """What the body needs of what does not change during a solve, in one row.
+
+    Args:
+        program: straight-line code.
+        params: as the Lagrangian takes them.
+        dtype: of the results.
+        kept: for every constraint row whether it is solved with; None for all.
+        there: for every one whether it is more than rounding; None for all.
+        sense: -1 where time runs backwards.
+    """
+    slots = numbers(program, dtype)
+    for given in FIXED:
+        wanted = {index: slot for (name, index), slot in program.inputs.items() if name == given}
+        values = {"kept": kept, "there": there, "sense": sense}
+        if given in values and values[given] is None:
+            slots |= {slot: jnp.ones((), dtype) for slot in wanted.values()}
+        elif wanted:
+            flat = leaves(_params.split(params)[0] if given == "params" else values[given])
+            slots |= {slot: jnp.asarray(flat[index], dtype) for index, slot in wanted.items()}
+    run(program.prelude, slots, program.whole)
+    row = [jnp.asarray(slots[slot], dtype) for slot in program.carried]
+    return jnp.stack([*row, opaque_one(dtype)])
+
+
+def body(
+    program: Program,
+    carried: Float[Array, " k"],
+    t: Array,
+    q: Float[Array, " n"],
+    v: Float[Array, " w"],
+    inputs: Mapping[str, Any],
+    lanes: bool = False,
+    in_loop: bool = False,
+) -> Float[Array, " r"]:
+    """The results at one state.
+
+    Args:
+        program: straight-line code.
+        carried: what `prelude` returned.
+        t: time.
+        q: coordinates.
+        v: velocities.
+        inputs: values of the inputs by name.
+        lanes: whether this is vmapped: every scalar is a row of numbers.
+        in_loop: whether this is in a loop over one trajectory or a few lanes.
+    """
+    names, dtype = {name for name, _ in program.inputs}, q.dtype
+    flat = leaves(dict(inputs)) if "inputs" in names else []
+    values = {"t": [t], "q": elements(q), "v": elements(v), "inputs": flat}
+    read = [key for key in program.inputs if key[0] not in FIXED]
+    given = [values[name][index] for name, index in read]
+    kinds = {jnp.result_type(x) for x in given} | {jnp.dtype(dtype)}
+    kind = program, jnp.dtype(dtype), lanes
+    short = len(program.body) <= (INLINE_IN_LOOP if in_loop else INLINE_UP_TO)
+    if short or len(kinds) > 1 or jax.default_backend() != "cpu":
+        return jnp.stack(_function(*kind)(carried, given))
+    # One flat array in and one out.
+    return called(*kind)(carried, stacked(given, dtype))
+
+
+@lru_cache(maxsize=256)
+def _function(program: Program, dtype: Any, lanes: bool) -> Any:
+    """The body as a function that is traced once, however many stages call it."""
+
+    def results(carried: Array, given: Sequence[Array]) -> tuple[Array, ...]:
+        return straight(program, dtype, elements(carried), given, lanes)
+
+    return jax.jit(results)

@@ -1,0 +1,1 @@
+"""Expressions of scalars: a graph, its simplification, elimination, its program."""

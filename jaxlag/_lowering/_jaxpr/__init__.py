@@ -1,0 +1,1 @@
+"""From programs of JAX to expressions of scalars."""

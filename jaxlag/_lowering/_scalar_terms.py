@@ -1,0 +1,345 @@
+"""The scalar program behind the terms: every element of every array its own scalar."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._linalg._independent_rows import Choice
+from jaxlag._linalg._projection import Surface
+from jaxlag._lowering._array_terms import ArrayTerms, Prepared
+from jaxlag._lowering._emit import _emit
+from jaxlag._lowering._graph._straight_line import Program
+from jaxlag._lowering._symbolic._lower import Lowered, lower
+from jaxlag._lowering._symbolic._program_key import key_of
+from jaxlag._lowering._symbolic._symbolic_system import Equations
+from jaxlag._lowering._terms import Terms
+from jaxlag._tracing import _params
+
+
+class ScalarPrepared(NamedTuple):
+    """What each program needs of what does not change during a solve.
+
+    Where nobody knows while tracing whether M is positive definite without the constraints, there
+    are programs for both cases.
+
+    Attributes:
+        definite: whether it is, in all lanes.
+        alone: what the shorter programs for such a mass matrix need; None where it is known.
+    """
+
+    acceleration: Array
+    position: Array | None = None
+    velocity: Array | None = None
+    shift: Array | None = None
+    kick: Array | None = None
+    lam: Array | None = None
+    rates: Array | None = None
+    determinants: Array | None = None
+    definite: Bool[Array, ""] | None = None
+    alone: "ScalarPrepared | None" = None
+
+
+_WITH_INPUTS = ("acceleration", "lam")
+_BY_MASS = ("acceleration", "lam", "shift", "kick")  # where M is divided by
+
+
+class ScalarTerms(Terms):
+    """Terms whose accelerations are straight-line code on scalars, derived on a graph.
+
+    A system that has no scalar program, or one of more operations than `limit`, gets its
+    accelerations from the array program. So do the other terms, which no solver evaluates in its
+    loop.
+
+    Attributes:
+        array: the array program of the same system.
+        limit: operations up to which the scalar program is used; None for no limit.
+        lanes: whether terms are vmapped, so that every scalar is a row of numbers.
+        in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
+    """
+
+    array: ArrayTerms
+    limit: int | None = eqx.field(static=True)
+    lanes: bool = eqx.field(static=True, default=False)
+    in_loop: bool = eqx.field(static=True, default=False)
+
+    def lowered(
+        self,
+        q: Any,
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample = _params.UNKNOWN,
+    ) -> Lowered:
+        """The scalar program for these shapes, or the reason why there is none.
+
+        It is compared with the array program when it is made: with `params` where their values
+        are known, else with the sample.
+        """
+        key = key_of(self.array, q, params, inputs, self.limit)
+        return lower(key, _params.sample(_params.split(params)[0], sample))
+
+    def prepare(
+        self,
+        q: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample = _params.UNKNOWN,
+        kept: Bool[Array, " m"] | None = None,
+        reacting: Choice | None = None,
+        sense: Array | float = 1.0,
+    ) -> ScalarPrepared | Prepared:
+        """All that accelerations and projections need of what depends on params alone."""
+        equations = self.lowered(q, params, inputs, sample).equations
+        if equations is None:
+            return self.array.prepare(q, params, inputs, sample, kept, reacting, sense)
+
+        def before(
+            code: Program | None, kept: Array | None, there: Array | None = None
+        ) -> Array | None:
+            if code is None:
+                return None
+            return _emit.prelude(code, params, q.dtype, kept, there, sense)
+
+        solving = (None, None) if reacting is None else reacting
+        first = before(equations.program, *solving)
+        assert first is not None
+        rates, determinants = before(equations.velocity, kept), before(equations.determinants, None)
+        if equations.surface is None:
+            return ScalarPrepared(first, rates=rates, determinants=determinants)
+        *moving, lam = equations.surface
+        others = [before(code, kept) for code in moving]
+        reacting_too = before(lam, *solving)
+        return ScalarPrepared(
+            first, *others, lam=reacting_too, rates=rates, determinants=determinants
+        )
+
+    def acceleration(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: Any = None,
+        reacting: Choice | None = None,
+    ) -> Float[Array, " n"]:
+        """Acceleration a; NaN, whole, where M is not positive definite.
+
+        In a solve, where `prepared` is known, of blocks of M that nothing couples the others keep
+        their values: the step fails by the one that is NaN.
+        """
+        if self.lowered(q, params, inputs).equations is None:
+            return self.array.acceleration(t, q, v, params, inputs, prepared, reacting)
+        if prepared is not None:
+            return self.rates(t, q, v, params, inputs, prepared)
+        own: Any = self.prepare(q, params, inputs, reacting=reacting)
+        a = self.rates(t, q, v, params, inputs, own)
+        return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
+
+    def rates(
+        self,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
+    ) -> Array:
+        """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
+        return self._run("acceleration", t, q, v, params, inputs, prepared)
+
+    def velocities(
+        self,
+        t: Array,
+        q: Array,
+        u: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
+    ) -> Array:
+        """v at (q, u) of quasi-velocities."""
+        return self._run("rates", t, q, u, params, inputs, prepared)
+
+    def determinants(
+        self, t: Array, q: Array, params: Any, inputs: Mapping[str, Any], prepared: ScalarPrepared
+    ) -> Array:
+        """What vanishes where quasi-velocities are singular, without what never changes."""
+        code = self._equations(q, params, inputs).determinants
+        assert code is not None
+        if not code.results:
+            return jnp.zeros((0,), q.dtype)
+        return self._run("determinants", t, q, q, params, inputs, prepared)  # no speed is read
+
+    def _run(
+        self,
+        name: str,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
+    ) -> Array:
+        """The results of one of the programs, whose prelude has this name."""
+
+        def by(terms: "ScalarTerms", prepared: ScalarPrepared) -> Array:
+            program = terms._equations(q, params, inputs).code(name)
+            carried = getattr(prepared, name)
+            assert program is not None
+            assert carried is not None
+            read = inputs if name in _WITH_INPUTS else {}
+            return _emit.body(program, carried, t, q, v, read, terms.lanes, terms.in_loop)
+
+        # Equations in quasi-velocities are projected: of them the projection alone divides by M.
+        projected = self.array.quasi is not None and name == "acceleration"
+        if prepared.alone is None or name not in _BY_MASS or projected:
+            return by(self, prepared)
+        alone = partial(by, self.regular(), prepared.alone)
+        return lax.cond(prepared.definite, alone, partial(by, self, prepared))
+
+    def regular(self) -> "ScalarTerms":
+        """The same where M is positive definite without the constraints."""
+        return replace(self, array=replace(self.array, regular=True))
+
+    def _equations(self, q: Array, params: Any, inputs: Mapping[str, Any]) -> Equations:
+        equations = self.lowered(q, params, inputs).equations
+        assert equations is not None
+        return equations
+
+    def surface(
+        self,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
+    ) -> Surface:
+        """The constraints near the state (q, v); positions alone near a (q, u)."""
+        code = self._equations(q, params, inputs).surface
+        assert code is not None
+
+        def run(name: str, q: Array, v: Array) -> Array:
+            return self._run(name, t, q, v, params, inputs, prepared)
+
+        n = q.shape[0]
+
+        def times(K: Array) -> Callable:
+            return lambda c: jnp.sum(c[:, None] * K, axis=0)
+
+        def position(q: Array) -> Array:
+            return run("position", q, v)
+
+        shift = run("shift", q, v)
+        if self.array.quasi is not None:
+            return Surface(position, None, times(shift.reshape(-1, n)), None)
+        kick = shift if code.kick is None else run("kick", q, v)
+        own, every = (len(c.results) for c in (code.position, code.velocity))
+        shift, masses = shift[: own * n], kick[every * n :]
+        shift, kick = shift.reshape(-1, n), kick[: every * n].reshape(-1, n)
+        held = position if code.position.results else None
+        return Surface(held, partial(run, "velocity"), times(shift), times(kick), kick, masses)
+
+    def multipliers(
+        self,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarPrepared,
+    ) -> Array:
+        """The multipliers that forces depend on, at (q, v)."""
+        return self._run("lam", t, q, v, params, inputs, prepared)
+
+    def momentum(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """Momentum p = dL/dv."""
+        return self.array.momentum(t, q, v, params)
+
+    def mass(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, "n n"]:
+        """Mass matrix M = d2L/dv2."""
+        return self.array.mass(t, q, v, params)
+
+    def bias(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """Bias h."""
+        return self.array.bias(t, q, v, params)
+
+    def euler_lagrange(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        a: Float[Array, " n"],
+        params: Any,
+    ) -> Float[Array, " n"]:
+        """M a + h; M is not formed."""
+        return self.array.euler_lagrange(t, q, v, a, params)
+
+    def force(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> Float[Array, " n"]:
+        """Q, summed over the declared forces."""
+        return self.array.force(t, q, v, params, inputs)
+
+    def position(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, " k"]:
+        """phi(t, q) of the holonomic rows."""
+        return self.array.position(t, q, params)
+
+    def velocity(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """A v + b."""
+        return self.array.velocity(t, q, v, params)
+
+    def rows(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
+        """(A, b)."""
+        return self.array.rows(t, q, v, params)
+
+    def gamma(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " m"]:
+        """A' v + b'."""
+        return self.array.gamma(t, q, v, params)
+
+    def reactions(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(a, lam)."""
+        return self.array.reactions(t, q, v, params, inputs)
+
+    def correction(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        prepared: Any = None,
+        kept: Bool[Array, " m"] | None = None,
+    ) -> Float[Array, "n m"]:
+        """M^-1 A^T (A M^-1 A^T)^-1."""
+        return self.array.correction(t, q, v, params, None, kept)

@@ -1,0 +1,1 @@
+"""A system as expressions, and its equations derived from them."""

@@ -1,0 +1,333 @@
+"""Constraint rows on the graph, and accelerations under them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxlag._lowering._graph._eliminate import GREATER, bordered, solve_general
+from jaxlag._lowering._graph._expression import Graph, Node, dependencies, substitute
+from jaxlag._lowering._graph._orthonormalize import dot, orthonormal, products, without
+from jaxlag._lowering._jaxpr._differentiate import tangents
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+from jaxlag._lowering._symbolic._shared_reactions import Sharing, shared
+
+
+class Constrained(NamedTuple):
+    """Residuals as read from the declaration, and how they are solved with.
+
+    Attributes:
+        velocity: A v + b of all rows.
+        position: phi of the holonomic rows, in their order.
+        holonomic: for every row, whether it is one of them.
+        kept: for every row 1, or 0 where it is left out; None where there is no choice.
+        formulation: "multipliers" or "null_space".
+        damping: Baumgarte's (2 alpha, beta^2), None without; alpha against the sense of time.
+        regular: whether M is known to be positive definite by itself.
+        reaction: the forces that depend on multipliers; None without.
+        lam: the multipliers that they depend on.
+        sharing: how rows that depend on one another share what forces read; None where none do.
+        crossing: whether rows that come to depend on others are left out there; else all is NaN.
+    """
+
+    velocity: Sequence[Node]
+    position: Sequence[Node]
+    holonomic: Sequence[bool]
+    kept: Sequence[Node] | None
+    formulation: str
+    damping: tuple[float, float] | None
+    regular: bool
+    reaction: Sequence[Node] | None = None
+    lam: Sequence[Node] = ()
+    sharing: Sharing | None = None
+    crossing: bool = False
+
+
+class Rows(NamedTuple):
+    """A, and gamma with A a + gamma = 0."""
+
+    A: list[list[Node]]
+    gamma: list[Node]
+
+
+def rows(graph: Graph, t: Node, q: Sequence[Node], v: Sequence[Node], c: Constrained) -> Rows:
+    """A from the residuals' slopes in v, gamma from their rate along the motion.
+
+    Raises:
+        Unsupported: a residual that is affine in v, but not so that its slopes show it.
+    """
+    columns = [tangents(graph, c.velocity, {x: graph.one}) for x in v]
+    A = [[column[k] for column in columns] for k in range(len(c.velocity))]
+    reached = dependencies(x for row in A for x in row)
+    if any(name == "v" for found in reached.values() for name, _ in found):
+        raise Unsupported("constraint rows whose slopes in v contain v")
+    gamma = tangents(graph, c.velocity, dict(zip(q, v, strict=True)) | {t: graph.one})
+    if c.damping is not None:
+        twice_alpha, beta_squared = c.damping
+        positions, sense = iter(c.position), graph.input("sense", 0)
+        for k, residual in enumerate(c.velocity):
+            terms = [(gamma[k], 1.0), (graph.mul(sense, residual), twice_alpha)]
+            if c.holonomic[k]:
+                terms.append((next(positions), beta_squared))
+            gamma[k] = graph.sum(terms)
+    return Rows(A, gamma)
+
+
+def solve_with_rows(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
+    eps: float,
+    kept: Sequence[Node] | None,
+    formulation: str,
+    regular: bool,
+    crossing: bool,
+) -> list[list[Node]]:
+    """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0."""
+    if formulation == "null_space":
+        return _null_space(graph, M, A, right, eps, kept, crossing)
+    if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
+        M, right = _augmented(graph, M, A, right, kept)
+    found = bordered(graph, M, A, right, eps, kept, checked=True, crossing=crossing)
+    return [x[: len(M)] for x in found]
+
+
+class Reaction(NamedTuple):
+    """Forces Q_0 + G lam that are affine in the multipliers; G by columns."""
+
+    rest: list[Node]
+    slopes: list[list[Node]]
+
+
+def reaction(graph: Graph, c: Constrained) -> Reaction | None:
+    """The forces that depend on multipliers, as an affine function.
+
+    Raises:
+        Unsupported: they are not affine.
+    """
+    if c.reaction is None:
+        return None
+    slopes = [tangents(graph, c.reaction, {x: graph.one}) for x in c.lam]
+    reached = dependencies(x for column in slopes for x in column)
+    if any(name == "lam" for found in reached.values() for name, _ in found):
+        raise Unsupported("forces that are not affine in multipliers")
+    return Reaction(substitute(graph, c.reaction, dict.fromkeys(c.lam, graph.zero)), slopes)
+
+
+def solve_with_reactions(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    rows: Rows,
+    r: Sequence[Node],
+    found: Reaction,
+    eps: float,
+    kept: Sequence[Node] | None,
+    sharing: Sharing | None,
+    regular: bool,
+) -> tuple[list[Node], list[Node]]:
+    """(a, lam) with M a = r + Q_0 + (A^T + G) lam, A a + gamma = 0.
+
+    As `_kkt.solve_reactions`: S = A M^-1 (A^T + G) by L U with row exchanges. S is not
+    symmetric, and where its determinant is not positive the friction has turned its sense.
+    """
+    m = len(rows.A)
+    A, gamma, G = rows.A, list(rows.gamma), found.slopes
+    seen = None
+    if kept is not None and sharing is not None:
+        seen = shared(graph, A, _units(graph, M, A, regular), kept, sharing, eps)
+    if seen is not None:
+        of_rows = zip(*seen, strict=True)
+        G = [[dot(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
+    if kept is not None:
+        A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
+        G = [[graph.mul(kept[k], x) for x in column] for k, column in enumerate(G)]
+        gamma = [graph.mul(kept[k], x) for k, x in enumerate(gamma)]
+    sides = [([graph.add(*pair) for pair in zip(r, found.rest, strict=True)], gamma)]
+    if not regular:
+        M, sides = _augmented(graph, M, A, sides, None)
+    pushes = [
+        [graph.add(a, g) for a, g in zip(row, column, strict=True)]
+        for row, column in zip(A, G, strict=True)
+    ]
+    free, *spread = bordered(graph, M, [], [(sides[0][0], []), *((p, []) for p in pushes)], eps)
+
+    S = [[dot(graph, A[k], spread[j]) for j in range(m)] for k in range(m)]
+    if kept is not None:
+        for k in range(m):
+            S[k][k] = graph.sum([(S[k][k], 1.0), (kept[k], -1.0)], 1.0)
+    right = [
+        graph.let(graph.sum([(gamma[k], -1.0), *_less(products(graph, A[k], free))]))
+        for k in range(m)
+    ]
+    lam = solve_general(graph, S, right, eps ** (2 / 3))
+    a = []
+    for i, x in enumerate(free):
+        pushed = [(graph.mul(lam[k], spread[k][i]), 1.0) for k in range(m)]
+        a.append(graph.let(graph.sum([(x, 1.0), *pushed])))
+    return a, lam if seen is None else [dot(graph, row, lam) for row in seen]
+
+
+def _less(terms: list[tuple[Node, float]]) -> list[tuple[Node, float]]:
+    return [(node, -c) for node, c in terms]
+
+
+def _augmented(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
+    kept: Sequence[Node] | None,
+) -> tuple[list[list[Node]], list[tuple[list[Node], Sequence[Node]]]]:
+    """M + A^T W A and r - A^T W c, for an M that may be singular: the x is the same."""
+    n, m = len(M), len(A)
+    weights = _weights(graph, M, A)
+    if kept is not None:
+        # Chosen, not multiplied: that of a row of rounding alone may be beyond all numbers.
+        half, zero = graph.const(0.5), graph.zero
+        weights = [
+            graph.select(graph.call(GREATER, kept[k], half), w, zero) for k, w in enumerate(weights)
+        ]
+    full: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i, n):
+            more = [(graph.mul(weights[k], A[k][i], A[k][j]), 1.0) for k in range(m)]
+            full[i][j] = full[j][i] = graph.let(graph.sum([(M[i][j], 1.0), *more]))
+    sides = []
+    for r, c in right:
+        moved = [
+            graph.sum(
+                [(r[i], 1.0), *((graph.mul(weights[k], A[k][i], c[k]), -1.0) for k in range(m))]
+            )
+            for i in range(n)
+        ]
+        sides.append((moved, c))
+    return full, sides
+
+
+def _weights(graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]]) -> list[Node]:
+    """W of `_kkt.augmented`."""
+    zero, one = graph.zero, graph.one
+
+    def inverse(x: Node) -> tuple[Node, Node]:
+        """(whether x > 0, 1/x there and 1 elsewhere)."""
+        there = graph.call(GREATER, x, zero)
+        return there, graph.let(graph.div(one, graph.let(graph.select(there, x, one))))
+
+    mobilities = [
+        zero if M[i][i] is zero else graph.select(*inverse(M[i][i]), zero) for i in range(len(M))
+    ]
+    weights = []
+    for row in A:
+        pairs = zip(row, mobilities, strict=True)
+        mobility = graph.let(graph.sum([(graph.mul(x, x, m), 1.0) for x, m in pairs]))
+        square = graph.let(graph.sum([(graph.power(x, 2), 1.0) for x in row]))
+        any_at_all, alone = inverse(square)
+        weight = graph.select(any_at_all, graph.mul(_size(graph, M), alone), zero)
+        if mobility is not zero:
+            weight = graph.select(*inverse(mobility), weight)
+        weights.append(graph.let(weight))
+    return weights
+
+
+def _size(graph: Graph, M: Sequence[Sequence[Node]]) -> Node:
+    """The trace of M; 1 where there is no inertia at all, as in a motion led throughout."""
+    trace = graph.let(graph.sum([(M[i][i], 1.0) for i in range(len(M))]))
+    return graph.select(graph.call(GREATER, trace, graph.zero), trace, graph.one)
+
+
+def _null_space(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
+    eps: float,
+    kept: Sequence[Node] | None,
+    crossing: bool,
+) -> list[list[Node]]:
+    """As `_kkt.NullSpace`: rows made orthonormal, M on what they leave free."""
+    n, m = len(M), len(A)
+    units = _units(graph, M, A, False)
+    M = [[graph.mul(units[i], M[i][j], units[j]) for j in range(n)] for i in range(n)]
+    A = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
+    right = [([graph.mul(x, s) for x, s in zip(r, units, strict=True)], c) for r, c in right]
+
+    L, Y = orthonormal(graph, A, kept, eps ** (2 / 3), crossing)
+
+    def tangent(x: Sequence[Node]) -> list[Node]:
+        return without(graph, x, [(dot(graph, y, x), y) for y in Y])
+
+    size = graph.let(graph.scale(_size(graph, M), 1.0 / n))
+    columns = [tangent([M[i][j] for i in range(n)]) for j in range(n)]  # P M
+    lines = [tangent([columns[j][i] for j in range(n)]) for i in range(n)]  # P M P
+    full: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i, n):
+            held = [(graph.mul(size, y[i], y[j]), 1.0) for y in Y]
+            full[i][j] = full[j][i] = graph.let(graph.sum([(lines[i][j], 1.0), *held]))
+
+    sides, offsets = [], []
+    for r, c in right:
+        z: list[Node] = []
+        for k in range(m):
+            known = [(graph.mul(L[k][j], z[j]), -1.0) for j in range(k)]
+            value = c[k] if kept is None else graph.mul(kept[k], c[k])
+            top = graph.sum([(value, 1.0), *known])
+            z.append(top if top is graph.zero else graph.let(graph.div(top, L[k][k])))
+        offset = without(graph, [graph.zero] * n, list(zip(z, Y, strict=True)))
+        moved = [
+            graph.sum([(r[i], 1.0), *((graph.mul(M[i][j], offset[j]), -1.0) for j in range(n))])
+            for i in range(n)
+        ]
+        sides.append((tangent(moved), []))
+        offsets.append(offset)
+    out = []
+    for y, offset in zip(bordered(graph, full, [], sides, eps), offsets, strict=True):
+        x = zip(units, offset, tangent(y), strict=True)
+        out.append([graph.let(graph.mul(s, graph.add(a, b))) for s, a, b in x])
+    return out
+
+
+def _units(
+    graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]], regular: bool
+) -> list[Node]:
+    """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
+    inertias = [M[i][i] for i in range(len(M))]
+    if regular:
+        return [graph.let(graph.div(graph.one, graph.sqrt(x))) for x in inertias]
+    full = _augmented(graph, M, A, [], None)[0]
+    units = []
+    for i, inertia in enumerate(inertias):
+        there = graph.call(GREATER, inertia, graph.zero)
+        lent = graph.select(there, inertia, full[i][i])
+        there = graph.call(GREATER, lent, graph.zero)
+        lent = graph.let(graph.select(there, lent, graph.one))
+        units.append(graph.let(graph.div(graph.one, graph.sqrt(lent))))
+    return units
+
+
+def correction(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    eps: float,
+    kept: Sequence[Node] | None,
+    regular: bool,
+    chosen: Sequence[int],
+    crossing: bool,
+) -> tuple[list[list[Node]], list[Node]]:
+    """Columns of M^-1 A^T (A M^-1 A^T)^-1, one for each of the chosen rows, solved by themselves.
+
+    And, when `crossing`, the diagonal of (A M^-1 A^T)^-1.
+
+    An M that may be singular is augmented by all rows: on the chosen ones alone it need not be
+    positive definite.
+    """
+    if not regular:
+        M, _ = _augmented(graph, M, A, [], kept)
+    A = [A[k] for k in chosen]
+    kept = None if kept is None else [kept[k] for k in chosen]
+    n, m = len(M), len(A)
+    nothing = [graph.zero] * n
+    sides = [(nothing, [graph.one if j == k else graph.zero for j in range(m)]) for k in range(m)]
+    found = bordered(graph, M, A, sides, eps, kept, crossing=crossing)
+    columns = [[graph.scale(x, -1.0) for x in column[:n]] for column in found]
+    return columns, [side[n + k] for k, side in enumerate(found)] if crossing else []

@@ -1,0 +1,263 @@
+"""Equations of motion in quasi-velocities on the graph: several ways to write them, one kept."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxlag._lowering._graph._eliminate import solve
+from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._orthonormalize import products
+from jaxlag._lowering._graph._simplify import Expansion
+from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+from jaxlag._lowering._symbolic._bias_forms import attempt, cost, mass_matrix
+from jaxlag._lowering._symbolic._cofactor_inverse import Inverse
+from jaxlag._lowering._symbolic._constraint_solve import rows
+from jaxlag._lowering._symbolic._surface import surface
+from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, Scene
+
+WRITTEN_OUT = 3  # forms of the right side, shortest first
+
+
+class _Moved(NamedTuple):
+    """v = V(t, q, u) and what follows from it.
+
+    Attributes:
+        V: v of all quasi-velocities.
+        v: the same with the bound ones zero.
+        B: columns dv/du of the free ones.
+        s: dv/dt at u' = 0, the bound ones zero.
+        healthy: truth values, all of which hold where v follows from u.
+        determinants: of blocks of dU/dv or dV/du, which vanish or grow beyond bounds where one of
+            v and u does not follow from the other. None where they are too long.
+    """
+
+    V: list[Node]
+    v: list[Node]
+    B: list[list[Node]]
+    s: list[Node]
+    healthy: list[Node]
+    determinants: list[Node] | None
+
+
+def derive_rates(scene: Scene, eps: float) -> Equations:
+    """v and u' of the free quasi-velocities, the bound ones zero, by the cheapest of several forms.
+
+    These are the projected equations, B^T M B u' = B^T (Q - h - M s) for v = B u + c and s = v' at
+    u' = 0, where L is a function of v; and those of Boltzmann and Hamel.
+
+    Raises:
+        Unsupported: the kinematics have no short inverse on scalars.
+    """
+    graph, expansion = scene.graph, Expansion(scene.graph)
+    assert scene.kinematics is not None
+    kinematics = scene.kinematics
+    moved = _moved(scene, kinematics, expansion, eps)
+    declared, forms, of_u, U = scene.lagrangian, [], None, None
+    if kinematics.in_u:
+        of_u = declared
+    else:
+        for words, L in _written(expansion, declared):
+            forms.append((f"projected, {words}", *_projected(scene, moved, L)))
+        if len(kinematics.u) == len(scene.v):
+            # With fewer u, momenta along what they leave out would be lost.
+            (of_u,) = substitute(graph, [declared], dict(zip(scene.v, moved.V, strict=True)))
+    if of_u is not None:
+        U = _quasi(scene, kinematics, expansion)
+        for words, L in _written(expansion, of_u):
+            forms.append((f"Boltzmann-Hamel, {words}", *_hamel(scene, kinematics, moved, U, L)))
+
+    masses = [mass for _, mass, _ in forms]
+    masses += [short for mass in masses if (short := _short(expansion, mass)) is not None]
+    mass = min(masses, key=lambda M: cost(graph, M))
+    v, sides = _guarded(graph, moved.v, moved.healthy), []
+    for words, _, right in forms:
+        sides.append((words, right))
+        short = attempt(partial(expansion.simplified, right))
+        if short is not None:
+            sides.append((f"{words}, expanded", short))
+    # Long ones are not worth being written out to be compared.
+    sides.sort(key=lambda side: len(order(side[1])))
+    found = []
+    for words, right in sides[:WRITTEN_OUT]:
+        rates = [*v, *solve(graph, mass, right, eps)]
+        rest = [graph.scale(x, -1.0) for x in right]
+        found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), words))
+    best = min(found, key=lambda equations: equations.program.cost)
+    best = best._replace(velocity=assemble(graph, v))
+    if moved.determinants is not None:
+        moving = [x for x in moved.determinants if not x.fixed]
+        best = best._replace(determinants=assemble(graph, moving))
+    bound = scene.constrained
+    if bound is None:
+        return best
+    of_v = declared
+    if kinematics.in_u:
+        assert U is not None
+        (of_v,) = substitute(graph, [declared], dict(zip(kinematics.u, U, strict=True)))
+    flat = [x for row in mass_matrix(graph, of_v, scene.v) for x in row]
+    flat += [x for row in rows(graph, scene.t, scene.q, scene.v, bound).A for x in row]
+    entries = iter(substitute(graph, flat, dict(zip(scene.v, moved.v, strict=True))))
+    M = [[next(entries) for _ in scene.v] for _ in scene.v]
+    A = [[next(entries) for _ in scene.v] for _ in bound.velocity]
+    return best._replace(surface=surface(graph, M, A, bound, eps, None))
+
+
+def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: float) -> _Moved:
+    graph, healthy = scene.graph, []
+    if kinematics.V is not None:
+        V = list(kinematics.V)
+        determinants = _determinants(graph, expansion, affine(graph, V, kinematics.u)[0])
+    else:
+        assert kinematics.U is not None
+        theta, theta_0 = affine(graph, kinematics.U, scene.v)
+        inverse = Inverse(graph, expansion, theta, eps)
+        right = [graph.sub(*pair) for pair in zip(kinematics.u, theta_0, strict=True)]
+        V, healthy, determinants = inverse(right), inverse.healthy, inverse.determinants
+    short = attempt(partial(expansion.simplified, V))
+    if short is not None and cost(graph, [short]) <= cost(graph, [V]):
+        V = short
+    still = dict.fromkeys(kinematics.bound, graph.zero)
+    v = substitute(graph, V, still)
+    B = [tangents(graph, V, {u: graph.one}) for u in kinematics.free]
+    s = tangents(graph, v, dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one})
+    return _Moved(V, v, B, s, healthy, determinants)
+
+
+def _determinants(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[Node] | None:
+    """Determinants of blocks of B, or of B^T B where it is tall; None where they are too long."""
+    k = len(B[0])
+    try:
+        square = B if len(B) == k else _gram(graph, expansion, B)
+        return Inverse(graph, expansion, square, 0.0).determinants
+    except Unsupported:
+        return None
+
+
+def _gram(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[list[Node]]:
+    """B^T B."""
+    columns = list(zip(*B, strict=True))
+    gram = [[_dot(graph, one, other) for other in columns] for one in columns]
+    short = _short(expansion, gram)
+    return gram if short is None else short
+
+
+def affine(
+    graph: Graph, functions: Sequence[Node], inputs: Sequence[Node]
+) -> tuple[list[list[Node]], list[Node]]:
+    """(matrix, rest) of functions that are affine in the inputs."""
+    columns = [tangents(graph, functions, {x: graph.one}) for x in inputs]
+    matrix = [[column[k] for column in columns] for k in range(len(functions))]
+    return matrix, substitute(graph, functions, dict.fromkeys(inputs, graph.zero))
+
+
+def _quasi(scene: Scene, kinematics: Kinematics, expansion: Expansion) -> list[Node]:
+    """U(t, q, v); where it is not given, B^-1 (v - c), or (B^T B)^-1 B^T (v - c) of a tall B.
+
+    A square B has digits that its square has not, above all between coordinates of unlike units.
+    """
+    graph = scene.graph
+    if kinematics.U is not None:
+        return list(kinematics.U)
+    assert kinematics.V is not None
+    B, c = affine(graph, kinematics.V, kinematics.u)
+    rest = [graph.sub(*pair) for pair in zip(scene.v, c, strict=True)]
+    if len(B) == len(B[0]):
+        return Inverse(graph, expansion, B, 0.0)(rest)
+    gram = _gram(graph, expansion, B)
+    right = [_dot(graph, column, rest) for column in zip(*B, strict=True)]
+    return Inverse(graph, expansion, gram, 0.0)(right)
+
+
+def _projected(scene: Scene, moved: _Moved, L: Node) -> tuple[list[list[Node]], list[Node]]:
+    """(B^T M B, B^T (Q - (M s + h))) from L(t, q, v): M s + h is Lagrange's left side at a = s."""
+    graph, v = scene.graph, scene.v
+    momentum = gradient(graph, L, v)
+    seeds = dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one}
+    rate = tangents(graph, momentum, seeds | dict(zip(v, moved.s, strict=True)))
+    pull = gradient(graph, L, scene.q)
+    left = [graph.sub(*pair) for pair in zip(rate, pull, strict=True)]
+    M = mass_matrix(graph, L, v)
+    at = dict(zip(v, moved.v, strict=True))
+    effort = [graph.scale(x, -1.0) for x in left]
+    if scene.force is not None:
+        effort = [graph.sub(*pair) for pair in zip(scene.force, left, strict=True)]
+    effort = substitute(graph, effort, at)
+    flat = iter(substitute(graph, [x for row in M for x in row], at))
+    M = [[next(flat) for _ in v] for _ in v]
+    heavy = [[_dot(graph, row, column) for row in M] for column in moved.B]  # M B, by columns
+    return (
+        [[_dot(graph, one, other) for other in heavy] for one in moved.B],
+        [_dot(graph, column, effort) for column in moved.B],
+    )
+
+
+def _hamel(
+    scene: Scene, kinematics: Kinematics, moved: _Moved, U: Sequence[Node], L: Node
+) -> tuple[list[list[Node]], list[Node]]:
+    """(d2L/du2, the right side of it u' = ...) from L(t, q, u), with p = dL/du.
+
+    d/dt p + B^T (Gamma p - dL/dq) = B^T Q,  Gamma p = d/dt(Theta) p - (dU/dq)^T p at fixed p and v.
+
+    Only then are the bound quasi-velocities zero: their p is not.
+
+    Source: Pila, eqs. 4.44 to 4.58, with what comes of explicit time and of affine U.
+    """
+    graph, q, v, u = scene.graph, scene.q, scene.v, kinematics.u
+    p = gradient(graph, L, u)
+    frozen = [graph.input("momentum", i) for i in range(len(u))]
+    weighted = _dot(graph, frozen, U)
+    along = dict(zip(q, v, strict=True)) | {scene.t: graph.one}
+    turning = tangents(graph, gradient(graph, weighted, v), along)
+    bending = gradient(graph, weighted, q)
+    pull = gradient(graph, L, q)
+    effort = [
+        graph.sum([(a, -1.0), (b, 1.0), (c, 1.0)])
+        for a, b, c in zip(turning, bending, pull, strict=True)
+    ]
+    if scene.force is not None:
+        effort = [graph.add(*pair) for pair in zip(scene.force, effort, strict=True)]
+    at = dict(zip(v, moved.v, strict=True)) | dict(zip(frozen, p, strict=True))
+    effort = substitute(graph, effort, at)
+    kept = [p[list(u).index(x)] for x in kinematics.free]
+    rate = tangents(graph, kept, dict(zip(q, moved.v, strict=True)) | {scene.t: graph.one})
+    right = [
+        graph.sub(_dot(graph, column, effort), x) for column, x in zip(moved.B, rate, strict=True)
+    ]
+    mass = mass_matrix(graph, L, kinematics.free)
+    still = dict.fromkeys(kinematics.bound, graph.zero)
+    flat = iter(substitute(graph, [*(x for row in mass for x in row), *right], still))
+    k = len(kinematics.free)
+    return [[next(flat) for _ in range(k)] for _ in range(k)], [next(flat) for _ in range(k)]
+
+
+def _written(expansion: Expansion, L: Node) -> list[tuple[str, Node]]:
+    """L as written and simplified, where these differ."""
+    short = attempt(partial(expansion.simplified, [L]))
+    forms = [("L as written", L)]
+    if short is not None and short[0] is not L:
+        forms.append(("L simplified", short[0]))
+    return forms
+
+
+def _guarded(graph: Graph, v: list[Node], healthy: list[Node]) -> list[Node]:
+    """v, its first element NaN where u does not determine it."""
+    first, *rest = v
+    for truth in healthy:
+        first = graph.select(truth, first, graph.const(np.nan))
+    return [first, *rest]
+
+
+def _short(expansion: Expansion, M: list[list[Node]]) -> list[list[Node]] | None:
+    flat = attempt(partial(expansion.simplified, [x for row in M for x in row]))
+    if flat is None:
+        return None
+    entries = iter(flat)
+    return [[next(entries) for _ in row] for row in M]
+
+
+def _dot(graph: Graph, x: Sequence[Node], y: Sequence[Node]) -> Node:
+    return graph.sum(products(graph, x, y))

@@ -1,0 +1,107 @@
+"""From a declared system to its scalar program, or to the reason why it has none."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from jaxlag._lowering._graph._expression import Node, order
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+from jaxlag._lowering._symbolic._derive import derive
+from jaxlag._lowering._symbolic._program_key import Key
+from jaxlag._lowering._symbolic._read_system import read_scene
+from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._lowering._symbolic._verify import compare
+from jaxlag._tracing import _params
+from jaxlag._tracing._index_check import OutOfRange
+
+# Operations, those once per solve included, and functions of weighted sums (the units of networks)
+# up to which "auto" takes the scalar program. Seconds of tracing and compiling a solve of order 8,
+# and milliseconds of its run, scalar | array. Chains of 8 links: 2.4, 0.42 | 1.8, 1.1; of 10: 3.8,
+# 0.75 | 1.6, 2.6; of 12 (1636 operations): 5.9, 1.3 | 1.8, 4.5; of 16: 10, 2.9 | 1.9, 9.8. Five
+# bodies: 1.5, 0.34 | 1.4, 3.5. A full stiffness matrix of 16 coordinates (816): 2.5, 0.14 | 0.75,
+# 0.30; of 24 (1800): 5.6, 0.22 | 1.8, 0.80; full constant matrices of mass and stiffness of 12
+# (1553): 7.0, 0.32 | 1.2, 0.30. Networks of 4 inputs, 8 units: 1.1, 0.10 | 0.6, 0.10; 16 units:
+# 2.4, 0.21 | 0.8, 0.14; 24 units: 4.0, 0.33 | 0.8, 0.12; 32 units (1648): 9.9, 0.47 | 0.8, 0.12.
+OPERATIONS = 1500
+UNITS = 15
+
+
+class Lowered(NamedTuple):
+    """The scalar program of a system, or why there is none.
+
+    Attributes:
+        equations: M, h and the code for a; None where the array program is used.
+        reason: in words, why there is no scalar program, or how it compared.
+        scene: L and Q as nodes.
+    """
+
+    equations: Equations | None
+    reason: str
+    scene: Scene | None
+
+
+@lru_cache(maxsize=256)
+def lower(key: Key, sample: _params.Sample) -> Lowered:
+    """The scalar program for a key; compared with the array program before it is used.
+
+    Whatever fails on the way, there is the array program; what is wrong with the declaration
+    itself comes to light there.
+
+    Args:
+        key: what it is made for.
+        sample: params to compare with where they are known, else random ones are used.
+    """
+    try:
+        return _lowered(key, sample)
+    except OutOfRange:
+        raise
+    except Exception as error:
+        said = (str(error) or "no message").splitlines()[0]
+        return Lowered(None, f"no scalar program: {type(error).__name__}: {said}", None)
+
+
+def _lowered(key: Key, sample: _params.Sample) -> Lowered:
+    try:
+        scene = read_scene(key)
+        if key.limit is not None and (units := _units(scene)) > UNITS:
+            return Lowered(None, f"{units} functions of weighted sums, more than {UNITS}", scene)
+        if key.limit is not None and (written := _written(scene)) > 2 * key.limit:
+            return Lowered(None, f"{written} operations in L and Q alone", scene)
+        equations = derive(scene, float(jnp.finfo(key.dtype).eps), key.limit)
+    except Unsupported as unsupported:
+        return Lowered(None, str(unsupported), None)
+    operations, once = equations.program.operations, len(equations.program.prelude)
+    if key.limit is not None and operations + once > key.limit:
+        found = f"{operations} operations, {once} more once per solve: more than {key.limit}"
+        return Lowered(None, found, scene)
+    compared = compare(key, scene, equations, sample.leaves)
+    return Lowered(equations if compared.sound else None, compared.words, scene)
+
+
+def _written(scene: Scene) -> int:
+    """Operations on what varies in L and Q, as they are written."""
+    roots = [scene.lagrangian, *(scene.force or ())]
+    return sum(max(len(node.args) - 1, 1) for node in order(roots) if not node.fixed)
+
+
+def _units(scene: Scene) -> int:
+    """Functions of weighted sums, as networks have them: products of matrices do them better."""
+    return sum(
+        node.op == "call" and _weighted(node.args[0])
+        for node in order([scene.lagrangian, *(scene.force or ())])
+    )
+
+
+def _weighted(node: Node) -> bool:
+    """Whether this is a sum of two or more variables, each times a number or a parameter."""
+    if node.op != "sum":
+        return False
+    moving = [(term, weight) for term, weight in node.data[1] if not term.fixed]
+    if len(moving) == 1:  # a sum beside a bias
+        return _weighted(moving[0][0])
+    return len(moving) > 1 and all(
+        abs(weight) != 1.0
+        or (term.op == "product" and any(factor.fixed for factor, _ in term.data))
+        for term, weight in moving
+    )

@@ -1,0 +1,154 @@
+"""A declared system read as scalars."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlag._lowering._array_terms import ArrayTerms
+from jaxlag._lowering._graph._expression import Graph, Node
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
+from jaxlag._lowering._row_layout import layout_of
+from jaxlag._lowering._symbolic._constraint_solve import Constrained
+from jaxlag._lowering._symbolic._program_key import Key, traced
+from jaxlag._lowering._symbolic._shared_reactions import Sharing
+from jaxlag._lowering._symbolic._symbolic_system import Kinematics, Scene
+from jaxlag._model._constraints import AbstractConstraint
+from jaxlag._model._forces import reads_lam
+from jaxlag._tracing import _params
+from jaxlag._tracing._index_check import check_indices
+from jaxlag._tracing._signature import real_scalar
+
+
+def read_scene(key: Key) -> Scene:
+    """L, Q, the constraints and the kinematics as nodes of one graph.
+
+    Raises:
+        Unsupported: something in them has no scalar form.
+    """
+    for name, like in (("params", key.params), ("inputs", key.inputs)):
+        kinds = {leaf.dtype for leaf in jax.tree.leaves(like.tree)}
+        if any(jnp.issubdtype(kind, jnp.integer) for kind in kinds):
+            raise Unsupported(f"integers among the {name}, which divide in a way of their own")
+    graph, n = Graph(), key.size
+    t = graph.input("t", 0)
+    # The velocities of a state (q, u) are no input of its equations.
+    names = "q", "v" if key.quasi is None else "speed"
+    q, v = ([graph.input(name, i) for i in range(n)] for name in names)
+    params, inputs = _inputs(graph, "params", key.params), _inputs(graph, "inputs", key.inputs)
+    state = [_array([t], ()), _array(q, (n,)), _array(v, (n,))]
+    kinematics, at = None, state
+    if key.quasi is not None:
+        kinematics = _kinematics(key, graph, state, params)
+        at = state if key.in_u is None else [*state[:2], _array(list(kinematics.u), (-1,))]
+    lagrangian = real_scalar("lagrangian", key.in_u or key.lagrangian)
+    of_L = traced(key, lagrangian, False, speeds=at[2].size)
+    check_indices(of_L, [None, "q", "v" if key.in_u is None else "u", *(None for _ in params)])
+    (L,) = read(graph, of_L, *at, *params)
+    force = None
+    if key.forces:
+        terms = ArrayTerms(key.lagrangian, key.forces)
+        (Q,) = read(graph, traced(key, terms.force, True), *state, *params, *inputs)
+        force = [_node(graph, x) for x in Q]
+    bound = _constrained(key, graph, state, params, inputs) if _own(key) else None
+    return Scene(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics)
+
+
+def _own(key: Key) -> tuple[AbstractConstraint, ...]:
+    """The constraints that the equations hold; velocities take care of theirs themselves."""
+    if key.quasi is None:
+        return key.constraints
+    return tuple(c for c in key.constraints if c.holonomic)
+
+
+def _kinematics(key: Key, graph: Graph, state: list, params: list) -> Kinematics:
+    quasi = key.quasi
+    assert quasi is not None
+    free = [graph.input("v", k) for k in range(len(quasi.free))]
+    bound = [graph.input("bound", k) for k in range(len(quasi.bound))]
+    u: list[Node] = [graph.zero] * quasi.size
+    for nodes, places in ((free, quasi.free), (bound, quasi.bound)):
+        for node, place in zip(nodes, places, strict=True):
+            u[int(place)] = node
+    U = V = None
+    if quasi.U is not None:
+        (found,) = read(graph, traced(key, quasi.of, False), *state, *params)
+        U = [_node(graph, x) for x in found]
+    if quasi.kinematics is not None:
+        code = traced(key, quasi.velocities, False, speeds=quasi.size)
+        (found,) = read(graph, code, *state[:2], _array(u, (quasi.size,)), *params)
+        V = [_node(graph, x) for x in found]
+    return Kinematics(u, free, bound, U, V, key.in_u is not None)
+
+
+def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list) -> Constrained:
+    terms = ArrayTerms(key.lagrangian, key.forces, _own(key))
+    (rates,) = read(graph, traced(key, terms.velocity, False), *state, *params)
+
+    def position(t: Any, q: Any, v: Any, params: Any) -> Any:
+        return terms.position(t, q, params)
+
+    (phi,) = read(graph, traced(key, position, False), *state, *params)
+    m = rates.size
+    layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
+    every = layout.holonomic
+    own = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
+    kept = [graph.input("kept", k) for k in own] if layout.chooses else None
+    holonomic = [every[k] for k in own]
+    lam, reaction = [graph.input("lam", k) for k in range(m)], None
+    sharing = None
+    if any(map(reads_lam, key.forces)):
+        chosen = np.flatnonzero(rows_read(key, terms)).tolist()
+        if kept is not None and len(chosen) > 1 and not key.apart:
+            sharing = Sharing(chosen, [graph.input("there", k) for k in own])
+        code = traced(key, terms.reactive, True, m)
+        (Q,) = read(graph, code, *state, *params, *inputs, _array(lam, (m,)))
+        reaction = [_node(graph, x) for x in Q]
+    damping = None
+    if key.baumgarte is not None:
+        damping = 2.0 * key.baumgarte.alpha, key.baumgarte.beta**2
+    return Constrained(
+        [_node(graph, x) for x in rates],
+        [_node(graph, x) for x in phi],
+        holonomic,
+        kept,
+        key.formulation,
+        damping,
+        key.regular,
+        reaction,
+        lam,
+        sharing,
+        key.crossing,
+    )
+
+
+def rows_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
+    """For every row, whether forces read its multiplier."""
+    found: list[tuple[bool, ...]] = []
+
+    def look(t: Any, q: Any, v: Any, params: Any, inputs: Any) -> Any:
+        found.append(terms.rows_read(t, q, v, params, inputs))
+        return t
+
+    traced(key, look, True)
+    return found[0]
+
+
+def _node(graph: Graph, x: Any) -> Node:
+    return x if isinstance(x, Node) else graph.const(float(x))
+
+
+def _inputs(graph: Graph, name: str, like: _params.Static) -> list[np.ndarray]:
+    arrays, count = [], 0
+    for leaf in jax.tree.leaves(like.tree):
+        nodes = [graph.input(name, count + i) for i in range(int(np.prod(leaf.shape)))]
+        count += len(nodes)
+        arrays.append(_array(nodes, leaf.shape))
+    return arrays
+
+
+def _array(nodes: list[Node], shape: tuple[int, ...]) -> np.ndarray:
+    array = np.empty(len(nodes), object)
+    array[:] = nodes
+    return array.reshape(shape)

@@ -1,0 +1,96 @@
+"""How rows that depend on one another share what forces read of their multipliers."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxlag._linalg._independent_rows import ROUNDINGS
+from jaxlag._lowering._graph._eliminate import GREATER, bordered
+from jaxlag._lowering._graph._expression import Graph, Node
+from jaxlag._lowering._graph._orthonormalize import backward, dot, orthonormal, without
+
+
+class Sharing(NamedTuple):
+    """Rows whose multipliers are of least norm among themselves where they depend on one another.
+
+    Attributes:
+        chosen: these.
+        there: for every row 1, or 0 where it is no more than rounding.
+    """
+
+    chosen: Sequence[int]
+    there: Sequence[Node]
+
+
+def shared(
+    graph: Graph,
+    A: Sequence[Sequence[Node]],
+    units: Sequence[Node],
+    kept: Sequence[Node],
+    sharing: Sharing,
+    eps: float,
+) -> list[list[Node]]:
+    """What takes multipliers of the rows kept to those that forces see, m rows.
+
+    As `_independent_rows.shared`, in whose words these are a_k, C, z and weights.
+    """
+    m, chosen = len(A), sharing.chosen
+    zero, one, places = graph.zero, graph.one, range(len(chosen))
+    A = [[graph.mul(sharing.there[k], x) for x in A[k]] for k in chosen]
+    scaled = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
+
+    def length(x: Sequence[Node]) -> Node:
+        """Of a vector; 1 where it is 0."""
+        square = graph.let(dot(graph, x, x))
+        some = graph.let(graph.select(graph.call(GREATER, square, zero), square, one))
+        return graph.let(graph.sqrt(some))
+
+    norms, sizes = [length(row) for row in A], [length(row) for row in scaled]
+    weights = [graph.let(graph.div(*pair)) for pair in zip(norms, sizes, strict=True)]
+    unit = [
+        [graph.let(graph.div(x, size)) for x in row]
+        for row, size in zip(scaled, sizes, strict=True)
+    ]
+    flags = [kept[k] for k in chosen]
+    L, Y = orthonormal(graph, unit, flags)
+    C, others, rounding = [], [], graph.const((ROUNDINGS * eps) ** 2)
+    for row, flag in zip(unit, flags, strict=True):
+        parts = [dot(graph, y, row) for y in Y]
+        rest = without(graph, row, list(zip(parts, Y, strict=True)))
+        near = graph.call(GREATER, graph.const(eps), dot(graph, rest, rest))
+        follows = graph.let(graph.select(near, graph.sum([(flag, -1.0)], 1.0), zero))
+        others.append(follows)
+        # What a row has of another by rounding alone may be much to one of smaller weight.
+        found = [(x, graph.let(graph.power(x, 2))) for x in backward(graph, L, parts)]
+        found = [graph.select(graph.call(GREATER, s, rounding), x, zero) for x, s in found]
+        C.append([graph.let(graph.mul(follows, x)) for x in found])
+    moved = [
+        [
+            graph.mul(weights[k], graph.sum([(others[j], -1.0)]) if j == k else C[j][k])
+            for k in places
+        ]
+        for j in places
+    ]
+    # In units in which the diagonal is 1: weights may be as unlike as forces and short levers.
+    lengths = [length(x) for x in moved]
+    moved = [[graph.let(graph.div(x, s)) for x in y] for y, s in zip(moved, lengths, strict=True)]
+    square = [[dot(graph, x, y) for y in moved] for x in moved]
+    for j in places:
+        square[j][j] = graph.sum([(square[j][j], 1.0), (others[j], -1.0)], 1.0)
+    sides = [[graph.mul(weights[k], flags[k], x[k]) for x in moved] for k in places]
+    columns = bordered(graph, square, [], [(side, []) for side in sides], eps)
+    seen = [[one if i == j else zero for j in range(m)] for i in range(m)]
+    for j, found in enumerate(columns):
+        z = [graph.let(graph.div(x, s)) for x, s in zip(found, lengths, strict=True)]
+        shares = []
+        for i in places:
+            taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
+            own = [(flags[i], 1.0)] if i == j else []
+            shares.append(graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken])))
+        # What all exert together stays what it is.
+        exerted = [graph.mul(flags[j], x) for x in unit[j]]
+        left = without(graph, exerted, list(zip(shares, unit, strict=True)))
+        more = backward(graph, L, [dot(graph, y, left) for y in Y])
+        for i in places:
+            share = graph.let(graph.add(shares[i], graph.mul(flags[i], more[i])))
+            seen[chosen[i]][chosen[j]] = graph.let(graph.div(graph.mul(share, sizes[j]), sizes[i]))
+    return seen

@@ -1,0 +1,55 @@
+"""Code for a projection onto constraints."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxlag._lowering._graph._expression import Graph, Node
+from jaxlag._lowering._graph._straight_line import Program, assemble
+from jaxlag._lowering._symbolic._constraint_solve import Constrained, correction
+
+
+class Surface(NamedTuple):
+    """Straight-line code for a projection: residuals, and what takes them to corrections.
+
+    Attributes:
+        position: phi of the holonomic rows.
+        velocity: A v + b.
+        shift: columns that take phi to a change of q.
+        kick: columns that take A v + b to a change of v; None where they are those of `shift`.
+            Those of all rows come before the diagonal of (A M^-1 A^T)^-1 where that is asked for.
+        lam: multipliers; None where no force depends on them.
+    """
+
+    position: Program
+    velocity: Program
+    shift: Program
+    kick: Program | None
+    lam: Program | None
+
+
+def surface(
+    graph: Graph,
+    M: Sequence[Sequence[Node]],
+    A: Sequence[Sequence[Node]],
+    bound: Constrained,
+    eps: float,
+    lam: Program | None,
+) -> Surface:
+    """Code for the residuals and their corrections."""
+    own = [k for k, holonomic in enumerate(bound.holonomic) if holonomic]
+    mixed = 0 < len(own) < len(A)
+
+    def columns(chosen: Sequence[int]) -> Program:
+        how = bound.kept, bound.regular, chosen, bound.crossing
+        found, masses = correction(graph, M, A, eps, *how)
+        masses = masses if len(chosen) == len(A) else []
+        return assemble(graph, [*(x for column in found for x in column), *masses])
+
+    every = columns(range(len(A)))
+    return Surface(
+        assemble(graph, list(bound.position)),
+        assemble(graph, list(bound.velocity)),
+        columns(own) if mixed else every,
+        every if mixed else None,
+        lam,
+    )

@@ -1,0 +1,85 @@
+"""A system as scalars, and the code that comes of it."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxlag._lowering._graph._expression import Graph, Node
+from jaxlag._lowering._graph._straight_line import Program
+from jaxlag._lowering._symbolic._constraint_solve import Constrained, Rows
+from jaxlag._lowering._symbolic._surface import Surface
+
+
+class Kinematics(NamedTuple):
+    """How u and v go together, as scalars; at least one of U and V is given.
+
+    Attributes:
+        u: all quasi-velocities.
+        free: those among them that make the state.
+        bound: the others.
+        U: u as functions of v.
+        V: v as functions of u.
+        in_u: whether L is a function of u in place of v.
+    """
+
+    u: Sequence[Node]
+    free: Sequence[Node]
+    bound: Sequence[Node]
+    U: Sequence[Node] | None
+    V: Sequence[Node] | None
+    in_u: bool
+
+
+class Scene(NamedTuple):
+    """A system as scalars: L and Q as functions of the inputs t, q, v."""
+
+    graph: Graph
+    t: Node
+    q: Sequence[Node]
+    v: Sequence[Node]
+    lagrangian: Node
+    force: Sequence[Node] | None
+    constrained: Constrained | None = None
+    kinematics: Kinematics | None = None
+
+
+class Equations(NamedTuple):
+    """M a + h = Q, and the straight-line code for a.
+
+    Where quasi-velocities make the state, a stands for (v, u') and M, h and Q for what is left of
+    them in the equations of u', Q on the left, too.
+
+    Attributes:
+        lagrangian: L, simplified where that is possible.
+        mass: M, n rows.
+        bias: h; of quasi-velocities h - Q.
+        accelerations: a.
+        program: straight-line code for a.
+        form: how h was written, in words.
+        rows: A and gamma, where there are constraints.
+        surface: their projection.
+        lam: multipliers, where forces depend on them.
+        velocity: code for v alone, where the state is made of quasi-velocities.
+        determinants: code for what vanishes where these are singular, without what never does; None
+            where that is too long.
+    """
+
+    lagrangian: Node
+    mass: list[list[Node]]
+    bias: list[Node]
+    accelerations: list[Node]
+    program: Program
+    form: str
+    rows: Rows | None = None
+    surface: Surface | None = None
+    lam: list[Node] | None = None
+    velocity: Program | None = None
+    determinants: Program | None = None
+
+    def code(self, name: str) -> Program | None:
+        """The code whose prelude has this name in `ScalarPrepared`."""
+        own = {
+            "acceleration": self.program,
+            "rates": self.velocity,
+            "determinants": self.determinants,
+        }
+        return own[name] if name in own else getattr(self.surface, name)

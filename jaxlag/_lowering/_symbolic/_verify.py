@@ -1,0 +1,356 @@
+"""A scalar program against the array program, at random states and without compiling."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.linalg import norm
+
+from jaxlag._linalg._independent_rows import shared
+from jaxlag._linalg._kkt import augmented
+from jaxlag._lowering._array_terms import ArrayTerms
+from jaxlag._lowering._row_layout import layout_of
+from jaxlag._lowering._symbolic._evaluate import evaluate
+from jaxlag._lowering._symbolic._program_key import Key, traced
+from jaxlag._lowering._symbolic._read_system import rows_read
+from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._model._forces import reads_lam
+from jaxlag._tracing._interpret import interpret
+
+STATES = 8  # random states at which both programs are compared
+LEAST = 6  # of them that must have been comparable
+DRAWS = 32  # to find them among
+SLACK = 1e4  # of roundings, between two ways to compute one acceleration
+NUDGES = 3  # of one rounding each of q and v, where that is not enough
+SENSITIVE = 1e-3  # states that change their acceleration so much by it compare nothing
+
+
+class Comparison(NamedTuple):
+    """How a program compares with the array program.
+
+    Attributes:
+        states: at how many states both have been compared.
+        difference: the worst, in units of SLACK roundings; inf where one has no value alone.
+    """
+
+    states: int
+    difference: float
+
+    @property
+    def words(self) -> str:
+        """What is said of it."""
+        if not self.difference <= 1.0:
+            if np.isinf(self.difference):
+                return "differs from the array program: one of them has no value"
+            return f"differs from the array program by {SLACK * self.difference:.1e} roundings"
+        if self.states < LEAST:
+            return f"only {self.states} of {DRAWS} random states to compare the array program at"
+        return f"equal to the array program at {self.states} random states"
+
+    @property
+    def sound(self) -> bool:
+        """Whether they are equal at states enough."""
+        return bool(self.difference <= 1.0) and self.states >= LEAST
+
+
+def compare(key: Key, scene: Scene, equations: Equations, known: list | None) -> Comparison:
+    """A program beside the array program, with the known params and with random ones.
+
+    What is known may be special, and random params may be none that a system has: both are drawn
+    with, until there are states enough. Where M is not positive definite, M, h, Q, A and gamma are
+    compared in place of the acceleration, with quasi-velocities what is left of them, and v; where
+    forces read multipliers, such states are left out. Where the array program has no value the
+    other must have none.
+    """
+    expected = _Plain(key) if key.quasi is None else _Quasi(key)
+    rng = np.random.default_rng(0)
+    n = key.size
+    speeds = n if key.quasi is None else len(key.quasi.free)
+    eps = float(jnp.finfo(key.dtype).eps)
+    like, given = jax.tree.leaves(key.params.tree), jax.tree.leaves(key.inputs.tree)
+
+    def drawn(own: bool) -> float | None:
+        """The difference at one more state; None where there is nothing to compare."""
+        t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
+        params = [
+            rng.uniform(0.5, 1.5, leaf.shape)
+            if jnp.issubdtype(leaf.dtype, jnp.floating)
+            else rng.integers(1, 4, leaf.shape).astype(leaf.dtype)
+            for leaf in like
+        ]
+        if own and known is not None:
+            params = [
+                np.asarray(x, np.float64 if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype)
+                for x in known
+            ]
+        inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
+        values: dict[tuple[str, int], Any] = {("t", 0): t, ("sense", 0): 1.0}
+        for name, rows in (("q", [q]), ("v", [v]), ("params", params), ("inputs", inputs)):
+            flat = np.concatenate([np.ravel(x) for x in rows]) if rows else []
+            values |= {(name, i): x for i, x in enumerate(flat)}
+        right = expected(t, q, v, params, inputs)
+        if right is None:
+            return None
+        values |= {("kept", k): float(x) for k, x in enumerate(right.kept)}
+        values |= {("there", k): 1.0 for k in range(len(right.kept))}
+        roots = equations.accelerations
+        if right.parts:
+            roots = [*(x for row in equations.mass for x in row), *equations.bias]
+            roots += (scene.force or []) if key.quasi is None else equations.accelerations[:n]
+            if equations.rows is not None:
+                roots += [*(x for row in equations.rows.A for x in row), *equations.rows.gamma]
+        found = np.array([float(x) for x in evaluate(roots, values)])
+        if not right.defined:
+            return np.inf if np.all(np.isfinite(found)) else None
+        off = float(np.max(np.abs(found - right.x) / right.allowed, initial=0.0))
+        if 1.0 < off < np.inf:
+            # Sines of a million lose digits in either program: as many as a nudge changes.
+            change = 0.0
+            for _ in range(NUDGES):
+                signs = 1.0 + eps * rng.choice([-1.0, 1.0], (2, max(n, speeds)))
+                near = expected(t, q * signs[0, :n], v * signs[1, :speeds], params, inputs)
+                if near is None or near.x.shape != right.x.shape:
+                    return None
+                change = max(change, float(np.max(np.abs(near.x - right.x))))
+            if change > SENSITIVE * norm(right.x):
+                return None
+            off = float(np.max(np.abs(found - right.x) / (right.allowed + SLACK * change)))
+        return off if np.isfinite(off) else np.inf
+
+    compared, worst = 0, 0.0
+    for own, wanted in ((True, STATES), (False, STATES // 2)) if known else ((False, STATES),):
+        states, wanted = 0, max(wanted, LEAST - compared)
+        for _ in range(DRAWS):
+            off = drawn(own)
+            if off is not None:
+                worst = max(worst, off)
+                states += bool(np.isfinite(off))
+            if states == wanted or worst > 1.0:
+                break
+        compared += states
+    return Comparison(compared, worst)
+
+
+class _Right(NamedTuple):
+    """What the array program gives.
+
+    Attributes:
+        x: the acceleration, or M, h and Q.
+        allowed: how far off a sound program may be.
+        kept: rows that are solved with.
+        defined: whether there is a value.
+        parts: whether x is M, h, Q, A and gamma; with quasi-velocities B^T M B, B^T (h + M s - Q)
+            and v.
+    """
+
+    x: np.ndarray
+    allowed: Any
+    kept: Any = ()
+    defined: bool = True
+    parts: bool = False
+
+
+_NONE = _Right(np.zeros(0), 0.0, defined=False)
+
+
+def _solved(key: Key, M: Any, right: Any) -> tuple[Any, float] | None:
+    """(x with M x = right, how far off another way to it may be); None where that means little."""
+    if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
+        return None
+    if not np.linalg.cond(M) < 1e9:
+        return None
+    x = np.linalg.solve(M, right)
+    size = norm(right) + norm(M) * norm(x) + 1.0
+    eps = float(jnp.finfo(key.dtype).eps)
+    return x, float(SLACK * eps * size * norm(np.linalg.inv(M)))
+
+
+def _definite(M: Any) -> bool:
+    """Whether M is finite and clearly positive definite."""
+    if not np.all(np.isfinite(M)):
+        return False
+    return bool(np.min(np.linalg.eigvalsh(M), initial=1.0) > 1e-9 * norm(M))
+
+
+class _Plain:
+    """The accelerations a with M a + h = Q + A^T lam, A a + gamma = 0."""
+
+    def __init__(self, key: Key) -> None:
+        terms = ArrayTerms(key.lagrangian, key.forces, key.constraints, baumgarte=key.baumgarte)
+        self.key = key
+        self.mass, self.bias = (traced(key, f, False) for f in (terms.mass, terms.bias))
+        self.force = traced(key, terms.force, True) if key.forces else None
+        self.bound = []
+        if key.constraints:
+            self.bound = [traced(key, f, False) for f in (terms.rows, terms.gamma)]
+        self.felt, self.read = None, ()
+        if any(map(reads_lam, key.forces)):
+            self.felt, self.read = _slopes(key, terms), rows_read(key, terms)
+
+    def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
+        n = self.key.size
+        (M,) = interpret(self.mass, t, q, v, *params)
+        (h,) = interpret(self.bias, t, q, v, *params)
+        Q = np.zeros(0)
+        right = -h
+        if self.force is not None:
+            (Q,) = interpret(self.force, t, q, v, *params, *inputs)
+            right = Q + right
+        if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
+            return None if self.bound else _NONE
+        kept: Any = ()
+        if self.bound:
+            (A, _), (gamma,) = (interpret(f, t, q, v, *params) for f in self.bound)
+            kept = _independent(A, self.read)
+            if not _definite(M if self.key.regular else _augmented(M, A[kept])):
+                return None if self.felt is not None else self._parts(v, M, h, Q, A, gamma)
+            G = np.zeros((n, len(A)))
+            if self.felt is not None:
+                rest, G = interpret(self.felt, t, q, v, *params, *inputs, np.zeros(len(A)))
+                right = right + rest
+                G = G if np.all(kept) else G @ _as_read(A, kept, self.read)
+            M, right = _bordered(M, A[kept], right, gamma[kept], G[:, kept])
+            if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
+                return None
+        elif not _definite(M):
+            return self._parts(v, M, h, Q)
+        found = _solved(self.key, M, right)
+        return None if found is None else _Right(found[0][:n], found[1], kept)
+
+    def _parts(self, v: Any, M: Any, *others: Any) -> _Right | None:
+        """What accelerations follow from, in place of these; None where it has no value."""
+        parts = np.concatenate([np.ravel(x) for x in (M, *others)])
+        if not np.all(np.isfinite(parts)):
+            return None
+        # Terms of h and gamma that cancel are of the size of M v v and A v v.
+        size = 1.0 + sum(map(norm, others)) + (norm(M) + sum(map(norm, others[2:]))) * norm(v) ** 2
+        eps = float(jnp.finfo(self.key.dtype).eps)
+        return _Right(parts, SLACK * eps * (size + norm(M)), parts=True)
+
+
+class _Quasi:
+    """v and u' with B^T M B u' = B^T (Q - h - M s), v = B u + c and s = v' at u' = 0."""
+
+    def __init__(self, key: Key) -> None:
+        terms, quasi = ArrayTerms(key.lagrangian, key.forces), key.quasi
+        assert quasi is not None
+        self.key, self.quasi = key, quasi
+        self.mass, self.bias = (traced(key, f, False) for f in (terms.mass, terms.bias))
+        self.force = traced(key, terms.force, True) if key.forces else None
+        if quasi.kinematics is None:
+            self.slopes = traced(key, _slopes_of(quasi.of), False)
+            self.drift = traced(key, _drift_of(quasi.of, lambda t, q, v, params: v), False)
+        else:
+            V, speeds = quasi.velocities, quasi.size
+            self.slopes = traced(key, _slopes_of(V), False, speeds=speeds)
+            self.drift = traced(key, _drift_of(V, V), False, speeds=speeds)
+
+    def __call__(self, t: Any, q: Any, w: Any, params: list, inputs: list) -> _Right | None:
+        u = np.zeros(self.quasi.size)
+        u[self.quasi.free] = w
+        if self.quasi.kinematics is None:
+            theta, theta_0 = interpret(self.slopes, t, q, np.zeros(self.key.size), *params)
+            inverted = _solved(self.key, theta, u - theta_0)
+            if inverted is None:
+                return None
+            v, allowed = inverted
+            (turn,) = interpret(self.drift, t, q, v, *params)
+            B, s = np.linalg.inv(theta), np.linalg.solve(theta, -turn)
+        else:
+            B, c = interpret(self.slopes, t, q, np.zeros_like(u), *params)
+            v, (s,) = B @ u + c, interpret(self.drift, t, q, u, *params)
+            allowed = SLACK * float(jnp.finfo(self.key.dtype).eps) * (1.0 + norm(v))
+        B = B[:, self.quasi.free]
+        (M,) = interpret(self.mass, t, q, v, *params)
+        (h,) = interpret(self.bias, t, q, v, *params)
+        Q = interpret(self.force, t, q, v, *params, *inputs)[0] if self.force is not None else 0.0
+        reduced, right = B.T @ M @ B, B.T @ (Q - h - M @ s)
+        # What is projected is larger than what is left of it, and B has errors of its own.
+        parts = norm(Q) + norm(h) + norm(M) * norm(s)
+        eps, size = float(jnp.finfo(self.key.dtype).eps), norm(B)
+        if not _definite(reduced):
+            x = np.concatenate([np.ravel(reduced), -right, v])
+            if not np.all(np.isfinite(x)):
+                return None
+            scale = (1.0 + size) ** 2 * (norm(M) * (1.0 + norm(v) ** 2) + parts) + 1.0
+            return _Right(x, SLACK * eps * scale + allowed, parts=True)
+        found = _solved(self.key, reduced, right)
+        if found is None:
+            return None
+        more = SLACK * eps * parts * size * norm(np.linalg.inv(reduced))
+        limits = [np.full(len(v), allowed), np.full(len(w), found[1] + more * (1.0 + size))]
+        return _Right(np.concatenate([v, found[0]]), np.concatenate(limits))
+
+
+def _slopes_of(function: Callable) -> Callable:
+    """(slopes in the third argument, value where it is zero) of an affine function of it."""
+
+    def slopes(t: Any, q: Any, x: Any, params: Any) -> Any:
+        return jax.jacfwd(lambda x: function(t, q, x, params))(x), function(t, q, 0.0 * x, params)
+
+    return slopes
+
+
+def _drift_of(function: Callable, velocity: Callable) -> Callable:
+    """The rate of a function of (t, q, x, params) along (1, velocity) at fixed x."""
+
+    def drift(t: Any, q: Any, x: Any, params: Any) -> Any:
+        along = jnp.ones_like(t), velocity(t, q, x, params)
+        return jax.jvp(lambda t, q: function(t, q, x, params), (t, q), along)[1]
+
+    return drift
+
+
+def _slopes(key: Key, terms: ArrayTerms) -> Any:
+    """The jaxpr of (Q_0, G) of the forces Q_0 + G lam."""
+
+    def affine(t: Any, q: Any, v: Any, params: Any, inputs: Any, lam: Any) -> Any:
+        def push(lam: Any) -> Any:
+            return terms.reactive(t, q, v, params, inputs, lam)
+
+        return push(lam), jax.jacfwd(push)(lam)
+
+    m = layout_of(key.constraints, key.params, key.static, key.size, key.dtype).size
+    return traced(key, affine, True, m)
+
+
+def _bordered(M: Any, A: Any, r: Any, c: Any, G: Any) -> tuple[Any, Any]:
+    """[M, A^T + G; A, 0] and (r, -c), for the unknowns (a, -lam)."""
+    none = np.zeros((len(A), len(A)))
+    return np.block([[M, A.T + G], [A, none]]), np.concatenate([r, -c])
+
+
+def _pressing(whole: Any, n: int) -> Any:
+    """[M + A^T A, -(A^T + G); A, 0], of a positive determinant where rows press as they should."""
+    whole = whole.copy()
+    A = whole[n:, :n]
+    whole[:n, :n] += A.T @ A
+    whole[:n, n:] *= -1.0
+    return whole
+
+
+def _augmented(M: Any, A: Any) -> np.ndarray:
+    """What the scalar program divides by where M may be singular, in numbers while tracing."""
+    with jax.ensure_compile_time_eval():
+        return np.asarray(augmented(jnp.asarray(M), jnp.asarray(A))[0])
+
+
+def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
+    """What takes multipliers of the rows kept to those that forces see, in numbers."""
+    with jax.ensure_compile_time_eval():
+        rows, given = jnp.asarray(A), (jnp.asarray(kept), jnp.asarray(norm(A, axis=1) > 0))
+        columns = [shared(rows, e, *given, read) for e in jnp.eye(len(A), dtype=rows.dtype)]
+        return np.asarray(jnp.stack(columns, axis=1))
+
+
+def _independent(A: Any, read: Sequence[bool]) -> np.ndarray:
+    """A largest set of clearly independent rows, first of those that are read."""
+    kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
+    for k in sorted(range(len(A)), key=lambda k: bool(read) and not read[k]):
+        rest = A[k] - (Y @ A[k]) @ Y
+        size = norm(rest)
+        if size > 1e-3 * norm(A[k]):
+            kept[k], Y = True, np.vstack([Y, rest / size])
+    return kept

@@ -1,0 +1,449 @@
+"""Quasi-velocities u = U(t, q, v), and the kinematics v = V(t, q, u) that go with them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from jaxlag._core._arrays import real
+from jaxlag._core._errors import bad
+from jaxlag._linalg._independent_rows import row_sizes
+from jaxlag._model._constraints import Pfaffian
+from jaxlag._tracing._dependence import outputs_depend_on
+from jaxlag._tracing._signature import require_arity
+from jaxlag._tracing._traced_function import captured
+
+# Least sine of the angle between a row of dU/dv and those before it, in roundings.
+SINE = 64
+
+REFINED = 2
+"""Steps of refinement. Worst errors over |B^-1| (|B| |u| + |v|) eps of 3000 matrices of 2 to 5
+rows, half of their other entries 0, between units of 1e-6 to 1e6: of v by U 3e10 without, 4e5 with
+one, 6 with two; of u by kinematics 7e9, 12, 0.5. The medians are 0.1 with any."""
+
+
+class QuasiVelocities(eqx.Module):
+    """Speeds u = U(t, q, v) = Theta^T v + theta_0 in place of v: body rates, slip, and the like.
+
+    Either U is given: then v = (Theta^T)^-1 (u - theta_0) with Theta^T = dU/dv, square. Or
+    `kinematics`, which says how v follows from u, v = B u + c: B may be taller than wide, as for
+    the rates of a quaternion of unit norm, which is a `Holonomic` constraint then, or for speeds
+    with which Pfaffian rows are satisfied by themselves.
+
+    A name in `constrained` is a constraint: the row U_name = 0, whose multiplier bears the name.
+    In the quasi-velocity formulation it is left out of the state.
+
+    There may be places where dU/dv is singular, as at a pitch of 90 degrees or where a wheel is
+    steered across the way: v does not follow from u there, though the motion may well go on. A
+    motion whose state holds u ends just before such a place in the status kinematics_singular, one
+    with fixed steps a step before it. With formulation "auto", outside of transforms and with L a
+    function of v, `simulate` goes on from the start by multipliers, and says so.
+
+    Args:
+        U: function `U(t, q, v, params)`, affine in v, returning shape (k,), in m/s or rad/s.
+        names: k names; as many as there are coordinates where U is given, no more than that and
+            no fewer than constraints leave where `kinematics` is given.
+        constrained: those among the names that vanish.
+        kinematics: function `f(t, q, u, params)`, affine in u (k,), returning v, shape (n,).
+
+    Raises:
+        ValueError: neither or both of U and `kinematics`, functions that cannot be called in
+            these forms, names that are empty, not distinct or unknown; nothing left that moves.
+            While tracing: shapes that do not fit the names, functions that are not affine.
+
+    Source: Pila, Introduction to Lagrangian Dynamics, sec. 4.3, eqs. 4.28 to 4.58; Greenwood,
+    Advanced Dynamics, sec. 4.1.
+    """
+
+    U: Callable | None = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    constrained: tuple[str, ...] = eqx.field(static=True)
+    kinematics: Callable | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        U: Callable | None = None,
+        names: Sequence[str] = (),
+        constrained: Sequence[str] = (),
+        *,
+        kinematics: Callable | None = None,
+    ) -> None:
+        if (U is None) == (kinematics is None):
+            was = "it got neither" if U is None else "it got both"
+            fix = "Write U(t, q, v, params), or kinematics=f with f(t, q, u, params)."
+            raise bad("QuasiVelocities", "get either U or kinematics", was, fix)
+        if U is not None:
+            require_arity("QuasiVelocities: U", U, ("t", "q", "v", "params"))
+        if kinematics is not None:
+            form = ("t", "q", "u", "params")
+            require_arity("QuasiVelocities: kinematics", kinematics, form)
+        self.U = None if U is None else captured(U)
+        self.kinematics = None if kinematics is None else captured(kinematics)
+        self.names = _names("names", names)
+        self.constrained = _names("constrained", constrained)
+        if not self.names:
+            raise bad("QuasiVelocities: names", "name at least one", "it was empty")
+        for name in self.constrained:
+            if name not in self.names:
+                must, was = f"be among the names {list(self.names)}", f"one was {name!r}"
+                raise bad("QuasiVelocities: constrained", must, was)
+        if len(self.constrained) == len(self.names):
+            raise bad("QuasiVelocities: constrained", "leave something that moves", "all were")
+
+    @property
+    def size(self) -> int:
+        """Number k of quasi-velocities, constrained ones included."""
+        return len(self.names)
+
+    @property
+    def free(self) -> np.ndarray:
+        """Indices of those that are not constrained."""
+        return np.array([i for i, name in enumerate(self.names) if name not in self.constrained])
+
+    @property
+    def bound(self) -> np.ndarray:
+        """Indices of the constrained ones, in the order of `constrained`."""
+        return np.array([self.names.index(name) for name in self.constrained], int)
+
+    @property
+    def rows(self) -> tuple[Pfaffian, ...]:
+        """The constraint that they declare: U_name = 0 for every constrained name."""
+        if not self.constrained:
+            return ()
+        return (Pfaffian(Vanishing(self), self.constrained),)
+
+    def of(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " k"]:
+        """u = U(t, q, v), shape (k,), in m/s or rad/s; without U the u with B u + c nearest to v.
+
+        Velocities that B u + c does not reach are compared over the lengths of the rows of B.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            v: velocities, shape (n,).
+            params: as U takes them.
+
+        Raises:
+            ValueError: the function returns anything but one real number for each name.
+        """
+        if self.U is not None:
+            return self._checked("U", self.U(t, q, v, params), self.size, v.dtype)
+        B, c = self._affine(t, q, v.dtype, params)
+        # Rows of long units would leave nothing but rounding of those of short ones.
+        size = _lengths(B)
+        return _nearest(B / size[:, None], (v - c) / size)
+
+    def velocities(
+        self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " k"], params: Any
+    ) -> Float[Array, " n"]:
+        """v = V(t, q, u), shape (n,), in m/s or rad/s; NaN where Theta^T is singular.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            u: quasi-velocities, shape (k,), constrained ones included.
+            params: as U takes them.
+
+        Raises:
+            ValueError: the function returns anything but one real number for each coordinate.
+        """
+        n = q.shape[0]
+        if self.kinematics is not None:
+            return self._checked("kinematics", self.kinematics(t, q, u, params), n, u.dtype)
+
+        def along(v: Array) -> Array:
+            return self.of(t, q, v, params)
+
+        rest = jnp.zeros((n,), u.dtype)
+        theta_0, push = jax.linearize(along, rest)
+        theta = jax.vmap(push)(jnp.eye(n, dtype=u.dtype))  # Theta_ij: of v_i in u_j
+        size, Q, R = _factored(theta)
+        fine = jnp.all(jnp.abs(jnp.diagonal(R)) > _floor(theta))
+
+        def regular(x: Array) -> Array:
+            """So that derivatives of what is masked are finite."""
+            return jnp.where(fine, x, jnp.eye(n, dtype=x.dtype))
+
+        theta = regular(theta)
+        inverse = _inverse(jnp.where(fine, size, 1.0), regular(Q), regular(R))
+        v = lax.custom_linear_solve(
+            lambda v: v @ theta,
+            u - theta_0,
+            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
+            lambda turned, b: _refined(lambda b: inverse @ b, turned, b),
+        )
+        return jnp.where(fine, v, jnp.nan)
+
+    def sines(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any, dtype: Any
+    ) -> Float[Array, " k"]:
+        """Sine of the angle between every quasi-velocity and those before it; 0 if it follows.
+
+        Or if it vanishes up to rounding, as cos(pitch) yaw' does at a pitch of 90 degrees.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            params: as U takes them.
+            dtype: of velocities.
+        """
+
+        def rows(q: Array) -> Array:
+            return self._columns(t, q, params, dtype).T
+
+        here = rows(q)
+        there = row_sizes(rows, q, here).there
+        return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
+
+    def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """Distance of every quasi-velocity's coefficients from the span of those before it.
+
+        That of every row of dU/dv, shape (k,), or of every column of B where `kinematics` are
+        given: |R_jj| of Q R = (dU/dv)^T or B.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,), m or rad.
+            params: as U takes them.
+        """
+        size, _, R = _factored(self._columns(t, q, params, q.dtype))
+        return size * jnp.abs(jnp.diagonal(R))
+
+    def determinant(
+        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
+    ) -> Float[Array, ""]:
+        """det dU/dv, or det B, or det B^T B where B is tall: 0 or infinite where it is singular.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,), m or rad.
+            params: as U takes them.
+        """
+        columns = self._columns(t, q, params, q.dtype)
+        square = columns.shape[0] == columns.shape[1]
+        return jnp.linalg.det(columns if square else columns.T @ columns)
+
+    def moves(self, q: Any, params: Any) -> bool:
+        """Whether dU/dv, or B, depends on time or coordinates, as far as its program shows.
+
+        Args:
+            q: coordinates, or one like them.
+            params: as U takes them.
+        """
+        like = jax.ShapeDtypeStruct(q.shape, q.dtype)
+        time = jax.ShapeDtypeStruct((), jnp.result_type(float))
+
+        def determinant(t: Array, q: Array) -> Array:
+            return self.determinant(t, q, params)
+
+        program = jax.make_jaxpr(determinant)(time, like).jaxpr
+        (found,) = outputs_depend_on(program, [frozenset("t"), frozenset("q")])
+        return bool(found)
+
+    def regular(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Bool[Array, ""]:
+        """Whether v follows from u there, and u from v.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            params: as U takes them.
+        """
+        return jnp.all(self.sines(t, q, params, q.dtype) > SINE * float(jnp.finfo(q.dtype).eps))
+
+    def vector(self, argument: str, u: Any) -> Float[Array, " k"]:
+        """All quasi-velocities from k numbers, or a dict by name; constrained ones may be left out.
+
+        Args:
+            argument: what errors call it.
+            u: m/s or rad/s.
+
+        Raises:
+            ValueError: other names or another number of values.
+        """
+        if isinstance(u, Mapping):
+            needed = [name for name in self.names if name not in self.constrained]
+            if not set(needed) <= set(u) <= set(self.names):
+                must = f"name {needed}" + (
+                    f", may name {list(self.constrained)}," * bool(self.constrained)
+                )
+                raise bad(argument, f"{must} and nothing else", f"it named {list(u)}")
+            u = [u.get(name, 0.0) for name in self.names]
+        x = real(argument, u)
+        if x.shape != (self.size,):
+            fix = f"Give one entry for each of {list(self.names)}, constrained ones included."
+            raise bad(argument, f"have shape ({self.size},)", f"its shape was {x.shape}", fix)
+        return x
+
+    def full(self, w: Float[Array, " r"]) -> Float[Array, " k"]:
+        """All quasi-velocities, shape (k,), from the free ones, shape (r,); the others are zero."""
+        if not self.constrained:
+            return w
+        return jnp.zeros((self.size,), w.dtype).at[self.free].set(w)
+
+    def _columns(self, t: Array, q: Array, params: Any, dtype: Any) -> Array:
+        """(dU/dv)^T or B: a column for every quasi-velocity."""
+        if self.U is None:
+            return self._affine(t, q, dtype, params)[0]
+        rest = jnp.zeros(q.shape, dtype)
+        return jax.jacfwd(lambda v: self.of(t, q, v, params))(rest).T
+
+    def _affine(self, t: Array, q: Array, dtype: Any, params: Any) -> tuple[Array, Array]:
+        """(B, c)."""
+
+        def along(u: Array) -> Array:
+            return self.velocities(t, q, u, params)
+
+        c, push = jax.linearize(along, jnp.zeros((self.size,), dtype))
+        return jax.vmap(push, out_axes=1)(jnp.eye(self.size, dtype=dtype)), c
+
+    def _checked(self, function: str, value: Any, size: int, dtype: Any) -> Array:
+        argument = f"QuasiVelocities: {function}"
+        if not eqx.is_array_like(value):
+            raise bad(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
+        value = jnp.asarray(value)
+        if value.shape != (size,) or not jnp.issubdtype(value.dtype, jnp.floating):
+            of = "name" if function == "U" else "coordinate"
+            must = f"return {size} numbers, one for each {of}"
+            raise bad(argument, must, f"it returned {value.dtype} of shape {value.shape}")
+        return value.astype(dtype)
+
+
+class Vanishing(eqx.Module):
+    """The residual of the constrained quasi-velocities; hashes by what they are."""
+
+    quasi: QuasiVelocities
+
+    def __call__(self, t: Array, q: Array, v: Array, params: Any) -> Array:
+        return self.quasi.of(t, q, v, params)[self.quasi.bound]
+
+
+class InQuasiVelocities(eqx.Module):
+    """A function of (t, q, u, params) as one of (t, q, v, params)."""
+
+    function: Callable = eqx.field(static=True)
+    quasi: QuasiVelocities
+
+    def __call__(self, t: Array, q: Array, v: Array, params: Any) -> Any:
+        return self.function(t, q, self.quasi.of(t, q, v, params), params)
+
+
+def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
+    """Raise unless these can be the quasi-velocities of n coordinates.
+
+    Args:
+        quasi: of the declaration.
+        n: number of coordinates.
+        taken: name -> what bears it already.
+    """
+    if not isinstance(quasi, QuasiVelocities):
+        must, fix = "be a jl.QuasiVelocities", "Write jl.QuasiVelocities(U, names)."
+        raise bad("quasi", must, f"it was {quasi!r}", fix)
+    for name in quasi.names:
+        if name in taken:
+            raise bad("quasi: names", "be names of their own", f"{name!r} is {taken[name]}, too")
+    k = quasi.size
+    if quasi.kinematics is None and k != n:
+        raise bad(
+            "quasi: names",
+            f"be as many as there are coordinates, {n}, so that v follows from u",
+            f"there were {k}",
+            "Name the combinations that constraints set to zero, too, in constrained=; or say how "
+            "v follows from u by kinematics=.",
+        )
+    if k > n:
+        raise bad("quasi: names", f"be no more than the {n} coordinates", f"there were {k}")
+
+
+def _sines(columns: Float[Array, "n k"]) -> Float[Array, " k"]:
+    """Sine of the angle between every column and the span of those before it."""
+    return jnp.abs(jnp.diagonal(_factored(columns)[2]))
+
+
+def _nearest(B: Float[Array, "n k"], b: Float[Array, " n"]) -> Float[Array, " k"]:
+    """The x with B x nearest to b; derivatives go through B x = b, not through its factors.
+
+    Of a B that is taller than wide it is found together with what is left, r = b - B x, B^T r = 0.
+
+    Source: Bjorck, BIT 7 (1967) 257.
+    """
+    n, k = B.shape
+    inverse, fixed = _inverse(*_factored(B)), lax.stop_gradient(B)
+    if n == k:
+        return lax.custom_linear_solve(
+            lambda x: B @ x,
+            b,
+            lambda product, b: _refined(lambda b: inverse @ b, product, b),
+            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
+        )
+
+    def bordered(z: Array) -> Array:
+        return jnp.concatenate([z[:n] + B @ z[n:], z[:n] @ B])
+
+    def solve(right: Array) -> Array:
+        given, out = right[:n], right[n:] @ inverse
+        left = given - fixed @ (inverse @ given) + out
+        return jnp.concatenate([left, inverse @ (given - out)])
+
+    right = jnp.concatenate([b, jnp.zeros((k,), b.dtype)])
+    found = lax.custom_linear_solve(
+        bordered, right, lambda product, b: _refined(solve, product, b), symmetric=True
+    )
+    return found[n:]
+
+
+def _refined(solve: Callable, product: Callable, b: Array) -> Array:
+    """The x with product(x) = b, with the residuals of the first ones solved for, too.
+
+    Between coordinates of unlike units rows are nearly parallel, and those of short units would be
+    left with the rounding of the others.
+
+    Source: Skeel, Math. Comp. 35 (1980) 817.
+    """
+    x = solve(b)
+    for _ in range(REFINED):
+        x = x + solve(b - product(x))
+    return x
+
+
+def _lengths(rows: Float[Array, "n k"]) -> Float[Array, " n"]:
+    """Lengths of rows, 1 of those that vanish; without derivatives."""
+    size = jnp.sqrt(jnp.sum(lax.stop_gradient(rows) ** 2, axis=1))
+    return jnp.where(size > 0, size, 1.0)
+
+
+def _factored(columns: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
+    """(s, Q, R) with Q R diag(s) the columns, s their lengths; without derivatives."""
+    columns = lax.stop_gradient(columns)
+    size = _lengths(columns.T)
+    Q, R = jnp.linalg.qr(columns / size[None])
+    return size, Q, R
+
+
+def _inverse(size: Array, Q: Array, R: Array) -> Float[Array, "k n"]:
+    """That of Q R diag(size) where it is square; where it is tall, the least-squares one."""
+    return solve_triangular(R, Q.T) / size[:, None]
+
+
+def _floor(columns: Array) -> float:
+    return SINE * float(jnp.finfo(columns.dtype).eps)
+
+
+def _names(argument: str, names: Any) -> tuple[str, ...]:
+    fix = 'Write names=("wx", "wy", "wz").'
+    argument = f"QuasiVelocities: {argument}"
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        raise bad(argument, "be a sequence of names", f"it was {names!r}", fix)
+    for name in names:
+        if not isinstance(name, str) or not name:
+            raise bad(argument, "be non-empty strings", f"one was {name!r}", fix)
+        if names.count(name) > 1:
+            raise bad(argument, "be distinct", f"{name!r} occurs {names.count(name)} times")
+    return tuple(names)

@@ -1,0 +1,1 @@
+"""`simulate`: its arguments, the problem that they pose, the solution."""

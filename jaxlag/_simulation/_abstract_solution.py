@@ -1,0 +1,92 @@
+"""What views, advice and further solves read of a `Solution`."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from jaxlag._simulation._failure import Scene
+from jaxlag._system._system import System
+
+
+class AbstractSolution(eqx.Module):
+    """The attributes of a `Solution` that do not depend on how it was made; see there."""
+
+    system: eqx.AbstractVar[System]
+    ts: eqx.AbstractVar[Array]
+    q: eqx.AbstractVar[Array]
+    v: eqx.AbstractVar[Array]
+    last_time: eqx.AbstractVar[Array]
+    last_state: eqx.AbstractVar[tuple[Array, Array]]
+    stats: eqx.AbstractVar[dict[str, Any]]
+    saved: eqx.AbstractVar[dict[str, Any]]
+    formulation: eqx.AbstractVar[str]
+    stabilization: eqx.AbstractVar[Any]
+    tolerances: eqx.AbstractVar[tuple[Array, Array] | None]
+    dt_max: eqx.AbstractVar[Array | None]
+    change_points: eqx.AbstractVar[str]
+    _solver: eqx.AbstractVar[str]
+    _params_traced: eqx.AbstractVar[Any]
+    _inputs_traced: eqx.AbstractVar[Any]
+
+    @property
+    @abstractmethod
+    def status(self) -> Array:
+        """How the motion ended."""
+
+    @property
+    @abstractmethod
+    def raw_status(self) -> Array:
+        """The same before the states around its end are looked at."""
+
+    @property
+    @abstractmethod
+    def scene(self) -> Scene:
+        """What moved."""
+
+    @property
+    @abstractmethod
+    def method(self) -> str:
+        """The name of the method."""
+
+    @property
+    @abstractmethod
+    def params(self) -> Any:
+        """As the user gave them."""
+
+    @property
+    @abstractmethod
+    def inputs(self) -> dict[str, Any]:
+        """By name."""
+
+    @property
+    @abstractmethod
+    def _given(self) -> Any:
+        """Params, and what declared functions close over."""
+
+    @property
+    @abstractmethod
+    def fallback(self) -> str:
+        """Why the equations in quasi-velocities were left."""
+
+    @property
+    @abstractmethod
+    def energy(self) -> Array:
+        """H at the rows."""
+
+    @abstractmethod
+    def __getitem__(self, name: Any) -> Any:
+        """A coordinate, or some motions of a batch."""
+
+    @abstractmethod
+    def rate(self, name: str) -> Array:
+        """The velocity of a coordinate."""
+
+    @abstractmethod
+    def message(self) -> str:
+        """How it ended, in words."""
+
+    @abstractmethod
+    def _rows(self, rows: list[int]) -> "AbstractSolution":
+        """The same with these rows only."""

@@ -1,0 +1,55 @@
+"""What is said where compiling takes long."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+from jaxlag._core._arrays import concrete
+from jaxlag._lowering import ScalarTerms
+from jaxlag._system._system import System
+
+LONG = 5.0  # s
+
+_logger = logging.getLogger("jaxlag")
+
+
+def timed(
+    program: Any,
+    system: System,
+    key: Any,
+    values: Any,
+    clock: Callable[[], float] = time.monotonic,
+) -> Any:
+    """program(key, values), a jitted function, with a word on the log where compiling it took long.
+
+    Inside a transform, whose program compiles as a whole, nothing is said.
+
+    Args:
+        program: jitted.
+        system: what moves.
+        key: what the program is compiled for.
+        values: what it is called with.
+        clock: seconds.
+    """
+    compiled = getattr(program, "_cache_size", None)  # JAX's own count
+    if compiled is None or not concrete(values):
+        return program(key, values)
+    count, start = compiled(), clock()
+    results = program(key, values)
+    seconds = clock() - start
+    if seconds > LONG and compiled() > count:
+        _logger.warning("%s", _words(system, seconds))
+    return results
+
+
+def _words(system: System, seconds: float) -> str:
+    names = system.coordinates.labels
+    shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    advice = "JAX_COMPILATION_CACHE_DIR keeps what is compiled for the next process"
+    if isinstance(system.terms, ScalarTerms):
+        advice += "; lowering='array' compiles long equations in less time, and runs slower"
+    return (
+        f"Compiling the motion of {len(names)} coordinates ({shown}) took {seconds:.0f} s, once "
+        f"for this program. {advice}. System.explain says what was found in the equations."
+    )

@@ -1,0 +1,372 @@
+"""How a trajectory ended, and what that concerns."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._core._arrays import concrete, still
+from jaxlag._core._status import Status
+from jaxlag._integration._initial_conditions import Start, residuals
+from jaxlag._integration._record import Outcome, Times
+from jaxlag._integration._step_arguments import Arguments
+from jaxlag._integration._step_end import Settling
+from jaxlag._integration._vector_field import Dynamics
+from jaxlag._linalg._independent_rows import row_sizes
+from jaxlag._linalg._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked
+from jaxlag._linalg._mass_solve import factor_mass, first_unhealthy, solve_mass
+from jaxlag._model._forces import reads_lam
+from jaxlag._model._quasi_velocities import SINE
+from jaxlag._tracing import _params
+
+
+class Ending(NamedTuple):
+    """How a trajectory ended, as far as the solve knows.
+
+    Attributes:
+        status: int32, see `Status`; `explained` may tell more.
+        where: index of the coordinate or constraint row that it concerns; -1 if none is known.
+        tried: end of the last attempted step, s.
+        state: (q, v), or (q, u), of the last good state.
+    """
+
+    status: Int[Array, "*batch"]
+    where: Int[Array, "*batch"]
+    tried: Float[Array, "*batch"]
+    state: Float[Array, "*batch m"]
+
+
+_PARTS = np.array([0.0, *[1.0] * 32, *2.0 ** np.arange(1, 7)]) / 32
+"""Of a failed step, from its start to its end and beyond: where these meet it is looked at."""
+
+_OPEN = (
+    *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
+    *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
+    Status.implicit_solve_failed,
+)
+"""Outcomes of which `explained` may say more."""
+
+
+def ended(
+    dynamics: Dynamics, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
+) -> Ending:
+    """What a solve knows of its end, at the price of nothing."""
+    status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
+    status = jnp.where(begun.pressed, status, int(Status.no_reaction_solution))
+    kind = jnp.where(
+        begun.consistent.contradictory,
+        int(Status.contradictory_rows),
+        int(Status.inconsistent_start),
+    )
+    kind = jnp.where(begun.consistent.complete, kind, int(Status.kinematics_singular))
+    status = jnp.where(begun.consistent.ok, status, kind)
+    short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
+    status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
+    status = jnp.where(begun.valid, status, int(Status.bad_value))
+
+    faults, n = ~jnp.isfinite(still(y0)), dynamics.system.size
+    start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
+    # Of quasi-velocities it would be no coordinate.
+    start = jnp.where(start < n, start, start % n if dynamics.quasi is None else -1)
+    start = start.astype(jnp.int32)
+    where = jnp.where(status == int(Status.bad_value), start, -1)
+    if dynamics.rows.size:
+        fault = (status == int(Status.inconsistent_start)) | (
+            status == int(Status.contradictory_rows)
+        )
+        where = jnp.where(fault, begun.consistent.row, where)
+    tried = dynamics.clock(outcome.tried, args)
+    found = status.astype(jnp.int32), where.astype(jnp.int32), tried, dynamics.idle(outcome.state)
+    return still(Ending(*found))
+
+
+def is_open(ending: Ending) -> bool:
+    """Whether `explained` may say more of one of these endings; True where they are traced."""
+    if not concrete(ending.status):
+        return True
+    return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
+
+
+class Scene(NamedTuple):
+    """What a motion was of, to explain it by: the key of a compiled program."""
+
+    system: Any
+    params: _params.Static
+    inputs: _params.Static
+    formulation: str
+    stabilization: Any
+    kinematic: bool  # quasi-velocities enter, whose kinematics may be singular
+    implicit: bool  # steps may be far longer than what decays takes
+
+
+def dynamics_of(
+    scene: Scene, ts: Array, t: Array, q: Array, v: Array, params: Any, inputs: Any
+) -> tuple[Dynamics, Arguments]:
+    """The equations of a motion over ts that passes (q, v) at t, and their arguments."""
+    dynamics = Dynamics(
+        scene.system,
+        scene.params,
+        scene.inputs,
+        None,
+        None,
+        _params.UNKNOWN,
+        formulation=scene.formulation,
+        stabilization=scene.stabilization,
+    )
+    args = dynamics.arguments(params, inputs, ts)
+    given, _ = dynamics.given(args)
+    dynamics = replace(dynamics, rows=dynamics.system.rows(given, q.dtype))
+    y = dynamics.state_of(t, q, v, given)
+    return dynamics, dynamics.prepare(dynamics.tau(t, args), y, args)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def explained(scene: Scene, batch: int, given: Any) -> Ending:
+    """The endings with what is found when one looks at the states around them.
+
+    Args:
+        scene: what moved.
+        batch: number of batch axes.
+        given: (ending, last time, ts, q0, v0, traced halves of params and inputs).
+    """
+
+    def one(given: Any) -> Ending:
+        ending, time, ts, q0, v0, params, inputs = still(given)
+        # Kinematics that are singular at the start have no v0.
+        v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
+        dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)
+        time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
+        return _explained(scene, dynamics, ending, time, tried, start, q0, args)
+
+    for _ in range(batch):
+        one = jax.vmap(one)
+    return one(given)
+
+
+def _explained(
+    scene: Scene,
+    dynamics: Dynamics,
+    ending: Ending,
+    time: Array,
+    tried: Array,
+    start: Array,
+    q0: Array,
+    args: Arguments,
+) -> Ending:
+    """What can be said by the state a failed step started from and one that it was heading for.
+
+    The latter is asked where the former is sound: the first one on the way with something that is
+    not finite, or q + (t1 - t0) v.
+    """
+    status = ending.status
+    unexplained = status == int(Status.nonfinite)
+    q, w = dynamics.parts(ending.state)
+    _, _, v, _ = dynamics.state(time, ending.state, args)
+    ahead = jnp.concatenate([q + (tried - time).astype(q.dtype) * v, w])
+    last = ending.state[: ahead.shape[0]]
+    args = dynamics.within(args, time)
+    found, tau, y = _lost(dynamics, time, tried, ending.state, args, unexplained, scene.implicit)
+    tried = jnp.where(found, tau, tried)
+    ahead = jnp.where(found, y[: ahead.shape[0]], ahead)
+    # Both states in one batch: the terms are traced and compiled once.
+    taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
+    culprits = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
+    mass, lost = (jnp.where(x[0] >= 0, x[0], x[1]) for x in culprits[:2])
+    row = jnp.full((), -1, jnp.int32)
+    if dynamics.rows.size and dynamics.quasi is None:
+        begin = jnp.concatenate([q0, w])
+        at = jnp.append(taus, start), jnp.vstack([states, begin]), args
+        row = _dependent(dynamics, args.kept, *at)
+        if args.rows is not None and args.rows.reacting.kept is not args.kept:
+            reacting = _dependent(dynamics, args.rows.reacting.kept, *at)
+            row = jnp.where(row >= 0, row, reacting)
+    worst = jnp.where(jnp.all(jnp.isfinite(ahead)), culprits[2][1], culprits[2][0])
+
+    if dynamics.rows.size:
+        short = status == int(Status.step_below_resolution)
+        apart = status == int(Status.projection_failed)
+        dependent = (unexplained | short | apart) & (row >= 0)
+        status = jnp.where(dependent, int(Status.rank_change), status)
+        if any(map(reads_lam, dynamics.system.forces)):
+            sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
+            status = jnp.where(unexplained & sound, int(Status.no_reaction_solution), status)
+    unsolved = status == int(Status.implicit_solve_failed)
+    status = jnp.where((unexplained | unsolved) & (mass >= 0), int(Status.mass_singular), status)
+    turned = passed = jnp.full((), -1, jnp.int32)
+    if scene.kinematic:
+        beyond, _ = dynamics.parts(states[1])
+        turned, passed = _turned(dynamics, taus, jnp.stack([q, beyond]), start, q0, args)
+        failed = unexplained | unsolved | (status == int(Status.step_below_resolution))
+        turned = jnp.where(status == int(Status.kinematics_singular), passed, turned)
+        status = jnp.where(failed & (turned >= 0), int(Status.kinematics_singular), status)
+    concerns = {
+        Status.mass_singular: mass,
+        Status.nonfinite: lost,
+        Status.step_below_resolution: worst,
+        Status.implicit_solve_failed: worst,
+        Status.kinematics_singular: turned,
+    }
+    if dynamics.rows.size:
+        farthest = _farthest(dynamics, tried, states[1], args)
+        concerns |= {
+            Status.projection_failed: farthest,
+            Status.rank_change: jnp.where(row >= 0, row, farthest),
+            Status.no_reaction_solution: jnp.asarray(Settling(dynamics).contact_row),
+        }
+    where = ending.where
+    for kind, index in concerns.items():
+        where = jnp.where(status == int(kind), index.astype(jnp.int32), where)
+    return ending._replace(status=status.astype(jnp.int32), where=where)
+
+
+def _turned(
+    dynamics: Dynamics, taus: Array, q: Array, tau0: Array, q0: Array, args: Arguments
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The quasi-velocity that follows from those before it, or came close to it; -1 for none.
+
+    And the one that a step was turned back for: its part that does not follow from those before it
+    has changed most since the start.
+
+    Args:
+        dynamics: what moves.
+        taus: of a last good state and of one ahead of it.
+        q: the coordinates of both.
+        tau0: start of the motion.
+        q0: coordinates there.
+        args: arguments.
+    """
+    quasi, params = dynamics.system.quasi, dynamics.given(args)[0]
+    assert quasi is not None
+    eps = float(jnp.finfo(q.dtype).eps)
+
+    def sines(tau: Array, q: Array) -> Array:
+        return quasi.sines(dynamics.clock(tau, args), q, params, q.dtype)
+
+    now = sines(taus[0], q[0])
+    # A small angle of its own, as of v0 + 1e-5 v1 and v0, is no fault.
+    found = (now < jnp.minimum(eps**0.25, 0.01 * sines(tau0, q0))) | ~(now > SINE * eps)
+    found = found & jnp.all(jnp.isfinite(q[0]))
+    if dynamics.quasi is None:
+        known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+        return known, known
+
+    def parts(tau: Array, q: Array) -> Array:
+        size = jnp.log(quasi.pivots(dynamics.clock(tau, args), q, params))
+        return jnp.where(jnp.isnan(size), -jnp.inf, size)
+
+    begin, *there = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
+    found = found | (there[0] - begin < 0.5 * float(np.log(eps)))
+    known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+    changed = jnp.max(jnp.abs(jnp.stack(there) - begin), axis=0)
+    turned_back = taus[1] > tau0
+    return known, jnp.where(turned_back, jnp.argmax(changed).astype(jnp.int32), known)
+
+
+def _lost(
+    dynamics: Dynamics,
+    time: Array,
+    tried: Array,
+    y: Array,
+    args: Arguments,
+    wanted: Array,
+    implicit: bool,
+) -> tuple[Bool[Array, ""], Array, Array]:
+    """(whether dy/dt is not finite somewhere on a step from y, the first such time, state there).
+
+    By Euler's steps from y on, or on the tangent of the motion: where steps are `implicit`, what
+    decays within one of them is over at y, and the tangent follows what is left. Stages may lie
+    beyond the end of the step, and one at the resolution of time does not move the state: parts of
+    doubling length follow.
+    """
+    lengths = (tried - time) * jnp.asarray(_PARTS, time.dtype)
+
+    def goes_on(carry: tuple) -> Array:
+        k, _, y, rates = carry
+        sound = jnp.all(jnp.isfinite(y)) & jnp.all(jnp.isfinite(rates))
+        return wanted & sound & (k < _PARTS.size)
+
+    def ahead(carry: tuple) -> tuple:
+        k, tau, y, rates = carry
+        tau, y = tau + lengths[k], y + lengths[k].astype(y.dtype) * rates
+        new = dynamics(tau, y, args)
+        if implicit:
+            new = jnp.where((k > 0) & jnp.all(jnp.isfinite(new)), rates, new)
+        return k + 1, tau, y, new
+
+    begin = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
+    _, tau, y, rates = jax.lax.while_loop(goes_on, ahead, begin)
+    # Where the state has grown beyond all numbers, so has all that depends on it.
+    found = wanted & ~jnp.all(jnp.isfinite(rates)) & jnp.all(jnp.isfinite(y))
+    return found, tau, y
+
+
+def _culprits(
+    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
+    """Coordinates (without inertia, of non-finite Q - h, of the largest |a|).
+
+    -1 where there is none.
+    """
+    M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
+    if dynamics.rows.size:
+        A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
+        A = jnp.where(jnp.isfinite(A), A, 0.0)  # what is not finite there is no fault of inertia
+        M, _ = augmented(M, masked(A, args.kept))
+    factor = factor_mass(M)
+    a = solve_mass(M, effort, factor)
+    # A component that is not finite spreads through the solve: it is looked for before.
+    finite = jnp.isfinite(effort)
+    lost = jnp.where(jnp.all(finite), -1, jnp.argmin(finite))
+    worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
+    return first_unhealthy(M, factor), lost.astype(jnp.int32), worst.astype(jnp.int32)
+
+
+def _dependent(
+    dynamics: Dynamics, kept: Array | None, taus: Array, states: Array, args: Arguments
+) -> Int[Array, ""]:
+    """The row that vanishes, or follows from those before it, or came close to that; -1 for none.
+
+    Args:
+        dynamics: what moves.
+        kept: rows that are solved with; None for all.
+        taus: of a last good state, of one ahead of it, and of the start.
+        states: these three.
+        args: arguments.
+    """
+
+    def squares(tau: Array, y: Array) -> tuple[Array, Array]:
+        """(squared distances of rows from those before them, whether they count as such)."""
+        t, q, v, params = dynamics.state(tau, y, args)
+
+        def rows(q: Array) -> Array:
+            return masked(dynamics.terms.rows(t, q, v, params)[0], kept)
+
+        A, M = rows(q), dynamics.mass(tau, y, args)
+        there = row_sizes(rows, q, A).there
+        factor = factor_kkt(M, A, kept, FORMULATIONS[0])
+        assert isinstance(factor, Multipliers)
+        fine = factor.healthy[1] & there
+        return factor.schur.pivots, fine if kept is None else fine | ~kept
+
+    pivots, fine = jax.vmap(squares)(taus, states)
+    eps = float(jnp.finfo(states.dtype).eps)
+    # A small angle of its own, between rods that almost lie in line, is no fault.
+    near = pivots[:2] < eps**0.5 * pivots[2:]
+    found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
+    if kept is not None:
+        found = found & kept
+    return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
+
+
+def _farthest(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:
+    """The constraint row with the largest residual, in units of its norm."""
+    at = dynamics.state(tau, y, args)
+    A, _ = dynamics.terms.rows(*at)
+    phi, rate = residuals(dynamics, *at)
+    size = jnp.abs(phi) + jnp.abs(rate)
+    unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+    return jnp.argmax(size / jnp.where(unit > 0, unit, 1.0)).astype(jnp.int32)

@@ -1,0 +1,342 @@
+"""Jumps of what is declared, at times that params tell: derivatives along a motion miss them.
+
+A force that is switched on at the time b jumps there. Derivatives are taken at frozen steps, and
+see no jump move with b. So operations whose outcome jumps, and which read both the time and a
+number that moves, are looked for in the program. Along the time the equations are then compared on
+both sides of every change of outcome: where they only bend, as between the rows of a table that is
+interpolated, derivatives are right.
+"""
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import source_info_util
+from jaxtyping import Array
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._custom_jvp import CustomJVP
+from jaxlag._core._nested_programs import called, equations, within
+from jaxlag._model._input_signals import AbstractInput, AbstractTable
+from jaxlag._model._inputs import evaluate
+from jaxlag._system._closure import declared
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._closure_params import Closed, plain
+from jaxlag._tracing._dependence import Names, outputs_depend_on
+from jaxlag._tracing._input_values import InputValues
+from jaxlag._tracing._nonsmooth_points import outcomes
+
+_TIME, _STATE = "t", "q, v"
+_GUARDS = ("eq", "ne", "is_finite")  # of a single place
+_STEPS = ("sign", "floor", "ceil", "round", "rem")
+_LOOPS = ("scan", "while", "cond")
+_NOT_RUN = ("pure_callback", "io_callback", "debug_callback", "debug_print", "while")
+_SIZES = (1.0, 0.1, 1e-3)  # of states that are made up: terms may not be finite at the larger ones
+_CLOSED_OVER = "a number that a declared function closes over"
+_TOGETHER = 64  # times at which outcomes are computed side by side
+_SPANS = 32  # of them in a row
+_PLACES = 16  # at which an operation is looked at from both sides
+_HALVINGS = 60
+
+
+class Jump(NamedTuple):
+    """An operation whose outcome jumps as a number moves.
+
+    Attributes:
+        leaf: of params or inputs, by its path.
+        line: where the user asks for it.
+    """
+
+    leaf: str
+    line: str
+
+
+class _Found(NamedTuple):
+    """An operation, what it reads, and where the user asks for it."""
+
+    eqn: Any
+    names: Names
+    line: str
+
+
+class Jumps:
+    """Those operations in what is declared.
+
+    Args:
+        system: what moves.
+        params: as simulate takes them, with what functions close over.
+        q: coordinates; their number and dtype matter.
+        inputs: by name. Tables, and functions with knots, jump where steps end.
+    """
+
+    def __init__(self, system: System, params: Any, q: Array, inputs: Mapping[str, Any]) -> None:
+        self._system = system
+        inside = {name: x for name, x in inputs.items() if not _has_knots(x)}
+        outside = {name: x for name, x in inputs.items() if name not in inside}
+        self._traced, self._static = _params.halves((params, inside))
+        t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        shape = jax.ShapeDtypeStruct(q.shape, q.dtype)
+
+        def values_at(t: Array, q: Array, v: Array) -> dict[str, Any]:
+            return dict(evaluate(outside, t, q, v, params))
+
+        values = jax.eval_shape(values_at, t, shape, shape)
+        self._moving = t, shape, shape, values
+        moving = [_TIME, _STATE, _STATE, *[_TIME] * len(jax.tree.leaves(values))]
+        names = [frozenset({name}) for name in (*moving, *names_of(*self._traced))]
+        self._found: list[_Found] = []
+        self._line = "a place that is not known"
+        self._program = jax.make_jaxpr(self._declared)(*self._moving, self._traced)
+        outputs_depend_on(self._program.jaxpr, names, self._look, continuous=True)
+
+    def _declared(self, t: Array, q: Array, v: Array, values: Any, traced: Any) -> Any:
+        params, inside = _params.join(traced, self._static)
+        found = InputValues(values | dict(evaluate(inside, t, q, v, params)))
+        return declared(self._system, t, q, v, params, found, None)
+
+    def _look(self, eqn: Any, operands: list[Names]) -> None:
+        # Operations of JAX's own functions have no line: that of the call counts.
+        self._line = source_info_util.summarize(eqn.source_info) or self._line
+        names = frozenset().union(*operands)
+        if names - {_TIME, _STATE} and _jumps(eqn):
+            self._found.append(_Found(eqn, names, self._line))
+
+    def of_leaves(self) -> tuple[Jump, ...]:
+        """All, whatever they compare a number with."""
+        return _told(self._found)
+
+    def in_time(self, leaves: set[str], ts: Any) -> tuple[Jump, ...]:
+        """Those that compare one of the leaves with the time, where the equations jump.
+
+        With the numbers that are known, and others in place of those that are not. What cannot be
+        told counts as a jump.
+        """
+        among = [x._replace(names=x.names & {_TIME, *leaves}) for x in self._found if _timed(x)]
+        among = [x for x in among if x.names - {_TIME}]
+        if among and self._may_be_run():
+            with jax.ensure_compile_time_eval(), jax.debug_nans(False), jax.debug_infs(False):
+                jump = self._jump([x.eqn for x in among], ts)
+            among = [x for x, does in zip(among, jump, strict=True) if does]
+        return _told(among)
+
+    def _may_be_run(self) -> bool:
+        """Whether the program may be run with numbers that are made up.
+
+        It may not where that could be seen, nor where a loop might not end.
+        """
+        leaves = jax.tree.leaves(self._traced)
+        numbers = [x for x in leaves if not concrete(x)]
+        known = all(jnp.issubdtype(x.dtype, np.number) or x.dtype == bool for x in numbers)
+        calls = {eqn.primitive.name for eqn in equations(self._program)} & set(_NOT_RUN)
+        return known and not calls and concrete(self._program.consts)
+
+    def _jump(self, eqns: Sequence[Any], ts: Any) -> list[bool]:
+        """Whether the equations jump where the operations come out otherwise, or may."""
+        leaves, own = self._numbers()
+        times = _params.known(ts)
+        own = own and times is not None
+        grid = _grid(times if own else None, leaves[0].dtype)
+        moves = [True] + [False] * (len(leaves) - 1)
+
+        def outcome(t: Array) -> list[Array | None]:
+            given = [t, *leaves[1:]]
+            return [outcomes(self._program, given, moves, only=eqn) for eqn in eqns]
+
+        along = jax.jit(jax.vmap(outcome))
+        terms = [self._sides(leaves, size) for size in _SIZES]
+
+        def jumps(i: int, eqn: Any) -> bool:
+            if spans[0][i] is None or eqn.primitive.name in _LOOPS:  # what it compares is not seen
+                return _jumps_anywhere(terms, grid)
+            seen = np.concatenate([np.asarray(span[i]) for span in spans])
+            if np.all(seen[1:] == seen[:-1]):
+                return not own
+            return _jumps_at_changes(lambda t: np.asarray(along(t)[i]), seen, terms, grid)
+
+        try:
+            spans = [along(jnp.asarray(span)) for span in grid]
+            return [jumps(i, eqn) for i, eqn in enumerate(eqns)]
+        except Exception:  # the user's functions may refuse numbers that are made up
+            return [True] * len(eqns)
+
+    def _sides(self, leaves: Sequence[Array], size: float) -> Callable:
+        """Terms at many times, states being so large."""
+        t, q, v, *rest = leaves
+        return jax.jit(jax.vmap(partial(self._terms, [t, size * q, size * v, *rest])))
+
+    def _numbers(self) -> tuple[list[Array], bool]:
+        """(arguments of the program, whether all are given ones): made up where not known."""
+        draw = np.random.default_rng(0).uniform
+        own, found = not jax.tree.leaves(self._moving[3]), []
+        for x in jax.tree.leaves(self._moving):
+            found.append(jnp.asarray(draw(0.5, 1.5, x.shape), x.dtype))
+        for x in jax.tree.leaves(self._traced):
+            value = x if concrete(x) else _params.known(x)
+            own = own and value is not None
+            if value is None:  # in order, as tables are
+                value = np.sort(draw(0.5, 1.5, (1, *x.shape)), axis=-1)[0]
+                value = value > 1.0 if x.dtype == bool else value
+            found.append(jnp.asarray(value, x.dtype))
+        return found, own
+
+    def _terms(self, leaves: Sequence[Array], t: Array) -> Array:
+        """What the equations of motion are made of, as numbers in a row."""
+        tree = jax.tree.structure((*self._moving, self._traced))
+        _, q, v, *rest = jax.tree.unflatten(tree, leaves)
+
+        def momenta(t: Array) -> Any:
+            by_v = jax.grad(lambda v: self._declared(t, q, v, *rest)[0])(v)
+            return by_v, self._declared(t, q, v, *rest)[1:3]
+
+        by_q = jax.grad(lambda q: self._declared(t, q, v, *rest)[0])(q)
+        rates = jax.jvp(momenta, (t,), (jnp.ones_like(t),))
+        terms = jax.tree.leaves((by_q, rates, self._declared(t, q, v, *rest)[3:]))
+        return jnp.concatenate([jnp.ravel(x).astype(t.dtype) for x in terms])
+
+
+def warned(jumps: Jumps, given: tuple[Any, Any], ts: Any) -> tuple[Any, Any]:
+    """Params and inputs as they are; who takes derivatives by what moves a jump is told so.
+
+    Args:
+        jumps: in what is declared.
+        given: traced halves of the params, with what functions close over, and of the inputs.
+        ts: times of the motion.
+    """
+    names = names_of(*given)
+
+    @CustomJVP
+    def same(*leaves: Any) -> list[Any]:
+        return list(leaves)
+
+    @partial(same.defjvp, symbolic_zeros=True)
+    def same_jvp(primals: Any, tangents: Any) -> Any:
+        moving = {name for name, dot in zip(names, tangents, strict=True) if dot is not None}
+        warn(jumps.in_time(moving, ts))
+        return list(primals), list(tangents)
+
+    leaves, tree = jax.tree.flatten(given)
+    return jax.tree.unflatten(tree, same(*leaves))
+
+
+def warn(jumps: Iterable[Jump]) -> None:
+    """Say by which numbers derivatives are not right, and how they would be."""
+    for leaf, line in jumps:
+        warnings.warn(
+            f"Derivatives by {leaf} leave out how the time moves at which the equations jump, as "
+            f"it is compared with t at {line}. Make that time a knot: pass inputs={{name: "
+            "jl.ZeroOrderHold(times, values)}, where the times depend on the params, or "
+            "jl.Function(f, knots=times), and read it in the force.",
+            UserWarning,
+            stacklevel=1,
+        )
+
+
+def names_of(params: Any, inputs: Any = None) -> list[str]:
+    """Of the leaves of params, with what functions close over, and inputs, by their paths."""
+    own = jax.tree_util.tree_flatten_with_path(plain(params))[0]
+    names = [f"params{jax.tree_util.keystr(path)}" for path, _ in own]
+    if isinstance(params, Closed):
+        names += [_CLOSED_OVER] * len(jax.tree.leaves(params.values))
+    signals = jax.tree_util.tree_flatten_with_path(inputs)[0]
+    return names + [f"inputs{jax.tree_util.keystr(path)}" for path, _ in signals]
+
+
+def _has_knots(signal: Any) -> bool:
+    if isinstance(signal, AbstractTable):
+        return True
+    return isinstance(signal, AbstractInput) and signal.knots() is not None
+
+
+def _jumps(eqn: Any) -> bool:
+    """Whether its outcome jumps as a number moves."""
+    if eqn.primitive.name in _LOOPS:
+        return any(map(_jumps, within(eqn)))
+    if called(eqn) is not None:
+        return False
+    given, found = ([_is_inexact(x) for x in some] for some in (eqn.invars, eqn.outvars))
+    name = eqn.primitive.name
+    return any(given) and (name in _STEPS or (not all(found) and name not in _GUARDS))
+
+
+def _is_inexact(atom: Any) -> bool:
+    return jnp.issubdtype(atom.aval.dtype, jnp.inexact)
+
+
+def _timed(found: _Found) -> bool:
+    return _TIME in found.names and _STATE not in found.names
+
+
+def _told(found: Iterable[_Found]) -> tuple[Jump, ...]:
+    """Operations by the numbers that they read, each once."""
+    jumps = [Jump(name, x.line) for x in found for name in sorted(x.names - {_TIME, _STATE})]
+    return tuple(dict.fromkeys(jumps))
+
+
+def _grid(times: np.ndarray | None, dtype: Any) -> np.ndarray:
+    """Times at which outcomes are looked at, in spans: of the motion, or of any size."""
+    count = _TOGETHER * _SPANS
+    if times is not None:
+        return np.linspace(np.min(times), np.max(times), count, dtype=dtype).reshape(_SPANS, -1)
+    largest = min(1e4, 1e-2 / np.sqrt(jnp.finfo(dtype).eps))  # where times are still near enough
+    sizes = np.geomspace(1e-3, largest, count // 4, dtype=dtype)
+    near = np.linspace(-10.0, 10.0, count // 2, dtype=dtype)
+    return np.sort(np.concatenate([-sizes, near, sizes])).reshape(_SPANS, -1)
+
+
+def _jumps_at_changes(
+    outcome: Callable, seen: np.ndarray, terms: Sequence[Callable], grid: np.ndarray
+) -> bool:
+    """Whether terms jump where an outcome, seen along the grid, changes."""
+    changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
+    some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
+    places = np.resize(some, _TOGETHER)
+    low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
+    for _ in range(_HALVINGS):
+        middle = (0.5 * (low + high)).astype(low.dtype)
+        same = np.all(outcome(jnp.asarray(middle)) == seen[places], axis=1)
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    _, found = _finite(terms, [low, high, *near])
+    return found is None or _apart(*found)
+
+
+def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
+    """Whether terms jump along the grid: looked for where their slope changes most."""
+    sides, found = _finite(terms, list(grid))
+    if found is None:
+        return True
+    found = np.concatenate(found)
+    size = np.max(np.abs(found), axis=0)
+    size = np.where(size > 0, size, 1.0)
+    bend = np.max(np.abs(np.diff(found, 2, axis=0)) / size, axis=1)
+    worst = np.argsort(bend)[-_PLACES:]
+    places = np.resize(np.concatenate([worst, worst + 1]), _TOGETHER)
+    low, high = near = grid.ravel()[places], grid.ravel()[places + 1]
+    for _ in range(_HALVINGS):
+        middle = (0.5 * (low + high)).astype(low.dtype)
+        a, b, c = (np.asarray(sides(jnp.asarray(x))) for x in (low, middle, high))
+        left = np.max(np.abs(b - a) / size, axis=1) >= np.max(np.abs(c - b) / size, axis=1)
+        low, high = np.where(left, low, middle), np.where(left, middle, high)
+    return _apart(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near)))
+
+
+def _finite(
+    terms: Sequence[Callable], times: Sequence[np.ndarray]
+) -> tuple[Callable, list[np.ndarray] | None]:
+    """(terms at the first size of states where they are finite at all times, these terms)."""
+    for sides in terms:
+        found = [np.asarray(sides(jnp.asarray(x))) for x in times]
+        if np.all(np.isfinite(found)):
+            return sides, found
+    return terms[-1], None
+
+
+def _apart(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:
+    """Whether terms jump from one time to the next, by what they are near; or may."""
+    size = np.max(np.abs([before, after, *near]), axis=(0, 1))
+    jump = np.abs(after - before) > np.sqrt(np.finfo(before.dtype).eps) * size
+    return bool(np.any(jump) or not np.all(np.isfinite(before + after)))

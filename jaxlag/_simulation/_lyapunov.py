@@ -1,0 +1,441 @@
+"""Growth of perturbations along a motion, and how far a gradient along it says anything."""
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._core._arrays import concrete, number
+from jaxlag._core._batching import in_batches
+from jaxlag._core._custom_jvp import CustomJVP
+from jaxlag._core._errors import bad
+from jaxlag._core._status import ADVICE, Status
+from jaxlag._linalg._mass_solve import rank_floor
+from jaxlag._model._inputs import all_knots
+from jaxlag._simulation._methods import default_tolerances
+from jaxlag._simulation._solution import Solution
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._traced_function import warn_of_changes
+
+SEGMENTS_AT_ONCE = 64  # beside one another in one loop, at most
+# Bytes of their stages from which XLA (0.10) splits operations between threads, for which it has
+# no function inside a small loop: compilation would end in "Failed to materialize symbols".
+STAGES_IN_BYTES = 2**18
+TRANSIENT = 0.25  # part of the motion left out of the exponent
+BLOCKS = 8  # that the rest is divided into, at most
+SURE = 3.0  # errors by which an exponent must exceed zero
+
+
+class GradientGrowth(eqx.Module):
+    """How much perturbations of a motion y = (q, v) grow, Phi' = df/dy Phi along y' = f(t, y).
+
+    Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
+    the batch axes in front. All is NaN where the status is not ok.
+
+    Attributes:
+        ts: (s,), s.
+        transition: (s - 1, 2n, 2n), Phi(ts[i + 1], ts[i]) P(ts[i]) in (q, v), with P the orthogonal
+            projector onto perturbations that the constraints allow; 1 without constraints.
+        log_kappa: (s,), logarithm of `kappa`.
+        log_norm: (s,), logarithm of |W(t)^-1 Phi(t, ts[0]) W(ts[0])|.
+        exponent: largest Lyapunov exponent, 1/s.
+        exponent_error: its standard error, 1/s.
+        horizon: time after ts[0], s, from which on a single gradient says nothing; inf for never.
+        rtol: of the weights W.
+        atol: of the weights W.
+        status: int32, see `Status`: ok, or that of the motion or of the segment that failed.
+    """
+
+    ts: Float[Array, "*batch s"]
+    transition: Float[Array, "*batch s-1 m m"]
+    log_kappa: Float[Array, "*batch s"]
+    log_norm: Float[Array, "*batch s"]
+    exponent: Float[Array, "*batch"]
+    exponent_error: Float[Array, "*batch"]
+    horizon: Float[Array, "*batch"]
+    rtol: Float[Array, "*batch"]
+    atol: Float[Array, "*batch"]
+    status: Int[Array, "*batch"]
+
+    @property
+    def kappa(self) -> Float[Array, "*batch s"]:
+        """Conditioning (s,): the largest |W(t)^-1 Phi(t, s) W(s)| over save times s up to t.
+
+        Infinite where it overflows; see `log_kappa`.
+        """
+        return jnp.exp(self.log_kappa)
+
+    @property
+    def exponential(self) -> Bool[Array, "*batch"]:
+        """Whether the exponent is positive beyond three of its errors."""
+        return self.exponent > SURE * self.exponent_error
+
+    def message(self) -> str:
+        """What the growth along a single motion is, and what to do about it, in words."""
+        if self.ts.ndim != 1:
+            raise bad("message", "be asked of a single motion", f"batch {self.ts.shape[:-1]}")
+        status = Status(int(self.status))
+        if status is not Status.ok:
+            return f"{status.name}: the motion, or a segment of it, could not be followed."
+        rate, error = float(self.exponent), float(self.exponent_error)
+        exponent = f"largest Lyapunov exponent {rate:.4g} +- {error:.2g} 1/s"
+        if self.exponential:
+            kind = f"exponential: {exponent}"
+        elif rate < -SURE * error:
+            kind = f"that of an error that dies out: {exponent}"
+        elif abs(rate) <= error:
+            kind = f"like a power of time at most: {exponent}, not significantly other than 0"
+        else:
+            kind = f"not decided by a motion as short as this: {exponent}"
+        span, decades = abs(float(self.ts[-1] - self.ts[0])), float(self.log_kappa[-1]) / np.log(10)
+        grown = f"{10**decades:.3g}" if decades < 300 else f"10^{decades:.0f}"
+        text = (
+            f"In {span:.6g} s an error of the state becomes at most {grown} times as large, "
+            f"measured by atol + rtol |y|. The growth is {kind}."
+        )
+        horizon, tolerance = float(self.horizon), float(_tolerance(self.rtol))
+        if horizon == np.inf:
+            return f"{text} Up to its end one gradient along the motion means what it says."
+        beyond = ", beyond its end (extrapolated)," if horizon > span else ""
+        return (
+            f"{text} From {horizon:.4g} s after its start{beyond} an error of {tolerance:.1g} is "
+            "as large as the state: neither the motion nor a gradient along it means anything "
+            "there. Use segments well shorter than that (multiple shooting), or a loss that ends "
+            "earlier."
+        )
+
+    def __str__(self) -> str:
+        return self.message() if self.ts.ndim == 1 else repr(self)
+
+    def __repr__(self) -> str:
+        return f"GradientGrowth(exponent {self.exponent} 1/s, horizon {self.horizon} s)"
+
+
+def grad_growth(
+    motion: Solution,
+    *,
+    rtol: Any = None,
+    atol: Any = None,
+    tol: Any = None,
+    max_steps: int = 1024,
+) -> GradientGrowth:
+    """Growth of perturbations along a motion: conditioning, Lyapunov exponent, horizon.
+
+    With y = (q, v), y' = f(t, y) and Phi(t, s) = dy(t)/dy(s), that is Phi' = df/dy Phi,
+    Phi(s, s) = 1, and weights w(t) = atol + rtol |y(t)|, W = diag(w), the conditioning is
+
+        kappa(t) = max over save times s up to t of |W(t)^-1 Phi(t, s) W(s)|  (2-norm):
+
+    errors of rtol and atol that a solver makes on the way are up to kappa(t) times as large at t.
+    Phi is the product of its parts between neighbouring save times. Each is integrated together
+    with y from the saved state, its error controlled as that of y; products are rescaled and kept
+    with their logarithms, so that nothing overflows.
+
+    Under constraints only perturbations dy that keep them count: the null space of the Jacobian of
+    (phi, A v + b) in (q, v), phi of the holonomic rows alone. There
+    kappa(t) = max over s and dy of |W(t)^-1 Phi(t, s) dy| / |W(s)^-1 dy|. The state is (q, v) for
+    motions in quasi-velocities, too.
+
+    The largest Lyapunov exponent is the growth rate of log |Phi(t, ts[0])|, in a norm with weights
+    of their own that do not change, after the first quarter of the motion. Its error is
+    that of the mean over eight blocks of what is left, together with what growth proportional to
+    time, as of regular motions, would add: log 4 / (3/4 span).
+
+    The horizon is where max(rtol, eps) kappa(t) reaches 1, eps the rounding of the dtype: an error
+    of the tolerance is as large as the state, and the gradient is that of some other motion. It is
+    extrapolated by the exponent where that is positive beyond three errors, else it is inf.
+
+    Args:
+        motion: from `simulate`, at s >= 3 times. Its system, params and inputs are used. With batch
+            axes all results have them.
+        rtol: of the weights, not negative; by default that of `simulate`, 1e-9 in float64, 1e-5 in
+            float32. kappa depends on atol / rtol alone, the horizon on rtol.
+        atol: of the weights, positive, m or rad and m/s or rad/s; by default 1e-9 and 1e-6.
+        tol: rtol and atol of the steps between save times; by default 1e-10, 1e-5 in float32. Each
+            part of Phi is wrong by about tol of its own size, or of 1 where that is larger, and
+            products by the sum over their parts. To this comes that Phi follows the saved states,
+            which have errors of their own.
+        max_steps: bound on steps from one save time to the next.
+
+    Raises:
+        ValueError: not a Solution; fewer than 3 save times; a single motion that did not succeed,
+            or has a segment that cannot be solved again; tolerances out of range; a derivative of
+            the results.
+
+    Warns where a motion goes on beyond its horizon, if its values are known.
+
+    Cost: s integrations of 2n + 4n^2 numbers, and s^2 norms of (2n, 2n) matrices, 2 us each.
+
+    Limits: the numbers have no derivatives of their own. Where f jumps with the state, as with dry
+    friction, what the jump itself contributes to Phi is left out. A finite motion shows a
+    finite-time exponent.
+
+    Source: Benettin, Galgani, Giorgilli, Strelcyn, Meccanica 15 (1980) 9 and 21; Hairer, Norsett,
+    Wanner, Solving Ordinary Differential Equations I, sec. I.14 (variational equation).
+
+    Example:
+        A pendulum upside down, theta'' = theta at small angles, falls as exp(t):
+
+        >>> import jax, jax.numpy as jnp, jaxlag as jl
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * v[0] ** 2 - jnp.cos(q[0])
+        >>> pendulum = jl.System(lagrangian, coordinates=("theta",))
+        >>> motion = jl.simulate(pendulum, [0.0], [0.0], jnp.linspace(0.0, 10.0, 21))
+        >>> growth = jl.grad_growth(motion)
+        >>> print(f"{growth.exponent:.4f} 1/s, kappa {growth.kappa[-1]:.1f}")
+        1.0000 1/s, kappa 22026.5
+        >>> print(f"horizon {growth.horizon:.3f} s")
+        horizon 20.723 s
+    """
+    if not isinstance(motion, Solution):
+        fix = "Pass what jl.simulate returns."
+        raise bad("grad_growth: motion", "be a jl.Solution", f"it was {motion!r}", fix)
+    if motion.ts.shape[-1] < 3:
+        must, was = "have at least 3 save times", f"it had {motion.ts.shape[-1]}"
+        fix = "Simulate it with ts=jnp.linspace(t0, t1, 101)."
+        raise bad("grad_growth: motion", must, was, fix)
+    single = motion.ts.ndim == 1 and concrete(motion.status)
+    if single and int(motion.status) != int(Status.ok):
+        was = f"it ended with status {motion.message()}"
+        raise bad("grad_growth: motion", "have reached its last time", was)
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise bad("grad_growth: max_steps", "be a positive integer", f"it was {max_steps!r}")
+    dtype = motion.q.dtype
+    defaults = default_tolerances(dtype)
+    finest = 1e-10 if jnp.finfo(dtype).bits == 64 else defaults[0]
+    rtol = _not_negative("rtol", rtol, defaults[0], dtype)
+    atol = _not_negative("atol", atol, defaults[1], dtype, zero=False)
+    tol = _not_negative("tol", tol, finest, dtype, zero=False)
+
+    warn_of_changes(motion.system, motion.inputs)
+    static = motion._params_static, motion._inputs_static
+    key = motion.system, *static, motion.formulation, max_steps, motion.ts.ndim - 1
+    given = (motion.ts, motion.q, motion.v, motion._params_traced, motion._inputs_traced)
+    traced = _not_differentiated(given)
+    growth, statuses = _growth(key, traced, motion.status, (rtol, atol, tol))
+    if single and int(growth.status) != int(Status.ok):
+        i = int(np.argmax(np.asarray(statuses) != int(Status.ok)))
+        status = Status(int(statuses[i]))
+        was = f"from t = {motion.ts[i]} to {motion.ts[i + 1]} the status was {status.name}"
+        raise bad("grad_growth: motion", "be solvable from each of its rows", was, _fix(status))
+    if concrete(growth.horizon):
+        _warn_beyond(growth)
+    return growth
+
+
+@CustomJVP
+def _not_differentiated(x: Any) -> Any:
+    """The same; an error says where a derivative is asked for."""
+    return x
+
+
+@partial(_not_differentiated.defjvp, symbolic_zeros=True)
+def _refused(primals: tuple, tangents: tuple) -> Any:
+    if jax.tree.leaves(tangents):
+        fix = "Pass jax.lax.stop_gradient of the motion's start and params."
+        raise bad("grad_growth", "be left out of what is differentiated", "it was not", fix)
+    return primals[0], None
+
+
+def _warn_beyond(growth: GradientGrowth) -> None:
+    """Say where motions go on beyond their horizon; Python shows it once for each caller."""
+    span, horizon = np.abs(growth.ts[..., -1] - growth.ts[..., 0]), np.asarray(growth.horizon)
+    beyond = np.asarray(span) > horizon
+    if beyond.ndim == 0 and beyond:
+        warnings.warn(growth.message(), stacklevel=3)
+    elif beyond.any():
+        text = f"{np.sum(beyond)} of {beyond.size} motions go on beyond the horizon of their growth"
+        warnings.warn(f"{text}: gradients at their ends say nothing.", stacklevel=3)
+
+
+def _not_negative(name: str, x: Any, default: float, dtype: Any, zero: bool = True) -> Array:
+    must = "be a number that is not negative" if zero else "be a positive number"
+    x = number(f"grad_growth: {name}", must, default if x is None else x, dtype)
+    if concrete(x) and not (x >= 0 if zero else x > 0):
+        raise bad(f"grad_growth: {name}", must, f"it was {x}")
+    return x
+
+
+def _fix(status: Status) -> str:
+    if status is Status.max_steps:
+        return "Save the motion at more times, raise max_steps, or loosen tol."
+    return ADVICE.get(status, "")
+
+
+@partial(jax.jit, static_argnums=0)
+def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
+    system, params_static, inputs_static, formulation, max_steps, batch = key
+    rtol, atol, tol = tolerances
+
+    def one(traced: Any, status: Array) -> tuple[GradientGrowth, Array]:
+        ts, q, v, params, inputs = traced
+        params = _params.join(params, params_static.tree)
+        inputs = eqx.combine(inputs, inputs_static.tree)
+        y = jnp.concatenate([q, v], -1)
+        y = jnp.where(status == int(Status.ok), y, y[:1])  # NaN where the motion did not get
+
+        rate = partial(_rate, system, formulation, params, inputs)
+        tangent = jax.vmap(partial(_tangent, system, params))
+        knots, allowed = all_knots(inputs), tangent(ts, y, jnp.ones_like(y))
+        Phi, statuses = _transitions(rate, ts, y, allowed, knots, tol, max_steps)
+
+        w = atol + rtol * jnp.abs(y)
+        kept = tangent(ts, y, w)
+        steps = kept[1:] @ (Phi * w[:-1, None, :] / w[1:, :, None]) @ kept[:-1]
+        # Weights that stay the same: the exponent is that of the motion alone.
+        scale = w / (atol + rtol * jnp.max(jnp.abs(y), axis=0))[None]
+        log_kappa, log_norm, log_size = _products(steps, kept, scale)
+
+        tau = jnp.abs(ts - ts[0]).astype(y.dtype)
+        exponent, error = _exponent(tau, log_size)
+        horizon = _horizon(tau, log_kappa, exponent, error, -jnp.log(_tolerance(rtol)))
+
+        status = jnp.where(status == int(Status.ok), jnp.max(statuses), status)
+        found = (Phi, log_kappa, log_norm, exponent, error, horizon)
+        found = [jnp.where(status == int(Status.ok), x, jnp.nan) for x in found]
+        return GradientGrowth(ts, *found, rtol=rtol, atol=atol, status=status), statuses
+
+    for _ in range(batch):
+        one = jax.vmap(one)
+    return one(traced, status)
+
+
+def _rate(system: System, formulation: str, params: Any, inputs: Any, t: Array, y: Array) -> Array:
+    """f(t, y) = (v, a)."""
+    q, v = jnp.split(y, 2)
+    if formulation == "quasi":
+        a = system.quasi_reactions(params, q, v, t, inputs)["a"]
+    else:
+        a = system.acceleration(params, q, v, t, inputs)
+    return jnp.concatenate([v, a])
+
+
+def _tolerance(rtol: Array) -> Array:
+    return jnp.maximum(rtol, jnp.finfo(rtol.dtype).eps)
+
+
+def _tangent(system: System, params: Any, t: Array, y: Array, w: Array) -> Array:
+    """Orthogonal projector onto the perturbations dy / w that keep phi = 0 and A v + b = 0."""
+    n, one = system.size, jnp.eye(y.shape[0], dtype=y.dtype)
+    if not system.constraints:
+        return one
+
+    def conditions(y: Array) -> Array:
+        phi = system.terms.position(t, y[:n], params)
+        return jnp.concatenate([phi, system.terms.velocity(t, y[:n], y[n:], params)])
+
+    C = jax.jacfwd(conditions)(y) * w
+    size = jnp.linalg.norm(C, axis=1, keepdims=True)
+    _, sizes, normals = jnp.linalg.svd(C / jnp.where(size > 0, size, 1.0), full_matrices=False)
+    independent = sizes > rank_floor(y.dtype) ** 0.5
+    normals = jnp.where(independent[:, None], normals, 0.0)
+    return one - normals.T @ normals
+
+
+def _transitions(
+    rate: Callable[[Array, Array], Array],
+    ts: Array,
+    y: Array,
+    directions: Array,
+    knots: Array | None,
+    tol: Array,
+    max_steps: int,
+) -> tuple[Array, Array]:
+    """(Phi(ts[i + 1], ts[i]) directions[i], status) of every segment: y' = f, Y' = df/dy Y.
+
+    Steps are those that Y needs: at an equilibrium y needs none.
+    """
+    # The solver keeps all it integrates in the dtype of time; the system wants its own.
+    inside, outside = y.dtype, ts.dtype
+
+    def rates(t: Any, state: tuple[Array, Array], _: None) -> tuple[Array, Array]:
+        y, Y = (x.astype(inside) for x in state)
+        f, along = jax.linearize(partial(rate, t), y)
+        return f.astype(outside), jax.vmap(along, in_axes=1, out_axes=1)(Y).astype(outside)
+
+    tol = tol.astype(outside)
+    controller = diffrax.PIDController(rtol=tol, atol=tol)
+    if knots is not None:
+        controller = diffrax.ClipStepSizeController(controller, jump_ts=knots.astype(outside))
+    solver, term = diffrax.Dopri8(), diffrax.ODETerm(rates)
+
+    def segment(row: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        begin, end, *state = row
+        state = tuple(x.astype(outside) for x in state)
+        found = diffrax.diffeqsolve(
+            term,
+            solver,
+            begin,
+            end,
+            None,
+            state,
+            stepsize_controller=controller,
+            max_steps=max_steps,
+            throw=False,
+        )
+        assert found.ys is not None
+        Y = found.ys[1][0].astype(inside)
+        many = found.result == diffrax.RESULTS.max_steps_reached
+        failure = jnp.where(many, int(Status.max_steps), int(Status.nonfinite))
+        good = (found.result == diffrax.RESULTS.successful) & jnp.all(jnp.isfinite(Y))
+        return Y, jnp.where(good, int(Status.ok), failure).astype(jnp.int32)
+
+    rows = (ts[:-1], ts[1:], y[:-1], directions[:-1])
+    stages = len(solver.tableau.b_sol) * y.shape[1] * (y.shape[1] + 1) * ts.dtype.itemsize
+    at_once = min(SEGMENTS_AT_ONCE, max(1, STAGES_IN_BYTES // stages))
+    return in_batches(segment, rows, ts.shape[0] - 1, at_once)
+
+
+def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, Array]:
+    """Logarithms at every save time of the largest product, the one from ts[0], and its size.
+
+    All products steps[j - 1] ... steps[i] starts[i] are carried along, each rescaled to norm 1.
+    """
+
+    def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], Any]:
+        (products, logs), (j, step, start, scale) = carry, row
+        products = (step @ products).at[j].set(start)
+        norms = jnp.linalg.norm(products, ord=2, axis=(-2, -1))
+        begun = jnp.arange(len(norms)) <= j
+        logs = jnp.where(begun, logs + jnp.log(norms), 0.0)
+        products = products / jnp.where(norms > 0, norms, 1.0)[:, None, None]
+        size = logs[0] + jnp.log(jnp.linalg.norm(scale[:, None] * products[0], ord=2))
+        return (products, logs), (jnp.max(jnp.where(begun, logs, -jnp.inf)), logs[0], size)
+
+    count = starts.shape[0]
+    begin = jnp.zeros_like(starts), jnp.zeros((count,), starts.dtype)
+    into = jnp.concatenate([starts[:1], steps])  # nothing has begun before the first row
+    rows = (jnp.arange(count), into, starts, scale)
+    return jax.lax.scan(turn, begin, rows)[1]
+
+
+def _exponent(tau: Array, log_size: Array) -> tuple[Array, Array]:
+    """Rate of log_size after the transient, and its standard error."""
+    begin, end = TRANSIENT * tau[-1], tau[-1]
+    count = int(np.clip((1 - TRANSIENT) * (tau.shape[0] - 1), 2, BLOCKS))
+    logs = jnp.interp(jnp.linspace(begin, end, count + 1), tau, log_size)
+    rates = jnp.diff(logs) * count / (end - begin)
+    by_chance = jnp.std(rates, ddof=1) / count**0.5
+    by_power = -float(np.log(TRANSIENT)) / (end - begin)  # of growth as t
+    return jnp.mean(rates), jnp.hypot(by_chance, by_power)
+
+
+def _horizon(tau: Array, log_kappa: Array, exponent: Array, error: Array, level: Array) -> Array:
+    """The time at which log_kappa first reaches the level, between rows or beyond the last."""
+    over = log_kappa >= level
+    i = jnp.maximum(jnp.argmax(over), 1)
+    slope = (log_kappa[i] - log_kappa[i - 1]) / (tau[i] - tau[i - 1])
+    within = tau[i - 1] + (level - log_kappa[i - 1]) / slope
+    sure = exponent > SURE * error
+    after = tau[-1] + (level - log_kappa[-1]) / jnp.where(sure, exponent, 1.0)
+    after = jnp.where(sure, after, jnp.inf)
+    return jnp.where(over[0], 0.0, jnp.where(jnp.any(over), within, after))

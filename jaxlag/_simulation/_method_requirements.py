@@ -1,0 +1,100 @@
+"""What structure-preserving methods ask of a system."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+
+from jaxlag._core._errors import bad
+from jaxlag._model._forces import components, reads_lam
+from jaxlag._model._inputs import evaluate
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._dependence import outputs_depend_on
+from jaxlag.solvers import AbstractPartitioned, GaussLegendre, Splitting
+
+
+def check_requirements(
+    system: System,
+    solver: diffrax.AbstractSolver,
+    formulation: str,
+    params: Any,
+    inputs: Mapping[str, Any],
+    dtype: Any,
+) -> None:
+    """Raise where a structure-preserving method is not one for this system.
+
+    Args:
+        system: what moves.
+        solver: any solver; those that ask for nothing pass.
+        formulation: what the state is.
+        params: as the Lagrangian takes them.
+        inputs: the inputs.
+        dtype: of the state.
+
+    Raises:
+        ValueError: with what the method needs, and what the system has.
+    """
+    if not isinstance(solver, Splitting | AbstractPartitioned):
+        return
+    name = f"method {type(solver).__name__}"
+    if formulation != "multipliers":
+        was = f"formulation was {formulation!r}"
+        fix = "Pass formulation='multipliers', or another method."
+        raise bad(name, "have a state (q, v) and multipliers", was, fix)
+    if isinstance(solver, Splitting):
+        _separable(system, name, params, inputs, dtype)
+        return
+    for force in filter(reads_lam, system.forces):
+        must = "be used without forces that depend on multipliers"
+        raise bad(name, must, f"{force.name!r} does", "Choose another method.")
+    rows = system.rows(params, dtype)
+    if rows.size and isinstance(solver, GaussLegendre):
+        must, fix = "be used without constraints", "Choose 'variational2' or 'variational4'."
+        raise bad(name, must, f"there were the rows {list(rows.labels)}", fix)
+    if not all(rows.holonomic):
+        label = rows.labels[rows.holonomic.index(False)]
+        must = "be used with holonomic constraints only"
+        raise bad(name, must, f"{label!r} is not holonomic", "Choose another method.")
+
+
+def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
+    """Whether it is T(v) - V(t, q) with nothing else that accelerates."""
+    if formulation != "multipliers" or system.constraints or system.forces:
+        return False
+    structure = system.structure(params, dtype)
+    return not (structure.mass & {"t", "q", "v"} or "v" in structure.bias)
+
+
+def _separable(
+    system: System, name: str, params: Any, inputs: Mapping[str, Any], dtype: Any
+) -> None:
+    """Raise unless M is constant and nothing that accelerates depends on v."""
+    fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
+    if system.constraints:
+        was = f"it has constraints ({', '.join(map(repr, system.rows(params, dtype).labels))})"
+        fix = "Choose 'variational2' or 'variational4', which hold holonomic constraints."
+        raise bad(name, "split a system without constraints", was, fix)
+    traced, static = _params.split(params)
+    structure = system.structure(params, dtype)
+    must = "split a Lagrangian T(v) - V(t, q) with constant mass matrix"
+    for what, found in (("mass matrix", structure.mass), ("bias", structure.bias)):
+        depends = sorted(found & ({"t", "q", "v"} if what == "mass matrix" else {"v"}))
+        if depends:
+            raise bad(name, must, f"its {what} contains {', '.join(depends)}", fix)
+    q = jax.ShapeDtypeStruct((system.size,), dtype)
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    for force in system.forces:
+
+        def push(t: Any, q: Any, v: Any, traced: Any, force: Any = force) -> Any:
+            params = _params.join(traced, static)
+            return components(force, t, q, v, params, evaluate(inputs, t, q, v, params))
+
+        program = jax.make_jaxpr(push)(t, q, q, traced).jaxpr
+        given = [frozenset({"t"}), frozenset({"q"}), frozenset({"v"})]
+        given += [frozenset()] * (len(program.invars) - 3)
+        if "v" in frozenset().union(*outputs_depend_on(program, given)):
+            was = f"the force {force.name!r} depends on v"
+            raise bad(name, "split a system whose forces do not depend on velocities", was, fix)

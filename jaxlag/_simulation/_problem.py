@@ -1,0 +1,221 @@
+"""From the arguments of a solve to its problem: the equations, the start, the times, the scheme."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxlag._core._arrays import still
+from jaxlag._gradient._modes import Keep
+from jaxlag._gradient._solve import Problem, Setup
+from jaxlag._integration._change_points import lengths_of, may_cross, may_stop, scales_at
+from jaxlag._integration._initial_conditions import (
+    Start,
+    residuals,
+    start_consistent,
+    start_finite,
+    values_allowed,
+)
+from jaxlag._integration._quasi_singularities import usual
+from jaxlag._integration._record import Times
+from jaxlag._integration._step_arguments import Arguments
+from jaxlag._integration._step_end import Settling
+from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._tableaus import looks_ahead
+from jaxlag._integration._term import term_of
+from jaxlag._integration._vector_field import Dynamics
+from jaxlag._model._constraints import Baumgarte
+from jaxlag._model._inputs import all_knots, common_range, in_order
+from jaxlag._simulation._method_requirements import check_requirements, splits
+from jaxlag._simulation._methods import for_state
+from jaxlag._statics._assemble import assembled
+from jaxlag._system._system import System, check_declaration
+from jaxlag._tracing import _params
+from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
+from jaxlag.solvers._explicit import in_loop_over_stages
+
+
+class Plan(NamedTuple):
+    """What the compiled program is keyed by."""
+
+    system: System
+    params: _params.Static
+    inputs: _params.Static
+    scheme: _params.Static
+    direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
+    max_steps: int
+    save: tuple[str, ...]
+    sample: _params.Sample
+    formulation: str
+    stabilization: str | Baumgarte | None
+    assemble: bool
+    regular: bool | None
+    apart: bool
+    keep: Keep
+    change_points: str
+    auto: bool  # whether the method may be chosen by the structure of the system
+
+
+class Values(NamedTuple):
+    """What the compiled program takes."""
+
+    q0: Array
+    v0: Array | None  # one of v0 and u0
+    u0: Array | None
+    ts: Array
+    params: Any
+    inputs: Any
+    scheme: Any
+    rtol: Array
+    atol: Array
+    step: Array | None  # dt or dt0
+    longest: Array | None = None  # dt_max
+
+
+def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
+    """The problem that a plan and its values describe."""
+    power = None
+    if "work" in plan.save:
+        params = _params.join(values.params, plan.params.tree)
+        power = plan.system.power_terms(params, values.q0.dtype)
+    dynamics = Dynamics(
+        plan.system,
+        plan.params,
+        plan.inputs,
+        plan.direction,
+        power,
+        plan.sample,
+        formulation=plan.formulation,
+        stabilization=plan.stabilization,
+        regular=plan.regular,
+        apart=plan.apart,
+    )
+    args = dynamics.arguments(values.params, values.inputs, values.ts)
+    params, inputs = dynamics.given(args)
+    dynamics = replace(dynamics, rows=plan.system.rows(params, values.q0.dtype))
+    crossing = plan.change_points == "pass" and may_cross(dynamics)
+    dynamics = replace(dynamics, crossing=crossing)
+    solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
+    if plan.auto and controller is None:
+        splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
+        solver = Splitting(8) if splitting else solver
+    dynamics = replace(dynamics, onwards=looks_ahead(solver))
+    check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
+
+    t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
+    if v0 is None:
+        v0 = plan.system.velocities(params, q0, u0, t0)
+    check_declaration(plan.system, params, inputs, t0, q0, v0)
+    if plan.assemble and dynamics.rows.size:
+        found = assembled(plan.system, q0, v0, params, t0)
+        q0, v0, u0 = found.q, found.v, None
+    w0 = v0
+    if dynamics.quasi is not None:
+        u0 = dynamics.quasi.of(t0, q0, v0, params) if u0 is None else u0
+        w0 = u0[dynamics.quasi.free]
+    if dynamics.quasi is not None or dynamics.rows.size:
+        # A lane that has no start, or none that is consistent, or whose kinematics are singular
+        # there, lends no derivatives to the others.
+        known = (q0, dynamics.velocities(t0, q0, w0, params))
+        known = (*known, *residuals(dynamics, t0, q0, v0, params))
+        sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
+        q0, w0, known = still_unless(sound, (q0, w0, args.params))
+        args = args._replace(params=known)
+    y0 = dynamics.start(q0, w0)
+    start = jnp.zeros_like(args.origin)
+    args = dynamics.prepare(start, y0, args)
+    if dynamics.quasi is not None:
+        args = args._replace(usual=usual(dynamics, *still((start, q0, args))))
+    consistent = start_consistent(dynamics, t0, q0, v0, params, args)
+    if dynamics.rows.size:
+        y0, args = still_unless(consistent.ok, (y0, args))
+    if dynamics.crossing:
+        masses = dynamics.surface(*still((start, y0, args))).masses
+        assert masses is not None
+        units, slopes = scales_at(dynamics, *still((start, y0, args)))
+        lengths = lengths_of(masses, args.kept)
+        args = args._replace(lengths=lengths, units=units, slopes=slopes)
+    if dynamics.projects:
+        moved, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
+        y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
+    if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
+        dynamics = replace(dynamics, stabilization=None, crossing=False)
+        args = args._replace(lengths=None, units=None, slopes=None)
+    solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
+    settling = Settling(dynamics)
+    settle = settling if settling.settles else None
+    term = term_of(dynamics, start, y0, args)
+    if isinstance(solver, AbstractExplicit) and solver.looped is None:
+        solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
+    how = (dynamics.windows, settle, dynamics.projects, values.longest)
+    passes = args.usual is not None
+    stops = not dynamics.crossing and may_stop(dynamics)
+    scheme = Scheme(solver, controller, term, *how, passes=passes, stops=stops)
+    scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
+    times, in_range = _times(dynamics, args, inputs, values.ts)
+    speeds = values.u0 if values.v0 is None else values.v0
+    assert speeds is not None
+    given = jnp.concatenate([values.q0, speeds])
+    saves = dynamics.turned(values.ts, args)
+    steps = (values.step, values.longest)
+    valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
+    valid = valid & in_order(inputs)
+    finite = start_finite(dynamics, start, y0, args)
+    if args.lengths is not None:  # what depends at the start is not known to be independent nearby
+        finite = finite & jnp.all(args.lengths > 0)
+    pressed = settling.pressed(start, y0, args)
+    begun = Start(valid, in_range, finite, consistent, pressed)
+    setup = Setup(values.step, begun.allowed, scheme_traced)
+    problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps, plan.keep)
+    return dynamics, begun, problem
+
+
+def still_unless(moves: Array, tree: Any) -> Any:
+    """The same values, without derivatives where `moves` is False."""
+
+    def still(x: Any) -> Any:
+        inexact = eqx.is_inexact_array(x)
+        return jnp.where(moves, x, jax.lax.stop_gradient(x)) if inexact else x
+
+    return jax.tree.map(still, tree)
+
+
+def velocities_at(
+    dynamics: Dynamics, ts: Array, y: Array, args: Arguments, moved: Array
+) -> tuple[Array, Array]:
+    """(q, v) at every row of one motion; NaN where the motion did not get.
+
+    A motion that took no step, as its kinematics may be singular at the start, lends no
+    derivatives.
+    """
+    q, w = dynamics.parts(y)
+    if dynamics.quasi is None:
+        return q, w
+    reached = jnp.isfinite(q[:, :1])
+    # Rows not reached are NaN: look at the start instead, so that derivatives stay finite.
+    safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
+    ts, safe, args = still_unless(moved, (ts, safe, args))
+    v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)
+    return q, jnp.where(reached, v, q[:, :1])  # which is NaN there, with NaN for its derivatives
+
+
+def _times(
+    dynamics: Dynamics, args: Arguments, inputs: Mapping[str, Any], ts: Array
+) -> tuple[Times, Array]:
+    """Anchors of the grid in tau, and whether the inputs are defined at the start."""
+
+    def tau(time: Array) -> Array:
+        return dynamics.tau(time.astype(ts.dtype), args)
+
+    saves, knots, span = tau(ts), all_knots(inputs), common_range(inputs)
+    knots = None if knots is None else jnp.sort(tau(knots))
+    if span is None:
+        return Times(saves[-1], knots, saves), jnp.array(True)
+    ends = jnp.stack([tau(time) for time in span])
+    first, last = jnp.min(ends), jnp.max(ends)
+    stop = jnp.where(saves[-1] <= last, saves[-1], last)
+    return Times(stop, knots, saves), (first <= 0) & (last >= 0)

@@ -1,0 +1,78 @@
+"""States of a motion between its rows."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlag._core._arrays import concrete, real
+from jaxlag._core._errors import bad
+from jaxlag._simulation._abstract_solution import AbstractSolution
+
+_ASK = "Ask for it as a row: ts=jnp.linspace(0, 10, 501)."
+
+
+def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
+    """See `Solution.at`.
+
+    Args:
+        motion: a Solution.
+        t: times.
+        solve: `simulate`.
+    """
+    if motion.ts.ndim != 1:
+        was = f"it was one of a batch {motion.ts.shape[:-1]}"
+        raise bad("at: motion", "be a single one", was, "Take one of them, as batch[3].")
+    if not concrete(motion.ts, motion.q, t):
+        raise bad("at", "be asked outside of jit, vmap and derivatives", "it was traced", _ASK)
+    if motion.tolerances is None:
+        must = "be that of a motion with adaptive steps"
+        raise bad("at: motion", must, "its steps were fixed, and end elsewhere", _ASK)
+    if motion._solver:
+        must, was = "have been made by a method that has a name", f"it was {motion._solver}"
+        raise bad("at: motion", must, was, _ASK)
+    asked = np.atleast_1d(np.asarray(real("at: t", t)))
+    if asked.ndim != 1:
+        raise bad("at: t", "be a number or one row of numbers", f"its shape was {asked.shape}")
+    ts = np.asarray(motion.ts)
+    sense = 1.0 if ts[-1] >= ts[0] else -1.0
+    last = float(motion.last_time)
+    outside = ~((sense * (asked - ts[0]) >= 0) & (sense * (last - asked) >= 0))
+    if np.any(outside):
+        was = f"one was {asked[outside][0]}"
+        raise bad("at: t", f"lie within the motion, from {ts[0]} to {last} s", was)
+    times = np.unique(sense * asked)
+    row = int(np.searchsorted(sense * ts, times[0], side="right")) - 1
+    times = sense * times[times > sense * ts[row]]
+    if not len(times):
+        return motion._rows([row] * len(asked))
+    project: Any = motion.stabilization or False
+    if project == "projection" or not motion.system.constraints:
+        project = True
+    plain = not motion.system.constraints and motion.system.quasi is None
+    further = solve(
+        motion.system,
+        motion.q[row],
+        motion.v[row],
+        np.concatenate([ts[row : row + 1], times]),
+        motion.params,
+        inputs=motion.inputs,
+        method=motion.method,
+        formulation="auto" if plain else motion.formulation,
+        rtol=motion.tolerances[0],
+        atol=motion.tolerances[1],
+        save=tuple(motion.saved),
+        project=project,
+        change_points=motion.change_points,
+        dt_max=motion.dt_max,
+        throw=False,
+    )
+    if "work" in motion.saved:
+        done = {name: work[row] for name, work in motion.saved["work"].items()}
+        since = jax.tree.map(jnp.add, further.saved["work"], done)
+        further = eqx.tree_at(lambda x: x.saved["work"], further, since)
+    places = np.searchsorted(sense * np.asarray(further.ts), sense * asked)
+    return further._rows(places.tolist())

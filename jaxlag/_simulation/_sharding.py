@@ -1,0 +1,61 @@
+"""Arrays that are spread over devices in ways that motions do not go along with."""
+
+from typing import Any
+
+import jax
+from jax.core import Tracer
+
+from jaxlag._core._errors import bad
+
+
+def check_placement(function: str, values: Any) -> None:
+    """Raise on arrays with axes of an explicit mesh, or of `shard_map` where these are checked.
+
+    Args:
+        function: as errors name it.
+        values: a pytree of what it is called with.
+
+    Raises:
+        ValueError: with the axes, and what to write instead.
+    """
+    for leaf in jax.tree.leaves(values):
+        if not isinstance(leaf, Tracer) and not _spread(leaf):
+            continue
+        varying, explicit = _axes(leaf)
+        if varying:
+            raise bad(
+                f"{function} inside shard_map",
+                "be called with check_vma=False",
+                f"an argument varies over the axes {sorted(varying)}",
+                "Write jax.shard_map(f, mesh=mesh, in_specs=..., out_specs=..., check_vma=False).",
+            )
+        if explicit:
+            raise bad(
+                function,
+                "get arrays of a mesh whose axes are of type Auto",
+                f"one lies along the explicit axes {sorted(explicit)}",
+                "Write jax.make_mesh(shape, names, axis_types=(jax.sharding.AxisType.Auto,) * n).",
+            )
+
+
+def _spread(x: Any) -> bool:
+    """Whether it is an array with values on several devices."""
+    return isinstance(x, jax.Array) and len(x.sharding.device_set) > 1
+
+
+def _axes(x: Any) -> tuple[set[str], set[str]]:
+    """(axes that it varies over in a shard_map, explicit axes that it lies along)."""
+    varying: set[str] = set()
+    explicit: set[str] = set()
+    while isinstance(x, jax.Array):  # a program's own variable, further down, is none
+        aval = jax.typeof(x)
+        manual = getattr(aval, "manual_axis_type", None)
+        varying |= set(getattr(manual, "varying", getattr(aval, "vma", ())))
+        spec = getattr(getattr(aval, "sharding", None), "spec", ())
+        for axes in spec:
+            explicit |= set() if axes is None else {axes} if isinstance(axes, str) else set(axes)
+        if not isinstance(x, Tracer):
+            break
+        # What vmap maps over, and what a derivative is taken of.
+        x = getattr(x, "val", getattr(x, "primal", None))
+    return varying, explicit

@@ -1,0 +1,400 @@
+"""Solution: a simulated motion."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import bad
+from jaxlag._core._status import CONCERNS_ROW, Status
+from jaxlag._model._constraints import Baumgarte
+from jaxlag._simulation._abstract_solution import AbstractSolution
+from jaxlag._simulation._failure import Ending, Scene, explained, is_open
+from jaxlag._simulation._methods import METHODS
+from jaxlag._simulation._quantities import over_rows
+from jaxlag._simulation._resolve_between import states_at
+from jaxlag._simulation._solution_views import as_dataset, as_dict, counted, described, plotted
+from jaxlag._simulation._step_diagnosis import advice, explain
+from jaxlag._system._power import in_order
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._closure_params import plain
+
+
+class Solution(AbstractSolution):
+    """A motion at the requested times, and how it ended.
+
+    Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
+    the batch axes in front. Rows not reached are NaN, and so are derivatives of them: a loss over a
+    batch leaves failed motions out by `jnp.where(motion.ok, loss, 0.0)`.
+
+    Attributes:
+        system: what was simulated.
+        ts: (s,), s.
+        q: coordinates (s, n), m or rad.
+        v: velocities (s, n), m/s or rad/s.
+        last_time: last time reached, s.
+        last_state: (q, v) there, each (n,).
+        stats: counts of "accepted" and "rejected" steps; "gradient", a `GradientMode`: how reverse
+            derivatives of this motion go through the steps.
+        saved: quantities named in `save=`, by name.
+        formulation: "quasi" where the state was (q, u), else how accelerations were found.
+        stabilization: "projection", a `Baumgarte`, or None: what kept states on the constraints
+            between steps.
+        tolerances: (rtol, atol) of the step-size control; None with fixed steps.
+        dt_max: bound on adaptive steps, s; None where none was given.
+        change_points: whether places where constraint rows depend on one another are passed.
+        error: with `estimate_error=True` the errors of (q, v) about to be expected at each row,
+            each (s, n), in their units; else None.
+    """
+
+    system: System
+    ts: Float[Array, "*batch s"]
+    q: Float[Array, "*batch s n"]
+    v: Float[Array, "*batch s n"]
+    last_time: Float[Array, "*batch"]
+    last_state: tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]
+    stats: dict[str, Int[Array, "*batch"]]
+    saved: dict[str, Any]
+    _params_traced: Any
+    _inputs_traced: Any
+    _params_static: _params.Static = eqx.field(static=True)
+    _inputs_static: _params.Static = eqx.field(static=True)
+    formulation: str = eqx.field(static=True)
+    _method: Int[Array, "*batch"]  # in METHODS; -1 for another
+    _solver: str = eqx.field(static=True)  # its name, then
+    stabilization: str | Baumgarte | None = eqx.field(static=True)
+    _ending: Ending
+    _kinematic: bool = eqx.field(static=True)
+    _implicit: bool = eqx.field(static=True)
+    _solve: Callable = eqx.field(static=True)  # `simulate`, which made it
+    tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
+    dt_max: Float[Array, "*batch"] | None = None
+    change_points: str = eqx.field(static=True, default="pass")
+    error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
+    # (last good time, index of the quasi-velocity) where those end that "auto" went on without
+    _singular: tuple[Float[Array, ""], Int[Array, ""]] | None = None
+
+    @property
+    def status(self) -> Int[Array, "*batch"]:
+        """How the motion ended: int32, see `Status`.
+
+        Where one failed, the states around its end are looked at when this is asked for; inside
+        jit and vmap always.
+        """
+        return self._explained().status
+
+    @property
+    def ok(self) -> Bool[Array, "*batch"]:
+        """Whether the motion reached ts[-1]. Unlike the status it costs nothing inside jit."""
+        return self.raw_status == int(Status.ok)
+
+    @property
+    def raw_status(self) -> Int[Array, "*batch"]:
+        """How the loop ended: the status before the states around the end are looked at."""
+        return self._ending.status
+
+    @property
+    def where(self) -> Int[Array, "*batch"]:
+        """Index of the coordinate or constraint row that a failure concerns; -1 if none."""
+        return self._explained().where
+
+    @property
+    def scene(self) -> Scene:
+        """What moved, as compiled programs are keyed by it."""
+        keys = self._params_static, self._inputs_static, self.formulation, self.stabilization
+        return Scene(self.system, *keys, self._kinematic, self._implicit)
+
+    def _explained(self) -> Ending:
+        if not is_open(self._ending):
+            return self._ending
+        start = self.q[..., 0, :], self.v[..., 0, :]
+        at = self._ending, self.last_time, self.ts, *start
+        batch = self.ts.ndim - 1
+        return explained(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
+
+    @property
+    def method(self) -> str:
+        """Name of the method that was used; of its class, where it is none of the named ones."""
+        if self._solver:
+            return self._solver
+        if not concrete(self._method):
+            raise bad("method", "be asked for outside jit and vmap", "the motion is traced")
+        return list(METHODS)[int(np.ravel(self._method)[0])]
+
+    @property
+    def params(self) -> Any:
+        """The params of this motion, numbers as arrays."""
+        return plain(self._given)
+
+    @property
+    def _given(self) -> Any:
+        return _params.join(self._params_traced, self._params_static.tree)
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """The inputs of this motion, by name."""
+        return eqx.combine(self._inputs_traced, self._inputs_static.tree)
+
+    def __getitem__(self, name: Any) -> Any:
+        """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
+
+        Of a batch by an index, a slice, or an array of indices the motions that it says.
+
+        Raises:
+            ValueError: no such name; an index into a single motion.
+        """
+        if not isinstance(name, str):
+            if self.ts.ndim == 1:
+                must, was = "be a name, for a single motion", f"it was {name!r}"
+                raise bad("name", must, was, "Rows are those of motion.ts, motion.q, motion.v.")
+            return jax.tree.map(lambda x: x[name], self)
+        quasi = self.system.quasi
+        if quasi is not None and name in quasi.names:
+            return self.u[..., quasi.names.index(name)]
+        if quasi is not None and name not in self.system.coordinates.names:
+            known = [*self.system.coordinates.names, *quasi.names]
+            raise bad("name", f"be one of {known}", f"it was {name!r}")
+        return self.system.coordinates.part(self.q, name)
+
+    def rate(self, name: str) -> Array:
+        """The velocity of a coordinate by its name, shape (s, *its shape)."""
+        return self.system.coordinates.part(self.v, name)
+
+    @property
+    def a(self) -> Float[Array, "*batch s n"]:
+        """Accelerations (s, n), m/s^2 or rad/s^2, from M a + h = Q + A^T lam at the rows."""
+        return self._quantity("a")
+
+    @property
+    def u(self) -> Float[Array, "*batch s k"]:
+        """Quasi-velocities (s, k), m/s or rad/s, in the order of their names.
+
+        Raises:
+            ValueError: the system has none.
+        """
+        return self._quantity("u")
+
+    @property
+    def p(self) -> Float[Array, "*batch s n"]:
+        """Momenta p = dL/dv, (s, n), kg m/s or kg m^2/s."""
+        return self._quantity("p")
+
+    @property
+    def energy(self) -> Float[Array, "*batch s"]:
+        """H = v . dL/dv - L, (s,), J."""
+        return self._quantity("energy")
+
+    @property
+    def kinetic(self) -> Float[Array, "*batch s"]:
+        """T, (s,), J, where the system declares it."""
+        return self._quantity("kinetic")
+
+    @property
+    def potential(self) -> Float[Array, "*batch s"]:
+        """V, (s,), J, where the system declares it."""
+        return self._quantity("potential")
+
+    @property
+    def Q(self) -> Float[Array, "*batch s n"]:
+        """Applied generalized forces, dissipation included, (s, n), N or N m."""
+        return self._quantity("Q")
+
+    @property
+    def lam(self) -> dict[str, Float[Array, "..."]]:
+        """Multipliers by the name of the row, each (s,) or (s, its shape).
+
+        See `System.multipliers` for sign, unit and what holds where rows depend on one another.
+        """
+        found = self._quantity("lam")
+        names = [name for c in self.system.constraints for name in c.all_names]
+        return {name: found[name] for name in names}
+
+    @property
+    def constraint_force(self) -> Float[Array, "*batch s n"]:
+        """A^T lam, (s, n), N or N m: what the constraints exert on the system."""
+        return self._quantity("constraint_force")
+
+    @property
+    def power(self) -> dict[str, Float[Array, "*batch s"]]:
+        """Terms of dH/dt by name, each (s,), W, in the order of `System.power`."""
+        return in_order(self._quantity("power"), self.system.forces, self.system.constraints)
+
+    @property
+    def work(self) -> dict[str, Float[Array, "*batch s"]]:
+        """Work since ts[0] of every term of dH/dt by name, each (s,), J, ordered as `power`.
+
+        The books close: H - H(ts[0]) is the sum over all names, to the accuracy of the solve.
+
+        Raises:
+            ValueError: it was not asked for with `simulate(..., save=("work",))`.
+        """
+        if "work" not in self.saved:
+            raise bad(
+                "work",
+                "be asked for when simulating",
+                f"save was {tuple(self.saved)!r}",
+                'Write simulate(..., save=("work",)): work is integrated along with the motion.',
+            )
+        return in_order(self.saved["work"], self.system.forces, self.system.constraints)
+
+    def message(self) -> str:
+        """How a motion ended, in words, with the coordinate and the likely remedy.
+
+        Of a batch: how many ended in each status, and the message of the first of each.
+        """
+        if self.ts.ndim != 1:
+            return counted(self)
+        status = Status(int(self.status))
+        if status is Status.ok:
+            said = f"ok at t = {self.last_time}"
+            return f"{said}, {self.fallback}" if self._singular is not None else said
+        index = int(self.where)
+        labels, more = self.system.coordinates.labels, ""
+        if status is Status.kinematics_singular:
+            assert self.system.quasi is not None
+            labels = self.system.quasi.names
+            if index < 0:
+                more = " The quasi-velocities are fewer than the freedoms that constraints leave."
+            else:
+                more = f" {self._fallen(index)}"
+        if status in CONCERNS_ROW:
+            rows = self.system.rows(self._given, self.q.dtype)
+            labels = rows.labels
+            if status is Status.contradictory_rows:
+                more = rows.contradiction(self.system.size)
+                if self.formulation == "quasi":
+                    more = " The kinematics v = B u + c do not satisfy it."
+        about = f" ({labels[index]!r})" if index >= 0 else ""
+        q, v = self.last_state
+        return (
+            f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
+            f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
+            f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
+        )
+
+    @property
+    def fallback(self) -> str:
+        """Why formulation "auto" took multipliers in place of quasi-velocities; "" where not."""
+        if self._singular is None or self.system.quasi is None:
+            return ""
+        time, index = self._singular
+        name = self.system.quasi.names[int(index)]
+        return f"by multipliers, as dU/dv is singular at t = {float(time):.6g} ({name!r})"
+
+    def _fallen(self, index: int) -> str:
+        """What has become of a quasi-velocity where it is singular, in words."""
+        quasi, (q, _) = self.system.quasi, self.last_state
+        assert quasi is not None
+        times, states = (self.ts[0], self.last_time), (self.q[0], q)
+        begin, end = (
+            float(quasi.pivots(t, q, self._given)[index])
+            for t, q in zip(times, states, strict=True)
+        )
+        if not (begin > 0 and end > 0) or begin == end:
+            return ""
+        what = "its part that does not follow from those before it"
+        return f"Since the start {what} has changed by a factor of {end / begin:.2g}."
+
+    def explain(self) -> str:
+        """Why the solve took as many steps as it did, and what to change; for a single motion.
+
+        Looks at up to 8 of the rows: the fastest rates of the linear equations there (stiffness),
+        rejected steps, cond(M), and, of an explicit step of order 8 from there as long as the
+        motion's were, the component with the largest error and the number of turns in which it is
+        moved back onto the constraints.
+
+        Returns:
+            A few lines of text, the last of them advice.
+
+        Raises:
+            ValueError: of a batch, or inside jit or vmap.
+        """
+        return explain(self)
+
+    def at(self, t: Any) -> "Solution":
+        """The motion at times between its rows, as accurate as its rows.
+
+        The equations are solved anew from the last row before, by the same method and tolerances.
+
+        Args:
+            t: a number or a row of them in any order, from ts[0] to last_time, s.
+
+        Returns:
+            A Solution with one row for every time, and what was saved there; work from ts[0] on.
+
+        Raises:
+            ValueError: times outside of the motion; a batch, fixed steps or a method without a
+                name: there rows have to be asked for when simulating.
+        """
+        return states_at(self, t, self._solve)
+
+    def _rows(self, rows: list[int]) -> "Solution":
+        """The same with these rows only, in this order."""
+        index = np.array(rows)
+        parts = lambda s: (s.ts, s.q, s.v, s.saved, s.error)  # noqa: E731
+        chosen = jax.tree.map(lambda x: x[index], parts(self))
+        return eqx.tree_at(parts, self, chosen, is_leaf=lambda x: x is None)
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Numpy arrays by name: "t", s; every coordinate "x" and its velocity "x'", (s, *shape).
+
+        Quasi-velocities, and what `save=` named, are in it, too; of a batch every array has its
+        axes in front.
+        """
+        return as_dict(self)
+
+    def to_xarray(self) -> Any:
+        """What `to_dict` has as an `xarray.Dataset` over "t"; needs the extra "xarray".
+
+        Of a batch over "motion" as well (or "motion_0", ...); where its motions have times of their
+        own, over "row" in place of "t". "status" is a variable.
+
+        Raises:
+            ValueError: xarray is not installed.
+        """
+        return as_dataset(self)
+
+    def plot(self) -> Any:
+        """Coordinates and energy over time, and in the plane the paths; needs the extra "plot".
+
+        In the plane are coordinates called x and y, or x1 and y1, and points of two components. Of
+        a batch up to 16 motions are drawn.
+
+        Returns:
+            A matplotlib `Figure`, which notebooks show; `figure.savefig("motion.png")` keeps it.
+
+        Raises:
+            ValueError: matplotlib is not installed.
+        """
+        return plotted(self)
+
+    def _quantity(self, name: str) -> Any:
+        if name in self.saved:
+            return self.saved[name]
+        key = (self._params_static, self._inputs_static)
+        traced = (self.ts, self.q, self.v, self._params_traced, self._inputs_traced)
+        return _derived(name, self.system, self.formulation, key, self.ts.ndim - 1, traced)
+
+    def __repr__(self) -> str:
+        return described(self)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
+def _derived(name: str, system: System, formulation: str, key: Any, batch: int, traced: Any) -> Any:
+    params_static, inputs_static = key
+
+    def one(traced: Any) -> Any:
+        ts, q, v, params, inputs = traced
+        params = _params.join(params, params_static.tree)
+        inputs = eqx.combine(inputs, inputs_static.tree)
+        return over_rows(name, system, formulation, ts, q, v, params, inputs)
+
+    for _ in range(batch):
+        one = jax.vmap(one)
+    return one(traced)

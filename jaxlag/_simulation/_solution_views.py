@@ -1,0 +1,174 @@
+"""A solution in other forms: in words, as a dict, as a dataset, as a figure."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import bad
+from jaxlag._core._status import Status
+from jaxlag._simulation._abstract_solution import AbstractSolution
+
+LINES = 16
+"""Motions of a batch that a figure shows."""
+
+
+def described(motion: AbstractSolution) -> str:
+    """A motion, or a batch of them, in one line."""
+    system, (*batch, rows) = motion.system, motion.ts.shape
+    names = ", ".join(system.coordinates.names)
+    times, many = f"{rows} times", f"batch {tuple(batch)} of " if batch else ""
+    if not concrete(motion.ts, motion.raw_status):
+        return f"Solution({names}: {many}{times}, traced)"
+    if not batch:
+        times += f" from {float(motion.ts[0]):g} to {float(motion.ts[-1]):g} s"
+    return f"Solution({names}: {many}{times}, {_counts(motion)})"
+
+
+def _counts(motion: AbstractSolution) -> str:
+    statuses = np.ravel(np.asarray(motion.status))
+    found = Counter(Status(int(status)).name for status in statuses)
+    if np.ndim(motion.status) == 0:
+        return next(iter(found))
+    return ", ".join(f"{count} {name}" for name, count in sorted(found.items(), key=_ok_first))
+
+
+def _ok_first(item: tuple[str, int]) -> tuple[bool, int]:
+    name, count = item
+    return name != Status.ok.name, -count
+
+
+def counted(motion: AbstractSolution) -> str:
+    """How the motions of a batch ended: counts by status, and of each but "ok" the first one."""
+    status = np.asarray(motion.status)
+    lines = [f"{status.size} motions: {_counts(motion)}"]
+    for kind in sorted({int(x) for x in status.ravel()} - {int(Status.ok)}):
+        index = tuple(int(i) for i in np.argwhere(status == kind)[0])
+        lines.append(f"{list(index)}: {motion[index].message()}")
+    return "\n".join(lines)
+
+
+def columns(motion: AbstractSolution) -> dict[str, Any]:
+    """Name -> what was moved through, without the times: coordinates, velocities, speeds."""
+    system = motion.system
+    found = {}
+    for name in system.coordinates.names:
+        found[name] = motion[name]
+        found[f"{name}'"] = motion.rate(name)
+    if system.quasi is not None:
+        found |= {name: motion[name] for name in system.quasi.names}
+    return found
+
+
+def as_dict(motion: AbstractSolution) -> dict[str, np.ndarray]:
+    """See `Solution.to_dict`."""
+    saved = {
+        f"{name} {key}".strip(): value
+        for name, part in motion.saved.items()
+        for key, value in (part.items() if isinstance(part, dict) else [("", part)])
+    }
+    found = {"t": motion.ts} | columns(motion) | saved
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def as_dataset(motion: AbstractSolution) -> Any:
+    """See `Solution.to_xarray`."""
+    try:
+        import xarray
+    except ImportError as error:
+        raise bad(
+            "to_xarray()", "find xarray", "it is not installed", 'pip install "jaxlag[xarray]"'
+        ) from error
+    batch = motion.ts.ndim - 1
+    axes = ("motion",) if batch == 1 else tuple(f"motion_{i}" for i in range(batch))
+    ts = np.asarray(motion.ts)
+    first = ts[(0,) * batch]
+    common = bool(np.all(ts == first))
+    rows = "t" if common else "row"
+    variables = {}
+    for name, value in as_dict(motion).items():
+        if name != "t":
+            more = [f"{name}_{i}" for i in range(value.ndim - batch - 1)]
+            variables[name] = ((*axes, rows, *more), value)
+    variables["status"] = (axes, np.asarray(motion.status))
+    time = ("t", first) if common else ((*axes, "row"), ts)
+    return xarray.Dataset(variables, {"t": time})
+
+
+def plotted(motion: AbstractSolution) -> Any:
+    """See `Solution.plot`."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise bad(
+            "plot()", "find matplotlib", "it is not installed", 'pip install "jaxlag[plot]"'
+        ) from error
+    every = list(np.ndindex(motion.ts.shape[:-1]))
+    count = len(every)
+    indices = [every[i] for i in np.linspace(0, count - 1, min(count, LINES)).astype(int)]
+    shapes = motion.system.coordinates.shapes
+    paths = _paths(shapes)
+    panels = [*shapes, "energy"]
+    width, rows = (9.0, 6.0)[not paths], len(panels)
+    figure = Figure(figsize=(width, 0.6 + 1.8 * rows), dpi=120, layout="constrained")
+    grid = figure.add_gridspec(rows, 2 if paths else 1)
+    axes = [figure.add_subplot(grid[0, 0])]
+    axes += [figure.add_subplot(grid[i, 0], sharex=axes[0]) for i in range(1, rows)]
+    plane = None
+    if paths:
+        plane = figure.add_subplot(grid[:, 1], aspect="equal", xlabel="x", ylabel="y")
+    alone = len(indices) == 1
+    ts, shown = np.asarray(motion.ts), {name: np.asarray(motion[name]) for name in shapes}
+    shown["energy"] = np.asarray(motion.energy)
+    for k, index in enumerate(indices):
+        for ax, name in zip(axes, panels, strict=True):
+            lines = shown[name][index].reshape(ts.shape[-1], -1)
+            for j, line in enumerate(lines.T):
+                label = _label(name, shapes.get(name, ()), j)
+                ax.plot(ts[index], line, color=f"C{j if alone else k}", lw=1, label=label)
+        for j, path in enumerate(paths):
+            x, y = path({name: value[index] for name, value in shown.items()})
+            assert plane is not None
+            plane.plot(x, y, color=f"C{j if alone else k}", lw=1)
+            plane.plot(x[:1], y[:1], ".", color=f"C{j if alone else k}")
+    for ax, name in zip(axes, panels, strict=True):
+        ax.set_ylabel(f"{name} [J]" if name == "energy" else name)
+        ax.grid(alpha=0.3)
+        ax.margins(x=0)
+        if alone and 1 < int(np.prod(shapes.get(name, ()), dtype=int)) <= 6:
+            ax.legend(fontsize=7)
+    axes[-1].set_xlabel("t [s]")
+    if plane is not None:
+        plane.grid(alpha=0.3)
+    if len(indices) < count:
+        figure.suptitle(f"{len(indices)} of {count} motions", fontsize=10)
+    return figure
+
+
+def _label(name: str, shape: tuple[int, ...], j: int) -> str:
+    index = np.unravel_index(j, shape) if shape else ()
+    return f"{name}[{','.join(str(int(i)) for i in index)}]" if shape else name
+
+
+def _paths(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
+    """Functions of the coordinates by name that return (x, y) of points in the plane.
+
+    Of x and y, x1 and y1, and so on, and of points of two components.
+    """
+    found: list[Any] = []
+    scalars = {name for name, shape in shapes.items() if shape == ()}
+    for x in (name for name in shapes if name.startswith("x")):
+        y, z = f"y{x[1:]}", f"z{x[1:]}"
+        if {x, y} <= scalars and z not in shapes:
+            found.append(lambda q, x=x, y=y: (q[x], q[y]))
+    for name, shape in shapes.items():
+        if len(shape) in (1, 2) and shape[-1] == 2:
+            for j in range(shape[0] if len(shape) == 2 else 1):
+
+                def of(q: dict[str, np.ndarray], name: str = name, j: int = j) -> Any:
+                    points = q[name].reshape(len(q[name]), -1, 2)
+                    return points[:, j, 0], points[:, j, 1]
+
+                found.append(of)
+    return found

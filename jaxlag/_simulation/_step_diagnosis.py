@@ -1,0 +1,343 @@
+"""What held the steps of a motion short: `Solution.explain`."""
+
+from collections import Counter
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxlag._core._arrays import concrete, still
+from jaxlag._core._errors import bad
+from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
+from jaxlag._integration._linearized_rates import linearized
+from jaxlag._integration._term import term_of
+from jaxlag._linalg._projection import turns_needed
+from jaxlag._simulation._abstract_solution import AbstractSolution
+from jaxlag._simulation._failure import Scene, dynamics_of
+from jaxlag._system._row_advice import advice_on_rows
+
+ROWS = 8  # states looked at, evenly along the motion
+STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
+FOLLOWED = (1.5, 25.0)  # steps per turn of an oscillation that they follow
+OFTEN = 1000  # turns within ts from which on following each is a reason to be slow
+REJECTED = 0.3  # part of the attempts
+UNEVEN = 0.1  # from this part on steps are as long as the sharpest places let them
+TURNS = 3  # of the projection, after one step
+
+
+class Look(NamedTuple):
+    """One state of the motion, and the step of mean length from there.
+
+    Attributes:
+        rates: d(dy/dt)/dy, (m, m).
+        mass: M, (n, n).
+        error: local error of a step of order 8 over the tolerance, (m,); over 1 where there is
+            none.
+        turns: of the projection at the end of this step.
+    """
+
+    rates: Float[Array, "m m"]
+    mass: Float[Array, "n n"]
+    error: Float[Array, " m"]
+    turns: Int[Array, ""]
+
+
+class Rates(NamedTuple):
+    """The fastest of the linear equations along a motion.
+
+    Attributes:
+        fastest: largest |lambda|, 1/s.
+        kind: what it does: "turns", "grows" or "decays".
+    """
+
+    fastest: float
+    kind: str
+
+
+def is_stiff(motion: AbstractSolution) -> bool:
+    """Whether explicit steps are about as long as the fastest decay lets them be stable."""
+    return _stiffness(motion) is not None
+
+
+def _stiffness(motion: AbstractSolution) -> Rates | None:
+    """The decay that explicit steps are as short as they must be for; None where it is not so."""
+    h = _mean_step(motion)
+    if h is None or motion.scene.implicit:
+        return None
+    rates = _rates(_look(motion, h, last=True))
+    if rates is None or rates.kind != "decays" or not _within(h * rates.fastest, STIFF):
+        return None
+    return rates
+
+
+def advice(motion: AbstractSolution, status: Status) -> str:
+    """What to do about the end of a single motion: about its rows where these are the cause."""
+    of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
+    if status in of_rows and motion.system.constraints:
+        # Under grad its numbers are traced, and have values all the same.
+        at = still((motion._given, motion.last_time, motion.last_state[0]))
+        dependent = status is Status.projection_failed
+        singular = advice_on_rows(motion.system, *at, dependent=dependent)
+        if singular:
+            return singular
+    fixed, (accepted, rejected) = motion.tolerances is None, _counts(motion)
+    sharp = rejected > UNEVEN * (accepted + rejected)
+    special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
+    said = (ADVICE | special).get(status, "")
+    if fixed:
+        return said
+    if status in (Status.max_steps, Status.step_below_resolution):
+        said = f"{said} {_about_time(motion)}".strip()
+    if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
+        return (
+            f"The motion is stiff: something in it decays at {rates.fastest:.3g} 1/s, and explicit "
+            f"steps must be about as short as that. Take method='kvaerno5'. {said}"
+        )
+    assert motion.tolerances is not None
+    if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
+        state = np.concatenate([np.ravel(x) for x in motion.last_state])
+        labels = motion.system.coordinates.labels
+        bounds = np.resize(motion.tolerances[1], state.shape)
+        names = (*labels, *(f"{label}'" for label in labels))
+        resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
+        if resting:
+            return (
+                f"With atol = 0 no error is small enough where a component is 0, as "
+                f"{', '.join(resting)} here: give atol > 0, or start elsewhere."
+            )
+    return said
+
+
+def explain(motion: AbstractSolution) -> str:
+    """What the steps of one motion were, what held them short, and what would change it.
+
+    Raises:
+        ValueError: a batch of motions, or a traced one.
+    """
+    if motion.ts.ndim != 1:
+        raise bad("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
+    if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
+        raise bad("explain", "be asked outside jit and vmap", "the motion is traced")
+    accepted, rejected = _counts(motion)
+    how = "fixed steps"
+    if motion.tolerances is not None:
+        rtol, atol = map(np.asarray, motion.tolerances)
+        least, most = np.min(atol), np.max(atol)
+        how = f"rtol {rtol:.3g}, atol {least:.3g}" + f" to {most:.3g}" * bool(most > least)
+    lines = [
+        f"method        {motion.method}, {how}, {motion.formulation}",
+        f"status        {motion.message()}",
+    ]
+    if motion.fallback:
+        lines.append(f"formulation   {motion.fallback}")
+    h, advice = _mean_step(motion), []
+    attempts = accepted + rejected
+    lines.append(
+        f"steps         {attempts} attempted, {rejected} rejected"
+        + (f" ({rejected / attempts:.0%})" if attempts else "")
+        + ("" if h is None else f", {h:.3g} s on average")
+    )
+    if h is None:
+        return "\n".join(lines)
+    if int(motion.status) == Status.max_steps:
+        elapsed = abs(float(motion.last_time - motion.ts[0]))
+        span = abs(float(motion.ts[-1] - motion.ts[0]))
+        advice.append(
+            f"It got through {elapsed / span:.1%} of ts: about {attempts * span / elapsed:.2g} "
+            "steps would do at this pace."
+        )
+    if attempts >= 20 and rejected > REJECTED * attempts:
+        advice.append(
+            "Many steps were rejected: forces that jump, bend or rise within a short way make the "
+            "step shrink each time. Where that is at known times, let them read an input with "
+            "knots, where steps end. Where it depends on the position, these steps are needed."
+        )
+    fixed = motion.tolerances is None
+    if coarse := _about_time(motion):
+        advice.append(coarse)
+    looks = _look(motion, h)
+    lines += _about_rates(motion, h, _rates(looks), advice)
+    lines += _about_mass(motion, looks, advice)
+    if not motion.scene.implicit:  # these are looked at in an explicit step
+        lines += [] if fixed else _about_errors(motion, looks)
+        lines += _about_projection(motion, looks, advice)
+    if not advice and fixed:
+        advice.append(
+            "dt alone sets the number of steps, and nothing stands out. Whether a longer one would "
+            "do is told by estimate_error=True."
+        )
+    elif not advice and rejected > UNEVEN * attempts:
+        advice.append("Accuracy sets the step, where forces change fast most of all.")
+    elif not advice:
+        advice.append("Accuracy sets the step, and nothing stands out: a looser tolerance is all.")
+    heads = ["advice        ", *["              "] * (len(advice) - 1)]
+    return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
+
+
+def _counts(motion: AbstractSolution) -> tuple[int, int]:
+    """Steps (accepted, rejected)."""
+    return int(motion.stats["accepted"]), int(motion.stats["rejected"])
+
+
+def _mean_step(motion: AbstractSolution) -> float | None:
+    accepted = int(motion.stats["accepted"])
+    elapsed = abs(float(motion.last_time - motion.ts[0]))
+    return elapsed / accepted if accepted and elapsed > 0 else None
+
+
+def _about_time(motion: AbstractSolution) -> str:
+    """Of times so far from 0 that what depends on them is rougher than the tolerance."""
+    h = _mean_step(motion)
+    if h is None or motion.tolerances is None:
+        return ""
+    farthest = float(jnp.max(jnp.abs(motion.ts)))
+    digit = float(jnp.finfo(motion.ts.dtype).eps) * farthest
+    if digit <= 10 * float(np.max(np.asarray(motion.tolerances[0]))) * h:
+        return ""
+    return (
+        f"Times near {farthest:.3g} s are {digit:.2g} s apart: steps this short see jumps of what "
+        "depends on time. Measure time from the start, and make the start a parameter."
+    )
+
+
+def _within(x: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] < x < bounds[1]
+
+
+def _about_rates(
+    motion: AbstractSolution, h: float, rates: Rates | None, advice: list[str]
+) -> list[str]:
+    if rates is None or rates.fastest == 0:
+        return []
+    product, time = h * rates.fastest, 1 / rates.fastest
+    if rates.kind == "grows":
+        return [f"rates         fastest growth e-fold in {time:.3g} s, {1 / product:.2g} steps"]
+    if rates.kind == "decays":
+        if _within(product, STIFF) and not motion.scene.implicit:
+            advice.append(
+                f"It is stiff: what decays in {time:.3g} s is over, but keeps explicit steps about "
+                "as short. Steps of method='kvaerno5' need not follow."
+            )
+        return [f"rates         fastest decay 1/e in {time:.3g} s, {1 / product:.2g} steps"]
+    period = 2 * np.pi * time
+    turns = abs(float(motion.ts[-1] - motion.ts[0])) / period
+    if _within(period / h, FOLLOWED) and turns > OFTEN and not motion.scene.implicit:
+        advice.append(
+            f"The steps follow an oscillation of period {period:.3g} s, {turns:.2g} of them in "
+            "ts: if it does not matter, put a constraint in the place of the stiff part."
+        )
+    return [
+        f"rates         fastest oscillation of period {period:.3g} s, {period / h:.3g} steps each"
+    ]
+
+
+def _about_errors(motion: AbstractSolution, looks: Look) -> list[str]:
+    error = np.asarray(looks.error)
+    sound = np.all(np.isfinite(error), axis=1) & (np.max(error, axis=1) > 0)
+    if not sound.any():
+        return []
+    labels, system = list(motion.system.coordinates.labels), motion.system
+    if motion.formulation == "quasi" and system.quasi is not None:
+        names = labels + [system.quasi.names[i] for i in system.quasi.free]
+    else:
+        names = labels + [f"d({label})/dt" for label in labels]
+    (index, often), *_ = Counter(np.argmax(error[sound], axis=1).tolist()).most_common(1)
+    share = f"in {often} of {int(sound.sum())} states"
+    return [f"error         largest, beside its tolerance, in {names[index]} ({share})"]
+
+
+def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
+    """Of M with its diagonal scaled to 1: units cost no digits."""
+    worst, label = 1.0, ""
+    for M in np.asarray(looks.mass):
+        size = np.sqrt(np.abs(np.diag(M)))
+        if not np.all(np.isfinite(M)):
+            continue
+        if np.min(size) == 0:
+            label = motion.system.coordinates.labels[int(np.argmin(size))]
+            return [f"mass matrix   no inertia of its own along {label!r}"]
+        values, axes = np.linalg.eigh(M / np.outer(size, size))
+        condition = values[-1] / max(values[0], np.finfo(M.dtype).tiny)
+        if condition > worst:
+            label = motion.system.coordinates.labels[int(np.argmax(np.abs(axes[:, 0])))]
+            worst = condition
+    eps = float(np.finfo(np.asarray(looks.mass).dtype).eps)
+    if worst * eps > 1:
+        return [f"mass matrix   singular by itself, as along {label!r}"]
+    if worst > 1 / np.sqrt(eps):
+        advice.append(
+            f"M is nearly singular, as along {label!r}: accelerations keep about "
+            f"{-np.log10(worst * eps):.0f} digits. Choose coordinates with inertias of their own."
+        )
+    return [f"mass matrix   cond(M) up to {worst:.2g} with its diagonal scaled to 1"]
+
+
+def _about_projection(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
+    most = int(np.max(looks.turns))
+    if most == 0:
+        return []
+    if most > TURNS:
+        advice.append(
+            f"Each step is moved back onto the constraints in up to {most} turns: steps are long "
+            "for how much the constraints bend. A tighter tolerance may be faster."
+        )
+    return [f"projection    up to {most} turn{'s' if most > 1 else ''} per step"]
+
+
+def _rates(looks: Look) -> Rates | None:
+    """Of all states looked at; None where none is finite."""
+    found = [J for J in np.asarray(looks.rates) if np.all(np.isfinite(J))]
+    if not found:
+        return None
+    rates: Any = np.concatenate([np.linalg.eigvals(J) for J in found])
+    size = np.abs(rates)
+    # Pairs of a saddle are equal up to what differences leave: it grows.
+    largest = rates[size > 0.99 * np.max(size)] if np.max(size) > 0 else rates
+    kind = "decays"
+    if np.any(np.abs(largest.imag) > np.abs(largest.real)):
+        kind = "turns"
+    elif np.any(largest.real > 0):
+        kind = "grows"
+    return Rates(float(np.max(size)), kind)
+
+
+def _look(motion: AbstractSolution, h: float, last: bool = False) -> Look:
+    reached = np.flatnonzero(np.all(np.isfinite(np.asarray(motion.q)), axis=1))
+    rows = reached[np.unique(np.linspace(0, len(reached) - 1, ROWS).round().astype(int))]
+    ts, q, v = (np.asarray(x)[rows] for x in (motion.ts, motion.q, motion.v))
+    end = [np.asarray(x)[None] for x in (motion.last_time, *motion.last_state)]
+    if last:
+        ts, q, v = end
+    elif int(motion.status) != Status.ok:
+        ts, q, v = (np.concatenate(pair) for pair in zip((ts, q, v), end, strict=True))
+    tolerances = motion.tolerances or (jnp.ones(()), jnp.ones(()))
+    given = motion._params_traced, motion._inputs_traced
+    return _looks(motion.scene, (motion.ts[jnp.array([0, -1])], ts, q, v, h, *given, tolerances))
+
+
+@partial(jax.jit, static_argnums=0)
+def _looks(scene: Scene, traced: Any) -> Look:
+    span, ts, q, v, h, params, inputs, (rtol, atol) = traced
+    dynamics, args = dynamics_of(scene, span, ts[0], q[0], v[0], params, inputs)
+    given, _ = dynamics.given(args)
+    solver = diffrax.Dopri8(scan_kind="lax")
+
+    def at(row: tuple[Array, Array, Array]) -> Look:
+        tau, y = dynamics.tau(row[0], args), dynamics.state_of(*row, given)
+        here = dynamics.within(args, tau)
+        term = term_of(dynamics, tau, y, here)
+        _, rates = linearized(lambda y: dynamics(tau, y, here), y)
+        memory = solver.init(term, tau, tau + h, y, here)
+        y1, error, *_ = solver.step(term, tau, tau + h, y, here, memory, made_jump=False)
+        turns = jnp.zeros((), jnp.int32)
+        if dynamics.projects:
+            turns = turns_needed(dynamics.surface(tau + h, y1, here), *dynamics.parts(y1))
+        allowed = atol if atol.ndim == 0 else jnp.tile(atol, 2)
+        scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
+        return Look(rates, dynamics.mass(tau, y, here), scaled, turns)
+
+    return jax.lax.map(at, (ts, q, v))

@@ -1,0 +1,1 @@
+"""What needs no time stepping: assembly, equilibria, inverse dynamics."""

@@ -1,0 +1,437 @@
+"""Assembly: the consistent state nearest to a guess."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._core._arrays import concrete, number, real, still
+from jaxlag._core._custom_jvp import keeping_rules
+from jaxlag._core._errors import AssemblyError, bad
+from jaxlag._core._status import Status
+from jaxlag._linalg._independent_rows import independent_rows, row_sizes, without_rounding
+from jaxlag._linalg._kkt import augmented, solve_kkt
+from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
+from jaxlag._lowering import ArrayTerms
+from jaxlag._model._constraints import Layout
+from jaxlag._model._coordinates import state_vectors
+from jaxlag._system._closure import check_params, closing
+from jaxlag._system._row_advice import advice_on_rows
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._traced_function import warn_of_changes
+
+MAX_TURNS = 200
+NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out on the way, where they
+# are not quite dependent although they are on the constraints
+FRACTIONS = 2.0 ** -np.arange(12)
+
+
+class Assembly(eqx.Module):
+    """A state (q, v) near a guess, and how well it satisfies the constraints.
+
+    Attributes:
+        system: whose state it is.
+        q: coordinates (n,), m or rad.
+        v: velocities (n,), m/s or rad/s.
+        position_residual: phi(t, q) of the holonomic rows, (k,).
+        velocity_residual: A v + b of all rows, (m,).
+        independent: (m,), a largest set of independent rows; the others follow from it.
+        status: int32, see `Status`: ok, contradictory_rows or nonfinite.
+        where: index of the row with the largest residual left, -1 where the status is ok.
+    """
+
+    system: System
+    q: Float[Array, "*batch n"]
+    v: Float[Array, "*batch n"]
+    position_residual: Float[Array, "*batch k"]
+    velocity_residual: Float[Array, "*batch m"]
+    independent: Bool[Array, "*batch m"]
+    status: Int[Array, "*batch"]
+    where: Int[Array, "*batch"]
+    _rows: Layout = eqx.field(static=True)
+
+    @property
+    def rank(self) -> Int[Array, "*batch"]:
+        """Number of independent rows."""
+        return jnp.sum(self.independent, axis=-1, dtype=jnp.int32)
+
+    @property
+    def dependent(self) -> tuple[str, ...]:
+        """Names of the rows that follow from the others, of a single assembly."""
+        if self.independent.ndim != 1:
+            raise bad("dependent", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
+        return tuple(
+            name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
+        )
+
+    def message(self) -> str:
+        """How a single assembly ended, in words."""
+        if self.q.ndim != 1:
+            raise bad("message", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
+        status = Status(int(self.status))
+        if status is Status.ok:
+            more = f"; dependent rows: {', '.join(self.dependent)}" if self.dependent else ""
+            return f"ok at q = {self.q}, v = {self.v}, rank {int(self.rank)}{more}"
+        row, more = self._rows.labels[int(self.where)], ""
+        if status is Status.contradictory_rows:
+            more = self._rows.contradiction(self.system.size)
+        return (
+            f"{status.name} ({row!r}): the nearest state was q = {self.q}, v = {self.v}, with "
+            f"residuals {self.position_residual} of position and {self.velocity_residual} of "
+            f"velocity.{more}"
+        )
+
+
+def assemble(
+    system: System,
+    q: Any,
+    v: Any,
+    params: Any = None,
+    *,
+    t: Any = 0.0,
+    hold: Sequence[str] = (),
+    weights: Any = None,
+    throw: bool = True,
+) -> Assembly:
+    """Consistent state near (q, v), a nearest one: phi(t, q) = 0 first, then A v + b = 0.
+
+    Minimises (q* - q)^T W (q* - q) over phi(t, q*) = 0, then (v* - v)^T W (v* - v) over
+    A(t, q*) v* + b(t, q*) = 0; W = M at the guess, or the diagonal given. Newton's method on the
+    conditions of a minimum, steps shortened so that they lead downhill. What is found for q is a
+    local minimum: nearer than all consistent states around it. Another branch of them, as of a
+    linkage that can be assembled in two ways, may be nearer where the guess is far from all of
+    them; then give a better guess. Of 200 random four-bars none had a nearer one for guesses with
+    angles off by 0.5 rad (standard deviation), 14 for 1 rad. v is the nearest of all.
+
+    The derivative is that of the implicit function, in every mode and order.
+
+    Args:
+        system: whose state it is, n coordinates.
+        q: guess, (n,) numbers or a dict by name; m or rad.
+        v: guess in the same form; m/s or rad/s.
+        params: as the Lagrangian takes them.
+        t: instant, s.
+        hold: names of what may not move: a coordinate `"theta"` (all of its entries), one entry
+            `"x[0,1]"`, or with a prime the velocity, `"theta'"`.
+        weights: (n,) positive numbers or a dict by name, the diagonal of W; by default W = M, in
+            which a coordinate moves the less the more inertia it has, and M + A^T D A with a
+            diagonal D where M is singular.
+        throw: raise where a concrete result has a status other than ok.
+
+    Raises:
+        ValueError: q, v, weights of wrong length or not finite; weights that are not positive; t
+            not a finite number; names in `hold` that do not exist.
+        AssemblyError: no consistent state was found; names the row, and what must not be held.
+            With `throw=True` and concrete values.
+
+    Source: Nocedal, Wright, Numerical Optimization, ch. 18 (sequential quadratic programming).
+
+    Example:
+        A pendulum in Cartesian coordinates of length 1, guessed too long; x is kept:
+
+        >>> import jax, jax.numpy as jnp, jaxlag as jl
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> pendulum = jl.System(
+        ...     lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[1],
+        ...     ("x", "y"),
+        ...     constraints=(jl.Holonomic(lambda t, q, params: q @ q - 1.0, "rod"),),
+        ... )
+        >>> state = jl.assemble(pendulum, [0.6, -0.9], [1.0, 0.0], hold=("x", "x'"))
+        >>> print(f"{state.q[1]:.4f} {state.v[1]:.4f} rank {state.rank}")
+        -0.8000 0.7500 rank 1
+    """
+    if not isinstance(system, System):
+        raise bad("assemble: system", "be a jl.System", f"it was {system!r}")
+    q, v = state_vectors(system.coordinates, q, v)
+    _check_finite("q", q)
+    _check_finite("v", v)
+    held, rates_held = _held(system, hold)
+    diagonal = None
+    if weights is not None:
+        given = system.flatten(weights) if isinstance(weights, dict) else weights
+        diagonal = real("assemble: weights", given).astype(q.dtype)
+        if diagonal.shape != q.shape:
+            must = f"have shape {q.shape}"
+            raise bad("assemble: weights", must, f"its shape was {diagonal.shape}")
+        if concrete(diagonal):
+            numbers = np.asarray(diagonal)
+            if not np.all((numbers > 0) & np.isfinite(numbers)):
+                raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
+    check_params(system, params, q, None)
+    warn_of_changes(system)
+    traced, static = _params.split(closing(system, params, q, None))
+    t = number("assemble: t", "be a number", t, jnp.result_type(float))
+    key = system, _params.Static(static), held, rates_held
+    found = _run(key, (q, v, traced, t, diagonal))
+    if throw and concrete(found.status) and int(found.status) != int(Status.ok):
+        found = still(found)  # under grad its numbers are traced, and have values all the same
+        fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
+        where = [t, found.q]
+        if np.ndim(found.status) == 0 and concrete(traced, where):
+            fix = f"{fix} {advice_on_rows(system, params, *where)}".rstrip()
+        raise AssemblyError(f"Assembly ended with status {found.message()}{fix}", found)
+    return found
+
+
+def assembled(system: System, q: Array, v: Array, params: Any, t: Array) -> Assembly:
+    """`assemble` with nothing held, for use while tracing."""
+    free = (False,) * system.size
+    return _assembled(system, q, v, params, t, free, free, None)
+
+
+@partial(jax.jit, static_argnums=0)
+def _run(key: Any, values: Any) -> Assembly:
+    system, static, held, rates_held = key
+    q, v, traced, t, diagonal = values
+    params = _params.join(traced, static.tree)
+    return _assembled(system, q, v, params, t, held, rates_held, diagonal)
+
+
+def _assembled(
+    system: System,
+    q: Array,
+    v: Array,
+    params: Any,
+    t: Array,
+    held: tuple[bool, ...],
+    rates_held: tuple[bool, ...],
+    diagonal: Array | None,
+) -> Assembly:
+    rows = system.rows(params, q.dtype)
+    terms = ArrayTerms(system.lagrangian, (), system.constraints)
+    fixed, rates_fixed = np.array(held), np.array(rates_held)
+
+    def metric(q: Array, held: np.ndarray) -> Array:
+        W = _inertia(terms, t, q, v, params) if diagonal is None else jnp.diag(diagonal)
+        free = np.outer(~held, ~held)
+        return jnp.where(free, W, jnp.eye(len(held), dtype=q.dtype) * jnp.trace(W) / len(held))
+
+    def phi(q: Array) -> Array:
+        return terms.position(t, q, params)
+
+    if any(rows.holonomic):
+        q = _nearest(phi, metric(q, fixed), q, ~fixed)
+
+    def all_rows(q: Array) -> Array:
+        return terms.rows(t, q, v, params)[0]
+
+    def of_free(q: Array) -> Array:
+        return jnp.where(rates_fixed, 0.0, all_rows(q))
+
+    A, W = all_rows(q), metric(q, rates_fixed)
+    if rows.size:
+        kept = _independent(of_free, W, q, rows.velocity)
+        residual = terms.velocity(t, q, v, params)
+        v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
+
+    position, velocity = phi(q), terms.velocity(t, q, v, params)
+    _, void, size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))
+    floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
+
+    def residuals(q: Array, v: Array) -> tuple[Array, Array]:
+        return rows.of_all(phi(q)), terms.velocity(t, q, v, params)
+
+    off = jnp.zeros_like(size)
+    for c, x in zip(without_rounding(residuals, void, size, q, v), (q, v), strict=True):
+        off = jnp.maximum(off, jnp.abs(c) / size / (1.0 + jnp.max(jnp.abs(x))))
+    ok = jnp.all(off <= floor)
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
+    failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))
+    independent = jnp.zeros((0,), bool)
+    if rows.size:
+        M = metric(q, np.zeros_like(fixed))
+        independent = _independent(all_rows, M, q, rows.velocity)
+    worst = jnp.argmax(off) if rows.size else 0
+    return Assembly(
+        system,
+        q,
+        v,
+        position,
+        velocity,
+        independent,
+        status=jnp.where(ok, int(Status.ok), failure).astype(jnp.int32),
+        where=jnp.where(ok, -1, worst).astype(jnp.int32),
+        _rows=rows,
+    )
+
+
+def _independent(
+    rows: Callable,
+    W: Array,
+    q: Array,
+    turn: Sequence[int] | None = None,
+    floor: float | None = None,
+) -> Bool[Array, " m"]:
+    """A largest set of independent rows at q, rounding left out."""
+    W, q = jax.lax.stop_gradient((W, q))
+    A = jax.lax.stop_gradient(rows(q))
+    there = row_sizes(rows, q, A).there
+    return independent_rows(W, A, turn, floor, there)
+
+
+def _inertia(terms: ArrayTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
+    """M; with what all rows lend where it is not positive definite by itself."""
+    M, (A, _) = terms.mass(t, q, v, params), terms.rows(t, q, v, params)
+    regular = jnp.all(factor_mass(jax.lax.stop_gradient(M)).healthy)
+    return jnp.where(regular, M, augmented(M, A)[0])
+
+
+class _Search(NamedTuple):
+    q: Array
+    lam: Array
+    step: Array
+    count: Array
+
+
+def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
+    """The q that minimises (q - start)^T W (q - start) / 2 over phi(q) = 0, a root of F."""
+
+    def rows(q: Array) -> Array:
+        return jnp.where(free, jax.jacrev(phi)(q), 0.0)
+
+    def F(z: tuple[Array, Array], kept: Array) -> tuple[Array, Array]:
+        q, lam = z
+        _, pull = jax.vjp(phi, q)
+        above = W @ (q - start) - jnp.where(free, pull(lam)[0], 0.0)
+        return above, jnp.where(kept, phi(q), lam)
+
+    frozen = jax.lax.stop_gradient((W, start))
+    still = partial(_still, phi)
+    q, lam = jax.lax.stop_gradient(_search(still, rows, *frozen))
+    kept = _independent(rows, W, q)
+    lam = jnp.where(kept, lam, 0.0)
+    n = start.shape[0]
+
+    def flat(z: Array) -> Array:
+        return jnp.concatenate(F((z[:n], z[n:]), kept))
+
+    def found(flat: Callable, z: Array) -> Array:
+        z = _polished(flat, z)
+        return z.at[:n].set(_closed(still, rows, frozen[0], z[:n]))
+
+    def tangent(linear: Callable, y: Array) -> Array:
+        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)
+
+    @keeping_rules
+    def root(z: Array) -> Array:
+        return jax.lax.custom_root(flat, z, found, tangent)
+
+    return root(jnp.concatenate([q, lam]))[:n]
+
+
+def _still(phi: Callable, q: Array) -> Array:
+    return jax.lax.stop_gradient(phi(q))
+
+
+def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Array, Array]:
+    """(q, lam) with W (q - start) = A^T lam, phi(q) = 0."""
+    eps = float(jnp.finfo(start.dtype).eps)
+    fractions = jnp.asarray(FRACTIONS, start.dtype)
+
+    def turn(s: _Search) -> _Search:
+        A, c = jax.lax.stop_gradient(rows(s.q)), phi(s.q)
+        floor = max(NEAR_DEPENDENCE, dependence_floor(start.dtype))
+        kept = _independent(rows, W, s.q, floor=floor)
+        step, lam = solve_kkt(W, A, W @ (start - s.q), c, kept)
+        # Down the exact penalty |q - start|^2 / 2 + nu |phi|_1, for nu larger than every |lam|.
+        nu = 2.0 * jnp.max(jnp.abs(lam)) + jnp.finfo(start.dtype).tiny
+
+        def penalty(fraction: Array) -> Array:
+            q = s.q + fraction * step
+            return 0.5 * (q - start) @ W @ (q - start) + nu * jnp.sum(jnp.abs(phi(q)))
+
+        values = jax.vmap(penalty)(fractions)
+        best = fractions[jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))]
+        # Near the end rounding hides what the penalty gains.
+        tiny = jnp.max(jnp.abs(step) / (1.0 + jnp.abs(s.q))) < eps**0.25
+        moved = jnp.where(tiny, 1.0, best) * step
+        return _Search(s.q + moved, lam, step, s.count + 1)
+
+    def goes_on(s: _Search) -> Array:
+        far = jnp.max(jnp.abs(s.step) / (1.0 + jnp.abs(s.q))) > 4 * eps
+        return far & (s.count < MAX_TURNS)
+
+    lam = jnp.zeros_like(phi(start))
+    begin = _Search(start, lam, jnp.full_like(start, jnp.inf), jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(goes_on, turn, begin)
+    return end.q, end.lam
+
+
+def _polished(F: Callable, z: Array) -> Array:
+    """Newton's method with the curvature of the rows, as long as F becomes smaller."""
+
+    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        z, _ = state
+        further = z - jnp.linalg.solve(jax.jacfwd(F)(z), F(z))
+        better = jnp.max(jnp.abs(F(further))) < 0.9 * jnp.max(jnp.abs(F(z)))
+        return jnp.where(better, further, z), better
+
+    return jax.lax.while_loop(lambda state: state[1], turn, (z, jnp.array(True)))[0]
+
+
+def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
+    """The shortest steps onto phi = 0, as long as the residual becomes smaller."""
+
+    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        q, _ = state
+        A, c = jax.lax.stop_gradient(rows(q)), phi(q)
+        further = q + solve_kkt(W, A, jnp.zeros_like(q), c, _independent(rows, W, q))[0]
+        better = jnp.max(jnp.abs(phi(further))) < 0.9 * jnp.max(jnp.abs(c))
+        return jnp.where(better, further, q), better
+
+    return jax.lax.while_loop(lambda state: state[1], turn, (q, jnp.array(True)))[0]
+
+
+def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+    """For every coordinate, whether it is held, and whether its velocity is."""
+    if isinstance(hold, str) or not isinstance(hold, Sequence):
+        raise bad("assemble: hold", "be a sequence of names", f"it was {hold!r}")
+    coordinates = system.coordinates
+    index = {label: [i] for i, label in enumerate(coordinates.labels)}
+    start = 0
+    for name, shape in coordinates.shapes.items():
+        size = int(np.prod(shape))
+        index[name] = list(range(start, start + size))
+        start += size
+    held = np.zeros((2, system.size), bool)
+    for name in hold:
+        rate = isinstance(name, str) and name.endswith("'")
+        plain = name[:-1] if rate else name
+        if plain not in index:
+            known = list(coordinates.names)
+            must = f"name coordinates among {known}, or with a prime their velocities"
+            raise bad("assemble: hold", must, f"one was {name!r}")
+        held[int(rate), index[plain]] = True
+    return tuple(held[0].tolist()), tuple(held[1].tolist())
+
+
+def _what_to_release(key: Any, values: Any) -> str:
+    """Which held coordinates or velocities are in the way, in words."""
+    system, static, *held = key
+    labels = system.coordinates.labels
+    free = (False,) * system.size
+    if int(_run((system, static, free, free), values).status) != int(Status.ok):
+        return " It cannot be satisfied with nothing held, either."
+    culprits = []
+    for rate in (0, 1):
+        for i in np.flatnonzero(held[rate]):
+            fewer = [list(x) for x in held]
+            fewer[rate][i] = False
+            less = (system, static, tuple(fewer[0]), tuple(fewer[1]))
+            if int(_run(less, values).status) == int(Status.ok):
+                culprits.append(labels[i] + "'" * rate)
+    if culprits:
+        return f" hold must leave the constraints solvable: release {' or '.join(culprits)}."
+    names = [labels[i] + "'" * rate for rate in (0, 1) for i in np.flatnonzero(held[rate])]
+    return f" hold must leave the constraints solvable: release some of {', '.join(names)}."
+
+
+def _check_finite(argument: str, x: Array) -> None:
+    if concrete(x) and not np.all(np.isfinite(x)):
+        raise bad(f"assemble: {argument}", "be finite", f"it was {x}")

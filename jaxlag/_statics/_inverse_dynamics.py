@@ -1,0 +1,189 @@
+"""Inverse dynamics: the generalized forces that a given motion needs."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxlag._core._arrays import concrete, of_state, real
+from jaxlag._core._errors import bad
+from jaxlag._model._forces import reads_lam
+from jaxlag._model._inputs import check_inputs, check_range, evaluate
+from jaxlag._system._system import System, check_declaration
+from jaxlag._tracing import _params
+from jaxlag._tracing._signature import require_arity
+from jaxlag._tracing._traced_function import warn_of_changes
+
+
+def inverse_dynamics(
+    system: System,
+    q: Any,
+    v: Any,
+    a: Any,
+    params: Any = None,
+    *,
+    t: Any = 0.0,
+    inputs: Mapping[str, Any] | None = None,
+) -> Float[Array, "*s n"]:
+    """Generalized force M a + h - Q that a motion needs beyond the forces declared.
+
+    What the constraints of the system exert, A^T lam, is part of it.
+
+    One derivative of the momentum along the motion: d/dt(dL/dv) - dL/dq - Q. M is neither formed
+    nor factored, so it may be singular (massless links). Composes with jit, vmap and every
+    derivative of JAX.
+
+    Args:
+        system: what moves, n coordinates.
+        q: coordinates, shape (n,), or (s, n) for s instants, or at one instant a dict by name;
+            m or rad.
+        v: velocities dq/dt, in the same form; m/s or rad/s.
+        a: accelerations dv/dt, in the same form; m/s^2 or rad/s^2.
+        params: as the Lagrangian takes them.
+        t: the instant in s, or the (s,) instants of the rows.
+        inputs: dict from names to input objects or arrays, as in `simulate`.
+
+    Returns:
+        Shape (n,) or (s, n): N where q_i is in m, N m where it is in rad; positive pushes towards
+        larger q_i.
+
+    Raises:
+        ValueError: q, v, a not real numbers of shape (n,) or (s, n), not one row at least, or,
+            where they have values, not finite (the coordinate is named); t not one instant for
+            each row; inputs that no force reads.
+
+    Source: Pila, secs. 2.7, 2.8 (motion prescribed, forces asked) and eq. 3.53.
+
+    Example:
+        What a driven pendulum's motor must supply, theta = 0.3 sin(2 t), at t = 0.5:
+
+        >>> import jax, jax.numpy as jnp, jaxlag as jl
+        >>> jax.config.update("jax_enable_x64", True)
+        >>> def lagrangian(t, q, v, params):
+        ...     return 0.5 * 0.4 * v[0] ** 2 + 0.4 * 9.81 * jnp.cos(q[0])
+        >>> pendulum = jl.System(lagrangian, coordinates=("theta",))
+        >>> q, v, a = jl.prescribed_motion(lambda t: 0.3 * jnp.sin(2 * jnp.array([t])), 0.5)
+        >>> print(f"{jl.inverse_dynamics(pendulum, q, v, a)[0]:.6f} N m")
+        0.576186 N m
+    """
+    if not isinstance(system, System):
+        raise bad("inverse_dynamics: system", "be a jl.System", f"it was {system!r}")
+    if any(map(reads_lam, system.forces)):
+        was = "it has some"
+        must = "be a system without forces that depend on multipliers"
+        raise bad("inverse_dynamics: system", must, was, "A motion does not say what lam is.")
+    q, v, a, t = _motion(system, q, v, a, t)
+    inputs = check_inputs(inputs)
+    check_range(inputs, t, "t")
+    warn_of_changes(system, inputs)
+    traced, static = _params.split(params)
+    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    key = (system, _params.Static(static), _params.Static(inputs_static))
+    return _needed(key, (t, q, v, a, traced, inputs_traced))
+
+
+def prescribed_motion(
+    motion: Callable, t: Any
+) -> tuple[Float[Array, "*s n"], Float[Array, "*s n"], Float[Array, "*s n"]]:
+    """(q, v, a) of a motion given as a function of time, by two forward derivatives.
+
+    Args:
+        motion: function `motion(t)` of a scalar time in s, returning q of shape (n,).
+        t: the instant in s, or (s,) instants.
+
+    Returns:
+        q, v = dq/dt and a = d2q/dt2, each (n,) or (s, n).
+
+    Raises:
+        ValueError: `motion` is no function of t, or does not return real numbers of shape (n,);
+            t is neither a number nor a row of them.
+    """
+    require_arity("prescribed_motion: motion", motion, ("t",))
+    t = real("prescribed_motion: t", t).astype(jnp.result_type(float))
+    if t.ndim > 1:
+        must, was = "be an instant or a row of them", f"its shape was {t.shape}"
+        raise bad("prescribed_motion: t", must, was)
+
+    def coordinates(t: Array) -> Array:
+        q = motion(t)
+        if not eqx.is_array_like(q) or jnp.ndim(q) != 1:
+            was = f"shape {jnp.shape(q)}" if eqx.is_array_like(q) else f"{q!r}"
+            raise bad(
+                "prescribed_motion: motion",
+                "return all coordinates as one vector of shape (n,)",
+                f"it returned {was}",
+                "Use jnp.stack([q1, q2]).",
+            )
+        return real("prescribed_motion: what motion returns", q)
+
+    def rate(f: Callable, t: Array) -> Array:
+        return jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
+
+    def at(t: Array) -> tuple[Array, Array, Array]:
+        velocity = partial(rate, coordinates)
+        return coordinates(t), velocity(t), rate(velocity, t)
+
+    return at(t) if t.ndim == 0 else jax.vmap(at)(t)
+
+
+def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Array, Array, Array]:
+    """(q, v, a, t) of one shape and precision, or an error that names the odd one out."""
+    vectors: list[Array] = []
+    n, labels = system.size, system.coordinates.labels
+    for name, x in (("q", q), ("v", v), ("a", a)):
+        argument = f"inverse_dynamics: {name}"
+        if isinstance(x, Mapping):
+            x = system.coordinates.flatten(x, argument)
+        x = real(argument, x)
+        shape = vectors[0].shape if vectors else x.shape
+        if x.ndim not in (1, 2) or x.shape[-1] != n or x.shape != shape:
+            same = f", as q with {shape}" if vectors else ""
+            must = f"have shape ({n},) or (s, {n}){same}: {', '.join(labels)}"
+            raise bad(argument, must, f"its shape was {x.shape}")
+        if x.size == 0:
+            raise bad(argument, "hold at least one instant", f"its shape was {x.shape}")
+        _check_finite(argument, x, labels)
+        vectors.append(x)
+    rows = vectors[0].shape[:-1]
+    t = real("inverse_dynamics: t", t)
+    if t.shape not in ((), rows):
+        raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
+    if concrete(t) and not np.all(np.isfinite(t)):
+        raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
+    q, v, a = of_state("q, v and a", *vectors)
+    return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
+
+
+def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
+    """Raise unless a vector or rows of them with values are finite."""
+    if not concrete(x) or np.all(np.isfinite(x)):
+        return
+    values = np.asarray(x)
+    *row, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
+    where = f"{argument.split()[-1]}[{', '.join(map(str, (*row, i)))}] ({labels[i]!r})"
+    fix = "Rows that a motion did not reach are NaN: leave them out." if row else ""
+    raise bad(argument, "be finite", f"{where} was {values[(*row, i)]}", fix)
+
+
+@partial(jax.jit, static_argnums=0)
+def _needed(key: Any, values: Any) -> Array:
+    system, params_static, inputs_static = key
+    t, q, v, a, params, inputs = values
+    params = _params.join(params, params_static.tree)
+    inputs = eqx.combine(inputs, inputs_static.tree)
+    first = (t, q, v) if q.ndim == 1 else (t[0], q[0], v[0])
+    check_declaration(system, params, inputs, *first)
+
+    def at(t: Array, q: Array, v: Array, a: Array) -> Array:
+        needed = system.terms.euler_lagrange(t, q, v, a, params)
+        if not system.forces:
+            return needed
+        given = evaluate(inputs, t, q, v, params)
+        return needed - system.terms.force(t, q, v, params, given)
+
+    return at(t, q, v, a) if q.ndim == 1 else jax.vmap(at)(t, q, v, a)

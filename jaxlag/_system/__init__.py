@@ -1,0 +1,1 @@
+"""The system, and its quantities at one state."""

@@ -1,0 +1,102 @@
+"""What a declaration reads: traced values that it closes over, and params."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import bad
+from jaxlag._lowering import ArrayTerms
+from jaxlag._model._forces import sliding
+from jaxlag._model._inputs import evaluate
+from jaxlag._system._system import System
+from jaxlag._tracing import _params
+from jaxlag._tracing._closure_params import Closed
+from jaxlag._tracing._dependence import outputs_depend_on
+from jaxlag._tracing._signature import real_scalar
+from jaxlag._tracing._traced_function import functions_of
+
+
+def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> Any:
+    """Params, and beside them whatever traced values the declared functions close over.
+
+    A Lagrangian written inside a function that is being differentiated may read its arguments:
+    derivatives in them are those in params. Without inputs the forces are left out.
+    """
+    declared = (system.lagrangian, system.constraints, system.quasi)
+    if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
+        return params
+    tracers = [x for x in _consts(system, params, q, inputs) if not concrete(x)]
+    return Closed(params, tracers, tuple(map(id, tracers))) if tracers else params
+
+
+def declared(
+    system: System, t: Array, q: Array, v: Array, params: Any, values: Any, lam: Array | None
+) -> Any:
+    """Everything that is declared, at one state; without values of the inputs, no forces.
+
+    Args:
+        system: whose functions are called.
+        t: time.
+        q: coordinates.
+        v: velocities.
+        params: as the Lagrangian takes them.
+        values: of the inputs, by name; None without.
+        lam: multipliers that forces read; None for zeros.
+    """
+    terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
+    L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
+    u = None if system.quasi is None else system.quasi.of(t, q, v, params)
+    rows = jnp.zeros(0), jnp.zeros(0)
+    if system.constraints:
+        rows = terms.position(t, q, params), terms.velocity(t, q, v, params)
+    if values is None:
+        return L, u, rows
+    slides = [slide(t, q, v, params) for slide in sliding(system.forces)]
+    lam = jnp.zeros_like(rows[1]) if lam is None else lam
+    return L, u, rows, slides, terms.force(t, q, v, params, values, lam)
+
+
+def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> None:
+    """Raise on numbers that are not finite and that anything declared reads.
+
+    And on objects that no program can be keyed by. Without inputs the forces read nothing.
+
+    Raises:
+        ValueError: with the leaf by its path.
+    """
+    _params.check_keys(params)
+    faults = _params.not_finite(params)
+    if not faults:
+        return
+    program, nothing = _program(system, params, q, inputs), frozenset()
+    given = [nothing] * 3 + [frozenset({path}) for path in _params.paths(params)]
+    given += [nothing] * (len(program.jaxpr.invars) - len(given))
+    read = nothing.union(*outputs_depend_on(program.jaxpr, given))
+    for path, name, was in faults:
+        if path in read:
+            raise bad(name, "be finite", f"it was {was}")
+
+
+def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
+    """What the declared functions close over."""
+    return _program(system, params, q, inputs).consts
+
+
+def _program(
+    system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
+) -> ClosedJaxpr:
+    """Everything that is declared as a program of (t, q, v, params, inputs)."""
+    traced, static = _params.halves((params, inputs))
+
+    def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:
+        params, inputs = _params.join(traced, static)
+        values = None if inputs is None else evaluate(inputs, t, q, v, params)
+        return declared(system, t, q, v, params, values, None)
+
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    return jax.make_jaxpr(everything)(t, q, q, traced)

@@ -1,0 +1,244 @@
+"""Forces, accelerations and reactions of a system at one state."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxlag._core._errors import bad
+from jaxlag._lowering import ArrayTerms, Moving
+from jaxlag._model._forces import reads_lam
+from jaxlag._system._state_functions import AbstractQuantities
+from jaxlag._tracing import _params
+from jaxlag._tracing._input_values import InputValues
+
+
+class AbstractReactions(AbstractQuantities):
+    """What M a + h = Q + A^T lam, A a + gamma = 0 gives at one state, besides its terms."""
+
+    def generalized_force(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Float[Array, " n"]:
+        """Q(t, q, v, inputs, lam), shape (n,), N or N m: the sum of the applied forces.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,).
+            v: shape (n,).
+            t: s.
+            inputs: dict from names to input objects or arrays.
+            names: only these forces; by default all, dissipation included.
+
+        Source: Pila, sec. 3.3 (virtual work) and 3.7 (Rayleigh).
+
+        Raises:
+            ValueError: wrong lengths, unknown force names, missing inputs.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        known = [force.name for force in self.forces]
+        for name in known if names is None else names:
+            if name not in known:
+                raise bad("generalized_force: names", f"be among {known}", f"one was {name!r}")
+        chosen = tuple(f for f in self.forces if names is None or f.name in names)
+        values = self._inputs_at(inputs, t, q, v, params)
+        lam = None
+        if any(map(reads_lam, chosen)):
+            _, lam, _ = self._reactions(t, q, v, params, values)
+        terms = ArrayTerms(self.lagrangian, chosen, self.constraints)
+        return terms.force(t, q, v, params, values, lam)
+
+    def acceleration(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> Float[Array, " n"]:
+        """Acceleration a with M a + h = Q + A^T lam, shape (n,), m/s^2 or rad/s^2.
+
+        NaN where M is singular, under constraints where it is so on their tangent space, and where
+        no acceleration satisfies all rows, as in turning through a dead point.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,).
+            v: shape (n,).
+            t: s.
+            inputs: dict from names to input objects or arrays.
+
+        Source: Pila, eq. 3.118.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        if self.constraints:
+            return self._reactions(t, q, v, params, values)[0]
+        return self.terms.acceleration(t, q, v, params, values)
+
+    def multipliers(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> dict[str, Float[Array, "..."]]:
+        """Multipliers lam of M a + h = Q + A^T lam, A a + gamma = 0, by the name of the row.
+
+        Where rows depend on one another, those of least norm sum_k (|A_k| lam_k)^2, in which
+        |A_k lam_k| is the generalized force of row k alone; where forces read multipliers, of least
+        norm among the rows that they read, as they see them, and among the others. |A_k| is the
+        Euclidean length of the row in the units of the coordinates, so that metres against
+        millimetres, or radians against degrees, share otherwise; A^T lam is the same, to rounding,
+        whatever the units and however short the levers. The unit is J
+        over that of the row's residual, for a `Pfaffian` W over it: N for a length or a velocity.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,), consistent with the constraints.
+            v: shape (n,), likewise.
+            t: s.
+            inputs: dict from names to input objects or arrays.
+
+        Source: Pila, eq. 3.118.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        return self.rows(params, q.dtype).unflatten(self._reactions(t, q, v, params, values)[1])
+
+    def constraint_force(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> Float[Array, " n"]:
+        """A^T lam, shape (n,), N or N m: what all constraints exert on the system.
+
+        Unique even where rows depend on one another.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,), consistent with the constraints.
+            v: shape (n,), likewise.
+            t: s.
+            inputs: dict from names to input objects or arrays.
+
+        Source: Pila, eq. 3.118.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        if not self.constraints:
+            return jnp.zeros_like(q)
+        _, lam, A = self._reactions(t, q, v, params, values)
+        return lam @ A
+
+    def quasi_reactions(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> dict[str, Any]:
+        """Accelerations and reactions from the equations in quasi-velocities, by name.
+
+        "a", shape (n,), from u' and v = B u + c; "lam", by the name of the row, from
+        A^T lam = M a + h - Q, of least norm as in `multipliers`; "constraint_force", A^T lam. To
+        rounding these are `acceleration`, `multipliers` and `constraint_force`, which solve for
+        the multipliers.
+
+        Args:
+            params: as the Lagrangian takes them.
+            q: shape (n,), consistent with the constraints.
+            v: shape (n,), likewise.
+            t: s.
+            inputs: dict from names to input objects or arrays.
+
+        Source: Pila, eqs. 4.44 to 4.58.
+
+        Raises:
+            ValueError: the system has no quasi-velocities.
+        """
+        self._with_quasi("quasi_reactions")
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        rows = self.rows(params, q.dtype)
+        traced, static = _params.split(params)
+        found = _quasi_reactions(self, _params.Static(static), t, q, v, traced, dict(values))
+        a, lam, force = found
+        return {"a": a, "lam": rows.unflatten(lam), "constraint_force": force}
+
+    def residuals(
+        self, params: Any, q: Any, v: Any, t: Any = 0.0
+    ) -> tuple[dict[str, Float[Array, "..."]], dict[str, Float[Array, "..."]]]:
+        """(phi(t, q) of the holonomic rows, A v + b of all rows), each by name.
+
+        Source: Pila, eqs. 3.10, 3.14.
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        rows = self.rows(params, q.dtype)
+        rates = rows.unflatten(self.terms.velocity(t, q, v, params))
+        return rows.holonomic_only(self.terms.position(t, q, params)), rates
+
+    def _reactions(
+        self, t: Array, q: Array, v: Array, params: Any, values: Mapping[str, Any]
+    ) -> tuple[Array, Array, Array]:
+        """(a, lam, A), compiled as one: there are many small operations."""
+        self.rows(params, q.dtype)
+        traced, static = _params.split(params)
+        return _reactions(self, _params.Static(static), t, q, v, traced, dict(values))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _reactions(
+    system: AbstractReactions,
+    static: _params.Static,
+    t: Array,
+    q: Array,
+    v: Array,
+    traced: Any,
+    values: dict[str, Any],
+) -> tuple[Array, Array, Array]:
+    params, terms = _params.join(traced, static.tree), system.terms
+    a, lam = terms.reactions(t, q, v, params, InputValues(values))
+    return a, lam, terms.rows(t, q, v, params)[0]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _quasi_reactions(
+    system: AbstractReactions,
+    static: _params.Static,
+    t: Array,
+    q: Array,
+    v: Array,
+    traced: Any,
+    values: dict[str, Any],
+) -> tuple[Array, Array, Array]:
+    """(a, lam, A^T lam), compiled as one."""
+    params, quasi = _params.join(traced, static.tree), system.quasi
+    assert quasi is not None
+    terms = ArrayTerms(
+        system.lagrangian, system.forces, system.constraints, quasi=quasi, in_u=system.in_u
+    )
+    w = quasi.of(t, q, v, params)[quasi.free]
+    moving = Moving(terms, t, q, w, params, InputValues(values))
+    if system.constraints:
+        a, lam = moving.reactions()
+        force = lam @ terms.rows(t, q, v, params)[0]
+    else:
+        a = moving.velocity_rate(moving.accelerations())
+        lam, force = jnp.zeros((0,), q.dtype), jnp.zeros_like(q)
+    regular = quasi.regular(t, q, params)
+    a, lam, force = (jnp.where(regular, x, jnp.nan) for x in (a, lam, force))
+    return a, lam, force

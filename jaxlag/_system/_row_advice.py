@@ -1,0 +1,96 @@
+"""What constraint rows are like at one state: whether they say there what they are to say."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._linalg._kkt import units_of
+
+EVEN = 0.25
+"""How much a residual may differ on two sides, over their sum, to count as the same on both."""
+SINGULAR = 1e-2
+"""Of the least sine nearby: below it rows are all but dependent at a place."""
+NEARBY = 1e-2
+"""As far away rows are compared with, over 1 + |q|."""
+
+
+def advice_on_rows(system: Any, params: Any, t: Any, q: Any, dependent: bool = True) -> str:
+    """What is singular about the rows at a state, and what is to be done; "" where nothing is.
+
+    Args:
+        system: whose rows they are.
+        params: as the Lagrangian takes them.
+        t: time, s.
+        q: coordinates, (n,), m or rad.
+        dependent: whether it is said, too, that rows depend on one another there alone.
+    """
+    vanishing = vanishing_rows(system, params, t, q)
+    if vanishing:
+        return (
+            f"The gradient of {', '.join(map(repr, vanishing))} vanishes wherever the row holds, "
+            "as of y**2, of a length, or of 1 - cos(y): such a row allows no velocity and has no "
+            "reaction that were defined. Write the quantity itself, y; of a length, each component."
+        )
+    if dependent and is_singular(system, params, t, q):
+        return (
+            "Rows are all but dependent there: a dead point or a change point, where no tolerance "
+            "helps and the motion may go on in more than one way. Start beyond it, or add the row "
+            "that decides."
+        )
+    return ""
+
+
+def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
+    """Holonomic rows that have an extremum of 0 here, as squares and lengths have."""
+    if not system.constraints:
+        return []
+    t, q = jnp.asarray(t, float), jnp.asarray(q)
+    rows = system.rows(params, q.dtype)
+    here = np.flatnonzero(rows.holonomic)
+    if not len(here) or not np.all(np.isfinite(q)):
+        return []
+    residuals = jax.jit(jax.vmap(lambda q: system.terms.position(t, q, params)))
+    ways = _ways(q)
+    vanish = np.zeros(len(here), bool)
+    for power in (0.0625, 0.125, 0.25):
+        far = float(jnp.finfo(q.dtype).eps) ** power * ways
+        places = jnp.concatenate([q[None], q[None] + far, q[None] - far])
+        found = np.asarray(residuals(places))
+        (middle,), ahead, behind = np.split(found, [1, 1 + len(far)])
+        both, largest = ahead + behind, np.max(np.abs(found), axis=0)
+        one_sign = np.all(both >= 0, axis=0) | np.all(both <= 0, axis=0)
+        even = np.all(np.abs(ahead - behind) <= EVEN * np.abs(both) + 1e-3 * largest, axis=0)
+        vanish |= one_sign & even & (largest > 0) & (np.abs(middle) <= EVEN * largest)
+    return [rows.labels[i] for i in here[vanish]]
+
+
+def is_singular(system: Any, params: Any, t: Any, q: Any) -> bool:
+    """Whether rows that are independent nearby are all but dependent here."""
+    if not system.constraints:
+        return False
+    t, q = jnp.asarray(t, float), jnp.asarray(q)
+
+    def sizes(q: Array) -> Array:
+        v = jnp.zeros_like(q)
+        A = system.terms.rows(t, q, v, params)[0]
+        A = A * units_of(system.terms.mass(t, q, v, params), A)[None]
+        norms = jnp.linalg.norm(A, axis=1, keepdims=True)
+        return jnp.linalg.svd(A / jnp.where(norms > 0, norms, 1.0), compute_uv=False)
+
+    places = jnp.concatenate([q[None], q[None] + NEARBY * _ways(q)])
+    here, *nearby = np.asarray(jax.jit(jax.vmap(sizes))(places))
+    if not np.all(np.isfinite(here)):
+        return False
+    usual = np.max(nearby, axis=0)
+    independent = usual > float(jnp.finfo(q.dtype).eps) ** 0.5
+    return bool(np.any(independent & (here < SINGULAR * usual)))
+
+
+def _ways(q: Array) -> Array:
+    """A few directions, as long as q is large."""
+    draw = np.random.default_rng(0).uniform(0.3, 1.0, (4, q.shape[0]))
+    signs = np.where(np.arange(q.shape[0])[None] % np.arange(1, 5)[:, None], -1.0, 1.0)
+    return jnp.asarray(draw * signs, q.dtype) * (1.0 + jnp.abs(q))

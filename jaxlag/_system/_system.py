@@ -1,0 +1,431 @@
+"""System: the declaration of a mechanical system."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import bad
+from jaxlag._linalg._kkt import augmented
+from jaxlag._linalg._mass_solve import first_unhealthy
+from jaxlag._lowering import (
+    OPERATIONS,
+    ArrayTerms,
+    ScalarTerms,
+    Structure,
+    check_kinematics,
+    layout,
+)
+from jaxlag._lowering._terms import Terms
+from jaxlag._model._constraints import (
+    AbstractConstraint,
+    Layout,
+    check_constraints,
+    check_reactions,
+)
+from jaxlag._model._coordinates import Coordinates
+from jaxlag._model._forces import AbstractForce, check_forces
+from jaxlag._model._inputs import evaluate
+from jaxlag._model._quasi_velocities import InQuasiVelocities, QuasiVelocities, check_quasi
+from jaxlag._system._explain import explain
+from jaxlag._system._reactions import AbstractReactions
+from jaxlag._system._row_advice import vanishing_rows
+from jaxlag._tracing import _params
+from jaxlag._tracing._index_check import check_indices
+from jaxlag._tracing._signature import require_arity
+from jaxlag._tracing._traced_function import as_written, captured
+
+
+class _Difference(eqx.Module):
+    """L = T - V as a function that hashes by the identity of T and V."""
+
+    kinetic: Callable = eqx.field(static=True)
+    potential: Callable = eqx.field(static=True)
+
+    def __call__(self, t: Array, q: Array, v: Array, params: Any) -> Array:
+        return self.kinetic(t, q, v, params) - self.potential(t, q, params)
+
+
+class System(AbstractReactions):
+    """A mechanical system given by its Lagrangian L(t, q, v, params).
+
+    Equations of motion: d/dt(dL/dv) - dL/dq = Q + A^T lam with A v + b = 0, that is
+    M a + h = Q + A^T lam with M = d2L/dv2. L may contain t, terms linear in v, and need not be
+    quadratic in v; M must be positive definite where A v = 0, so that links without mass are
+    possible. What needs no params is checked here, everything else at first use or by `check`.
+
+    Methods that take a state are called as (params, q, v, t): `params` any pytree, q and v of
+    shape (n,) in SI units (m or rad, and per s), t in s. Of params arrays and floats are traced,
+    with derivatives in the real ones; Python ints, truth values, text and functions are part of the
+    program, which compiles anew for each of their values. They compose with jit, vmap and every
+    derivative of JAX. A system hashes by the identity of its functions: declare it once, not
+    in a loop, or every declaration compiles anew. Every function is traced once for each kind of
+    arguments (shapes, dtypes, static params), and what it reads from globals and closures holds as
+    it was then, for motions, energies and accelerations alike; where a number, an array or a
+    function that it read is another one later, a warning names it.
+
+    Args:
+        lagrangian: scalar function `L(t, q, v, params)`, in J. Either this, or both of
+            `kinetic` and `potential`.
+        coordinates: names, or names with shapes `{"x": (8, 3), "y": 3, "theta": ()}`; L receives q
+            and v flat, `unflatten` gives the parts.
+        kinetic: scalar function `T(t, q, v, params)`, in J; then L = T - V.
+        potential: scalar function `V(t, q, params)`, in J.
+        forces: applied forces, each with its own name: `PointForce`, `Couple`,
+            `GeneralizedForce`, `Rayleigh`.
+        constraints: `Holonomic` and `Pfaffian` constraints, each row with its own name.
+        quasi: `QuasiVelocities` to move by in place of v; the constrained ones among them are
+            rows of their own, beside `constraints`.
+        written_in: the velocities that L, or T, is a function of: "v", or "u", all
+            quasi-velocities, as in L(t, q, u, params); constrained ones must not be left out, since
+            their momenta enter the equations.
+        lowering: how accelerations are compiled: "auto", as straight-line code on scalars where
+            it exists and is short, else on arrays; "scalar", however long it is; "array".
+
+    Raises:
+        ValueError: neither or both ways of giving L, functions that cannot be called in these
+            forms, missing or duplicate names.
+
+    Source: Pila, Introduction to Lagrangian Dynamics, eqs. 3.50 to 3.56; Goldstein, Classical
+    Mechanics, sec. 1.4.
+    """
+
+    lagrangian: Callable = eqx.field(static=True)
+    coordinates: Coordinates = eqx.field(static=True)
+    forces: tuple[AbstractForce, ...]
+    constraints: tuple[AbstractConstraint, ...]
+    quasi: QuasiVelocities | None
+    written_in: str = eqx.field(static=True)
+    lowering: str = eqx.field(static=True)
+    in_u: Callable | None = eqx.field(static=True)
+    _kinetic: Callable | None = eqx.field(static=True)
+    _potential: Callable | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        lagrangian: Callable | None = None,
+        coordinates: Sequence[str] | Mapping[str, tuple[int, ...] | int] = (),
+        *,
+        kinetic: Callable | None = None,
+        potential: Callable | None = None,
+        forces: Sequence[AbstractForce] = (),
+        constraints: Sequence[AbstractConstraint] = (),
+        quasi: QuasiVelocities | None = None,
+        written_in: str = "v",
+        lowering: str = "auto",
+    ) -> None:
+        pair = kinetic is not None or potential is not None
+        if (lagrangian is None) == (not pair) or (pair and (kinetic is None or potential is None)):
+            given = {"lagrangian": lagrangian, "kinetic": kinetic, "potential": potential}
+            names = [name for name, value in given.items() if value is not None]
+            raise bad(
+                "System",
+                "get either lagrangian, or both kinetic and potential",
+                f"it got {' and '.join(names) or 'none of them'}",
+            )
+        self.coordinates = Coordinates(coordinates)
+        self.forces = check_forces(forces)
+        rows = check_constraints(constraints)
+        if quasi is not None:
+            check_quasi(quasi, self.coordinates.size, self._taken(rows))
+            rows = check_constraints((*quasi.rows, *rows))
+        check_reactions(rows, self.forces)
+        self.constraints, self.quasi = rows, quasi
+        if written_in not in ("v", "u"):
+            raise bad("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
+        if written_in == "u" and quasi is None:
+            was = "this one has none"
+            raise bad("written_in='u'", "go with a system that has quasi-velocities", was)
+        if written_in == "u" and quasi is not None and quasi.size < self.coordinates.size:
+            speeds = [c.all_names[0] for c in self.constraints if not c.holonomic]
+            if speeds:
+                raise bad(
+                    "written_in",
+                    "be 'v' where kinematics= leave out velocities that Pfaffian rows forbid, "
+                    "since their momenta enter the equations",
+                    f"it was 'u' beside the row {speeds[0]!r}",
+                    "Give L as a function of v; or name as many quasi-velocities as coordinates, "
+                    "those that vanish in constrained=.",
+                )
+        self.written_in = written_in
+        form = ("t", "q", written_in, "params")
+        if lagrangian is None:
+            assert kinetic is not None
+            assert potential is not None
+            require_arity("kinetic", kinetic, form)
+            require_arity("potential", potential, ("t", "q", "params"))
+            kinetic, potential = captured(kinetic), captured(potential)
+            whole: Callable = _Difference(kinetic, potential)
+        else:
+            require_arity("lagrangian", lagrangian, form)
+            whole = captured(lagrangian)
+        self.in_u = None
+        if written_in == "u":
+            assert quasi is not None
+            self.in_u = whole
+            kinetic = None if kinetic is None else InQuasiVelocities(kinetic, quasi)
+            whole = InQuasiVelocities(whole, quasi)
+        self.lagrangian = whole
+        self._kinetic, self._potential = kinetic, potential
+        if lowering not in ("auto", "scalar", "array"):
+            raise bad("lowering", "be 'auto', 'scalar' or 'array'", f"it was {lowering!r}")
+        self.lowering = lowering
+
+    @property
+    def _key(self) -> tuple:
+        parts = (self.lagrangian, self.coordinates, self.forces, self.constraints)
+        return (*parts, self.quasi, self.lowering)
+
+    def _taken(self, rows: Sequence[AbstractConstraint]) -> dict[str, str]:
+        """Names that quasi-velocities must not bear -> what bears them."""
+        taken = dict.fromkeys(self.coordinates.names, "a coordinate")
+        taken |= {force.name: "a force" for force in self.forces}
+        fix = "a constraint (the row of a constrained name is declared by that name alone)"
+        return taken | {name: fix for row in rows for name in row.all_names}
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, System) and self._key == other._key
+
+    @property
+    def terms(self) -> Terms:
+        """The lowered terms of the equations of motion."""
+        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
+        if self.lowering == "array":
+            return array
+        return ScalarTerms(array, OPERATIONS if self.lowering == "auto" else None)
+
+    def with_forces(self, *forces: AbstractForce) -> "System":
+        """The same system under further forces.
+
+        Raises:
+            ValueError: a force that is none, a name that is taken.
+        """
+        both = check_forces((*self.forces, *forces))
+        check_reactions(self.constraints, both)
+        if self.quasi is not None:
+            taken = dict.fromkeys((force.name for force in both), "a force")
+            check_quasi(self.quasi, self.size, taken)
+        return eqx.tree_at(lambda s: s.forces, self, both, is_leaf=lambda x: x is self.forces)
+
+    def unflatten(self, q: Array) -> dict[str, Array]:
+        """Named parts of q (or v, a, p), shape (..., n)."""
+        return self.coordinates.unflatten(q)
+
+    def flatten(self, parts: Mapping[str, Any]) -> Array:
+        """Flat vector, shape (n,), from a dict of named values."""
+        return self.coordinates.flatten(parts)
+
+    def mass_regular(self, params: Any, t: Any, q: Array, v: Array | None) -> bool | None:
+        """Whether M is positive definite for these params without the help of constraints.
+
+        Looked at in the given state, where it is known, and in one other, as the mass of a link is
+        zero everywhere or nowhere; where the state is traced and M depends on it, in some where
+        inertias vanish, as that of polar coordinates does at r = 0. None where the params have no
+        values, since they are traced. Of use to a system with constraints alone.
+        """
+        if not self.constraints:
+            return False
+        if not concrete(params):
+            return None
+        n = self.size
+        states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
+        v = jnp.zeros_like(q) if v is None else v
+        if concrete((t, q, v)):
+            states.append((t, q, v))
+        elif self.structure(params, q.dtype).mass & {"t", "q", "v"}:
+            states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
+        floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
+        for state in states:
+            with jax.ensure_compile_time_eval():
+                traced, static = _params.split(params)
+                at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
+                M = _mass(self, _params.Static(static), *at, traced)
+            if not concrete(M):
+                return None  # the Lagrangian closes over a traced value
+            M = np.asarray(M, np.float64)
+            units = np.sqrt(np.abs(np.diagonal(M)))
+            if not np.all(units > 0) or not np.all(np.isfinite(M)):
+                return False
+            if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
+                return False
+        return True
+
+    def contacts_apart(
+        self, params: Any, t: Any, q: Array, v: Array | None, inputs: Mapping[str, Any]
+    ) -> bool:
+        """Whether rows whose multipliers forces read are clearly independent of one another.
+
+        In the given state, where all has values; else False.
+        """
+        v = jnp.zeros_like(q) if v is None else v
+        if not self.constraints or not concrete(params, t, q, v, inputs):
+            return False
+        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
+        t = jnp.asarray(t, float)
+        chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
+        if len(chosen) < 2:
+            return True
+        traced, static = _params.split(params)
+        with jax.ensure_compile_time_eval():
+            A = np.asarray(_rows(self, _params.Static(static), t, q, v, traced), np.float64)[chosen]
+        sizes = np.linalg.norm(A, axis=1, keepdims=True)
+        if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
+            return False
+        return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
+
+    def rows(self, params: Any, dtype: Any) -> Layout:
+        """Names and shapes of the constraint rows, for params like these.
+
+        Raises:
+            ValueError: quasi-velocities that are not affine; fewer than constraints leave.
+        """
+        if self.quasi is not None:
+            check_kinematics(self.quasi, params, self.size, dtype)
+        rows = layout(self.constraints, params, self.size, dtype)
+        if self.quasi is not None and len(self.quasi.free) + rows.size < self.size:
+            raise bad(
+                "quasi: names",
+                f"leave at least {self.size - rows.size} that are not constrained, as many as "
+                f"{self.size} coordinates have freedoms under {rows.size} rows",
+                f"there were {len(self.quasi.free)}",
+                "Add quasi-velocities for the freedoms that are missing, or the constraints.",
+            )
+        return rows
+
+    def check(
+        self,
+        params: Any,
+        q: Any,
+        v: Any,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Examine the declaration at one state, with these params; silent if all is well.
+
+        Traces L and the forces, then looks at the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
+        positive definite by its pivots (under constraints on their tangent space), the rows of
+        the constraints affine in v, a with M a + h = Q + A^T lam finite.
+
+        Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
+
+        Raises:
+            ValueError: L not a real scalar or not finite, a force of wrong shape, missing
+                inputs, a coordinate without inertia (named).
+        """
+        t, q, v, params = self._state(params, q, v, t)
+        values = self._inputs_at(inputs, t, q, v, params)
+        self.check_traceable(params, q.dtype, values)
+        L = as_written(self.lagrangian)(t, q, v, params)
+        if not bool(jnp.isfinite(L)):
+            raise bad("lagrangian", "be finite at the given state", f"it was {L}")
+        M = self.terms.mass(t, q, v, params)
+        if self.constraints:
+            self.rows(params, q.dtype)
+            M, _ = augmented(M, self.terms.rows(t, q, v, params)[0])
+        vanishing = vanishing_rows(self, params, t, q)
+        if vanishing:
+            must = "have a gradient where it holds"
+            was = "it was 0 there and the same on both sides, as y**2 or a length is"
+            fix = "Write the quantity itself, y; of a length, each component."
+            raise bad(f"constraint {vanishing[0]!r}", must, was, fix)
+        index = int(first_unhealthy(M))
+        if index >= 0:
+            raise bad(
+                f"coordinate {self.coordinates.label(index)!r}",
+                "have inertia: d2L/dv2 positive definite",
+                f"its pivot was not positive at q = {q}, v = {v}",
+                "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
+            )
+        a = self.acceleration(params, q, v, t, inputs)
+        if not bool(jnp.all(jnp.isfinite(a))):
+            label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
+            raise bad(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
+
+    def explain(self, params: Any) -> str:
+        """What was found in M a + h = Q of this system, and what is therefore skipped, as text.
+
+        Dependencies of M, h and L on t, q, v and params are read from the traced program, never
+        from numbers; so are cyclic coordinates, blocks of M and the like. Forces that read inputs
+        are left out of the operations counted.
+        """
+        traced, static = _params.split(params)
+        params = _params.join(traced, static)
+        dtype = jnp.result_type(float)
+        self.check_traceable(params, dtype, None)
+        terms, lowered = self.terms, None
+        if isinstance(terms, ScalarTerms):
+            free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
+            whole = ArrayTerms(
+                self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self.in_u
+            )
+            terms = ScalarTerms(whole, terms.limit)
+            lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
+        return explain(self, self.structure(params, dtype), lowered, self.rows(params, dtype))
+
+    def structure(self, params: Any, dtype: Any) -> Structure:
+        """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes)."""
+        return ArrayTerms(self.lagrangian, ()).structure(params, self.size, dtype)
+
+    def check_traceable(self, params: Any, dtype: Any, values: Any) -> None:
+        """Trace L and the forces at abstract states; raise if a shape or dtype is wrong.
+
+        Args:
+            params: as the Lagrangian takes them.
+            dtype: of the state.
+            values: values of the inputs by name; None to leave the forces out.
+        """
+        t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        q = v = jax.ShapeDtypeStruct((self.size,), dtype)
+        traced, static = _params.split(params)
+        terms = self.terms
+
+        def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Array:
+            params = _params.join(traced, static)
+            p = terms.momentum(t, q, v, params)
+            return p if values is None else p + terms.force(t, q, v, params, values)
+
+        closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
+        check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
+
+
+APART = 1e-3
+"""Least singular value of rows of unit length that count as clearly independent."""
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _rows(
+    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system.terms.rows(t, q, v, _params.join(traced, static.tree))[0]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _mass(
+    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system.terms.mass(t, q, v, _params.join(traced, static.tree))
+
+
+def check_declaration(
+    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
+) -> None:
+    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
+    values = evaluate(inputs, t, q, v, params)
+    system.check_traceable(params, q.dtype, values)
+    for name in inputs:
+        if name not in values.read:
+            raise bad(
+                "inputs",
+                "hold only signals that a force reads",
+                f"no force read {name!r}",
+                "Drop it, or read inputs[name] in a GeneralizedForce.",
+            )

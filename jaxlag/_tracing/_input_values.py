@@ -1,0 +1,44 @@
+"""Values of the inputs at one state, as forces read them."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from jaxlag._core._errors import bad
+
+
+class InputValues(Mapping[str, Any]):
+    """Values of the inputs by name; remembers which names were read."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = dict(values)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._values:
+            raise bad(
+                "inputs",
+                f"have an entry {name!r}, which a force reads",
+                f"its names were {sorted(self)}",
+                "Pass inputs={...} with this name.",
+            )
+        self.read.add(name)
+        return self._values[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def peek(self) -> dict[str, Any]:
+        """All values; none of them counts as read."""
+        return dict(self._values)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The value, or `default` where there is no such input."""
+        if name not in self:
+            return default
+        return self[name]

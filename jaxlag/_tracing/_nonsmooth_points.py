@@ -1,0 +1,104 @@
+"""Where a traced program bends or jumps: the comparisons in it, and how they come out.
+
+A function of `max`, `where`, `abs` and the like is smooth as long as every comparison within comes
+out as before. Of a loop the integers that come out are looked at (an interval of a table), not the
+comparisons in its body; so with `cond`, whose index is looked at.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.extend.core import ClosedJaxpr, Literal
+
+from jaxlag._core._nested_programs import called
+
+_SMOOTH = "jaxlag smooth"
+smooth = jax.named_scope(_SMOOTH)
+"""Decorator of a function that compares, and is smooth all the same."""
+
+# Of a single place, and the order of an elimination, which its results do not depend on.
+_GUARDS = ("eq", "ne", "is_finite", "lu")
+
+
+def outcomes(
+    program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool], only: Any = None
+) -> Array | None:
+    """How the comparisons of what moves come out, as numbers in a row; None where there are none.
+
+    A comparison with == or != is taken for the guard of a single place, and not listed.
+
+    Args:
+        program: the traced program.
+        args: its arguments.
+        moving: which of these move.
+        only: the equation that is looked at; None for all.
+    """
+    found: list[Array] = []
+    _run(program, list(args), list(moving), found, only)
+    return jnp.concatenate(found) if found else None
+
+
+def _run(
+    program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array], only: Any
+) -> tuple[list[Any], list[bool]]:
+    """(results, which of them move); outcomes of comparisons are added to `found`."""
+    jaxpr = program.jaxpr
+    known = dict(zip(jaxpr.constvars, program.consts, strict=True))
+    known |= dict(zip(jaxpr.invars, args, strict=True))
+    moves = {x for x, does in zip(jaxpr.invars, moving, strict=True) if does}
+    for eqn in jaxpr.eqns:
+        given = [x.val if isinstance(x, Literal) else known[x] for x in eqn.invars]
+        touched = [not isinstance(x, Literal) and x in moves for x in eqn.invars]
+        inner = called(eqn)
+        if inner is not None:
+            looks = found if _SMOOTH not in str(eqn.source_info.name_stack) else []
+            results, does = _run(inner, given, touched, looks, only)
+        else:
+            results = eqn.primitive.bind(*given, **eqn.params)
+            results = results if eqn.primitive.multiple_results else [results]
+            does = [any(touched)] * len(results)
+            looks = _SMOOTH not in str(eqn.source_info.name_stack) and only in (None, eqn)
+            if any(touched) and looks:
+                found.extend(_outcomes(eqn, given, results))
+        known.update(zip(eqn.outvars, results, strict=True))
+        moves.update(x for x, moved in zip(eqn.outvars, does, strict=True) if moved)
+    ends = [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
+    return ends, [not isinstance(x, Literal) and x in moves for x in jaxpr.outvars]
+
+
+def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:
+    """Those of one operation."""
+    name, first = eqn.primitive.name, given[0]
+    if name in _GUARDS or not any(_is_inexact(x) for x in given):
+        return
+    for x in results:
+        if not _is_inexact(x):
+            yield _row(x)
+    if not _is_inexact(first):
+        return
+    if name in ("max", "min"):
+        yield _row(jnp.sign(given[0] - given[1]))
+    elif name in ("abs", "sign"):
+        yield _row(jnp.sign(first))
+    elif name == "clamp":
+        low, x, high = given
+        yield _row(jnp.sign(x - low) + jnp.sign(x - high))
+    elif name in ("floor", "ceil", "round"):
+        yield _row(results[0])
+    elif name == "rem":
+        yield _row(jnp.trunc(given[0] / given[1]))
+    elif name in ("reduce_max", "reduce_min"):
+        yield _row(first == jnp.expand_dims(results[0], eqn.params["axes"]))
+    elif name in ("cummax", "cummin", "sort"):
+        yield _row(first == results[0])
+
+
+def _is_inexact(x: Any) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+
+
+def _row(x: Any) -> Array:
+    return jnp.ravel(jnp.asarray(x)).astype(float)

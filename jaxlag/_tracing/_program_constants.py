@@ -1,0 +1,39 @@
+"""A program with constants of its own: arrays of numpy's, and views of them, change in place."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._program_rewrite import rewritten
+
+
+def owned(code: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program, no constant of which anybody else can change."""
+    return rewritten(code, _equation, _copied)
+
+
+def _equation(eqn: Any) -> Any:
+    atoms = list(map(_atom, eqn.invars))
+    same = all(new is old for new, old in zip(atoms, eqn.invars, strict=True))
+    return eqn if same else eqn.replace(invars=atoms)
+
+
+def _atom(atom: Any) -> Any:
+    if not isinstance(atom, Literal) or not isinstance(atom.val, np.ndarray):
+        return atom
+    return Literal(atom.val.copy(), atom.aval)
+
+
+def _copied(x: Any) -> Any:
+    if not concrete(x):
+        return x
+    if isinstance(x, np.ndarray):
+        return x.copy()
+    if isinstance(x, jax.Array) and not jnp.issubdtype(x.dtype, jax.dtypes.extended):
+        with jax.ensure_compile_time_eval():
+            return jnp.array(x, copy=True)
+    return x

@@ -1,0 +1,123 @@
+"""What functions of the user's take and return."""
+
+from collections.abc import Callable
+from inspect import Parameter, signature
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxlag._core._errors import bad
+from jaxlag._tracing._closure_params import plain
+from jaxlag._tracing._source_lines import line_of
+
+
+def real_scalar(argument: str, function: Callable) -> Callable:
+    """`function`, raising in our form while it is traced unless it returns a real scalar."""
+
+    def checked(*arguments: Any) -> Any:
+        value = function(*arguments)
+        must, fix = (
+            "return a real scalar",
+            "Sum with jnp.sum, of one coordinate take v[0]; use real energies.",
+        )
+        if not eqx.is_array_like(value):
+            raise bad(argument, "return an array", f"it returned {value!r}", fix)
+        value = jnp.asarray(value)
+        if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+            was = f"it returned {value.dtype} of shape {value.shape}"
+            raise bad(argument, must, was, _narrowed(arguments[-1]) or fix)
+        return value
+
+    return checked
+
+
+def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) -> Callable:
+    """The gradient of a real scalar function of (t, q, v, params), as `jax.grad` has it.
+
+    It raises in our form where a loop in the function has no reverse derivative.
+    """
+    scalar = real_scalar(argument, function)
+
+    def of(*arguments: Any) -> Any:
+        try:
+            return jax.grad(scalar, argnums)(*arguments)
+        except ValueError as error:
+            if "Reverse-mode differentiation does not work" not in str(error):
+                raise
+            *state, params = arguments
+            line = line_of(jax.make_jaxpr(lambda *state: scalar(*state, params))(*state), "while")
+            raise bad(
+                argument,
+                "have reverse derivatives, from which momenta and forces follow",
+                f"a loop in it has no fixed number of turns: {line}",
+                "Write it by jax.lax.scan, or fori_loop between numbers; or give its derivative "
+                "by jax.custom_jvp, by jax.lax.custom_root where it solves an equation.",
+            ) from error
+
+    return of
+
+
+def _narrowed(params: Any) -> str:
+    """What to do about a parameter of one entry, which makes arrays of scalars."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(plain(params))[0]:
+        if jnp.shape(leaf) == (1,):
+            return f"params{jax.tree_util.keystr(path)} has shape (1,): give a number, or index it."
+    return ""
+
+
+def wants(function: Callable, position: int, name: str) -> bool:
+    """Whether `function` asks for a positional argument there: required, or called `name`."""
+    try:
+        parameters = list(signature(function).parameters.values())
+    except ValueError:
+        return False
+    if any(p.kind is Parameter.VAR_POSITIONAL for p in parameters):
+        return True
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    there = [p for p in parameters if p.kind in kinds][position : position + 1]
+    return any(p.default is Parameter.empty or p.name == name for p in there)
+
+
+def accepts(function: Callable, count: int) -> bool:
+    """Whether `function` can be called with `count` positional arguments."""
+    try:
+        signature(function).bind(*range(count))
+    except TypeError:
+        return False
+    except ValueError:  # builtins without a signature: let the call itself decide
+        return True
+    return True
+
+
+def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> None:
+    """Raise unless `function` is callable as `function(*names)`."""
+    form = f"({', '.join(names)})"
+    if not callable(function):
+        raise bad(argument, f"be a function of {form}", f"it was {function!r}")
+    if not accepts(function, len(names)):
+        raise bad(
+            argument,
+            f"be callable as {form}",
+            f"its signature was {signature(function)}",
+            "Add or drop arguments so that it takes exactly these, in this order.",
+        )
+    for place, (name, other) in enumerate(zip(names, _positional(function), strict=False)):
+        if other in names and names.index(other) != place:
+            raise bad(
+                argument,
+                f"take {form} in this order",
+                f"its signature was {signature(function)}",
+                f"{other!r} stands where {name!r} is handed over.",
+            )
+
+
+def _positional(function: Callable) -> list[str]:
+    """Names of the arguments that it takes by position, as far as they are known."""
+    try:
+        parameters = signature(function).parameters.values()
+    except ValueError:
+        return []
+    kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    return [p.name for p in parameters if p.kind in kinds]

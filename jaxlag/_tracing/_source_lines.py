@@ -1,0 +1,20 @@
+"""Where in the user's source an operation of a traced program was asked for."""
+
+from typing import Any
+
+from jax.extend import source_info_util
+
+from jaxlag._core._nested_programs import equations
+
+
+def line_of(program: Any, *primitives: str) -> str:
+    """File, line and function of the first of these operations; "" where it does none of them.
+
+    Args:
+        program: traced; programs within it are searched, too.
+        primitives: names of operations.
+    """
+    for eqn in equations(program):
+        if eqn.primitive.name in primitives:
+            return source_info_util.summarize(eqn.source_info)
+    return ""

@@ -1,0 +1,337 @@
+"""A function of the user's as a program: traced once for each kind of arguments.
+
+What it reads from globals and closures is read then, and holds for everything that is ever computed
+of it: the motion, its energy, its derivatives.
+"""
+
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
+from functools import update_wrapper
+from inspect import signature, unwrap
+from types import CodeType
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary, WeakValueDictionary
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._custom_jvp import with_rules_kept
+from jaxlag._core._errors import bad
+from jaxlag._tracing import _params
+from jaxlag._tracing._closure_params import Closed, plain
+from jaxlag._tracing._custom_vjp import with_forward_derivatives
+from jaxlag._tracing._defining_package import of_library
+from jaxlag._tracing._free_variables import outside
+from jaxlag._tracing._input_values import InputValues
+from jaxlag._tracing._program_constants import owned
+from jaxlag._tracing._user_errors import said
+from jaxlag._tracing._watched_values import Outside, changes
+
+
+class _Program(NamedTuple):
+    """A function traced for one kind of arguments.
+
+    Attributes:
+        code: from the traced leaves of the arguments to those of the result.
+        form: the structure of the latter.
+        static: the rest of the result.
+        inputs: names of the inputs that were read.
+    """
+
+    code: ClosedJaxpr
+    form: Any
+    static: Any
+    inputs: frozenset[str]
+
+
+class _Traced(NamedTuple):
+    """In the place of a traced value that a function closes over: which one it is."""
+
+    id: int
+
+
+class Captured:
+    """A function that is traced once for every kind of arguments, and never called again.
+
+    It hashes and compares as the function does, and is one object as long as it lives: systems made
+    of one function share what it read.
+
+    Attributes:
+        function: as the user wrote it.
+    """
+
+    function: Callable
+
+    def __init__(self, function: Callable) -> None:
+        self.function = function
+        self._programs: dict[Any, _Program] = {}
+        self._outside: Outside | None = None
+        self._told: set[str] = set()  # paths of Python ints that were warned about
+        update_wrapper(self, function, updated=())  # an object's own attributes are its own
+
+    def __hash__(self) -> int:
+        return hash(self.function)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Captured) and self.function == other.function
+
+    def __reduce__(self) -> Any:
+        return captured, (self.function,)
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """What the function returns."""
+        if keywords:
+            arguments = signature(self.function).bind(*arguments, **keywords).args
+        closed = [x for x in arguments if isinstance(x, Closed)]
+        return self.beside(closed[0] if closed else None, *arguments)
+
+    def beside(self, params: Any, *arguments: Any) -> Any:
+        """The same; what stands for traced values of its closure comes with the params."""
+        named = tuple(i for i, x in enumerate(arguments) if isinstance(x, InputValues))
+        given = [x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments]
+        traced, rest = _params.halves(given)
+        leaves, tree = jax.tree.flatten(traced)
+        if len({x.dtype for x in leaves}) == 1:  # numbers of Python's have nothing to give way to
+            leaves = [jnp.asarray(x, x.dtype) for x in leaves]
+        static = _params.Static(rest)
+        if not _params.are_keys(rest):  # no compiled program knows such params either
+            return _called(self.function, [plain(x) for x in arguments])
+        kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
+        program = self._programs.get(kind)
+        if program is None:
+            program = self._closing(params, kind, leaves)
+        else:
+            self.warn()
+        for i in named:
+            arguments[i].read |= program.inputs
+        found = map(jnp.asarray, jaxpr_as_fun(program.code)(*leaves))
+        return eqx.combine(jax.tree.unflatten(program.form, found), program.static)
+
+    def _closing(self, params: Any, kind: Any, leaves: list) -> _Program:
+        """One that isn't kept, or not yet: with what stands for traced values of its closure."""
+        if not isinstance(params, Closed):
+            return self._trace(kind, leaves)
+        instead, made = params.by_tracer, params.programs
+        if (self, kind) not in made:
+            program = self._trace(kind, leaves)
+            # Without the tracers, which programs in a cache would keep alive.
+            reads = [_Traced(id(x)) if id(x) in instead else x for x in program.code.consts]
+            if not concrete(reads):
+                return program
+            made[self, kind] = program._replace(code=ClosedJaxpr(program.code.jaxpr, reads))
+        program = made[self, kind]
+        consts = [instead[x.id] if isinstance(x, _Traced) else x for x in program.code.consts]
+        return program._replace(code=ClosedJaxpr(program.code.jaxpr, consts))
+
+    def _trace(self, kind: Any, leaves: list) -> _Program:
+        """The program for a new kind of arguments; kept, unless it closes over traced values."""
+        read = outside(self.function) if self._outside is None else {}
+        tree, static, _, named, _ = kind
+        program = self._traced(tree, static, leaves, named)
+        if not concrete(*program.code.consts):
+            return program
+        if not self._programs:
+            _count(self.function)
+        self._warn_of_counts(kind)
+        if self._outside is None:
+            # What the function changes itself is no business of its results: counters, records.
+            own = {name for name, _, _ in changes(read)}
+            self._outside = {name: x for name, x in read.items() if name not in own}
+        return self._programs.setdefault(kind, program)
+
+    def _traced(
+        self, tree: Any, static: _params.Static, leaves: list, named: tuple[int, ...]
+    ) -> _Program:
+        form = static_part = None
+        read: set[str] = set()
+
+        def flat(*leaves: Any) -> list[Any]:
+            arguments = list(_params.join(jax.tree.unflatten(tree, leaves), static.tree))
+            for i in named:
+                arguments[i] = InputValues(arguments[i])
+            value = _called(self.function, arguments)
+            for i in named:
+                read.update(arguments[i].read)
+            dynamic, rest = eqx.partition(value, _params.is_array)
+            nonlocal form, static_part
+            static_part = rest
+            found, form = jax.tree.flatten(dynamic)
+            return found
+
+        code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
+        code = with_rules_kept(with_forward_derivatives(owned(code)))
+        return _Program(code, form, static_part, frozenset(read))
+
+    def _warn_of_counts(self, kind: Any) -> None:
+        """Say where ints of Python's are given as if they were numbers: each value compiles anew.
+
+        That is so at the third value of one and the same leaf.
+        """
+        tree, static, *rest = kind
+        given, _ = jax.tree_util.tree_flatten_with_path(static.tree)
+        others = [
+            jax.tree.leaves(other.tree)
+            for form, other, *more in self._programs
+            if form == tree and other.treedef == static.treedef and more == rest
+        ]
+        for i, (path, leaf) in enumerate(given):
+            if type(leaf) is not int:
+                continue
+            values = {leaf, *(leaves[i] for leaves in others if type(leaves[i]) is int)}
+            name = _leaf(path)
+            if len(values) < MANY_VALUES or name in self._told:
+                continue
+            self._told.add(name)
+            warnings.warn(
+                f"{name} of {_named(self.function)} is the Python int {leaf}, the "
+                f"{len(values)}th value that it has: ints count as part of the program, which "
+                f"compiles anew for each of them. Write {float(leaf)} where it is a number.",
+                UserWarning,
+                stacklevel=1,
+            )
+
+    @property
+    def known(self) -> bool:
+        """Whether it has been traced, and closes over no traced value."""
+        return bool(self._programs)
+
+    def warn(self) -> None:
+        """Say what the function reads from outside and is not any more what it read."""
+        for name, before, now in changes(self._outside or {}):
+            message = (
+                f"{name}, which {_named(self.function)} reads from outside, was {before} when it "
+                f"was first traced, which still holds, and is {now} now. Hand it over in params, "
+                "or define the function anew."
+            )
+            warnings.warn(message, UserWarning, stacklevel=1)
+
+
+MANY_VALUES = 3  # of one int among the params, after which it looks like a number
+MANY_FUNCTIONS = 20  # made of one piece of code, after which it looks like a loop
+_logger = logging.getLogger("jaxlag")
+# Not settings: how often a piece of code was declared anew; the object for a function, as long as
+# anybody holds it.
+_MADE: WeakKeyDictionary[CodeType, int] = WeakKeyDictionary()
+_ALIVE: WeakValueDictionary[Callable, Captured] = WeakValueDictionary()
+
+
+def _leaf(path: Any) -> str:
+    """A leaf of the params, by its path in the arguments of a function."""
+    return f"params{jax.tree_util.keystr(path[1:])}"
+
+
+def _count(function: Callable) -> None:
+    """Say once where a function is made anew again and again, as a lambda in a loop is."""
+    code = getattr(unwrap(function), "__code__", None)
+    if code is None:
+        return
+    _MADE[code] = _MADE.get(code, 0) + 1
+    if _MADE[code] == MANY_FUNCTIONS:
+        _logger.warning(
+            "%s (line %d of %s) was traced as a new function for the %dth time: systems made of "
+            "new functions compile anew. Define it once, outside of loops, and hand over what "
+            "changes in params.",
+            *(_named(function), code.co_firstlineno, code.co_filename, MANY_FUNCTIONS),
+        )
+
+
+def _called(function: Callable, arguments: list[Any]) -> Any:
+    """What the function returns; what goes wrong in it is said in our form where that helps."""
+    try:
+        return function(*arguments)
+    except Exception as error:
+        better = said(function, arguments, error)
+        if better is None:
+            raise
+        raise better from error
+
+
+def captured(function: Callable) -> Captured:
+    """The function as one that is traced once; the same object for the same function.
+
+    Raises:
+        ValueError: it does not hash, as modules that hold arrays do not.
+    """
+    if isinstance(function, Captured):
+        return function
+    try:
+        hash(function)
+    except TypeError as error:
+        module = getattr(function, "__self__", function)
+        raise bad(
+            f"function {_named(function)}",
+            "hash, as functions do that programs are compiled for",
+            f"the {type(module).__name__} that it belongs to holds arrays",
+            "Put the module into params and call it from a function: "
+            'def lagrangian(t, q, v, params): return params["model"](t, q, v).',
+        ) from error
+    return _ALIVE.setdefault(function, Captured(function))
+
+
+def once(function: Any) -> Any:
+    """The same of a plain function; a module, whose arrays are traced, as it is.
+
+    Raises:
+        ValueError: a module whose static fields can change.
+    """
+    if not isinstance(function, eqx.Module):
+        return captured(function)
+    if not of_library(function):  # of one, whoever made its parts has asked
+        _params.check_keys(function, type(function).__name__)
+    return function
+
+
+def as_written(function: Any) -> Any:
+    """The function of the user's itself, which sees numbers where it is given numbers."""
+    if isinstance(function, Captured):
+        return function.function
+    if not isinstance(function, eqx.Module):
+        return function
+    parts = {f.name: as_written(getattr(function, f.name)) for f in fields(function)}
+    return replace(function, **parts)
+
+
+def functions_of(declared: Any) -> Iterator[Captured]:
+    """All the functions in a declaration, or in inputs."""
+    return (part for part in _parts_of(declared) if isinstance(part, Captured))
+
+
+def warn_of_changes(*declared: Any) -> None:
+    """Say what in declarations, or in inputs, reads something from outside that has changed."""
+    for part in _parts_of(declared):
+        if isinstance(part, Captured):
+            part.warn()
+        elif not of_library(part):
+            _params.check_keys(part, type(part).__name__)
+
+
+def _parts_of(declared: Any) -> Iterator[Any]:
+    """The functions and the modules."""
+    if isinstance(declared, Captured):
+        yield declared
+    elif isinstance(declared, tuple | Mapping):
+        for part in declared.values() if isinstance(declared, Mapping) else declared:
+            yield from _parts_of(part)
+    elif isinstance(declared, eqx.Module):
+        yield declared
+        for part in vars(declared).values():
+            yield from _parts_of(part)
+
+
+def _config() -> tuple:
+    """What else tracing depends on."""
+    config: Any = jax.config
+    return (
+        config.jax_enable_x64,
+        config.jax_numpy_dtype_promotion,
+        config.jax_default_matmul_precision,
+    )
+
+
+def _named(function: Callable) -> str:
+    return repr(getattr(function, "__qualname__", function))

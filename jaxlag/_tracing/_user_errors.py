@@ -1,0 +1,129 @@
+"""What goes wrong inside a function of the user's, said in the form of every other error."""
+
+import linecache
+import re
+from collections.abc import Callable, Mapping, Sequence
+from inspect import signature, unwrap
+from textwrap import shorten
+from types import TracebackType
+from typing import Any
+
+import jax
+import jax.errors
+
+from jaxlag._core._errors import bad
+
+_LONGEST = 80  # characters of a line of the user's code that are shown
+_CONVERTED = (
+    (
+        jax.errors.TracerArrayConversionError,
+        "compute with jax.numpy",
+        "hands a traced array to numpy",
+        "Write jnp.cos(q[0]) where it says np.cos(q[0]).",
+    ),
+    (
+        jax.errors.TracerIntegerConversionError,
+        "index with numbers that are known while it is traced",
+        "turns a traced number into an index of Python's",
+        "Keep indices and counts as Python ints in params, or use jnp.take.",
+    ),
+    (
+        jax.errors.TracerBoolConversionError,
+        "choose without `if`, `and`, `or` and `while` on traced numbers",
+        "asks whether a traced number is true",
+        "Write jnp.where(condition, a, b), jnp.minimum, jnp.maximum or jax.lax.cond.",
+    ),
+    (
+        jax.errors.ConcretizationTypeError,
+        "keep traced numbers as they are",
+        "turns a traced number into one of Python's",
+        "Leave out float(), int() and .item(); what stays the same goes into params as a number.",
+    ),
+)
+
+
+def said(function: Callable, arguments: Sequence[Any], error: Exception) -> Exception | None:
+    """The error in our form, for faults that are common; None where JAX or Python says it best.
+
+    Args:
+        function: of the user's, that raised it.
+        arguments: what it was called with.
+        error: what it raised.
+    """
+    named = _arguments(function, arguments)
+    name, place = f"function {_name(function)}", _place(function, error.__traceback__)
+    for kind, must, was, fix in _CONVERTED:
+        if isinstance(error, kind):
+            return bad(name, must, f"{place} {was}", fix)
+    if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str):
+        return _missing(name, place, named, error.args[0])
+    if isinstance(error, TypeError | AttributeError):
+        return _of_params(name, place, named)
+    return None
+
+
+def _missing(name: str, place: str, named: Mapping[str, Any], key: str) -> Exception | None:
+    """For a key that a dict among the arguments does not have."""
+    lacking = {
+        argument: sorted(map(str, value))
+        for argument, value in named.items()
+        if isinstance(value, Mapping) and key not in value
+    }
+    if not lacking:
+        return None
+    asked = [argument for argument in lacking if re.search(rf"\b{argument}\[", place)]
+    argument = (*asked, *(["params"] if "params" in lacking else lacking))[0]
+    must = f"have an entry {key!r}, which {name} reads"
+    return bad(argument, must, f"its names were {lacking[argument]}: {place}")
+
+
+def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | None:
+    """For params that are no numbers."""
+    if "params" not in named:
+        return None
+    params = named["params"]
+    if params is None:
+        was = f"they were left out: {place}"
+        return bad("params", f"be given, since {name} reads them", was, "Pass params={...}.")
+    for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        if isinstance(leaf, str):
+            leaf_name = f"params{jax.tree_util.keystr(path)}"
+            must = f"be a number where {name} calculates with it"
+            return bad(leaf_name, must, f"it was the text {leaf!r}: {place}")
+    return None
+
+
+def _arguments(function: Callable, arguments: Sequence[Any]) -> dict[str, Any]:
+    """What it was called with, by our names: the fourth argument is called params."""
+    try:
+        names = list(signature(function).parameters)
+    except (TypeError, ValueError):
+        names = []
+    names += [f"argument {i}" for i in range(len(names), len(arguments))]
+    named = dict(zip(names, arguments, strict=False))
+    position = 3 if len(arguments) > 3 else 2
+    if "params" not in named and len(arguments) > position:
+        named = {
+            ("params" if i == position else key): value
+            for i, (key, value) in enumerate(named.items())
+        }
+    return named
+
+
+def _name(function: Callable) -> str:
+    return repr(getattr(function, "__qualname__", type(function).__qualname__))
+
+
+def _place(function: Callable, traceback: TracebackType | None) -> str:
+    """The line of the function's file that the error came through last, in words."""
+    code = getattr(unwrap(function), "__code__", None)
+    found = None
+    while traceback is not None:
+        frame = traceback.tb_frame
+        if code is not None and frame.f_code.co_filename == code.co_filename:
+            found = (code.co_filename, traceback.tb_lineno)
+        traceback = traceback.tb_next
+    if found is None:
+        return "it"
+    text = shorten(linecache.getline(*found).strip(), _LONGEST, placeholder=" ...")
+    return f"line {found[1]} (`{text}`)" if text else f"line {found[1]}"

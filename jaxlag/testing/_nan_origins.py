@@ -1,0 +1,348 @@
+"""Where numbers that are not finite are born in a program, and in the derivatives of a program.
+
+A derivative is a program of its own, whose equations bear the names of others: that of sqrt(x)
+divides by 2 sqrt(x). So the equations of a traced function are labelled before it is
+differentiated; JAX hands the labels on, through every transform, to what it makes of each.
+"""
+
+import re
+from collections.abc import Callable
+from inspect import getfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jaxtyping
+import numpy as np
+from jax._src import source_info_util
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+from jaxlag._tracing._dependence import scan_sizes
+from jaxlag._tracing._interpret import equation
+
+_LABEL = re.compile(r"jaxlag equation (\d+)\.")
+_NOT_THE_USERS = (
+    str(Path(__file__).parents[1]),
+    *(str(Path(getfile(package)).parent) for package in (eqx, jaxtyping)),
+)
+_LONG = 64  # turns of a loop that is not run equation by equation, unless it has to be searched
+_CALLED = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+_PROGRAMS = {*_CALLED, "branches", "body_jaxpr"}
+_RULES = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
+
+
+class Origin(NamedTuple):
+    """An operation of the user's program.
+
+    Attributes:
+        primitive: its name in JAX, as in a jaxpr.
+        file: where the user's code asks for it; "" where that is not known.
+        line: of the file, from 1; 0 where that is not known.
+    """
+
+    primitive: str
+    file: str = ""
+    line: int = 0
+
+
+class Program:
+    """A function traced once; called, it can be differentiated, and `origins` knows its operations.
+
+    Args:
+        function: of one pytree of arrays, returning an array.
+        example: the pytree, of which shapes and dtypes matter.
+    """
+
+    def __init__(self, function: Callable, example: Any) -> None:
+        closed = jax.make_jaxpr(function)(example)
+        self.operations: list[Origin] = []
+        self.rules: list[Origin] = []
+        self.closed = closed.replace(jaxpr=self._labelled(closed.jaxpr, ("", 0)))
+
+    def __call__(self, z: Any) -> Any:
+        return jaxpr_as_fun(self.closed)(*jax.tree.leaves(z))[0]
+
+    def contains(self, *primitives: str) -> bool:
+        """Whether it does one of these, in nested programs too."""
+        return any(operation.primitive in primitives for operation in self.operations)
+
+    def origins(self, derivative: ClosedJaxpr, *args: Any) -> list[Origin]:
+        """Operations of this program where a derivative of it stops being finite, first one first.
+
+        Only those from which the results inherit it: what a `where` leaves out is not asked. ""
+        is the primitive of what has no counterpart in this program.
+        """
+        with np.errstate(all="ignore"):
+            known = _run(derivative, [np.asarray(x) for x in jax.tree.leaves(args)])
+            wanted = [_bad(_value(known, atom)) for atom in derivative.jaxpr.outvars]
+            births, _ = _back(derivative, known, wanted)
+        return list(dict.fromkeys(self._origin(eqn) for eqn in births))
+
+    def _origin(self, eqn: Any) -> Origin:
+        labels = _LABEL.findall(str(eqn.source_info.name_stack))
+        return self.operations[int(labels[-1])] if labels else Origin("")
+
+    def _labelled(self, jaxpr: Jaxpr, outer: tuple[str, int]) -> Jaxpr:
+        """The program with a label on every equation; `outer` is the line that called it."""
+        eqns = []
+        for eqn in jaxpr.eqns:
+            name, info = eqn.primitive.name, eqn.source_info
+            place = _line(info.traceback) or outer
+            label = f"jaxlag equation {len(self.operations)}."
+            self.operations.append(Origin(name, *place))
+            if name in _RULES:
+                self.rules += _rule(eqn)
+            params = {key: self._inside(value, place) for key, value in eqn.params.items()}
+            info = info.replace(name_stack=info.name_stack.extend(label))
+            eqns.append(eqn.replace(params=params, source_info=info))
+        return jaxpr.replace(eqns=eqns)
+
+    def _inside(self, value: Any, outer: tuple[str, int]) -> Any:
+        if isinstance(value, ClosedJaxpr):
+            return value.replace(jaxpr=self._labelled(value.jaxpr, outer))
+        if isinstance(value, Jaxpr):
+            return self._labelled(value, outer)
+        if type(value) in (tuple, list):
+            return type(value)(self._inside(item, outer) for item in value)
+        return value
+
+
+def _line(traceback: Any) -> tuple[str, int] | None:
+    """The innermost line of the user's code, JAX's and ours skipped.
+
+    What called us is not among the frames: those of a traced function begin where its tracing does.
+    """
+    for frame in source_info_util.user_frames(traceback):
+        if _is_users(frame.file_name):
+            return frame.file_name, frame.start_line
+    return None
+
+
+def _is_users(file: str) -> bool:
+    return not file.startswith((*_NOT_THE_USERS, "<@beartype")) and "/beartype/" not in file
+
+
+def _rule(eqn: Any) -> list[Origin]:
+    """The function that a custom rule of the user's belongs to."""
+    info = eqn.params["call_jaxpr"].jaxpr.debug_info
+    found = re.fullmatch(r".* at (.*):(\d+)", info.func_src_info or "")
+    if not found or not _is_users(found[1]) or not source_info_util.is_user_filename(found[1]):
+        return []
+    return [Origin(eqn.primitive.name, found[1], int(found[2]))]
+
+
+# ---- A program run forwards, then asked backwards ---------------------------------------------
+
+
+def evaluate(closed: ClosedJaxpr, *args: Any) -> list[np.ndarray]:
+    """The results of a program at given arrays, equation by equation, nothing compiled.
+
+    Unlike `interpret` it goes through choices and short loops itself.
+    """
+    with np.errstate(all="ignore"):
+        return _results(closed, [np.asarray(x) for x in args])
+
+
+def _value(known: dict, atom: Any) -> np.ndarray:
+    return np.asarray(atom.val if isinstance(atom, Literal) else known[atom])
+
+
+def _run(closed: ClosedJaxpr, args: list) -> dict:
+    """Every variable of a program -> its value."""
+    jaxpr = closed.jaxpr
+    known = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
+    known.update(zip(jaxpr.invars, args, strict=True))
+    for eqn in jaxpr.eqns:
+        operands = [np.asarray(a.val) if isinstance(a, Literal) else known[a] for a in eqn.invars]
+        long = eqn.params.get("length", 0) > _LONG  # JAX compiles it
+        plain = long or _PROGRAMS.isdisjoint(eqn.params)
+        nested = None if plain else _nested(eqn, operands)
+        results = equation(eqn, operands) if nested is None else nested.results
+        known.update(zip(eqn.outvars, results, strict=True))
+    return known
+
+
+def _back(closed: ClosedJaxpr, known: dict, wanted: list) -> tuple[list, list]:
+    """Equations, in order, where the wanted entries of the results stop being finite.
+
+    Args:
+        closed: the program.
+        known: what `_run` returned for it.
+        wanted: for every result which of its entries are asked for, none of them finite.
+
+    Returns:
+        Those equations, and for every input which of its entries the results inherit it from.
+    """
+    asked: dict[Any, np.ndarray] = {}
+
+    def ask(atoms: list, masks: list) -> None:
+        for atom, mask in zip(atoms, masks, strict=True):
+            if not isinstance(atom, Literal) and mask.any():
+                asked[atom] = asked[atom] | mask if atom in asked else mask
+
+    def answer(atoms: list) -> list:
+        return [asked.get(a, np.zeros(np.shape(known[a]), bool)) for a in atoms]
+
+    births: list = []
+    ask(closed.jaxpr.outvars, wanted)
+    for eqn in reversed(closed.jaxpr.eqns):
+        masks = answer(eqn.outvars)
+        if not any(mask.any() for mask in masks):
+            continue
+        operands = [_value(known, atom) for atom in eqn.invars]
+        nested = _nested(eqn, operands)
+        if nested is None:
+            sources = _sources(eqn, operands, masks)
+            inside = [] if any(mask.any() for mask in sources) else [eqn]
+        else:
+            inside, sources = nested.back(masks)
+        births = inside + births
+        ask(eqn.invars, sources)
+    return births, answer(closed.jaxpr.invars)
+
+
+def _bad(x: np.ndarray) -> np.ndarray:
+    inexact = np.issubdtype(x.dtype, np.inexact)
+    return np.asarray(~np.isfinite(x)) if inexact else np.zeros(x.shape, bool)
+
+
+# Entry by entry: a result that is not finite is not due to other entries of the operands.
+_ENTRYWISE = frozenset(
+    """abs acos acosh add add_any asin asinh atan atan2 atanh cbrt clamp convert_element_type copy
+    copy_p cos cosh div erf exp exp2 expm1 integer_pow log log1p logistic max min mul neg pow
+    reduce_precision rsqrt sign sin sinh sqrt square stop_gradient sub tan tanh""".split()  # noqa: SIM905
+)
+
+
+def _sources(eqn: Any, operands: list, masks: list) -> list:
+    """For every operand the entries that are not finite and reach what is asked for.
+
+    Numbers that the program itself states count as finite: it is born where they are used.
+    """
+    stated = [isinstance(atom, Literal) for atom in eqn.invars]
+    bad = [_bad(x) & (not s) for x, s in zip(operands, stated, strict=True)]
+    if eqn.primitive.name == "select_n":
+        which = operands[0].astype(int)
+        chosen = [masks[0] & (which == k) for k in range(len(operands) - 1)]
+        return [bad[0], *(x & mask for x, mask in zip(bad[1:], chosen, strict=True))]
+    if eqn.primitive.name in _ENTRYWISE:
+        return [x & masks[0] if x.shape == masks[0].shape else x for x in bad]
+    return bad
+
+
+# ---- Programs within programs -----------------------------------------------------------------
+
+
+class _Call(NamedTuple):
+    """An equation that runs one program on its operands, the first `offset` of them left out."""
+
+    body: ClosedJaxpr
+    operands: list[np.ndarray]
+    offset: int
+
+    @property
+    def results(self) -> list[np.ndarray]:
+        """Of the equation."""
+        return _results(self.body, self.operands[self.offset :])
+
+    def back(self, masks: list) -> tuple[list, list]:
+        """As `_back`, for the operands of the equation."""
+        births, found = _back(self.body, _run(self.body, self.operands[self.offset :]), masks)
+        return births, [*_nothing(self.operands[: self.offset]), *found]
+
+
+class _Loop(NamedTuple):
+    """An equation that runs a program in turns, each of which takes up what the last one left.
+
+    Attributes:
+        body: the program of one turn.
+        operands: of the equation: `offset` that the body does not take, `fixed` that all turns
+            share, `carried` from turn to turn, and one row for each turn of what remains.
+        turns: (row, arguments of the body) in the order in which they were done.
+        results: of the equation: what is carried at the end, and the rows that the turns made.
+    """
+
+    body: ClosedJaxpr
+    operands: list[np.ndarray]
+    offset: int
+    fixed: int
+    carried: int
+    turns: list[tuple[int, list]]
+    results: list[np.ndarray]
+
+    def back(self, masks: list) -> tuple[list, list]:
+        """As `_back`, for the operands of the equation."""
+        births: list = []
+        sources = _nothing(self.operands)
+        first = self.offset + self.fixed
+        carry, stacked = masks[: self.carried], masks[self.carried :]
+        for row, args in reversed(self.turns):
+            wanted = [*carry, *(mask[row] for mask in stacked)]
+            inside, found = _back(self.body, _run(self.body, args), wanted)
+            births = inside + births
+            carry = found[self.fixed : self.fixed + self.carried]
+            for k, mask in enumerate(found[: self.fixed]):
+                sources[self.offset + k] |= mask
+            for k, mask in enumerate(found[self.fixed + self.carried :]):
+                sources[first + self.carried + k][row] |= mask
+        sources[first : first + self.carried] = carry
+        return births, sources
+
+
+def _results(closed: ClosedJaxpr, args: list) -> list[np.ndarray]:
+    known = _run(closed, args)
+    return [_value(known, atom) for atom in closed.jaxpr.outvars]
+
+
+def _nothing(operands: list) -> list[np.ndarray]:
+    return [np.zeros(np.shape(x), bool) for x in operands]
+
+
+def _nested(eqn: Any, operands: list) -> _Call | _Loop | None:
+    """An equation with its programs, run as far as they are chosen; None if it has none."""
+    name, params = eqn.primitive.name, eqn.params
+    if name == "cond":
+        branches = params["branches"]
+        return _Call(branches[np.clip(int(operands[0]), 0, len(branches) - 1)], operands, 1)
+    if name == "scan":
+        return _scan(eqn, operands)
+    if name == "while":
+        return _while(params, operands)
+    for key in _CALLED:
+        inner = params.get(key)
+        inner = ClosedJaxpr(inner, ()) if isinstance(inner, Jaxpr) else inner
+        sizes = (len(eqn.invars), len(eqn.outvars))
+        if isinstance(inner, ClosedJaxpr) and not inner.jaxpr.constvars[len(inner.consts) :]:
+            jaxpr = inner.jaxpr
+            if (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
+                return _Call(inner, operands, 0)
+    return None
+
+
+def _scan(eqn: Any, operands: list) -> _Loop:
+    body, length = eqn.params["jaxpr"], eqn.params["length"]
+    fixed, carried = scan_sizes(eqn.params)
+    consts, carry = operands[:fixed], operands[fixed : fixed + carried]
+    rows = operands[fixed + carried :]
+    made = [np.zeros(v.aval.shape, v.aval.dtype) for v in eqn.outvars[carried:]]
+    turns = []
+    for row in reversed(range(length)) if eqn.params["reverse"] else range(length):
+        args = [*consts, *carry, *(x[row] for x in rows)]
+        turns.append((row, args))
+        outs = _results(body, args)
+        carry = outs[:carried]
+        for x, out in zip(made, outs[carried:], strict=True):
+            x[row] = out
+    return _Loop(body, operands, 0, fixed, carried, turns, [*carry, *made])
+
+
+def _while(params: Any, operands: list) -> _Loop:
+    offset, fixed = params["cond_nconsts"], params["body_nconsts"]
+    asked, consts = operands[:offset], operands[offset : offset + fixed]
+    carry, turns = operands[offset + fixed :], []
+    while bool(_results(params["cond_jaxpr"], [*asked, *carry])[0]):
+        args = [*consts, *carry]
+        turns.append((0, args))
+        carry = _results(params["body_jaxpr"], args)
+    return _Loop(params["body_jaxpr"], operands, offset, fixed, len(carry), turns, carry)
