@@ -20,9 +20,9 @@ from bench._fit_part import Figure, Part
 from bench._harness import Reference, Target
 from jaxlag._fit._fit import last_gap
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
-from jaxlag._fit._information import linearised
-from jaxlag._fit._losses import squares
+from jaxlag._fit._identifiability import linearised
 from jaxlag._fit._multiple_shooting import Guess, Shooting, search
+from jaxlag._fit._residuals import squares
 from jaxlag._fit._segments import layout
 from jaxlag._fit._setup import pose, readers_of
 

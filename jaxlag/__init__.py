@@ -2,9 +2,10 @@
 
 from importlib.metadata import version as _version
 
-from jaxlag._core import _xla
+from jaxlag._core import _old_layout, _xla
 
 _xla.configure()
+_old_layout.install()
 
 from jaxlag import energy as energy  # noqa: E402
 from jaxlag import math as math  # noqa: E402

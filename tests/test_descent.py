@@ -12,8 +12,8 @@ from _silence import no_warning
 import jaxlag as jl
 from jaxlag._fit._descent import cost_of
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
-from jaxlag._fit._losses import squares
 from jaxlag._fit._multiple_shooting import Guess
+from jaxlag._fit._residuals import squares
 from jaxlag._fit._segments import layout
 from jaxlag._fit._setup import pose, readers_of
 

@@ -1,1 +1,9 @@
 """Params from measurements: multiple shooting, its statistics, predictions."""
+
+from typing import NoReturn
+
+from jaxlag._core._old_layout import missing
+
+
+def __getattr__(name: str) -> NoReturn:
+    missing(__name__, name)

@@ -11,14 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._core._errors import bad
-from jaxlag._fit._channels import Reader
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit_result import FitResult, summarised
 from jaxlag._fit._free_parameters import NO_PRIOR, Unknowns, paths, prior_rows, unknowns
 from jaxlag._fit._initial_guess import start_freedom
-from jaxlag._fit._losses import LOSSES, squares
 from jaxlag._fit._multiple_shooting import Found, Guess, Shooting, judged, search
+from jaxlag._fit._residuals import LOSSES, Reader, squares
 from jaxlag._fit._segments import Layout, layout
 from jaxlag._fit._setup import (
     check_search,

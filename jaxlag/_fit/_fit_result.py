@@ -13,16 +13,14 @@ from scipy.special import stdtrit
 
 from jaxlag._core._errors import bad
 from jaxlag._core._status import Status
-from jaxlag._fit._channels import Reader
 from jaxlag._fit._dissipation import feeding
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns, paths
-from jaxlag._fit._identifiability import Spectrum, run_off
-from jaxlag._fit._information import distance, linearised
+from jaxlag._fit._identifiability import Spectrum, distance, linearised, run_off
 from jaxlag._fit._multiple_shooting import Found, Shooting
 from jaxlag._fit._plot import plotted
 from jaxlag._fit._predict import Prediction, predict, residuals_of
-from jaxlag._fit._residuals import channels_of, rms_of
+from jaxlag._fit._residuals import Reader, channels_of, rms_of
 from jaxlag._fit._segments import Layout
 from jaxlag._fit._setup import freedom
 from jaxlag._simulation._jump_times import names_of

@@ -22,9 +22,9 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._core._batching import in_batches
 from jaxlag._core._status import Status
 from jaxlag._fit._bounded_least_squares import box_least_squares
-from jaxlag._fit._channels import Reader, read
 from jaxlag._fit._free_parameters import IDLE, Unknowns
 from jaxlag._fit._linear_least_squares import Rows, condense, eliminate, sizes_of, states_of
+from jaxlag._fit._residuals import Reader, read
 from jaxlag._fit._segments import Segments
 from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System

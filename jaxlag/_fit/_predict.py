@@ -11,14 +11,12 @@ from jaxtyping import Float
 
 from jaxlag._core._errors import bad
 from jaxlag._core._status import Status
-from jaxlag._fit._channels import Reader
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
 from jaxlag._fit._initial_guess import start_freedom
-from jaxlag._fit._losses import squares
 from jaxlag._fit._multiple_shooting import Guess, Shooting, moved, search
 from jaxlag._fit._plot import plotted
-from jaxlag._fit._residuals import channels_of, rms_of
+from jaxlag._fit._residuals import Reader, channels_of, rms_of, squares
 from jaxlag._fit._segments import Layout, layout
 from jaxlag._fit._setup import check_search, experiments_of, plain_options, pose, readers_of
 from jaxlag._system._system import System

@@ -11,13 +11,12 @@ from jaxtyping import Array
 
 from jaxlag._core._errors import bad
 from jaxlag._core._status import Status
-from jaxlag._fit._channels import Reader, readers
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns
-from jaxlag._fit._information import spent
+from jaxlag._fit._identifiability import spent
 from jaxlag._fit._initial_guess import initial_states, typical
-from jaxlag._fit._losses import squares
 from jaxlag._fit._multiple_shooting import Found, Shooting
+from jaxlag._fit._residuals import Reader, readers, squares
 from jaxlag._fit._segments import Layout, pack
 from jaxlag._system._system import System
 

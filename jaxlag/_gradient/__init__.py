@@ -1,1 +1,9 @@
 """Derivatives of a motion: its steps are recorded, and swept forwards or backwards."""
+
+from typing import NoReturn
+
+from jaxlag._core._old_layout import missing
+
+
+def __getattr__(name: str) -> NoReturn:
+    missing(__name__, name)

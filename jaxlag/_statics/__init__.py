@@ -1,1 +1,9 @@
 """What needs no time stepping: assembly, equilibria, inverse dynamics."""
+
+from typing import NoReturn
+
+from jaxlag._core._old_layout import missing
+
+
+def __getattr__(name: str) -> NoReturn:
+    missing(__name__, name)

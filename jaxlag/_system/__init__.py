@@ -1,1 +1,9 @@
 """The system, and its quantities at one state."""
+
+from typing import NoReturn
+
+from jaxlag._core._old_layout import missing
+
+
+def __getattr__(name: str) -> NoReturn:
+    missing(__name__, name)

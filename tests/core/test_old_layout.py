@@ -1,0 +1,36 @@
+"""What was pickled when all modules lay in one folder is refused, with what to do."""
+
+import pickle
+import sys
+
+import pytest
+
+import jaxlag
+from jaxlag._core import _old_layout
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["_solution.Solution", "_system.System", "_statics.Equilibrium", "_gradient.GradientMode"],
+)
+def test_a_pickle_of_the_old_layout_is_refused(name):
+    module, _, kind = name.rpartition(".")
+    old = f"cjaxlag.{module}\n{kind}\n.".encode()
+    must = rf"jaxlag\.{module}.* must be a name of this version.*keep `to_dict\(\)`"
+    with pytest.raises(ImportError, match=must):
+        pickle.loads(old)
+
+
+def test_names_that_are_there_and_names_of_others_are_as_ever():
+    new = pickle.loads(b"cjaxlag._system._system\nSystem\n.")
+    assert new is jaxlag.System
+    with pytest.raises(ModuleNotFoundError, match="No module named 'jaxlogs'"):
+        pickle.loads(b"cjaxlogs\nSystem\n.")
+    assert not hasattr(jaxlag._system, "__wrapped__")
+    assert not hasattr(jaxlag, "nothing")
+
+
+def test_python_asks_once():
+    _old_layout.install()
+    finders = [x for x in sys.meta_path if type(x).__module__ == _old_layout.__name__]
+    assert len(finders) == 1

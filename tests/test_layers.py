@@ -1,0 +1,101 @@
+"""Which package may import which, by the syntax tree: late imports and those for types count, too.
+
+One way: model -> lowering -> system -> integration -> gradient -> simulation -> fit.
+"""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import jaxlag
+
+ROOT = Path(jaxlag.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+MOST = 20
+"""Source files in a folder."""
+
+_BASE = ("_core", "_linalg", "_tracing", "_model")
+_TO_SYSTEM = (*_BASE, "_lowering", "solvers", "_system")
+ALLOWED = {
+    "_core": (),
+    "_linalg": ("_core",),
+    "_tracing": ("_core",),
+    "solvers": ("_core",),
+    "math": ("_core", "_tracing"),
+    "rotation": ("_core",),
+    "_model": _BASE,
+    "energy": ("_core", "_tracing", "_model", "math", "rotation"),
+    "_lowering": _BASE,
+    "_system": _TO_SYSTEM,
+    "_statics": _TO_SYSTEM,
+    "testing": _TO_SYSTEM,
+    "_integration": _TO_SYSTEM,
+    "_gradient": ("_core", "_integration"),
+    "_simulation": (*_TO_SYSTEM, "_statics", "_integration", "_gradient"),
+    "_fit": ("_core", "_tracing", "_model", "_system", "_simulation"),
+}
+WITHIN_LOWERING = {
+    "_graph": (),
+    "_jaxpr": ("_graph",),
+    "_emit": ("_graph", "_jaxpr"),
+    "_symbolic": ("_graph", "_jaxpr", "_array_terms", "_row_layout"),
+    "_terms": (),
+    "_structure": (),
+    "_row_layout": ("_graph", "_jaxpr"),
+    "_array_terms": ("_terms", "_structure", "_row_layout"),
+    "_quasi_equations": ("_terms", "_structure", "_row_layout", "_array_terms"),
+}
+
+
+def name(path: Path) -> str:
+    """As it is imported."""
+    parts = ("jaxlag", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name(path): path for path in FILES}
+
+
+def imported(path: Path) -> list[tuple[int, str]]:
+    """(line, module) of every import of this package."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jaxlag":
+            for alias in node.names:
+                module = f"{node.module}.{alias.name}"
+                found.append((node.lineno, module if module in MODULES else str(node.module)))
+        elif isinstance(node, ast.Import):
+            names = (alias.name for alias in node.names)
+            found += [(node.lineno, x) for x in names if x.split(".")[0] == "jaxlag"]
+    return found
+
+
+def test_every_package_has_its_place():
+    assert {module.split(".")[1] for module in MODULES if "." in module} == set(ALLOWED)
+
+
+@pytest.mark.parametrize("module", sorted(MODULES.keys() - {"jaxlag"}))
+def test_a_module_imports_only_what_lies_below(module):
+    package, *inner = module.split(".")[1:]
+    for line, other in imported(MODULES[module]):
+        at = f"{MODULES[module]}:{line} imports {other}"
+        assert other != "jaxlag", f"{at}, which is for users"
+        there, *part = other.split(".")[1:]
+        assert there == package or there in ALLOWED[package], at
+        if there == package == "_lowering" and inner and inner[0] in WITHIN_LOWERING:
+            assert part, at
+            assert part[0] == inner[0] or part[0] in WITHIN_LOWERING[inner[0]], at
+
+
+def test_no_two_modules_need_one_another():
+    """A facade stands above what it gathers, and what it gathers does not import it."""
+    needs = {module: {other for _, other in imported(path)} for module, path in MODULES.items()}
+    assert len(list(TopologicalSorter(needs).static_order())) == len(MODULES)
+
+
+@pytest.mark.parametrize("folder", sorted({path.parent for path in FILES}), ids=str)
+def test_a_folder_can_be_read_at_once(folder):
+    files = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+    assert len(files) <= MOST
