@@ -43,12 +43,12 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 # Tests that run under both lowerings, by module. That both give the same accelerations and
-# derivatives is tested for every system in test_lowering_scalar.
+# derivatives is tested for every system in test_scalar_terms.
 BOTH = {
     "test_batch": {"test_lanes_equal_single_runs"},
     "test_gradients": {"test_forward_equals_reverse_under_both_lowerings"},
-    "test_lanes": {"test_chunks_are_what_is_compiled"},
-    "test_lowering_both": {
+    "test_batching": {"test_chunks_are_what_is_compiled"},
+    "test_both": {
         "test_accelerations_are_compiled_from_the_lowering_in_use",
         "test_solves_are_compiled_from_the_lowering_in_use",
         "test_only_systems_left_at_auto_follow",

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _closed_forms import close, move, space_axes
+from _states import random_states
 from numpy import cos, sin
 from scipy.special import ellipj, ellipkinc
-from test_systems_equations import random_states
 
 from systems._catalogue import ENTRIES
 

@@ -1,0 +1,348 @@
+"""Constraints where numbers are extreme: far away, unequal masses, singular states, no inertia."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _families import mostly_full
+from _systems.mechanisms import FOUR_BAR, four_bar
+from numpy import cos, sin
+
+import jaxlag as jl
+
+G = 9.81
+TIGHT = {"rtol": 1e-11, "atol": 1e-11, "throw": False}
+
+
+def free(t, q, v, params):
+    return 0.5 * v @ v
+
+
+# ---- Rows that were left out ---------------------------------------------------------------------
+
+
+def parting(t, q, params):
+    """Two rows that are one at y = 0 and part where y grows."""
+    return jnp.stack([q[0], q[0] + q[1] ** 3])
+
+
+@pytest.mark.parametrize("project", mostly_full([True, False, jl.Baumgarte(5.0, 5.0)], True))
+def test_rows_that_part_are_told(project):
+    system = jl.System(free, ("x", "y"), constraints=(jl.Holonomic(parting, ("a", "b")),))
+    motion = jl.simulate(
+        system, [0.0, 0.0], [0.0, 1.0], [0.0, 1.0], project=project, method="tsit5", throw=False
+    )
+    assert motion.status == jl.Status.rank_change
+    assert motion.last_time < 0.05
+
+
+@pytest.mark.parametrize("gap", mostly_full([1e-6, 1e-9, 1e-11, 1e-13], 1e-9, 1e-13))
+def test_a_small_contradiction_is_one(gap):
+    """Two lengths of one rod; what is below rounding is none."""
+    rods = (jl.Holonomic(rod, "rod"), jl.Holonomic(lambda t, q, p: rod(t, q, p) - p, "other"))
+    system = jl.System(pendulum, ("x", "y"), constraints=rods)
+    motion = jl.simulate(
+        system, [1.0, 0.0], [0.0, 0.0], [0.0, 1.0], gap, dt=0.1, method="tsit5", throw=False
+    )
+    if gap < 1e-12:
+        assert motion.status == jl.Status.ok
+    else:
+        assert motion.status == jl.Status.contradictory_rows
+        assert "('other')" in motion.message()
+
+
+# ---- Time backwards ------------------------------------------------------------------------------
+
+
+def pendulum(t, q, v, params):
+    return 0.5 * v @ v - G * q[1]
+
+
+def rod(t, q, params):
+    return q @ q - 1.0
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("traced", [False, True])
+def test_baumgarte_damps_backwards(traced):
+    """There and back: alpha has the sense of time."""
+    system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
+
+    def end(ts):
+        return jl.simulate(
+            system, [1.0, 0.0], [0.0, 0.0], ts, project=jl.Baumgarte(20.0, 20.0), **TIGHT
+        ).q[-1]
+
+    ahead, back = map(jax.jit(end) if traced else end, map(jnp.array, ([0.0, 2.0], [0.0, -2.0])))
+    np.testing.assert_allclose(back, ahead, atol=1e-8)  # it starts at rest
+    assert abs(rod(0.0, back, None)) < 1e-9
+
+
+# ---- Far from the origin -------------------------------------------------------------------------
+
+
+def chain(t, q, v, params):
+    return 0.25 * v @ v - 0.5 * G * (q[2] + q[5])
+
+
+def links(t, q, x0):
+    first, second = q[:3] - jnp.array([1.0, 0.0, 0.0]) * x0, q[3:] - q[:3]
+    return jnp.stack([first @ first - 1.0, second @ second - 1.0])
+
+
+@pytest.mark.full
+def test_lengths_are_those_of_the_rows_not_of_the_frame():
+    """Two rods of 1 m that hang 100 km from the origin move as they do near it."""
+    system = jl.System(
+        chain, {"a": (3,), "b": (3,)}, constraints=(jl.Holonomic(links, ("upper", "lower")),)
+    )
+
+    def moved(x0, off=0.0):
+        q0 = [x0 + 1.0 + off, 0.0, 0.0, x0 + 2.0, 0.0, 0.0]
+        return jl.simulate(system, q0, [0.0] * 6, [0.0, 0.3], x0, throw=False)
+
+    near, far = moved(0.0), moved(1e5)
+    assert near.status == far.status == 0
+    np.testing.assert_allclose(far.q[-1, [2, 5]], near.q[-1, [2, 5]], rtol=1e-6)
+    assert moved(1e5, off=0.2).status == jl.Status.inconsistent_start
+
+
+# ---- Unequal masses ------------------------------------------------------------------------------
+
+
+def cart(t, q, v, params):
+    heavy, light = params["M"], params["m"]
+    return 0.5 * heavy * v[0] ** 2 + 0.5 * light * (v[1] ** 2 + v[2] ** 2) - light * G * q[2]
+
+
+def hanging(t, q, params):
+    return (q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
+def test_masses_may_be_as_unequal_as_they_like(formulation):
+    """Against one coordinate, params traced: M = 1e12 m."""
+    system = jl.System(cart, ("X", "x", "y"), constraints=(jl.Holonomic(hanging, "rod"),))
+    angle, heavy, light = 1.0, 1e11, 0.1
+    start = [0.0, sin(angle), -cos(angle)], [0.0, 0.0, 0.0]
+
+    @jax.jit
+    def run(params):
+        return jl.simulate(system, *start, [0.0, 1.0], params, formulation=formulation, **TIGHT)
+
+    motion = run({"M": heavy, "m": light})
+    assert motion.status == 0
+    single = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + G * jnp.cos(q[0]), ("angle",))
+    expected = jl.simulate(single, [angle], [0.0], [0.0, 1.0], **TIGHT).q[-1, 0]
+    np.testing.assert_allclose(motion.q[-1, 1], sin(expected), atol=1e-9)
+    even = run({"M": 1.0, "m": 1.0})
+    assert motion.stats["accepted"] < 3 * even.stats["accepted"]
+
+
+# ---- Almost dependent rows -----------------------------------------------------------------------
+
+
+def almost(t, q, angle):
+    return jnp.stack([q[0], q[0] * jnp.cos(angle) + q[1] * jnp.sin(angle)])
+
+
+@pytest.mark.parametrize("angle", [1e-2, 2e-4, 5e-5])
+def test_almost_dependent_rows_have_their_reactions(angle):
+    """Both hold x and y; digits are lost as sin(angle)^2 says."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - G * q[1] + q[0] - 3.0 * q[2],
+        ("x", "y", "z"),
+        constraints=(jl.Holonomic(almost, ("a", "b")),),
+    )
+    state = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    atol = 1e-14 / sin(angle) ** 2
+    np.testing.assert_allclose(system.acceleration(angle, *state), [0, 0, -3], atol=atol)
+    np.testing.assert_allclose(system.constraint_force(angle, *state), [-1, G, 0], atol=G * atol)
+    lam = system.multipliers(angle, *state)
+    np.testing.assert_allclose(lam["b"], G / sin(angle), rtol=1e-6)
+
+
+# ---- Singular inertia ----------------------------------------------------------------------------
+
+
+def polar(t, q, v, params):
+    return 0.5 * params * (v[0] ** 2 + (q[0] * v[1]) ** 2) - 0.5 * q[0] ** 2
+
+
+@pytest.mark.parametrize("traced", mostly_full([False, True], False))
+def test_a_start_where_a_coordinate_has_no_inertia(traced):
+    """A slot through the centre of polar coordinates: r = sin(t)."""
+    slot = jl.Holonomic(lambda t, q, params: q[1] - 0.3, "slot")
+    system = jl.System(polar, ("r", "phi"), constraints=(slot,))
+
+    def end(params):
+        return jl.simulate(system, [0.0, 0.3], [1.0, 0.0], [0.0, 1.0], params, **TIGHT).q[-1, 0]
+
+    found = (jax.jit(end) if traced else end)(1.0)
+    np.testing.assert_allclose(found, sin(1.0), atol=1e-10)
+
+
+def test_whether_a_coordinate_has_inertia_is_asked_of_traced_states_too():
+    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the centre as well."""
+    turn = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
+    system = jl.System(
+        lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2),
+        ("r", "phi"),
+        constraints=(turn,),
+    )
+
+    def end(r):
+        start = jnp.stack([r, 0.0]), jnp.array([1.0, 2.0])
+        return jl.simulate(system, *start, jnp.array([0.0, 1.0]), method="tsit5", **TIGHT).q[-1, 0]
+
+    r = jnp.array([0.0, 0.3])
+    expected = np.cosh(2.0) * r + 0.5 * np.sinh(2.0)
+    np.testing.assert_allclose(jax.vmap(end)(r), expected, rtol=1e-9)
+
+
+def spring(t, q, v, params):
+    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
+
+
+def geared():
+    """x drives a wheel a by rolling, and a drives b by a gear; neither wheel has inertia."""
+    return jl.System(
+        spring,
+        ("x", "a", "b"),
+        constraints=(
+            jl.Holonomic(lambda t, q, params: q[1] + 2 * q[2], "gear"),
+            jl.Pfaffian(lambda t, q, v, params: v[0] - params * v[1], "roll"),
+        ),
+    )
+
+
+@pytest.mark.parametrize("formulation", mostly_full(["multipliers", "null_space"], "multipliers"))
+def test_wheels_without_inertia(formulation):
+    """Held by a row of velocities beside one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
+    motion = jl.simulate(
+        geared(),
+        [0.3, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [0.0, 1.0],
+        0.5,
+        formulation=formulation,
+        **TIGHT,
+    )
+    x = 0.3 * cos(1.0)
+    np.testing.assert_allclose(motion.q[-1], [x, (x - 0.3) / 0.5, (0.3 - x)], atol=1e-10)
+
+
+def test_a_guess_for_wheels_without_inertia():
+    state = jl.assemble(geared(), [0.3, 0.1, 0.0], [0.2, 0.0, 0.0], 0.5)
+    np.testing.assert_allclose(state.q[1] + 2 * state.q[2], 0.0, atol=1e-15)
+    np.testing.assert_allclose(state.v[0], 0.5 * state.v[1], atol=1e-15)
+
+
+def test_all_of_a_heavy_state_may_be_held():
+    """Nothing is left to move, and nothing needs to."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * p * v @ v, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),)
+    )
+    hold = ("x", "y", "x'", "y'")
+    state = jl.assemble(system, [0.6, -0.8], [0.8, 0.6], 30.0, hold=hold)
+    np.testing.assert_array_equal(state.q, [0.6, -0.8])
+
+
+# ---- Loops that lie flat, where a row is sin(pi) -----------------------------------------------
+
+
+PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
+
+
+@pytest.mark.parametrize("crank", [0.0, np.pi])
+def test_what_rounding_leaves_of_a_row_is_no_row(crank):
+    """Of the pin only y holds; forces along x are not found in 1e-16 of a row."""
+    params, q, v = PARALLELOGRAM, [crank, 0.0, crank + np.pi], [0.3, 0.2, -0.7]
+    found = jl.assemble(four_bar, q, v, params)
+    assert int(found.rank) == 1
+    A = np.array([0.5 * cos(crank), 1.0, 0.5 * cos(crank + np.pi)])
+    M = four_bar.mass_matrix(params, q)
+    way = np.linalg.solve(M, A)
+    np.testing.assert_allclose(found.v, v - way * (A @ v) / (A @ way), atol=1e-12)
+    rest = four_bar.multipliers(params, q, np.zeros(3))["pin"]
+    h = four_bar.bias(params, q, np.zeros(3))
+    expected = way @ h / (A @ way)
+    np.testing.assert_allclose(rest, [0.0, expected], rtol=1e-12, atol=1e-12)
+
+
+def test_no_acceleration_satisfies_rows_that_contradict():
+    """Turning through the flat place the links would have to leave the pin."""
+    a = four_bar.acceleration(PARALLELOGRAM, [0.0, 0.0, np.pi], [1.0, -0.5, 0.0])
+    assert np.all(np.isnan(a))
+
+
+def once_more(t, q, v, params):
+    """A row twice, once by a factor that turns with x."""
+    row = 0.7 * v[1] + 0.3 * params
+    return jnp.stack([(1.5 + jnp.sin(q[0])) * row, row])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dtype):
+    """The factor's rate times what rounding leaves of the row: the row itself asks for 0."""
+    system = jl.System(free, ("x", "y"), constraints=(jl.Pfaffian(once_more, "rows"),))
+    params = jnp.arange(0.1, 1.2, 0.1, dtype=dtype)
+    q, speed = jnp.asarray([0.3, 0.1], dtype), dtype(2.0)
+
+    def acceleration(p):
+        v = jnp.stack([jnp.asarray(speed), -0.3 * p / 0.7]).astype(dtype)
+        return system.acceleration(p, q, v)
+
+    found = jax.vmap(acceleration)(params)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, np.zeros((11, 2)), atol=16 * np.finfo(dtype).eps)
+
+
+# ---- Starts that cannot be solved with -----------------------------------------------------------
+
+
+def test_a_row_that_vanishes_at_the_start_is_named():
+    """The user's state is kept, finite as it is."""
+    system = jl.System(
+        free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, params: q[0] ** 2, "flat"),)
+    )
+    motion = jl.simulate(system, [0.0, 1.0], [0.0, 1.0], [0.0, 1.0], throw=False)
+    assert motion.status == jl.Status.rank_change
+    assert "('flat')" in motion.message()
+    np.testing.assert_array_equal(motion.last_state[0], [0.0, 1.0])
+
+
+def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
+    system = jl.System(
+        free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, p: jnp.log(q[0]), "log"),)
+    )
+    motion = jl.simulate(system, [-1.0, 1.0], [0.0, 1.0], [0.0, 1.0], throw=False)
+    assert motion.status == jl.Status.nonfinite
+
+
+def test_a_lane_without_a_start_spoils_no_derivative():
+    """Neither one that is not a number nor one off the constraint, in what all lanes share."""
+    system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
+
+    def height(angle, length, g):
+        q = length * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+        motion = jl.simulate(
+            system, q, g * jnp.zeros(2), jnp.array([0.0, 0.3]), method="tsit5", dt=0.1, throw=False
+        )
+        return motion.status, jnp.where(motion.ok, motion.q[-1, 1], 0.0)
+
+    def total(angles, lengths, g):
+        status, heights = jax.vmap(height, (0, 0, None))(angles, lengths, g)
+        return jnp.sum(heights), status
+
+    slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2), has_aux=True))
+    angles, lengths = jnp.array([0.3, jnp.nan, 0.7, 1.2]), jnp.array([1.0, 1.0, 1.5, 1.0])
+    found, status = slopes(angles, lengths, 1.0)
+    assert [jl.Status(int(kind)).name for kind in status] == [
+        *("ok", "bad_value", "inconsistent_start", "ok")
+    ]
+    alone, _ = slopes(angles[::3], lengths[::3], 1.0)
+    assert np.all(np.isfinite(alone[0]))
+    np.testing.assert_allclose(found[0][::3], alone[0], rtol=1e-12)
+    np.testing.assert_array_equal(found[2], alone[2])

@@ -1,0 +1,75 @@
+"""Programs of a solve: what is computed once, at every evaluation, and in all."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from _jaxprs import operations
+from _systems.problems import MOTIONS
+
+import jaxlag as jl
+from bench._scenes import SCENES
+from systems._catalogue import ENTRIES
+
+SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
+PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}
+# Divisions of a step itself: 1/h; by that, of the gains of q and v, their errors and what these do
+# not see; the error over its tolerance, two in the factor by which h changes.
+STEP = 9
+
+
+class Case(NamedTuple):
+    """A system at a state; `inputs` by name."""
+
+    system: jl.System
+    params: Any
+    q0: jax.Array
+    inputs: dict
+
+
+def case(name):
+    if name in SCENES:
+        scene = SCENES[name]
+        system = jl.System(scene.lagrangian, {"q": (len(scene.q0),)})
+        return Case(system, floats(scene.params), floats(scene.q0), {})
+    if name in MOTIONS:
+        motion = MOTIONS[name]
+        inputs = {} if motion.inputs is None else {"tau": jnp.array(0.3)}
+        return Case(motion.system, floats(motion.params), motion.q0, inputs)
+    entry = ENTRIES[name]
+    return Case(entry.system, floats(entry.example.params), floats(entry.example.q0), {})
+
+
+def floats(values):
+    if isinstance(values, tuple):
+        return jnp.array(values)
+    return {name: jnp.asarray(x, float) for name, x in values.items()}
+
+
+def prelude(case):
+    """The operations done once per solve."""
+    system, params, q, inputs = case
+    return operations(lambda params: system.terms.prepare(q, params, inputs), params)
+
+
+def evaluation(case, regular=False):
+    """The operations of one acceleration inside a solve; whether M is known to be regular."""
+    system, params, q, inputs = case
+    terms = system.terms.regular() if regular else system.terms
+    prepared = terms.prepare(q, params, inputs)
+
+    def acceleration(prepared, params, t, q, v, inputs):
+        return terms.acceleration(t, q, v, params, inputs, prepared)
+
+    return operations(acceleration, prepared, params, jnp.zeros(()), q, q, inputs)
+
+
+def solve(case):
+    """A solve as a function of (params, q0, v0), and such arguments."""
+    system, params, q0, inputs = case
+
+    def end(params, q0, v0):
+        ts = jnp.array([0.0, 1.0])
+        return jl.simulate(system, q0, v0, ts, params, inputs=inputs or None, throw=False).q[-1]
+
+    return end, (params, q0, 0.1 * q0)

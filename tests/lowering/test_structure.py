@@ -1,0 +1,385 @@
+"""What is found in a Lagrangian from its program alone, and what `explain` says about it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _families import mostly_full
+from _systems.mechanics import GENERAL, chain
+
+import jaxlag as jl
+from jaxlag._lowering import find_structure
+from jaxlag._tracing._dependence import outputs_depend_on
+from systems._catalogue import ENTRIES
+
+PAIR = ("x", "y")
+
+
+def structure(lagrangian, params=None, coordinates=PAIR):
+    return jl.System(lagrangian, coordinates).structure(params, jnp.float64)
+
+
+def of(name):
+    if name in ENTRIES:
+        return ENTRIES[name].system.structure(dict(ENTRIES[name].example.params), jnp.float64)
+    return GENERAL[name].system.structure(GENERAL[name].params, jnp.float64)
+
+
+# ---- What depends on what ------------------------------------------------------------------------
+
+
+def test_a_free_particle_has_a_constant_mass_and_no_bias():
+    found = structure(lambda t, q, v, params: 0.5 * params["m"] * v @ v, {"m": 2.0})
+    assert found == (frozenset({"params"}), frozenset(), frozenset({"v", "params"}), True)
+    assert (found.quadratic, found.mass_constant, found.explicit_time) == (True, True, False)
+    bare = structure(lambda t, q, v, params: 0.5 * v @ v)
+    assert (bare.mass, bare.bias_zero, bare.mass_constant) == (frozenset(), True, True)
+
+
+def test_a_constant_force_is_a_bias_though_it_depends_on_nothing():
+    """Zero is told from constant by value."""
+    found = structure(lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[0])
+    assert (found.bias, found.bias_zero) == (frozenset(), False)
+    with_params = structure(lambda t, q, v, params: 0.5 * v @ v - params["g"] * q[0], {"g": 0.0})
+    assert (with_params.bias, with_params.bias_zero) == (frozenset({"params"}), False)
+
+
+def test_values_of_params_never_decide():
+    """K = 0 or k = 1, one and the same structure: it is read from the program."""
+    found = [
+        structure(lambda t, q, v, params: 0.5 * v @ v - params["k"] * q @ q, {"k": k})
+        for k in (0.0, 1.0, np.nan)
+    ]
+    assert found[0] == found[1] == found[2]
+    assert found[0].bias == {"q", "params"}
+
+
+@pytest.mark.parametrize(
+    ("name", "mass", "bias", "time"),
+    [
+        ("mass_spring", {"params"}, {"q", "params"}, False),
+        ("two_mass_three_springs", {"params"}, {"q", "params"}, False),
+        ("simple_pendulum", {"params"}, {"q", "params"}, False),
+        ("double_pendulum", {"q", "params"}, {"q", "v", "params"}, False),
+        ("cart_pendulum", {"q", "params"}, {"q", "v", "params"}, False),
+        ("chain", {"q", "params"}, {"q", "v", "params"}, False),
+        ("charged", {"params"}, {"v", "params"}, False),
+        ("driven_pivot", {"q", "params"}, {"t", "q", "v", "params"}, True),
+        ("bead", {"t", "q", "params"}, {"t", "q", "v", "params"}, True),
+        ("relativistic", {"v", "params"}, {"params"}, False),
+    ],
+)
+def test_dependencies_are_those_of_the_equations(name, mass, bias, time):
+    """Or of the program, where only algebra cancels them: cos^2 + sin^2 in driven_pivot."""
+    found = of(name)
+    assert (found.mass, found.explicit_time) == (mass, time)
+    assert (found.bias, found.bias_zero) == (bias, False)
+
+
+PLAIN = "cart_pendulum", "quadcopter", "rolling_disk", "falling_stick_friction", *GENERAL
+
+
+@pytest.mark.parametrize("name", mostly_full([*ENTRIES, *GENERAL], *PLAIN))
+def test_nothing_unlisted_moves_a_term(name):
+    """Soundness at numbers: move an argument that is not listed and nothing changes at all."""
+    case = ENTRIES[name].example if name in ENTRIES else GENERAL[name]
+    system = ENTRIES[name].system if name in ENTRIES else GENERAL[name].system
+    found, params, n = of(name), dict(case.params), system.size
+    state = {"t": jnp.array(0.3), "q": jnp.linspace(0.2, 0.7, n), "v": jnp.linspace(0.5, 1.0, n)}
+
+    @jax.jit
+    def terms(t, q, v):
+        M = system.mass_matrix(params, q, v, t)
+        return {"mass": M, "bias": system.bias(params, q, v, t)}
+
+    here = terms(**state)
+    for argument, value in state.items():
+        there = terms(**(state | {argument: value + 0.37}))
+        for term in ("mass", "bias"):
+            if argument not in getattr(found, term):
+                np.testing.assert_array_equal(here[term], there[term])
+
+
+# ---- Forms of writing ----------------------------------------------------------------------------
+
+FORMS = {
+    "v @ v": lambda t, q, v, params: 0.5 * v @ v,
+    "sum v**2": lambda t, q, v, params: 0.5 * jnp.sum(v**2),
+    "sum v**1 v": lambda t, q, v, params: 0.5 * jnp.sum(v**1 * v),
+    "sum v*v": lambda t, q, v, params: 0.5 * jnp.sum(v * v),
+    "square": lambda t, q, v, params: 0.5 * jnp.sum(jnp.square(v)),
+    "entries": lambda t, q, v, params: 0.5 * (v[0] ** 2 + v[1] * v[1]),
+    "unpacked": lambda t, q, v, params: 0.5 * (lambda a, b: a**2 + b**2)(*v),
+    "dot": lambda t, q, v, params: 0.5 * jnp.dot(v, jnp.eye(2) @ v),
+    "einsum": lambda t, q, v, params: 0.5 * jnp.einsum("i,ij,j", v, jnp.eye(2), v),
+    "vdot": lambda t, q, v, params: 0.5 * jnp.vdot(v, v),
+    "jit": lambda t, q, v, params: 0.5 * jax.jit(lambda v: v @ v)(v),
+    "checkpoint": lambda t, q, v, params: 0.5 * jax.checkpoint(lambda v: v @ v)(v),
+    "vmap": lambda t, q, v, params: 0.5 * jnp.sum(jax.vmap(lambda x: x**2)(v)),
+    "derivative": lambda t, q, v, params: (
+        0.5 * jnp.sum(jax.jvp(lambda x: 1.0 * x, (q,), (v,))[1] ** 2)
+    ),
+    "shifted": lambda t, q, v, params: 0.5 * v @ v + v[0] + 1.0,
+}
+
+LOOPS = {
+    "v**2.0": lambda t, q, v, params: 0.5 * jnp.sum(v**2.0),
+    "loop": lambda t, q, v, params: 0.5 * jax.lax.fori_loop(0, 2, lambda i, T: T + v[i] ** 2, 0.0),
+    "scan": lambda t, q, v, params: (
+        0.5 * jax.lax.scan(lambda T, x: (T + x**2, None), jnp.zeros(()), v)[0]
+    ),
+    "rows of a scan": lambda t, q, v, params: (
+        0.5 * jnp.sum(jax.lax.scan(lambda k, x: (2 * k, x**2), 1.0, v)[1])
+    ),
+    "cond on a constant": lambda t, q, v, params: jax.lax.cond(
+        jnp.asarray(True), lambda v: v @ v, lambda v: 2 * v @ v, v
+    ),
+}
+
+
+@pytest.mark.parametrize("form", LOOPS)
+def test_a_quadratic_kinetic_energy_is_seen_through_loops(form):
+    found = structure(LOOPS[form])
+    assert found.quadratic
+    assert found.mass_constant
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
+    found = structure(FORMS[form])
+    assert found.quadratic
+    assert found.mass_constant
+    assert found.bias_zero
+
+
+@pytest.mark.parametrize(
+    "lagrangian",
+    [
+        lambda t, q, v, params: 0.5 * v @ v + v[0] ** 4,
+        lambda t, q, v, params: 0.5 * v @ v + v[0] ** 3,
+        lambda t, q, v, params: -jnp.sqrt(1 - v @ v),
+        lambda t, q, v, params: jnp.cosh(v[0]) + jnp.cosh(v[1]),
+        lambda t, q, v, params: 0.5 * jnp.where(v[0] > 0, 1.0, 2.0) * v @ v,
+    ],
+    ids=["fourth", "third", "sqrt", "cosh", "where"],
+)
+def test_what_is_not_quadratic_is_seen(lagrangian):
+    found = structure(lagrangian)
+    assert "v" in found.mass
+    assert not found.quadratic
+    assert not found.mass_constant
+
+
+def test_powers_that_are_not_quadratic_are_seen():
+    """The second derivative of v**1.0 is 0 * v**-1: NaN at rest, where M is then not taken."""
+    for power in (1.0, 2.5, 3.0, -1.0):
+        found = structure(lambda t, q, v, params, k=power: 0.5 * v @ v + jnp.sum(v**k))
+        assert not found.quadratic
+    found = structure(lambda t, q, v, params: 0.5 * jnp.sum(v ** (2.0 + 0.0 * q[0])))
+    assert "v" in found.mass
+
+
+def dependences(function, **arguments):
+    """What each output of a function of named arguments depends on, as strings of their names."""
+    jaxpr = jax.make_jaxpr(function)(*arguments.values()).jaxpr
+    found = outputs_depend_on(jaxpr, [frozenset({name}) for name in arguments])
+    return ["".join(sorted(names)) for names in found]
+
+
+def test_dependence_goes_round_a_loop_to_the_end():
+    """a -> b -> c -> d takes three turns; e passes through; a row reads what the carries do."""
+
+    def turn(carry, row):
+        a, b, c, d, e = carry
+        return (a, a * b, b, c, e), (row + d, e)
+
+    def function(a, b, c, d, e, rows):
+        return jax.lax.scan(turn, (a, b, c, d, e), rows)
+
+    found = dependences(function, a=1.0, b=1.0, c=1.0, d=1.0, e=1.0, r=jnp.ones(9))
+    assert found == ["a", "ab", "abc", "abcd", "e", "abcdr", "e"]
+    once = dependences(lambda a, k: jax.lax.scan(lambda x, _: (k * x, k), a, None, 3), a=1.0, k=2.0)
+    assert once == ["ak", "k"]
+
+
+def test_dependence_in_a_while_loop_is_that_of_its_condition_too():
+    """Whatever decides on the number of turns reaches what they change, and nothing else."""
+
+    def function(limit, x, y, k):
+        def body(carry):
+            i, x, y = carry
+            return i + 1.0, k * x, y
+
+        return jax.lax.while_loop(lambda carry: carry[0] < limit, body, (0.0, x, y))
+
+    assert dependences(function, l=1.0, x=1.0, y=1.0, k=2.0) == ["l", "klx", "y"]
+
+    def until_met(x, y):
+        return jax.lax.while_loop(lambda c: c[0] < 9.0, lambda c: (c[0] + 1, 2 * c[1]), (x, y))
+
+    assert dependences(until_met, x=1.0, y=1.0) == ["x", "xy"]
+
+    def late(x, y, z):
+        """The condition reads y from the second turn on."""
+        return jax.lax.while_loop(lambda c: c[0] < 9.0, lambda c: (c[1], c[1], c[2] + 1), (x, y, z))
+
+    assert dependences(late, x=1.0, y=1.0, z=1.0) == ["xy", "y", "xyz"]
+
+
+def test_dependence_of_a_choice_is_that_of_every_branch_and_of_the_index():
+    def function(k, x, y, z):
+        branches = [lambda x, y, z: (x, z), lambda x, y, z: (y, z), lambda x, y, z: (1.0, 2 * z)]
+        return jax.lax.switch(k, branches, x, y, z)
+
+    assert dependences(function, k=1, x=1.0, y=1.0, z=1.0) == ["kxy", "kz"]
+    nested = dependences(
+        lambda n, x: jax.lax.fori_loop(
+            0, n, lambda i, x: jax.lax.cond(i > 1, lambda: x, lambda: 2 * x), x
+        ),
+        n=3,
+        x=1.0,
+    )
+    assert nested == ["nx"]
+
+
+def test_control_flow_hides_no_dependence():
+    """What is read inside cond, scan and while counts."""
+
+    def choose(t, q, v, params):
+        return jax.lax.cond(t > 1.0, lambda: 1.0 + q[0] ** 2, lambda: 2.0 + q[0] ** 2) * v @ v
+
+    def power(t, q, v, params):
+        return jax.lax.fori_loop(0, 2, lambda _, x: x * q[0], jnp.ones(())) * v @ v
+
+    assert structure(choose).mass >= {"t", "q"}
+    assert structure(power).mass >= {"q"}
+    assert structure(power).bias >= {"q", "v"}
+
+
+def test_custom_rules_are_followed():
+    """A function with its own derivative counts by what that derivative reads."""
+
+    @jax.custom_jvp
+    def mass(x):
+        return 1.0 + 0.0 * x
+
+    @mass.defjvp
+    def _(primals, tangents):
+        return mass(primals[0]), primals[0] * tangents[0]
+
+    found = structure(lambda t, q, v, params: 0.5 * mass(q[0]) * v @ v)
+    assert (found.mass >= {"q"}, found.bias >= {"q", "v"}) == (True, True)
+
+
+def test_dependence_is_traced_per_argument():
+    """The finder itself, on functions of (t, q, v, params)."""
+    state = (jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
+
+    def nothing(t, q, v, params):
+        return jnp.ones(3)
+
+    def all_of_it(t, q, v, params):
+        return t + q[0] * v[1] + params
+
+    found = find_structure(nothing, all_of_it, lambda t, q, v, params: q, state, jnp.ones(()))
+    assert found.mass == frozenset()
+    assert found.bias == {"t", "q", "v", "params"}
+    assert found.lagrangian == {"q"}
+    assert not found.bias_zero
+
+
+# ---- Caching -------------------------------------------------------------------------------------
+
+
+def test_structure_is_traced_once_per_kind_of_params():
+    traces = []
+
+    def lagrangian(t, q, v, params):
+        traces.append(params)
+        return 0.5 * params["m"] * v @ v
+
+    system = jl.System(lagrangian, PAIR)
+    system.structure({"m": 1.0}, jnp.float64)
+    first = len(traces)
+    system.structure({"m": 7.0}, jnp.float64)
+    jl.System(lagrangian, PAIR).structure({"m": 3.0}, jnp.float64)
+    assert len(traces) == first > 0
+    system.structure({"m": 2}, jnp.float64)  # static: another program
+    assert len(traces) > first
+
+
+def test_python_numbers_take_the_precision_of_the_state():
+    """Weakly typed in the structure as in the program: no promotion that strict JAX refuses."""
+    system = jl.System(lambda t, q, v, params: 0.5 * params["m"] * v @ v, PAIR)
+    assert system.structure({"m": 2.0}, jnp.float32).quadratic
+    M = system.mass_matrix({"m": 2.0}, np.zeros(2, np.float32))
+    np.testing.assert_array_equal(M, 2 * np.eye(2, dtype=np.float32))
+    assert M.dtype == jnp.float32
+
+
+# ---- Explain -------------------------------------------------------------------------------------
+
+
+def said(name):
+    """What `explain` says, blanks closed up."""
+    system, params = (
+        (ENTRIES[name].system, dict(ENTRIES[name].example.params))
+        if name in ENTRIES
+        else GENERAL[name][:2]
+    )
+    lines = system.explain(params).splitlines()
+    return [" ".join(line.split()) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("mass_spring", "lagrangian depends on q, v, params; no explicit time"),
+        ("mass_spring", "mass matrix depends on params"),
+        ("mass_spring", "bias depends on q, params"),
+        ("double_pendulum", "mass matrix depends on q, params"),
+        ("double_pendulum", "bias depends on q, v, params"),
+        ("double_pendulum", "forces none, so no force code is compiled"),
+        ("driven_pivot", "lagrangian depends on t, q, v, params; explicit time"),
+        ("relativistic", "mass matrix depends on v, params"),
+        ("cart_pendulum", "coordinates 2: x, theta"),
+        (
+            "cart_pendulum",
+            "forces cart (GeneralizedForce), rod end (GeneralizedForce), damper (Rayleigh)",
+        ),
+        ("chain", "coordinates 3: theta[0], theta[1], theta[2]"),
+    ],
+)
+def test_explain_states_what_was_found(name, line):
+    assert [found for found in said(name) if found.startswith(line)] != []
+
+
+def test_explain_says_what_is_not_there():
+    lines = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR).explain(None).splitlines()
+    assert "mass matrix   depends on nothing" in lines
+    assert "bias          zero" in lines
+
+
+def test_explain_says_how_the_mass_matrix_is_solved():
+    for n, said in (
+        (8, "unrolled"),
+        (9, "in a loop over rows (n > 8)"),
+        (17, "by library Cholesky (n > 16)"),
+    ):
+        explained = chain(n, lowering="array").explain(GENERAL["chain"].params)
+        assert f"mass solve    one factorisation per evaluation, {said}" in explained
+
+
+def test_explain_says_that_a_constant_mass_matrix_is_factored_once():
+    system = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR, lowering="array")
+    explained = system.explain(None)
+    assert "mass solve    one factorisation once per solve, unrolled" in explained
+    assert "h by" not in explained
+
+
+def test_explain_refuses_what_is_no_lagrangian():
+    system = jl.System(lambda t, q, v, params: 0.5 * v**2, PAIR)
+    with pytest.raises(
+        ValueError, match=r"^lagrangian must return a real scalar, but it returned "
+    ):
+        system.explain(None)

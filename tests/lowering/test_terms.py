@@ -1,0 +1,424 @@
+"""The array programs of the equations of motion, read as jaxprs: what, how often, how large.
+
+A chain of N links stands for any system. Its Lagrangian may carry a mark: arrays turned round,
+an operation that is linear, so that every derivative of L repeats it and is counted with it.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _jaxprs import count, largest, loop, names, operations
+from _systems.mechanics import CHAIN_PARAMS, chain_lagrangian
+from _systems.mechanics import chain as any_chain
+
+import jaxlag as jl
+from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
+from systems._catalogue import ENTRIES
+
+SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2
+chain = partial(any_chain, lowering="array")
+FACTORISATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
+MARK = 3  # entries of the marked array
+
+
+def marked(t, q, v, params):
+    """The chain's L plus a function of t, q and v in which `rev` marks one evaluation."""
+    mixed = jnp.stack([jnp.sum(q * v), jnp.sum(jnp.sin(q)), t])
+    return chain_lagrangian(t, q, v, params) + jnp.prod(jnp.sin(jax.lax.rev(mixed, (0,))))
+
+
+def evaluations(program):
+    """Evaluations of the mark, one for each array of MARK entries that is turned round."""
+    turned = [o for o in program if o.name == "rev"]
+    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in turned)
+
+
+def at_rest(n):
+    return CHAIN_PARAMS, jnp.linspace(0.1, 1.0, n), jnp.linspace(-1.0, 1.0, n)
+
+
+def gradient(function):
+    """The reverse derivative of a vector function of params, weighted by its components."""
+
+    def weighted(params, q, v):
+        return jnp.sum(function(params, q, v) * jnp.arange(1.0, q.size + 1))
+
+    return jax.grad(weighted)
+
+
+def tangent(function):
+    def moved(params, q, v):
+        return jax.jvp(partial(function, params), (q, v), (v, q))
+
+    return moved
+
+
+# ---- One factorisation -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [LOOP_UP_TO + 1, LARGE])
+def test_large_systems_take_one_cholesky(n, derivative):
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert count(program, "cholesky") == 1
+    assert names(program) & FACTORISATIONS == {"cholesky"}
+
+
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [2, SMALL, UNROLL_UP_TO])
+def test_small_systems_take_one_elimination(n, derivative):
+    """The only divisions are n (n - 1)/2 of the elimination, and 2 n of each solve."""
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert names(program) & FACTORISATIONS == set()
+    assert count(program, "div", without=("custom_linear_solve",)) == n * (n - 1) // 2
+    solves = count(program, "custom_linear_solve")
+    assert solves == (2 if derivative else 1)
+    assert count(program, "div") - n * (n - 1) // 2 <= 2 * n * solves
+
+
+@pytest.mark.parametrize("derivative", [None, gradient, tangent])
+@pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, MIDDLE])
+def test_middling_systems_take_one_elimination_by_rows(n, derivative):
+    """One row of divisions a turn of the elimination, one division a turn of each solve's loops."""
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert names(program) & FACTORISATIONS == set()
+    assert count(program, "div", without=("custom_linear_solve",)) == n
+    assert count(program, "div") == n + 2 * n * (2 if derivative else 1)
+
+
+def test_the_counts_see_a_second_factorisation():
+    """The counter itself: the two forms that the tests above forbid."""
+
+    def twice(M, r):
+        return solve_mass(M, solve_mass(M, r))
+
+    for n in (SMALL, LARGE):
+        program = operations(twice, jnp.eye(n), jnp.ones(n))
+        assert count(program, "cholesky") == (2 if n > LOOP_UP_TO else 0)
+        if n <= UNROLL_UP_TO:
+            divisions = count(program, "div", without=("custom_linear_solve",))
+            assert divisions == n * (n - 1)
+    assert "svd" in names(operations(jnp.linalg.pinv, jnp.eye(SMALL)))
+
+
+def test_a_factor_at_hand_is_used():
+    def solve(M, r):
+        factor = factor_mass(M)
+        return solve_mass(M, r, factor), solve_mass(M, 2 * r, factor)
+
+    assert count(operations(solve, jnp.eye(LARGE), jnp.ones(LARGE)), "cholesky") == 1
+
+
+# ---- Sizes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+@pytest.mark.parametrize("derivative", [None, tangent])
+def test_no_array_is_larger_than_the_mass_matrix(n, derivative):
+    acceleration = chain(n).acceleration
+    program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
+    assert largest(program) == n * n
+    with_cubes = operations(jax.jacfwd(chain(n).mass_matrix, argnums=1), *at_rest(n))
+    assert largest(with_cubes) >= n**3  # what a derivative of M would show
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+def test_the_bias_holds_vectors_only(n):
+    assert largest(operations(chain(n).bias, *at_rest(n))) == n
+
+
+# ---- Evaluations of the Lagrangian ---------------------------------------------------------------
+
+
+def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
+    """Forward and reverse, each with its tangent: four, whatever n."""
+    found = {
+        n: evaluations(
+            operations(jl.System(marked, {"theta": (n,)}, lowering="array").bias, *at_rest(n))
+        )
+        for n in (2, 10)
+    }
+    assert found == {2: 4, 10: 4}
+
+
+def test_the_mass_matrix_evaluates_it_once_per_column():
+    """The mark does count: forward and reverse, and the tangents of both for every column."""
+    found = {
+        n: evaluations(
+            operations(
+                jl.System(marked, {"theta": (n,)}, lowering="array").mass_matrix, *at_rest(n)
+            )
+        )
+        for n in (2, 10)
+    }
+    assert found == {2: 2 + 2 * 2, 10: 2 + 2 * 10}
+
+
+def test_the_acceleration_evaluates_what_mass_and_bias_do():
+    n = 10
+    program = operations(
+        jl.System(marked, {"theta": (n,)}, lowering="array").acceleration, *at_rest(n)
+    )
+    assert evaluations(program) <= (2 + 2 * n) + 4
+
+
+# ---- What is not declared is not there -----------------------------------------------------------
+
+
+def push(t, q, v, params):
+    return jnp.sin(jax.lax.rev(q, (0,)))
+
+
+def drag(t, q, v, params):
+    return jnp.sum(jnp.cosh(v))
+
+
+PUSHED = (jl.GeneralizedForce(push, "push"), jl.Rayleigh(drag, "drag"))
+
+
+def test_no_force_code_without_forces():
+    """A free chain is M, h and the solve of -h, not one operation more."""
+    n, free = 4, chain(4)
+
+    def bare(params, q, v):
+        return solve_mass(free.mass_matrix(params, q, v), -free.bias(params, q, v))
+
+    program = operations(free.acceleration, *at_rest(n))
+    expected = operations(bare, *at_rest(n))
+    assert sorted(o.name for o in program) == sorted(o.name for o in expected)
+    assert names(program).isdisjoint({"rev", "sinh", "cosh"})
+    pushed = operations(chain(n, PUSHED).acceleration, *at_rest(n))
+    assert {"rev", "sinh"} <= names(pushed)
+
+
+def test_only_the_forces_asked_for_are_computed():
+    force = chain(4, PUSHED).generalized_force
+    found = {
+        chosen: names(operations(partial(force, names=chosen), *at_rest(4))) & {"rev", "sinh"}
+        for chosen in [(), ("push",), ("drag",), ("push", "drag")]
+    }
+    assert found == {
+        (): set(),
+        ("push",): {"rev"},
+        ("drag",): {"sinh"},
+        ("push", "drag"): {"rev", "sinh"},
+    }
+
+
+def test_tables_are_searched_only_where_there_are_tables():
+    def pulled(t, q, v, params, inputs):
+        return inputs["u"] * q
+
+    system = chain(4, (jl.GeneralizedForce(pulled, "pull"),))
+
+    def acceleration(signal, params, q, v):
+        return system.acceleration(params, q, v, inputs={"u": signal})
+
+    table = jl.Linear(jnp.arange(5.0), jnp.ones(5))
+    free = names(operations(chain(4).acceleration, *at_rest(4)))
+    with_number = names(operations(acceleration, jnp.array(2.0), *at_rest(4)))
+    with_table = names(operations(acceleration, table, *at_rest(4)))
+    assert with_number == free
+    assert "dynamic_slice" in with_table - free
+
+
+# ---- What depends on params alone ----------------------------------------------------------------
+
+INERTIA = {"a": jnp.array(1.3), "k": jnp.array(2.0)}
+HELD = jl.GeneralizedForce(lambda t, q, v, params: params["k"] * q, "spring")
+
+
+def coupled(t, q, v, params):
+    """Masses coupled by inertia and by nothing else, in a field g = k."""
+    M = params["a"] * jnp.eye(q.size) + 0.1
+    return 0.5 * v @ M @ v - params["k"] * jnp.sum(q)
+
+
+def hidden(t, q, v, params):
+    """The same with a T that is written with q, so that the structure must take M to vary."""
+    return coupled(t, q, v, params) + 0.0 * jnp.sum(q) * v @ v
+
+
+def free(t, q, v, params):
+    """The same without a field: h = 0."""
+    return coupled(t, q, v, params | {"k": 0.0})
+
+
+def of(lagrangian, n, forces=()):
+    return jl.System(lagrangian, {"x": (n,)}, forces=forces, lowering="array")
+
+
+def swung(lagrangian, n, params, t1=0.2):
+    """(q, v) at t1 and half-way, by fixed steps."""
+    system, q0 = of(lagrangian, n, (HELD,)), jnp.linspace(0.1, 1.0, n)
+    options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
+    motion = jl.simulate(system, q0, -q0, [0.0, t1 / 2, t1], params, **options)
+    return jnp.concatenate([motion.q[-1], motion.v[-1], motion.q[1]])
+
+
+@pytest.mark.parametrize("n", [SMALL, LARGE])
+def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
+    """Inside the loop of a whole solve there are solves and no factorisation."""
+
+    def factorisations(program):
+        if n > UNROLL_UP_TO:
+            return count(program, "cholesky")
+        return count(program, "div", without=("custom_linear_solve",)) // (n * (n - 1) // 2)
+
+    found = {}
+    for lagrangian in (coupled, hidden):
+        solve = partial(swung, lagrangian, n)
+        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, turns=1))
+        solves = count(inside, "custom_linear_solve")
+        assert solves > 0
+        assert names(inside) & FACTORISATIONS <= {"cholesky"}
+        found[lagrangian] = factorisations(inside)
+    assert found[coupled] == 0
+    assert found[hidden] > 0
+
+
+def test_the_factor_is_made_where_the_solve_is_prepared():
+    """Once per solve: M's columns and its elimination, and not one more evaluation of L for M."""
+    n, system = SMALL, of(coupled, SMALL)
+    q = v = jnp.linspace(0.1, 1.0, n)
+    prepared = system.terms.prepare(q, INERTIA, {})
+
+    def once(params):
+        return system.terms.prepare(q, params, {})
+
+    def each(prepared, q, v):
+        return system.terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+
+    def bias(params, q, v):
+        return system.bias(params, q, v)
+
+    assert count(operations(once, INERTIA), "div") == n * (n - 1) // 2
+    inside = operations(each, prepared, q, v)
+    products = count(inside, "dot_general", without=("custom_linear_solve",))
+    assert products == count(operations(bias, INERTIA, q, v), "dot_general")
+    assert count(inside, "div") == 2 * n
+
+
+def test_no_bias_is_computed_where_it_is_zero():
+    """A free body: no derivative of L is left in the loop, only the solve."""
+    n = SMALL
+    for lagrangian, left in ((free, set()), (coupled, {"dot_general", "mul"})):
+        terms = of(lagrangian, n).terms
+        q = v = jnp.linspace(0.1, 1.0, n)
+        prepared = terms.prepare(q, INERTIA, {})
+
+        def each(prepared, q, v, terms=terms):
+            return terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+
+        program = operations(each, prepared, q, v)
+        outside = [o for o in program if "custom_linear_solve" not in o.inside]
+        assert names(outside) & {"dot_general", "mul"} == left
+        assert bool(np.any(each(prepared, q, v))) == (lagrangian is coupled)
+
+
+DERIVATIVES = {
+    "fwd": jax.jacfwd,
+    "rev": jax.jacrev,
+    "fwd fwd": lambda f: jax.jacfwd(jax.jacfwd(f)),
+    "fwd rev": lambda f: jax.jacfwd(jax.jacrev(f)),
+    "rev rev": lambda f: jax.jacrev(jax.jacrev(f)),
+}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("derivative", DERIVATIVES)
+def test_derivatives_go_through_the_factor(derivative):
+    """Those of a whole solve as where M is formed and factored at every state, to round-off."""
+    of_order = DERIVATIVES[derivative]
+    once, anew = (jax.jit(of_order(partial(swung, f, 2)))(INERTIA) for f in (coupled, hidden))
+    for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(anew), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13 * (1 + np.abs(b).max()))
+        assert np.any(b)
+
+
+@pytest.mark.parametrize("n", [3, UNROLL_UP_TO + 1])
+def test_derivatives_of_one_acceleration_go_through_the_factor(n):
+    """To third order, reverse and forward, batched, for both kinds of factor."""
+    q = jnp.linspace(0.1, 1.0, n)
+
+    def total(lagrangian, a):
+        params, system = INERTIA | {"a": a}, of(lagrangian, n, (HELD,))
+        prepared = system.terms.prepare(q, params, {})
+        return jnp.sum(system.terms.acceleration(jnp.zeros(()), q, q, params, {}, prepared) ** 2)
+
+    def orders(f):
+        first, second = jax.jacrev(f), jax.jacfwd(jax.jacrev(f))
+        return lambda a: [f(a), first(a), second(a), jax.jacfwd(second)(a)]
+
+    masses = jnp.linspace(1.3, 2.0, 4)
+    once, anew = (jax.jit(jax.vmap(orders(partial(total, f))))(masses) for f in (coupled, hidden))
+    for a, b in zip(once, anew, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+        assert np.all(b != 0)
+
+
+@pytest.mark.parametrize("n", [3, pytest.param(UNROLL_UP_TO + 1, marks=pytest.mark.full)])
+def test_a_constant_mass_matrix_without_inertia_ends_in_its_status(n):
+    """The factor carries its pivots' health."""
+    q0, params = jnp.linspace(0.1, 1.0, n), {"a": -0.05, "k": 1.0}
+    options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
+    motion = jl.simulate(of(coupled, n), q0, q0, [0.0, 0.1], params, **options)
+    assert motion.status == jl.Status.mass_singular
+    assert motion.message().startswith("mass_singular ('x[1]')")
+
+
+def test_a_lagrangian_may_hold_a_traced_value():
+    """Its structure and its program are those of this trace; a bias that is traced is not zero."""
+
+    def acceleration(lowering, c):
+        def lagrangian(t, q, v, params):
+            return 0.5 * v @ v - c * q[0]
+
+        system = jl.System(lagrangian, ("x",), lowering=lowering)
+        return system.acceleration(None, jnp.zeros(1), jnp.zeros(1))[0]
+
+    for lowering in ("auto", "array"):
+        for transform in (lambda f: f, jax.grad):
+            assert jax.jit(transform(partial(acceleration, lowering)))(2.0) in (-2.0, -1.0)
+
+
+# ---- The protocol --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chosen", ["scalar", "array"])
+def test_terms_without_constraints_have_no_rows(chosen):
+    system = jl.System(ENTRIES["double_pendulum"].system.lagrangian, ("a", "b"), lowering=chosen)
+    params = dict(ENTRIES["double_pendulum"].example.params)
+    t, q, v = jnp.zeros(()), jnp.ones(2), jnp.ones(2)
+    A, b = system.terms.rows(t, q, v, params)
+    assert (A.shape, b.shape, system.terms.gamma(t, q, v, params).shape) == ((0, 2), (0,), (0,))
+    assert isinstance(system.terms, jl.Terms)
+
+
+@pytest.mark.parametrize("chosen", ["scalar", "array"])
+def test_terms_are_those_of_the_public_methods(chosen):
+    entry = ENTRIES["cart_pendulum"]
+    declared, params = entry.system, dict(entry.example.params)
+    system = jl.System(declared.lagrangian, ("x", "a"), forces=declared.forces, lowering=chosen)
+    t, q, v = jnp.array(0.7), jnp.array([0.2, 0.9]), jnp.array([-1.0, 2.0])
+
+    @jax.jit
+    def both():
+        terms = system.terms
+        return [
+            (terms.mass(t, q, v, params), system.mass_matrix(params, q, v, t)),
+            (terms.bias(t, q, v, params), system.bias(params, q, v, t)),
+            (terms.momentum(t, q, v, params), system.momentum(params, q, v, t)),
+            (terms.force(t, q, v, params, {}), system.generalized_force(params, q, v, t)),
+            (terms.acceleration(t, q, v, params, {}), system.acceleration(params, q, v, t)),
+        ]
+
+    for found, expected in both():
+        np.testing.assert_array_equal(found, expected)
+        assert np.any(found)

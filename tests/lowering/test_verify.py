@@ -1,0 +1,212 @@
+"""The scalar program beside the array program: what is compared, and what is found by it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _lowered import lowered
+from _scenes import case
+
+import jaxlag as jl
+from bench._scenes import SCENES, links
+from jaxlag._lowering._symbolic import _lower
+from systems import lamina_on_parabola, rigid_aircraft
+
+EPS = np.finfo(float).eps
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0])
+def test_bad_params_at_first_use_decide_nothing(bad):
+    """A program is made for all params of these shapes, whichever came first."""
+    system = jl.System(lambda t, q, v, p: 0.5 * p["m"] * v @ v + jnp.cos(q[0]), ("x",))
+    found = lowered(system, {"m": bad})
+    assert found.equations is not None
+    assert found.reason.startswith("equal to the array program at ")
+    np.testing.assert_allclose(
+        system.acceleration({"m": 2.0}, [0.5], [0.0]), -0.5 * np.sin([0.5]), rtol=4 * EPS
+    )
+
+
+def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
+    """Wrong where k is not 1: the random params tell."""
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        right, graph = derive(scene, eps, limit), scene.graph
+        k = graph.input("params", 0)
+        return right._replace(accelerations=[graph.mul(x, k) for x in right.accelerations])
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.cos(q[0]), ("x",))
+    assert "differs from the array program" in lowered(system, {"k": 1.0}).reason
+
+
+def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        return derive(scene, eps, limit)._replace(accelerations=[scene.graph.one])
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
+    assert "one of them has no value" in lowered(system).reason
+
+
+def test_too_few_states_to_compare_at_decide_for_the_array_program():
+    """L has no value but near a state that random ones miss."""
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
+    assert "only 0 of 32 random states" in lowered(system).reason
+    a = system.acceleration(None, [11.0], [0.0])
+    np.testing.assert_allclose(a, [-0.5 / np.sqrt(2.0)], rtol=4 * EPS)
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "n"),
+    [
+        (lambda t, q, v, p: 0.5 * v[0] ** 2 - q @ q, 2),
+        (lambda t, q, v, p: 0.5 * v[0] ** 2 + 0.5 * (v[1] + v[2]) ** 2 - q @ q, 3),
+    ],
+)
+def test_a_coordinate_without_inertia_leaves_no_acceleration(lagrangian, n):
+    """M is singular everywhere: M and h are compared in place of the acceleration."""
+    system = jl.System(lagrangian, {"x": (n,)})
+    assert lowered(system).reason == "equal to the array program at 8 random states"
+    assert np.all(np.isnan(system.acceleration(None, np.ones(n), np.zeros(n))))
+
+
+SHAPES = {
+    "coordinates": {},
+    "quasi-velocities": {
+        "quasi": jl.QuasiVelocities(
+            lambda t, q, v, p: jnp.stack([v[0] + jnp.sin(q[1]) * v[1], 2.0 * v[1]]), ("u", "w")
+        )
+    },
+    "constraint": {"constraints": (jl.Holonomic(lambda t, q, p: q[0] - q[1] ** 2, "on"),)},
+}
+
+
+def _wrong(equations, part, graph):
+    """Equations with the last entry of one part off by 1e-9."""
+
+    def off(rows):
+        *others, last = rows
+        if isinstance(last, list):
+            return [*others, off(last)]
+        return [*others, graph.scale(last, 1.0 + 1e-9)]
+
+    if part == "accelerations":  # the velocities are the first of them
+        v, others = equations.accelerations[:2], equations.accelerations[2:]
+        return equations._replace(accelerations=[*off(v), *others])
+    if part == "rows":
+        return equations._replace(rows=equations.rows._replace(A=off(equations.rows.A)))
+    return equations._replace(**{part: off(getattr(equations, part))})
+
+
+@pytest.mark.parametrize(
+    ("shape", "part"),
+    [
+        *((shape, part) for shape in SHAPES for part in (None, "mass", "bias")),
+        ("quasi-velocities", "accelerations"),
+        ("constraint", "rows"),
+    ],
+)
+def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
+    """Params that make it so at every state; an entry of any part off by 1e-9 is found."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * (v[0] ** 2 - p["m"] * (1.0 + q[0] ** 2) * v[1] ** 2) - q @ q
+
+    derive = _lower.derive
+    if part is not None:
+        monkeypatch.setattr(
+            _lower, "derive", lambda scene, *rest: _wrong(derive(scene, *rest), part, scene.graph)
+        )
+    found = lowered(jl.System(lagrangian, ("x", "y"), **SHAPES[shape]), {"m": 2.0})
+    assert (found.equations is None) == (part is not None)
+    assert found.reason.startswith("equal to" if part is None else "differs from")
+
+
+@pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
+def test_params_that_are_traced_need_not_be_known(module):
+    """Random numbers are no inertia of a body: in a jit over params there is a scalar program."""
+    found = []
+    params = jax.tree.map(jnp.asarray, dict(module.entry.example.params))
+    jax.eval_shape(lambda params: found.append(lowered(module.system, params)), params)
+    assert found[0].reason.startswith("equal to")
+
+
+# ---- The comparison before use -------------------------------------------------------------------
+
+
+def test_a_program_that_differs_is_not_used(monkeypatch):
+    """One sign flipped in h: the reason says so and the array program answers."""
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        right = derive(scene, eps, limit)
+        flipped = [scene.graph.scale(x, -1.0) for x in right.accelerations]
+        return right._replace(accelerations=flipped)
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.cos(q[0]), ("x",))
+    assert "differs from the array program" in system.explain({"k": 2.0})
+    a = system.acceleration({"k": 2.0}, [0.5], [0.0])
+    np.testing.assert_allclose(a, 2.0 * np.sin([0.5]), rtol=4 * EPS)
+
+
+def test_a_program_that_gives_nan_is_not_used(monkeypatch):
+    """Where the array program is finite; nan compares as smaller than nothing."""
+    derive = _lower.derive
+
+    def wrong(scene, eps, limit):
+        right = derive(scene, eps, limit)
+        return right._replace(accelerations=[scene.graph.const(np.nan)])
+
+    monkeypatch.setattr(_lower, "derive", wrong)
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.sin(q[0]), ("x",))
+    assert "differs from the array program" in system.explain({"k": 2.0})
+
+
+def test_constrained_states_of_indefinite_mass_are_not_compared_at():
+    """Known params beside random ones, which may make M indefinite on what rows leave free."""
+
+    def lagrangian(t, q, v, params):
+        return 0.5 * ((params["I"] - params["m"]) * v[0] ** 2 + v[1] ** 2) - q[0] * q[1]
+
+    row = jl.Holonomic(lambda t, q, p: q[1] - p["a"] * q[0] ** 2, ("parabola",))
+    system = jl.System(lagrangian, ("x", "y"), constraints=(row,))
+    assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
+
+
+def test_params_at_hand_are_compared_with():
+    """An inertia that random numbers would make indefinite."""
+    declared, params, q0, _ = case("lamina_two_forces_fixed_direction")
+
+    def fresh():
+        def lagrangian(t, q, v, params):
+            return declared.lagrangian(t, q, v, params)
+
+        return jl.System(lagrangian, declared.coordinates.shapes)
+
+    assert "equal to the array program at 12 random states" in fresh().explain(params)
+    simulated = fresh()
+    jl.simulate(simulated, q0, np.zeros(3), [0.0, 0.1], params)
+    assert "equal to the array program at 12 random states" in simulated.explain(params)
+
+
+@pytest.mark.full
+def test_too_many_operations_go_to_the_array_program():
+    scene = SCENES["chain_8"]
+    names = {"q": (8,)}
+    short = jl.System(scene.lagrangian, names)
+    assert "scalar program" in short.explain(dict(scene.params))
+    long = links(16)
+    system = jl.System(long.lagrangian, {"q": (16,)})
+    assert "array program (at least 1840 operations, more than 1500)" in system.explain(
+        dict(long.params)
+    )
+
+
+def test_bad_lowering_is_refused():
+    with pytest.raises(ValueError, match=r"^lowering must be 'auto', 'scalar' or 'array', but it"):
+        jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x",), lowering="fast")

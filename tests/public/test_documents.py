@@ -1,0 +1,138 @@
+"""Every documented line runs: the README's code and its printed numbers, doctests, set-up lines."""
+
+import contextlib
+import doctest
+import importlib
+import io
+import pkgutil
+import re
+import tomllib
+from pathlib import Path
+
+import jax
+import pytest
+from _families import mostly_full
+from sybil import Document
+from sybil.parsers.markdown import CodeBlockParser
+
+import jaxlag
+
+ROOT = Path(__file__).parents[2]
+README = ROOT / "README.md"
+
+
+class Blocks(CodeBlockParser):
+    """Code blocks of one language, handed to the test as they are."""
+
+    def evaluate(self, example):
+        raise NotImplementedError
+
+
+def blocks():
+    """(line, language, text) of the README's Python and text blocks, in order."""
+    document = Document.parse(str(README), Blocks("python"), Blocks("text"))
+    found = {}
+    for example in document:
+        language = re.match(r"```(\w+)", document.text[example.start :]).group(1)
+        found[example.line] = (language, example.parsed)
+    return [(line, *found[line]) for line in sorted(found)]
+
+
+def numbers(text):
+    return [float(x) for x in re.findall(r"-?\d+\.\d+", text)]
+
+
+FIRST = 4
+"""Blocks of the README's opening example: a program and what it prints, twice."""
+
+
+@pytest.mark.parametrize(
+    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 10)], (FIRST, 2)), ids=["first", "all"]
+)
+def test_readme_runs_and_prints_what_it_says(count, outputs):
+    namespace, printed, compared = {}, "", 0
+    for line, language, text in blocks()[:count]:
+        if language == "python":
+            out = io.StringIO()
+            # What optax computes needs JAX's own promotion of dtypes.
+            kind = "standard" if "import optax" in text else "strict"
+            with contextlib.redirect_stdout(out), jax.numpy_dtype_promotion(kind):
+                exec(compile(text, f"README.md:{line}", "exec"), namespace)
+            printed = out.getvalue()
+        else:
+            assert printed.strip() == str(text).strip(), f"README.md:{line}"
+            compared += 1
+    assert compared == outputs
+
+
+def test_readme_shows_the_same_numbers_twice():
+    """The simulated and the closed form, to the digits shown."""
+    shown = [numbers(text) for _, language, text in blocks() if language == "text"]
+    assert len(shown[0]) == 2
+    assert shown[0] == pytest.approx(shown[1], abs=2e-6)
+
+
+def test_first_program_is_short():
+    first = next(text for _, language, text in blocks() if language == "python")
+    assert sum(bool(line.strip()) for line in first.splitlines()) <= 15
+
+
+def test_two_set_up_lines():
+    lines = re.findall(r"^pip install -e .*$", README.read_text(), re.MULTILINE)
+    assert lines == [
+        'pip install -e ".[plot]" && python -m systems fit-pendulum',
+        'pip install -e ".[test]" && pytest',
+    ]
+
+
+def modules():
+    names = [jaxlag.__name__]
+    names += [m.name for m in pkgutil.walk_packages(jaxlag.__path__, "jaxlag.")]
+    return [importlib.import_module(name) for name in names]
+
+
+EXAMPLES = {
+    module.__name__: module
+    for module in modules()
+    if any(found.examples for found in doctest.DocTestFinder().find(module))
+}
+
+
+FEW = "jaxlag._simulation._simulate", "jaxlag._statics._inverse_dynamics"
+
+
+def test_there_are_doctests():
+    assert {*FEW, "jaxlag._statics._equilibrium"} <= EXAMPLES.keys()
+
+
+@pytest.mark.parametrize("name", mostly_full(EXAMPLES, *FEW))
+def test_doctests(name):
+    result = doctest.testmod(EXAMPLES[name])
+    assert result.failed == 0
+    assert result.attempted > 0
+
+
+def test_every_public_name_says_what_it_is():
+    for name, thing in vars(jaxlag).items():
+        if not name.startswith("_") and callable(thing):
+            assert thing.__doc__, name
+
+
+def test_version_and_extras():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert jaxlag.__version__ == project["version"]
+    assert project["version"] in (ROOT / "CHANGELOG.md").read_text()
+    assert {"plot", "test"} <= set(project["optional-dependencies"])
+
+
+@pytest.mark.parametrize("name", ["energy", "math", "rotation"])
+def test_every_public_function_says_what_it_is(name):
+    module = importlib.import_module(f"jaxlag.{name}")
+    public = {
+        label: thing
+        for label, thing in vars(module).items()
+        if not label.startswith("_") and getattr(thing, "__module__", None) == module.__name__
+    }
+    assert len(public) >= 5
+    for label, thing in public.items():
+        assert thing.__doc__, label

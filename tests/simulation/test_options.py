@@ -1,0 +1,127 @@
+"""Bad options of `simulate`: each is refused by name, with what it must be and was."""
+
+import re
+
+import diffrax
+import jax.numpy as jnp
+import pytest
+from _refused import SYSTEM, WHOLE, kinetic, refused, run
+from _user import unchecked  # noqa: F401
+
+import jaxlag as jl
+
+# ---- Options -------------------------------------------------------------------------------------
+
+STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"system": kinetic}, "system must be a jl.System, but it was <function kinetic"),
+        ({"formulation": "quasi"}, "formulation must be 'auto', but it was 'quasi'."),
+        (
+            {"gradient": "adjoint"},
+            "gradient must be one of 'auto', 'forward', 'recorded', 'checkpoints', but it was "
+            "'adjoint'.",
+        ),
+        (
+            {"project": 1},
+            "project must be True, False or a jl.Baumgarte(alpha, beta), but it was 1.",
+        ),
+        ({"assemble": None}, "assemble must be True or False, but it was None."),
+        (
+            {"save": ("a", "force")},
+            "save must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
+            "'power', 'lam', 'constraint_force', 'Q', 'work'], but one was 'force'.",
+        ),
+        ({"save": "energy"}, "save must be a sequence of names, but it was 'energy'. Write save="),
+        ({"save": None}, "save must be a sequence of names, but it was None."),
+        (
+            {"save": ("kinetic",), "system": WHOLE},
+            "save must name energies that the system declares, but one was 'kinetic'. Declare the",
+        ),
+        ({"max_steps": 0}, "max_steps must be a positive integer, but it was 0."),
+        ({"max_steps": 10.0}, "max_steps must be a positive integer, but it was 10.0."),
+        ({"max_steps": True}, "max_steps must be a positive integer, but it was True."),
+        (
+            {"method": "rk4"},
+            "method must be 'auto', one of ['bosh3', 'dopri5', 'dopri8', 'euler', ",
+        ),
+        (
+            {"method": diffrax.Tsit5},
+            "method must be a name or a diffrax solver instance, but",
+        ),
+        ({"method": 5}, "method must be a name or a diffrax solver instance, but it was 5."),
+        (
+            {"method": diffrax.ItoMilstein()},
+            "method must integrate an ordinary differential equation y' = f(t, y), but ItoMilstein",
+        ),
+        (
+            {"method": "euler"},
+            "method must estimate its error when dt is left out, but Euler has no error estimate. "
+            "Give dt= for fixed steps",
+        ),
+        (
+            {"method": (diffrax.Tsit5(), "pid")},
+            "method[1] must be a diffrax step-size controller",
+        ),
+        (
+            {"method": (diffrax.Tsit5(), diffrax.ConstantStepSize())},
+            "method[1] must adapt the step, but it was ConstantStepSize. Give dt= for fixed steps.",
+        ),
+        (
+            {"method": (diffrax.Tsit5(), STEPS), "dt": 0.1},
+            "dt must be left out when method brings its own controller, but both were given.",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_bad_option_is_refused(changes, message):
+    refused(message, **changes)
+
+
+def test_an_unknown_method_is_told_the_known_ones():
+    with pytest.raises(ValueError, match=r"^method .* but it was 'rk4'\.") as caught:
+        run(method="rk4")
+    for name in ("dopri8", "tsit5", "kvaerno5", "a diffrax solver or (solver, controller)"):
+        assert name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("rk4", "'dopri5' with dt="),
+        ("RK45", "'tsit5' or 'dopri5'"),
+        ("symplectic", "'splitting4' where L = T(v) - V(q)"),
+        ("leapfrog", "'splitting2' with dt="),
+        ("BDF", "'kvaerno5'"),
+        ("dopri_8", "'dopri8'"),
+    ],
+)
+def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
+    message = f"but it was {name!r}. The nearest is {nearest}"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        run(method=name)
+
+
+def test_arguments_in_another_order_are_told():
+    """Where the names say so: q, v, t, p."""
+    message = r"^lagrangian must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
+    with pytest.raises(ValueError, match=message):
+        jl.System(lambda q, v, t, p: 0.5 * v @ v, ("x",))
+    with pytest.raises(ValueError, match=r"phi must take \(t, q, params\) in this order"):
+        jl.Holonomic(lambda q, t, params: q[0], "row")
+    jl.System(lambda time, x, v, p: 0.5 * v @ v, ("x",))
+
+
+def test_a_parameter_of_one_entry_is_told():
+    params = {"k": 1.0, "m": jnp.ones(1)}
+    with pytest.raises(ValueError, match=r"of shape \(1,\)\. params\['m'\] has shape \(1,\)"):
+        run(jl.System(lambda t, q, v, params: params["m"] * (v @ v), ("x", "y")), params=params)
+
+
+@pytest.mark.parametrize("parts", ["forces", "constraints"])
+def test_none_is_no_sequence(parts, unchecked):  # noqa: F811
+    with pytest.raises(ValueError, match=rf"^{parts} must be a sequence .*Leave it out"):
+        jl.System(SYSTEM.lagrangian, ("x", "y"), **{parts: None})

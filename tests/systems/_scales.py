@@ -1,0 +1,8 @@
+"""Sizes of sums, to which rounding is relative."""
+
+import numpy as np
+
+
+def scale_of_T(system, params, t, q, v):
+    moments = np.diagonal(system.mass_matrix(params, q, v, t))
+    return 0.5 * np.sum(np.sqrt(moments) * np.abs(v)) ** 2
