@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxlag import math, rotation
 from jaxlag._core._arrays import common, concrete, real, reals
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model import _inertia
 from jaxlag._tracing._signature import require_arity
 
@@ -94,7 +94,7 @@ def particles(
     """
     rates = velocity(position, t, q, v, params)
     if rates.ndim not in (1, 2):
-        raise bad(
+        raise invalid(
             "position",
             "return a vector of shape (d,), or (k, d) for k particles",
             f"it returned shape {rates.shape}",
@@ -116,7 +116,7 @@ def gravity(mass: Any, r: Any, g: Any) -> Float[Array, ""]:
     """
     r, g = real("gravity: r", r), real("gravity: g", g)
     if g.ndim != 1 or r.ndim == 0 or r.shape[-1] != g.shape[0]:
-        raise bad(
+        raise invalid(
             "gravity: g",
             "be a vector with one component for each axis of r",
             f"its shape was {g.shape}, that of r {r.shape}",
@@ -144,11 +144,11 @@ def spring(stiffness: Any, r: Any, length: Any = 0.0) -> Float[Array, ""]:
     r = real("spring: r", r)
     if r.ndim != 1:
         was = f"its shape was {r.shape}"
-        raise bad("spring: r", "be one vector", was, "Several springs: sum over jax.vmap.")
+        raise invalid("spring: r", "be one vector", was, "Several springs: sum over jax.vmap.")
     k = _inertia.number("spring: stiffness", stiffness).astype(r.dtype)
     l0 = _inertia.number("spring: length", length)
     if concrete(l0) and not float(l0) >= 0:
-        raise bad("spring: length", "not be negative", f"it was {l0} m")
+        raise invalid("spring: length", "not be negative", f"it was {l0} m")
     squared = jnp.sum(r**2)
     if isinstance(length, int | float) and length == 0:
         return 0.5 * k * squared
@@ -279,7 +279,7 @@ def _along(function: Callable, t: Any, q: Any, v: Any, params: Any) -> tuple[Any
     q, v = common(real("q", q), real("v", v))
     if v.shape != q.shape:
         was = f"their shapes were {v.shape} and {q.shape}"
-        raise bad("v", "have the shape of q", was, "Give one velocity for each coordinate.")
+        raise invalid("v", "have the shape of q", was, "Give one velocity for each coordinate.")
     return jax.jvp(lambda t, q: function(t, q, params), (t, q), (jnp.ones_like(t), v))
 
 
@@ -291,7 +291,7 @@ def _located(position: Callable) -> Callable:
         value = position(t, q, params)
         if not eqx.is_array_like(value):
             fix = "Return jnp.stack([x, y]), several points as jnp.stack([r1, r2])."
-            raise bad("position", "return an array", f"it returned {type(value).__name__}", fix)
+            raise invalid("position", "return an array", f"it returned {type(value).__name__}", fix)
         return real("position", value)
 
     return located
@@ -304,10 +304,10 @@ def _placed(pose: Pose) -> Pose:
     def placed(t: Any, q: Any, params: Any) -> tuple[Array, Array]:
         value = pose(t, q, params)
         if not isinstance(value, tuple | list) or len(value) != 2:
-            raise bad("pose", "return the pair (R, r_O)", f"it returned {type(value).__name__}")
+            raise invalid("pose", "return the pair (R, r_O)", f"it returned {type(value).__name__}")
         R, r = common(real("pose: R", value[0]), real("pose: r_O", value[1]))
         if R.shape != (3, 3) or r.shape != (3,):
-            raise bad(
+            raise invalid(
                 "pose",
                 "return R of shape (3, 3) and r_O of shape (3,)",
                 f"the shapes were {R.shape} and {r.shape}",
@@ -321,7 +321,7 @@ def _placed(pose: Pose) -> Pose:
 def _weighted(mass: Any, values: Array) -> Array:
     mass = real("mass", mass)
     if mass.shape not in ((), values.shape) or values.ndim > 1:
-        raise bad(
+        raise invalid(
             "mass",
             "be a number, or one for each of the positions",
             f"its shape was {mass.shape}, the positions' (..., d) with {values.shape} in front",

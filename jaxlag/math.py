@@ -38,7 +38,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxlag._core._custom_jvp import CustomJVP
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._nonsmooth_points import smooth
 
 # Of the Taylor series of sin(x)/x in z = x^2. Up to |z| = 4 the first term left out is below EPSEPS
@@ -108,7 +108,7 @@ def angle_between(a: Any, b: Any) -> Float[Array, "..."]:
     a, b = _vector("angle_between: a", a), _vector("angle_between: b", b)
     if a.shape[-1] != b.shape[-1]:
         was = f"they had {a.shape[-1]} and {b.shape[-1]}"
-        raise bad("angle_between: a and b", "have the same number of components", was)
+        raise invalid("angle_between: a and b", "have the same number of components", was)
     (a, _), (b, _) = _scaled(a), _scaled(b)
     i, j = np.triu_indices(a.shape[-1], 1)
     left, right = a[..., i] * b[..., j], a[..., j] * b[..., i]
@@ -251,14 +251,14 @@ def _real(argument: str, x: Any) -> Array:
     # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
     x = jnp.asarray(float(x) if isinstance(x, int) else x)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
-        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+        raise invalid(argument, "be real", f"its dtype was {x.dtype}")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
 def _vector(argument: str, x: Any) -> Array:
     x = _real(argument, x)
     if x.ndim == 0:
-        raise bad(argument, "be a vector", "it was a scalar")
+        raise invalid(argument, "be a vector", "it was a scalar")
     return x
 
 

@@ -20,7 +20,7 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import reals
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 def _times(A: Array, B: Array) -> Array:
@@ -113,7 +113,7 @@ def compose(*rotations: Any) -> Float[Array, "3 3"]:
     Source: Pila, ch. 1 (successive yaw, pitch and roll).
     """
     if not rotations:
-        raise bad("rotations", "hold at least one matrix", "none was given")
+        raise invalid("rotations", "hold at least one matrix", "none was given")
     first, *others = reals(*((f"rotations[{i}]", R, (3, 3)) for i, R in enumerate(rotations)))
     for R in others:
         first = _times(first, R)

@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 def concrete(*arrays: Any) -> bool:
@@ -17,7 +17,7 @@ def concrete(*arrays: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
-def still(tree: Any) -> Any:
+def stop_gradient(tree: Any) -> Any:
     """Without derivatives: a status has none, and differentiating its making would cost."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
@@ -28,9 +28,9 @@ def real(argument: str, x: Any) -> Array:
         # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
         x = jnp.asarray(float(x) if isinstance(x, int) else x)
     except (TypeError, ValueError, OverflowError) as error:
-        raise bad(argument, "be real numbers", f"it was {x!r}") from error
+        raise invalid(argument, "be real numbers", f"it was {x!r}") from error
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
-        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+        raise invalid(argument, "be real", f"its dtype was {x.dtype}")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
@@ -46,11 +46,11 @@ def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
     try:
         x = jnp.asarray(x, dtype)
     except (TypeError, ValueError) as error:
-        raise bad(argument, must, f"it was {x!r}") from error
+        raise invalid(argument, must, f"it was {x!r}") from error
     if x.ndim != 0:
-        raise bad(argument, must, f"its shape was {x.shape}")
+        raise invalid(argument, must, f"its shape was {x.shape}")
     if concrete(x) and not np.isfinite(x):
-        raise bad(argument, "be finite", f"it was {x}")
+        raise invalid(argument, "be finite", f"it was {x}")
     return x
 
 
@@ -71,7 +71,7 @@ def of_state(argument: str, *arrays: Array) -> list[Array]:
     if jnp.finfo(dtype).bits < 32:
         was = f"in {dtype.name} equations keep {jnp.finfo(dtype).precision} digits at most"
         fix = f"Write {argument.replace(',', ' ').split()[0]}.astype(float)."
-        raise bad(argument, "be float32 or float64", was, fix)
+        raise invalid(argument, "be float32 or float64", was, fix)
     return state
 
 
@@ -82,7 +82,7 @@ def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
         x = real(argument, x)
         if x.shape != shape:
             fix = "Use jax.vmap for batches." if x.ndim > len(shape) else ""
-            raise bad(argument, f"have shape {shape}", f"its shape was {x.shape}", fix)
+            raise invalid(argument, f"have shape {shape}", f"its shape was {x.shape}", fix)
         arrays.append(x)
     return common(*arrays)
 

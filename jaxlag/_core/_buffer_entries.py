@@ -18,7 +18,7 @@ from jaxlag._core._batching import LANES, at_most
 from jaxlag._core._custom_jvp import CustomJVP
 
 
-def put(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
+def set_entry(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
     """buffer[index] = row in every leaf. Not to be transposed."""
     return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, row)
 

@@ -37,11 +37,11 @@ class AssemblyError(RuntimeError):
         self.assembly = assembly
 
 
-def complaint(argument: str, must: str, was: str, fix: str = "") -> str:
+def requirement(argument: str, must: str, was: str, fix: str = "") -> str:
     """`<argument> must <must>, but <was>. <fix>`."""
     return f"{argument} must {must}, but {was}." + (f" {fix}" if fix else "")
 
 
-def bad(argument: str, must: str, was: str, fix: str = "") -> ValueError:
-    """A `ValueError` in the form of `complaint`, to be raised by the caller."""
-    return ValueError(complaint(argument, must, was, fix))
+def invalid(argument: str, must: str, was: str, fix: str = "") -> ValueError:
+    """A `ValueError` in the form of `requirement`, to be raised by the caller."""
+    return ValueError(requirement(argument, must, was, fix))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit import fit
 from jaxlag._fit._fit_result import FitResult
@@ -49,7 +49,7 @@ class Candidate(eqx.Module):
     ) -> None:
         if not forces or not all(isinstance(x, AbstractForce) for x in forces):
             fix = 'Write jl.Candidate(jl.Rayleigh(R, "friction"), params0={"k": 0.1}).'
-            raise bad("Candidate: forces", "be one force or more", f"they were {forces!r}", fix)
+            raise invalid("Candidate: forces", "be one force or more", f"they were {forces!r}", fix)
         self.forces = forces
         self.params0 = dict(params0 or {})
         self.transforms, self.priors = dict(transforms or {}), dict(priors or {})
@@ -93,7 +93,7 @@ class Comparison(eqx.Module):
             if model.name == name:
                 return model
         names = [model.name for model in self.models]
-        raise bad("model", f"be one of {names}", f"it was {name!r}")
+        raise invalid("model", f"be one of {names}", f"it was {name!r}")
 
     def __str__(self) -> str:
         channels = self.best.prediction.channels
@@ -237,27 +237,29 @@ def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool
 
 def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
     if isinstance(free, str):
-        raise bad("free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},).")
+        raise invalid(
+            "free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},)."
+        )
     if not isinstance(system, System):
-        raise bad("system", "be a jl.System", f"it was {system!r}")
+        raise invalid("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(params0, Mapping):
         must = "be a dict, to which candidates add their own"
-        raise bad("params0", must, f"it was {type(params0).__name__}")
+        raise invalid("params0", must, f"it was {type(params0).__name__}")
     if not isinstance(candidates, Mapping) or not candidates:
-        raise bad("candidates", "be a dict of jl.Candidate by name", f"it was {candidates!r}")
+        raise invalid("candidates", "be a dict of jl.Candidate by name", f"it was {candidates!r}")
     taken = dict.fromkeys(params0, "the system")
     for name, candidate in candidates.items():
         if not isinstance(candidate, Candidate):
-            raise bad(f"candidates[{name!r}]", "be a jl.Candidate", f"it was {candidate!r}")
+            raise invalid(f"candidates[{name!r}]", "be a jl.Candidate", f"it was {candidate!r}")
         for key in candidate.params0:
             if key in taken:
                 must = "bring params under names of its own"
-                raise bad(f"candidates[{name!r}]", must, f"{taken[key]} has {key!r}, too")
+                raise invalid(f"candidates[{name!r}]", must, f"{taken[key]} has {key!r}, too")
             if most != 1:  # else candidates never meet
                 taken[key] = f"candidate {name!r}"
     if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= len(candidates):
         must = f"be an integer from 1 to the {len(candidates)} candidates"
-        raise bad("most", must, f"it was {most!r}")
+        raise invalid("most", must, f"it was {most!r}")
 
 
 def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._multiple_shooting import Guess, Seen, Shooting
 
 
@@ -51,12 +51,14 @@ class Descent(eqx.Module):
             getattr(optimiser, "update", None)
         ):
             must = "have init and update, as the optimisers of optax"
-            raise bad("Descent: optimiser", must, f"it was {optimiser!r}", "Try optax.adam(1e-3).")
+            raise invalid(
+                "Descent: optimiser", must, f"it was {optimiser!r}", "Try optax.adam(1e-3)."
+            )
         for name, value in (("epochs", epochs), ("batch", batch)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise bad(f"Descent: {name}", "be a positive integer", f"it was {value!r}")
+                raise invalid(f"Descent: {name}", "be a positive integer", f"it was {value!r}")
         if not gap > 0:
-            raise bad("Descent: gap", "be positive", f"it was {gap!r}")
+            raise invalid("Descent: gap", "be positive", f"it was {gap!r}")
         self.optimiser, self.epochs, self.batch = optimiser, epochs, batch
         self.seed, self.gap = seed, float(gap)
 

@@ -7,10 +7,10 @@ from typing import Any, final
 import equinox as eqx
 import numpy as np
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._inputs import check_inputs, check_range
 from jaxlag._tracing._signature import require_arity
-from jaxlag._tracing._traced_function import Captured, captured
+from jaxlag._tracing._traced_function import TracedFunction, traced_function
 
 
 @final
@@ -80,11 +80,13 @@ class Experiment(eqx.Module):
         self.ts = _times(name, ts)
         count = len(self.ts)
         if not isinstance(channels, Mapping) or not channels:
-            raise bad(f"{name}: channels", "be a dict with one channel or more", f"was {channels}")
+            raise invalid(
+                f"{name}: channels", "be a dict with one channel or more", f"was {channels}"
+            )
         self.channels = {key: _channel(name, key, x, count) for key, x in channels.items()}
         if callable(inputs):
             require_arity(f"{name}: inputs", inputs, ("params",))
-            self.inputs = captured(inputs)
+            self.inputs = traced_function(inputs)
         else:
             self.inputs = check_inputs(inputs)
             check_range(self.inputs, self.ts, f"ts of {name}")
@@ -92,28 +94,28 @@ class Experiment(eqx.Module):
         for key, x in (sigma or {}).items():
             if key not in self.channels:
                 known = sorted(self.channels)
-                raise bad(f"{name}: sigma", f"name channels among {known}", f"one was {key!r}")
+                raise invalid(f"{name}: sigma", f"name channels among {known}", f"one was {key!r}")
             x, shape = np.asarray(x, float), self.channels[key].shape
             given = x.shape
             try:
                 x = np.broadcast_to(x[:, None] if x.ndim == 1 else x, shape)
             except ValueError:
                 must = f"be a number, {shape[0]} of them, or of shape {shape}"
-                raise bad(f"{name}: sigma[{key!r}]", must, f"its shape was {given}") from None
+                raise invalid(f"{name}: sigma[{key!r}]", must, f"its shape was {given}") from None
             if not np.all((x > 0) & (x < np.inf)):
                 fix = "Write NaN into the channel where it does not count."
                 was = f"its least was {np.min(x):g}, its largest {np.max(x):g}"
-                raise bad(f"{name}: sigma[{key!r}]", "be positive and finite", was, fix)
+                raise invalid(f"{name}: sigma[{key!r}]", "be positive and finite", was, fix)
             self.sigma[key] = x
         self.q0, self.v0 = _guess(name, "q0", q0, count), _guess(name, "v0", v0, count)
         self.start_sigma = None if start_sigma is None else np.asarray(start_sigma, float)
         if self.start_sigma is not None:
             if self.q0 is None or self.v0 is None:
                 was = "q0 and v0 were not both given"
-                raise bad(f"{name}: start_sigma", "come with the start it is about", was)
+                raise invalid(f"{name}: start_sigma", "come with the start it is about", was)
             if not np.all(self.start_sigma >= 0):
                 was = f"it was {start_sigma}"
-                raise bad(f"{name}: start_sigma", "be zero or positive, or None", was)
+                raise invalid(f"{name}: start_sigma", "be zero or positive, or None", was)
 
     def inputs_at(self, params: Any) -> dict[str, Any]:
         """The inputs by name, of these params.
@@ -121,7 +123,7 @@ class Experiment(eqx.Module):
         Raises:
             ValueError: they are no inputs, or tables do not reach from ts[0] to ts[-1].
         """
-        if not isinstance(self.inputs, Captured):
+        if not isinstance(self.inputs, TracedFunction):
             return self.inputs
         found = check_inputs(self.inputs.function(params))
         check_range(found, self.ts, f"ts of {self.name}")
@@ -156,17 +158,17 @@ class Experiment(eqx.Module):
             ValueError: the recording is shorter than that, or a piece would have one row.
         """
         if not 0 < seconds < np.inf:
-            raise bad("seconds", "be a positive number", f"it was {seconds!r}")
+            raise invalid("seconds", "be a positive number", f"it was {seconds!r}")
         per_row = np.median(np.diff(self.ts))
         count = int(np.floor((self.ts[-1] - self.ts[0] + per_row) / seconds * (1 + 1e-9)))
         if count < 1:
             length = self.ts[-1] - self.ts[0]
             must = f"be at most the {length + per_row:g} s of {self.name}"
-            raise bad("seconds", must, f"it was {seconds:g}")
+            raise invalid("seconds", must, f"it was {seconds:g}")
         edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_row
         rows = np.searchsorted(self.ts, edges)
         if seconds < 2 * per_row:
-            raise bad("seconds", "be two samples or more", f"it was {seconds:g}")
+            raise invalid("seconds", "be two samples or more", f"it was {seconds:g}")
         return tuple(
             self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
             for a, b in pairwise(rows)
@@ -177,13 +179,13 @@ class Experiment(eqx.Module):
 def _times(name: str, ts: Any) -> np.ndarray:
     ts = np.asarray(ts, float)
     if ts.ndim != 1 or len(ts) < 2:
-        raise bad(f"{name}: ts", "be one row of two times or more", f"its shape was {ts.shape}")
+        raise invalid(f"{name}: ts", "be one row of two times or more", f"its shape was {ts.shape}")
     if not np.all(np.isfinite(ts)):
-        raise bad(f"{name}: ts", "be finite", "some were nan or inf")
+        raise invalid(f"{name}: ts", "be finite", "some were nan or inf")
     if not np.all(np.diff(ts) > 0):
         i = int(np.argmin(np.diff(ts) > 0))
         was = f"ts[{i}] = {ts[i]:g} and ts[{i + 1}] = {ts[i + 1]:g}"
-        raise bad(f"{name}: ts", "increase strictly", was, "Sort the rows, drop repeated ones.")
+        raise invalid(f"{name}: ts", "increase strictly", was, "Sort the rows, drop repeated ones.")
     return ts
 
 
@@ -191,13 +193,13 @@ def _channel(name: str, key: str, x: Any, count: int) -> np.ndarray:
     x = np.asarray(x, float)
     if x.ndim not in (1, 2) or x.shape[0] != count:
         must = f"have one row per time, {count}"
-        raise bad(f"{name}: channels[{key!r}]", must, f"its shape was {x.shape}")
+        raise invalid(f"{name}: channels[{key!r}]", must, f"its shape was {x.shape}")
     if not np.any(np.isfinite(x)):
         fix = "Leave the channel out."
-        raise bad(f"{name}: channels[{key!r}]", "hold some numbers", "all were NaN", fix)
+        raise invalid(f"{name}: channels[{key!r}]", "hold some numbers", "all were NaN", fix)
     if np.any(np.isinf(x)):
         must = "be finite, or NaN where nothing was measured"
-        raise bad(f"{name}: channels[{key!r}]", must, "some were inf")
+        raise invalid(f"{name}: channels[{key!r}]", must, "some were inf")
     return x[:, None] if x.ndim == 1 else x
 
 
@@ -207,5 +209,5 @@ def _guess(name: str, which: str, x: Any, count: int) -> np.ndarray | None:
     x = np.asarray(x, float)
     if x.ndim not in (1, 2) or (x.ndim == 2 and x.shape[0] != count):
         must = f"be (n,) numbers at ts[0] or ({count}, n) along ts"
-        raise bad(f"{name}: {which}", must, f"its shape was {x.shape}")
+        raise invalid(f"{name}: {which}", must, f"its shape was {x.shape}")
     return x

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit_result import FitResult, summarised
@@ -169,14 +169,14 @@ def fit(
 
 def _check(system: Any, segments: Any, loss: Any, optimiser: Any) -> None:
     if not isinstance(system, System):
-        raise bad("system", "be a jl.System", f"it was {system!r}")
+        raise invalid("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(segments, int | np.integer) or segments < 1:
-        raise bad("segments", "be a positive integer", f"it was {segments!r}")
+        raise invalid("segments", "be a positive integer", f"it was {segments!r}")
     if optimiser is not None and not isinstance(optimiser, Descent):
         fix = "Write jl.Descent(optax.adam(1e-3))."
-        raise bad("optimiser", "be None or a jl.Descent", f"it was {optimiser!r}", fix)
+        raise invalid("optimiser", "be None or a jl.Descent", f"it was {optimiser!r}", fix)
     if loss not in LOSSES:
-        raise bad("loss", f"be one of {list(LOSSES)}", f"it was {loss!r}")
+        raise invalid("loss", f"be one of {list(LOSSES)}", f"it was {loss!r}")
 
 
 def _count(experiments: Sequence[Experiment], params: int, priors: int, start: int) -> None:
@@ -186,7 +186,7 @@ def _count(experiments: Sequence[Experiment], params: int, priors: int, start: i
     if numbers + priors < unknown:
         must = f"hold at least as many numbers as there are unknowns, {unknown}"
         was = f"they held {numbers}"
-        raise bad("experiments", must, was, "Measure more, or free fewer parameters.")
+        raise invalid("experiments", must, was, "Measure more, or free fewer parameters.")
 
 
 def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:

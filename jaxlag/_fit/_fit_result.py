@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._dissipation import feeding
 from jaxlag._fit._experiment import Experiment
@@ -156,7 +156,7 @@ class FitResult(eqx.Module):
             level: between 0 and 1.
         """
         if not 0 < level < 1:
-            raise bad("level", "be between 0 and 1", f"it was {level}", "Write 0.95 for 95 %.")
+            raise invalid("level", "be between 0 and 1", f"it was {level}", "Write 0.95 for 95 %.")
         width = NormalDist().inv_cdf(0.5 + level / 2)
         if self.noise and self.freedom > 0:
             width = float(stdtrit(self.freedom, 0.5 + level / 2))

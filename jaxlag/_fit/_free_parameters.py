@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._transforms import AbstractTransform, Free
 
 NO_PRIOR = np.zeros(0, int), np.zeros(0), np.zeros(0)
@@ -38,10 +38,10 @@ class Prior(eqx.Module):
     def __init__(self, mean: Any, sigma: Any) -> None:
         self.mean, self.sigma = np.asarray(mean, float), np.asarray(sigma, float)
         if not np.all(np.isfinite(self.mean)):
-            raise bad("Prior: mean", "be finite", f"it was {mean}")
+            raise invalid("Prior: mean", "be finite", f"it was {mean}")
         if not np.all((self.sigma > 0) & (self.sigma < np.inf)):
             fix = "Leave the prior out where nothing is known."
-            raise bad("Prior: sigma", "be positive and finite", f"it was {sigma}", fix)
+            raise invalid("Prior: sigma", "be positive and finite", f"it was {sigma}", fix)
 
 
 def paths(params: Any) -> list[str]:
@@ -197,26 +197,30 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
             that is not free.
     """
     if isinstance(free, str):
-        raise bad("free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},).")
+        raise invalid(
+            "free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},)."
+        )
     names, values = paths(params0), jax.tree.leaves(params0)
     chosen: dict[int, None] = {}
     for name in free:
         branch = f"{name}.", f"{name}["
         below = [i for i, path in enumerate(names) if path == name or path.startswith(branch)]
         if not below:
-            raise bad("free", f"name parameters among {names}", f"one was {name!r}")
+            raise invalid("free", f"name parameters among {names}", f"one was {name!r}")
         real = [i for i in below if _is_real(values[i])]
         if not real:
             must, was = "hold real numbers to be found", f"it was {values[below[0]]!r}"
-            raise bad(f"params0[{name!r}]", must, was, "Write 1.0 for 1.")
+            raise invalid(f"params0[{name!r}]", must, was, "Write 1.0 for 1.")
         chosen |= dict.fromkeys(real)
     for name, transform in transforms.items():
         if name not in [names[i] for i in chosen]:
             free_names = [names[i] for i in chosen]
-            raise bad("transforms", f"be of free parameters {free_names}", f"one was of {name!r}")
+            raise invalid(
+                "transforms", f"be of free parameters {free_names}", f"one was of {name!r}"
+            )
         if not isinstance(transform, AbstractTransform):
             must = "be a transform such as jl.Positive()"
-            raise bad(f"transforms[{name!r}]", must, f"it was {transform!r}")
+            raise invalid(f"transforms[{name!r}]", must, f"it was {transform!r}")
     leaves, on_bound = [], []
     columns: list[np.ndarray] = [np.zeros((7, 0))]
     k = 0
@@ -258,17 +262,19 @@ def prior_rows(
     by_name = {leaf.name: leaf for leaf in free.leaves}
     for name, prior in priors.items():
         if name not in by_name:
-            raise bad("priors", f"be of free parameters {list(by_name)}", f"one was of {name!r}")
+            raise invalid(
+                "priors", f"be of free parameters {list(by_name)}", f"one was of {name!r}"
+            )
         if not isinstance(prior, Prior):
             must, fix = "be a jl.Prior", "Write jl.Prior(mean, sigma)."
-            raise bad(f"priors[{name!r}]", must, f"it was {prior!r}", fix)
+            raise invalid(f"priors[{name!r}]", must, f"it was {prior!r}", fix)
         leaf = by_name[name]
         try:
             mean, sigma = (np.broadcast_to(x, leaf.shape) for x in (prior.mean, prior.sigma))
         except ValueError:
             must = f"hold numbers or arrays of shape {leaf.shape}"
             was = f"its mean had {prior.mean.shape}, its sigma {prior.sigma.shape}"
-            raise bad(f"priors[{name!r}]", must, was) from None
+            raise invalid(f"priors[{name!r}]", must, was) from None
         which += range(leaf.first, leaf.first + len(leaf.indices))
         means.append(np.array([mean[index] for index in leaf.indices]))
         sigmas.append(np.array([sigma[index] for index in leaf.indices]))

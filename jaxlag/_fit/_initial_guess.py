@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
@@ -76,11 +76,11 @@ def _check(system: System, experiment: Experiment) -> None:
     ):
         if given is not None and given.shape[-1] != want:
             must = f"hold {want} numbers at each time, one for each of the {of}"
-            raise bad(f"{name}: {kind}", must, f"its shape was {given.shape}")
+            raise invalid(f"{name}: {kind}", must, f"its shape was {given.shape}")
     sigma, size = experiment.start_sigma, start_size(system)
     if sigma is not None and sigma.ndim and sigma.shape != (size,):
         must = f"be one number or {size}, of all coordinates and {what} that are free"
-        raise bad(f"{name}: start_sigma", must, f"its shape was {sigma.shape}")
+        raise invalid(f"{name}: start_sigma", must, f"its shape was {sigma.shape}")
 
 
 def _along(system: System, experiment: Experiment, rows: Sequence[int], kind: str) -> np.ndarray:
@@ -143,13 +143,13 @@ def _simulated(
     if missing.any():
         fix = f"Pass {experiment.name} a q0 and v0: where the search for them starts."
         must = "be among the channels or in q0"
-        raise bad("coordinates", must, f"{labels[missing].tolist()} were not", fix)
+        raise invalid("coordinates", must, f"{labels[missing].tolist()} were not", fix)
     start: dict[str, Any] = {"v0": v0}
     if system.quasi is not None and given is not None:
         start = {"u0": v0}
     elif np.isnan(v0).any():
         fix = f"Pass {experiment.name} a v0."
-        raise bad("velocities", "follow from the channels or v0", "some did not", fix)
+        raise invalid("velocities", "follow from the channels or v0", "some did not", fix)
     ts, inputs = experiment.ts, experiment.inputs_at(params)
     return simulate(
         system, q0, ts=ts, params=params, inputs=inputs, throw=False, **start, **options

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._residuals import channels_of, rms_of
 
@@ -34,7 +34,7 @@ def plotted(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise bad(
+        raise invalid(
             "plot()", "find matplotlib", "it is not installed", 'pip install "jaxlag[plot]"'
         ) from error
     shown = np.arange(len(residuals))

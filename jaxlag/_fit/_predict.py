@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
@@ -172,16 +172,16 @@ def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> E
     if settle is None:
         return experiment
     if not settle > 0:
-        raise bad("settle", "be a positive number of seconds, or None", f"it was {settle!r}")
+        raise invalid("settle", "be a positive number of seconds, or None", f"it was {settle!r}")
     rows = int(np.searchsorted(experiment.ts, experiment.ts[0] + settle, side="right"))
     if rows >= len(experiment.ts):
         was = f"it was {settle:g} s of {experiment.ts[-1] - experiment.ts[0]:g} s"
-        raise bad("settle", f"leave rows of {experiment.name} to be predicted", was)
+        raise invalid("settle", f"leave rows of {experiment.name} to be predicted", was)
     known = experiment.start_sigma is not None
     numbers = sum(int(np.isfinite(x[:rows]).sum()) for x in experiment.channels.values())
     if rows < 2 or (not known and numbers < fewest):
         must = f"hold {fewest} numbers or more of {experiment.name}, as many as a start"
-        raise bad("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
+        raise invalid("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
     return experiment.part(slice(0, rows))
 
 

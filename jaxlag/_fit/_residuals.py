@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._simulation._solution import Solution
 from jaxlag._system._system import System
 
@@ -25,7 +25,7 @@ def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float
     """
     known = channels_of(residuals)
     if channel not in known:
-        raise bad("channel", f"be one of {list(known)}", f"it was {channel!r}")
+        raise invalid("channel", f"be one of {list(known)}", f"it was {channel!r}")
     rows = np.concatenate([each[channel] for each in residuals if channel in each])
     count = np.count_nonzero(np.isfinite(rows), axis=0)
     total = np.nansum(rows**2, axis=0)
@@ -57,7 +57,7 @@ def readers(
         if name not in known:
             fix = f"Pass channels={{{name!r}: function of a jl.Solution}} to jl.fit."
             must = f"be named as one of {sorted(known)}"
-            raise bad("channels of the experiments", must, f"one was {name!r}", fix)
+            raise invalid("channels of the experiments", must, f"one was {name!r}", fix)
     return {name: known[name] for name in names}
 
 
@@ -97,7 +97,7 @@ def read(
         x = x[:, None] if x.ndim == 1 else x
         if x.shape != (count, width):
             must = f"have as many columns as were measured, {width}, at each of {count} times"
-            raise bad(f"channels[{name!r}]", must, f"the motion shows {x.shape}")
+            raise invalid(f"channels[{name!r}]", must, f"the motion shows {x.shape}")
         shown.append(x)
     return jnp.concatenate(shown, axis=1)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._stacked_inputs import AbstractStackedInputs, computed, stacked
 from jaxlag._model._input_signals import Linear, ZeroOrderHold
@@ -67,7 +67,7 @@ def layout(experiments: Sequence[Experiment], segments: int) -> Layout:
         rows = len(experiment.ts)
         if segments > rows // 2:
             was = f"it was {segments}, and {experiment.name} has {rows} rows"
-            raise bad("segments", "leave two rows or more to each", was)
+            raise invalid("segments", "leave two rows or more to each", was)
         edges = np.round(np.linspace(0, rows, segments + 1)).astype(int)
         owner += [i] * segments
         first += edges[:-1].tolist()
@@ -78,7 +78,7 @@ def layout(experiments: Sequence[Experiment], segments: int) -> Layout:
             if widths.setdefault(name, x.shape[1]) != x.shape[1]:
                 must = f"have {widths[name]} columns in every experiment"
                 was = f"it had {x.shape[1]} in {experiment.name}"
-                raise bad(f"channels[{name!r}]", must, was)
+                raise invalid(f"channels[{name!r}]", must, was)
     edges = np.cumsum([0, *widths.values()])
     columns = {name: slice(a, b) for name, a, b in zip(widths, edges[:-1], edges[1:], strict=True)}
     follows = np.array([a == b for a, b in pairwise([*owner, -1])])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns
@@ -33,19 +33,23 @@ ASSUMED_NOISE = 1e-2
 def experiments_of(given: Any) -> tuple[Experiment, ...]:
     """What was given as one experiment or several, as a tuple."""
     if not isinstance(given, Experiment | Iterable):
-        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
+        raise invalid(
+            "experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}"
+        )
     found = (given,) if isinstance(given, Experiment) else tuple(given)
     if not found or not all(isinstance(x, Experiment) for x in found):
-        raise bad("experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}")
+        raise invalid(
+            "experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}"
+        )
     return found
 
 
 def check_search(tolerance: Any, max_iterations: Any) -> None:
     """Raise where an optimiser could not work with these."""
     if not isinstance(tolerance, int | float | np.number) or not 0 < tolerance < 1:
-        raise bad("tolerance", "be a number between 0 and 1", f"it was {tolerance!r}")
+        raise invalid("tolerance", "be a number between 0 and 1", f"it was {tolerance!r}")
     if not isinstance(max_iterations, int | np.integer) or max_iterations < 1:
-        raise bad("max_iterations", "be a positive integer", f"it was {max_iterations!r}")
+        raise invalid("max_iterations", "be a positive integer", f"it was {max_iterations!r}")
 
 
 def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
@@ -57,11 +61,11 @@ def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
     found = {}
     for name, value in options.items():
         if name in OURS:
-            raise bad(name, f"be left to {by}", "it was given")
+            raise invalid(name, f"be left to {by}", "it was given")
         if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
             if np.ndim(value):
                 must, was = "be one number, a name or an object without arrays", f"it was {value!r}"
-                raise bad(name, must, was)
+                raise invalid(name, must, was)
             value = value.item()
         found[name] = value
     return found
@@ -80,7 +84,7 @@ def readers_of(
                     must = f"have {size} columns, as many as the coordinate has numbers"
                     was = f"it had {each.channels[key].shape[1]}"
                     fix = "Fill columns that were not measured with NaN."
-                    raise bad(f"{each.name}: channels[{key!r}]", must, was, fix)
+                    raise invalid(f"{each.name}: channels[{key!r}]", must, was, fix)
     rows = tuple(system.rows(params, jnp.dtype(float)).labels) if system.constraints else ()
     return readers(system, names, own, rows)
 
@@ -90,7 +94,9 @@ def _unstated(experiments: Sequence[Experiment]) -> set[str]:
     without = {name for each in experiments for name in each.channels if name not in each.sigma}
     for name in without & {name for each in experiments for name in each.sigma}:
         was = f"that of {name!r} was given in some"
-        raise bad("sigma", "be given in all experiments that measure a channel, or in none", was)
+        raise invalid(
+            "sigma", "be given in all experiments that measure a channel, or in none", was
+        )
     return without
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._input_signals import (
     AbstractInput,
     AbstractTable,
@@ -22,7 +22,7 @@ from jaxlag._model._input_signals import (
 )
 from jaxlag._model._inputs import check_inputs
 from jaxlag._tracing import _params
-from jaxlag._tracing._traced_function import Captured, captured, functions_of
+from jaxlag._tracing._traced_function import TracedFunction, functions_of, traced_function
 
 JUST_AFTER = 1e-9
 """Of the length of a segment."""
@@ -61,7 +61,7 @@ class ComputedInputs(AbstractStackedInputs):
     """
 
     which: Int[Array, " k"]
-    functions: tuple[Captured, ...] = eqx.field(static=True)
+    functions: tuple[TracedFunction, ...] = eqx.field(static=True)
     ends: tuple[float, ...] = eqx.field(static=True)
 
     def at(self, params: Any, ts: Array) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def _chosen(
     shapes = {x.shape for x in values}
     if len(shapes) > 1:
         was = f"they had {sorted(shapes)}"
-        raise bad(f"inputs[{choice.name!r}]", "have one shape in all experiments", was)
+        raise invalid(f"inputs[{choice.name!r}]", "have one shape in all experiments", was)
     return jax.lax.select_n(choice.which, *values)
 
 
@@ -140,7 +140,9 @@ def _check_closures(inputs: dict[str, Any]) -> None:
             if not concrete([cell.cell_contents for cell in cells]):
                 must = "take params where experiments have functions of their own"
                 fix = "Write jl.Function(f) of f(t, params), jl.Feedback(f) of f(t, q, v, params)."
-                raise bad(f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix)
+                raise invalid(
+                    f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix
+                )
 
 
 def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:
@@ -150,12 +152,12 @@ def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:
         inputs: of each segment, by name, or a function.
         ends: its last time, s.
     """
-    functions: dict[Any, Captured] = {}
+    functions: dict[Any, TracedFunction] = {}
     last: dict[Any, float] = {}
     for each, end in zip(inputs, ends, strict=True):
         key = each if callable(each) else id(each)
         if key not in functions:
-            functions[key] = captured(each if callable(each) else _constant(each))
+            functions[key] = traced_function(each if callable(each) else _constant(each))
         last[key] = max(end, last.get(key, end))
     keys = list(functions)
     which = [keys.index(each if callable(each) else id(each)) for each in inputs]
@@ -182,7 +184,7 @@ def stacked(inputs: Sequence[dict[str, Any]], ends: Sequence[float]) -> StackedI
     """
     if any(each.keys() != inputs[0].keys() for each in inputs):
         was = " or ".join(sorted({str(sorted(each)) for each in inputs}))
-        raise bad("names of the inputs", "be the same in every experiment", f"they were {was}")
+        raise invalid("names of the inputs", "be the same in every experiment", f"they were {was}")
     columns = {name: _alike(name, [each[name] for each in inputs], ends) for name in inputs[0]}
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     halves = [eqx.partition(row, _params.is_array) for row in rows or [{}] * len(inputs)]
@@ -196,7 +198,7 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
     tables = any(isinstance(signal, AbstractTable) for signal in signals)
     must = "be tables of one kind in every experiment, or functions and constants in all"
     if tables and len(kinds) > 1:
-        raise bad(f"inputs[{name!r}]", must, f"they were {' and '.join(kinds)}")
+        raise invalid(f"inputs[{name!r}]", must, f"they were {' and '.join(kinds)}")
     if all(isinstance(signal, Linear | ZeroOrderHold) for signal in signals):
         longest = max(len(table.times) for table in signals)
         return [_filled(table, longest) for table in signals]
@@ -205,7 +207,7 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
     most = max(0 if times is None else len(times) for times in knots)
     if of_state and most:
         must = "be without knots where another experiment has a Feedback in its place"
-        raise bad(f"inputs[{name!r}]", must, f"one had {most}")
+        raise invalid(f"inputs[{name!r}]", must, f"one had {most}")
     plain = [Function(x.f) if isinstance(x, Function) else x for x in signals]
     if not _equal(plain):
         among = _different(plain)

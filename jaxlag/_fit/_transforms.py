@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 class AbstractTransform(eqx.Module):
@@ -87,7 +87,7 @@ class Positive(AbstractTransform):
         x = np.ravel(np.asarray(value, float))
         if not np.all(x > 0):
             fix = "Start it above 0, or bound it by jl.Bounded(0.0, np.inf)."
-            raise bad(f"params0[{name!r}]", "be positive (jl.Positive)", f"it was {value}", fix)
+            raise invalid(f"params0[{name!r}]", "be positive (jl.Positive)", f"it was {value}", fix)
         return np.log(x), False
 
 
@@ -112,9 +112,9 @@ class Bounded(AbstractTransform):
         self.lower, self.upper = float(lower), float(upper)
         if not self.lower < self.upper:
             was = f"they were {lower} and {upper}"
-            raise bad("Bounded: lower and upper", "be in increasing order", was)
+            raise invalid("Bounded: lower and upper", "be in increasing order", was)
         if math.isinf(self.lower) and math.isinf(self.upper):
-            raise bad("Bounded: lower and upper", "be finite, one at least", "neither was")
+            raise invalid("Bounded: lower and upper", "be finite, one at least", "neither was")
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
         """U, or the bound that it is beyond, with the derivative of u: also from there back."""
@@ -126,7 +126,7 @@ class Bounded(AbstractTransform):
         x = np.ravel(np.asarray(value, float))
         if not np.all((x >= self.lower) & (x <= self.upper)):
             must = f"lie between its bounds {self.lower:g} and {self.upper:g}"
-            raise bad(f"params0[{name!r}]", must, f"it was {value}")
+            raise invalid(f"params0[{name!r}]", must, f"it was {value}")
         return x, bool(np.any((x == self.lower) | (x == self.upper)))
 
     @property
@@ -162,13 +162,15 @@ class SPD(AbstractTransform):
         x = np.asarray(value, float)
         if x.ndim != 2 or x.shape[0] != x.shape[1] or not np.allclose(x, x.T):
             must, was = "be a symmetric matrix", f"its shape was {x.shape}"
-            raise bad(f"params0[{name!r}]", must, was if x.ndim != 2 else f"it was {x.tolist()}")
+            raise invalid(
+                f"params0[{name!r}]", must, was if x.ndim != 2 else f"it was {x.tolist()}"
+            )
         try:
             factor = np.linalg.cholesky(x)
         except np.linalg.LinAlgError:
             smallest = np.linalg.eigvalsh(x)[0]
             was = f"its smallest eigenvalue was {smallest:g}"
-            raise bad(f"params0[{name!r}]", "be positive definite", was) from None
+            raise invalid(f"params0[{name!r}]", "be positive definite", was) from None
         return np.concatenate([np.log(np.diag(factor)), factor[np.tril_indices(len(x), -1)]]), False
 
     def entries(self, shape: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
@@ -203,12 +205,12 @@ class Inertia(AbstractTransform):
         x = np.asarray(value, float)
         if x.shape not in ((3,), (3, 3)):
             must = "be a matrix (3, 3) or three principal moments (jl.Inertia)"
-            raise bad(f"params0[{name!r}]", must, f"its shape was {x.shape}")
+            raise invalid(f"params0[{name!r}]", must, f"its shape was {x.shape}")
         moments = x if x.ndim == 1 else np.linalg.eigvalsh(x)
         second = np.sum(moments) / 2 - moments
         if not np.all(second > 0):
             must = "obey the triangle inequalities, each moment less than the sum of the others"
-            raise bad(f"params0[{name!r}]", must, f"the moments were {moments.tolist()}")
+            raise invalid(f"params0[{name!r}]", must, f"the moments were {moments.tolist()}")
         if x.ndim == 1:
             return np.log(second), False
         return SPD().start(name, np.trace(x) / 2 * np.eye(3) - x)
@@ -244,7 +246,7 @@ class PseudoInertia(AbstractTransform):
         x = np.asarray(value, float)
         if x.shape != (10,):
             must = "be ten numbers (jl.PseudoInertia)"
-            raise bad(f"params0[{name!r}]", must, f"its shape was {x.shape}")
+            raise invalid(f"params0[{name!r}]", must, f"its shape was {x.shape}")
         I = np.diag(x[4:7])  # noqa: E741
         I[[0, 0, 1], [1, 2, 2]] = I[[1, 2, 2], [0, 0, 1]] = x[7:]
         J = np.zeros((4, 4))
@@ -254,5 +256,5 @@ class PseudoInertia(AbstractTransform):
         if np.linalg.eigvalsh(J)[0] <= 0:
             must = "be those of a body of positive density: a positive definite pseudo-inertia"
             was = f"its smallest eigenvalue was {np.linalg.eigvalsh(J)[0]:g}"
-            raise bad(f"params0[{name!r}]", must, was)
+            raise invalid(f"params0[{name!r}]", must, was)
         return SPD().start(name, J)

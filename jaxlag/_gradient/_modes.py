@@ -4,7 +4,7 @@ import math
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 MODES = ("auto", "forward", "recorded", "checkpoints")
 # States that "auto" keeps: as many steps go backwards without any taken again, and what they
@@ -62,7 +62,7 @@ def choose_gradient(
         return Keep(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
     if not isinstance(rows, int):
         was = f"it was {memory} for {rows} times"
-        raise bad("gradient_memory", "be left out where the number of times is a symbol", was)
+        raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
     turns = max_steps + rows - 2  # at most, of lanes together
     needs = {
         name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
@@ -76,12 +76,12 @@ def choose_gradient(
         if fitting:
             return Keep(mode, rooms[fitting[0]])
         must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
-        raise bad("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
+        raise invalid("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
     if needs[mode] > memory:
         fits = [f"{name!r} ({need} bytes)" for name, need in needs.items() if need <= memory]
         fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
         must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"
-        raise bad("gradient_memory", must, f"it was {memory}", fix)
+        raise invalid("gradient_memory", must, f"it was {memory}", fix)
     return Keep(mode, rooms[mode])
 
 

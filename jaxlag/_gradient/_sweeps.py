@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag._core._buffer_entries import put
+from jaxlag._core._buffer_entries import set_entry
 from jaxlag._gradient._recorded_motion import Change, Path, Walk, all_rows, arrived, at, pick
 from jaxlag._integration._record import Record
 
@@ -67,7 +67,7 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
         to_row, row, i = jnp.array(False), jnp.array(False), k
         if points:
             at_point = (k < record.turns) & (k % record.stride == 0)
-            kept = put(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
+            kept = set_entry(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
         before = (y, dy)
         if rows is not None:
             j = _turn_of_row(record, r)
@@ -101,7 +101,7 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
             y1, dy1 = jax.jvp(step, given, dots)
         if rows is not None:
             assert record.row_turn is not None
-            rows = put(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
+            rows = set_entry(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
             r, base = r + row.astype(jnp.int32), pick(use, (y, dy), base)
         y, dy = pick(use, (y1, dy1), (y, dy))
         return k + (~to_row).astype(jnp.int32), r, y, dy, base, rows, kept
@@ -226,14 +226,14 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
         k = carry[0]
         first = jnp.where(stride == 1, 0, (k - 1) // stride * stride)
         y = at(record.points, first // record.stride)
-        states = put(_zeros(y, longest), zero, y)
+        states = set_entry(_zeros(y, longest), zero, y)
 
         def ahead(carry: tuple) -> tuple:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
             use = (j < record.turns) & (end > t)
             y = pick(use, path.found(j, anchors, y), y)
-            return j + 1, y, put(states, j + 1 - first, y)
+            return j + 1, y, set_entry(states, j + 1 - first, y)
 
         begin = (first, y, states)
         missing = lambda c: (stride > 1) & (c[0] < k - 1)  # noqa: E731
@@ -276,4 +276,4 @@ def _added(bar: Array, more: Array, start: Array | None) -> Array:
 
 def _added_at(bar: Array, index: Array, more: Array) -> Array:
     """One entry with more of it."""
-    return put(bar, index, at(bar, index) + more)
+    return set_entry(bar, index, at(bar, index) + more)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._core._arrays import still
+from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._step_arguments import Arguments
 from jaxlag._integration._vector_field import Dynamics
 from jaxlag._linalg._kkt import augmented, masked
@@ -52,7 +52,7 @@ class Canonical(eqx.Module):
         self, tau: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
     ) -> Bool[Array, ""]:
         """Whether d2L/dv2 is positive definite, under constraints where these leave motion."""
-        tau, q, v, form = still((tau, q, v, self))
+        tau, q, v, form = stop_gradient((tau, q, v, self))
         t, params = form._at(tau)
         M = form.dynamics.terms.mass(t, q, v, params)
         if form.rows:

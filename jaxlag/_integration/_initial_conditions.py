@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxlag._core._arrays import still
+from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._step_arguments import Arguments
 from jaxlag._integration._vector_field import Dynamics
 from jaxlag._linalg._independent_rows import (
@@ -68,7 +68,7 @@ def values_allowed(
 
 def start_finite(dynamics: Dynamics, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
     """Whether L and the residuals are finite there; of accelerations the first step tells."""
-    at = dynamics.state(*still((tau, y0, args)))
+    at = dynamics.state(*stop_gradient((tau, y0, args)))
     finite = jnp.isfinite(dynamics.system.lagrangian(*at))
     for residual in residuals(dynamics, *at):
         finite = finite & jnp.all(jnp.isfinite(residual))
@@ -90,7 +90,7 @@ def start_consistent(
     found = _rows_consistent(dynamics, t, q, v, params, args)
     if dynamics.quasi is None:
         return found
-    regular = dynamics.quasi.regular(*still((t, q, params)))
+    regular = dynamics.quasi.regular(*stop_gradient((t, q, params)))
     return found._replace(ok=found.ok & regular, complete=found.complete & regular)
 
 
@@ -105,7 +105,7 @@ def _rows_consistent(
     if not dynamics.rows.size:
         true = jnp.array(True)
         return Consistency(true, ~true, jnp.full((), -1, jnp.int32), true)
-    t, q, v, params, args = still((t, q, v, params, args))
+    t, q, v, params, args = stop_gradient((t, q, v, params, args))
     terms = dynamics.terms
     A, _ = terms.rows(t, q, v, params)
     sure = all(dynamics.rows.sure)
@@ -204,7 +204,7 @@ def rows_hold(
     quasi = dynamics.quasi
     if quasi is None or quasi.U is not None or not dynamics.rows.size:
         return jnp.array(True), jnp.full((), -1, jnp.int32)
-    ts, q, v, params = still((ts, q, v, params))
+    ts, q, v, params = stop_gradient((ts, q, v, params))
     rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
     first = _sizes(dynamics, ts[0], q[0], v[0], params).size

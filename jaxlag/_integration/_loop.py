@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._core._batching import at_most
-from jaxlag._core._buffer_entries import put
+from jaxlag._core._buffer_entries import set_entry
 from jaxlag._core._status import Status
 from jaxlag._integration._change_points import UNLIKE, Crossing, is_across, no_crossing
 from jaxlag._integration._loop_state import (
@@ -260,16 +260,16 @@ def _turn(loop: Loop, c: Carry) -> Carry:
         turns, reaches = rows.turns, rows.reaches
         if reaches is not None:
             assert reach is not None
-            reaches = put(reaches, slot, jnp.where(to_row, reach, 0))
+            reaches = set_entry(reaches, slot, jnp.where(to_row, reach, 0))
         if turns is not None:
             # The slot after the last row is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
-            turns = put(turns, slot, jnp.where(to_row, rows.turn, beyond))
+            turns = set_entry(turns, slot, jnp.where(to_row, rows.turn, beyond))
         rows = Rows(
             base=select(take, c.at, rows.base),
             turn=jnp.where(take, c.turn, rows.turn),
             next=rows.next + to_row.astype(jnp.int32),
-            values=put(rows.values, slot, value),
+            values=set_entry(rows.values, slot, value),
             turns=turns,
             reaches=reaches,
             missed=jnp.where(to_row & ~known, failure, rows.missed).astype(jnp.int32),

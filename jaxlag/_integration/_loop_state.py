@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag._core._buffer_entries import put
+from jaxlag._core._buffer_entries import set_entry
 from jaxlag._integration._change_points import Crossing
 from jaxlag._integration._record import Times
 from jaxlag._integration._stepper import Scheme
@@ -106,12 +106,12 @@ def written(loop: Loop, c: Carry, kept: Kept, t: Array, anchor: Array) -> Kept:
     if anchors is None:
         offset = jnp.where(anchor == 1, -1.0, t)
     else:
-        anchors = put(anchors, c.turn, anchor)
+        anchors = set_entry(anchors, c.turn, anchor)
         offset = t - loop.anchors[anchor]
-    offsets = put(kept.offsets, c.turn, offset)
-    jumps = None if jumps is None else put(jumps, c.turn, c.at.jump)
+    offsets = set_entry(kept.offsets, c.turn, offset)
+    jumps = None if jumps is None else set_entry(jumps, c.turn, c.at.jump)
     if points is not None:
         spare = jax.tree.leaves(points)[0].shape[0] - 1
         slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
-        points = put(points, slot, (c.at.y, None))
+        points = set_entry(points, slot, (c.at.y, None))
     return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxlag._core._arrays import still
+from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._change_points import LOST, SHORT, lengths_of, unknown_below
 from jaxlag._integration._step_arguments import Arguments, Verdict
 from jaxlag._integration._vector_field import Dynamics
 from jaxlag._linalg._mass_solve import closed_to
-from jaxlag._linalg._projection import Surface, project, tangential
+from jaxlag._linalg._projection import ConstraintProjector, project, tangential
 from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
 from jaxlag._model._forces import reads_lam, sliding
 
@@ -68,8 +68,8 @@ class Settling(eqx.Module):
         elif args.rows is not None:
 
             def look() -> Array:
-                surface = self.dynamics.surface(*still((tau, y, args)))
-                return self._closed(surface, *self.dynamics.parts(still(y)), args)
+                surface = self.dynamics.surface(*stop_gradient((tau, y, args)))
+                return self._closed(surface, *self.dynamics.parts(stop_gradient(y)), args)
 
             one = self.dynamics.rows.size == 1
             hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
@@ -80,7 +80,7 @@ class Settling(eqx.Module):
         """Whether contacts press and slide as their friction takes them to."""
         if not self._contacts and not self._slides:
             return jnp.array(True)
-        tau, y, args = still((tau, y, args))
+        tau, y, args = stop_gradient((tau, y, args))
         t, q, v, params, values = self.dynamics.at(tau, y, args)
         right, terms = [], self.dynamics.terms
         if self._contacts:
@@ -141,7 +141,7 @@ class Settling(eqx.Module):
             refuses: whether it is NaN at a change point, so that the step is not taken. It is to be
                 where no estimate tells that the step is off.
         """
-        around = self._near(*still((tau, y, args)))
+        around = self._near(*stop_gradient((tau, y, args)))
         near, apart = around.surface, around.apart
         assert apart is not None
         surface = self.dynamics.surface(tau, y, args)
@@ -155,7 +155,7 @@ class Settling(eqx.Module):
 
     def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
         """The least length of a row over its length at the start of the motion."""
-        found = self._near(*still((tau, y, args))).apart
+        found = self._near(*stop_gradient((tau, y, args))).apart
         assert found is not None
         return found
 
@@ -170,7 +170,7 @@ class Settling(eqx.Module):
         """The constraints near a state, without rows that all but depend on one another."""
         surface, frozen = self.dynamics.surface(tau, y, args), None
         if differentiable:
-            frozen = self.dynamics.surface(*still((tau, y, args)))
+            frozen = self.dynamics.surface(*stop_gradient((tau, y, args)))
         if args.lengths is None:
             return _Near(surface, frozen, None)
         masses = (surface if frozen is None else frozen).masses
@@ -178,7 +178,7 @@ class Settling(eqx.Module):
         lengths = lengths_of(masses, args.kept)
         alone, own = lengths > LOST * args.lengths, np.flatnonzero(self.dynamics.rows.holonomic)
 
-        def without(surface: Surface) -> Surface:
+        def without(surface: ConstraintProjector) -> ConstraintProjector:
             shift, kick = surface.shift, surface.kick
             assert kick is not None
             return surface._replace(
@@ -193,7 +193,9 @@ class Settling(eqx.Module):
         """The state y with other coordinates and velocities."""
         return jnp.concatenate([q, v, y[self.dynamics.system.size + self.dynamics.speeds :]])
 
-    def _closed(self, surface: Surface, q: Array, v: Array, args: Arguments) -> Bool[Array, ""]:
+    def _closed(
+        self, surface: ConstraintProjector, q: Array, v: Array, args: Arguments
+    ) -> Bool[Array, ""]:
         """Whether rows that were left out hold as well.
 
         Where nothing holds the others, these may drift as they do.
@@ -229,6 +231,6 @@ class _Near(NamedTuple):
         apart: see `_change_points.Crossing`; None where nobody asks.
     """
 
-    surface: Surface
-    frozen: Surface | None
+    surface: ConstraintProjector
+    frozen: ConstraintProjector | None
     apart: Array | None

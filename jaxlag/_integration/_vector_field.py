@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._core._arrays import still
-from jaxlag._core._errors import bad
+from jaxlag._core._arrays import stop_gradient
+from jaxlag._core._errors import invalid
 from jaxlag._integration._step_arguments import Arguments, Gaps, RowChoice
 from jaxlag._linalg._independent_rows import Choice, independent_rows, row_sizes
 from jaxlag._linalg._mass_solve import clearly_definite
-from jaxlag._linalg._projection import Surface
+from jaxlag._linalg._projection import ConstraintProjector
 from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
 from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import NO_ROWS, Baumgarte, Layout
@@ -140,7 +140,7 @@ class Dynamics(eqx.Module):
         back = Gaps(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
         onwards = self.turned(jnp.ones_like(ts[0]), args) > 0
         gaps = jax.tree.map(partial(jnp.where, onwards), ahead, back)
-        return args._replace(gaps=still(gaps))
+        return args._replace(gaps=stop_gradient(gaps))
 
     def _traced(self, inputs: Any) -> Any:
         return eqx.filter(inputs, _params.is_array)
@@ -172,7 +172,7 @@ class Dynamics(eqx.Module):
 
         Looked at as by `System.mass_regular`; a lane without values is none to be careful for.
         """
-        t, q, v, params = still((t, q, v, params))
+        t, q, v, params = stop_gradient((t, q, v, params))
         elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
         found = []
         for at, rates in ((q, v), tuple(jnp.asarray(elsewhere, q.dtype))):
@@ -184,7 +184,7 @@ class Dynamics(eqx.Module):
         """The rows to solve with; None where that is no question."""
         if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
-        t, q, v, params, values = still((t, q, v, params, values))
+        t, q, v, params, values = stop_gradient((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         sure = all(self.rows.sure)
         there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
@@ -199,7 +199,7 @@ class Dynamics(eqx.Module):
             return RowChoice(kept, size, void, Choice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
-            raise bad(
+            raise invalid(
                 "project",
                 "be True where forces read multipliers of Pfaffian rows beside holonomic ones, "
                 "whose phi would not be damped if they follow from these",
@@ -350,7 +350,7 @@ class Dynamics(eqx.Module):
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
         return self.turned(jnp.concatenate(rates), args)
 
-    def surface(self, tau: Array, y: Array, args: Arguments) -> Surface:
+    def surface(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
         """The constraints near a predicted state."""
         t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
         params, _ = self.given(args)
@@ -369,12 +369,12 @@ class Dynamics(eqx.Module):
 
         if self.quasi is not None:
             near, _ = corrections(holonomic)
-            return Surface(position, None, lambda c: near @ c, None)
+            return ConstraintProjector(position, None, lambda c: near @ c, None)
         K, masses = corrections(None)
         K_of_position = K
         if 0 < len(holonomic) < self.rows.size:
             K_of_position, _ = corrections(holonomic)
-        return Surface(
+        return ConstraintProjector(
             position if holonomic else None,
             lambda q, v: terms.velocity(t, q, v, params),
             lambda c: K_of_position @ c,

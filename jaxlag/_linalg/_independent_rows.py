@@ -118,7 +118,7 @@ def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
     return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
 
-def rows_hold(
+def redundant_rows_hold(
     A: Float[Array, "m n"],
     x: Float[Array, " n"],
     gamma: Callable[..., Array],

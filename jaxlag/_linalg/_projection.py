@@ -13,7 +13,7 @@ TARGET = 8.0  # roundings of the state below which a correction is not worth a t
 ACCEPTED = 0.6  # a state counts as consistent where its correction is below eps^this
 
 
-class Surface(NamedTuple):
+class ConstraintProjector(NamedTuple):
     """The constraints near a predicted state, as functions of vectors.
 
     Attributes:
@@ -34,7 +34,7 @@ class Surface(NamedTuple):
 
 
 def project(
-    surface: Surface, q: Array, v: Array, frozen: Surface | None = None
+    surface: ConstraintProjector, q: Array, v: Array, frozen: ConstraintProjector | None = None
 ) -> tuple[Array, Array, Bool[Array, ""]]:
     """The consistent (q, v) nearest to a predicted one, and whether it was found.
 
@@ -64,7 +64,9 @@ def project(
     return q, v, found & also
 
 
-def tangential(surface: Surface, q: Array, v: Array, dq: Array, dv: Array) -> tuple[Array, Array]:
+def tangential(
+    surface: ConstraintProjector, q: Array, v: Array, dq: Array, dv: Array
+) -> tuple[Array, Array]:
     """What is left of an error (dq, dv) when both states, with it and without, are projected.
 
     What is left is along the constraints, and of second order in the rest, by one turn of Newton's
@@ -86,7 +88,7 @@ def tangential(surface: Surface, q: Array, v: Array, dq: Array, dv: Array) -> tu
     return dq, dv - surface.kick(surface.velocity(q + dq, v + dv))
 
 
-def turns_needed(surface: Surface, q: Array, v: Array) -> Int[Array, ""]:
+def turns_needed(surface: ConstraintProjector, q: Array, v: Array) -> Int[Array, ""]:
     """The larger of the numbers of turns that `project` takes for q and for v."""
     count = jnp.zeros((), jnp.int32)
     if surface.position is not None:
@@ -98,7 +100,7 @@ def turns_needed(surface: Surface, q: Array, v: Array) -> Int[Array, ""]:
     return jnp.maximum(count, _iterate(_rates_at(surface, q), v)[2])
 
 
-def _rates_at(surface: Surface, q: Array) -> "_Equation":
+def _rates_at(surface: ConstraintProjector, q: Array) -> "_Equation":
     velocity, kick = surface.velocity, surface.kick
     assert velocity is not None
     assert kick is not None

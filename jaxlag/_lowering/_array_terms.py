@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._linalg._independent_rows import Choice, independent_rows, row_sizes, rows_hold, shared
+from jaxlag._linalg._independent_rows import (
+    Choice,
+    independent_rows,
+    redundant_rows_hold,
+    row_sizes,
+    shared,
+)
 from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._lowering._row_layout import layout
@@ -307,7 +313,9 @@ class ArrayTerms(Terms):
             def gamma(t: Array, q: Array, v: Array) -> Array:
                 return self.gamma(t, q, v, params)
 
-            fine = rows_hold(*still((A, a)), gamma, *still(((t, q, v), sizes, right, units)))
+            fine = redundant_rows_hold(
+                *still((A, a)), gamma, *still(((t, q, v), sizes, right, units))
+            )
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
     def multipliers(

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jax.extend.core import ClosedJaxpr
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
 from jaxlag._lowering._jaxpr._differentiate import gradient
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
@@ -120,7 +120,7 @@ def _examine(
     rows = examine(constraint.velocity, position, like, static, n, dtype)
     bent = [label for label, row in zip(labels, rows, strict=True) if not row.affine]
     if bent:
-        raise bad(
+        raise invalid(
             f"constraint {_listed(bent)}: residual",
             "be affine in v",
             "its slope depends on v, as far as its program tells",
@@ -128,7 +128,7 @@ def _examine(
         )
     empty = [label for label, row in zip(labels, rows, strict=True) if row.empty and not row.zero]
     if empty:
-        raise bad(
+        raise invalid(
             f"constraint {_listed(empty)}",
             "contain a coordinate",
             "none enters it: its row of A is zero",
@@ -167,7 +167,7 @@ def _checked(
         rows = examine(quasi.velocities, None, like, static, n, dtype, quasi.size)
         bent = [str(i) for i, row in enumerate(rows) if not row.affine]
         if bent:
-            raise bad(
+            raise invalid(
                 "QuasiVelocities: kinematics",
                 "be affine in u",
                 f"the slope of v[{bent[0]}] depends on u, as far as its program tells",
@@ -177,7 +177,7 @@ def _checked(
     rows = examine(quasi.of, None, like, static, n, dtype)
     bent = [name for name, row in zip(quasi.names, rows, strict=True) if not row.affine]
     if bent:
-        raise bad(
+        raise invalid(
             f"quasi-velocity {_listed(bent)}: U",
             "be affine in v",
             "its slope depends on v, as far as its program tells",
@@ -185,7 +185,7 @@ def _checked(
         )
     empty = [name for name, row in zip(quasi.names, rows, strict=True) if row.empty]
     if empty:
-        raise bad(f"quasi-velocity {_listed(empty)}: U", "contain a velocity", "none enters it")
+        raise invalid(f"quasi-velocity {_listed(empty)}: U", "contain a velocity", "none enters it")
 
 
 def _listed(labels: list[str]) -> str:

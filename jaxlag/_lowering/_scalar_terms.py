@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import Choice
-from jaxlag._linalg._projection import Surface
+from jaxlag._linalg._projection import ConstraintProjector
 from jaxlag._lowering._array_terms import ArrayTerms, Prepared
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
@@ -219,7 +219,7 @@ class ScalarTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: ScalarPrepared,
-    ) -> Surface:
+    ) -> ConstraintProjector:
         """The constraints near the state (q, v); positions alone near a (q, u)."""
         code = self._equations(q, params, inputs).surface
         assert code is not None
@@ -237,13 +237,15 @@ class ScalarTerms(Terms):
 
         shift = run("shift", q, v)
         if self.array.quasi is not None:
-            return Surface(position, None, times(shift.reshape(-1, n)), None)
+            return ConstraintProjector(position, None, times(shift.reshape(-1, n)), None)
         kick = shift if code.kick is None else run("kick", q, v)
         own, every = (len(c.results) for c in (code.position, code.velocity))
         shift, masses = shift[: own * n], kick[every * n :]
         shift, kick = shift.reshape(-1, n), kick[: every * n].reshape(-1, n)
         held = position if code.position.results else None
-        return Surface(held, partial(run, "velocity"), times(shift), times(kick), kick, masses)
+        return ConstraintProjector(
+            held, partial(run, "velocity"), times(shift), times(kick), kick, masses
+        )
 
     def multipliers(
         self,

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._forces import EXPLICIT_TIME, AbstractForce, reads_lam
 from jaxlag._tracing._signature import require_arity
-from jaxlag._tracing._traced_function import captured, once
+from jaxlag._tracing._traced_function import traced_function, traced_unless_module
 
 
 class AbstractConstraint(eqx.Module):
@@ -74,7 +74,7 @@ class Holonomic(AbstractConstraint):
     def __init__(self, phi: Callable, names: str | Sequence[str]) -> None:
         self.names = _names("Holonomic", names)
         require_arity(f"constraint {names!r}: phi", phi, ("t", "q", "params"))
-        self.phi = captured(phi)
+        self.phi = traced_function(phi)
 
     def position(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
@@ -115,7 +115,7 @@ class Pfaffian(AbstractConstraint):
     def __init__(self, residual: Callable, names: str | Sequence[str]) -> None:
         self.names = _names("Pfaffian", names)
         require_arity(f"constraint {names!r}: residual", residual, ("t", "q", "v", "params"))
-        self.residual = once(residual)
+        self.residual = traced_unless_module(residual)
 
     def velocity(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -146,7 +146,7 @@ class Baumgarte:
             value = getattr(self, name)
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if not number or not 0 <= value < float("inf"):
-                raise bad(
+                raise invalid(
                     f"Baumgarte: {name}", "be a number that is not negative", f"it was {value!r}"
                 )
 
@@ -155,13 +155,15 @@ def _names(kind: str, names: Any) -> str | tuple[str, ...]:
     given = (names,) if isinstance(names, str) else names
     fix = 'Write "rod", or ("x of pin", "y of pin") for two rows.'
     if not isinstance(given, Sequence) or not given:
-        raise bad(f"{kind}: names", "be a name or a sequence of names", f"it was {names!r}", fix)
+        raise invalid(
+            f"{kind}: names", "be a name or a sequence of names", f"it was {names!r}", fix
+        )
     for name in given:
         if not isinstance(name, str) or not name:
-            raise bad(f"{kind}: names", "be non-empty strings", f"one was {name!r}", fix)
+            raise invalid(f"{kind}: names", "be non-empty strings", f"one was {name!r}", fix)
         if name == EXPLICIT_TIME:
             must = "not contain that of the power of explicit time"
-            raise bad(f"{kind}: names", must, f"one was {name!r}", "Choose another name.")
+            raise invalid(f"{kind}: names", must, f"one was {name!r}", "Choose another name.")
     return names if isinstance(names, str) else tuple(given)
 
 
@@ -169,7 +171,7 @@ def _rows(constraint: AbstractConstraint, function: str, value: Any, dtype: Any)
     """What a residual returned, as one row of numbers; raises in our form while tracing."""
     argument = f"constraint {constraint.names!r}: {function}"
     if not eqx.is_array_like(value):
-        raise bad(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
+        raise invalid(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
     value = jnp.asarray(value)
     names = constraint.names
     count = None if isinstance(names, str) else len(names)
@@ -178,9 +180,11 @@ def _rows(constraint: AbstractConstraint, function: str, value: Any, dtype: Any)
         right = False
     if not right or not jnp.issubdtype(value.dtype, jnp.floating):
         must = "a scalar or a vector" if count is None else f"{count} numbers, one for each name"
-        raise bad(argument, f"return {must}", f"it returned {value.dtype} of shape {value.shape}")
+        raise invalid(
+            argument, f"return {must}", f"it returned {value.dtype} of shape {value.shape}"
+        )
     if value.size == 0:
-        raise bad(argument, "have at least one row", f"it returned shape {value.shape}")
+        raise invalid(argument, "have at least one row", f"it returned shape {value.shape}")
     return jnp.ravel(value).astype(dtype)
 
 
@@ -188,15 +192,15 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     """Constraints as a tuple; raises unless each is one of the classes here, names distinct."""
     if isinstance(constraints, AbstractConstraint):
         fix = "Write constraints=(constraint,)."
-        raise bad("constraints", "be a sequence", "it was a single constraint", fix)
+        raise invalid("constraints", "be a sequence", "it was a single constraint", fix)
     if not isinstance(constraints, Iterable):
         was, fix = f"it was {constraints!r}", "Leave it out where there are none."
-        raise bad("constraints", "be a sequence of constraints", was, fix)
+        raise invalid("constraints", "be a sequence of constraints", was, fix)
     constraints = tuple(constraints)
     names: list[str] = []
     for constraint in constraints:
         if not isinstance(constraint, AbstractConstraint):
-            raise bad(
+            raise invalid(
                 "constraints",
                 "contain Holonomic and Pfaffian objects",
                 f"one was {constraint!r}",
@@ -206,7 +210,7 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     for name in names:
         if names.count(name) > 1:
             was = f"{name!r} occurs {names.count(name)} times"
-            raise bad("constraints", "have distinct names", was)
+            raise invalid("constraints", "have distinct names", was)
     return constraints
 
 
@@ -219,14 +223,14 @@ def check_reactions(
     for name in names:
         if name in taken:
             was = f"{name!r} is the name of a force, too"
-            raise bad("constraints", "have names that no force bears", was)
+            raise invalid("constraints", "have names that no force bears", was)
     for force in filter(reads_lam, forces):
         if not constraints:
             was = "the system has none"
-            raise bad(f"force {force.name!r}", "have constraints whose lam it reads", was)
+            raise invalid(f"force {force.name!r}", "have constraints whose lam it reads", was)
         if force.contact is not None and force.contact not in names:
             was = f"it was {force.contact!r}"
-            raise bad(f"force {force.name!r}: contact", f"be among {names}", was)
+            raise invalid(f"force {force.name!r}: contact", f"be among {names}", was)
 
 
 class Layout(NamedTuple):

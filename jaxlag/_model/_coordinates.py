@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._core._arrays import of_state
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 class Coordinates:
@@ -26,24 +26,28 @@ class Coordinates:
     def __init__(self, declared: Sequence[str] | Mapping[str, tuple[int, ...] | int]) -> None:
         fix = 'Write coordinates=("x", "theta") or {"x": (8, 3), "theta": ()}.'
         if isinstance(declared, str) or not isinstance(declared, Sequence | Mapping):
-            raise bad("coordinates", "be names, or names with shapes", f"it was {declared!r}", fix)
+            raise invalid(
+                "coordinates", "be names, or names with shapes", f"it was {declared!r}", fix
+            )
         items = (
             list(declared.items())
             if isinstance(declared, Mapping)
             else [(name, ()) for name in declared]
         )
         if not items:
-            raise bad("coordinates", "name at least one coordinate", "it was empty", fix)
+            raise invalid("coordinates", "name at least one coordinate", "it was empty", fix)
         items = [(name, (s,) if _is_count(s) else s) for name, s in items]
         for name, shape in items:
             if not isinstance(name, str) or not name:
-                raise bad("coordinates", "be non-empty strings", f"one was {name!r}", fix)
+                raise invalid("coordinates", "be non-empty strings", f"one was {name!r}", fix)
             if not isinstance(shape, tuple) or not all(map(_is_count, shape)):
-                raise bad(f"coordinates[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix)
+                raise invalid(
+                    f"coordinates[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix
+                )
         names = [name for name, _ in items]
         for name in names:
             if names.count(name) > 1:
-                raise bad(
+                raise invalid(
                     "coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times"
                 )
         shapes: dict[str, Any] = dict(items)
@@ -76,22 +80,24 @@ class Coordinates:
     def part(self, x: Array, name: str) -> Array:
         """The part of x, shape (..., n), that belongs to one coordinate."""
         if name not in self.shapes:
-            raise bad("name", f"be one of {list(self.names)}", f"it was {name!r}")
+            raise invalid("name", f"be one of {list(self.names)}", f"it was {name!r}")
         return self.unflatten(x)[name]
 
     def flatten(self, parts: Mapping[str, Any], argument: str = "q") -> Array:
         """Inverse of `unflatten` for a single state: dict of named values to shape (n,)."""
         if set(parts) != set(self.shapes):
-            raise bad(argument, f"name exactly {list(self.shapes)}", f"it named {list(parts)}")
+            raise invalid(argument, f"name exactly {list(self.shapes)}", f"it named {list(parts)}")
         rows = []
         for name, shape in self.shapes.items():
             try:
                 part = jnp.asarray(parts[name])
             except (TypeError, ValueError) as error:
                 was = f"it was {parts[name]!r}"
-                raise bad(f"{argument}[{name!r}]", "be numeric", was) from error
+                raise invalid(f"{argument}[{name!r}]", "be numeric", was) from error
             if part.shape != shape:
-                raise bad(f"{argument}[{name!r}]", f"have shape {shape}", f"it was {part.shape}")
+                raise invalid(
+                    f"{argument}[{name!r}]", f"have shape {shape}", f"it was {part.shape}"
+                )
             rows.append(part.reshape(-1))
         return jnp.concatenate([row.astype(jnp.result_type(*rows)) for row in rows])
 
@@ -128,13 +134,13 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     try:
         x = jnp.asarray(x)
     except (TypeError, ValueError) as error:
-        raise bad(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
+        raise invalid(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
     if n == 1 and x.shape == ():
         x = x[None]
     if x.shape != (n,):
-        raise bad(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
+        raise invalid(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
-        raise bad(argument, "be real", f"its dtype was {x.dtype}")
+        raise invalid(argument, "be real", f"its dtype was {x.dtype}")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import accepts, gradient, require_arity, wants
-from jaxlag._tracing._traced_function import captured
+from jaxlag._tracing._traced_function import traced_function
 
 EXPLICIT_TIME = "explicit time"
 """Name of the power -dL/dt at fixed (q, v), which no force may bear."""
@@ -21,9 +21,11 @@ _ARGUMENTS = ("t", "q", "v", "params", "inputs")
 
 def _require_name(kind: str, name: object) -> None:
     if not isinstance(name, str) or not name:
-        raise bad(f"{kind}: name", "be a non-empty string", f"it was {name!r}")
+        raise invalid(f"{kind}: name", "be a non-empty string", f"it was {name!r}")
     if name == EXPLICIT_TIME:
-        raise bad(f"{kind}: name", "not be that of the power of explicit time", f"it was {name!r}")
+        raise invalid(
+            f"{kind}: name", "not be that of the power of explicit time", f"it was {name!r}"
+        )
 
 
 def _takes_inputs(argument: str, function: Callable) -> bool:
@@ -36,10 +38,10 @@ def _takes_inputs(argument: str, function: Callable) -> bool:
 def _real(argument: str, value: Any) -> Array:
     """A real array, or an error in our form while tracing."""
     if not eqx.is_array_like(value):
-        raise bad(argument, "return an array", f"it returned {value!r}")
+        raise invalid(argument, "return an array", f"it returned {value!r}")
     value = jnp.asarray(value)
     if not jnp.issubdtype(value.dtype, jnp.floating):
-        raise bad(argument, "return real numbers", f"it returned {value.dtype}")
+        raise invalid(argument, "return real numbers", f"it returned {value.dtype}")
     return value
 
 
@@ -116,13 +118,15 @@ class GeneralizedForce(AbstractForce):
             for other, value in (("contact", contact), ("sliding", sliding)):
                 if value is not None:
                     fix = "Write reaction=True and let Q take lam as its last argument."
-                    raise bad(f"{argument}: {other}", "be left out", "reaction was False", fix)
+                    raise invalid(f"{argument}: {other}", "be left out", "reaction was False", fix)
         if contact is not None and (not isinstance(contact, str) or not contact):
-            raise bad(f"{argument}: contact", "be the name of a constraint", f"it was {contact!r}")
+            raise invalid(
+                f"{argument}: contact", "be the name of a constraint", f"it was {contact!r}"
+            )
         if sliding is not None:
             require_arity(f"{argument}: sliding", sliding, ("t", "q", "v", "params"))
-        self.Q, self.name, self.reaction = captured(Q), name, reaction
-        self.contact, self.sliding = contact, None if sliding is None else captured(sliding)
+        self.Q, self.name, self.reaction = traced_function(Q), name, reaction
+        self.contact, self.sliding = contact, None if sliding is None else traced_function(sliding)
 
     def __call__(
         self,
@@ -169,7 +173,11 @@ class PointForce(AbstractForce):
         _require_name("PointForce", name)
         require_arity(f"force {name!r}: position", position, ("t", "q", "params"))
         self.takes_inputs = _takes_inputs(f"force {name!r}: force", force)
-        self.position, self.force, self.name = captured(position), captured(force), name
+        self.position, self.force, self.name = (
+            traced_function(position),
+            traced_function(force),
+            name,
+        )
 
     def __call__(
         self,
@@ -183,7 +191,7 @@ class PointForce(AbstractForce):
         argument = f"force {self.name!r}: position"
         r, pull = jax.vjp(lambda q: _real(argument, self.position(t, q, params)), q)
         if r.ndim == 0 or r.shape[-1] not in (1, 2, 3):
-            raise bad(
+            raise invalid(
                 argument,
                 "return 1, 2 or 3 components along its last axis",
                 f"it returned shape {r.shape}",
@@ -227,7 +235,10 @@ class Couple(AbstractForce):
         arguments = ("t", "q", "v", "params")
         require_arity(f"couple {name!r}: angular_velocity", angular_velocity, arguments)
         self.takes_inputs = _takes_inputs(f"couple {name!r}: torque", torque)
-        self.angular_velocity, self.torque = captured(angular_velocity), captured(torque)
+        self.angular_velocity, self.torque = (
+            traced_function(angular_velocity),
+            traced_function(torque),
+        )
         self.name = name
 
     def __call__(
@@ -246,9 +257,11 @@ class Couple(AbstractForce):
 
         w, pull = jax.vjp(rate, v)
         if w.ndim > 0 and w.shape[-1] != 3:
-            raise bad(argument, "return 3 components or a scalar", f"it returned shape {w.shape}")
+            raise invalid(
+                argument, "return 3 components or a scalar", f"it returned shape {w.shape}"
+            )
         if not _affine(rate, v, w):
-            raise bad(
+            raise invalid(
                 argument,
                 "be affine in v",
                 "its derivative dw/dv depends on v, as far as its program tells",
@@ -270,7 +283,7 @@ def _like(argument: str, value: Any, conjugate: Array) -> Array:
     """A real array in the shape and precision of what it does work on."""
     value = _real(argument, value)
     if value.shape != conjugate.shape:
-        raise bad(argument, f"return shape {conjugate.shape}", f"it returned {value.shape}")
+        raise invalid(argument, f"return shape {conjugate.shape}", f"it returned {value.shape}")
     return value.astype(conjugate.dtype)  # time is float64 where x64 is on, whatever q is
 
 
@@ -294,7 +307,7 @@ class Rayleigh(AbstractForce):
     def __init__(self, R: Callable, name: str = "rayleigh") -> None:
         _require_name("Rayleigh", name)
         require_arity(f"Rayleigh {name!r}: R", R, ("t", "q", "v", "params"))
-        self.R, self.name = captured(R), name
+        self.R, self.name = traced_function(R), name
 
     def __call__(
         self,
@@ -311,15 +324,17 @@ class Rayleigh(AbstractForce):
 def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
     """Forces as a tuple; raises unless each is one of the classes here, under a name of its own."""
     if isinstance(forces, AbstractForce):
-        raise bad("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
+        raise invalid("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
     if not isinstance(forces, Iterable):
         was = f"it was {forces!r}"
-        raise bad("forces", "be a sequence of forces", was, "Leave it out where there are none.")
+        raise invalid(
+            "forces", "be a sequence of forces", was, "Leave it out where there are none."
+        )
     forces = tuple(forces)
     names: list[str] = []
     for force in forces:
         if not isinstance(force, AbstractForce):
-            raise bad(
+            raise invalid(
                 "forces",
                 "contain PointForce, Couple, GeneralizedForce and Rayleigh objects",
                 f"one was {force!r}",
@@ -328,7 +343,9 @@ def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
         names.append(force.name)
     for name in names:
         if names.count(name) > 1:
-            raise bad("forces", "have distinct names", f"{name!r} occurs {names.count(name)} times")
+            raise invalid(
+                "forces", "have distinct names", f"{name!r} occurs {names.count(name)} times"
+            )
     return forces
 
 
@@ -356,8 +373,8 @@ def components(
     Q = force(*state, lam) if isinstance(force, GeneralizedForce) else force(*state)
     must = f"return {q.shape[0]} real components, one per coordinate"
     if not eqx.is_array_like(Q):
-        raise bad(f"force {force.name!r}", "return an array", f"it returned {Q!r}")
+        raise invalid(f"force {force.name!r}", "return an array", f"it returned {Q!r}")
     Q = jnp.asarray(Q)
     if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
-        raise bad(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
+        raise invalid(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
     return Q.astype(q.dtype)  # time is float64 where x64 is on, whatever the state is

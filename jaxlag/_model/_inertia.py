@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import common, concrete, real
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 def stated(*values: Any) -> AbstractContextManager:
@@ -26,7 +26,7 @@ def number(argument: str, x: Any) -> Array:
     with stated(x):
         x = real(argument, x)
     if x.ndim != 0:
-        raise bad(argument, "be a number", f"its shape was {x.shape}")
+        raise invalid(argument, "be a number", f"its shape was {x.shape}")
     return x
 
 
@@ -36,7 +36,7 @@ def place(argument: str, x: Any) -> Array:
         x = real(argument, x)
     if x.shape != (3,):
         must, was = "be a vector of 3 components", f"its shape was {x.shape}"
-        raise bad(argument, must, was, "Planar bodies: (x, y, 0).")
+        raise invalid(argument, must, was, "Planar bodies: (x, y, 0).")
     return x
 
 
@@ -49,7 +49,7 @@ def matrix(argument: str, inertia: Any) -> Array:
             return jnp.asarray(xp.diag(x))
     if x.shape != (3, 3):
         must, was = "be (3, 3), or (3,) principal moments", f"its shape was {x.shape}"
-        raise bad(argument, must, was, "Planar bodies: (0, 0, Iz).")
+        raise invalid(argument, must, was, "Planar bodies: (0, 0, Iz).")
     return x
 
 
@@ -75,15 +75,15 @@ def check_mass(argument: str, mass: Array) -> None:
     if not concrete(mass):
         return
     if not np.isfinite(float(mass)):
-        raise bad(argument, "be finite", f"it was {mass} kg")
+        raise invalid(argument, "be finite", f"it was {mass} kg")
     if float(mass) < 0:  # a float, for comparing arrays is traced
-        raise bad(argument, "not be negative", f"it was {mass} kg")
+        raise invalid(argument, "not be negative", f"it was {mass} kg")
 
 
 def check_finite(argument: str, x: Array) -> None:
     """Raise unless an array with values is finite."""
     if concrete(x) and not np.all(np.isfinite(x)):
-        raise bad(argument, "be finite", f"it was {np.asarray(x).tolist()}")
+        raise invalid(argument, "be finite", f"it was {np.asarray(x).tolist()}")
 
 
 def check_inertia(argument: str, inertia: Float[Array, "3 3"]) -> None:
@@ -96,10 +96,10 @@ def check_inertia(argument: str, inertia: Float[Array, "3 3"]) -> None:
     if not np.all(np.abs(J - J.T) <= slack):
         i, j = np.unravel_index(np.argmax(np.abs(J - J.T)), (3, 3))
         was = f"element ({i}, {j}) was {J[i, j]} and ({j}, {i}) was {J[j, i]}"
-        raise bad(argument, "be symmetric", was, "Use energy.inertia_matrix.")
+        raise invalid(argument, "be symmetric", was, "Use energy.inertia_matrix.")
     moments, axes = np.linalg.eigh(J)
     if not moments[0] >= -slack:
-        raise bad(
+        raise invalid(
             argument,
             "have no negative principal moment",
             f"its eigenvalue about the axis {_axis(axes[:, 0])} was {moments[0]:.6g} kg m^2",
@@ -126,7 +126,7 @@ def check_about_origin(argument: str, inertia: Array, mass: Array, centre: Array
         return
     axis = np.zeros(3)
     axis[turning] = axes[:, 0]
-    raise bad(
+    raise invalid(
         argument,
         "be at least that of the mass at its centre, m (|c|^2 E - c c^T)",
         f"what is left, the inertia about the mass centre, has the eigenvalue {moments[0]:.6g} "

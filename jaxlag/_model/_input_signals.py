@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._closure_params import plain
 from jaxlag._tracing._signature import accepts, require_arity, wants
-from jaxlag._tracing._traced_function import Captured, once
+from jaxlag._tracing._traced_function import TracedFunction, traced_unless_module
 
 
 class AbstractInput(eqx.Module):
@@ -78,13 +78,13 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
     times, values = _inexact(times), _inexact(values)
     _increasing(f"{kind}: times", times, 2)
     if values.ndim < 1 or values.shape[0] != times.shape[0]:
-        raise bad(
+        raise invalid(
             f"{kind}: values",
             f"have one entry per time, {times.shape[0]}",
             f"its shape was {values.shape}",
         )
     if concrete(values) and not np.all(np.isfinite(values)):
-        raise bad(f"{kind}: values", "be finite", "some were nan or inf")
+        raise invalid(f"{kind}: values", "be finite", "some were nan or inf")
     return times, values
 
 
@@ -92,12 +92,12 @@ def _increasing(argument: str, times: Array, least: int) -> Array:
     """Times as they are; raises unless there are so many and they increase, as far as is known."""
     if times.ndim != 1 or times.shape[0] < least:
         must = f"be one row of at least {least} times"
-        raise bad(argument, must, f"its shape was {times.shape}")
+        raise invalid(argument, must, f"its shape was {times.shape}")
     if concrete(times):
         steps = np.diff(np.asarray(times, float))
         if not np.all(steps > 0):
             i, name = int(np.argmin(steps > 0)), argument.split()[-1]
-            raise bad(
+            raise invalid(
                 argument,
                 "increase strictly",
                 f"{name}[{i}] = {times[i]} and {name}[{i + 1}] = {times[i + 1]}",
@@ -198,8 +198,8 @@ def _slope(f: Callable, t: Array) -> Array:
 
 
 def _called(f: Callable, params: Any, *arguments: Any) -> Any:
-    if isinstance(f, Captured):
-        return f.beside(params, *arguments)
+    if isinstance(f, TracedFunction):
+        return f.call_with_closure(params, *arguments)
     return f(*map(plain, arguments))
 
 
@@ -229,7 +229,7 @@ class Function(AbstractInput):
     def __init__(self, f: Callable, knots: Any = None) -> None:
         self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
         require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
-        self.f = once(f)
+        self.f = traced_unless_module(f)
         self.ends = None
         if knots is not None:
             times = _increasing("Function: knots", _inexact(knots), 1)
@@ -303,7 +303,7 @@ class Feedback(AbstractInput):
 
     def __init__(self, f: Callable) -> None:
         require_arity("Feedback: f", f, ("t", "q", "v", "params"))
-        self.f = once(f)
+        self.f = traced_unless_module(f)
 
     def value(
         self,

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._input_signals import (
     AbstractInput,
     AbstractTable,
@@ -32,14 +32,16 @@ def check_inputs(inputs: Any) -> dict[str, Any]:
     if inputs is None:
         return {}
     if not isinstance(inputs, Mapping) or not all(isinstance(k, str) for k in inputs):
-        raise bad("inputs", "be a dict from names to input objects or arrays", f"it was {inputs!r}")
+        raise invalid(
+            "inputs", "be a dict from names to input objects or arrays", f"it was {inputs!r}"
+        )
     checked = {}
     for name, signal in inputs.items():
         if isinstance(signal, AbstractInput):
             checked[name] = signal
             continue
         if callable(signal):
-            raise bad(
+            raise invalid(
                 f"inputs[{name!r}]",
                 "be an input object or an array",
                 f"it was the function {signal!r}",
@@ -49,7 +51,7 @@ def check_inputs(inputs: Any) -> dict[str, Any]:
             checked[name] = jnp.asarray(signal)
         except (TypeError, ValueError) as error:
             must = "be an input object or an array"
-            raise bad(f"inputs[{name!r}]", must, f"it was {signal!r}") from error
+            raise invalid(f"inputs[{name!r}]", must, f"it was {signal!r}") from error
     return checked
 
 
@@ -187,7 +189,7 @@ def check_range(inputs: Mapping[str, Any], times: Any, argument: str = "ts") -> 
     low, high = float(np.min(times)), float(np.max(times))
     if low < first or high > last:
         asked = f"from {low} to {high} s" if low < high else f"{low} s"
-        raise bad(
+        raise invalid(
             "inputs",
             f"cover {argument}, {asked}",
             f"their tables cover {first} to {last} s",

@@ -12,12 +12,12 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import real
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._linalg._independent_rows import row_sizes
 from jaxlag._model._constraints import Pfaffian
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import require_arity
-from jaxlag._tracing._traced_function import captured
+from jaxlag._tracing._traced_function import traced_function
 
 # Least sine of the angle between a row of dU/dv and those before it, in roundings.
 SINE = 64
@@ -77,24 +77,24 @@ class QuasiVelocities(eqx.Module):
         if (U is None) == (kinematics is None):
             was = "it got neither" if U is None else "it got both"
             fix = "Write U(t, q, v, params), or kinematics=f with f(t, q, u, params)."
-            raise bad("QuasiVelocities", "get either U or kinematics", was, fix)
+            raise invalid("QuasiVelocities", "get either U or kinematics", was, fix)
         if U is not None:
             require_arity("QuasiVelocities: U", U, ("t", "q", "v", "params"))
         if kinematics is not None:
             form = ("t", "q", "u", "params")
             require_arity("QuasiVelocities: kinematics", kinematics, form)
-        self.U = None if U is None else captured(U)
-        self.kinematics = None if kinematics is None else captured(kinematics)
+        self.U = None if U is None else traced_function(U)
+        self.kinematics = None if kinematics is None else traced_function(kinematics)
         self.names = _names("names", names)
         self.constrained = _names("constrained", constrained)
         if not self.names:
-            raise bad("QuasiVelocities: names", "name at least one", "it was empty")
+            raise invalid("QuasiVelocities: names", "name at least one", "it was empty")
         for name in self.constrained:
             if name not in self.names:
                 must, was = f"be among the names {list(self.names)}", f"one was {name!r}"
-                raise bad("QuasiVelocities: constrained", must, was)
+                raise invalid("QuasiVelocities: constrained", must, was)
         if len(self.constrained) == len(self.names):
-            raise bad("QuasiVelocities: constrained", "leave something that moves", "all were")
+            raise invalid("QuasiVelocities: constrained", "leave something that moves", "all were")
 
     @property
     def size(self) -> int:
@@ -274,12 +274,12 @@ class QuasiVelocities(eqx.Module):
                 must = f"name {needed}" + (
                     f", may name {list(self.constrained)}," * bool(self.constrained)
                 )
-                raise bad(argument, f"{must} and nothing else", f"it named {list(u)}")
+                raise invalid(argument, f"{must} and nothing else", f"it named {list(u)}")
             u = [u.get(name, 0.0) for name in self.names]
         x = real(argument, u)
         if x.shape != (self.size,):
             fix = f"Give one entry for each of {list(self.names)}, constrained ones included."
-            raise bad(argument, f"have shape ({self.size},)", f"its shape was {x.shape}", fix)
+            raise invalid(argument, f"have shape ({self.size},)", f"its shape was {x.shape}", fix)
         return x
 
     def full(self, w: Float[Array, " r"]) -> Float[Array, " k"]:
@@ -307,12 +307,12 @@ class QuasiVelocities(eqx.Module):
     def _checked(self, function: str, value: Any, size: int, dtype: Any) -> Array:
         argument = f"QuasiVelocities: {function}"
         if not eqx.is_array_like(value):
-            raise bad(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
+            raise invalid(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
         value = jnp.asarray(value)
         if value.shape != (size,) or not jnp.issubdtype(value.dtype, jnp.floating):
             of = "name" if function == "U" else "coordinate"
             must = f"return {size} numbers, one for each {of}"
-            raise bad(argument, must, f"it returned {value.dtype} of shape {value.shape}")
+            raise invalid(argument, must, f"it returned {value.dtype} of shape {value.shape}")
         return value.astype(dtype)
 
 
@@ -345,13 +345,15 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
     """
     if not isinstance(quasi, QuasiVelocities):
         must, fix = "be a jl.QuasiVelocities", "Write jl.QuasiVelocities(U, names)."
-        raise bad("quasi", must, f"it was {quasi!r}", fix)
+        raise invalid("quasi", must, f"it was {quasi!r}", fix)
     for name in quasi.names:
         if name in taken:
-            raise bad("quasi: names", "be names of their own", f"{name!r} is {taken[name]}, too")
+            raise invalid(
+                "quasi: names", "be names of their own", f"{name!r} is {taken[name]}, too"
+            )
     k = quasi.size
     if quasi.kinematics is None and k != n:
-        raise bad(
+        raise invalid(
             "quasi: names",
             f"be as many as there are coordinates, {n}, so that v follows from u",
             f"there were {k}",
@@ -359,7 +361,7 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
             "v follows from u by kinematics=.",
         )
     if k > n:
-        raise bad("quasi: names", f"be no more than the {n} coordinates", f"there were {k}")
+        raise invalid("quasi: names", f"be no more than the {n} coordinates", f"there were {k}")
 
 
 def _sines(columns: Float[Array, "n k"]) -> Float[Array, " k"]:
@@ -440,10 +442,10 @@ def _names(argument: str, names: Any) -> tuple[str, ...]:
     fix = 'Write names=("wx", "wy", "wz").'
     argument = f"QuasiVelocities: {argument}"
     if isinstance(names, str) or not isinstance(names, Sequence):
-        raise bad(argument, "be a sequence of names", f"it was {names!r}", fix)
+        raise invalid(argument, "be a sequence of names", f"it was {names!r}", fix)
     for name in names:
         if not isinstance(name, str) or not name:
-            raise bad(argument, "be non-empty strings", f"one was {name!r}", fix)
+            raise invalid(argument, "be non-empty strings", f"one was {name!r}", fix)
         if names.count(name) > 1:
-            raise bad(argument, "be distinct", f"{name!r} occurs {names.count(name)} times")
+            raise invalid(argument, "be distinct", f"{name!r} occurs {names.count(name)} times")
     return tuple(names)

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete, of_state
 from jaxlag._core._batching import at_most
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._gradient._modes import MODES
 from jaxlag._integration._change_points import CHANGE_POINTS
 from jaxlag._linalg._kkt import FORMULATIONS
@@ -32,47 +32,51 @@ def check_options(
 ) -> None:
     """Raise on options that no value of the traced arguments could make right."""
     if not isinstance(system, System):
-        raise bad("system", "be a jl.System", f"it was {system!r}")
+        raise invalid("system", "be a jl.System", f"it was {system!r}")
     if gradient not in MODES:
-        raise bad("gradient", f"be one of {', '.join(map(repr, MODES))}", f"it was {gradient!r}")
+        raise invalid(
+            "gradient", f"be one of {', '.join(map(repr, MODES))}", f"it was {gradient!r}"
+        )
     number = isinstance(gradient_memory, int | float | np.integer | np.floating)
     if gradient_memory is not None and (not number or not gradient_memory > 0):
         was = f"it was {gradient_memory!r}"
-        raise bad("gradient_memory", "be a positive number of bytes or None", was)
+        raise invalid("gradient_memory", "be a positive number of bytes or None", was)
     if not isinstance(assemble, bool):
-        raise bad("assemble", "be True or False", f"it was {assemble!r}")
+        raise invalid("assemble", "be True or False", f"it was {assemble!r}")
     if not isinstance(project, bool | Baumgarte):
         must = "be True, False or a jl.Baumgarte(alpha, beta)"
-        raise bad("project", must, f"it was {project!r}")
+        raise invalid("project", must, f"it was {project!r}")
     if isinstance(project, Baumgarte) and not system.constraints:
-        raise bad("project", "be True for a system without constraints", f"it was {project!r}")
+        raise invalid("project", "be True for a system without constraints", f"it was {project!r}")
     if isinstance(save, str):
-        raise bad("save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},).")
+        raise invalid(
+            "save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},)."
+        )
     if not isinstance(save, Sequence):
-        raise bad("save", "be a sequence of names", f"it was {save!r}")
+        raise invalid("save", "be a sequence of names", f"it was {save!r}")
     for name in save:
         if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
             known = [*QUANTITIES, "work"]
-            raise bad("save", f"name quantities among {known}", f"one was {name!r}")
+            raise invalid("save", f"name quantities among {known}", f"one was {name!r}")
         if name == "u" and system.quasi is None:
             must, was = "name what the system has", "one was 'u' without quasi-velocities"
-            raise bad("save", must, was, "Declare the system with quasi=.")
+            raise invalid("save", must, was, "Declare the system with quasi=.")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
-            raise bad(
+            raise invalid(
                 "save",
                 "name energies that the system declares",
                 f"one was {name!r}",
                 "Declare the system with kinetic= and potential=.",
             )
     if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
+        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
 
 
 def check_change_points(change_points: Any) -> None:
     """Raise unless it is one of the words."""
     if change_points not in CHANGE_POINTS:
         must = f"be one of {', '.join(map(repr, CHANGE_POINTS))}"
-        raise bad("change_points", must, f"it was {change_points!r}")
+        raise invalid("change_points", must, f"it was {change_points!r}")
 
 
 def check_formulation(
@@ -100,7 +104,7 @@ def check_formulation(
             known.append("quasi")
     if formulation not in known:
         must = f"be among {tuple(known)}" if len(known) > 1 else "be 'auto'"
-        raise bad("formulation", must, f"it was {formulation!r}", why)
+        raise invalid("formulation", must, f"it was {formulation!r}", why)
     if formulation != "auto":
         return formulation
     if quasi is None or "quasi" not in known:
@@ -116,10 +120,12 @@ def check_start(
     """(q0, v0, u0) as arrays of one dtype; one of v0 and u0 is None."""
     if (v0 is None) == (u0 is None):
         was = "neither was given" if v0 is None else "both were given"
-        raise bad("v0 and u0", "be given one at a time", was, "Pass v0=, the velocities at ts[0].")
+        raise invalid(
+            "v0 and u0", "be given one at a time", was, "Pass v0=, the velocities at ts[0]."
+        )
     quasi = system.quasi
     if u0 is not None and quasi is None:
-        raise bad(
+        raise invalid(
             "u0",
             "be given for a system with quasi-velocities only",
             "this system has none",
@@ -133,7 +139,7 @@ def check_start(
     for argument, values, words in (("q0", q0, system.coordinates.labels), (name, x, labels)):
         if concrete(values) and not np.all(np.isfinite(values)):
             i = int(np.argmin(np.isfinite(values)))
-            raise bad(argument, "be finite", f"{argument}[{i}] ({words[i]!r}) was {values[i]}")
+            raise invalid(argument, "be finite", f"{argument}[{i}] ({words[i]!r}) was {values[i]}")
     q0, x = of_state(f"q0 and {name}", q0, x)
     return (q0, None, x) if name == "u0" else (q0, x, None)
 
@@ -146,28 +152,28 @@ def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
         if any(jnp.issubdtype(given.dtype, kind) for kind in kinds):
             return given.astype(dtype)
     except (TypeError, ValueError) as error:
-        raise bad(argument, must, f"it was {x!r}") from error
-    raise bad(argument, must, f"it was {x!r}", "Only real numbers will do.")
+        raise invalid(argument, must, f"it was {x!r}") from error
+    raise invalid(argument, must, f"it was {x!r}", "Only real numbers will do.")
 
 
 def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
-        raise bad("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
+        raise invalid("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number("ts", "be one row of times", ts, jnp.result_type(float))
     if ts.ndim != 1 or not at_most(2, ts.shape[0]):
         fix = ""
         if ts.ndim == 1 and not isinstance(ts.shape[0], int):
             fix = f'Write jax.export.symbolic_shape("k", constraints=["{ts.shape[0]} >= 2"]).'
-        raise bad("ts", "be one row of at least 2 times", f"its shape was {ts.shape}", fix)
+        raise invalid("ts", "be one row of at least 2 times", f"its shape was {ts.shape}", fix)
     if not concrete(ts):
         return ts, None
     if not np.all(np.isfinite(ts)):
-        raise bad("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(ts)))}] was not")
+        raise invalid("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(ts)))}] was not")
     steps = np.diff(ts)
     direction = 1 if ts[-1] >= ts[0] else -1
     if not np.all(steps * direction > 0):
         i = int(np.argmin(steps * direction > 0))
-        raise bad(
+        raise invalid(
             "ts",
             "be strictly monotone",
             f"ts[{i}] = {ts[i]}, ts[{i + 1}] = {ts[i + 1]}",
@@ -180,14 +186,16 @@ def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
     """Raise where two arguments would set the same thing."""
     tolerances = rtol is not None or atol is not None
     if dt is not None and tolerances:
-        raise bad("rtol and atol", "be left out with fixed steps", "dt was given too")
+        raise invalid("rtol and atol", "be left out with fixed steps", "dt was given too")
     if not isinstance(method, tuple):
         return
     if tolerances:
-        raise bad("rtol and atol", "be left out when method brings a controller", "both were given")
+        raise invalid(
+            "rtol and atol", "be left out when method brings a controller", "both were given"
+        )
     for name in ("step_ts", "jump_ts"):
         if getattr(method[-1], name, None) is not None:
-            raise bad(
+            raise invalid(
                 "method[1]",
                 "leave times to the inputs",
                 f"it had {name}",
@@ -212,15 +220,15 @@ def check_tolerances(
         if x.ndim != 0 and (name == "rtol" or x.shape != (system.size,)):
             or_each = f", or one for each of {system.size} coordinates" * (name == "atol")
             must = f"be a number{or_each}"
-            raise bad(name, must, f"its shape was {x.shape}")
+            raise invalid(name, must, f"its shape was {x.shape}")
         if concrete(x) and not np.all(np.isfinite(x) & (x >= 0)):
-            raise bad(name, "be finite and not negative", f"it was {x}")
+            raise invalid(name, "be finite and not negative", f"it was {x}")
     if concrete(rtol, atol):
         if rtol == 0 and np.any(atol == 0):
-            raise bad("rtol and atol", "not both be zero", "both were")
+            raise invalid("rtol and atol", "not both be zero", "both were")
         least = 10 * jnp.finfo(dtype).eps
         if 0 < rtol < least:
-            raise bad(
+            raise invalid(
                 "rtol",
                 f"be 0 or at least {least:.1e}, ten roundings of {jnp.dtype(dtype).name}",
                 f"it was {rtol:g}",
@@ -238,14 +246,14 @@ def check_tolerances(
 def check_longest(dt: Any, dt_max: Any) -> Any:
     """The bound on adaptive steps, None for none."""
     if dt is not None and dt_max is not None:
-        raise bad("dt_max", "be left out with fixed steps", "dt was given too")
+        raise invalid("dt_max", "be left out with fixed steps", "dt was given too")
     return None if dt_max is None else _positive("dt_max", dt_max)
 
 
 def check_step(dt: Any, dt0: Any) -> Any:
     """The fixed step, or the first one; None where neither is given."""
     if dt is not None and dt0 is not None:
-        raise bad("dt and dt0", "be given one at a time", "both were given")
+        raise invalid("dt and dt0", "be given one at a time", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
     return None if step is None else _positive(name, step)
 
@@ -253,7 +261,7 @@ def check_step(dt: Any, dt0: Any) -> Any:
 def _positive(name: str, step: Any) -> Any:
     step = _number(name, "be a number", step, jnp.result_type(float))
     if step.ndim != 0:
-        raise bad(name, "be a number", f"its shape was {step.shape}")
+        raise invalid(name, "be a number", f"its shape was {step.shape}")
     if concrete(step) and not (np.isfinite(step) and step > 0):
-        raise bad(name, "be positive, whichever way time runs", f"it was {step}")
+        raise invalid(name, "be positive, whichever way time runs", f"it was {step}")
     return step

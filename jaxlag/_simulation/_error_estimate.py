@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._simulation._solution import Solution
 
 # Room for what is left of the error in the finer motion.
@@ -21,10 +21,10 @@ ROUNDED = 32.0
 def check_estimate(estimate_error: Any, method: Any) -> None:
     """Raise where there is no finer motion to be had."""
     if not isinstance(estimate_error, bool):
-        raise bad("estimate_error", "be True or False", f"it was {estimate_error!r}")
+        raise invalid("estimate_error", "be True or False", f"it was {estimate_error!r}")
     if estimate_error and isinstance(method, tuple):
         must = "be False for a method with a controller of its own"
-        raise bad("estimate_error", must, "it was True", "Pass rtol= and atol=, or dt=.")
+        raise invalid("estimate_error", must, "it was True", "Pass rtol= and atol=, or dt=.")
 
 
 def finer(rtol: Any, atol: Any, step: Any, fixed: bool) -> tuple[Any, Any, Any]:

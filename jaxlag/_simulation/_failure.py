@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arrays import concrete, still
+from jaxlag._core._arrays import concrete, stop_gradient
 from jaxlag._core._status import Status
 from jaxlag._integration._initial_conditions import Start, residuals
 from jaxlag._integration._record import Outcome, Times
@@ -68,7 +68,7 @@ def ended(
     status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
     status = jnp.where(begun.valid, status, int(Status.bad_value))
 
-    faults, n = ~jnp.isfinite(still(y0)), dynamics.system.size
+    faults, n = ~jnp.isfinite(stop_gradient(y0)), dynamics.system.size
     start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
     # Of quasi-velocities it would be no coordinate.
     start = jnp.where(start < n, start, start % n if dynamics.quasi is None else -1)
@@ -81,7 +81,7 @@ def ended(
         where = jnp.where(fault, begun.consistent.row, where)
     tried = dynamics.clock(outcome.tried, args)
     found = status.astype(jnp.int32), where.astype(jnp.int32), tried, dynamics.idle(outcome.state)
-    return still(Ending(*found))
+    return stop_gradient(Ending(*found))
 
 
 def is_open(ending: Ending) -> bool:
@@ -135,7 +135,7 @@ def explained(scene: Scene, batch: int, given: Any) -> Ending:
     """
 
     def one(given: Any) -> Ending:
-        ending, time, ts, q0, v0, params, inputs = still(given)
+        ending, time, ts, q0, v0, params, inputs = stop_gradient(given)
         # Kinematics that are singular at the start have no v0.
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
         dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)

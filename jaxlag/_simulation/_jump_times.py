@@ -26,7 +26,7 @@ from jaxlag._model._inputs import evaluate
 from jaxlag._system._closure import declared
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
-from jaxlag._tracing._closure_params import Closed, plain
+from jaxlag._tracing._closure_params import ParamsWithClosure, plain
 from jaxlag._tracing._dependence import Names, outputs_depend_on
 from jaxlag._tracing._input_values import InputValues
 from jaxlag._tracing._nonsmooth_points import outcomes
@@ -240,7 +240,7 @@ def names_of(params: Any, inputs: Any = None) -> list[str]:
     """Of the leaves of params, with what functions close over, and inputs, by their paths."""
     own = jax.tree_util.tree_flatten_with_path(plain(params))[0]
     names = [f"params{jax.tree_util.keystr(path)}" for path, _ in own]
-    if isinstance(params, Closed):
+    if isinstance(params, ParamsWithClosure):
         names += [_CLOSED_OVER] * len(jax.tree.leaves(params.values))
     signals = jax.tree_util.tree_flatten_with_path(inputs)[0]
     return names + [f"inputs{jax.tree_util.keystr(path)}" for path, _ in signals]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._batching import in_batches
 from jaxlag._core._custom_jvp import CustomJVP
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import ADVICE, Status
 from jaxlag._linalg._mass_solve import rank_floor
 from jaxlag._model._inputs import all_knots
@@ -81,7 +81,7 @@ class GradientGrowth(eqx.Module):
     def message(self) -> str:
         """What the growth along a single motion is, and what to do about it, in words."""
         if self.ts.ndim != 1:
-            raise bad("message", "be asked of a single motion", f"batch {self.ts.shape[:-1]}")
+            raise invalid("message", "be asked of a single motion", f"batch {self.ts.shape[:-1]}")
         status = Status(int(self.status))
         if status is not Status.ok:
             return f"{status.name}: the motion, or a segment of it, could not be followed."
@@ -198,17 +198,17 @@ def grad_growth(
     """
     if not isinstance(motion, Solution):
         fix = "Pass what jl.simulate returns."
-        raise bad("grad_growth: motion", "be a jl.Solution", f"it was {motion!r}", fix)
+        raise invalid("grad_growth: motion", "be a jl.Solution", f"it was {motion!r}", fix)
     if motion.ts.shape[-1] < 3:
         must, was = "have at least 3 save times", f"it had {motion.ts.shape[-1]}"
         fix = "Simulate it with ts=jnp.linspace(t0, t1, 101)."
-        raise bad("grad_growth: motion", must, was, fix)
+        raise invalid("grad_growth: motion", must, was, fix)
     single = motion.ts.ndim == 1 and concrete(motion.status)
     if single and int(motion.status) != int(Status.ok):
         was = f"it ended with status {motion.message()}"
-        raise bad("grad_growth: motion", "have reached its last time", was)
+        raise invalid("grad_growth: motion", "have reached its last time", was)
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise bad("grad_growth: max_steps", "be a positive integer", f"it was {max_steps!r}")
+        raise invalid("grad_growth: max_steps", "be a positive integer", f"it was {max_steps!r}")
     dtype = motion.q.dtype
     defaults = default_tolerances(dtype)
     finest = 1e-10 if jnp.finfo(dtype).bits == 64 else defaults[0]
@@ -226,7 +226,7 @@ def grad_growth(
         i = int(np.argmax(np.asarray(statuses) != int(Status.ok)))
         status = Status(int(statuses[i]))
         was = f"from t = {motion.ts[i]} to {motion.ts[i + 1]} the status was {status.name}"
-        raise bad("grad_growth: motion", "be solvable from each of its rows", was, _fix(status))
+        raise invalid("grad_growth: motion", "be solvable from each of its rows", was, _fix(status))
     if concrete(growth.horizon):
         _warn_beyond(growth)
     return growth
@@ -242,7 +242,7 @@ def _not_differentiated(x: Any) -> Any:
 def _refused(primals: tuple, tangents: tuple) -> Any:
     if jax.tree.leaves(tangents):
         fix = "Pass jax.lax.stop_gradient of the motion's start and params."
-        raise bad("grad_growth", "be left out of what is differentiated", "it was not", fix)
+        raise invalid("grad_growth", "be left out of what is differentiated", "it was not", fix)
     return primals[0], None
 
 
@@ -261,7 +261,7 @@ def _not_negative(name: str, x: Any, default: float, dtype: Any, zero: bool = Tr
     must = "be a number that is not negative" if zero else "be a positive number"
     x = number(f"grad_growth: {name}", must, default if x is None else x, dtype)
     if concrete(x) and not (x >= 0 if zero else x > 0):
-        raise bad(f"grad_growth: {name}", must, f"it was {x}")
+        raise invalid(f"grad_growth: {name}", must, f"it was {x}")
     return x
 
 

@@ -7,7 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._forces import components, reads_lam
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._system import System
@@ -43,21 +43,21 @@ def check_requirements(
     if formulation != "multipliers":
         was = f"formulation was {formulation!r}"
         fix = "Pass formulation='multipliers', or another method."
-        raise bad(name, "have a state (q, v) and multipliers", was, fix)
+        raise invalid(name, "have a state (q, v) and multipliers", was, fix)
     if isinstance(solver, Splitting):
         _separable(system, name, params, inputs, dtype)
         return
     for force in filter(reads_lam, system.forces):
         must = "be used without forces that depend on multipliers"
-        raise bad(name, must, f"{force.name!r} does", "Choose another method.")
+        raise invalid(name, must, f"{force.name!r} does", "Choose another method.")
     rows = system.rows(params, dtype)
     if rows.size and isinstance(solver, GaussLegendre):
         must, fix = "be used without constraints", "Choose 'variational2' or 'variational4'."
-        raise bad(name, must, f"there were the rows {list(rows.labels)}", fix)
+        raise invalid(name, must, f"there were the rows {list(rows.labels)}", fix)
     if not all(rows.holonomic):
         label = rows.labels[rows.holonomic.index(False)]
         must = "be used with holonomic constraints only"
-        raise bad(name, must, f"{label!r} is not holonomic", "Choose another method.")
+        raise invalid(name, must, f"{label!r} is not holonomic", "Choose another method.")
 
 
 def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
@@ -76,14 +76,14 @@ def _separable(
     if system.constraints:
         was = f"it has constraints ({', '.join(map(repr, system.rows(params, dtype).labels))})"
         fix = "Choose 'variational2' or 'variational4', which hold holonomic constraints."
-        raise bad(name, "split a system without constraints", was, fix)
+        raise invalid(name, "split a system without constraints", was, fix)
     traced, static = _params.split(params)
     structure = system.structure(params, dtype)
     must = "split a Lagrangian T(v) - V(t, q) with constant mass matrix"
     for what, found in (("mass matrix", structure.mass), ("bias", structure.bias)):
         depends = sorted(found & ({"t", "q", "v"} if what == "mass matrix" else {"v"}))
         if depends:
-            raise bad(name, must, f"its {what} contains {', '.join(depends)}", fix)
+            raise invalid(name, must, f"its {what} contains {', '.join(depends)}", fix)
     q = jax.ShapeDtypeStruct((system.size,), dtype)
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     for force in system.forces:
@@ -97,4 +97,4 @@ def _separable(
         given += [frozenset()] * (len(program.invars) - 3)
         if "v" in frozenset().union(*outputs_depend_on(program, given)):
             was = f"the force {force.name!r} depends on v"
-            raise bad(name, "split a system whose forces do not depend on velocities", was, fix)
+            raise invalid(name, "split a system whose forces do not depend on velocities", was, fix)

@@ -14,7 +14,7 @@ import optimistix
 from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._integration._tableaus import with_stages
 from jaxlag.solvers import (
     AbstractFixedStep,
@@ -97,11 +97,15 @@ def choose(
     if isinstance(method, tuple) and len(method) == 2:
         method, controller = method
         if not isinstance(controller, diffrax.AbstractStepSizeController):
-            raise bad("method[1]", "be a diffrax step-size controller", f"it was {controller!r}")
+            raise invalid(
+                "method[1]", "be a diffrax step-size controller", f"it was {controller!r}"
+            )
         if not adaptive:
-            raise bad("dt", "be left out when method brings its own controller", "both were given")
+            raise invalid(
+                "dt", "be left out when method brings its own controller", "both were given"
+            )
         if isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
-            raise bad(
+            raise invalid(
                 "method[1]",
                 "adapt the step",
                 f"it was {type(controller).__name__}",
@@ -111,7 +115,7 @@ def choose(
     known = adaptive and concrete((rtol, atol))
     solver = _solver(method, (rtol if rtol > 0 else np.min(atol)) if known else None)
     if adaptive and isinstance(solver, AbstractFixedStep):
-        raise bad(
+        raise invalid(
             "dt",
             f"be given for {type(solver).__name__}",
             "a step-size controller was given instead" if controller else "it was left out",
@@ -119,7 +123,7 @@ def choose(
             "steps are equal: pass dt=0.01.",
         )
     if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise bad(
+        raise invalid(
             "method",
             "estimate its error when dt is left out",
             f"{type(solver).__name__} has no error estimate",
@@ -184,7 +188,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
     if isinstance(method, str):
         name = automatic(tolerance) if method == "auto" else method
         if name not in METHODS:
-            raise bad(
+            raise invalid(
                 "method",
                 f"be 'auto', one of {sorted(METHODS)}, a diffrax solver or (solver, controller)",
                 f"it was {method!r}",
@@ -192,12 +196,12 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
             )
         method = METHODS[name]()
     if not isinstance(method, diffrax.AbstractSolver):
-        raise bad("method", "be a name or a diffrax solver instance", f"it was {method!r}")
+        raise invalid("method", "be a name or a diffrax solver instance", f"it was {method!r}")
     if not (
         isinstance(method.term_structure, type)
         and issubclass(diffrax.ODETerm, method.term_structure)
     ):
-        raise bad(
+        raise invalid(
             "method",
             "integrate an ordinary differential equation y' = f(t, y)",
             f"{type(method).__name__} wants terms {method.term_structure}",

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxlag._core._arrays import still
+from jaxlag._core._arrays import stop_gradient
 from jaxlag._gradient._modes import Keep
 from jaxlag._gradient._solve import Problem, Setup
 from jaxlag._integration._change_points import lengths_of, may_cross, may_stop, scales_at
@@ -123,20 +123,20 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         known = (q0, dynamics.velocities(t0, q0, w0, params))
         known = (*known, *residuals(dynamics, t0, q0, v0, params))
         sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
-        q0, w0, known = still_unless(sound, (q0, w0, args.params))
+        q0, w0, known = stop_gradient_unless(sound, (q0, w0, args.params))
         args = args._replace(params=known)
     y0 = dynamics.start(q0, w0)
     start = jnp.zeros_like(args.origin)
     args = dynamics.prepare(start, y0, args)
     if dynamics.quasi is not None:
-        args = args._replace(usual=usual(dynamics, *still((start, q0, args))))
+        args = args._replace(usual=usual(dynamics, *stop_gradient((start, q0, args))))
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)
     if dynamics.rows.size:
-        y0, args = still_unless(consistent.ok, (y0, args))
+        y0, args = stop_gradient_unless(consistent.ok, (y0, args))
     if dynamics.crossing:
-        masses = dynamics.surface(*still((start, y0, args))).masses
+        masses = dynamics.surface(*stop_gradient((start, y0, args))).masses
         assert masses is not None
-        units, slopes = scales_at(dynamics, *still((start, y0, args)))
+        units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
         lengths = lengths_of(masses, args.kept)
         args = args._replace(lengths=lengths, units=units, slopes=slopes)
     if dynamics.projects:
@@ -174,14 +174,14 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     return dynamics, begun, problem
 
 
-def still_unless(moves: Array, tree: Any) -> Any:
+def stop_gradient_unless(moves: Array, tree: Any) -> Any:
     """The same values, without derivatives where `moves` is False."""
 
-    def still(x: Any) -> Any:
+    def unless(x: Any) -> Any:
         inexact = eqx.is_inexact_array(x)
         return jnp.where(moves, x, jax.lax.stop_gradient(x)) if inexact else x
 
-    return jax.tree.map(still, tree)
+    return jax.tree.map(unless, tree)
 
 
 def velocities_at(
@@ -198,7 +198,7 @@ def velocities_at(
     reached = jnp.isfinite(q[:, :1])
     # Rows not reached are NaN: look at the start instead, so that derivatives stay finite.
     safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
-    ts, safe, args = still_unless(moved, (ts, safe, args))
+    ts, safe, args = stop_gradient_unless(moved, (ts, safe, args))
     v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)
     return q, jnp.where(reached, v, q[:, :1])  # which is NaN there, with NaN for its derivatives
 

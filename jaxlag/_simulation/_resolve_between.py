@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlag._core._arrays import concrete, real
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
 _ASK = "Ask for it as a row: ts=jnp.linspace(0, 10, 501)."
@@ -25,25 +25,25 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
     """
     if motion.ts.ndim != 1:
         was = f"it was one of a batch {motion.ts.shape[:-1]}"
-        raise bad("at: motion", "be a single one", was, "Take one of them, as batch[3].")
+        raise invalid("at: motion", "be a single one", was, "Take one of them, as batch[3].")
     if not concrete(motion.ts, motion.q, t):
-        raise bad("at", "be asked outside of jit, vmap and derivatives", "it was traced", _ASK)
+        raise invalid("at", "be asked outside of jit, vmap and derivatives", "it was traced", _ASK)
     if motion.tolerances is None:
         must = "be that of a motion with adaptive steps"
-        raise bad("at: motion", must, "its steps were fixed, and end elsewhere", _ASK)
+        raise invalid("at: motion", must, "its steps were fixed, and end elsewhere", _ASK)
     if motion._solver:
         must, was = "have been made by a method that has a name", f"it was {motion._solver}"
-        raise bad("at: motion", must, was, _ASK)
+        raise invalid("at: motion", must, was, _ASK)
     asked = np.atleast_1d(np.asarray(real("at: t", t)))
     if asked.ndim != 1:
-        raise bad("at: t", "be a number or one row of numbers", f"its shape was {asked.shape}")
+        raise invalid("at: t", "be a number or one row of numbers", f"its shape was {asked.shape}")
     ts = np.asarray(motion.ts)
     sense = 1.0 if ts[-1] >= ts[0] else -1.0
     last = float(motion.last_time)
     outside = ~((sense * (asked - ts[0]) >= 0) & (sense * (last - asked) >= 0))
     if np.any(outside):
         was = f"one was {asked[outside][0]}"
-        raise bad("at: t", f"lie within the motion, from {ts[0]} to {last} s", was)
+        raise invalid("at: t", f"lie within the motion, from {ts[0]} to {last} s", was)
     times = np.unique(sense * asked)
     row = int(np.searchsorted(sense * ts, times[0], side="right")) - 1
     times = sense * times[times > sense * ts[row]]

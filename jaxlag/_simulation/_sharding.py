@@ -5,7 +5,7 @@ from typing import Any
 import jax
 from jax.core import Tracer
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 def check_placement(function: str, values: Any) -> None:
@@ -23,14 +23,14 @@ def check_placement(function: str, values: Any) -> None:
             continue
         varying, explicit = _axes(leaf)
         if varying:
-            raise bad(
+            raise invalid(
                 f"{function} inside shard_map",
                 "be called with check_vma=False",
                 f"an argument varies over the axes {sorted(varying)}",
                 "Write jax.shard_map(f, mesh=mesh, in_specs=..., out_specs=..., check_vma=False).",
             )
         if explicit:
-            raise bad(
+            raise invalid(
                 function,
                 "get arrays of a mesh whose axes are of type Auto",
                 f"one lies along the explicit axes {sorted(explicit)}",

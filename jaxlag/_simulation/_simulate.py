@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlag._core import _xla
-from jaxlag._core._arrays import concrete, still
-from jaxlag._core._errors import SimulationError, bad
+from jaxlag._core._arrays import concrete, stop_gradient
+from jaxlag._core._errors import SimulationError, invalid
 from jaxlag._core._status import Status
 from jaxlag._gradient._modes import choose_gradient
 from jaxlag._gradient._solve import solve
@@ -43,7 +43,7 @@ from jaxlag._simulation._quantities import over_rows
 from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
 from jaxlag._simulation._step_diagnosis import is_stiff
-from jaxlag._system._closure import check_params, closing
+from jaxlag._system._closure import check_params, lift_closure_tracers
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -231,8 +231,8 @@ def simulate(
     formulation = check_formulation(system, formulation, project, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":
         must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
-        raise bad("atol", must, was, "Or pass formulation='multipliers'.")
-    params = closing(system, params, q0, inputs)
+        raise invalid("atol", must, was, "Or pass formulation='multipliers'.")
+    params = lift_closure_tracers(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     if not concrete(params_traced, inputs_traced):
@@ -241,10 +241,12 @@ def simulate(
     scheme = choose(method, dt is None, rtol, atol)
     if isinstance(scheme[0], AbstractPartitioned) and isinstance(project, Baumgarte):
         must = f"be left out for {type(scheme[0]).__name__}, whose steps hold the constraints"
-        raise bad("project", must, f"it was {project!r}")
+        raise invalid("project", must, f"it was {project!r}")
     if gradient_memory is not None and remembers(scheme[0]):
         must = f"be left out for {type(scheme[0]).__name__}, which keeps every step for derivatives"
-        raise bad("gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method.")
+        raise invalid(
+            "gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method."
+        )
     size = 2 * system.size
     if gradient_memory is not None and "work" in save:
         size += len(system.power_terms(params, q0.dtype).names)
@@ -413,5 +415,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
 def _raise_unless_ok(motion: Solution) -> None:
     status = motion.raw_status
     if np.ndim(status) == 0 and int(status) != int(Status.ok):
-        motion = still(motion)  # under grad its numbers are traced, and have values all the same
+        motion = stop_gradient(
+            motion
+        )  # under grad its numbers are traced, and have values all the same
         raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import CONCERNS_ROW, Status
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
@@ -124,7 +124,7 @@ class Solution(AbstractSolution):
         if self._solver:
             return self._solver
         if not concrete(self._method):
-            raise bad("method", "be asked for outside jit and vmap", "the motion is traced")
+            raise invalid("method", "be asked for outside jit and vmap", "the motion is traced")
         return list(METHODS)[int(np.ravel(self._method)[0])]
 
     @property
@@ -152,14 +152,14 @@ class Solution(AbstractSolution):
         if not isinstance(name, str):
             if self.ts.ndim == 1:
                 must, was = "be a name, for a single motion", f"it was {name!r}"
-                raise bad("name", must, was, "Rows are those of motion.ts, motion.q, motion.v.")
+                raise invalid("name", must, was, "Rows are those of motion.ts, motion.q, motion.v.")
             return jax.tree.map(lambda x: x[name], self)
         quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]
         if quasi is not None and name not in self.system.coordinates.names:
             known = [*self.system.coordinates.names, *quasi.names]
-            raise bad("name", f"be one of {known}", f"it was {name!r}")
+            raise invalid("name", f"be one of {known}", f"it was {name!r}")
         return self.system.coordinates.part(self.q, name)
 
     def rate(self, name: str) -> Array:
@@ -235,7 +235,7 @@ class Solution(AbstractSolution):
             ValueError: it was not asked for with `simulate(..., save=("work",))`.
         """
         if "work" not in self.saved:
-            raise bad(
+            raise invalid(
                 "work",
                 "be asked for when simulating",
                 f"save was {tuple(self.saved)!r}",

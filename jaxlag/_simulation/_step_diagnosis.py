@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlag._core._arrays import concrete, still
-from jaxlag._core._errors import bad
+from jaxlag._core._arrays import concrete, stop_gradient
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
@@ -79,7 +79,7 @@ def advice(motion: AbstractSolution, status: Status) -> str:
     of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
     if status in of_rows and motion.system.constraints:
         # Under grad its numbers are traced, and have values all the same.
-        at = still((motion._given, motion.last_time, motion.last_state[0]))
+        at = stop_gradient((motion._given, motion.last_time, motion.last_state[0]))
         dependent = status is Status.projection_failed
         singular = advice_on_rows(motion.system, *at, dependent=dependent)
         if singular:
@@ -119,9 +119,9 @@ def explain(motion: AbstractSolution) -> str:
         ValueError: a batch of motions, or a traced one.
     """
     if motion.ts.ndim != 1:
-        raise bad("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
+        raise invalid("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
     if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
-        raise bad("explain", "be asked outside jit and vmap", "the motion is traced")
+        raise invalid("explain", "be asked outside jit and vmap", "the motion is traced")
     accepted, rejected = _counts(motion)
     how = "fixed steps"
     if motion.tolerances is not None:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arrays import concrete, number, real, still
+from jaxlag._core._arrays import concrete, number, real, stop_gradient
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import AssemblyError, bad
+from jaxlag._core._errors import AssemblyError, invalid
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import independent_rows, row_sizes, without_rounding
 from jaxlag._linalg._kkt import augmented, solve_kkt
@@ -20,7 +20,7 @@ from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
 from jaxlag._model._constraints import Layout
 from jaxlag._model._coordinates import state_vectors
-from jaxlag._system._closure import check_params, closing
+from jaxlag._system._closure import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -65,7 +65,9 @@ class Assembly(eqx.Module):
     def dependent(self) -> tuple[str, ...]:
         """Names of the rows that follow from the others, of a single assembly."""
         if self.independent.ndim != 1:
-            raise bad("dependent", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
+            raise invalid(
+                "dependent", "be asked of a single assembly", f"batch {self.q.shape[:-1]}"
+            )
         return tuple(
             name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
         )
@@ -73,7 +75,7 @@ class Assembly(eqx.Module):
     def message(self) -> str:
         """How a single assembly ended, in words."""
         if self.q.ndim != 1:
-            raise bad("message", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
+            raise invalid("message", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
         status = Status(int(self.status))
         if status is Status.ok:
             more = f"; dependent rows: {', '.join(self.dependent)}" if self.dependent else ""
@@ -147,7 +149,7 @@ def assemble(
         -0.8000 0.7500 rank 1
     """
     if not isinstance(system, System):
-        raise bad("assemble: system", "be a jl.System", f"it was {system!r}")
+        raise invalid("assemble: system", "be a jl.System", f"it was {system!r}")
     q, v = state_vectors(system.coordinates, q, v)
     _check_finite("q", q)
     _check_finite("v", v)
@@ -158,19 +160,23 @@ def assemble(
         diagonal = real("assemble: weights", given).astype(q.dtype)
         if diagonal.shape != q.shape:
             must = f"have shape {q.shape}"
-            raise bad("assemble: weights", must, f"its shape was {diagonal.shape}")
+            raise invalid("assemble: weights", must, f"its shape was {diagonal.shape}")
         if concrete(diagonal):
             numbers = np.asarray(diagonal)
             if not np.all((numbers > 0) & np.isfinite(numbers)):
-                raise bad("assemble: weights", "be positive and finite", f"they were {diagonal}")
+                raise invalid(
+                    "assemble: weights", "be positive and finite", f"they were {diagonal}"
+                )
     check_params(system, params, q, None)
     warn_of_changes(system)
-    traced, static = _params.split(closing(system, params, q, None))
+    traced, static = _params.split(lift_closure_tracers(system, params, q, None))
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     key = system, _params.Static(static), held, rates_held
     found = _run(key, (q, v, traced, t, diagonal))
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
-        found = still(found)  # under grad its numbers are traced, and have values all the same
+        found = stop_gradient(
+            found
+        )  # under grad its numbers are traced, and have values all the same
         fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
         where = [t, found.q]
         if np.ndim(found.status) == 0 and concrete(traced, where):
@@ -302,8 +308,8 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
         return above, jnp.where(kept, phi(q), lam)
 
     frozen = jax.lax.stop_gradient((W, start))
-    still = partial(_still, phi)
-    q, lam = jax.lax.stop_gradient(_search(still, rows, *frozen))
+    constant = partial(_still, phi)
+    q, lam = jax.lax.stop_gradient(_search(constant, rows, *frozen))
     kept = _independent(rows, W, q)
     lam = jnp.where(kept, lam, 0.0)
     n = start.shape[0]
@@ -313,7 +319,7 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
 
     def found(flat: Callable, z: Array) -> Array:
         z = _polished(flat, z)
-        return z.at[:n].set(_closed(still, rows, frozen[0], z[:n]))
+        return z.at[:n].set(_closed(stop_gradient, rows, frozen[0], z[:n]))
 
     def tangent(linear: Callable, y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)
@@ -391,7 +397,7 @@ def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
 def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     """For every coordinate, whether it is held, and whether its velocity is."""
     if isinstance(hold, str) or not isinstance(hold, Sequence):
-        raise bad("assemble: hold", "be a sequence of names", f"it was {hold!r}")
+        raise invalid("assemble: hold", "be a sequence of names", f"it was {hold!r}")
     coordinates = system.coordinates
     index = {label: [i] for i, label in enumerate(coordinates.labels)}
     start = 0
@@ -406,7 +412,7 @@ def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]
         if plain not in index:
             known = list(coordinates.names)
             must = f"name coordinates among {known}, or with a prime their velocities"
-            raise bad("assemble: hold", must, f"one was {name!r}")
+            raise invalid("assemble: hold", must, f"one was {name!r}")
         held[int(rate), index[plain]] = True
     return tuple(held[0].tolist()), tuple(held[1].tolist())
 
@@ -434,4 +440,4 @@ def _what_to_release(key: Any, values: Any) -> str:
 
 def _check_finite(argument: str, x: Array) -> None:
     if concrete(x) and not np.all(np.isfinite(x)):
-        raise bad(f"assemble: {argument}", "be finite", f"it was {x}")
+        raise invalid(f"assemble: {argument}", "be finite", f"it was {x}")

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arrays import concrete, number, of_state, still
+from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import EquilibriumError, bad
+from jaxlag._core._errors import EquilibriumError, invalid
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm, row_sizes, without_rounding
 from jaxlag._model._constraints import Layout
@@ -22,7 +22,7 @@ from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._statics._rest_search import Rest, find_rest
 from jaxlag._statics._root_search import differentiable_if, solve_tangent
-from jaxlag._system._closure import closing
+from jaxlag._system._closure import lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System, check_declaration
 from jaxlag._tracing import _params
@@ -134,7 +134,9 @@ class Equilibrium(eqx.Module):
     def message(self) -> str:
         """How a single search ended, in words."""
         if self.q.ndim != 1:
-            raise bad("message", "be asked of a single equilibrium", f"batch {self.q.shape[:-1]}")
+            raise invalid(
+                "message", "be asked of a single equilibrium", f"batch {self.q.shape[:-1]}"
+            )
         labels = self.system.coordinates.labels
         status = Status(int(self.status))
         if status is Status.ok:
@@ -224,9 +226,9 @@ def equilibrium(
         0.1962 m, stable: True
     """
     if not isinstance(system, System):
-        raise bad("system", "be a jl.System", f"it was {system!r}")
+        raise invalid("system", "be a jl.System", f"it was {system!r}")
     if not all(c.holonomic for c in system.constraints) or any(map(reads_lam, system.forces)):
-        raise bad(
+        raise invalid(
             "system",
             "have holonomic constraints alone, and no forces that depend on multipliers",
             "it has others",
@@ -234,26 +236,28 @@ def equilibrium(
         )
     (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
     if concrete(q0) and not np.all(np.isfinite(q0)):
-        raise bad("q0", "be finite", f"it was {q0}")
+        raise invalid("q0", "be finite", f"it was {q0}")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise bad("max_steps", "be a positive integer", f"it was {max_steps!r}")
+        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
     if tol is None:
         tol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
     tol = number("tol", "be a positive number", tol, q0.dtype)
     if concrete(tol) and not tol > 0:
-        raise bad("tol", "be a positive number", f"it was {tol}")
+        raise invalid("tol", "be a positive number", f"it was {tol}")
     if concrete(tol) and not tol < 1:
-        raise bad("tol", "be less than 1", f"it was {tol}")
+        raise invalid("tol", "be less than 1", f"it was {tol}")
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     warn_of_changes(system, inputs)
-    traced, static = _params.split(closing(system, params, q0, inputs))
+    traced, static = _params.split(lift_closure_tracers(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
     found = _search(key, (q0, t, tol, traced, inputs_traced))
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
-        found = still(found)  # under grad its numbers are traced, and have values all the same
+        found = stop_gradient(
+            found
+        )  # under grad its numbers are traced, and have values all the same
         more = ""
         if np.ndim(found.status) == 0 and concrete(traced, t, found.q):
             more = f" {advice_on_rows(system, params, t, found.q)}".rstrip()
@@ -323,11 +327,11 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
         return find_rest(at_rest, phi, whole, q0, tol, max_steps)
 
-    still = jax.lax.stop_gradient((q0, tol, idle, t, *given))
+    constant = jax.lax.stop_gradient((q0, tol, idle, t, *given))
     if jax.default_backend() == "cpu":
-        found = in_lanes(searched, searched, *still, at_once=at_once_implicit(n + rows.size))
+        found = in_lanes(searched, searched, *constant, at_once=at_once_implicit(n + rows.size))
     else:
-        found = searched(*still)
+        found = searched(*constant)
     z, balance, steps = jax.lax.stop_gradient(found)
     parts, unbalanced, _, whole = forces(idle, t, *given)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import concrete, of_state, real
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._system._system import System, check_declaration
@@ -72,11 +72,11 @@ def inverse_dynamics(
         0.576186 N m
     """
     if not isinstance(system, System):
-        raise bad("inverse_dynamics: system", "be a jl.System", f"it was {system!r}")
+        raise invalid("inverse_dynamics: system", "be a jl.System", f"it was {system!r}")
     if any(map(reads_lam, system.forces)):
         was = "it has some"
         must = "be a system without forces that depend on multipliers"
-        raise bad("inverse_dynamics: system", must, was, "A motion does not say what lam is.")
+        raise invalid("inverse_dynamics: system", must, was, "A motion does not say what lam is.")
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
@@ -107,13 +107,13 @@ def prescribed_motion(
     t = real("prescribed_motion: t", t).astype(jnp.result_type(float))
     if t.ndim > 1:
         must, was = "be an instant or a row of them", f"its shape was {t.shape}"
-        raise bad("prescribed_motion: t", must, was)
+        raise invalid("prescribed_motion: t", must, was)
 
     def coordinates(t: Array) -> Array:
         q = motion(t)
         if not eqx.is_array_like(q) or jnp.ndim(q) != 1:
             was = f"shape {jnp.shape(q)}" if eqx.is_array_like(q) else f"{q!r}"
-            raise bad(
+            raise invalid(
                 "prescribed_motion: motion",
                 "return all coordinates as one vector of shape (n,)",
                 f"it returned {was}",
@@ -144,17 +144,17 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
         if x.ndim not in (1, 2) or x.shape[-1] != n or x.shape != shape:
             same = f", as q with {shape}" if vectors else ""
             must = f"have shape ({n},) or (s, {n}){same}: {', '.join(labels)}"
-            raise bad(argument, must, f"its shape was {x.shape}")
+            raise invalid(argument, must, f"its shape was {x.shape}")
         if x.size == 0:
-            raise bad(argument, "hold at least one instant", f"its shape was {x.shape}")
+            raise invalid(argument, "hold at least one instant", f"its shape was {x.shape}")
         _check_finite(argument, x, labels)
         vectors.append(x)
     rows = vectors[0].shape[:-1]
     t = real("inverse_dynamics: t", t)
     if t.shape not in ((), rows):
-        raise bad("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
+        raise invalid("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
     if concrete(t) and not np.all(np.isfinite(t)):
-        raise bad("inverse_dynamics: t", "be finite", f"it was {t}")
+        raise invalid("inverse_dynamics: t", "be finite", f"it was {t}")
     q, v, a = of_state("q, v and a", *vectors)
     return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
 
@@ -167,7 +167,7 @@ def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
     *row, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
     where = f"{argument.split()[-1]}[{', '.join(map(str, (*row, i)))}] ({labels[i]!r})"
     fix = "Rows that a motion did not reach are NaN: leave them out." if row else ""
-    raise bad(argument, "be finite", f"{where} was {values[(*row, i)]}", fix)
+    raise invalid(argument, "be finite", f"{where} was {values[(*row, i)]}", fix)
 
 
 @partial(jax.jit, static_argnums=0)

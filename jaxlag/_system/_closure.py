@@ -9,19 +9,21 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
-from jaxlag._tracing._closure_params import Closed
+from jaxlag._tracing._closure_params import ParamsWithClosure
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import real_scalar
 from jaxlag._tracing._traced_function import functions_of
 
 
-def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> Any:
+def lift_closure_tracers(
+    system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
+) -> Any:
     """Params, and beside them whatever traced values the declared functions close over.
 
     A Lagrangian written inside a function that is being differentiated may read its arguments:
@@ -31,7 +33,7 @@ def closing(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | N
     if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
         return params
     tracers = [x for x in _consts(system, params, q, inputs) if not concrete(x)]
-    return Closed(params, tracers, tuple(map(id, tracers))) if tracers else params
+    return ParamsWithClosure(params, tracers, tuple(map(id, tracers))) if tracers else params
 
 
 def declared(
@@ -79,7 +81,7 @@ def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any
     read = nothing.union(*outputs_depend_on(program.jaxpr, given))
     for path, name, was in faults:
         if path in read:
-            raise bad(name, "be finite", f"it was {was}")
+            raise invalid(name, "be finite", f"it was {was}")
 
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:

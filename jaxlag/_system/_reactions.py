@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, Moving
 from jaxlag._model._forces import reads_lam
 from jaxlag._system._state_functions import AbstractQuantities
@@ -47,7 +47,7 @@ class AbstractReactions(AbstractQuantities):
         known = [force.name for force in self.forces]
         for name in known if names is None else names:
             if name not in known:
-                raise bad("generalized_force: names", f"be among {known}", f"one was {name!r}")
+                raise invalid("generalized_force: names", f"be among {known}", f"one was {name!r}")
         chosen = tuple(f for f in self.forces if names is None or f.name in names)
         values = self._inputs_at(inputs, t, q, v, params)
         lam = None

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import common
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, Structure
 from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import AbstractConstraint, Layout
@@ -79,7 +79,7 @@ class AbstractQuantities(eqx.Module):
         t, q, v, params = self._state(params, q, v, t)
         if v is None:
             if not self.structure(params, q.dtype).quadratic:
-                raise bad(
+                raise invalid(
                     "mass_matrix: v",
                     "be given, since M depends on the velocities",
                     "it was left out",
@@ -114,7 +114,7 @@ class AbstractQuantities(eqx.Module):
         """
         t, q, v, params = self._state(params, q, v, t)
         if not self.structure(params, q.dtype).quadratic:
-            raise bad(
+            raise invalid(
                 "coriolis_matrix",
                 "get a Lagrangian quadratic in the velocities",
                 "its mass matrix d2L/dv2 depends on v",
@@ -162,7 +162,7 @@ class AbstractQuantities(eqx.Module):
     def _with_quasi(self, method: str) -> QuasiVelocities:
         if self.quasi is None:
             must = "be called on a system with quasi-velocities"
-            raise bad(f"System.{method}", must, "this one was declared without quasi=")
+            raise invalid(f"System.{method}", must, "this one was declared without quasi=")
         return self.quasi
 
     def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
@@ -240,7 +240,7 @@ class AbstractQuantities(eqx.Module):
 
     def _declared(self, name: str, function: Callable | None) -> Callable:
         if function is None:
-            raise bad(
+            raise invalid(
                 f"System.{name}",
                 "be called on a system declared by kinetic= and potential=",
                 "this one was declared by its Lagrangian alone",

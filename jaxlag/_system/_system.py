@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._linalg._kkt import augmented
 from jaxlag._linalg._mass_solve import first_unhealthy
 from jaxlag._lowering import (
@@ -39,7 +39,7 @@ from jaxlag._system._row_advice import vanishing_rows
 from jaxlag._tracing import _params
 from jaxlag._tracing._index_check import check_indices
 from jaxlag._tracing._signature import require_arity
-from jaxlag._tracing._traced_function import as_written, captured
+from jaxlag._tracing._traced_function import as_written, traced_function
 
 
 class _Difference(eqx.Module):
@@ -124,7 +124,7 @@ class System(AbstractReactions):
         if (lagrangian is None) == (not pair) or (pair and (kinetic is None or potential is None)):
             given = {"lagrangian": lagrangian, "kinetic": kinetic, "potential": potential}
             names = [name for name, value in given.items() if value is not None]
-            raise bad(
+            raise invalid(
                 "System",
                 "get either lagrangian, or both kinetic and potential",
                 f"it got {' and '.join(names) or 'none of them'}",
@@ -138,14 +138,14 @@ class System(AbstractReactions):
         check_reactions(rows, self.forces)
         self.constraints, self.quasi = rows, quasi
         if written_in not in ("v", "u"):
-            raise bad("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
+            raise invalid("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
         if written_in == "u" and quasi is None:
             was = "this one has none"
-            raise bad("written_in='u'", "go with a system that has quasi-velocities", was)
+            raise invalid("written_in='u'", "go with a system that has quasi-velocities", was)
         if written_in == "u" and quasi is not None and quasi.size < self.coordinates.size:
             speeds = [c.all_names[0] for c in self.constraints if not c.holonomic]
             if speeds:
-                raise bad(
+                raise invalid(
                     "written_in",
                     "be 'v' where kinematics= leave out velocities that Pfaffian rows forbid, "
                     "since their momenta enter the equations",
@@ -160,11 +160,11 @@ class System(AbstractReactions):
             assert potential is not None
             require_arity("kinetic", kinetic, form)
             require_arity("potential", potential, ("t", "q", "params"))
-            kinetic, potential = captured(kinetic), captured(potential)
+            kinetic, potential = traced_function(kinetic), traced_function(potential)
             whole: Callable = _Difference(kinetic, potential)
         else:
             require_arity("lagrangian", lagrangian, form)
-            whole = captured(lagrangian)
+            whole = traced_function(lagrangian)
         self.in_u = None
         if written_in == "u":
             assert quasi is not None
@@ -174,7 +174,7 @@ class System(AbstractReactions):
         self.lagrangian = whole
         self._kinetic, self._potential = kinetic, potential
         if lowering not in ("auto", "scalar", "array"):
-            raise bad("lowering", "be 'auto', 'scalar' or 'array'", f"it was {lowering!r}")
+            raise invalid("lowering", "be 'auto', 'scalar' or 'array'", f"it was {lowering!r}")
         self.lowering = lowering
 
     @property
@@ -292,7 +292,7 @@ class System(AbstractReactions):
             check_kinematics(self.quasi, params, self.size, dtype)
         rows = layout(self.constraints, params, self.size, dtype)
         if self.quasi is not None and len(self.quasi.free) + rows.size < self.size:
-            raise bad(
+            raise invalid(
                 "quasi: names",
                 f"leave at least {self.size - rows.size} that are not constrained, as many as "
                 f"{self.size} coordinates have freedoms under {rows.size} rows",
@@ -326,7 +326,7 @@ class System(AbstractReactions):
         self.check_traceable(params, q.dtype, values)
         L = as_written(self.lagrangian)(t, q, v, params)
         if not bool(jnp.isfinite(L)):
-            raise bad("lagrangian", "be finite at the given state", f"it was {L}")
+            raise invalid("lagrangian", "be finite at the given state", f"it was {L}")
         M = self.terms.mass(t, q, v, params)
         if self.constraints:
             self.rows(params, q.dtype)
@@ -336,10 +336,10 @@ class System(AbstractReactions):
             must = "have a gradient where it holds"
             was = "it was 0 there and the same on both sides, as y**2 or a length is"
             fix = "Write the quantity itself, y; of a length, each component."
-            raise bad(f"constraint {vanishing[0]!r}", must, was, fix)
+            raise invalid(f"constraint {vanishing[0]!r}", must, was, fix)
         index = int(first_unhealthy(M))
         if index >= 0:
-            raise bad(
+            raise invalid(
                 f"coordinate {self.coordinates.label(index)!r}",
                 "have inertia: d2L/dv2 positive definite",
                 f"its pivot was not positive at q = {q}, v = {v}",
@@ -348,7 +348,7 @@ class System(AbstractReactions):
         a = self.acceleration(params, q, v, t, inputs)
         if not bool(jnp.all(jnp.isfinite(a))):
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
-            raise bad(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
+            raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
 
     def explain(self, params: Any) -> str:
         """What was found in M a + h = Q of this system, and what is therefore skipped, as text.
@@ -423,7 +423,7 @@ def check_declaration(
     system.check_traceable(params, q.dtype, values)
     for name in inputs:
         if name not in values.read:
-            raise bad(
+            raise invalid(
                 "inputs",
                 "hold only signals that a force reads",
                 f"no force read {name!r}",

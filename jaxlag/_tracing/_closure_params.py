@@ -16,7 +16,7 @@ class Programs(dict[Any, Any]):
 
 
 @jax.tree_util.register_pytree_node_class
-class Closed:
+class ParamsWithClosure:
     """Params together with what stands for the tracers in the closures of declared functions.
 
     In this way these are arguments of every program, as params are, and have derivatives. Functions
@@ -47,7 +47,9 @@ class Closed:
         return (self.params, self.values), (self.tracers, self.programs)
 
     @classmethod
-    def tree_unflatten(cls, fixed: tuple[tuple[int, ...], "Programs"], parts: Any) -> "Closed":
+    def tree_unflatten(
+        cls, fixed: tuple[tuple[int, ...], "Programs"], parts: Any
+    ) -> "ParamsWithClosure":
         """As JAX asks for it."""
         (params, values), (tracers, programs) = parts, fixed
         return cls(params, values, tracers, programs)
@@ -55,4 +57,4 @@ class Closed:
 
 def plain(params: Any) -> Any:
     """Params as the user gave them; anything else as it is."""
-    return params.params if isinstance(params, Closed) else params
+    return params.params if isinstance(params, ParamsWithClosure) else params

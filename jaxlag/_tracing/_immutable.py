@@ -23,7 +23,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._defining_package import of_arrays, of_library
 from jaxlag._tracing._free_variables import reading
 from jaxlag._tracing._function_code import own_attributes, unwrapped
@@ -95,7 +95,7 @@ def check_nodes(tree: Any, name: str) -> None:
 
 
 def _refusal(leaf: Any, name: str, fault: _Fault) -> ValueError:
-    return bad(name, _MUST, f"it was {_words(leaf)}, and {fault.text}", fault.fix)
+    return invalid(name, _MUST, f"it was {_words(leaf)}, and {fault.text}", fault.fix)
 
 
 def _fault(x: Any, data: bool = False) -> _Fault | None:

@@ -9,7 +9,7 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import complaint
+from jaxlag._core._errors import requirement
 from jaxlag._tracing._interpret import NUMPY, equation
 
 
@@ -94,7 +94,7 @@ def _check(eqn: Any, name: str, indices: list[Any], of: str) -> None:
         where = source_info_util.summarize(eqn.source_info)
         taken = off[0] if off[0] >= 0 else off[0] - size
         raise OutOfRange(
-            complaint(
+            requirement(
                 of,
                 f"take indices from {-size} to {size - 1} of {name}, which has {size} entries",
                 f"{name}[{taken}] was taken" + (f" at {where}" if where else ""),

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 
 class InputValues(Mapping[str, Any]):
@@ -15,7 +15,7 @@ class InputValues(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._values:
-            raise bad(
+            raise invalid(
                 "inputs",
                 f"have an entry {name!r}, which a force reads",
                 f"its names were {sorted(self)}",

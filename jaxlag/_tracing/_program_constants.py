@@ -11,7 +11,7 @@ from jaxlag._core._arrays import concrete
 from jaxlag._core._program_rewrite import rewritten
 
 
-def owned(code: ClosedJaxpr) -> ClosedJaxpr:
+def copy_constants(code: ClosedJaxpr) -> ClosedJaxpr:
     """The same program, no constant of which anybody else can change."""
     return rewritten(code, _equation, _copied)
 

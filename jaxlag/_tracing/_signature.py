@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._closure_params import plain
 from jaxlag._tracing._source_lines import line_of
 
@@ -23,11 +23,11 @@ def real_scalar(argument: str, function: Callable) -> Callable:
             "Sum with jnp.sum, of one coordinate take v[0]; use real energies.",
         )
         if not eqx.is_array_like(value):
-            raise bad(argument, "return an array", f"it returned {value!r}", fix)
+            raise invalid(argument, "return an array", f"it returned {value!r}", fix)
         value = jnp.asarray(value)
         if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
             was = f"it returned {value.dtype} of shape {value.shape}"
-            raise bad(argument, must, was, _narrowed(arguments[-1]) or fix)
+            raise invalid(argument, must, was, _narrowed(arguments[-1]) or fix)
         return value
 
     return checked
@@ -48,7 +48,7 @@ def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) 
                 raise
             *state, params = arguments
             line = line_of(jax.make_jaxpr(lambda *state: scalar(*state, params))(*state), "while")
-            raise bad(
+            raise invalid(
                 argument,
                 "have reverse derivatives, from which momenta and forces follow",
                 f"a loop in it has no fixed number of turns: {line}",
@@ -95,9 +95,9 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
     """Raise unless `function` is callable as `function(*names)`."""
     form = f"({', '.join(names)})"
     if not callable(function):
-        raise bad(argument, f"be a function of {form}", f"it was {function!r}")
+        raise invalid(argument, f"be a function of {form}", f"it was {function!r}")
     if not accepts(function, len(names)):
-        raise bad(
+        raise invalid(
             argument,
             f"be callable as {form}",
             f"its signature was {signature(function)}",
@@ -105,7 +105,7 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
         )
     for place, (name, other) in enumerate(zip(names, _positional(function), strict=False)):
         if other in names and names.index(other) != place:
-            raise bad(
+            raise invalid(
                 argument,
                 f"take {form} in this order",
                 f"its signature was {signature(function)}",

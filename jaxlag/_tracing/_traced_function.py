@@ -21,15 +21,15 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._custom_jvp import with_rules_kept
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._tracing import _params
-from jaxlag._tracing._closure_params import Closed, plain
+from jaxlag._tracing._closure_params import ParamsWithClosure, plain
 from jaxlag._tracing._custom_vjp import with_forward_derivatives
 from jaxlag._tracing._defining_package import of_library
 from jaxlag._tracing._free_variables import outside
 from jaxlag._tracing._input_values import InputValues
-from jaxlag._tracing._program_constants import owned
-from jaxlag._tracing._user_errors import said
+from jaxlag._tracing._program_constants import copy_constants
+from jaxlag._tracing._user_errors import translate
 from jaxlag._tracing._watched_values import Outside, changes
 
 
@@ -55,7 +55,7 @@ class _Traced(NamedTuple):
     id: int
 
 
-class Captured:
+class TracedFunction:
     """A function that is traced once for every kind of arguments, and never called again.
 
     It hashes and compares as the function does, and is one object as long as it lives: systems made
@@ -78,19 +78,19 @@ class Captured:
         return hash(self.function)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Captured) and self.function == other.function
+        return isinstance(other, TracedFunction) and self.function == other.function
 
     def __reduce__(self) -> Any:
-        return captured, (self.function,)
+        return traced_function, (self.function,)
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """What the function returns."""
         if keywords:
             arguments = signature(self.function).bind(*arguments, **keywords).args
-        closed = [x for x in arguments if isinstance(x, Closed)]
-        return self.beside(closed[0] if closed else None, *arguments)
+        closed = [x for x in arguments if isinstance(x, ParamsWithClosure)]
+        return self.call_with_closure(closed[0] if closed else None, *arguments)
 
-    def beside(self, params: Any, *arguments: Any) -> Any:
+    def call_with_closure(self, params: Any, *arguments: Any) -> Any:
         """The same; what stands for traced values of its closure comes with the params."""
         named = tuple(i for i, x in enumerate(arguments) if isinstance(x, InputValues))
         given = [x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments]
@@ -114,7 +114,7 @@ class Captured:
 
     def _closing(self, params: Any, kind: Any, leaves: list) -> _Program:
         """One that isn't kept, or not yet: with what stands for traced values of its closure."""
-        if not isinstance(params, Closed):
+        if not isinstance(params, ParamsWithClosure):
             return self._trace(kind, leaves)
         instead, made = params.by_tracer, params.programs
         if (self, kind) not in made:
@@ -164,7 +164,7 @@ class Captured:
             return found
 
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
-        code = with_rules_kept(with_forward_derivatives(owned(code)))
+        code = with_rules_kept(with_forward_derivatives(copy_constants(code)))
         return _Program(code, form, static_part, frozenset(read))
 
     def _warn_of_counts(self, kind: Any) -> None:
@@ -217,7 +217,7 @@ _logger = logging.getLogger("jaxlag")
 # Not settings: how often a piece of code was declared anew; the object for a function, as long as
 # anybody holds it.
 _MADE: WeakKeyDictionary[CodeType, int] = WeakKeyDictionary()
-_ALIVE: WeakValueDictionary[Callable, Captured] = WeakValueDictionary()
+_ALIVE: WeakValueDictionary[Callable, TracedFunction] = WeakValueDictionary()
 
 
 def _leaf(path: Any) -> str:
@@ -245,42 +245,42 @@ def _called(function: Callable, arguments: list[Any]) -> Any:
     try:
         return function(*arguments)
     except Exception as error:
-        better = said(function, arguments, error)
+        better = translate(function, arguments, error)
         if better is None:
             raise
         raise better from error
 
 
-def captured(function: Callable) -> Captured:
+def traced_function(function: Callable) -> TracedFunction:
     """The function as one that is traced once; the same object for the same function.
 
     Raises:
         ValueError: it does not hash, as modules that hold arrays do not.
     """
-    if isinstance(function, Captured):
+    if isinstance(function, TracedFunction):
         return function
     try:
         hash(function)
     except TypeError as error:
         module = getattr(function, "__self__", function)
-        raise bad(
+        raise invalid(
             f"function {_named(function)}",
             "hash, as functions do that programs are compiled for",
             f"the {type(module).__name__} that it belongs to holds arrays",
             "Put the module into params and call it from a function: "
             'def lagrangian(t, q, v, params): return params["model"](t, q, v).',
         ) from error
-    return _ALIVE.setdefault(function, Captured(function))
+    return _ALIVE.setdefault(function, TracedFunction(function))
 
 
-def once(function: Any) -> Any:
+def traced_unless_module(function: Any) -> Any:
     """The same of a plain function; a module, whose arrays are traced, as it is.
 
     Raises:
         ValueError: a module whose static fields can change.
     """
     if not isinstance(function, eqx.Module):
-        return captured(function)
+        return traced_function(function)
     if not of_library(function):  # of one, whoever made its parts has asked
         _params.check_keys(function, type(function).__name__)
     return function
@@ -288,7 +288,7 @@ def once(function: Any) -> Any:
 
 def as_written(function: Any) -> Any:
     """The function of the user's itself, which sees numbers where it is given numbers."""
-    if isinstance(function, Captured):
+    if isinstance(function, TracedFunction):
         return function.function
     if not isinstance(function, eqx.Module):
         return function
@@ -296,15 +296,15 @@ def as_written(function: Any) -> Any:
     return replace(function, **parts)
 
 
-def functions_of(declared: Any) -> Iterator[Captured]:
+def functions_of(declared: Any) -> Iterator[TracedFunction]:
     """All the functions in a declaration, or in inputs."""
-    return (part for part in _parts_of(declared) if isinstance(part, Captured))
+    return (part for part in _parts_of(declared) if isinstance(part, TracedFunction))
 
 
 def warn_of_changes(*declared: Any) -> None:
     """Say what in declarations, or in inputs, reads something from outside that has changed."""
     for part in _parts_of(declared):
-        if isinstance(part, Captured):
+        if isinstance(part, TracedFunction):
             part.warn()
         elif not of_library(part):
             _params.check_keys(part, type(part).__name__)
@@ -312,7 +312,7 @@ def warn_of_changes(*declared: Any) -> None:
 
 def _parts_of(declared: Any) -> Iterator[Any]:
     """The functions and the modules."""
-    if isinstance(declared, Captured):
+    if isinstance(declared, TracedFunction):
         yield declared
     elif isinstance(declared, tuple | Mapping):
         for part in declared.values() if isinstance(declared, Mapping) else declared:

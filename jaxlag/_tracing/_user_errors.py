@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.errors
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 
 _LONGEST = 80  # characters of a line of the user's code that are shown
 _CONVERTED = (
@@ -42,7 +42,7 @@ _CONVERTED = (
 )
 
 
-def said(function: Callable, arguments: Sequence[Any], error: Exception) -> Exception | None:
+def translate(function: Callable, arguments: Sequence[Any], error: Exception) -> Exception | None:
     """The error in our form, for faults that are common; None where JAX or Python says it best.
 
     Args:
@@ -54,7 +54,7 @@ def said(function: Callable, arguments: Sequence[Any], error: Exception) -> Exce
     name, place = f"function {_name(function)}", _place(function, error.__traceback__)
     for kind, must, was, fix in _CONVERTED:
         if isinstance(error, kind):
-            return bad(name, must, f"{place} {was}", fix)
+            return invalid(name, must, f"{place} {was}", fix)
     if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str):
         return _missing(name, place, named, error.args[0])
     if isinstance(error, TypeError | AttributeError):
@@ -74,7 +74,7 @@ def _missing(name: str, place: str, named: Mapping[str, Any], key: str) -> Excep
     asked = [argument for argument in lacking if re.search(rf"\b{argument}\[", place)]
     argument = (*asked, *(["params"] if "params" in lacking else lacking))[0]
     must = f"have an entry {key!r}, which {name} reads"
-    return bad(argument, must, f"its names were {lacking[argument]}: {place}")
+    return invalid(argument, must, f"its names were {lacking[argument]}: {place}")
 
 
 def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | None:
@@ -84,12 +84,12 @@ def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | N
     params = named["params"]
     if params is None:
         was = f"they were left out: {place}"
-        return bad("params", f"be given, since {name} reads them", was, "Pass params={...}.")
+        return invalid("params", f"be given, since {name} reads them", was, "Pass params={...}.")
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
         if isinstance(leaf, str):
             leaf_name = f"params{jax.tree_util.keystr(path)}"
             must = f"be a number where {name} calculates with it"
-            return bad(leaf_name, must, f"it was the text {leaf!r}: {place}")
+            return invalid(leaf_name, must, f"it was the text {leaf!r}: {place}")
     return None
 
 

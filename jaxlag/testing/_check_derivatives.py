@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxlag._core._arrays import concrete, number
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._system._system import System
@@ -212,7 +212,7 @@ def check_derivatives(
     extrapolation: Press et al., Numerical Recipes, sec. 5.7.
     """
     if not isinstance(system, System):
-        raise bad("check_derivatives: system", "be a jl.System", f"it was {system!r}")
+        raise invalid("check_derivatives: system", "be a jl.System", f"it was {system!r}")
     q, v = state_vectors(system.coordinates, q, v)
     t = number("t", "be a number", t, jnp.result_type(float))
     own = _declared_functions.Params(params)
@@ -251,10 +251,10 @@ def _require_numbers(name: str, values: Any) -> None:
     if not concrete(values):
         must = "have values, since the check looks at numbers"
         fix = "Call check_derivatives outside jit, vmap and grad."
-        raise bad(f"check_derivatives: {name}", must, "it was traced", fix)
+        raise invalid(f"check_derivatives: {name}", must, "it was traced", fix)
     for x in jax.tree.leaves(values):
         if not np.all(np.isfinite(x)):
-            raise bad(f"check_derivatives: {name}", "be finite", f"it was {values}")
+            raise invalid(f"check_derivatives: {name}", "be finite", f"it was {values}")
 
 
 class _Search:

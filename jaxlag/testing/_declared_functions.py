@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxlag._core._errors import bad
+from jaxlag._core._errors import invalid
 from jaxlag._model._constraints import Holonomic, Pfaffian
 from jaxlag._model._forces import Couple, GeneralizedForce, PointForce, Rayleigh, reads_lam
 from jaxlag._model._input_signals import AbstractInput
@@ -133,7 +133,7 @@ def states(names: Sequence[str], q: Array, v: Array, u: Array | None) -> dict[st
     """Name -> q, v and, unless it is None, u, of those states asked for that are distinct."""
     if isinstance(names, str) or not names or not set(names) <= set(STATES):
         must, was = f"be names among {list(STATES)}", f"it was {names!r}"
-        raise bad("check_derivatives: states", must, was, 'Write states=("given", "rest").')
+        raise invalid("check_derivatives: states", must, was, 'Write states=("given", "rest").')
     given = {"q": q, "v": v} | ({} if u is None else {"u": u})
     rng = np.random.default_rng(0)
 

@@ -8,7 +8,7 @@ from _jaxprs import operations
 
 import jaxlag as jl
 from jaxlag._core import _batching
-from jaxlag._core._buffer_entries import put
+from jaxlag._core._buffer_entries import set_entry
 from systems import double_pendulum
 
 EPS = np.finfo(float).eps
@@ -139,15 +139,15 @@ def test_rows_are_put_where_each_lane_says(lanes, dtype):
     index = jnp.asarray(rng.integers(0, 5, lanes), jnp.int32)
     right = np.array(buffer)
     right[np.arange(lanes), index] = row
-    each = jax.vmap(put)
+    each = jax.vmap(set_entry)
     np.testing.assert_array_equal(jax.jit(each)(buffer, index, row), right)
     same = np.array(buffer)
     same[:, 2] = row[0]
-    several = jax.vmap(put, (0, None, None))(buffer, jnp.asarray(2), row[0])
+    several = jax.vmap(set_entry, (0, None, None))(buffer, jnp.asarray(2), row[0])
     np.testing.assert_array_equal(several, same)
     assert several.dtype == dtype
     # Directions inside of trajectories, and the other way round.
-    once, twice = jax.vmap(put, (0, None, 0)), jnp.stack([buffer, 2 * buffer], 1)
+    once, twice = jax.vmap(set_entry, (0, None, 0)), jnp.stack([buffer, 2 * buffer], 1)
     found = jax.jit(jax.vmap(once))(twice, index, jnp.stack([row, 2 * row], 1))
     np.testing.assert_array_equal(found, np.stack([right, 2 * right], 1))
     found = jax.jit(jax.vmap(each, (1, None, 1)))(twice, index, jnp.stack([row, 2 * row], 1))

@@ -16,7 +16,7 @@ from _systems.mechanisms import (
 
 import jaxlag as jl
 from jaxlag._linalg import _projection
-from jaxlag._linalg._projection import Surface, project
+from jaxlag._linalg._projection import ConstraintProjector, project
 
 
 @pytest.mark.full
@@ -49,7 +49,7 @@ def circle(q):
     def position(x):
         return jnp.stack([x @ x - 1.0])
 
-    return Surface(position, lambda q, v: jnp.stack([2 * q @ v]), correct, correct)
+    return ConstraintProjector(position, lambda q, v: jnp.stack([2 * q @ v]), correct, correct)
 
 
 @pytest.mark.parametrize("off", [1e-12, 1e-6, 1e-3, 0.1])

@@ -90,7 +90,7 @@ def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
 
     def check(times, values):
         inputs = {"u": jl.Linear(times, values)}
-        assert _closure.closing(system, {}, jnp.zeros(1), inputs) == {}
+        assert _closure.lift_closure_tracers(system, {}, jnp.zeros(1), inputs) == {}
         return jl.simulate(system, [0.0], [1.0], TS, {}, inputs=inputs).q[-1, 0]
 
     jax.make_jaxpr(jax.grad(check, (0, 1)))(jnp.array([0.0, 2.0]), jnp.array([1.0, 3.0]))

@@ -21,7 +21,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag._tracing._params import check_keys
-from jaxlag._tracing._traced_function import captured
+from jaxlag._tracing._traced_function import traced_function
 
 TABLE = {"k": 2.0}
 STIFFNESS = 2.0
@@ -400,7 +400,7 @@ FIXED = {
     "default": collections.defaultdict(float, {"a": 1.0}),
     "module": Named.steel(),
     "frozen": Frozen(),
-    "declared": Static(captured(of_own_attribute)),
+    "declared": Static(traced_function(of_own_attribute)),
     "circle": of_circle,
     "dispatched": dispatched_purely,
     "remembered": functools.lru_cache(lambda x: x),

@@ -10,8 +10,8 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import jaxlag as jl
-from jaxlag._tracing._program_constants import owned
-from jaxlag._tracing._traced_function import captured
+from jaxlag._tracing._program_constants import copy_constants
+from jaxlag._tracing._traced_function import traced_function
 
 TS = jnp.array([0.0, 0.5, 1.0])
 GRAVITY = 2.0
@@ -123,7 +123,7 @@ def test_a_function_of_a_system_is_taken_as_it_is():
     again = jl.System(system.lagrangian, ("x",))
     assert again == system
     assert again.lagrangian is system.lagrangian
-    assert captured(system.lagrangian.function) is system.lagrangian
+    assert traced_function(system.lagrangian.function) is system.lagrangian
     x = jnp.array([1.0])
     assert system.lagrangian(0.0, x, x, params=None) == 0.5
 
@@ -192,7 +192,7 @@ def test_constants_are_owned_and_what_has_none_is_shared():
         return x @ jnp.asarray(k)
 
     code = jax.make_jaxpr(lambda x: without(x) @ x + with_array(x))(jnp.ones(2))
-    mine = owned(code)
+    mine = copy_constants(code)
     before, after = (
         {eqn.params["name"]: eqn.params["jaxpr"] for eqn in c.jaxpr.eqns if "jaxpr" in eqn.params}
         for c in (code, mine)
@@ -213,7 +213,7 @@ def test_the_third_int_of_one_leaf_is_warned_about():
         kinetic = 0.5 * params["m"] * v[0] ** 2
         return kinetic - q[0] ** params["n"] if params["on"] else kinetic
 
-    call = captured(stiff)
+    call = traced_function(stiff)
 
     def of(m, n=2, on=True):
         return call(jnp.array(0.0), jnp.ones(1), jnp.ones(1), {"m": m, "n": n, "on": on})
@@ -233,7 +233,7 @@ def test_the_third_int_of_one_leaf_is_warned_about():
 
 def test_a_function_made_in_a_loop_is_told_once(caplog):
     def made(k):
-        return captured(lambda t: k * t)
+        return traced_function(lambda t: k * t)
 
     with caplog.at_level("WARNING", logger="jaxlag"):
         for k in range(25):

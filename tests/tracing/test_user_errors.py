@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._tracing._user_errors import said
+from jaxlag._tracing._user_errors import translate
 
 PARAMS = {"m": 1.0, "k": 2.0}
 
@@ -84,8 +84,8 @@ def test_other_faults_are_left_as_they_are():
 
     with pytest.raises(RuntimeError, match="mine"):
         run(own)
-    assert said(good, [0.0, [1.0], [0.0], PARAMS], KeyError("m")) is None
-    assert said(good, [0.0, [1.0], [0.0], PARAMS], TypeError("other")) is None
+    assert translate(good, [0.0, [1.0], [0.0], PARAMS], KeyError("m")) is None
+    assert translate(good, [0.0, [1.0], [0.0], PARAMS], TypeError("other")) is None
 
 
 def test_derivatives_say_the_same():
