@@ -21,10 +21,10 @@ from bench._harness import Reference, Target
 from jaxlag._fit._fit import last_gap
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
 from jaxlag._fit._identifiability import linearised
-from jaxlag._fit._multiple_shooting import Guess, Shooting, search
+from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, search
 from jaxlag._fit._residuals import squares
 from jaxlag._fit._segments import layout
-from jaxlag._fit._setup import pose, readers_of
+from jaxlag._fit._setup import build_shooting, readers_of
 
 TRUE = {"l1": 1.0, "l2": 0.8, "m2": 0.7, "m1": 1.0, "g": 9.81}
 FREE = ("l1", "l2", "m2")
@@ -132,12 +132,12 @@ def recovered(ts: np.ndarray, seeds: int, segments: int) -> Tally:
     return Tally(int(found), len(near), float(max(near, default=np.nan)), float(np.median(solves)))
 
 
-def posed(ts: np.ndarray, exact: np.ndarray) -> Shooting:
+def posed(ts: np.ndarray, exact: np.ndarray) -> MultipleShooting:
     """The least squares, of measurements without noise."""
     data = (jl.Experiment(ts, {"theta": exact}, sigma={"theta": NOISE}),)
     shown = readers_of(PENDULUM, data, {}, TRUE)
     free, where = unknowns(TRUE, FREE, {}), layout(data, SEGMENTS)
-    return pose(PENDULUM, data, where, free, shown, NO_PRIOR, squares, OPTIONS)[0]
+    return build_shooting(PENDULUM, data, where, free, shown, NO_PRIOR, squares, OPTIONS)[0]
 
 
 def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
@@ -147,9 +147,9 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     noise = NOISE * rng.normal(size=(fits, *segments.values.shape))
     values = segments.values + jnp.where(segments.weights > 0, noise, 0.0)
-    guess = Guess(jnp.zeros((fits, len(FREE))), jnp.zeros((fits, *segments.guess.shape)))
+    guess = FitVariables(jnp.zeros((fits, len(FREE))), jnp.zeros((fits, *segments.guess.shape)))
 
-    def one(values: Array, guess: Guess, join: Array) -> tuple[Guess, Array, Array]:
+    def one(values: Array, guess: FitVariables, join: Array) -> tuple[FitVariables, Array, Array]:
         own = eqx.tree_at(lambda x: x.segments.values, problem, values)
         found = search(own, guess, join, jnp.asarray(1e-6), 50)
         factor, by_z, _ = linearised(problem.free, found)

@@ -15,8 +15,8 @@ from bench._compared import SLACK, Compared, worst
 from bench._random_mechanisms import Mechanism, values
 from bench._reference import Equations, Solved, Terms, Unclear, terms_of
 from bench._rounding import evaluated
-from jaxlag._linalg._independent_rows import Choice
-from jaxlag._lowering import ArrayTerms, Moving, ScalarTerms
+from jaxlag._linalg._independent_rows import RowChoice
+from jaxlag._lowering import ArrayTerms, QuasiState, ScalarTerms
 
 NUDGES = 4
 NEARBY = 2  # to tell a contradiction from roundings
@@ -204,7 +204,7 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     system = mechanism.system
     array = ArrayTerms(system.lagrangian, system.forces, system.constraints)
     kept = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
-    choice = Choice(jnp.asarray(kept), jnp.asarray(~prepared.equations.void))
+    choice = RowChoice(jnp.asarray(kept), jnp.asarray(~prepared.equations.void))
 
     def by(terms: Any) -> Any:
         def a(t: Any, q: Any, v: Any, params: Any) -> Any:
@@ -224,7 +224,7 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     return found
 
 
-def _in_quasi(mechanism: Mechanism, choice: Choice) -> dict[str, Any]:
+def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
     """The programs of quasi-velocities."""
     system = mechanism.system
     quasi = system.quasi
@@ -238,7 +238,7 @@ def _in_quasi(mechanism: Mechanism, choice: Choice) -> dict[str, Any]:
 
     def projected(t: Any, q: Any, v: Any, params: Any) -> Any:
         w = speeds(t, q, v, params)
-        moving = Moving(terms, t, q, w, params, {})
+        moving = QuasiState(terms, t, q, w, params, {})
         if system.constraints:
             found = moving.reactions()
         else:

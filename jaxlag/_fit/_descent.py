@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxlag._core._errors import invalid
-from jaxlag._fit._multiple_shooting import Guess, Seen, Shooting
+from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, SegmentOutputs
 
 
 @final
@@ -75,8 +75,8 @@ class Descent(eqx.Module):
 
 @eqx.filter_jit
 def descend(
-    shooting: Shooting, guess: Guess, descent: Descent
-) -> tuple[Guess, Float[Array, " epochs"], Int[Array, ""]]:
+    shooting: MultipleShooting, guess: FitVariables, descent: Descent
+) -> tuple[FitVariables, Float[Array, " epochs"], Int[Array, ""]]:
     """(where the descent ends, mean cost of the steps of each epoch, unsound steps).
 
     Unsound are steps some of whose derivatives were not finite; they move nothing by those.
@@ -89,10 +89,12 @@ def descend(
     steps, batch = descent.steps(count)
     join = jnp.asarray(descent.gap)
 
-    def step(carry: tuple[Guess, Any], which: Int[Array, " b"]) -> tuple[Any, tuple[Array, Array]]:
+    def step(
+        carry: tuple[FitVariables, Any], which: Int[Array, " b"]
+    ) -> tuple[Any, tuple[Array, Array]]:
         guess, state = carry
 
-        def value(guess: Guess) -> Array:
+        def value(guess: FitVariables) -> Array:
             return cost_of(guess, shooting, which, join)
 
         cost, slope = jax.value_and_grad(value)(guess)
@@ -104,9 +106,9 @@ def descend(
             updates, state = update(slope, state, guess, value=cost, grad=slope, value_fn=value)
         z, x = eqx.apply_updates(guess, updates)
         held = jnp.clip(z, shooting.free.low, shooting.free.high)
-        return (Guess(held, x), state), (cost, ~sound)
+        return (FitVariables(held, x), state), (cost, ~sound)
 
-    def epoch(carry: tuple[Guess, Any], key: Array) -> tuple[Any, tuple[Array, Array]]:
+    def epoch(carry: tuple[FitVariables, Any], key: Array) -> tuple[Any, tuple[Array, Array]]:
         order = jax.random.permutation(key, count)[: steps * batch]
         carry, (costs, unsound) = jax.lax.scan(step, carry, order.reshape(steps, batch))
         return carry, (jnp.mean(costs), jnp.sum(unsound))
@@ -118,11 +120,11 @@ def descend(
 
 
 def cost_of(
-    guess: Guess, shooting: Shooting, which: Int[Array, " b"], join: Float[Array, ""]
+    guess: FitVariables, shooting: MultipleShooting, which: Int[Array, " b"], join: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Half the sum of squares over all segments, guessed from some of them; and of the priors."""
     segments = jax.tree.map(lambda x: x[which], shooting.segments)
-    seen = Seen(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
+    seen = SegmentOutputs(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
     rows = shooting.weighed(guess.x[which], segments, seen.residuals)
     total = jnp.sum(rows**2)
     if shooting.chained:

@@ -16,15 +16,21 @@ from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit_result import FitResult, summarised
 from jaxlag._fit._free_parameters import NO_PRIOR, Unknowns, paths, prior_rows, unknowns
 from jaxlag._fit._initial_guess import start_freedom
-from jaxlag._fit._multiple_shooting import Found, Guess, Shooting, judged, search
+from jaxlag._fit._multiple_shooting import (
+    FitVariables,
+    MultipleShooting,
+    SearchResult,
+    judged,
+    search,
+)
 from jaxlag._fit._residuals import LOSSES, Reader, squares
-from jaxlag._fit._segments import Layout, layout
+from jaxlag._fit._segments import SegmentLayout, layout
 from jaxlag._fit._setup import (
+    build_shooting,
     check_search,
     estimated_noise,
     experiments_of,
     plain_options,
-    pose,
     readers_of,
     with_noise,
 )
@@ -145,7 +151,9 @@ def fit(
         _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
     _warn_before(experiments, unknown)
     compared = _compared(system, experiments, unknown)
-    problem, noise = pose(system, experiments, where, unknown, shown, prior, LOSSES[loss], options)
+    problem, noise = build_shooting(
+        system, experiments, where, unknown, shown, prior, LOSSES[loss], options
+    )
     costs = np.zeros(0)
     if optimiser is None:
         problem, found, turns = _stages(problem, tolerance, max_iterations)
@@ -217,15 +225,15 @@ def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns)
 
 
 def _stages(
-    problem: Shooting, tolerance: float, max_iterations: int
-) -> tuple[Shooting, Found, int]:
+    problem: MultipleShooting, tolerance: float, max_iterations: int
+) -> tuple[MultipleShooting, SearchResult, int]:
     """(the problem in units that fit, what is found from loosely joined segments on, all steps).
 
     By squares first, whatever the loss: losses that count outliers for less have minima wherever
     everything is an outlier.
     """
     turns = 0
-    guess = Guess(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
+    guess = FitVariables(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
     by_squares, loss = replace(problem, loss=squares), problem.loss
     last = last_gap(problem)
     gaps = (*(gap for gap in GAPS if gap > last), last) if problem.chained else (last,)
@@ -247,7 +255,7 @@ def _stages(
     return problem, found, turns
 
 
-def _units(problem: Shooting, found: Found) -> Float[np.ndarray, " p"]:
+def _units(problem: MultipleShooting, found: SearchResult) -> Float[np.ndarray, " p"]:
     """Scales of the unknowns: as they are, but for those that are far from what they measure.
 
     An unknown is of order one where its unit is as large as it is; or, where it is about 0, as what
@@ -271,7 +279,7 @@ def _units(problem: Shooting, found: Found) -> Float[np.ndarray, " p"]:
     return np.where(np.isinf(free.reach) & np.isfinite(wanted) & off, wanted, free.scale)
 
 
-def last_gap(problem: Shooting) -> float:
+def last_gap(problem: MultipleShooting) -> float:
     """Of segments that are one motion, as far as measurements can see."""
     if not problem.chained:
         return 1.0
@@ -282,13 +290,13 @@ def last_gap(problem: Shooting) -> float:
 
 
 def _with_its_noise(
-    problem: Shooting,
+    problem: MultipleShooting,
     noise: dict[str, float],
-    found: Found,
-    where: Layout,
+    found: SearchResult,
+    where: SegmentLayout,
     tolerance: float,
     max_iterations: int,
-) -> tuple[Shooting, dict[str, float], Found, int]:
+) -> tuple[MultipleShooting, dict[str, float], SearchResult, int]:
     """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
     turns = 0
     for _ in range(NOISE_ROUNDS if noise else 0):
@@ -304,42 +312,44 @@ def _with_its_noise(
 
 
 def _downhill(
-    problem: Shooting, descent: Descent, max_iterations: int
-) -> tuple[Guess, Float[np.ndarray, " epochs"], int]:
+    problem: MultipleShooting, descent: Descent, max_iterations: int
+) -> tuple[FitVariables, Float[np.ndarray, " epochs"], int]:
     """(where a descent ends, its costs, solves); starts by least squares before and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
     before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_iterations)
-    guess, costs, unsound = descend(problem, Guess(z, before.guess.x), descent)
+    guess, costs, unsound = descend(problem, FitVariables(z, before.guess.x), descent)
     if int(unsound):
         text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
         warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
     after = _starts(problem, guess.z, guess.x, join, max_iterations)
     count = len(guess.x)
     solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
-    return Guess(guess.z, after.guess.x), np.asarray(costs), solves
+    return FitVariables(guess.z, after.guess.x), np.asarray(costs), solves
 
 
-def _join(problem: Shooting, descent: Descent) -> Float[Array, ""]:
+def _join(problem: MultipleShooting, descent: Descent) -> Float[Array, ""]:
     return jnp.asarray(descent.gap if problem.chained else 1.0)
 
 
-def _starts(problem: Shooting, z: Array, x: Array, join: Array, max_iterations: int) -> Found:
+def _starts(
+    problem: MultipleShooting, z: Array, x: Array, join: Array, max_iterations: int
+) -> SearchResult:
     """Starts by least squares, params as they are at z."""
     held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
-    return search(held, Guess(jnp.zeros(0), x), join, jnp.asarray(1e-4), max_iterations)
+    return search(held, FitVariables(jnp.zeros(0), x), join, jnp.asarray(1e-4), max_iterations)
 
 
 def _judged(
-    problem: Shooting,
-    guess: Guess,
+    problem: MultipleShooting,
+    guess: FitVariables,
     descent: Descent,
     costs: Float[np.ndarray, " epochs"],
     linear: bool,
-) -> Found:
+) -> SearchResult:
     """All that is known where a descent ended, with derivatives or without."""
     cost, rows, seen, starts = judged(problem, guess, _join(problem, descent), linear)
     fell = bool(np.all(np.isfinite(costs)) and costs[-1] <= costs[0])
-    return Found(guess, jnp.asarray(fell), jnp.asarray(len(costs)), cost, rows, seen, starts)
+    return SearchResult(guess, jnp.asarray(fell), jnp.asarray(len(costs)), cost, rows, seen, starts)
 
 
 def _warn_after(result: FitResult) -> None:

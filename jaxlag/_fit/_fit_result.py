@@ -16,12 +16,12 @@ from jaxlag._core._status import Status
 from jaxlag._fit._dissipation import feeding
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns, paths
-from jaxlag._fit._identifiability import Spectrum, distance, linearised, run_off
-from jaxlag._fit._multiple_shooting import Found, Shooting
+from jaxlag._fit._identifiability import Spectrum, distance, linearised, saturated
+from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._plot import plotted
 from jaxlag._fit._predict import Prediction, predict, residuals_of
 from jaxlag._fit._residuals import Reader, channels_of, rms_of
-from jaxlag._fit._segments import Layout
+from jaxlag._fit._segments import SegmentLayout
 from jaxlag._fit._setup import freedom
 from jaxlag._simulation._jump_times import names_of
 from jaxlag._system._system import System
@@ -192,10 +192,10 @@ class FitResult(eqx.Module):
 
 
 def summarised(
-    problem: Shooting,
-    found: Found,
+    problem: MultipleShooting,
+    found: SearchResult,
     experiments: tuple[Experiment, ...],
-    where: Layout,
+    where: SegmentLayout,
     noise: dict[str, float],
     own: Mapping[str, Reader],
     costs: Float[np.ndarray, " epochs"],
@@ -257,7 +257,10 @@ def summarised(
 
 
 def _feeding(
-    problem: Shooting, params: Any, covariance: np.ndarray, experiments: tuple[Experiment, ...]
+    problem: MultipleShooting,
+    params: Any,
+    covariance: np.ndarray,
+    experiments: tuple[Experiment, ...],
 ) -> dict[str, tuple[str, ...]]:
     """Forces that give energy and should not, with the numbers found that they depend on."""
     free = problem.free
@@ -291,7 +294,9 @@ class _Uncertainty(NamedTuple):
     distance: float
 
 
-def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncertainty:
+def _uncertainty(
+    problem: MultipleShooting, found: SearchResult, values: np.ndarray
+) -> _Uncertainty:
     names = np.array(problem.free.names)
     unknown = np.full((len(names), len(names)), np.nan)
     nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), (), np.nan)
@@ -302,7 +307,7 @@ def _uncertainty(problem: Shooting, found: Found, values: np.ndarray) -> _Uncert
         return nothing
     told = np.linalg.norm(factor, axis=0) > UNTOLD * np.linalg.norm(factor)
     held = problem.free.at_limit(found.guess.z) & told
-    moves = ~(run_off(factor, by_z, at_first) | held)
+    moves = ~(saturated(factor, by_z, at_first) | held)
     own = np.ix_(moves, moves)
     by_value = np.linalg.solve(by_z[own].T, np.where(told, factor, 0.0)[:, moves].T).T
     spectrum = Spectrum(tuple(names[moves].tolist()), values[moves], by_value)
@@ -324,7 +329,7 @@ def _at(free: Unknowns, z: Float[Array, " p"]) -> tuple[Any, Array]:
     return free.params(z), free.numbers(z)
 
 
-def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
+def _how_it_ended(problem: MultipleShooting, z: Any, found: SearchResult, k: int) -> str:
     """The status of a segment that failed, or the channel that is not finite."""
     segment = jax.tree.map(lambda x: x[k], problem.segments)
     start = jnp.asarray(found.starts)[k]
@@ -337,7 +342,7 @@ def _how_it_ended(problem: Shooting, z: Any, found: Found, k: int) -> str:
     return Status(int(motion.status)).name
 
 
-def _gaps(found: Found, problem: Shooting) -> np.ndarray:
+def _gaps(found: SearchResult, problem: MultipleShooting) -> np.ndarray:
     """Ends less the starts that follow, over the range of the states."""
     apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states[None]
     ok = np.asarray(found.seen.status == Status.ok)[:, None]

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._status import Status
 from jaxlag._fit._free_parameters import IDLE, Unknowns
-from jaxlag._fit._linear_least_squares import Rows, eliminate
-from jaxlag._fit._multiple_shooting import Found, Shooting
+from jaxlag._fit._linear_least_squares import LinearRows, eliminate
+from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 
 NEGLIGIBLE = 1e-6
 """Singular values of normed columns below it are those of derivatives that vanish: solves at a
@@ -82,7 +82,7 @@ def relative(values: np.ndarray) -> np.ndarray:
     return np.where(values == 0, 1.0, values)
 
 
-def run_off(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.ndarray:
+def saturated(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.ndarray:
     """(e,) which numbers are on a bound of their transform, where no derivative moves them.
 
     Of a matrix, all that its transform ties to such a number.
@@ -166,23 +166,23 @@ def _together(names: tuple[str, ...], row: np.ndarray) -> str:
 # ---- The linear problem where a search ended, states eliminated ----------------------------------
 
 
-FAINT = 1e-20
+REGULARIZATION = 1e-20
 """Damping, in squares of unknowns of order one, that keeps starts regular that are not observed."""
 NOTHING = 1e-7
 """Singular values below this part of the largest: of directions in which no motion goes."""
 
 
 @eqx.filter_jit
-def linearised(free: Unknowns, found: Found) -> tuple[Array, Array, Array]:
+def linearised(free: Unknowns, found: SearchResult) -> tuple[Array, Array, Array]:
     """(a factor of the weighted derivatives by z, derivatives of the numbers by z, those at 0)."""
     numbers, z = jax.jacfwd(free.numbers), found.guess.z
     assert found.rows is not None
-    left = eliminate(_without_failed(found.rows, found), jnp.asarray(FAINT))
+    left = eliminate(_without_failed(found.rows, found), jnp.asarray(REGULARIZATION))
     return left.params[:-1, :-1], numbers(z), numbers(jnp.zeros_like(z))
 
 
 @eqx.filter_jit
-def distance(found: Found, moves: Bool[Array, " p"]) -> Float[Array, ""]:
+def distance(found: SearchResult, moves: Bool[Array, " p"]) -> Float[Array, ""]:
     """How far params are from where their derivatives lead, in standard deviations.
 
     sqrt(dz . C^-1 dz), dz the step of Gauss and Newton, C the covariance, of unknowns that move.
@@ -196,12 +196,12 @@ def distance(found: Found, moves: Bool[Array, " p"]) -> Float[Array, ""]:
         return x.at[..., -p - 1 : -1].multiply(jnp.where(moves, 1.0, 0.0))
 
     joined = None if rows.joined is None else kept(rows.joined)
-    moving = Rows(kept(rows.measured), joined, rows.next, kept(rows.prior))
-    left = eliminate(moving, jnp.asarray(FAINT))
+    moving = LinearRows(kept(rows.measured), joined, rows.next, kept(rows.prior))
+    left = eliminate(moving, jnp.asarray(REGULARIZATION))
     return jnp.linalg.norm(left.params[:-1, -1])
 
 
-def _without_failed(rows: Rows, found: Found) -> Rows:
+def _without_failed(rows: LinearRows, found: SearchResult) -> LinearRows:
     """The linear problem without rows of segments that failed."""
     ok = (found.seen.status == Status.ok)[:, None, None]
     joined = None if rows.joined is None else jnp.where(ok, rows.joined, 0.0)
@@ -209,7 +209,7 @@ def _without_failed(rows: Rows, found: Found) -> Rows:
     return rows._replace(measured=jnp.where(ok, rows.measured, 0.0), joined=joined, next=following)
 
 
-def spent(problem: Shooting, found: Found) -> float:
+def effective_parameters(problem: MultipleShooting, found: SearchResult) -> float:
     """How many of the numbers measured went into unknowns: the trace of the hat matrix.
 
     As many as there are unknowns that measurements tell: not those that are held, those along which

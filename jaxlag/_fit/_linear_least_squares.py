@@ -19,7 +19,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 
-class Rows(NamedTuple):
+class LinearRows(NamedTuple):
     """Rows of the problem; the last column of each is the right-hand side.
 
     Attributes:
@@ -35,7 +35,7 @@ class Rows(NamedTuple):
     prior: Float[Array, "c e"]
 
 
-class Eliminated(NamedTuple):
+class ReducedRows(NamedTuple):
     """What is left of the rows.
 
     Attributes:
@@ -55,12 +55,12 @@ def _triangle(rows: Float[Array, "*k m c"]) -> Float[Array, "*k c c"]:
     return jnp.linalg.qr(rows, mode="r")
 
 
-def condense(rows: Rows) -> Rows:
+def condense(rows: LinearRows) -> LinearRows:
     """The same problem with as many measured rows as columns: once for every damping."""
     return rows._replace(measured=_triangle(rows.measured), prior=_triangle(rows.prior))
 
 
-def sizes_of(rows: Rows) -> Float[Array, " c"]:
+def sizes_of(rows: LinearRows) -> Float[Array, " c"]:
     """Norms of the columns of one state, the params and the right-hand side, all rows together."""
     d = rows.measured.shape[-1] - rows.prior.shape[-1]
     squares = jnp.sum(rows.measured**2, axis=(0, 1))
@@ -70,8 +70,8 @@ def sizes_of(rows: Rows) -> Float[Array, " c"]:
 
 
 def eliminate(
-    rows: Rows, damping: Float[Array, ""], weights: Float[Array, " p"] | None = None
-) -> Eliminated:
+    rows: LinearRows, damping: Float[Array, ""], weights: Float[Array, " p"] | None = None
+) -> ReducedRows:
     """Rows of condensed problems from which params and states follow by substitution.
 
     Args:
@@ -93,7 +93,7 @@ def eliminate(
         turned = _triangle(both)
         states = jnp.insert(turned[:, :d], jnp.full(d, d), 0.0, axis=2)
         rest = turned[:, d:, d:].reshape(-1, size)
-        return Eliminated(states, _triangle(jnp.concatenate([about, rest])))
+        return ReducedRows(states, _triangle(jnp.concatenate([about, rest])))
 
     def spread(x: Array) -> Array:
         """Zeros in the columns of the next state."""
@@ -110,10 +110,10 @@ def eliminate(
     start = jnp.zeros((d, columns), dtype), _triangle(about)
     (left, params), states = jax.lax.scan(one, start, (rows.measured, rows.joined, rows.next))
     # The last segment ends: what is left over holds p alone.
-    return Eliminated(states, _triangle(jnp.concatenate([params, left[:, d:]])))
+    return ReducedRows(states, _triangle(jnp.concatenate([params, left[:, d:]])))
 
 
-def states_of(left: Eliminated, p: Float[Array, " p"]) -> Float[Array, "k d"]:
+def states_of(left: ReducedRows, p: Float[Array, " p"]) -> Float[Array, "k d"]:
     """The states x of least squares where the params are p."""
     d = left.states.shape[1]
 

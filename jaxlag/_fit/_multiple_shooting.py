@@ -23,7 +23,7 @@ from jaxlag._core._batching import in_batches
 from jaxlag._core._status import Status
 from jaxlag._fit._bounded_least_squares import box_least_squares
 from jaxlag._fit._free_parameters import IDLE, Unknowns
-from jaxlag._fit._linear_least_squares import Rows, condense, eliminate, sizes_of, states_of
+from jaxlag._fit._linear_least_squares import LinearRows, condense, eliminate, sizes_of, states_of
 from jaxlag._fit._residuals import Reader, read
 from jaxlag._fit._segments import Segments
 from jaxlag._simulation._simulate import simulate
@@ -40,7 +40,7 @@ LARGEST_GAP = 1e4
 digits for what else is summed up."""
 
 
-class Guess(NamedTuple):
+class FitVariables(NamedTuple):
     """What the optimiser moves: z (p,) of the params, x (k, d) of the states, all of order one."""
 
     z: Float[Array, " p"]
@@ -61,7 +61,7 @@ class Residuals(NamedTuple):
     prior: Float[Array, " c"]
 
 
-class Seen(NamedTuple):
+class SegmentOutputs(NamedTuple):
     """What segments did.
 
     Attributes:
@@ -75,7 +75,7 @@ class Seen(NamedTuple):
     status: Array
 
 
-class Shooting(eqx.Module):
+class MultipleShooting(eqx.Module):
     """The problem.
 
     Attributes:
@@ -152,7 +152,7 @@ class Shooting(eqx.Module):
         # Rows beyond those that were measured hold nothing, not even NaN.
         return jnp.where(measured, residuals, 0.0), end, status
 
-    def linearized(self, guess: Guess) -> tuple[Any, Any]:
+    def linearized(self, guess: FitVariables) -> tuple[Any, Any]:
         """((residuals, ends, status), their derivatives by z and by the segment's own x)."""
 
         def both(z: Array, x: Array, segment: Segments) -> tuple[Any, Any]:
@@ -169,7 +169,7 @@ class Shooting(eqx.Module):
         by, values = in_batches(one, (guess.x, self.segments), count, at_once)
         return values, by
 
-    def __call__(self, guess: Guess, join: Float[Array, ""]) -> tuple[Residuals, Any]:
+    def __call__(self, guess: FitVariables, join: Float[Array, ""]) -> tuple[Residuals, Any]:
         """(residuals, what is seen of them), written as their own expansion about `guess`.
 
         So a segment is differentiated by its own start only: in p + d directions, not p + k d.
@@ -178,12 +178,14 @@ class Shooting(eqx.Module):
         (residuals, ends, status), by = self.linearized(here)
         (r_z, r_x), (e_z, e_x) = by
         dz, dx = guess.z - here.z, guess.x - here.x
-        seen = Seen(residuals, ends, status)
+        seen = SegmentOutputs(residuals, ends, status)
         residuals += r_z @ dz + jnp.einsum("ksmd,kd->ksm", r_x, dx)
         ends += e_z @ dz + jnp.einsum("ked,kd->ke", e_x, dx)
-        return self.compared(guess, Seen(residuals, ends, status), join), seen
+        return self.compared(guess, SegmentOutputs(residuals, ends, status), join), seen
 
-    def compared(self, guess: Guess, seen: Seen, join: Float[Array, ""]) -> Residuals:
+    def compared(
+        self, guess: FitVariables, seen: SegmentOutputs, join: Float[Array, ""]
+    ) -> Residuals:
         """All that is to be small, of what segments do."""
         joined = None
         if self.chained:
@@ -202,7 +204,11 @@ class Shooting(eqx.Module):
         return jnp.concatenate([self.loss(residuals).reshape(len(starts), -1), starts], axis=1)
 
     def gaps(
-        self, segments: Segments, seen: Seen, begins: Float[Array, "k d"], join: Float[Array, ""]
+        self,
+        segments: Segments,
+        seen: SegmentOutputs,
+        begins: Float[Array, "k d"],
+        join: Float[Array, ""],
     ) -> Float[Array, "k d"]:
         """Ends less the starts that follow, over `join` times the range of the states.
 
@@ -222,7 +228,7 @@ class Shooting(eqx.Module):
 # The optimiser: optimistix' Levenberg-Marquardt, its linear steps by elimination.
 
 
-def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> Rows:
+def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> LinearRows:
     """The linear problem: the operator's columns by z, and by the states of all segments at once.
 
     A segment's measured rows hold its own state only. The rows that join it to the next hold
@@ -232,7 +238,7 @@ def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> Rows:
     guess = operator.in_structure()
     p, (k, d) = guess.z.shape[0], guess.x.shape
     dtype = guess.x.dtype
-    nothing = Guess(jnp.zeros(p, dtype), jnp.zeros((k, d), dtype))
+    nothing = FitVariables(jnp.zeros(p, dtype), jnp.zeros((k, d), dtype))
     by_z = jax.vmap(lambda z: operator.mv(nothing._replace(z=z)))(jnp.eye(p, dtype=dtype))
 
     def by_x(which: Array) -> Residuals:
@@ -246,14 +252,14 @@ def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> Rows:
     prior = jnp.concatenate([by_z.prior.T, residuals.prior[:, None]], axis=1)
     if residuals.joined is None:
         measured = by_x(jnp.ones(k, bool)).measured
-        return Rows(columns(measured, by_z.measured, residuals.measured), None, None, prior)
+        return LinearRows(columns(measured, by_z.measured, residuals.measured), None, None, prior)
     even = jnp.arange(k) % 2 == 0
     evens, odds = by_x(even), by_x(~even)
     assert evens.joined is not None
     assert odds.joined is not None
     own = jnp.where(even[:, None], evens.joined, odds.joined)
     after = jnp.where(even[:, None], odds.joined, evens.joined)
-    return Rows(
+    return LinearRows(
         columns(evens.measured + odds.measured, by_z.measured, residuals.measured),
         columns(own, by_z.joined, residuals.joined),
         -jnp.diagonal(after, axis1=0, axis2=2),
@@ -270,7 +276,7 @@ class _Condensed(eqx.Module):
         box: how far each may go down and up, (p,) each; None where all may go anywhere.
     """
 
-    rows: Rows
+    rows: LinearRows
     weights: Float[Array, " p"] | None
     box: tuple[Float[Array, " p"], Float[Array, " p"]] | None
 
@@ -282,9 +288,9 @@ class Eliminating(optx.AbstractDescent):
     or else a number on its way to a bound would take ever smaller steps.
     """
 
-    shooting: Shooting
+    shooting: MultipleShooting
 
-    def init(self, y: Guess, f_info_struct: Any) -> _Condensed:
+    def init(self, y: FitVariables, f_info_struct: Any) -> _Condensed:
         """Of the right shapes."""
         shapes = eqx.filter_eval_shape(self._condense, f_info_struct)
         rows = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -292,10 +298,10 @@ class Eliminating(optx.AbstractDescent):
             return _Condensed(rows, None, None)
         return _Condensed(rows, y.z, (y.z, y.z))
 
-    def _condense(self, f_info: Any) -> Rows:
+    def _condense(self, f_info: Any) -> LinearRows:
         return condense(rows_of(f_info.jac, f_info.residual))
 
-    def query(self, y: Guess, f_info: Any, state: _Condensed) -> _Condensed:
+    def query(self, y: FitVariables, f_info: Any, state: _Condensed) -> _Condensed:
         """Of new derivatives."""
         free, rows = self.shooting.free, self._condense(f_info)
         if free.plain:
@@ -306,7 +312,7 @@ class Eliminating(optx.AbstractDescent):
         down, up = jnp.maximum(-reach, free.low - y.z), jnp.minimum(reach, free.high - y.z)
         return _Condensed(rows, jnp.minimum(speeds, 1.0), (down, up))
 
-    def step(self, step_size: Array, state: _Condensed) -> tuple[Guess, optx.RESULTS]:
+    def step(self, step_size: Array, state: _Condensed) -> tuple[FitVariables, optx.RESULTS]:
         """Of a step size: the best within what each of the params may move."""
         left = eliminate(state.rows, 1.0 / step_size, state.weights)
         factor, right = left.params[:-1, :-1], left.params[:-1, -1]
@@ -314,7 +320,7 @@ class Eliminating(optx.AbstractDescent):
             z = solve_triangular(factor, -right)
         else:
             z = box_least_squares(factor, -right, *state.box)
-        return Guess(z, -states_of(left, -z)), optx.RESULTS.successful
+        return FitVariables(z, -states_of(left, -z)), optx.RESULTS.successful
 
 
 class Shooter(optx.AbstractGaussNewton):
@@ -327,7 +333,7 @@ class Shooter(optx.AbstractGaussNewton):
     search: optx.ClassicalTrustRegion
     verbose: Callable[..., None]
 
-    def __init__(self, shooting: Shooting, rtol: Array, atol: Array) -> None:
+    def __init__(self, shooting: MultipleShooting, rtol: Array, atol: Array) -> None:
         self.rtol, self.atol, self.norm = rtol, atol, optx.max_norm
         self.descent = Eliminating(shooting)
         self.search = optx.ClassicalTrustRegion()
@@ -338,7 +344,7 @@ def _quiet(**_: Any) -> None:
     """Print nothing."""
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Where the optimiser ended.
 
     Attributes:
@@ -351,22 +357,24 @@ class Found(NamedTuple):
         starts: (k, d), states where they start, m, rad, m/s, rad/s.
     """
 
-    guess: Guess
+    guess: FitVariables
     converged: Bool[Array, ""]
     steps: Array
     cost: Float[Array, ""]
-    rows: Rows | None
-    seen: Seen
+    rows: LinearRows | None
+    seen: SegmentOutputs
     starts: Float[Array, "k d"]
 
 
 @eqx.filter_jit
 def search(
-    shooting: Shooting, guess: Guess, join: Array, tolerance: Array, max_steps: int
-) -> Found:
+    shooting: MultipleShooting, guess: FitVariables, join: Array, tolerance: Array, max_steps: int
+) -> SearchResult:
     """Least squares from a guess, with gaps of `join` times the range of the states."""
 
-    def function(guess: Guess, args: tuple[Shooting, Array]) -> tuple[Residuals, Any]:
+    def function(
+        guess: FitVariables, args: tuple[MultipleShooting, Array]
+    ) -> tuple[Residuals, Any]:
         shooting, join = args
         return shooting(guess, join)
 
@@ -381,7 +389,7 @@ def search(
     )
     # What the optimiser knows of the last point that it accepted; nothing is solved once more.
     state = solution.state
-    return Found(
+    return SearchResult(
         solution.value,
         solution.result == optx.RESULTS.successful,
         solution.stats["num_steps"],
@@ -393,20 +401,20 @@ def search(
 
 
 @eqx.filter_jit
-def moved(shooting: Shooting, guess: Guess) -> Seen:
+def moved(shooting: MultipleShooting, guess: FitVariables) -> SegmentOutputs:
     """What segments do, without derivatives."""
 
     def one(row: tuple[Array, Segments]) -> tuple[Array, Array, Array]:
         return shooting.one(guess.z, *row)
 
     count = guess.x.shape[0]
-    return Seen(*in_batches(one, (guess.x, shooting.segments), count, AT_ONCE))
+    return SegmentOutputs(*in_batches(one, (guess.x, shooting.segments), count, AT_ONCE))
 
 
 @eqx.filter_jit
 def judged(
-    shooting: Shooting, guess: Guess, join: Array, linear: bool
-) -> tuple[Float[Array, ""], Rows | None, Seen, Float[Array, "k d"]]:
+    shooting: MultipleShooting, guess: FitVariables, join: Array, linear: bool
+) -> tuple[Float[Array, ""], LinearRows | None, SegmentOutputs, Float[Array, "k d"]]:
     """(cost, the linear problem condensed, what segments do, where they start) at a guess.
 
     Args:

@@ -14,11 +14,17 @@ from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
 from jaxlag._fit._initial_guess import start_freedom
-from jaxlag._fit._multiple_shooting import Guess, Shooting, moved, search
+from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, moved, search
 from jaxlag._fit._plot import plotted
 from jaxlag._fit._residuals import Reader, channels_of, rms_of, squares
-from jaxlag._fit._segments import Layout, layout
-from jaxlag._fit._setup import check_search, experiments_of, plain_options, pose, readers_of
+from jaxlag._fit._segments import SegmentLayout, layout
+from jaxlag._fit._setup import (
+    build_shooting,
+    check_search,
+    experiments_of,
+    plain_options,
+    readers_of,
+)
 from jaxlag._system._system import System
 from jaxlag._tracing._params import check_keys
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -130,13 +136,15 @@ def predict(
     fixed = unknowns(params, (), {})
     shown = readers_of(system, experiments, own, params)
 
-    def posed(these: tuple[Experiment, ...]) -> tuple[Shooting, Layout]:
+    def posed(these: tuple[Experiment, ...]) -> tuple[MultipleShooting, SegmentLayout]:
         where = layout(these, 1)
-        problem, _ = pose(system, these, where, fixed, shown, NO_PRIOR, squares, options, noise)
+        problem, _ = build_shooting(
+            system, these, where, fixed, shown, NO_PRIOR, squares, options, noise
+        )
         return problem, where
 
     whole, where = posed(early)
-    nowhere = Guess(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
+    nowhere = FitVariables(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
     found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray(tolerance), max_iterations)
     if not found.converged:
         text = f"The search for starts did not converge in {int(found.steps)} iterations: raise "
@@ -186,11 +194,11 @@ def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> E
 
 
 def residuals_of(
-    problem: Shooting,
+    problem: MultipleShooting,
     weighted: np.ndarray,
     status: np.ndarray,
     experiments: Sequence[Experiment],
-    where: Layout,
+    where: SegmentLayout,
 ) -> tuple[dict[str, np.ndarray], ...]:
     """Of each experiment by channel, in the channels' units; NaN where a segment failed."""
     weights = np.asarray(problem.segments.weights)

@@ -40,7 +40,7 @@ class Segments(NamedTuple):
     held: Float[Array, "k d"]
 
 
-class Layout(NamedTuple):
+class SegmentLayout(NamedTuple):
     """Where rows of experiments stand.
 
     Attributes:
@@ -60,7 +60,7 @@ class Layout(NamedTuple):
     columns: dict[str, slice]
 
 
-def layout(experiments: Sequence[Experiment], segments: int) -> Layout:
+def layout(experiments: Sequence[Experiment], segments: int) -> SegmentLayout:
     """At most `segments` per experiment, of equally many rows as far as that goes."""
     owner, first, count = [], [], []
     for i, experiment in enumerate(experiments):
@@ -87,13 +87,15 @@ def layout(experiments: Sequence[Experiment], segments: int) -> Layout:
         np.arange(n) if further else np.append(np.arange(n - 1), last)
         for n, further in zip(count, follows, strict=True)
     )
-    return Layout(np.array(owner), np.array(first), np.array(count), follows, places, columns)
+    return SegmentLayout(
+        np.array(owner), np.array(first), np.array(count), follows, places, columns
+    )
 
 
 def pack(
     system: System,
     experiments: Sequence[Experiment],
-    where: Layout,
+    where: SegmentLayout,
     sigma: dict[str, float],
     guess: np.ndarray,
 ) -> Segments:

@@ -13,11 +13,11 @@ from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns
-from jaxlag._fit._identifiability import spent
+from jaxlag._fit._identifiability import effective_parameters
 from jaxlag._fit._initial_guess import initial_states, typical
-from jaxlag._fit._multiple_shooting import Found, Shooting
+from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._residuals import Reader, readers, squares
-from jaxlag._fit._segments import Layout, pack
+from jaxlag._fit._segments import SegmentLayout, pack
 from jaxlag._system._system import System
 
 OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
@@ -100,17 +100,17 @@ def _unstated(experiments: Sequence[Experiment]) -> set[str]:
     return without
 
 
-def pose(
+def build_shooting(
     system: System,
     experiments: Sequence[Experiment],
-    where: Layout,
+    where: SegmentLayout,
     free: Unknowns,
     shown: Mapping[str, Reader],
     prior: tuple[np.ndarray, np.ndarray, np.ndarray],
     loss: Callable[[Array], Array],
     options: Mapping[str, Any],
     known_noise: Mapping[str, float] | None = None,
-) -> tuple[Shooting, dict[str, float]]:
+) -> tuple[MultipleShooting, dict[str, float]]:
     """The problem, and the noise assumed of channels whose noise is not stated.
 
     Args:
@@ -142,7 +142,7 @@ def pose(
         guesses.append(states[: len(rows)])
         spread.append(states[len(rows) :])
     segments = pack(system, experiments, where, noise, np.concatenate(guesses))
-    problem = Shooting(
+    problem = MultipleShooting(
         system,
         tuple(sorted(options.items())),
         tuple(shown.items()),
@@ -158,15 +158,15 @@ def pose(
     return problem, noise
 
 
-def freedom(found: Found, problem: Shooting) -> float:
+def freedom(found: SearchResult, problem: MultipleShooting) -> float:
     """How many more numbers were measured than went into unknowns; segments that failed aside."""
     ok = (np.asarray(found.seen.status) == Status.ok)[:, None, None]
     measured = np.count_nonzero((np.asarray(problem.segments.weights) > 0) & ok)
-    return measured - spent(problem, found)
+    return measured - effective_parameters(problem, found)
 
 
 def estimated_noise(
-    found: Found, problem: Shooting, where: Layout, noise: Mapping[str, float]
+    found: SearchResult, problem: MultipleShooting, where: SegmentLayout, noise: Mapping[str, float]
 ) -> dict[str, float]:
     """Standard deviations of the channels' residuals, m, rad or what they are measured in.
 
@@ -198,7 +198,9 @@ def spreads(x: np.ndarray) -> np.ndarray:
     return np.where(found > 0, found, 1.0)
 
 
-def with_noise(problem: Shooting, where: Layout, noise: Mapping[str, float]) -> Shooting:
+def with_noise(
+    problem: MultipleShooting, where: SegmentLayout, noise: Mapping[str, float]
+) -> MultipleShooting:
     """The problem with other weights of these channels."""
     weights = problem.segments.weights
     for name, sigma in noise.items():

@@ -24,7 +24,7 @@ class GradientMode(IntEnum):
     checkpoints = 3
 
 
-class Keep(NamedTuple):
+class CheckpointPlan(NamedTuple):
     """What is kept for derivatives.
 
     Attributes:
@@ -44,7 +44,7 @@ def choose_gradient(
     state: int,
     itemsize: int,
     knots: bool = False,
-) -> Keep:
+) -> CheckpointPlan:
     """What to keep of `max_steps` steps.
 
     Args:
@@ -59,7 +59,7 @@ def choose_gradient(
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
     if memory is None:
-        return Keep(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
+        return CheckpointPlan(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
     if not isinstance(rows, int):
         was = f"it was {memory} for {rows} times"
         raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
@@ -71,10 +71,10 @@ def choose_gradient(
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
         if needed(room, turns, state, itemsize, knots) <= memory:
-            return Keep(mode, room)
+            return CheckpointPlan(mode, room)
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
-            return Keep(mode, rooms[fitting[0]])
+            return CheckpointPlan(mode, rooms[fitting[0]])
         must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
         raise invalid("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
     if needs[mode] > memory:
@@ -82,7 +82,7 @@ def choose_gradient(
         fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
         must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"
         raise invalid("gradient_memory", must, f"it was {memory}", fix)
-    return Keep(mode, rooms[mode])
+    return CheckpointPlan(mode, rooms[mode])
 
 
 def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag._core import _xla
-from jaxlag._integration._record import Record, Times, step_end
+from jaxlag._integration._record import Record, Times, reached_time
 
 
-class Walk(NamedTuple):
+class SolveTangents(NamedTuple):
     """What is wanted of a motion or of its derivative.
 
     Attributes:
@@ -28,7 +28,7 @@ class Walk(NamedTuple):
     points: PyTree | None
 
 
-class Change(NamedTuple):
+class InputTangents(NamedTuple):
     """A direction of what a motion depends on; None for what does not move.
 
     Attributes:
@@ -44,7 +44,7 @@ class Change(NamedTuple):
     saves: Array | None
 
 
-class Clock(NamedTuple):
+class StepTimes(NamedTuple):
     """When the turns of a recorded motion ended; time -1 is that of the start."""
 
     times: Times
@@ -92,7 +92,7 @@ class Clock(NamedTuple):
         return self.record.turns - 1
 
 
-class Path(NamedTuple):
+class RecordedMotion(NamedTuple):
     """A recorded motion: what was given to the loop and what it kept.
 
     Attributes:
@@ -116,7 +116,7 @@ class Path(NamedTuple):
     tree: Any
     moving: tuple[int, ...]
     windows: Callable
-    clock: Clock
+    clock: StepTimes
     stages: int
     plain: bool
 
@@ -146,9 +146,9 @@ class Path(NamedTuple):
         if reach is None:
             return self.step(args, t, end, state, jump, end)
         assert turn_end is not None
-        return self.step(args, t, step_end(reach, t, end, turn_end), state, jump, end)
+        return self.step(args, t, reached_time(reach, t, end, turn_end), state, jump, end)
 
-    def found(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
+    def recompute(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
         """The state after turn k, with the arguments as they are."""
         t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
         reach = self.clock.reach(end, anchors)
@@ -196,7 +196,7 @@ def all_rows(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -
     return jax.tree.map(of, first, rows, last)
 
 
-def arrived(path: Path, anchors: Array) -> Array:
+def arrived(path: RecordedMotion, anchors: Array) -> Array:
     """Whether the last row was reached."""
     clock = path.clock
     return clock.time(clock.last, anchors) >= clock.times.saves[-1]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag._gradient._recorded_motion import Path, Walk, all_rows, arrived, pick
+from jaxlag._gradient._recorded_motion import RecordedMotion, SolveTangents, all_rows, arrived, pick
 from jaxlag._integration._loop import CHUNK
 
 
@@ -25,7 +25,9 @@ class _Slots(NamedTuple):
     turn_ends: Array | None
 
 
-def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Array | None]:
+def _slots(
+    path: RecordedMotion, anchors: Array, saves: Array
+) -> tuple[_Slots, Array, Array | None]:
     """The sequence, and the places of turns and of rows in it."""
     clock, record = path.clock, path.clock.record
     index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
@@ -66,13 +68,13 @@ def _slots(path: Path, anchors: Array, saves: Array) -> tuple[_Slots, Array, Arr
 
 
 def again(
-    path: Path,
+    path: RecordedMotion,
     start: PyTree,
     moved: Sequence[Array],
     anchors: Array,
     saves: Array,
     points: bool,
-) -> Walk:
+) -> SolveTangents:
     """The motion itself by a scan, which JAX differentiates in any mode and to any order.
 
     The scan skips whole chunks that no lane of a vmapped solve needs. Turns that are not wanted
@@ -133,4 +135,6 @@ def again(
 
         point_states = jax.tree.map(kept, befores)
     time = clock.time(clock.last, anchors)
-    return Walk(last, time, all_rows(start, rows, last, arrived(path, anchors)), point_states)
+    return SolveTangents(
+        last, time, all_rows(start, rows, last, arrived(path, anchors)), point_states
+    )

@@ -18,15 +18,15 @@ from jaxlag._core import _xla
 from jaxlag._core._batching import LANES, at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._status import Status
-from jaxlag._gradient._modes import GradientMode, Keep
+from jaxlag._gradient._modes import CheckpointPlan, GradientMode
 from jaxlag._gradient._rescan import again
 from jaxlag._gradient._tangent_map import Setup, changed, changes, filled, in_loops, path_of, unpack
 from jaxlag._gradient._unreached_saves import unreached
-from jaxlag._integration._loop import drive
+from jaxlag._integration._loop import integrate
 from jaxlag._integration._record import Outcome, Times
 
 
-class Rows(NamedTuple):
+class SavedStates(NamedTuple):
     """The solution at the save times, and where the solve ended."""
 
     saved: PyTree  # leaves (s, ...), NaN where not reached
@@ -41,17 +41,17 @@ class Problem(NamedTuple):
     args: Any
     times: Times
     setup: Setup
-    scheme: Any  # static half of the Scheme
+    stepper: Any  # static half of the Scheme
     max_steps: int
-    keep: Keep
+    keep: CheckpointPlan
 
 
-def solve(problem: Problem) -> tuple[Rows, Outcome]:
+def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
     """Integrate and save; differentiable in y0, args and times."""
     inexact, rest, setup, static = halves(problem)
 
     @CustomJVP
-    def run(inexact: Any, rest: Any, setup: Setup) -> tuple[Rows, Outcome]:
+    def run(inexact: Any, rest: Any, setup: Setup) -> tuple[SavedStates, Outcome]:
         outcome = _driven(inexact, rest, setup, static, record=False)
         return _told(outcome)
 
@@ -68,7 +68,7 @@ def solve(problem: Problem) -> tuple[Rows, Outcome]:
         else:
             walk = changed(inexact, rest, setup, static, outcome.record, change)
             rows, told = _told(outcome)
-            rows_dot = Rows(walk.rows[0], walk.last[0], walk.time)
+            rows_dot = SavedStates(walk.rows[0], walk.last[0], walk.time)
         told = told._replace(gradient=_mode(outcome, static))
         reached = jnp.all(jnp.isfinite(outcome.rows), axis=tuple(range(1, outcome.rows.ndim)))
         rows_dot = rows_dot._replace(saved=unreached(reached, inexact, change, rows_dot.saved))
@@ -81,14 +81,14 @@ def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
     """A problem as (differentiable leaves, other arrays, setup, static rest)."""
     inexact, rest = eqx.partition(problem[:3], eqx.is_inexact_array)
     rest, static = eqx.partition(rest, eqx.is_array)
-    return inexact, rest, problem.setup, (static, problem.scheme, problem.max_steps, problem.keep)
+    return inexact, rest, problem.setup, (static, problem.stepper, problem.max_steps, problem.keep)
 
 
-def _told(outcome: Outcome) -> tuple[Rows, Outcome]:
+def _told(outcome: Outcome) -> tuple[SavedStates, Outcome]:
     """The rows, and what is said of a solve without what was kept on the way."""
     lost = (outcome.missed != int(Status.ok)) & (outcome.status == int(Status.ok))
     status = jnp.where(lost, outcome.missed, outcome.status).astype(jnp.int32)
-    rows = Rows(outcome.rows, outcome.state, outcome.time)
+    rows = SavedStates(outcome.rows, outcome.state, outcome.time)
     return rows, outcome._replace(status=status, rows=None, record=None)
 
 
@@ -137,31 +137,31 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
     """The loop of steps; of scalar programs and implicit methods, vmapped, in chunks."""
 
     def single(inexact: Any, rest: Any, setup: Setup, lanes: bool = False) -> Outcome:
-        y0, args, times, scheme, max_steps = unpack(inexact, rest, setup, static)
+        y0, args, times, stepper, max_steps = unpack(inexact, rest, setup, static)
         if record:
-            scheme = scheme.for_derivatives(y0, args)
-        fast = scheme.on_scalars(lanes)
+            stepper = stepper.for_derivatives(y0, args)
+        fast = stepper.on_scalars(lanes)
         if record and lanes:  # written out, this half would take most of the time to compile
             fast = None if fast is None else in_loops(fast)
         rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room
         native = None if fast is None else _xla.native
-        return drive(fast or scheme, y0, args, times, *rest_of_it, native)
+        return integrate(fast or stepper, y0, args, times, *rest_of_it, native)
 
-    y0, _, _, scheme, _ = unpack(inexact, rest, setup, static)
-    on_scalars = scheme.on_scalars() is not None
-    if jax.default_backend() != "cpu" or not (on_scalars or scheme.implicit):
+    y0, _, _, stepper, _ = unpack(inexact, rest, setup, static)
+    on_scalars = stepper.on_scalars() is not None
+    if jax.default_backend() != "cpu" or not (on_scalars or stepper.implicit):
         return single(inexact, rest, setup)
     at_once = LANES if on_scalars else at_once_implicit(y0.size)
     vmapped, given = partial(single, lanes=True), (inexact, rest, setup)
     return in_lanes(single, vmapped, *given, at_once=at_once, even=not on_scalars)
 
 
-def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> Rows:
+def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> SavedStates:
     """The rows as a function of `inexact` alone, all steps taken again."""
-    y0, args, times, scheme, _ = unpack(inexact, rest, setup, static)
+    y0, args, times, stepper, _ = unpack(inexact, rest, setup, static)
     assert outcome.record is not None
-    path = path_of(scheme, y0, args, times, outcome.record, ())
+    path = path_of(stepper, y0, args, times, outcome.record, ())
     walk = again(path, path.start, [], times.anchors(), times.saves, False)
     # What was not reached, or failed, is so again.
     found = jnp.isfinite(outcome.rows)
-    return Rows(jnp.where(found, walk.rows[0], jnp.nan), walk.last[0], walk.time)
+    return SavedStates(jnp.where(found, walk.rows[0], jnp.nan), walk.last[0], walk.time)

@@ -25,7 +25,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from jaxlag._core._buffer_entries import set_entry
-from jaxlag._gradient._recorded_motion import Change, Path, Walk, all_rows, arrived, at, pick
+from jaxlag._gradient._recorded_motion import (
+    InputTangents,
+    RecordedMotion,
+    SolveTangents,
+    all_rows,
+    arrived,
+    at,
+    pick,
+)
 from jaxlag._integration._record import Record
 
 
@@ -43,7 +51,7 @@ def _turn_of_row(record: Record, r: Array) -> Array:
     return jnp.where(r < 0, -1, at(record.row_turn, r))
 
 
-def forwards(path: Path, change: Change, points: bool) -> Walk:
+def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> SolveTangents:
     """The derivative in one direction."""
     clock, record = path.clock, path.clock.record
     anchors, dues = clock.times.anchors(), clock.times.dues()
@@ -118,15 +126,17 @@ def forwards(path: Path, change: Change, points: bool) -> Walk:
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
         time = change.anchors[clock.anchor(clock.last)]
-    return Walk(dy, time, all_rows(dy0, rows, dy, arrived(path, anchors)), kept)
+    return SolveTangents(dy, time, all_rows(dy0, rows, dy, arrived(path, anchors)), kept)
 
 
-def backwards(path: Path, change: Change, wanted: Walk) -> Change:
+def adjoint_sweep(
+    path: RecordedMotion, change: InputTangents, wanted: SolveTangents
+) -> InputTangents:
     """The transposed map.
 
     Args:
         path: the motion.
-        change: which parts of `Change` there are.
+        change: which parts of `InputTangents` there are.
         wanted: cotangents.
     """
     clock, record = path.clock, path.clock.record
@@ -232,7 +242,7 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
             use = (j < record.turns) & (end > t)
-            y = pick(use, path.found(j, anchors, y), y)
+            y = pick(use, path.recompute(j, anchors, y), y)
             return j + 1, y, set_entry(states, j + 1 - first, y)
 
         begin = (first, y, states)
@@ -262,7 +272,7 @@ def backwards(path: Path, change: Change, wanted: Walk) -> Change:
     if moves:
         ends = jnp.zeros_like(clock.times.saves[:1])
         saves_bar = jnp.concatenate([ends, dues_bar[:-1], ends])
-    return Change(None if change.y0 is None else bar[0], args_bar, anchors_bar, saves_bar)
+    return InputTangents(None if change.y0 is None else bar[0], args_bar, anchors_bar, saves_bar)
 
 
 def _added(bar: Array, more: Array, start: Array | None) -> Array:

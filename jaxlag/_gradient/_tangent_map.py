@@ -12,11 +12,16 @@ from jaxtyping import Array, Bool, PyTree
 
 from jaxlag._core._batching import LANES, in_batches
 from jaxlag._core._linear_map import LinearMap, linear
-from jaxlag._gradient._recorded_motion import Change, Clock, Path, Walk
+from jaxlag._gradient._recorded_motion import (
+    InputTangents,
+    RecordedMotion,
+    SolveTangents,
+    StepTimes,
+)
 from jaxlag._gradient._rescan import again
-from jaxlag._gradient._sweeps import backwards, forwards
+from jaxlag._gradient._sweeps import adjoint_sweep, tangent_sweep
 from jaxlag._integration._record import Outcome, Record, Times
-from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import with_stages
 
 
@@ -25,14 +30,14 @@ class Setup(NamedTuple):
 
     first_step: Array | None
     allowed: Bool[Array, ""]
-    scheme: Any  # traced half of the Scheme
+    stepper: Any  # traced half of the Scheme
 
 
 def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
-    """(start, arguments, times, scheme, bound on the steps) from the halves of a problem."""
-    static_problem, static_scheme, max_steps, _ = static
+    """(start, arguments, times, stepper, bound on the steps) from the halves of a problem."""
+    static_problem, static_stepper, max_steps, _ = static
     y0, args, times = eqx.combine(inexact, rest, static_problem)
-    return y0, args, times, eqx.combine(setup.scheme, static_scheme), max_steps
+    return y0, args, times, eqx.combine(setup.stepper, static_stepper), max_steps
 
 
 def changes(tangents: Any, outcome: Outcome) -> Any:
@@ -62,7 +67,7 @@ def changed(
     record: Record,
     change: Any,
     points: bool = False,
-) -> Walk:
+) -> SolveTangents:
     """The derivative of the states on the way, at the points of the record too if asked for."""
     y0_dot, args_dot, times_dot = change
     dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
@@ -71,7 +76,7 @@ def changed(
     if jax.tree.leaves(times_dot):
         whole = filled(times_dot, times)
         anchors_dot, saves_dot = jax.jvp(Times.anchors, (times,), (whole,))[1], whole.saves
-    x = Change(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
+    x = InputTangents(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
     kind = _Kind(static, moving, y0_dot is not None, anchors_dot is not None, points)
     return linear(_map(kind), (inexact, rest, setup, record), x)
 
@@ -89,35 +94,35 @@ class _Kind(NamedTuple):
 def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
     """The variational equations as a linear map."""
 
-    def path(r: Any) -> tuple[Path, Any]:
+    def path(r: Any) -> tuple[RecordedMotion, Any]:
         inexact, rest, setup, record = r
-        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
-        fast = scheme.on_scalars(lanes)
-        return path_of(scheme, y0, args, times, record, kind.moving, fast, lanes), y0
+        y0, args, times, stepper, _ = unpack(inexact, rest, setup, kind.static)
+        fast = stepper.on_scalars(lanes)
+        return path_of(stepper, y0, args, times, record, kind.moving, fast, lanes), y0
 
-    def forward(r: Any, x: Change) -> Walk:
-        return forwards(path(r)[0], x, kind.points)
+    def forward(r: Any, x: InputTangents) -> SolveTangents:
+        return tangent_sweep(path(r)[0], x, kind.points)
 
-    def like(r: Any) -> tuple[Path, Change]:
+    def like(r: Any) -> tuple[RecordedMotion, InputTangents]:
         way, y0 = path(r)
         times = way.clock.times
         moves = (times.anchors(), times.saves) if kind.times else (None, None)
-        return way, Change(y0 if kind.start else None, way.moved(), *moves)
+        return way, InputTangents(y0 if kind.start else None, way.moved(), *moves)
 
-    def backward(r: Any, y: Walk) -> Change:
+    def backward(r: Any, y: SolveTangents) -> InputTangents:
         way, change = like(r)
-        return backwards(way, change, y)
+        return adjoint_sweep(way, change, y)
 
-    def by_directions(r: Any, y: Walk) -> Change:
+    def by_directions(r: Any, y: SolveTangents) -> InputTangents:
         """The same from `forward`, one direction of x after another."""
         return _transposed(partial(forward, r), like(r)[1], y)
 
-    def plain(r: Any, x: Change) -> Walk:
+    def plain(r: Any, x: InputTangents) -> SolveTangents:
         inexact, rest, setup, record = r
-        y0, args, times, scheme, _ = unpack(inexact, rest, setup, kind.static)
-        way = path_of(scheme, y0, args, times, record, kind.moving)
+        y0, args, times, stepper, _ = unpack(inexact, rest, setup, kind.static)
+        way = path_of(stepper, y0, args, times, record, kind.moving)
 
-        def motion(y0: Array, moved: list, anchors: Array, saves: Array) -> Walk:
+        def motion(y0: Array, moved: list, anchors: Array, saves: Array) -> SolveTangents:
             return again(way, (y0, None), moved, anchors, saves, kind.points)
 
         given = (y0, way.moved(), times.anchors(), times.saves)
@@ -155,42 +160,42 @@ def _transposed(function: Callable, like: Any, y: Any) -> Any:
 
 
 def path_of(
-    scheme: Scheme,
+    stepper: Stepper,
     y0: Array,
     args: Any,
     times: Times,
     record: Record,
     moving: tuple[int, ...],
-    fast: Scheme | None = None,
+    fast: Stepper | None = None,
     lanes: bool = False,
-) -> Path:
+) -> RecordedMotion:
     """The recorded motion, by steps with loops over stages.
 
     Written out, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
     pendulum: a gradient 5.3 | 2.3 s, a Hessian 22 | 4.5 s, a gradient of lanes 15 | 4.5 s) and
     run 0.9 to 1.4 times as fast.
     """
-    looped = in_loops(scheme if fast is None else fast)
+    looped = in_loops(stepper if fast is None else fast)
 
     def step(args: Any, t0: Array, t1: Array, state: PyTree, jump: Array, wanted: Array) -> PyTree:
         return one_step(looped, args, t0, t1, state, jump, True, wanted)[0]
 
     zero = jnp.zeros_like(times.stop)
-    memory = scheme.begin(zero, times.stop, y0, args) if scheme.remembers else None
+    memory = stepper.begin(zero, times.stop, y0, args) if stepper.remembers else None
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
-    stages = getattr(getattr(scheme.solver, "tableau", None), "num_stages", 0)
-    clock, start = Clock(times, record), (y0, memory)
+    stages = getattr(getattr(stepper.solver, "tableau", None), "num_stages", 0)
+    clock, start = StepTimes(times, record), (y0, memory)
     plain = not (lanes and record.row_turn is not None)
-    return Path(step, start, leaves, tree, moving, scheme.windows, clock, stages, plain)
+    return RecordedMotion(step, start, leaves, tree, moving, stepper.windows, clock, stages, plain)
 
 
-def in_loops(scheme: Scheme) -> Scheme:
+def in_loops(stepper: Stepper) -> Stepper:
     """The form with loops over stages that JAX differentiates in any mode."""
-    return eqx.tree_at(lambda s: s.solver, scheme, with_stages(scheme.solver, "bounded"))
+    return eqx.tree_at(lambda s: s.solver, stepper, with_stages(stepper.solver, "bounded"))
 
 
 def one_step(
-    scheme: Scheme,
+    stepper: Stepper,
     args: Any,
     t0: Array,
     t1: Array,
@@ -204,12 +209,12 @@ def one_step(
     Near change points the state may be `wanted` at another time than that of its end.
     """
     y0, memory = y, _ = state
-    args = scheme.within(args, t0)
+    args = stepper.within(args, t0)
     jumped: Any = jump
-    if not scheme.remembers:
-        memory, jumped = scheme.afresh(t0, t1, y, args)
-    y, _, memory, solved = scheme.step(t0, t1, y, args, memory, jumped)
-    y, verdict = scheme.settled(t1, y, args, differentiable)
+    if not stepper.remembers:
+        memory, jumped = stepper.afresh(t0, t1, y, args)
+    y, _, memory, solved = stepper.step(t0, t1, y, args, memory, jumped)
+    y, verdict = stepper.settled(t1, y, args, differentiable)
     if wanted is not None and args.lengths is not None:
-        y = scheme.reached(t0, y0, t1, y, wanted, wanted != t1, args)
-    return (y, memory if scheme.remembers else None), solved & verdict.good
+        y = stepper.reached(t0, y0, t1, y, wanted, wanted != t1, args)
+    return (y, memory if stepper.remembers else None), solved & verdict.good

@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array
 
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._model._input_signals import AbstractInput, AbstractTable
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._closure import declared
@@ -15,7 +15,7 @@ from jaxlag._tracing._input_values import InputValues
 from jaxlag._tracing._nonsmooth_points import outcomes
 
 
-def branches(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Array | None:
+def branches(dynamics: VectorField, tau: Array, y: Array, args: Arguments) -> Array | None:
     """Outcomes of the comparisons in what is declared, at (tau, y); None where there are none.
 
     As long as they stay the same, forces are smooth. Tables and functions with knots bend and

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._kkt import augmented, masked
 from jaxlag._linalg._mass_solve import factor_mass
 from jaxlag._tracing._signature import gradient
@@ -25,7 +25,7 @@ class Canonical(eqx.Module):
         args: within a step.
     """
 
-    dynamics: Dynamics
+    dynamics: VectorField
     args: Arguments
 
     def span(self, tau0: Float[Array, ""], tau1: Float[Array, ""]) -> Float[Array, ""]:

@@ -49,7 +49,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._integration._step_arguments import Arguments, midway
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._kkt import solve_general, units_of
 from jaxlag._model._forces import reads_lam
 
@@ -318,7 +318,7 @@ def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Fl
 
 
 def scales_at(
-    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+    dynamics: VectorField, tau: Array, y: Array, args: Arguments
 ) -> tuple[Float[Array, " n"], Float[Array, "m n"]]:
     """Units of the coordinates in which their inertias at a state are 1, and |A| there."""
     t, q, v, params = dynamics.state(tau, y, args)
@@ -326,7 +326,7 @@ def scales_at(
     return units_of(dynamics.mass(tau, y, args), A), jnp.abs(A)
 
 
-def may_cross(dynamics: Dynamics) -> bool:
+def may_cross(dynamics: VectorField) -> bool:
     """Whether there are rows of which one may be left out for a moment.
 
     Beyond the place the state is moved back onto all of them. A force that reads multipliers is not
@@ -336,13 +336,13 @@ def may_cross(dynamics: Dynamics) -> bool:
     return dynamics.projects and may_stop(dynamics) and not reads
 
 
-def may_stop(dynamics: Dynamics) -> bool:
+def may_stop(dynamics: VectorField) -> bool:
     """Whether there are rows that accelerations are solved with."""
     return dynamics.quasi is None and dynamics.rows.size > 0
 
 
 def same_sense(
-    dynamics: Dynamics,
+    dynamics: VectorField,
     t0: Array,
     t1: Array,
     y0: Array,

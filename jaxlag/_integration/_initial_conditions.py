@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._independent_rows import (
     ROUNDINGS,
     Sizes,
@@ -27,12 +27,12 @@ class Start(NamedTuple):
     in_range: Array  # the inputs are defined there
     finite: Array  # L and the residuals are finite there
     consistent: "Consistency"
-    pressed: Array  # contacts press and slide as their friction takes them to
+    contacts_valid: Array  # contacts press and slide as their friction takes them to
 
     @property
     def allowed(self) -> Bool[Array, ""]:
         """Whether all is well."""
-        return self.valid & self.in_range & self.finite & self.consistent.ok & self.pressed
+        return self.valid & self.in_range & self.finite & self.consistent.ok & self.contacts_valid
 
 
 class Consistency(NamedTuple):
@@ -66,7 +66,7 @@ def values_allowed(
     return jnp.all(jnp.stack([jnp.all(jnp.asarray(check)) for check in checks]))
 
 
-def start_finite(dynamics: Dynamics, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
+def start_finite(dynamics: VectorField, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
     """Whether L and the residuals are finite there; of accelerations the first step tells."""
     at = dynamics.state(*stop_gradient((tau, y0, args)))
     finite = jnp.isfinite(dynamics.system.lagrangian(*at))
@@ -75,7 +75,9 @@ def start_finite(dynamics: Dynamics, tau: Array, y0: Array, args: Arguments) -> 
     return finite
 
 
-def residuals(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> tuple[Array, ...]:
+def residuals(
+    dynamics: VectorField, t: Array, q: Array, v: Array, params: Any
+) -> tuple[Array, ...]:
     """(phi for every row, A v + b), none without constraints."""
     if not dynamics.rows.size:
         return ()
@@ -84,7 +86,7 @@ def residuals(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> 
 
 
 def start_consistent(
-    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
+    dynamics: VectorField, t: Array, q: Array, v: Array, params: Any, args: Arguments
 ) -> Consistency:
     """Whether a state satisfies the constraints, and its quasi-velocities stand for velocities."""
     found = _rows_consistent(dynamics, t, q, v, params, args)
@@ -95,7 +97,7 @@ def start_consistent(
 
 
 def _rows_consistent(
-    dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any, args: Arguments
+    dynamics: VectorField, t: Array, q: Array, v: Array, params: Any, args: Arguments
 ) -> Consistency:
     """Whether residuals are below sqrt(eps) of the state, and no row contradicts the others.
 
@@ -158,7 +160,7 @@ def _rows_consistent(
     return _consistency(off, bad, near, phi, rate)
 
 
-def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Sizes:
+def _sizes(dynamics: VectorField, t: Array, q: Array, v: Array, params: Any) -> Sizes:
     """Of every row, see `row_sizes`."""
 
     def rows(q: Array) -> Array:
@@ -168,7 +170,7 @@ def _sizes(dynamics: Dynamics, t: Array, q: Array, v: Array, params: Any) -> Siz
 
 
 def _fitting(
-    dynamics: Dynamics,
+    dynamics: VectorField,
     t: Array,
     q: Array,
     v: Array,
@@ -193,8 +195,8 @@ def _fitting(
     return jnp.max(jnp.where(jnp.isfinite(sines), sines, 0.0), axis=1), rank == q.shape[0]
 
 
-def rows_hold(
-    dynamics: Dynamics, ts: Array, q: Array, v: Array, params: Any
+def rows_hold_after(
+    dynamics: VectorField, ts: Array, q: Array, v: Array, params: Any
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Whether velocities that kinematics give satisfy the rows at all saved times; else which not.
 

@@ -23,26 +23,26 @@ from jaxlag._core._buffer_entries import set_entry
 from jaxlag._core._status import Status
 from jaxlag._integration._change_points import UNLIKE, Crossing, is_across, no_crossing
 from jaxlag._integration._loop_state import (
-    Carry,
-    Kept,
     Loop,
-    Place,
-    Rows,
+    LoopState,
+    RecordBuffers,
+    SaveProgress,
+    StepStart,
     buffer,
     is_full,
     select,
-    thinned,
-    written,
+    thin,
+    write_turn,
 )
-from jaxlag._integration._record import Outcome, Reach, Record, Times, step_end
-from jaxlag._integration._stepper import SINGULAR, Estimate, Scheme, all_finite, resolution
+from jaxlag._integration._record import Outcome, Reach, Record, Times, reached_time
+from jaxlag._integration._stepper import SINGULAR, Estimate, Stepper, all_finite, resolution
 
 # The record is a whole number of chunks of this many turns.
 CHUNK = 64
 
 
-def drive(
-    scheme: Scheme,
+def integrate(
+    stepper: Stepper,
     y0: PyTree,
     args: Any,
     times: Times,
@@ -56,9 +56,9 @@ def drive(
     """Integrate from tau = 0 to `times.stop`.
 
     Args:
-        scheme: solver, controller, vector field.
+        stepper: solver, controller, vector field.
         y0: state at the start.
-        args: passed to the vector field, after `scheme.windows`.
+        args: passed to the vector field, after `stepper.windows`.
         times: anchors and save times.
         first_step: the fixed step without a controller; else the first step, None for automatic.
         allowed: False where the trajectory must not start (status set by the caller).
@@ -72,21 +72,21 @@ def drive(
     count = times.saves.shape[0]
     # Turns in which any lane takes a step: at most those in which one attempts it or goes to rows.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
-    room = (room if room < max_steps else size) if record and not scheme.remembers else 0
-    if scheme.controller is not None:
-        memory, sound, h, control = scheme.start(t0, times.stop, y0, args, first_step)
+    room = (room if room < max_steps else size) if record and not stepper.remembers else 0
+    if stepper.controller is not None:
+        memory, sound, h, control = stepper.start(t0, times.stop, y0, args, first_step)
         # The estimate is 0/0 where atol = 0 meets a component that is 0.
         h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * times.stop)
-        h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
+        h = h if stepper.longest is None else jnp.minimum(h, stepper.longest)
     else:
         assert first_step is not None
-        memory, h, control = scheme.begin(t0, times.stop, y0, args), first_step, None
-        sound = scheme.is_sound(memory)
-    jumps = times.knots is not None or not scheme.standard
-    determinants = scheme.determinants(t0, y0, args)
+        memory, h, control = stepper.begin(t0, times.stop, y0, args), first_step, None
+        sound = stepper.is_sound(memory)
+    jumps = times.knots is not None or not stepper.standard
+    determinants = stepper.determinants(t0, y0, args)
     crossing = None if args.lengths is None else no_crossing(t0, args.units.size, args.units.dtype)
-    reaches_beyond = crossing is not None and scheme.controller is not None
-    start = Place(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
+    reaches_beyond = crossing is not None and stepper.controller is not None
+    start = StepStart(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
     rows = kept = None
@@ -94,16 +94,16 @@ def drive(
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = buffer(count - 1, y0, jnp.nan)
         reaches = jnp.zeros_like(places) if reaches_beyond and places is not None else None
-        rows = Rows(start, zero, zero, values, places, reaches, zero)
+        rows = SaveProgress(start, zero, zero, values, places, reaches, zero)
     if record:
-        kept = Kept(
+        kept = RecordBuffers(
             offsets=buffer(size, t0, 0.0),
             anchors=None if times.knots is None else buffer(size, zero, 0),
             jumps=buffer(size, zero > 0, 0) if jumps else None,
             points=buffer(room + 1, (y0, None), 0.0) if room else None,
             stride=jnp.ones((), jnp.int32),
         )
-    carry = Carry(
+    carry = LoopState(
         at=start,
         h=jnp.asarray(h, t0.dtype),
         control=control,
@@ -122,7 +122,7 @@ def drive(
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
     dynamic, static = eqx.partition(carry, eqx.is_array)
     fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps)
-    loop = Loop(scheme, args, *fixed)
+    loop = Loop(stepper, args, *fixed)
 
     def turn(dynamic: Any) -> Any:
         c = _turn(loop, eqx.combine(dynamic, static))
@@ -136,13 +136,13 @@ def drive(
             return jax.lax.while_loop(goes_on, turn, dynamic)
         until_full = lambda c: goes_on(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
-        return jax.lax.while_loop(goes_on, lambda c: fill(thinned(c, room)), dynamic)
+        return jax.lax.while_loop(goes_on, lambda c: fill(thin(c, room)), dynamic)
 
     final = turns(dynamic) if native is None else native(turns, dynamic)
     return _outcome(eqx.combine(final, static), times, y0, allowed)
 
 
-def _outcome(c: Carry, times: Times, y0: PyTree, allowed: Array) -> Outcome:
+def _outcome(c: LoopState, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     arrived = allowed & (times.saves[-1] <= c.at.t)
     last = jax.tree.map(lambda y: jnp.where(arrived, y, jnp.nan), c.at.y)
     parts = [jax.tree.map(lambda y: y[None], y0)]
@@ -167,15 +167,15 @@ def _is_due(loop: Loop, c: Any) -> Array:
     return (loop.dues[c.rows.next] <= c.at.t) & (c.accepted > 0)
 
 
-def _turn(loop: Loop, c: Carry) -> Carry:
+def _turn(loop: Loop, c: LoopState) -> LoopState:
     """One attempted step, or one that reaches a row."""
-    scheme, times, t = loop.scheme, loop.times, c.at.t
+    stepper, times, t = loop.stepper, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
-    fixed = scheme.controller is None
+    fixed = stepper.controller is None
     h = c.h
     if c.at.crossing is not None and not fixed:
         following = jnp.inf if c.rows is None else loop.dues[c.rows.next]
-        h = c.at.crossing.step(t, c.h, scheme.gap, times.stop, following)
+        h = c.at.crossing.step(t, c.h, stepper.gap, times.stop, following)
     goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + h
     boundary, boundary_anchor = _next_boundary(times, t)
     slack = jnp.maximum(1e-10 * (goal - t), resolution(boundary))
@@ -195,18 +195,18 @@ def _turn(loop: Loop, c: Carry) -> Carry:
         there = (t1 >= times.stop) & begin.crossing.is_at(begin.t, t1)
         beyond = jnp.where(to_row, c.reach == Reach.beyond, there)
         reach = jnp.where(beyond, int(Reach.beyond), int(Reach.step))
-        end = step_end(reach, begin.t, t1, t1)
+        end = reached_time(reach, begin.t, t1, t1)
     jumped = False if begin.jump is None else begin.jump
-    args = scheme.within(loop.args, begin.t)
+    args = stepper.within(loop.args, begin.t)
     step = (begin.t, end, begin.y, args, begin.memory, jumped, begin.crossing)
-    y1, estimate, memory, solved = scheme.step(*step)
+    y1, estimate, memory, solved = stepper.step(*step)
     finite = all_finite(y1)
     ends = (begin.t, end, begin.y, y1, args, estimate, begin.crossing, lands | to_row)
-    settled, verdict, estimate, crossing = scheme.settled_with_error(*ends)
+    settled, checks, estimate, crossing = stepper.settled_with_error(*ends)
     step = (begin.t, end, begin.y, settled, args, estimate.turn)
-    passage = scheme.passage(*step, begin.determinants)
+    passage = stepper.passage(*step, begin.determinants)
     regular, share, determinants = (jnp.array(True), None, None) if passage is None else passage
-    crossable = independent = scheme.same_sense(*step)
+    crossable = independent = stepper.same_sense(*step)
     met = jnp.array(False)  # a change point, by a stage
     if crossing is not None:
         # A step from such a place, or one of equal steps to it, has a stage there.
@@ -214,17 +214,17 @@ def _turn(loop: Loop, c: Carry) -> Carry:
         stands = begin.crossing.stands | (crossing.stands if fixed else False)
         met = fixed & ~finite & (begin.crossing.time < t1 + (t1 - begin.t))
         crossable, independent = crossing.passes & ~stands & ~met, ~crossing.depends
-    good = finite & solved & ((regular & crossable) | to_row) & verdict.good
+    good = finite & solved & ((regular & crossable) | to_row) & checks.good
     rest = (estimate, good, cut, share, regular | to_row)
     keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
     across = jnp.array(False)
     if reach is not None:
-        sound = good & scheme.is_small(begin.y, y1, estimate.error, UNLIKE)
+        sound = good & stepper.is_small(begin.y, y1, estimate.error, UNLIKE)
         known = cast(tuple[Crossing, Crossing, Crossing], (begin.crossing, c.at.crossing, crossing))
         across = to_row & (reach == Reach.step) & is_across(*known, sound) & finite
         reach = jnp.where(across, int(Reach.within), reach)
         end, last = jnp.where(across, c.at.t, end), select(across, c.at.y, settled)
-        settled = scheme.reached(begin.t, begin.y, end, last, t1, reach != Reach.step, args)
+        settled = stepper.reached(begin.t, begin.y, end, last, t1, reach != Reach.step, args)
 
     active = ~c.done & ~to_row
     take = active & keep
@@ -233,14 +233,14 @@ def _turn(loop: Loop, c: Carry) -> Carry:
     failure = jnp.full((), int(Status.step_below_resolution))
     smooth = jnp.array(True)
     if c.rows is not None:
-        smooth = ~to_row | across | scheme.is_small(begin.y, y1, estimate.error, SINGULAR)
+        smooth = ~to_row | across | stepper.is_small(begin.y, y1, estimate.error, SINGULAR)
     for right, kind in (
-        (smooth | (not scheme.moves), Status.projection_failed),
-        (verdict.pressed, Status.no_reaction_solution),
+        (smooth | (not stepper.moves), Status.projection_failed),
+        (checks.contacts_valid, Status.no_reaction_solution),
         (regular, Status.kinematics_singular),
-        (verdict.closed, Status.rank_change),
+        (checks.redundant_rows_hold, Status.rank_change),
         (crossable & independent, Status.rank_change),
-        (verdict.found | met, Status.projection_failed),
+        (checks.projected | met, Status.projection_failed),
         (solved | met, Status.implicit_solve_failed),
         (finite | met, Status.nonfinite),
     ):
@@ -265,7 +265,7 @@ def _turn(loop: Loop, c: Carry) -> Carry:
             # The slot after the last row is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
             turns = set_entry(turns, slot, jnp.where(to_row, rows.turn, beyond))
-        rows = Rows(
+        rows = SaveProgress(
             base=select(take, c.at, rows.base),
             turn=jnp.where(take, c.turn, rows.turn),
             next=rows.next + to_row.astype(jnp.int32),
@@ -279,10 +279,10 @@ def _turn(loop: Loop, c: Carry) -> Carry:
     own_anchor = jnp.zeros_like(c.anchor) if fixed else c.anchor
     anchor = jnp.where(take, jnp.where(lands, boundary_anchor, own_anchor), c.anchor)
     jump = None if c.at.jump is None else jump | lands
-    end = Place(t1, settled, memory, jump, determinants, crossing)
+    end = StepStart(t1, settled, memory, jump, determinants, crossing)
     at = select(take, end, c.at)
-    kept = None if c.kept is None else written(loop, c, c.kept, at.t, anchor)
-    return Carry(
+    kept = None if c.kept is None else write_turn(loop, c, c.kept, at.t, anchor)
+    return LoopState(
         at=at,
         h=jnp.where(active, h, c.h),
         control=select(active, control, c.control),
@@ -302,7 +302,7 @@ def _turn(loop: Loop, c: Carry) -> Carry:
 
 def _next_step(
     loop: Loop,
-    c: Carry,
+    c: LoopState,
     t1: Array,
     y1: PyTree,
     estimate: Estimate,
@@ -317,19 +317,19 @@ def _next_step(
         whether to keep it, length of the next, the controller's state, whether the field jumps,
         whether there is no next one.
     """
-    scheme, t, y = loop.scheme, c.at.t, c.at.y
-    if scheme.controller is None:
+    stepper, t, y = loop.stepper, c.at.t, c.at.y
+    if stepper.controller is None:
         return good, c.h, None, jnp.zeros_like(good), ~good
-    order: Any = scheme.solver.error_order(scheme.term)
+    order: Any = stepper.solver.error_order(stepper.term)
     # What derivatives need must not use up the steps of the motion: as many as get through it.
     stop = loop.times.stop
     spare = c.attempted.astype(t.dtype) * stop < loop.max_steps * jnp.maximum(0.25 * stop, 0.9 * t)
-    error = scheme.held_to(t, t1, y, y1, loop.args, estimate, spare)
+    error = stepper.held_to(t, t1, y, y1, loop.args, estimate, spare)
     if share is not None:
         error = jax.tree.map(lambda e: e / share, error)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
     y1 = select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
-    proposal: Any = scheme.controller.adapt_step_size(
+    proposal: Any = stepper.controller.adapt_step_size(
         t, t1, y, y1, loop.args, error, order, c.control
     )
     keep, next0, next1, jump, control, result = proposal
@@ -338,9 +338,9 @@ def _next_step(
     # A step cut short says nothing against the length proposed before it.
     cut = keep & cut
     h = jnp.where(cut, jnp.maximum(h, c.h), h)
-    if scheme.standard:
-        control = _uncut(scheme.controller, cut, h, c.control, control)
-    h = h if scheme.longest is None else jnp.minimum(h, scheme.longest)
+    if stepper.standard:
+        control = _uncut(stepper.controller, cut, h, c.control, control)
+    h = h if stepper.longest is None else jnp.minimum(h, stepper.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
     if share is not None:  # before a singular place a state in fewer digits would stand still
         coarse = 64 * float(jnp.finfo(share.dtype).eps) * loop.times.stop

@@ -10,24 +10,24 @@ from jaxtyping import Array, PyTree
 from jaxlag._core._buffer_entries import set_entry
 from jaxlag._integration._change_points import Crossing
 from jaxlag._integration._record import Times
-from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._stepper import Stepper
 
 
-class Place(NamedTuple):
+class StepStart(NamedTuple):
     """Where a step starts."""
 
     t: Array
     y: PyTree
     memory: Any  # the solver's own state
     jump: Array | None  # whether the field jumps there; None where nothing ever does
-    determinants: Array | None  # see `Scheme.determinants`
+    determinants: Array | None  # see `Stepper.determinants`
     crossing: Crossing | None  # what is known of change points; None where none are passed
 
 
-class Rows(NamedTuple):
+class SaveProgress(NamedTuple):
     """Rows between the first and the last."""
 
-    base: Place  # where the last accepted step started
+    base: StepStart  # where the last accepted step started
     turn: Array  # that took it
     next: Array  # index of the row that is due next
     values: PyTree  # one more for what is not kept
@@ -36,7 +36,7 @@ class Rows(NamedTuple):
     missed: Array
 
 
-class Kept(NamedTuple):
+class RecordBuffers(NamedTuple):
     """The record on the way."""
 
     offsets: Array
@@ -46,8 +46,8 @@ class Kept(NamedTuple):
     stride: Array
 
 
-class Carry(NamedTuple):
-    at: Place
+class LoopState(NamedTuple):
+    at: StepStart
     h: Array
     control: Any  # the controller's own state
     mark: Array  # number of marks of the fixed grid passed
@@ -58,15 +58,15 @@ class Carry(NamedTuple):
     accepted: Array
     attempted: Array
     turn: Array  # number of those in which any lane took a step
-    rows: Rows | None
-    kept: Kept | None
+    rows: SaveProgress | None
+    kept: RecordBuffers | None
     reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
 
 
 class Loop(NamedTuple):
     """What stays the same from turn to turn."""
 
-    scheme: Scheme
+    stepper: Stepper
     args: Any
     times: Times
     anchors: Array
@@ -88,7 +88,7 @@ def is_full(c: Any, room: int) -> Array:
     return (c.turn >= room * c.kept.stride) & ~c.done
 
 
-def thinned(c: Any, room: int) -> Any:
+def thin(c: Any, room: int) -> Any:
     """Every other point dropped, if they are full."""
 
     def halved(leaf: Array) -> Array:
@@ -100,7 +100,9 @@ def thinned(c: Any, room: int) -> Any:
     return c._replace(kept=jax.lax.cond(is_full(c, room), thin, lambda kept: kept, c.kept))
 
 
-def written(loop: Loop, c: Carry, kept: Kept, t: Array, anchor: Array) -> Kept:
+def write_turn(
+    loop: Loop, c: LoopState, kept: RecordBuffers, t: Array, anchor: Array
+) -> RecordBuffers:
     """The record with this turn."""
     anchors, jumps, points = kept.anchors, kept.jumps, kept.points
     if anchors is None:

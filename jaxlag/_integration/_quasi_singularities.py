@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._integration._step_arguments import Arguments, midway
-from jaxlag._integration._vector_field import Dynamics
-from jaxlag._lowering import ScalarPrepared, ScalarTerms
+from jaxlag._integration._vector_field import VectorField
+from jaxlag._lowering import ScalarSolveConstants, ScalarTerms
 
 PART = 0.5  # of the least of three samples
 SPREAD = 8.0  # of samples within one step
@@ -35,7 +35,7 @@ class Passage(NamedTuple):
 
 
 def passage(
-    dynamics: Dynamics,
+    dynamics: VectorField,
     tolerance: Array | None,
     t0: Array,
     t1: Array,
@@ -82,7 +82,7 @@ def passage(
 
 
 def determinants(
-    dynamics: Dynamics, tau: Array, q: Float[Array, " n"], args: Arguments
+    dynamics: VectorField, tau: Array, q: Float[Array, " n"], args: Arguments
 ) -> Float[Array, " b"]:
     """What is 0 or infinite where quasi-velocities are singular.
 
@@ -100,10 +100,12 @@ def determinants(
 
 
 def _by_program(args: Arguments) -> bool:
-    return isinstance(args.prepared, ScalarPrepared) and args.prepared.determinants is not None
+    return (
+        isinstance(args.prepared, ScalarSolveConstants) and args.prepared.determinants is not None
+    )
 
 
-def opening(dynamics: Dynamics, found: Float[Array, " b"]) -> Float[Array, " b"]:
+def opening(dynamics: VectorField, found: Float[Array, " b"]) -> Float[Array, " b"]:
     """How large dU/dv is, by its determinants, or by those of its inverse where that is given."""
     quasi = dynamics.quasi
     assert quasi is not None
@@ -113,7 +115,9 @@ def opening(dynamics: Dynamics, found: Float[Array, " b"]) -> Float[Array, " b"]
     return 1.0 / (size if quasi.size == dynamics.system.size else jnp.sqrt(size))
 
 
-def usual(dynamics: Dynamics, tau: Array, q: Float[Array, " n"], args: Arguments) -> Array | None:
+def usual(
+    dynamics: VectorField, tau: Array, q: Float[Array, " n"], args: Arguments
+) -> Array | None:
     """How large dU/dv is at the start of a motion, or near it where that lies close to a zero.
 
     None where its determinants never change.

@@ -42,7 +42,7 @@ class Reach(enum.IntEnum):
     """By that through the ends of a step half the way to it."""
 
 
-def step_end(reach: Array, t0: Array, t1: Array, end: Array) -> Array:
+def reached_time(reach: Array, t0: Array, t1: Array, end: Array) -> Array:
     """Where the step ends by which t1 is reached from t0.
 
     Args:

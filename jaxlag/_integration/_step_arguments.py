@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._linalg._independent_rows import Choice
+from jaxlag._linalg._independent_rows import RowChoice
 
 
-class RowChoice(NamedTuple):
+class RowSelection(NamedTuple):
     """Which constraint rows are solved with: a largest independent set at the start.
 
     Attributes:
@@ -21,10 +21,10 @@ class RowChoice(NamedTuple):
     kept: Bool[Array, " m"]
     size: Float[Array, " m"]
     void: Bool[Array, " m"]
-    reacting: Choice
+    reacting: RowChoice
 
 
-class Gaps(NamedTuple):
+class KnotIntervals(NamedTuple):
     """The intervals between the knots of all tables.
 
     Attributes:
@@ -37,27 +37,27 @@ class Gaps(NamedTuple):
     lower: Float[Array, " g"]
 
 
-class Verdict(NamedTuple):
-    """What is to be said about the end of a step.
+class StepChecks(NamedTuple):
+    """Checks of the state at the end of a step.
 
     Attributes:
-        found: the projection was found.
-        closed: rows that were left out hold, too.
-        pressed: contacts press and slide as their friction takes them to.
+        projected: Newton's method of the projection converged.
+        redundant_rows_hold: rows that were left out as dependent are satisfied.
+        contacts_valid: multipliers of contacts are not negative, and sliding has not reversed.
         apart: see `_change_points.Crossing`; None where nobody asks.
         columns: of the matrix of the projection; None likewise.
     """
 
-    found: Bool[Array, ""]
-    closed: Bool[Array, ""]
-    pressed: Bool[Array, ""]
+    projected: Bool[Array, ""]
+    redundant_rows_hold: Bool[Array, ""]
+    contacts_valid: Bool[Array, ""]
     apart: Float[Array, ""] | None = None
     columns: Float[Array, "m n"] | None = None
 
     @property
     def good(self) -> Bool[Array, ""]:
         """Whether all is well; where rows depend on one another a motion may still go on."""
-        return self.found & self.closed & self.pressed
+        return self.projected & self.redundant_rows_hold & self.contacts_valid
 
 
 class Arguments(NamedTuple):
@@ -68,9 +68,9 @@ class Arguments(NamedTuple):
     sigma: Float[Array, ""] | None  # direction of time where it is traced
     origin: Float[Array, ""]  # the start, in the user's time
     end: Float[Array, ""]  # beyond which no time is read
-    gaps: Gaps | None  # None without tables
+    gaps: KnotIntervals | None  # None without tables
     prepared: Any  # what accelerations need of what depends on params alone
-    rows: RowChoice | None = None  # None where there is no choice
+    rows: RowSelection | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     usual: Float[Array, " b"] | None = None  # see `_quasi_singularities.usual`
     lengths: Float[Array, " m"] | None = None  # of rows at the start, see `_change_points`
@@ -83,7 +83,7 @@ class Arguments(NamedTuple):
         return None if self.rows is None else self.rows.kept
 
     @property
-    def reacting(self) -> Choice | None:
+    def reacting(self) -> RowChoice | None:
         """Rows to solve accelerations with; None for all."""
         return None if self.rows is None else self.rows.reacting
 

@@ -11,22 +11,22 @@ from jaxtyping import Array, Bool
 
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._change_points import LOST, SHORT, lengths_of, unknown_below
-from jaxlag._integration._step_arguments import Arguments, Verdict
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._step_arguments import Arguments, StepChecks
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._mass_solve import closed_to
 from jaxlag._linalg._projection import ConstraintProjector, project, tangential
-from jaxlag._lowering import Prepared, ScalarPrepared, ScalarTerms
+from jaxlag._lowering import ScalarSolveConstants, ScalarTerms, SolveConstants
 from jaxlag._model._forces import reads_lam, sliding
 
 
-class Settling(eqx.Module):
+class StepEnd(eqx.Module):
     """Moves the end of a step onto the constraints, and looks whether what was assumed holds.
 
     Attributes:
         dynamics: what moves.
     """
 
-    dynamics: Dynamics
+    dynamics: VectorField
 
     @property
     def _slides(self) -> tuple[Any, ...]:
@@ -59,12 +59,12 @@ class Settling(eqx.Module):
 
     def __call__(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
-    ) -> tuple[Array, Verdict]:
+    ) -> tuple[Array, StepChecks]:
         """The state at the end of a step as it is kept, and what is to be said about it."""
         true = jnp.array(True)
-        verdict = Verdict(true, true, true)
+        checks = StepChecks(true, true, true)
         if self.dynamics.projects:
-            y, verdict = self.project(tau, y, args, differentiable)
+            y, checks = self.project(tau, y, args, differentiable)
         elif args.rows is not None:
 
             def look() -> Array:
@@ -73,10 +73,10 @@ class Settling(eqx.Module):
 
             one = self.dynamics.rows.size == 1
             hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
-            verdict = Verdict(true, hold, true)
-        return y, verdict._replace(pressed=self.pressed(tau, y, args))
+            checks = StepChecks(true, hold, true)
+        return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args))
 
-    def pressed(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
+    def contacts_valid(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
         """Whether contacts press and slide as their friction takes them to."""
         if not self._contacts and not self._slides:
             return jnp.array(True)
@@ -84,11 +84,11 @@ class Settling(eqx.Module):
         t, q, v, params, values = self.dynamics.at(tau, y, args)
         right, terms = [], self.dynamics.terms
         if self._contacts:
-            if isinstance(args.prepared, ScalarPrepared) and isinstance(terms, ScalarTerms):
+            if isinstance(args.prepared, ScalarSolveConstants) and isinstance(terms, ScalarTerms):
                 lam = terms.multipliers(t, q, v, params, values, args.prepared)
             else:
                 array, prepared = self.dynamics.array, args.prepared
-                assert isinstance(prepared, Prepared)
+                assert isinstance(prepared, SolveConstants)
                 lam = array.multipliers(t, q, v, params, values, prepared, args.reacting)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
@@ -98,13 +98,13 @@ class Settling(eqx.Module):
 
     def project(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
-    ) -> tuple[Array, Verdict]:
+    ) -> tuple[Array, StepChecks]:
         """The state on the constraints nearest to y, and what is to be said about it."""
         return self._projected(self._near(tau, y, args, differentiable), y, args)
 
     def with_error(
         self, tau: Array, y: Array, args: Arguments, error: Array, near: Bool[Array, ""]
-    ) -> tuple[Array, Verdict, Array]:
+    ) -> tuple[Array, StepChecks, Array]:
         """The same as a call, and the error of the state that is kept.
 
         It is another near change points alone: elsewhere errors across the rows, which the
@@ -118,15 +118,15 @@ class Settling(eqx.Module):
             near: whether the step starts near such a place.
         """
         around = self._near(tau, y, args)
-        y, verdict = self._projected(around, y, args)
-        assert verdict.apart is not None
+        y, checks = self._projected(around, y, args)
+        assert checks.apart is not None
 
         def left() -> Array:
             parts = self.dynamics.parts
             return self._joined(*tangential(around.surface, *parts(y), *parts(error)), error)
 
-        error = jax.lax.cond(near | (verdict.apart < SHORT), left, lambda: error)
-        return y, verdict._replace(pressed=self.pressed(tau, y, args)), error
+        error = jax.lax.cond(near | (checks.apart < SHORT), left, lambda: error)
+        return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args)), error
 
     def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
         """A state within a step moved towards the constraints, by one turn of Newton's method.
@@ -159,10 +159,10 @@ class Settling(eqx.Module):
         assert found is not None
         return found
 
-    def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, Verdict]:
+    def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, StepChecks]:
         q, v, found = project(near.surface, *self.dynamics.parts(y), near.frozen)
         closed = self._closed(near.surface, q, v, args)
-        return self._joined(q, v, y), Verdict(
+        return self._joined(q, v, y), StepChecks(
             found, closed, jnp.array(True), near.apart, near.surface.columns
         )
 

@@ -18,8 +18,8 @@ from jaxlag._integration._first_step import first_step, slope_and_step
 from jaxlag._integration._linearized_rates import longest_step
 from jaxlag._integration._quasi_singularities import Passage, determinants, passage
 from jaxlag._integration._quintic_hermite import hermite
-from jaxlag._integration._step_arguments import Verdict, midway
-from jaxlag._integration._step_end import Settling
+from jaxlag._integration._step_arguments import StepChecks, midway
+from jaxlag._integration._step_end import StepEnd
 from jaxlag._integration._tableaus import explicit_tableau, nodes_of, remembers
 from jaxlag._integration._term import Term
 from jaxlag.solvers import AbstractExplicit, Splitting
@@ -43,7 +43,7 @@ class Estimate(NamedTuple):
     near: Bool[Array, ""] | None = None
 
 
-class Scheme(eqx.Module):
+class Stepper(eqx.Module):
     """How one step is taken and the next one chosen; with no controller steps are fixed."""
 
     solver: diffrax.AbstractSolver
@@ -52,8 +52,8 @@ class Scheme(eqx.Module):
     # (args, tau) -> (args of a step from tau, where rows of tables begin in them)
     windows: Callable = eqx.field(static=True)
     # (tau, y, args, differentiable) -> (the end of a step as it is kept, Verdict)
-    settle: Callable | None = eqx.field(static=True, default=None)
-    moves: bool = eqx.field(static=True, default=False)  # whether `settle` moves the state
+    step_end: Callable | None = eqx.field(static=True, default=None)
+    moves: bool = eqx.field(static=True, default=False)  # whether `step_end` moves the state
     longest: Array | None = None  # bound on adaptive steps
     # whether steps in which a comparison comes out otherwise are held to what derivatives need
     across: bool = eqx.field(static=True, default=False)
@@ -82,7 +82,7 @@ class Scheme(eqx.Module):
         """Whether steps are fixed or chosen by diffrax's own control, not a variant of it."""
         return self.controller is None or type(self.controller) is diffrax.PIDController
 
-    def on_scalars(self, lanes: bool = False, in_loop: bool = True) -> "Scheme | None":
+    def on_scalars(self, lanes: bool = False, in_loop: bool = True) -> "Stepper | None":
         """The form for loops that are one native function, where there is one.
 
         Args:
@@ -94,8 +94,8 @@ class Scheme(eqx.Module):
         if not isinstance(self.solver, AbstractExplicit | Splitting):
             return None
         term = self.term.compiled_for(lanes, in_loop)
-        settle = None if self.settle is None else Settling(term.dynamics)
-        return replace(self, term=term, settle=settle)
+        step_end = None if self.step_end is None else StepEnd(term.dynamics)
+        return replace(self, term=term, step_end=step_end)
 
     def within(self, args: Any, tau: Array) -> Any:
         """The arguments of a step from tau."""
@@ -106,8 +106,8 @@ class Scheme(eqx.Module):
         explicit = isinstance(self.solver, AbstractExplicit)
         return all_finite(memory) if explicit and memory is not None else jnp.array(True)
 
-    def for_derivatives(self, y: Array, args: Any) -> "Scheme":
-        """The scheme for a motion of which derivatives are taken.
+    def for_derivatives(self, y: Array, args: Any) -> "Stepper":
+        """The stepper for a motion of which derivatives are taken.
 
         A motion that starts at rest or moves steadily, up to what error estimates do not see, takes
         steps of any length, though perturbations of it turn or grow; and so does one whose fastest
@@ -123,10 +123,10 @@ class Scheme(eqx.Module):
             return self
         zero = jnp.zeros_like(args.origin)
         compares = isinstance(self.term, Term) and self._compares(zero, y, args)
-        scheme = replace(self, across=True) if compares else self
-        return scheme._bounded_at_rest(y, args)
+        stepper = replace(self, across=True) if compares else self
+        return stepper._bounded_at_rest(y, args)
 
-    def _bounded_at_rest(self, y: Array, args: Any) -> "Scheme":
+    def _bounded_at_rest(self, y: Array, args: Any) -> "Stepper":
         """With steps bounded where error estimates do not see what perturbations do."""
         controller: Any = self.controller
         explicit = not self.implicit
@@ -173,8 +173,8 @@ class Scheme(eqx.Module):
         step = t0, t1, y, args, memory, jump
         if args.lengths is None:
             return self._step(*step)
-        settle = cast(Settling, self.settle)
-        apart = settle.apart(t0, y, args) if crossing is None else crossing.apart
+        step_end = cast(StepEnd, self.step_end)
+        apart = step_end.apart(t0, y, args) if crossing is None else crossing.apart
         near = apart < (AHEAD if self.controller is None else SHORT)
         held = self._held(near)
         if not isinstance(self.solver, AbstractExplicit) or self.solver.looped:
@@ -188,14 +188,14 @@ class Scheme(eqx.Module):
 
         return jax.lax.cond(eqxi.unvmap_any(near), chosen, lambda: plain)
 
-    def _held(self, near: Array) -> "Scheme":
-        """The scheme with stages on the constraints in a step that is near a change point."""
-        settle, term = cast(Settling, self.settle), cast(Term, self.term)
+    def _held(self, near: Array) -> "Stepper":
+        """The stepper with stages on the constraints in a step that is near a change point."""
+        step_end, term = cast(StepEnd, self.step_end), cast(Term, self.term)
         refuses = self.controller is None and not self.implicit
 
         @jax.checkpoint  # what transposes keep of a branch is copied in all steps
         def closer(t: Array, y: Array, args: Any) -> Array:
-            return jnp.where(near, settle.stage(t, y, args, refuses), y)
+            return jnp.where(near, step_end.stage(t, y, args, refuses), y)
 
         def field(t: Any, y: Any, args: Any) -> Array:
             y = jax.lax.cond(eqxi.unvmap_any(near), closer, lambda t, y, args: y, t, y, args)
@@ -348,12 +348,12 @@ class Scheme(eqx.Module):
 
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False
-    ) -> tuple[PyTree, Verdict]:
+    ) -> tuple[PyTree, StepChecks]:
         """The end of a step as it is kept, and what is to be said about it."""
-        if self.settle is None:
+        if self.step_end is None:
             true = jnp.array(True)
-            return y, Verdict(true, true, true)
-        return self.settle(t, y, args, differentiable)
+            return y, StepChecks(true, true, true)
+        return self.step_end(t, y, args, differentiable)
 
     def settled_with_error(
         self,
@@ -365,7 +365,7 @@ class Scheme(eqx.Module):
         estimate: Estimate,
         crossing: Crossing | None,
         bound: Array,
-    ) -> tuple[PyTree, Verdict, Estimate, Crossing | None]:
+    ) -> tuple[PyTree, StepChecks, Estimate, Crossing | None]:
         """The same, the error of the state that is kept, and what is known of change points there.
 
         Rounding of what is projected near such a place is not made less by shorter steps. A step
@@ -383,20 +383,20 @@ class Scheme(eqx.Module):
         """
         if crossing is None:
             return *self.settled(t, y, args), estimate, None
-        settle, error, unseen = cast(Settling, self.settle), estimate.error, estimate.unseen
+        step_end, error, unseen = cast(StepEnd, self.step_end), estimate.error, estimate.unseen
         if error is None:
-            y, verdict = settle(t, y, args)
+            y, checks = step_end(t, y, args)
         else:
-            y, verdict, error = settle.with_error(t, y, args, cast(Array, error), crossing.is_near)
-        assert verdict.apart is not None
+            y, checks, error = step_end.with_error(t, y, args, cast(Array, error), crossing.is_near)
+        assert checks.apart is not None
         parts = cast(Term, self.term).dynamics.parts
         (q0, _), (q, v) = parts(y0), parts(y)
-        ends = crossing.onwards(t0, t, verdict.apart, (q - q0) / args.units)
+        ends = crossing.onwards(t0, t, checks.apart, (q - q0) / args.units)
         if error is None:
-            return y, verdict, estimate, ends
-        assert verdict.columns is not None
+            return y, checks, estimate, ends
+        assert checks.columns is not None
         beyond = jnp.zeros_like(y[2 * q.size :])
-        rounding = jnp.concatenate([*ends.rounding(q, v, verdict.columns, args), beyond])
+        rounding = jnp.concatenate([*ends.rounding(q, v, checks.columns, args), beyond])
         error = jnp.where(jnp.abs(error) <= rounding, 0.0, error)
         if unseen is not None:
             noise = jnp.concatenate([*ends.noise(v, args), beyond])
@@ -406,7 +406,7 @@ class Scheme(eqx.Module):
             again = ends.is_beside(crossing) & ~bound
             least = AGAIN * (controller.atol + controller.rtol * jnp.abs(y))
             error = jnp.where(again, jnp.maximum(jnp.abs(error), least), error)
-        return y, verdict, estimate._replace(error=error, unseen=unseen), ends
+        return y, checks, estimate._replace(error=error, unseen=unseen), ends
 
     def start(
         self, t0: Array, t1: Array, y: PyTree, args: Any, guess: Array | None

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxlag._integration._canonical import Canonical
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 
 
 class Term(diffrax.ODETerm):
@@ -23,12 +23,12 @@ class Term(diffrax.ODETerm):
         dtype: of the state.
     """
 
-    dynamics: Dynamics
+    dynamics: VectorField
     lines: int | None = eqx.field(static=True)
     dtype: Any = eqx.field(static=True)
 
     def compiled_for(self, lanes: bool, in_loop: bool) -> "Term":
-        """The same, written for where it is going to be evaluated, as told to `Dynamics`."""
+        """The same, written for where it is going to be evaluated, as told to `VectorField`."""
         dynamics = replace(self.dynamics, lanes=lanes, in_loop=in_loop)
         field: Any = dynamics.__call__
         return Term(field, dynamics, self.lines, self.dtype)
@@ -70,7 +70,7 @@ class Term(diffrax.ODETerm):
 
 
 def term_of(
-    dynamics: Dynamics, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    dynamics: VectorField, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
 ) -> Term:
     """The vector field of `dynamics`, for states and arguments like these."""
     field: Any = dynamics.__call__

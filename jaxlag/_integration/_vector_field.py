@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._core._errors import invalid
-from jaxlag._integration._step_arguments import Arguments, Gaps, RowChoice
-from jaxlag._linalg._independent_rows import Choice, independent_rows, row_sizes
+from jaxlag._integration._step_arguments import Arguments, KnotIntervals, RowSelection
+from jaxlag._linalg._independent_rows import RowChoice, independent_rows, row_sizes
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._lowering import ArrayTerms, Moving, ScalarPrepared, ScalarTerms
+from jaxlag._lowering import ArrayTerms, QuasiState, ScalarSolveConstants, ScalarTerms
 from jaxlag._lowering._terms import Terms
-from jaxlag._model._constraints import NO_ROWS, Baumgarte, Layout
+from jaxlag._model._constraints import NO_ROWS, Baumgarte, ConstraintRows
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import (
     all_knots,
@@ -35,7 +35,7 @@ from jaxlag._system._system import System
 from jaxlag._tracing import _params
 
 
-class Dynamics(eqx.Module):
+class VectorField(eqx.Module):
     """dy/dtau = sigma (v, a), y = (q, v), M a + h = Q + A^T lam, A a + gamma = 0.
 
     tau = sigma (t - t0) with t0 the start and sigma the direction of time.
@@ -71,7 +71,7 @@ class Dynamics(eqx.Module):
     sample: _params.Sample = eqx.field(static=True)
     lanes: bool = eqx.field(static=True, default=False)
     in_loop: bool = eqx.field(static=True, default=False)
-    rows: Layout = eqx.field(static=True, default=NO_ROWS)
+    rows: ConstraintRows = eqx.field(static=True, default=NO_ROWS)
     formulation: str = eqx.field(static=True, default="multipliers")
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool | None = eqx.field(static=True, default=False)
@@ -136,8 +136,8 @@ class Dynamics(eqx.Module):
         # They say which rows are read, and no derivative passes through that.
         knots = jnp.sort(jax.lax.stop_gradient(knots.astype(ts.dtype)))
         never = jnp.full((1,), jnp.finfo(ts.dtype).min, ts.dtype)
-        ahead = Gaps(self.tau(knots, args), jnp.concatenate([never, knots]))
-        back = Gaps(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
+        ahead = KnotIntervals(self.tau(knots, args), jnp.concatenate([never, knots]))
+        back = KnotIntervals(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
         onwards = self.turned(jnp.ones_like(ts[0]), args) > 0
         gaps = jax.tree.map(partial(jnp.where, onwards), ahead, back)
         return args._replace(gaps=stop_gradient(gaps))
@@ -158,11 +158,11 @@ class Dynamics(eqx.Module):
         given = q, params, values, self.sample, *rows, sense
         prepared = self.terms.prepare(*given)
         either = self.regular is None and self.formulation != "null_space"
-        if either and isinstance(prepared, ScalarPrepared):
+        if either and isinstance(prepared, ScalarSolveConstants):
             terms = self.terms
             assert isinstance(terms, ScalarTerms)
             alone = terms.regular().prepare(*given)
-            if isinstance(alone, ScalarPrepared):
+            if isinstance(alone, ScalarSolveConstants):
                 definite = self._definite(t, q, v, params)
                 prepared = prepared._replace(definite=definite, alone=alone)
         return args._replace(prepared=prepared)
@@ -180,7 +180,9 @@ class Dynamics(eqx.Module):
             found.append(clearly_definite(M) | ~jnp.all(jnp.isfinite(M)))
         return eqxi.unvmap_all(jnp.stack(found))
 
-    def _choice(self, t: Array, q: Array, v: Array, params: Any, values: Any) -> RowChoice | None:
+    def _choice(
+        self, t: Array, q: Array, v: Array, params: Any, values: Any
+    ) -> RowSelection | None:
         """The rows to solve with; None where that is no question."""
         if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
@@ -189,14 +191,14 @@ class Dynamics(eqx.Module):
         sure = all(self.rows.sure)
         there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
         if self.rows.size == 1:  # one that vanishes here alone is not to be done without
-            return RowChoice(~void, size, void, Choice(~void, ~void))
+            return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
         # Where multipliers are read, what is left out is told by those that are kept.
         reads = not np.all(unread)
         kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
         if not np.any(velocity & ~unread):  # then those that are read come first already
-            return RowChoice(kept, size, void, Choice(kept, there))
+            return RowSelection(kept, size, void, RowChoice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise invalid(
@@ -206,7 +208,7 @@ class Dynamics(eqx.Module):
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
         reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
-        return RowChoice(kept, size, void, Choice(reacting, there))
+        return RowSelection(kept, size, void, RowChoice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
@@ -251,7 +253,7 @@ class Dynamics(eqx.Module):
         if args.gaps is not None and args.gaps.knots.size:
             gap = jnp.searchsorted(args.gaps.knots, tau, side="right")
             inputs, starts = at_interval(inputs, args.gaps.lower[gap])
-            none = Gaps(args.gaps.knots[:0], args.gaps.lower[:0])
+            none = KnotIntervals(args.gaps.knots[:0], args.gaps.lower[:0])
             located = args._replace(inputs=self._traced(inputs), gaps=none)
 
         nowhere = jax.tree.map(lambda _: None, args)
@@ -272,14 +274,14 @@ class Dynamics(eqx.Module):
         """(v, w') of a state of quasi-velocities."""
         terms, (q, w) = self.terms, self.parts(y)
         if isinstance(terms, ScalarTerms):
-            if isinstance(args.prepared, ScalarPrepared):
+            if isinstance(args.prepared, ScalarSolveConstants):
                 t, (params, _) = self.clock(tau, args), self.given(args)
                 values = self._values(tau, q, w, args)
                 return terms.rates(t, q, w, params, values, args.prepared)
             terms = terms.array
         assert isinstance(terms, ArrayTerms)
         t, q, _, params, values = self.at(tau, y, args)
-        moving = Moving(terms, t, q, w, params, values)
+        moving = QuasiState(terms, t, q, w, params, values)
         return jnp.concatenate([moving.v, moving.accelerations()])
 
     def effort(
@@ -308,7 +310,7 @@ class Dynamics(eqx.Module):
 
     def velocities_of(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
         """The same, by the scalar program where there is one."""
-        if self.quasi is None or not isinstance(args.prepared, ScalarPrepared):
+        if self.quasi is None or not isinstance(args.prepared, ScalarSolveConstants):
             return self.velocities(t, q, w, self.given(args)[0])
         return self._by_program(t, q, w, args)
 
@@ -354,7 +356,7 @@ class Dynamics(eqx.Module):
         """The constraints near a predicted state."""
         t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
         params, _ = self.given(args)
-        if isinstance(args.prepared, ScalarPrepared):
+        if isinstance(args.prepared, ScalarSolveConstants):
             assert isinstance(terms, ScalarTerms)
             values = self._values(tau, q, v, args)
             return terms.surface(t, q, v, params, values, args.prepared)

@@ -21,7 +21,7 @@ ALIKE = 0.01
 """Pivots above this part of the largest one are as good as it."""
 
 
-class Choice(NamedTuple):
+class RowChoice(NamedTuple):
     """Rows to solve with.
 
     Attributes:

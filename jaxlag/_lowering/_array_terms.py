@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import (
-    Choice,
+    RowChoice,
     independent_rows,
     redundant_rows_hold,
     row_sizes,
@@ -36,7 +36,7 @@ from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import gradient
 
 
-class Prepared(eqx.Module):
+class SolveConstants(eqx.Module):
     """What the array program computes once per solve, and what it leaves out.
 
     Attributes:
@@ -250,18 +250,18 @@ class ArrayTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
         sense: Array | float = 1.0,
-    ) -> Prepared:
+    ) -> SolveConstants:
         """M and its factor where M depends on params alone."""
         structure = self.structure(params, q.shape[0], q.dtype)
         if not structure.mass_constant:
-            return Prepared(None, None, structure.bias_zero, sense)
+            return SolveConstants(None, None, structure.bias_zero, sense)
         anywhere = jnp.ones(q.shape, q.dtype)
         M = self.mass(jnp.zeros((), jnp.result_type(float)), anywhere, anywhere, params)
         # Derivatives with respect to params go through M, never through the elimination.
         factor = None if self.constraints else factor_mass(jax.lax.stop_gradient(M))
-        return Prepared(M, factor, structure.bias_zero, sense)
+        return SolveConstants(M, factor, structure.bias_zero, sense)
 
     def acceleration(
         self,
@@ -271,7 +271,7 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
         prepared = self.prepare(q, params, inputs) if prepared is None else prepared
@@ -297,7 +297,7 @@ class ArrayTerms(Terms):
         sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
         there, void, _ = sizes
         if A.shape[0] == 1:
-            choice = Choice(~void, ~void)
+            choice = RowChoice(~void, ~void)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
             lam = jnp.where(void, 0.0, lam)
             fine = (there | void)[0]
@@ -305,7 +305,7 @@ class ArrayTerms(Terms):
             read = self.rows_read(t, q, v, params, inputs)
             unread = np.logical_not(read)
             kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
-            choice = Choice(kept, there)
+            choice = RowChoice(kept, there)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
             units = units_of(*still((M, A)))
             lam = shared(A, lam, kept, there, unread, units)
@@ -325,8 +325,8 @@ class ArrayTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: Prepared,
-        reacting: Choice | None,
+        prepared: SolveConstants,
+        reacting: RowChoice | None,
     ) -> Float[Array, " m"]:
         """The multipliers as forces see them, solved with these rows."""
         M, right = self._balance(t, q, v, params, inputs, prepared)
@@ -341,7 +341,7 @@ class ArrayTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        reacting: Choice | None,
+        reacting: RowChoice | None,
         sense: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """(a, lam) under constraints; lam as forces read it where some do."""

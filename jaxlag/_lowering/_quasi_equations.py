@@ -14,7 +14,7 @@ from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._tracing._signature import gradient
 
 
-class Moving:
+class QuasiState:
     """One state (t, q, u), u the quasi-velocities that are not constrained, and its rates.
 
     Attributes:

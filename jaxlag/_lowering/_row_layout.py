@@ -16,7 +16,7 @@ from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
 from jaxlag._lowering._jaxpr._differentiate import gradient
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
 from jaxlag._lowering._jaxpr._node_arrays import nodes
-from jaxlag._model._constraints import NO_ROWS, AbstractConstraint, Layout
+from jaxlag._model._constraints import NO_ROWS, AbstractConstraint, ConstraintRows
 from jaxlag._model._quasi_velocities import QuasiVelocities
 from jaxlag._tracing import _params
 from jaxlag._tracing._dependence import outputs_depend_on
@@ -43,7 +43,9 @@ class Contents(NamedTuple):
     zero: bool = False
 
 
-def layout(constraints: tuple[AbstractConstraint, ...], params: Any, n: int, dtype: Any) -> Layout:
+def layout(
+    constraints: tuple[AbstractConstraint, ...], params: Any, n: int, dtype: Any
+) -> ConstraintRows:
     """The rows of all constraints, for params like these; checked to be affine in v."""
     if not constraints:
         return NO_ROWS
@@ -60,7 +62,7 @@ def layout_of(
     static: _params.Static,
     n: int,
     dtype: Any,
-) -> Layout:
+) -> ConstraintRows:
     """The same, from shapes and dtypes of the traced params and the values of the static ones."""
     shapes: list[tuple[str, tuple[int, ...]]] = []
     labels: list[str] = []
@@ -99,7 +101,9 @@ def layout_of(
         contents = _examine(constraint, labels[-count:], like, static, n, dtype)
         driven += [row.driven for row in contents]
         sure += [row.sure for row in contents]
-    return Layout(tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven), tuple(sure))
+    return ConstraintRows(
+        tuple(shapes), tuple(labels), tuple(holonomic), tuple(driven), tuple(sure)
+    )
 
 
 def _watched(like: _params.Static, speeds: str) -> list[str | None]:

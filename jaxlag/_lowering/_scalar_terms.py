@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._linalg._independent_rows import Choice
+from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._lowering._array_terms import ArrayTerms, Prepared
+from jaxlag._lowering._array_terms import ArrayTerms, SolveConstants
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._lowering._symbolic._lower import Lowered, lower
@@ -22,7 +22,7 @@ from jaxlag._lowering._terms import Terms
 from jaxlag._tracing import _params
 
 
-class ScalarPrepared(NamedTuple):
+class ScalarSolveConstants(NamedTuple):
     """What each program needs of what does not change during a solve.
 
     Where nobody knows while tracing whether M is positive definite without the constraints, there
@@ -42,7 +42,7 @@ class ScalarPrepared(NamedTuple):
     rates: Array | None = None
     determinants: Array | None = None
     definite: Bool[Array, ""] | None = None
-    alone: "ScalarPrepared | None" = None
+    alone: "ScalarSolveConstants | None" = None
 
 
 _WITH_INPUTS = ("acceleration", "lam")
@@ -90,9 +90,9 @@ class ScalarTerms(Terms):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
         sense: Array | float = 1.0,
-    ) -> ScalarPrepared | Prepared:
+    ) -> ScalarSolveConstants | SolveConstants:
         """All that accelerations and projections need of what depends on params alone."""
         equations = self.lowered(q, params, inputs, sample).equations
         if equations is None:
@@ -110,11 +110,11 @@ class ScalarTerms(Terms):
         assert first is not None
         rates, determinants = before(equations.velocity, kept), before(equations.determinants, None)
         if equations.surface is None:
-            return ScalarPrepared(first, rates=rates, determinants=determinants)
+            return ScalarSolveConstants(first, rates=rates, determinants=determinants)
         *moving, lam = equations.surface
         others = [before(code, kept) for code in moving]
         reacting_too = before(lam, *solving)
-        return ScalarPrepared(
+        return ScalarSolveConstants(
             first, *others, lam=reacting_too, rates=rates, determinants=determinants
         )
 
@@ -126,7 +126,7 @@ class ScalarTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Acceleration a; NaN, whole, where M is not positive definite.
 
@@ -148,7 +148,7 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarPrepared,
+        prepared: ScalarSolveConstants,
     ) -> Array:
         """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
         return self._run("acceleration", t, q, v, params, inputs, prepared)
@@ -160,13 +160,18 @@ class ScalarTerms(Terms):
         u: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarPrepared,
+        prepared: ScalarSolveConstants,
     ) -> Array:
         """v at (q, u) of quasi-velocities."""
         return self._run("rates", t, q, u, params, inputs, prepared)
 
     def determinants(
-        self, t: Array, q: Array, params: Any, inputs: Mapping[str, Any], prepared: ScalarPrepared
+        self,
+        t: Array,
+        q: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        prepared: ScalarSolveConstants,
     ) -> Array:
         """What vanishes where quasi-velocities are singular, without what never changes."""
         code = self._equations(q, params, inputs).determinants
@@ -183,11 +188,11 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarPrepared,
+        prepared: ScalarSolveConstants,
     ) -> Array:
         """The results of one of the programs, whose prelude has this name."""
 
-        def by(terms: "ScalarTerms", prepared: ScalarPrepared) -> Array:
+        def by(terms: "ScalarTerms", prepared: ScalarSolveConstants) -> Array:
             program = terms._equations(q, params, inputs).code(name)
             carried = getattr(prepared, name)
             assert program is not None
@@ -218,7 +223,7 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarPrepared,
+        prepared: ScalarSolveConstants,
     ) -> ConstraintProjector:
         """The constraints near the state (q, v); positions alone near a (q, u)."""
         code = self._equations(q, params, inputs).surface
@@ -254,7 +259,7 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarPrepared,
+        prepared: ScalarSolveConstants,
     ) -> Array:
         """The multipliers that forces depend on, at (q, v)."""
         return self._run("lam", t, q, v, params, inputs, prepared)

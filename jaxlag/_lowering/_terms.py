@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._linalg._independent_rows import Choice
+from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._tracing import _params
 
 
@@ -92,7 +92,7 @@ class Terms(eqx.Module):
         inputs: Mapping[str, Any],
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
         sense: Array | float = 1.0,
     ) -> Any:
         """What accelerations need of what depends on params alone, to be computed once per solve.
@@ -111,7 +111,7 @@ class Terms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         prepared: Any = None,
-        reacting: Choice | None = None,
+        reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """a, with one factorisation; NaN where M is not positive definite where A a = 0.
 

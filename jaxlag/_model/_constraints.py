@@ -233,7 +233,7 @@ def check_reactions(
             raise invalid(f"force {force.name!r}: contact", f"be among {names}", was)
 
 
-class Layout(NamedTuple):
+class ConstraintRows(NamedTuple):
     """Which rows are whose, found by tracing.
 
     Attributes:
@@ -316,7 +316,7 @@ class Layout(NamedTuple):
         return parts
 
 
-NO_ROWS = Layout((), (), (), (), ())
+NO_ROWS = ConstraintRows((), (), (), (), ())
 
 
 def position_rows(

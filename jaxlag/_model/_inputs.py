@@ -147,7 +147,7 @@ def counted_from(origin: Float[Array, ""], inputs: Mapping[str, Any]) -> dict[st
     return dict(inputs) | moved
 
 
-def in_order(inputs: Mapping[str, Any]) -> Bool[Array, ""]:
+def knots_increase(inputs: Mapping[str, Any]) -> Bool[Array, ""]:
     """Whether the times of all knots are finite and increase strictly."""
     right = jnp.array(True)
     for signal in inputs.values():

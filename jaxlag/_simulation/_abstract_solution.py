@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
-from jaxlag._simulation._failure import Scene
+from jaxlag._simulation._failure import MotionKey
 from jaxlag._system._system import System
 
 
@@ -42,7 +42,7 @@ class AbstractSolution(eqx.Module):
 
     @property
     @abstractmethod
-    def scene(self) -> Scene:
+    def scene(self) -> MotionKey:
         """What moved."""
 
     @property

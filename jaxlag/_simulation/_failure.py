@@ -14,8 +14,8 @@ from jaxlag._core._status import Status
 from jaxlag._integration._initial_conditions import Start, residuals
 from jaxlag._integration._record import Outcome, Times
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._step_end import Settling
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._step_end import StepEnd
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._independent_rows import row_sizes
 from jaxlag._linalg._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked
 from jaxlag._linalg._mass_solve import factor_mass, first_unhealthy, solve_mass
@@ -28,7 +28,7 @@ class Ending(NamedTuple):
     """How a trajectory ended, as far as the solve knows.
 
     Attributes:
-        status: int32, see `Status`; `explained` may tell more.
+        status: int32, see `Status`; `diagnose_failure` may tell more.
         where: index of the coordinate or constraint row that it concerns; -1 if none is known.
         tried: end of the last attempted step, s.
         state: (q, v), or (q, u), of the last good state.
@@ -48,15 +48,15 @@ _OPEN = (
     *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
     Status.implicit_solve_failed,
 )
-"""Outcomes of which `explained` may say more."""
+"""Outcomes of which `diagnose_failure` may say more."""
 
 
-def ended(
-    dynamics: Dynamics, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
+def final_status(
+    dynamics: VectorField, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
 ) -> Ending:
     """What a solve knows of its end, at the price of nothing."""
     status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
-    status = jnp.where(begun.pressed, status, int(Status.no_reaction_solution))
+    status = jnp.where(begun.contacts_valid, status, int(Status.no_reaction_solution))
     kind = jnp.where(
         begun.consistent.contradictory,
         int(Status.contradictory_rows),
@@ -85,13 +85,13 @@ def ended(
 
 
 def is_open(ending: Ending) -> bool:
-    """Whether `explained` may say more of one of these endings; True where they are traced."""
+    """Whether `diagnose_failure` may say more of an ending; True where they are traced."""
     if not concrete(ending.status):
         return True
     return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
 
 
-class Scene(NamedTuple):
+class MotionKey(NamedTuple):
     """What a motion was of, to explain it by: the key of a compiled program."""
 
     system: Any
@@ -104,10 +104,10 @@ class Scene(NamedTuple):
 
 
 def dynamics_of(
-    scene: Scene, ts: Array, t: Array, q: Array, v: Array, params: Any, inputs: Any
-) -> tuple[Dynamics, Arguments]:
+    scene: MotionKey, ts: Array, t: Array, q: Array, v: Array, params: Any, inputs: Any
+) -> tuple[VectorField, Arguments]:
     """The equations of a motion over ts that passes (q, v) at t, and their arguments."""
-    dynamics = Dynamics(
+    dynamics = VectorField(
         scene.system,
         scene.params,
         scene.inputs,
@@ -125,7 +125,7 @@ def dynamics_of(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def explained(scene: Scene, batch: int, given: Any) -> Ending:
+def diagnose_failure(scene: MotionKey, batch: int, given: Any) -> Ending:
     """The endings with what is found when one looks at the states around them.
 
     Args:
@@ -148,8 +148,8 @@ def explained(scene: Scene, batch: int, given: Any) -> Ending:
 
 
 def _explained(
-    scene: Scene,
-    dynamics: Dynamics,
+    scene: MotionKey,
+    dynamics: VectorField,
     ending: Ending,
     time: Array,
     tried: Array,
@@ -215,7 +215,7 @@ def _explained(
         concerns |= {
             Status.projection_failed: farthest,
             Status.rank_change: jnp.where(row >= 0, row, farthest),
-            Status.no_reaction_solution: jnp.asarray(Settling(dynamics).contact_row),
+            Status.no_reaction_solution: jnp.asarray(StepEnd(dynamics).contact_row),
         }
     where = ending.where
     for kind, index in concerns.items():
@@ -224,7 +224,7 @@ def _explained(
 
 
 def _turned(
-    dynamics: Dynamics, taus: Array, q: Array, tau0: Array, q0: Array, args: Arguments
+    dynamics: VectorField, taus: Array, q: Array, tau0: Array, q0: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """The quasi-velocity that follows from those before it, or came close to it; -1 for none.
 
@@ -267,7 +267,7 @@ def _turned(
 
 
 def _lost(
-    dynamics: Dynamics,
+    dynamics: VectorField,
     time: Array,
     tried: Array,
     y: Array,
@@ -305,7 +305,7 @@ def _lost(
 
 
 def _culprits(
-    dynamics: Dynamics, tau: Array, y: Array, args: Arguments
+    dynamics: VectorField, tau: Array, y: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
     """Coordinates (without inertia, of non-finite Q - h, of the largest |a|).
 
@@ -326,7 +326,7 @@ def _culprits(
 
 
 def _dependent(
-    dynamics: Dynamics, kept: Array | None, taus: Array, states: Array, args: Arguments
+    dynamics: VectorField, kept: Array | None, taus: Array, states: Array, args: Arguments
 ) -> Int[Array, ""]:
     """The row that vanishes, or follows from those before it, or came close to that; -1 for none.
 
@@ -362,7 +362,7 @@ def _dependent(
     return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
 
 
-def _farthest(dynamics: Dynamics, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:
+def _farthest(dynamics: VectorField, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:
     """The constraint row with the largest residual, in units of its norm."""
     at = dynamics.state(tau, y, args)
     A, _ = dynamics.terms.rows(*at)

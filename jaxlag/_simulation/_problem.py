@@ -1,4 +1,4 @@
-"""From the arguments of a solve to its problem: the equations, the start, the times, the scheme."""
+"""From the arguments of a solve to its problem: equations, start, times, and the stepper."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag._core._arrays import stop_gradient
-from jaxlag._gradient._modes import Keep
+from jaxlag._gradient._modes import CheckpointPlan
 from jaxlag._gradient._solve import Problem, Setup
 from jaxlag._integration._change_points import lengths_of, may_cross, may_stop, scales_at
 from jaxlag._integration._initial_conditions import (
@@ -23,13 +23,13 @@ from jaxlag._integration._initial_conditions import (
 from jaxlag._integration._quasi_singularities import usual
 from jaxlag._integration._record import Times
 from jaxlag._integration._step_arguments import Arguments
-from jaxlag._integration._step_end import Settling
-from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._step_end import StepEnd
+from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import looks_ahead
 from jaxlag._integration._term import term_of
-from jaxlag._integration._vector_field import Dynamics
+from jaxlag._integration._vector_field import VectorField
 from jaxlag._model._constraints import Baumgarte
-from jaxlag._model._inputs import all_knots, common_range, in_order
+from jaxlag._model._inputs import all_knots, common_range, knots_increase
 from jaxlag._simulation._method_requirements import check_requirements, splits
 from jaxlag._simulation._methods import for_state
 from jaxlag._statics._assemble import assembled
@@ -39,13 +39,13 @@ from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages
 
 
-class Plan(NamedTuple):
+class ProgramKey(NamedTuple):
     """What the compiled program is keyed by."""
 
     system: System
     params: _params.Static
     inputs: _params.Static
-    scheme: _params.Static
+    stepper: _params.Static
     direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
     max_steps: int
     save: tuple[str, ...]
@@ -55,7 +55,7 @@ class Plan(NamedTuple):
     assemble: bool
     regular: bool | None
     apart: bool
-    keep: Keep
+    keep: CheckpointPlan
     change_points: str
     auto: bool  # whether the method may be chosen by the structure of the system
 
@@ -69,20 +69,20 @@ class Values(NamedTuple):
     ts: Array
     params: Any
     inputs: Any
-    scheme: Any
+    stepper: Any
     rtol: Array
     atol: Array
     step: Array | None  # dt or dt0
     longest: Array | None = None  # dt_max
 
 
-def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
+def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
     """The problem that a plan and its values describe."""
     power = None
     if "work" in plan.save:
         params = _params.join(values.params, plan.params.tree)
         power = plan.system.power_terms(params, values.q0.dtype)
-    dynamics = Dynamics(
+    dynamics = VectorField(
         plan.system,
         plan.params,
         plan.inputs,
@@ -99,7 +99,7 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     dynamics = replace(dynamics, rows=plan.system.rows(params, values.q0.dtype))
     crossing = plan.change_points == "pass" and may_cross(dynamics)
     dynamics = replace(dynamics, crossing=crossing)
-    solver, controller = eqx.combine(values.scheme, plan.scheme.tree)
+    solver, controller = eqx.combine(values.stepper, plan.stepper.tree)
     if plan.auto and controller is None:
         splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
         solver = Splitting(8) if splitting else solver
@@ -140,22 +140,22 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
         lengths = lengths_of(masses, args.kept)
         args = args._replace(lengths=lengths, units=units, slopes=slopes)
     if dynamics.projects:
-        moved, _ = Settling(dynamics).project(start, y0, args, differentiable=True)
+        moved, _ = StepEnd(dynamics).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
     if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
         dynamics = replace(dynamics, stabilization=None, crossing=False)
         args = args._replace(lengths=None, units=None, slopes=None)
     solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
-    settling = Settling(dynamics)
-    settle = settling if settling.settles else None
+    step_end = StepEnd(dynamics)
     term = term_of(dynamics, start, y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
-    how = (dynamics.windows, settle, dynamics.projects, values.longest)
+    after = step_end if step_end.settles else None
+    how = (dynamics.windows, after, dynamics.projects, values.longest)
     passes = args.usual is not None
     stops = not dynamics.crossing and may_stop(dynamics)
-    scheme = Scheme(solver, controller, term, *how, passes=passes, stops=stops)
-    scheme_traced, scheme_static = eqx.partition(scheme, eqx.is_array)
+    stepper = Stepper(solver, controller, term, *how, passes=passes, stops=stops)
+    stepper_traced, stepper_static = eqx.partition(stepper, eqx.is_array)
     times, in_range = _times(dynamics, args, inputs, values.ts)
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
@@ -163,14 +163,14 @@ def pose(plan: Plan, values: Values) -> tuple[Dynamics, Start, Problem]:
     saves = dynamics.turned(values.ts, args)
     steps = (values.step, values.longest)
     valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
-    valid = valid & in_order(inputs)
+    valid = valid & knots_increase(inputs)
     finite = start_finite(dynamics, start, y0, args)
     if args.lengths is not None:  # what depends at the start is not known to be independent nearby
         finite = finite & jnp.all(args.lengths > 0)
-    pressed = settling.pressed(start, y0, args)
+    pressed = step_end.contacts_valid(start, y0, args)
     begun = Start(valid, in_range, finite, consistent, pressed)
-    setup = Setup(values.step, begun.allowed, scheme_traced)
-    problem = Problem(y0, args, times, setup, scheme_static, plan.max_steps, plan.keep)
+    setup = Setup(values.step, begun.allowed, stepper_traced)
+    problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.keep)
     return dynamics, begun, problem
 
 
@@ -185,7 +185,7 @@ def stop_gradient_unless(moves: Array, tree: Any) -> Any:
 
 
 def velocities_at(
-    dynamics: Dynamics, ts: Array, y: Array, args: Arguments, moved: Array
+    dynamics: VectorField, ts: Array, y: Array, args: Arguments, moved: Array
 ) -> tuple[Array, Array]:
     """(q, v) at every row of one motion; NaN where the motion did not get.
 
@@ -204,7 +204,7 @@ def velocities_at(
 
 
 def _times(
-    dynamics: Dynamics, args: Arguments, inputs: Mapping[str, Any], ts: Array
+    dynamics: VectorField, args: Arguments, inputs: Mapping[str, Any], ts: Array
 ) -> tuple[Times, Array]:
     """Anchors of the grid in tau, and whether the inputs are defined at the start."""
 

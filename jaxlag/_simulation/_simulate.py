@@ -16,8 +16,8 @@ from jaxlag._core._errors import SimulationError, invalid
 from jaxlag._core._status import Status
 from jaxlag._gradient._modes import choose_gradient
 from jaxlag._gradient._solve import solve
-from jaxlag._integration._initial_conditions import rows_hold
-from jaxlag._integration._stepper import Scheme
+from jaxlag._integration._initial_conditions import rows_hold_after
+from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
@@ -35,10 +35,10 @@ from jaxlag._simulation._arguments import (
 )
 from jaxlag._simulation._compile_log import timed
 from jaxlag._simulation._error_estimate import LEFT, check_estimate, finer, with_error
-from jaxlag._simulation._failure import ended
+from jaxlag._simulation._failure import final_status
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import FINER, IMPLICIT, METHODS, choose, name_of
-from jaxlag._simulation._problem import Plan, Values, pose, velocities_at
+from jaxlag._simulation._problem import ProgramKey, Values, build_problem, velocities_at
 from jaxlag._simulation._quantities import over_rows
 from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
@@ -238,24 +238,26 @@ def simulate(
     if not concrete(params_traced, inputs_traced):
         jumps = Jumps(system, params, q0, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
-    scheme = choose(method, dt is None, rtol, atol)
-    if isinstance(scheme[0], AbstractPartitioned) and isinstance(project, Baumgarte):
-        must = f"be left out for {type(scheme[0]).__name__}, whose steps hold the constraints"
+    stepper = choose(method, dt is None, rtol, atol)
+    if isinstance(stepper[0], AbstractPartitioned) and isinstance(project, Baumgarte):
+        must = f"be left out for {type(stepper[0]).__name__}, whose steps hold the constraints"
         raise invalid("project", must, f"it was {project!r}")
-    if gradient_memory is not None and remembers(scheme[0]):
-        must = f"be left out for {type(scheme[0]).__name__}, which keeps every step for derivatives"
+    if gradient_memory is not None and remembers(stepper[0]):
+        must = (
+            f"be left out for {type(stepper[0]).__name__}, which keeps every step for derivatives"
+        )
         raise invalid(
             "gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method."
         )
     size = 2 * system.size
     if gradient_memory is not None and "work" in save:
         size += len(system.power_terms(params, q0.dtype).names)
-    scheme_traced, scheme_static = eqx.partition(scheme, _params.is_array)
-    plan = Plan(
+    stepper_traced, stepper_static = eqx.partition(stepper, _params.is_array)
+    plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
         inputs=_params.Static(inputs_static),
-        scheme=_params.Static(scheme_static),
+        stepper=_params.Static(stepper_static),
         direction=direction,
         max_steps=max_steps,
         save=tuple(save),
@@ -278,7 +280,7 @@ def simulate(
         auto=method == "auto" and "work" not in save,
     )
     start = q0, v0, u0, ts, params_traced, inputs_traced
-    values = Values(*start, scheme_traced, rtol, atol, step, longest)
+    values = Values(*start, stepper_traced, rtol, atol, step, longest)
     _xla.warn_if_late()
     warn_of_changes(system, inputs)
     motion = timed(_simulate, system, plan, values)
@@ -293,13 +295,13 @@ def simulate(
             plan = plan._replace(formulation=implicit.formulation)
         if abs(other.last_time - ts[0]) > abs(motion.last_time - ts[0]):
             motion, method = other, IMPLICIT
-            scheme = choose(IMPLICIT, True, rtol, atol)
+            stepper = choose(IMPLICIT, True, rtol, atol)
     if estimate_error:
         # Half the step takes twice as many; of a tenth of the tolerance, at order 5, 1.6 times.
         # Steps of a higher order share no errors with those of the motion.
         room = plan._replace(max_steps=2 * max_steps)
         steps = finer(rtol, atol, step, dt is not None)
-        better = method if dt is not None else FINER.get(name_of(scheme[0]), method)
+        better = method if dt is not None else FINER.get(name_of(stepper[0]), method)
         beside = _simulate(*_with_method(room, values, better, *steps, fixed=dt is not None))
         motion = with_error(motion, beside, 1.0 if better is method else LEFT)
     if throw and concrete(motion.raw_status):
@@ -308,22 +310,24 @@ def simulate(
 
 
 def _with_method(
-    plan: Plan,
+    plan: ProgramKey,
     values: Values,
     method: Any,
     rtol: Any,
     atol: Any,
     step: Any,
     fixed: bool = False,
-) -> tuple[Plan, Values]:
+) -> tuple[ProgramKey, Values]:
     """The same motion by another method, or with other tolerances or steps."""
-    scheme = choose(method, not fixed, rtol, atol)
-    traced, static = eqx.partition(scheme, _params.is_array)
-    plan = plan._replace(scheme=_params.Static(static))
-    return plan, values._replace(scheme=traced, rtol=rtol, atol=atol, step=step)
+    stepper = choose(method, not fixed, rtol, atol)
+    traced, static = eqx.partition(stepper, _params.is_array)
+    plan = plan._replace(stepper=_params.Static(static))
+    return plan, values._replace(stepper=traced, rtol=rtol, atol=atol, step=step)
 
 
-def _past_singular(plan: Plan, values: Values, motion: Solution) -> tuple[Plan, Solution]:
+def _past_singular(
+    plan: ProgramKey, values: Values, motion: Solution
+) -> tuple[ProgramKey, Solution]:
     """The motion by multipliers where one in quasi-velocities ends as these are singular.
 
     One motion, with values, and where it gets further so.
@@ -350,15 +354,15 @@ def _ran_out(motion: Solution) -> bool:
 
 
 @partial(jax.jit, static_argnums=0)
-def _simulate(plan: Plan, values: Values) -> Solution:
+def _simulate(plan: ProgramKey, values: Values) -> Solution:
     """The compiled program: pose, solve, derive what `save` names."""
     values = values._replace(ts=jnp.asarray(values.ts))  # under jax.disable_jit it is numpy's
-    dynamics, start, problem = pose(plan, values)
-    scheme: Scheme = eqx.combine(problem.setup.scheme, problem.scheme)
-    name = name_of(scheme.solver)
+    dynamics, start, problem = build_problem(plan, values)
+    stepper: Stepper = eqx.combine(problem.setup.stepper, problem.stepper)
+    name = name_of(stepper.solver)
     known = name in METHODS
     rows, outcome = solve(problem)
-    ending = ended(dynamics, problem.times, problem.y0, problem.args, outcome, start)
+    ending = final_status(dynamics, problem.times, problem.y0, problem.args, outcome, start)
     params = _params.join(values.params, plan.params.tree)
     inputs = eqx.combine(values.inputs, plan.inputs.tree)
     moved = outcome.accepted > 0
@@ -368,7 +372,7 @@ def _simulate(plan: Plan, values: Values) -> Solution:
     states = jnp.concatenate([rows.saved, rows.state[None]])
     q, v = velocities_at(dynamics, at, states, problem.args, moved)
     (q, last_q), (v, last_v) = ((x[:-1], x[-1]) for x in (q, v))
-    hold, row = rows_hold(dynamics, values.ts, q, v, params)
+    hold, row = rows_hold_after(dynamics, values.ts, q, v, params)
     broken = ~hold & (ending.status == int(Status.ok))
     ending = ending._replace(
         status=jnp.where(broken, int(Status.contradictory_rows), ending.status),
@@ -403,11 +407,11 @@ def _simulate(plan: Plan, values: Values) -> Solution:
         _solver="" if known else name,
         _ending=ending,
         _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
-        _implicit=scheme.implicit,
+        _implicit=stepper.implicit,
         _solve=simulate,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
         change_points=plan.change_points,
-        tolerances=None if scheme.controller is None else (values.rtol, values.atol),
+        tolerances=None if stepper.controller is None else (values.rtol, values.atol),
         dt_max=values.longest,
     )
 

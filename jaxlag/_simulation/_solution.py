@@ -14,7 +14,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._core._status import CONCERNS_ROW, Status
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
-from jaxlag._simulation._failure import Ending, Scene, explained, is_open
+from jaxlag._simulation._failure import Ending, MotionKey, diagnose_failure, is_open
 from jaxlag._simulation._methods import METHODS
 from jaxlag._simulation._quantities import over_rows
 from jaxlag._simulation._resolve_between import states_at
@@ -105,10 +105,10 @@ class Solution(AbstractSolution):
         return self._explained().where
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> MotionKey:
         """What moved, as compiled programs are keyed by it."""
         keys = self._params_static, self._inputs_static, self.formulation, self.stabilization
-        return Scene(self.system, *keys, self._kinematic, self._implicit)
+        return MotionKey(self.system, *keys, self._kinematic, self._implicit)
 
     def _explained(self) -> Ending:
         if not is_open(self._ending):
@@ -116,7 +116,7 @@ class Solution(AbstractSolution):
         start = self.q[..., 0, :], self.v[..., 0, :]
         at = self._ending, self.last_time, self.ts, *start
         batch = self.ts.ndim - 1
-        return explained(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
+        return diagnose_failure(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
 
     @property
     def method(self) -> str:

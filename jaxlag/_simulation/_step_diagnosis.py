@@ -17,7 +17,7 @@ from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
 from jaxlag._linalg._projection import turns_needed
 from jaxlag._simulation._abstract_solution import AbstractSolution
-from jaxlag._simulation._failure import Scene, dynamics_of
+from jaxlag._simulation._failure import MotionKey, dynamics_of
 from jaxlag._system._row_advice import advice_on_rows
 
 ROWS = 8  # states looked at, evenly along the motion
@@ -320,7 +320,7 @@ def _look(motion: AbstractSolution, h: float, last: bool = False) -> Look:
 
 
 @partial(jax.jit, static_argnums=0)
-def _looks(scene: Scene, traced: Any) -> Look:
+def _looks(scene: MotionKey, traced: Any) -> Look:
     span, ts, q, v, h, params, inputs, (rtol, atol) = traced
     dynamics, args = dynamics_of(scene, span, ts[0], q[0], v[0], params, inputs)
     given, _ = dynamics.given(args)

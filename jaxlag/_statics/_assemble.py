@@ -18,7 +18,7 @@ from jaxlag._linalg._independent_rows import independent_rows, row_sizes, withou
 from jaxlag._linalg._kkt import augmented, solve_kkt
 from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
-from jaxlag._model._constraints import Layout
+from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._system._closure import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
@@ -54,7 +54,7 @@ class Assembly(eqx.Module):
     independent: Bool[Array, "*batch m"]
     status: Int[Array, "*batch"]
     where: Int[Array, "*batch"]
-    _rows: Layout = eqx.field(static=True)
+    _rows: ConstraintRows = eqx.field(static=True)
 
     @property
     def rank(self) -> Int[Array, "*batch"]:

@@ -16,7 +16,7 @@ from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import EquilibriumError, invalid
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm, row_sizes, without_rounding
-from jaxlag._model._constraints import Layout
+from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import vector
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
@@ -65,7 +65,7 @@ class Equilibrium(eqx.Module):
     multipliers: Float[Array, "*batch m"]
     status: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
-    _layout: Layout = eqx.field(static=True)
+    _layout: ConstraintRows = eqx.field(static=True)
 
     @property
     def lam(self) -> dict[str, Float[Array, "..."]]:

@@ -15,7 +15,7 @@ WORK, GOOD_WORK = 0.1, 0.75  # least work done, over the work expected, of a ste
 MISS, GOOD_MISS = 1.0, 0.25  # largest error of the predicted forces, over the forces at its start
 
 
-class Rows(NamedTuple):
+class RowsAt(NamedTuple):
     """Constraint rows in units of the coordinates, each of length 1, by singular values.
 
     Rows that depend on others are left out. Such rows may be independent beside the constraints,
@@ -44,15 +44,15 @@ class Rows(NamedTuple):
         return -(self.left @ part) / self.norms
 
 
-def _rows(A: Float[Array, "m n"], norms: Float[Array, " m"], floor: Array | float) -> Rows:
+def _rows(A: Float[Array, "m n"], norms: Float[Array, " m"], floor: Array | float) -> RowsAt:
     (m, n), dtype = A.shape, A.dtype
     if m == 0:
         none = jnp.zeros((0,), dtype)
-        return Rows(none, jnp.zeros((0, 0), dtype), none, jnp.eye(n, dtype=dtype))
+        return RowsAt(none, jnp.zeros((0, 0), dtype), none, jnp.eye(n, dtype=dtype))
     left, sizes, axes = jnp.linalg.svd(A / norms[:, None], full_matrices=True)
     regular = sizes > floor * sizes[0]
     inverse = jnp.where(regular, 1 / jnp.where(regular, sizes, 1), 0)
-    return Rows(norms, left[:, : len(sizes)], inverse, axes)
+    return RowsAt(norms, left[:, : len(sizes)], inverse, axes)
 
 
 def _lengths(A: Float[Array, "m n"]) -> Float[Array, " m"]:

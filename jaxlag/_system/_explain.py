@@ -8,7 +8,7 @@ from jaxlag._core import _xla
 from jaxlag._core._batching import LANES, MOST
 from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO
 from jaxlag._lowering import Equations, Lowered, Program, Structure, find
-from jaxlag._model._constraints import Layout
+from jaxlag._model._constraints import ConstraintRows
 from jaxlag._system._state_functions import AbstractQuantities
 from jaxlag.solvers import Dopri8
 from jaxlag.solvers._explicit import WRITTEN_OUT, in_loop_over_stages
@@ -20,7 +20,7 @@ def _list(names: frozenset[str]) -> str:
 
 
 def explain(
-    system: AbstractQuantities, structure: Structure, lowered: Lowered | None, rows: Layout
+    system: AbstractQuantities, structure: Structure, lowered: Lowered | None, rows: ConstraintRows
 ) -> str:
     """What was found in `system` and what follows for the compiled program.
 
@@ -58,7 +58,7 @@ def _quasi(system: AbstractQuantities) -> list[str]:
     return [f"quasi         {', '.join(free)} make the state with q{zero}"]
 
 
-def _constraints(rows: Layout, quasi: bool) -> list[str]:
+def _constraints(rows: ConstraintRows, quasi: bool) -> list[str]:
     if not rows.size:
         return ["constraints   none, so no multipliers are computed"]
     kinds = zip(rows.labels, rows.holonomic, rows.driven, strict=True)

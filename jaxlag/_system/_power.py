@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._lowering._terms import Terms
-from jaxlag._model._constraints import AbstractConstraint, Layout
+from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
 from jaxlag._model._forces import EXPLICIT_TIME, AbstractForce, components, reads_lam
 from jaxlag._tracing._signature import gradient
 
@@ -27,7 +27,7 @@ class Power(eqx.Module):
     forces: tuple[AbstractForce, ...]
     explicit_time: bool = eqx.field(static=True)
     terms: Terms
-    rows: Layout = eqx.field(static=True)
+    rows: ConstraintRows = eqx.field(static=True)
 
     @property
     def names(self) -> tuple[str, ...]:

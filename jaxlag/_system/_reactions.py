@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._core._errors import invalid
-from jaxlag._lowering import ArrayTerms, Moving
+from jaxlag._lowering import ArrayTerms, QuasiState
 from jaxlag._model._forces import reads_lam
 from jaxlag._system._state_functions import AbstractQuantities
 from jaxlag._tracing import _params
@@ -232,7 +232,7 @@ def _quasi_reactions(
         system.lagrangian, system.forces, system.constraints, quasi=quasi, in_u=system.in_u
     )
     w = quasi.of(t, q, v, params)[quasi.free]
-    moving = Moving(terms, t, q, w, params, InputValues(values))
+    moving = QuasiState(terms, t, q, w, params, InputValues(values))
     if system.constraints:
         a, lam = moving.reactions()
         force = lam @ terms.rows(t, q, v, params)[0]

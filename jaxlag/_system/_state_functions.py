@@ -13,7 +13,7 @@ from jaxlag._core._arrays import common
 from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, Structure
 from jaxlag._lowering._terms import Terms
-from jaxlag._model._constraints import AbstractConstraint, Layout
+from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
 from jaxlag._model._coordinates import Coordinates, state_vectors
 from jaxlag._model._forces import AbstractForce
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
@@ -59,7 +59,7 @@ class AbstractQuantities(eqx.Module):
         """The lowered terms of the equations of motion."""
 
     @abstractmethod
-    def rows(self, params: Any, dtype: Any) -> Layout:
+    def rows(self, params: Any, dtype: Any) -> ConstraintRows:
         """Names and shapes of the constraint rows, for params like these."""
 
     @abstractmethod

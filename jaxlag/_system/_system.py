@@ -25,7 +25,7 @@ from jaxlag._lowering import (
 from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import (
     AbstractConstraint,
-    Layout,
+    ConstraintRows,
     check_constraints,
     check_reactions,
 )
@@ -282,7 +282,7 @@ class System(AbstractReactions):
             return False
         return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
 
-    def rows(self, params: Any, dtype: Any) -> Layout:
+    def rows(self, params: Any, dtype: Any) -> ConstraintRows:
         """Names and shapes of the constraint rows, for params like these.
 
         Raises:

@@ -17,7 +17,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag.testing import _nan_origins
 from jaxlag.testing._declared_functions import Declared
-from jaxlag.testing._nan_origins import Origin, Program
+from jaxlag.testing._nan_origins import Origin, TracedProgram
 
 VALUE, FORWARD, REVERSE, TWICE = "value", "forward", "reverse", "reverse twice"
 
@@ -107,7 +107,7 @@ class Ladder:
         self.groups = [name for name in function.arguments if jax.tree.leaves(z[name])]
         self._names = {*function.arguments, "params"}
         self._example = self._own(z)
-        self.program = Program(function.function, self._example)
+        self.program = TracedProgram(function.function, self._example)
         self._weights = dense(np.random.default_rng(0), self.program.closed.out_avals[0].shape)
         self._by: dict[tuple[str, ...], Derivatives] = {}
         modes, self.omitted = [FORWARD, REVERSE, TWICE], ""

@@ -46,7 +46,7 @@ class Origin(NamedTuple):
     line: int = 0
 
 
-class Program:
+class TracedProgram:
     """A function traced once; called, it can be differentiated, and `origins` knows its operations.
 
     Args:

@@ -17,7 +17,7 @@ from bench._random_systems import Drawn
 from bench._reference import Unclear
 from jaxlag._linalg import _independent_rows
 from jaxlag._lowering import ArrayTerms, _array_terms
-from jaxlag._lowering import Moving as Rates
+from jaxlag._lowering import QuasiState as Rates
 from jaxlag._lowering._jaxpr import _from_jaxpr
 from jaxlag._lowering._scalar_terms import ScalarTerms
 from jaxlag._tracing import _traced_function

@@ -12,10 +12,10 @@ from _silence import no_warning
 import jaxlag as jl
 from jaxlag._fit._descent import cost_of
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
-from jaxlag._fit._multiple_shooting import Guess
+from jaxlag._fit._multiple_shooting import FitVariables
 from jaxlag._fit._residuals import squares
 from jaxlag._fit._segments import layout
-from jaxlag._fit._setup import pose, readers_of
+from jaxlag._fit._setup import build_shooting, readers_of
 
 
 @pytest.mark.full
@@ -42,10 +42,10 @@ def test_the_cost_is_guessed_without_bias(segments):
     free = unknowns(TRUE, ("l",), {})
     where = layout(data, segments)
     shown = readers_of(pendulum, data, {}, TRUE)
-    problem, _ = pose(pendulum, data, where, free, shown, NO_PRIOR, squares, OPTIONS)
+    problem, _ = build_shooting(pendulum, data, where, free, shown, NO_PRIOR, squares, OPTIONS)
     rng = np.random.default_rng(0)
     x = jnp.asarray(0.01 * rng.normal(size=problem.segments.guess.shape))
-    guess = Guess(jnp.asarray([0.02]), x)
+    guess = FitVariables(jnp.asarray([0.02]), x)
     join = jnp.asarray(1e-2)
     residuals, _ = problem(guess, join)
     whole = 0.5 * sum(float(jnp.sum(r**2)) for r in jax.tree.leaves(residuals))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlag._fit._identifiability import Spectrum, combination, run_off
+from jaxlag._fit._identifiability import Spectrum, combination, saturated
 
 
 def spectrum(names, values, *known):
@@ -45,11 +45,11 @@ def test_combinations_in_words():
 def test_numbers_whose_unknowns_have_run_off_are_on_a_bound():
     """b moves no longer; c moves little, but what it moves was measured."""
     by_z, factor = np.diag([1.0, 1e-9, 1e-5]), np.diag([50.0, 1e-6, 3.0])
-    assert run_off(factor, by_z, np.eye(3)).tolist() == [False, True, False]
+    assert saturated(factor, by_z, np.eye(3)).tolist() == [False, True, False]
 
 
 def test_a_number_that_nothing_depends_on_is_on_no_bound():
-    assert run_off(np.diag([50.0, 0.0]), np.eye(2), np.eye(2)).tolist() == [False, False]
+    assert saturated(np.diag([50.0, 0.0]), np.eye(2), np.eye(2)).tolist() == [False, False]
 
 
 def test_all_of_a_matrix_is_on_the_bound_that_one_of_its_unknowns_is_on():
@@ -62,4 +62,4 @@ def test_all_of_a_matrix_is_on_the_bound_that_one_of_its_unknowns_is_on():
     at_first[:3, :3] = [[2.0, 0.0, 0.0], [c, 0.0, 1.0], [0.0, 2.0, 2 * c]]
     by_z[3, 3] = at_first[3, 3] = 1.0
     factor = 100.0 * by_z
-    assert run_off(factor, by_z, at_first).tolist() == [True, True, True, False]
+    assert saturated(factor, by_z, at_first).tolist() == [True, True, True, False]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from jax.scipy.linalg import solve_triangular
 
-from jaxlag._fit._linear_least_squares import Rows, condense, eliminate, sizes_of, states_of
+from jaxlag._fit._linear_least_squares import LinearRows, condense, eliminate, sizes_of, states_of
 
 EPS = np.finfo(float).eps
 SEGMENTS, ROWS, STATES, PARAMS, DAMPING = 7, 9, 4, 3, 0.3
@@ -42,7 +42,7 @@ def problem(chained):
     blocks[-1][:, :PARAMS] = prior[:, :-1]
     right.append(prior[:, -1])
     chain = (jnp.asarray(joined), jnp.asarray(following)) if chained else (None, None)
-    rows = Rows(jnp.asarray(measured), *chain, jnp.asarray(prior))
+    rows = LinearRows(jnp.asarray(measured), *chain, jnp.asarray(prior))
     return rows, np.concatenate(blocks), np.concatenate(right)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlag._integration._quintic_hermite import hermite
-from jaxlag._integration._record import Reach, step_end
+from jaxlag._integration._record import Reach, reached_time
 
 EPS = np.finfo(float).eps
 
@@ -53,5 +53,5 @@ def test_errors_are_of_order_6_and_5():
 def test_which_step_leads_to_a_time():
     """One to it, the one that it lies in, or one half the way there."""
     t0, t, end = jnp.array(1.0), jnp.array(1.5), jnp.array(4.0)
-    found = [float(step_end(jnp.array(int(reach)), t0, t, end)) for reach in Reach]
+    found = [float(reached_time(jnp.array(int(reach)), t0, t, end)) for reach in Reach]
     assert found == [1.5, 4.0, 1.25]

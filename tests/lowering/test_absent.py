@@ -19,7 +19,7 @@ from _programs import (
 from _systems.problems import MOTIONS
 
 import jaxlag as jl
-from jaxlag._integration._step_end import Settling
+from jaxlag._integration._step_end import StepEnd
 from jaxlag._lowering import ArrayTerms
 
 # ---- A constant mass matrix ----------------------------------------------------------------------
@@ -158,7 +158,7 @@ def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
 
     for name in ("rows", "gamma", "position", "velocity", "correction", "reactions"):
         monkeypatch.setattr(ArrayTerms, name, asked)
-    monkeypatch.setattr(Settling, "__call__", asked)
+    monkeypatch.setattr(StepEnd, "__call__", asked)
 
     def fresh(t, q, v, params):
         return coupled(t, q, v, params)

@@ -22,7 +22,7 @@ from jax import lax
 
 import jaxlag as jl
 from jaxlag import testing
-from jaxlag.testing._nan_origins import Program
+from jaxlag.testing._nan_origins import TracedProgram
 from tests._user import unchecked  # noqa: F401
 
 
@@ -117,7 +117,7 @@ def test_inside_choices_under_vmap():
     def chosen(q):
         return lax.cond(q > -1.0, lambda x: jnp.cos(x) + jnp.sqrt(x), lambda x: x / 2.0, q)  # wrong
 
-    program = Program(chosen, jnp.zeros(()))
+    program = TracedProgram(chosen, jnp.zeros(()))
     batch = jnp.zeros(3)
     for derivative in (jax.vmap(jax.grad(program)), jax.grad(lambda q: jax.vmap(program)(q).sum())):
         found = program.origins(jax.make_jaxpr(derivative)(batch), batch)
@@ -173,13 +173,13 @@ def before_an_open_loop(q):
 def test_followed_through_choices_and_loops(function, primitive):
     """Back to the one operation that the result inherits it from."""
     q = jnp.array([0.0, 1.0])
-    program = Program(function, q)
+    program = TracedProgram(function, q)
     found = program.origins(program.closed, q)
     assert found == [(primitive, __file__, line_of(function, "# wrong"))]
 
 
 def test_the_line_that_calls_the_check_is_not_named():
-    program = Program(lax.log, jnp.zeros(()))
+    program = TracedProgram(lax.log, jnp.zeros(()))
     assert program.origins(program.closed, jnp.zeros(())) == [("log", "", 0)]
 
 

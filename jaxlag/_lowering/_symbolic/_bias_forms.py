@@ -7,7 +7,7 @@ from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
 from jaxlag._lowering._graph._simplify import TooLong
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
-from jaxlag._lowering._symbolic._symbolic_system import Scene
+from jaxlag._lowering._symbolic._symbolic_system import SymbolicSystem
 
 
 def attempt(make: Callable) -> list[Node] | None:
@@ -30,7 +30,7 @@ def mass_matrix(graph: Graph, L: Node, v: Sequence[Node]) -> list[list[Node]]:
     return M
 
 
-def momentum_form(scene: Scene, L: Node) -> list[Node]:
+def momentum_form(scene: SymbolicSystem, L: Node) -> list[Node]:
     """h = (dp/dq) v + dp/dt - dL/dq by one derivative of p along the motion."""
     graph = scene.graph
     momentum = gradient(graph, L, scene.v)
@@ -40,7 +40,7 @@ def momentum_form(scene: Scene, L: Node) -> list[Node]:
     return [graph.sub(a, b) for a, b in zip(rate, pull, strict=True)]
 
 
-def christoffel_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
+def christoffel_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
     """h_i = sum_jk (dM_ij/dq_k - dM_jk/dq_i / 2) v_j v_k + the rest of L, for L quadratic in v.
 
     The rest, L - v.Mv/2, is linear in v: c . v + L_0, with c and L_0 read off at v = 0. With
@@ -81,7 +81,7 @@ def christoffel_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list
     return h
 
 
-def rate_form(scene: Scene, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
+def rate_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
     """h = dM/dt v + dc/dt - dL/dq along the motion, for L quadratic in v: p = M v + c."""
     graph, n = scene.graph, len(scene.q)
     at_rest = dict.fromkeys(scene.v, graph.zero)

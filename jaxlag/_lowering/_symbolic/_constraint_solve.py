@@ -41,14 +41,16 @@ class Constrained(NamedTuple):
     crossing: bool = False
 
 
-class Rows(NamedTuple):
+class SymbolicRows(NamedTuple):
     """A, and gamma with A a + gamma = 0."""
 
     A: list[list[Node]]
     gamma: list[Node]
 
 
-def rows(graph: Graph, t: Node, q: Sequence[Node], v: Sequence[Node], c: Constrained) -> Rows:
+def rows(
+    graph: Graph, t: Node, q: Sequence[Node], v: Sequence[Node], c: Constrained
+) -> SymbolicRows:
     """A from the residuals' slopes in v, gamma from their rate along the motion.
 
     Raises:
@@ -68,7 +70,7 @@ def rows(graph: Graph, t: Node, q: Sequence[Node], v: Sequence[Node], c: Constra
             if c.holonomic[k]:
                 terms.append((next(positions), beta_squared))
             gamma[k] = graph.sum(terms)
-    return Rows(A, gamma)
+    return SymbolicRows(A, gamma)
 
 
 def solve_with_rows(
@@ -116,7 +118,7 @@ def reaction(graph: Graph, c: Constrained) -> Reaction | None:
 def solve_with_reactions(
     graph: Graph,
     M: Sequence[Sequence[Node]],
-    rows: Rows,
+    rows: SymbolicRows,
     r: Sequence[Node],
     found: Reaction,
     eps: float,

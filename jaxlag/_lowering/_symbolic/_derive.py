@@ -27,10 +27,10 @@ from jaxlag._lowering._symbolic._constraint_solve import (
 )
 from jaxlag._lowering._symbolic._derive_quasi import derive_rates
 from jaxlag._lowering._symbolic._surface import surface
-from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 
 
-def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
+def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
     """The cheapest of the forms that exist.
 
     Raises:
@@ -109,7 +109,7 @@ def derive(scene: Scene, eps: float, limit: int | None) -> Equations:
     return best._replace(surface=surface(graph, mass, found_rows.A, bound, eps, lam))
 
 
-def pattern(scene: Scene) -> list[list[bool]]:
+def pattern(scene: SymbolicSystem) -> list[list[bool]]:
     """Which entries of M may differ from zero: p_i depends on v_j, on u_j where L is of u."""
     known = scene.kinematics
     v = scene.v if known is None or not known.in_u else known.u

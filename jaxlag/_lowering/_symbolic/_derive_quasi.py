@@ -17,7 +17,7 @@ from jaxlag._lowering._symbolic._bias_forms import attempt, cost, mass_matrix
 from jaxlag._lowering._symbolic._cofactor_inverse import Inverse
 from jaxlag._lowering._symbolic._constraint_solve import rows
 from jaxlag._lowering._symbolic._surface import surface
-from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, Scene
+from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, SymbolicSystem
 
 WRITTEN_OUT = 3  # forms of the right side, shortest first
 
@@ -43,7 +43,7 @@ class _Moved(NamedTuple):
     determinants: list[Node] | None
 
 
-def derive_rates(scene: Scene, eps: float) -> Equations:
+def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
     """v and u' of the free quasi-velocities, the bound ones zero, by the cheapest of several forms.
 
     These are the projected equations, B^T M B u' = B^T (Q - h - M s) for v = B u + c and s = v' at
@@ -106,7 +106,9 @@ def derive_rates(scene: Scene, eps: float) -> Equations:
     return best._replace(surface=surface(graph, M, A, bound, eps, None))
 
 
-def _moved(scene: Scene, kinematics: Kinematics, expansion: Expansion, eps: float) -> _Moved:
+def _moved(
+    scene: SymbolicSystem, kinematics: Kinematics, expansion: Expansion, eps: float
+) -> _Moved:
     graph, healthy = scene.graph, []
     if kinematics.V is not None:
         V = list(kinematics.V)
@@ -154,7 +156,7 @@ def affine(
     return matrix, substitute(graph, functions, dict.fromkeys(inputs, graph.zero))
 
 
-def _quasi(scene: Scene, kinematics: Kinematics, expansion: Expansion) -> list[Node]:
+def _quasi(scene: SymbolicSystem, kinematics: Kinematics, expansion: Expansion) -> list[Node]:
     """U(t, q, v); where it is not given, B^-1 (v - c), or (B^T B)^-1 B^T (v - c) of a tall B.
 
     A square B has digits that its square has not, above all between coordinates of unlike units.
@@ -172,7 +174,9 @@ def _quasi(scene: Scene, kinematics: Kinematics, expansion: Expansion) -> list[N
     return Inverse(graph, expansion, gram, 0.0)(right)
 
 
-def _projected(scene: Scene, moved: _Moved, L: Node) -> tuple[list[list[Node]], list[Node]]:
+def _projected(
+    scene: SymbolicSystem, moved: _Moved, L: Node
+) -> tuple[list[list[Node]], list[Node]]:
     """(B^T M B, B^T (Q - (M s + h))) from L(t, q, v): M s + h is Lagrange's left side at a = s."""
     graph, v = scene.graph, scene.v
     momentum = gradient(graph, L, v)
@@ -196,7 +200,7 @@ def _projected(scene: Scene, moved: _Moved, L: Node) -> tuple[list[list[Node]], 
 
 
 def _hamel(
-    scene: Scene, kinematics: Kinematics, moved: _Moved, U: Sequence[Node], L: Node
+    scene: SymbolicSystem, kinematics: Kinematics, moved: _Moved, U: Sequence[Node], L: Node
 ) -> tuple[list[list[Node]], list[Node]]:
     """(d2L/du2, the right side of it u' = ...) from L(t, q, u), with p = dL/du.
 

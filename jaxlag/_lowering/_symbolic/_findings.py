@@ -6,7 +6,7 @@ from typing import NamedTuple
 from jaxlag._lowering._graph._eliminate import blocks
 from jaxlag._lowering._graph._expression import Node, dependencies
 from jaxlag._lowering._symbolic._bias_forms import degree
-from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 
 
 class Findings(NamedTuple):
@@ -38,7 +38,7 @@ class Findings(NamedTuple):
         return not self.mass_depends
 
 
-def find(scene: Scene, equations: Equations) -> Findings:
+def find(scene: SymbolicSystem, equations: Equations) -> Findings:
     """Read the structure of a system from its equations."""
     graph, n = scene.graph, len(scene.q)
     M, h = equations.mass, equations.bias
@@ -68,7 +68,7 @@ def _state(inputs: Iterable[frozenset[tuple[str, int]]]) -> frozenset[tuple[str,
 
 
 def _coupled(
-    scene: Scene, M: Sequence[Sequence[Node]], effort: Sequence[Node], reached: dict
+    scene: SymbolicSystem, M: Sequence[Sequence[Node]], effort: Sequence[Node], reached: dict
 ) -> tuple[tuple[int, ...], ...]:
     n, zero = len(scene.q), scene.graph.zero
     linked = [[i == j for j in range(n)] for i in range(n)]

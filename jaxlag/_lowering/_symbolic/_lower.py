@@ -10,7 +10,7 @@ from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._derive import derive
 from jaxlag._lowering._symbolic._program_key import Key
 from jaxlag._lowering._symbolic._read_system import read_scene
-from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 from jaxlag._lowering._symbolic._verify import compare
 from jaxlag._tracing import _params
 from jaxlag._tracing._index_check import OutOfRange
@@ -38,7 +38,7 @@ class Lowered(NamedTuple):
 
     equations: Equations | None
     reason: str
-    scene: Scene | None
+    scene: SymbolicSystem | None
 
 
 @lru_cache(maxsize=256)
@@ -79,13 +79,13 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
     return Lowered(equations if compared.sound else None, compared.words, scene)
 
 
-def _written(scene: Scene) -> int:
+def _written(scene: SymbolicSystem) -> int:
     """Operations on what varies in L and Q, as they are written."""
     roots = [scene.lagrangian, *(scene.force or ())]
     return sum(max(len(node.args) - 1, 1) for node in order(roots) if not node.fixed)
 
 
-def _units(scene: Scene) -> int:
+def _units(scene: SymbolicSystem) -> int:
     """Functions of weighted sums, as networks have them: products of matrices do them better."""
     return sum(
         node.op == "call" and _weighted(node.args[0])

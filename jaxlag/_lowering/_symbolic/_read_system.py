@@ -13,7 +13,7 @@ from jaxlag._lowering._row_layout import layout_of
 from jaxlag._lowering._symbolic._constraint_solve import Constrained
 from jaxlag._lowering._symbolic._program_key import Key, traced
 from jaxlag._lowering._symbolic._shared_reactions import Sharing
-from jaxlag._lowering._symbolic._symbolic_system import Kinematics, Scene
+from jaxlag._lowering._symbolic._symbolic_system import Kinematics, SymbolicSystem
 from jaxlag._model._constraints import AbstractConstraint
 from jaxlag._model._forces import reads_lam
 from jaxlag._tracing import _params
@@ -21,7 +21,7 @@ from jaxlag._tracing._index_check import check_indices
 from jaxlag._tracing._signature import real_scalar
 
 
-def read_scene(key: Key) -> Scene:
+def read_scene(key: Key) -> SymbolicSystem:
     """L, Q, the constraints and the kinematics as nodes of one graph.
 
     Raises:
@@ -52,7 +52,7 @@ def read_scene(key: Key) -> Scene:
         (Q,) = read(graph, traced(key, terms.force, True), *state, *params, *inputs)
         force = [_node(graph, x) for x in Q]
     bound = _constrained(key, graph, state, params, inputs) if _own(key) else None
-    return Scene(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics)
+    return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics)
 
 
 def _own(key: Key) -> tuple[AbstractConstraint, ...]:
@@ -99,7 +99,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
     lam, reaction = [graph.input("lam", k) for k in range(m)], None
     sharing = None
     if any(map(reads_lam, key.forces)):
-        chosen = np.flatnonzero(rows_read(key, terms)).tolist()
+        chosen = np.flatnonzero(rows_that_forces_read(key, terms)).tolist()
         if kept is not None and len(chosen) > 1 and not key.apart:
             sharing = Sharing(chosen, [graph.input("there", k) for k in own])
         code = traced(key, terms.reactive, True, m)
@@ -123,7 +123,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
     )
 
 
-def rows_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
+def rows_that_forces_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
     """For every row, whether forces read its multiplier."""
     found: list[tuple[bool, ...]] = []
 

@@ -8,7 +8,7 @@ from jaxlag._lowering._graph._straight_line import Program, assemble
 from jaxlag._lowering._symbolic._constraint_solve import Constrained, correction
 
 
-class Surface(NamedTuple):
+class ProjectionCode(NamedTuple):
     """Straight-line code for a projection: residuals, and what takes them to corrections.
 
     Attributes:
@@ -34,7 +34,7 @@ def surface(
     bound: Constrained,
     eps: float,
     lam: Program | None,
-) -> Surface:
+) -> ProjectionCode:
     """Code for the residuals and their corrections."""
     own = [k for k, holonomic in enumerate(bound.holonomic) if holonomic]
     mixed = 0 < len(own) < len(A)
@@ -46,7 +46,7 @@ def surface(
         return assemble(graph, [*(x for column in found for x in column), *masses])
 
     every = columns(range(len(A)))
-    return Surface(
+    return ProjectionCode(
         assemble(graph, list(bound.position)),
         assemble(graph, list(bound.velocity)),
         columns(own) if mixed else every,

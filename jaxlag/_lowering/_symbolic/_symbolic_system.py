@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from jaxlag._lowering._graph._expression import Graph, Node
 from jaxlag._lowering._graph._straight_line import Program
-from jaxlag._lowering._symbolic._constraint_solve import Constrained, Rows
-from jaxlag._lowering._symbolic._surface import Surface
+from jaxlag._lowering._symbolic._constraint_solve import Constrained, SymbolicRows
+from jaxlag._lowering._symbolic._surface import ProjectionCode
 
 
 class Kinematics(NamedTuple):
@@ -29,7 +29,7 @@ class Kinematics(NamedTuple):
     in_u: bool
 
 
-class Scene(NamedTuple):
+class SymbolicSystem(NamedTuple):
     """A system as scalars: L and Q as functions of the inputs t, q, v."""
 
     graph: Graph
@@ -69,8 +69,8 @@ class Equations(NamedTuple):
     accelerations: list[Node]
     program: Program
     form: str
-    rows: Rows | None = None
-    surface: Surface | None = None
+    rows: SymbolicRows | None = None
+    surface: ProjectionCode | None = None
     lam: list[Node] | None = None
     velocity: Program | None = None
     determinants: Program | None = None

@@ -14,8 +14,8 @@ from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._row_layout import layout_of
 from jaxlag._lowering._symbolic._evaluate import evaluate
 from jaxlag._lowering._symbolic._program_key import Key, traced
-from jaxlag._lowering._symbolic._read_system import rows_read
-from jaxlag._lowering._symbolic._symbolic_system import Equations, Scene
+from jaxlag._lowering._symbolic._read_system import rows_that_forces_read
+from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 from jaxlag._model._forces import reads_lam
 from jaxlag._tracing._interpret import interpret
 
@@ -27,7 +27,7 @@ NUDGES = 3  # of one rounding each of q and v, where that is not enough
 SENSITIVE = 1e-3  # states that change their acceleration so much by it compare nothing
 
 
-class Comparison(NamedTuple):
+class Verification(NamedTuple):
     """How a program compares with the array program.
 
     Attributes:
@@ -55,7 +55,9 @@ class Comparison(NamedTuple):
         return bool(self.difference <= 1.0) and self.states >= LEAST
 
 
-def compare(key: Key, scene: Scene, equations: Equations, known: list | None) -> Comparison:
+def compare(
+    key: Key, scene: SymbolicSystem, equations: Equations, known: list | None
+) -> Verification:
     """A program beside the array program, with the known params and with random ones.
 
     What is known may be special, and random params may be none that a system has: both are drawn
@@ -130,7 +132,7 @@ def compare(key: Key, scene: Scene, equations: Equations, known: list | None) ->
             if states == wanted or worst > 1.0:
                 break
         compared += states
-    return Comparison(compared, worst)
+    return Verification(compared, worst)
 
 
 class _Right(NamedTuple):
@@ -187,7 +189,7 @@ class _Plain:
             self.bound = [traced(key, f, False) for f in (terms.rows, terms.gamma)]
         self.felt, self.read = None, ()
         if any(map(reads_lam, key.forces)):
-            self.felt, self.read = _slopes(key, terms), rows_read(key, terms)
+            self.felt, self.read = _slopes(key, terms), rows_that_forces_read(key, terms)
 
     def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
         n = self.key.size
