@@ -40,7 +40,7 @@ def choose_gradient(
     mode: str,
     memory: int | float | None,
     max_steps: int,
-    rows: Any,
+    saves: Any,
     state: int,
     itemsize: int,
     knots: bool = False,
@@ -51,7 +51,7 @@ def choose_gradient(
         mode: as asked for.
         memory: bytes that one trajectory may keep; None for no bound.
         max_steps: bound on the steps.
-        rows: saved; a number, or a symbol of `jax.export`.
+        saves: number of save times, or a symbol of `jax.export`.
         state: numbers in a state.
         itemsize: bytes of a number.
         knots: whether inputs have some.
@@ -60,10 +60,10 @@ def choose_gradient(
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
     if memory is None:
         return CheckpointPlan(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
-    if not isinstance(rows, int):
-        was = f"it was {memory} for {rows} times"
+    if not isinstance(saves, int):
+        was = f"it was {memory} for {saves} times"
         raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
-    turns = max_steps + rows - 2  # at most, of lanes together
+    turns = max_steps + saves - 2  # at most, of lanes together
     needs = {
         name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])

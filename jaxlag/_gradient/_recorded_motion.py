@@ -18,13 +18,13 @@ class SolveTangents(NamedTuple):
     Attributes:
         last: state after the last step.
         time: of it.
-        rows: the rows, (s, ...).
+        saved: states at the save times, (s, ...).
         points: states at the points of the record; None where nobody asks.
     """
 
     last: PyTree
     time: Array
-    rows: PyTree
+    saved: PyTree
     points: PyTree | None
 
 
@@ -68,23 +68,23 @@ class StepTimes(NamedTuple):
         return None if self.record.jumps is None else at(self.record.jumps, k)
 
     def reach(
-        self, end: Array, anchors: Array, row: Array | None = None, r: Array | None = None
+        self, end: Array, anchors: Array, save: Array | None = None, r: Array | None = None
     ) -> Array | None:
-        """How the end of a turn is reached, or row r between the first and the last.
+        """How the end of a turn is reached, or save time r between the first and the last.
 
         Args:
             end: time after the turn.
             anchors: of `Times.anchors`.
-            row: whether it is a row.
+            save: whether it is a save time.
             r: its index.
         """
         if self.record.last_reach is None:
             return None
         reach = jnp.where(end >= anchors[1], self.record.last_reach, 0)
-        if row is None:
+        if save is None:
             return reach
         assert r is not None
-        return jnp.where(row, at(self.record.row_reach, r), reach)
+        return jnp.where(save, at(self.record.save_reach, r), reach)
 
     @property
     def last(self) -> Array:
@@ -101,13 +101,12 @@ class RecordedMotion(NamedTuple):
         args: leaves of the arguments.
         tree: of the arguments.
         moving: indices of the leaves that may move.
-        windows: (args, t0) -> (args as a step from t0 reads them: of each table two rows; where
-            these rows start in the leaves that may move, None for those that are no tables).
+        windows: (args, t0) -> (args as a step from t0 reads them: of each table two entries; where
+            these start in the leaves that may move, None for those that are no tables).
         clock: times of the steps.
         stages: number of them in a step, 0 where it has none.
-        plain: whether loops along it are of plain operations alone, which lanes that read rows at
-            places of their own are not: what such an operation costs is taken for that of reading
-            the whole buffer, and it is shared among cores.
+        plain: whether XLA may compile a sweep to one native function. Not where lanes gather at
+            different indices: it overestimates the cost of such a gather, and splits it over threads.
     """
 
     step: Callable
@@ -163,7 +162,7 @@ class RecordedMotion(NamedTuple):
         """What a step from t reads of the arguments.
 
         Returns:
-            moved -> arguments, what moves of them (of tables two rows), where these rows start.
+            moved -> arguments, what moves of them (of tables two entries), where these start.
         """
         args, starts = self.windows(self.with_args(self.moved()), t)
         leaves = jax.tree.leaves(args, is_leaf=lambda x: x is None)
@@ -172,7 +171,7 @@ class RecordedMotion(NamedTuple):
 
 
 def at(buffer: PyTree, k: Array) -> PyTree:
-    """Row k of a buffer, the first one below 0."""
+    """Entry k of a buffer, the first one below 0."""
     index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
     return jax.tree.map(index, buffer)
 
@@ -182,8 +181,8 @@ def pick(use: Array, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(use, a, b), new, old)
 
 
-def all_rows(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -> PyTree:
-    """All rows, from those between the first and the last; zero where there was none."""
+def all_saved(first: PyTree, saved: PyTree | None, last: PyTree, reached: Array) -> PyTree:
+    """All saved states, from those between the first and the last; zero where there was none."""
 
     def of(a: Array, between: Array | None, b: Array) -> Array:
         parts = [a[None], jnp.where(reached, b, 0.0)[None]]
@@ -191,12 +190,12 @@ def all_rows(first: PyTree, rows: PyTree | None, last: PyTree, reached: Array) -
             parts.insert(1, between[:-1])
         return jnp.concatenate(parts)
 
-    if rows is None:
+    if saved is None:
         return jax.tree.map(lambda a, b: of(a, None, b), first, last)
-    return jax.tree.map(of, first, rows, last)
+    return jax.tree.map(of, first, saved, last)
 
 
 def arrived(path: RecordedMotion, anchors: Array) -> Array:
-    """Whether the last row was reached."""
+    """Whether the last save time was reached."""
     clock = path.clock
     return clock.time(clock.last, anchors) >= clock.times.saves[-1]

@@ -9,17 +9,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from jaxlag._gradient._recorded_motion import RecordedMotion, SolveTangents, all_rows, arrived, pick
+from jaxlag._gradient._recorded_motion import (
+    RecordedMotion,
+    SolveTangents,
+    all_saved,
+    arrived,
+    pick,
+)
 from jaxlag._integration._loop import CHUNK
 
 
 class _Slots(NamedTuple):
-    """Steps and rows in one sequence, a row before the step that it lies in."""
+    """Steps and save times in one sequence, a save time before the step that it lies in."""
 
     begins: Array
     ends: Array
     used: Array
-    to_row: Array
+    to_save: Array
     jumps: Array | None
     reaches: Array | None
     turn_ends: Array | None
@@ -28,34 +34,34 @@ class _Slots(NamedTuple):
 def _slots(
     path: RecordedMotion, anchors: Array, saves: Array
 ) -> tuple[_Slots, Array, Array | None]:
-    """The sequence, and the places of turns and of rows in it."""
+    """The sequence, and the places of turns and of save times in it."""
     clock, record = path.clock, path.clock.record
     index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
     ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
     begins = jnp.concatenate([anchors[:1], ends[:-1]])
     used, reaches = (index < record.turns) & (ends > begins), clock.reach(ends, anchors)
-    if record.row_turn is None:
+    if record.save_turn is None:
         still = jnp.zeros_like(used)
         whole = (None, None) if reaches is None else (reaches, ends)
         return _Slots(begins, ends, used, still, record.jumps, *whole), index, None
-    turn = record.row_turn[:-1]
+    turn = record.save_turn[:-1]
     count = turn.shape[0]
     reached = turn < record.turns
     before = jnp.searchsorted(turn, index, side="right").astype(jnp.int32)
     of_turn = index + before
-    of_row = jnp.where(reached, turn + jnp.arange(count, dtype=jnp.int32), 0)
+    of_save = jnp.where(reached, turn + jnp.arange(count, dtype=jnp.int32), 0)
     size = -(-(index.shape[0] + count) // CHUNK) * CHUNK
 
-    def merged(steps: Array, rows: Array) -> Array:
-        place = jnp.where(reached, of_row, size)
+    def merged(steps: Array, saved: Array) -> Array:
+        place = jnp.where(reached, of_save, size)
         out = jnp.zeros((size,), steps.dtype).at[of_turn].set(steps)
-        return out.at[place].set(rows, mode="drop")
+        return out.at[place].set(saved, mode="drop")
 
     safe = jnp.where(reached, turn, 0)
     whole = (None, None)
     if reaches is not None:
-        assert record.row_reach is not None
-        whole = merged(reaches, record.row_reach[:-1]), merged(ends, ends[safe])
+        assert record.save_reach is not None
+        whole = merged(reaches, record.save_reach[:-1]), merged(ends, ends[safe])
     slots = _Slots(
         merged(begins, begins[safe]),
         merged(ends, saves[1:-1]),
@@ -64,7 +70,7 @@ def _slots(
         None if record.jumps is None else merged(record.jumps, record.jumps[safe]),
         *whole,
     )
-    return slots, of_turn, of_row
+    return slots, of_turn, of_save
 
 
 def again(
@@ -81,7 +87,7 @@ def again(
     repeat the first step and drop its result, so that no derivative meets a state out of reach.
     """
     clock, record = path.clock, path.clock.record
-    slots, of_turn, of_row = _slots(path, anchors, saves)
+    slots, of_turn, of_save = _slots(path, anchors, saves)
     first = jnp.argmax(slots.used)
     begins = jnp.where(slots.used, slots.begins, slots.begins[first])
     ends = jnp.where(slots.used, slots.ends, slots.ends[first])
@@ -97,7 +103,7 @@ def again(
 
     def one(y: PyTree, slot: _Slots) -> tuple[PyTree, tuple[PyTree, PyTree]]:
         new = step(slot, pick(slot.used, y, start))
-        return pick(slot.used & ~slot.to_row, new, y), (y, new)
+        return pick(slot.used & ~slot.to_save, new, y), (y, new)
 
     def chunk(y: PyTree, slots: _Slots) -> tuple[PyTree, PyTree]:
         def skip(y: PyTree) -> tuple[PyTree, PyTree]:
@@ -112,17 +118,17 @@ def again(
     parts = jax.tree.map(lambda x: x.reshape(-1, CHUNK), slots)
     last, found = path.native(partial(jax.lax.scan, chunk), start, parts)
     befores, afters = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
-    rows = point_states = None
-    if of_row is not None:
-        assert record.row_turn is not None
-        reached = record.row_turn[:-1] < record.turns
+    saved = point_states = None
+    if of_save is not None:
+        assert record.save_turn is not None
+        reached = record.save_turn[:-1] < record.turns
 
         def gathered(x: Array) -> Array:
             wide = reached.reshape(reached.shape + (1,) * (x.ndim - 1))
-            found = jnp.where(wide, x[of_row], 0.0)
+            found = jnp.where(wide, x[of_save], 0.0)
             return jnp.concatenate([found, jnp.zeros_like(x[:1])])
 
-        rows = jax.tree.map(gathered, afters)
+        saved = jax.tree.map(gathered, afters)
     if points:
         count = jax.tree.leaves(record.points)[0].shape[0]
         at = jnp.arange(count, dtype=jnp.int32) * record.stride
@@ -136,5 +142,5 @@ def again(
         point_states = jax.tree.map(kept, befores)
     time = clock.time(clock.last, anchors)
     return SolveTangents(
-        last, time, all_rows(start, rows, last, arrived(path, anchors)), point_states
+        last, time, all_saved(start, saved, last, arrived(path, anchors)), point_states
     )

@@ -1,6 +1,6 @@
-"""The differentiable solve: rows at the save times, with one derivative for every transform.
+"""The differentiable solve: states at the save times, with one derivative for every transform.
 
-The derivative is that of the map from (state, args, times) to the rows at the FROZEN sequence of
+The derivative is that of the map from (state, args, times) to the saved states at the FROZEN sequence of
 accepted steps: step ends keep their distance from the start, knot or stop they are anchored to,
 and move with it. The loop of steps is never differentiated; under any derivative it records where
 it went, and the derivative goes the same way again.
@@ -63,16 +63,18 @@ def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
         assert outcome.record is not None
         if static[1].remembers:
             function = partial(_replay, rest, setup, static, outcome)
-            rows, rows_dot = jax.jvp(function, (inexact,), (filled(change, inexact),))
+            states, states_dot = jax.jvp(function, (inexact,), (filled(change, inexact),))
             told = _told(outcome)[1]
         else:
             walk = changed(inexact, rest, setup, static, outcome.record, change)
-            rows, told = _told(outcome)
-            rows_dot = SavedStates(walk.rows[0], walk.last[0], walk.time)
+            states, told = _told(outcome)
+            states_dot = SavedStates(walk.saved[0], walk.last[0], walk.time)
         told = told._replace(gradient=_mode(outcome, static))
-        reached = jnp.all(jnp.isfinite(outcome.rows), axis=tuple(range(1, outcome.rows.ndim)))
-        rows_dot = rows_dot._replace(saved=unreached(reached, inexact, change, rows_dot.saved))
-        return (rows, told), (rows_dot, jax.tree.map(lambda _: None, told))
+        reached = jnp.all(jnp.isfinite(outcome.saved), axis=tuple(range(1, outcome.saved.ndim)))
+        states_dot = states_dot._replace(
+            saved=unreached(reached, inexact, change, states_dot.saved)
+        )
+        return (states, told), (states_dot, jax.tree.map(lambda _: None, told))
 
     return run(inexact, rest, setup)
 
@@ -85,11 +87,11 @@ def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
 
 
 def _told(outcome: Outcome) -> tuple[SavedStates, Outcome]:
-    """The rows, and what is said of a solve without what was kept on the way."""
+    """The saved states, and what is said of a solve without what was kept on the way."""
     lost = (outcome.missed != int(Status.ok)) & (outcome.status == int(Status.ok))
     status = jnp.where(lost, outcome.missed, outcome.status).astype(jnp.int32)
-    rows = SavedStates(outcome.rows, outcome.state, outcome.time)
-    return rows, outcome._replace(status=status, rows=None, record=None)
+    states = SavedStates(outcome.saved, outcome.state, outcome.time)
+    return states, outcome._replace(status=status, saved=None, record=None)
 
 
 def _mode(outcome: Outcome, static: Any) -> Array:
@@ -103,7 +105,7 @@ def _mode(outcome: Outcome, static: Any) -> Array:
 
 
 def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
-    """The loop with its record; states on the way and rows are differentiable."""
+    """The loop with its record; states on the way and saved ones are differentiable."""
 
     @CustomJVP
     def run(inexact: Any, rest: Any, setup: Setup) -> Outcome:
@@ -122,7 +124,7 @@ def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
             walk = changed(inexact, rest, setup, static, record, change, points=kept)
             record = dots.record._replace(points=walk.points)
             dots = dots._replace(
-                state=walk.last[0], time=walk.time, rows=walk.rows[0], record=record
+                state=walk.last[0], time=walk.time, saved=walk.saved[0], record=record
             )
         return outcome, dots
 
@@ -157,11 +159,11 @@ def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) ->
 
 
 def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> SavedStates:
-    """The rows as a function of `inexact` alone, all steps taken again."""
+    """The saved states as a function of `inexact` alone, all steps taken again."""
     y0, args, times, stepper, _ = unpack(inexact, rest, setup, static)
     assert outcome.record is not None
     path = path_of(stepper, y0, args, times, outcome.record, ())
     walk = again(path, path.start, [], times.anchors(), times.saves, False)
     # What was not reached, or failed, is so again.
-    found = jnp.isfinite(outcome.rows)
-    return SavedStates(jnp.where(found, walk.rows[0], jnp.nan), walk.last[0], walk.time)
+    found = jnp.isfinite(outcome.saved)
+    return SavedStates(jnp.where(found, walk.saved[0], jnp.nan), walk.last[0], walk.time)

@@ -1,11 +1,11 @@
-"""Along a recorded motion and back: derivatives of states and rows, in loops that end where it did.
+"""Tangent and adjoint sweeps over the recorded steps.
 
 With y_{k+1} = step(y_k, args, t_k, t_{k+1}) at recorded times the derivative is
 
     dy_{k+1} = J_k dy_k + B_k dargs + c_k dt_k + e_k dt_{k+1},
 
-and the same for a row, which is a step from y_k to its own time: a linear map from (dy_0, dargs,
-danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the rows. Forwards dy is carried
+and the same for a saved state, which a step from y_k reaches at its own time: a linear map from (dy_0, dargs,
+danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the saved states. Forwards dy is carried
 beside y. Backwards the transposed steps are taken from the last to the first, at the recorded
 points, or at states found anew from them where points are further apart than a step. Neither
 depends on the step-size control, whose error estimates round differently in another program.
@@ -29,7 +29,7 @@ from jaxlag._gradient._recorded_motion import (
     InputTangents,
     RecordedMotion,
     SolveTangents,
-    all_rows,
+    all_saved,
     arrived,
     at,
     pick,
@@ -45,10 +45,10 @@ def _zeros(state: PyTree, size: Any) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
 
 
-def _turn_of_row(record: Record, r: Array) -> Array:
-    """The turn of row r between the first and the last; none beyond these."""
-    assert record.row_turn is not None
-    return jnp.where(r < 0, -1, at(record.row_turn, r))
+def _turn_of_save(record: Record, r: Array) -> Array:
+    """The turn of save time r between the first and the last; none beyond these."""
+    assert record.save_turn is not None
+    return jnp.where(r < 0, -1, at(record.save_turn, r))
 
 
 def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> SolveTangents:
@@ -62,36 +62,36 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
     dy0 = jax.tree.map(jnp.zeros_like, start) if change.y0 is None else (change.y0, None)
     count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
     zero = jnp.zeros((), jnp.int32)
-    rows = None if record.row_turn is None else _zeros(start, record.row_turn.shape[0])
-    # Rows are reached from the state before the last step, with dy there.
-    base = None if rows is None else (start, dy0)
-    begin = (zero, zero, start, dy0, base, rows, _zeros(start, count) if points else None)
+    saved = None if record.save_turn is None else _zeros(start, record.save_turn.shape[0])
+    # Save times are reached from the state before the last step, with dy there.
+    base = None if saved is None else (start, dy0)
+    begin = (zero, zero, start, dy0, base, saved, _zeros(start, count) if points else None)
 
     def turn(carry: tuple) -> tuple:
-        """One step, or a row where a lane takes none or must not go on without."""
-        k, r, y, dy, base, rows, kept = carry
+        """One step, or one to a save time where a lane takes none or must not go on without."""
+        k, r, y, dy, base, saved, kept = carry
         t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
         use, end = (k < record.turns) & (turn_end > t), turn_end
-        to_row, row, i = jnp.array(False), jnp.array(False), k
+        to_save, save, i = jnp.array(False), jnp.array(False), k
         if points:
             at_point = (k < record.turns) & (k % record.stride == 0)
             kept = set_entry(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
         before = (y, dy)
-        if rows is not None:
-            j = _turn_of_row(record, r)
+        if saved is not None:
+            j = _turn_of_save(record, r)
             left = (j < k) & (j < record.turns)
-            to_row = eqxi.unvmap_any(left & use)
-            use, row = use & ~to_row, left & (~use | to_row)
-            i, before = jnp.where(row, j, k), pick(row, base, before)
+            to_save = eqxi.unvmap_any(left & use)
+            use, save = use & ~to_save, left & (~use | to_save)
+            i, before = jnp.where(save, j, k), pick(save, base, before)
             t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
-            end = jnp.where(row, dues[r], turn_end)
-        reach = clock.reach(turn_end, anchors, *(() if rows is None else (row, r)))
+            end = jnp.where(save, dues[r], turn_end)
+        reach = clock.reach(turn_end, anchors, *(() if saved is None else (save, r)))
         jump, end_dot = clock.jump(i), None
         if change.anchors is not None:
             end_dot = change.anchors[clock.anchor(i)]
-            if rows is not None:
+            if saved is not None:
                 assert dues_dot is not None
-                end_dot = jnp.where(row, dues_dot[r], end_dot)
+                end_dot = jnp.where(save, dues_dot[r], end_dot)
         if end_dot is None:
             step = lambda y, moved: path.ahead(  # noqa: E731
                 path.with_args(moved), t, end, jump, y, reach, turn_end
@@ -107,26 +107,26 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
             if reach is not None:
                 given, dots = (*given, turn_end), (*dots, change.anchors[clock.anchor(i)])
             y1, dy1 = jax.jvp(step, given, dots)
-        if rows is not None:
-            assert record.row_turn is not None
-            rows = set_entry(rows, jnp.where(row, r, record.row_turn.shape[0] - 1), dy1)
-            r, base = r + row.astype(jnp.int32), pick(use, (y, dy), base)
+        if saved is not None:
+            assert record.save_turn is not None
+            saved = set_entry(saved, jnp.where(save, r, record.save_turn.shape[0] - 1), dy1)
+            r, base = r + save.astype(jnp.int32), pick(use, (y, dy), base)
         y, dy = pick(use, (y1, dy1), (y, dy))
-        return k + (~to_row).astype(jnp.int32), r, y, dy, base, rows, kept
+        return k + (~to_save).astype(jnp.int32), r, y, dy, base, saved, kept
 
     def goes_on(carry: tuple) -> Array:
         k, r, *_ = carry
         left = k < record.turns
-        if rows is not None:
-            left = left | (_turn_of_row(record, r) < record.turns)
+        if saved is not None:
+            left = left | (_turn_of_save(record, r) < record.turns)
         return eqxi.unvmap_any(left)
 
     loop = partial(jax.lax.while_loop, goes_on, turn)
-    *_, dy, _, rows, kept = path.native(loop, begin)
+    *_, dy, _, saved, kept = path.native(loop, begin)
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
         time = change.anchors[clock.anchor(clock.last)]
-    return SolveTangents(dy, time, all_rows(dy0, rows, dy, arrived(path, anchors)), kept)
+    return SolveTangents(dy, time, all_saved(dy0, saved, dy, arrived(path, anchors)), kept)
 
 
 def adjoint_sweep(
@@ -142,11 +142,11 @@ def adjoint_sweep(
     clock, record = path.clock, path.clock.record
     anchors, dues = clock.times.anchors(), clock.times.dues()
     assert record.points is not None
-    between = None if record.row_turn is None else jax.tree.map(lambda x: x[1:], wanted.rows)
+    between = None if record.save_turn is None else jax.tree.map(lambda x: x[1:], wanted.saved)
     moves = change.anchors is not None
     zero = jnp.zeros((), jnp.int32)
     reached = arrived(path, anchors)
-    end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.rows)
+    end_bar = jax.tree.map(lambda x: jnp.where(reached, x[-1], 0.0), wanted.saved)
     bars = (
         [jnp.zeros_like(x) for x in path.moved()],
         _added_at(jnp.zeros_like(anchors), clock.anchor(clock.last), wanted.time)
@@ -155,32 +155,32 @@ def adjoint_sweep(
         jnp.zeros_like(dues) if moves else None,
     )
 
-    def row_left(r: Array) -> Array:
-        """The turn of the last row that is left."""
-        return jnp.array(-1) if between is None else _turn_of_row(record, r - 1)
+    def save_left(r: Array) -> Array:
+        """The turn of the last save time that is left."""
+        return jnp.array(-1) if between is None else _turn_of_save(record, r - 1)
 
     def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
-        """One turn back: turn k - 1, or rows reached from the state before turn k.
+        """One turn back: turn k - 1, or save times reached from the state before turn k.
 
         The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
-        a row reached from the state before its last step; `owed` is what that adds there.
+        a save time reached from the state before its last step; `owed` is what that adds there.
         """
         k, r, bar, owed, (args_bar, anchors_bar, dues_bar) = carry
-        j, now = row_left(r), clock.time(k - 1, anchors)
+        j, now = save_left(r), clock.time(k - 1, anchors)
         here = j == k
-        to_row = eqxi.unvmap_any(here)
-        k = jnp.where(to_row, k, k - 1)
+        to_save = eqxi.unvmap_any(here)
+        k = jnp.where(to_save, k, k - 1)
         t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
-        use, row, i, given = (k < record.turns) & (turn_end > t) & ~to_row, here, k, bar
+        use, save, i, given = (k < record.turns) & (turn_end > t) & ~to_save, here, k, bar
         end, reached = turn_end, clock.reach(turn_end, anchors)
         if between is not None:
-            row = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
-            i = jnp.where(row, j, k)
+            save = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
+            i = jnp.where(save, j, k)
             t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
-            end = jnp.where(row, dues[r - 1], end)
-            reached = clock.reach(turn_end, anchors, row, r - 1)
-            given = pick(row, at(between, r - 1), bar)
-        y, jump, takes = state_before(i), clock.jump(i), use | row
+            end = jnp.where(save, dues[r - 1], end)
+            reached = clock.reach(turn_end, anchors, save, r - 1)
+            given = pick(save, at(between, r - 1), bar)
+        y, jump, takes = state_before(i), clock.jump(i), use | save
         with_moved, moved, starts = path.local(t)
         if not moves:
             step = lambda y, moved: path.ahead(  # noqa: E731
@@ -194,11 +194,11 @@ def adjoint_sweep(
             times = (t, end) if reached is None else (t, end, turn_end)
             before, more, *times_bar = jax.vjp(step, y, moved, *times)[1](given)
             t_bar, end_bar, *turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
-            at_row = jnp.where(row, end_bar, 0.0)
+            at_save = jnp.where(save, end_bar, 0.0)
             anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(i), sum(turn_bar, end_bar - at_row))
+            anchors_bar = _added_at(anchors_bar, clock.anchor(i), sum(turn_bar, end_bar - at_save))
             if between is not None:
-                dues_bar = _added_at(dues_bar, r - 1, at_row)
+                dues_bar = _added_at(dues_bar, r - 1, at_save)
         more = [jnp.where(takes, x, 0.0) for x in more]
         args_bar = [_added(*pair) for pair in zip(args_bar, more, starts, strict=True)]
         if between is None:
@@ -207,19 +207,19 @@ def adjoint_sweep(
             zeros = jax.tree.map(jnp.zeros_like, bar)
             summed = _add(before, pick(here, bar, owed))
             bar = pick(use | here, summed, bar)
-            owed = pick(use, zeros, pick(row & ~here, summed, owed))
-            r = r - row.astype(jnp.int32)
+            owed = pick(use, zeros, pick(save & ~here, summed, owed))
+            r = r - save.astype(jnp.int32)
         if wanted.points is not None:
-            at_point = ~to_row & (k % record.stride == 0) & (k < record.turns)
+            at_point = ~to_save & (k % record.stride == 0) & (k < record.turns)
             bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
         return k, r, bar, owed, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
-        """All turns after the first, that one and its rows."""
+        """All turns after the first, that one and its save times."""
 
         def left(carry: tuple) -> Array:
             k, r, *_ = carry
-            return (k > first) | eqxi.unvmap_any(row_left(r) == k)
+            return (k > first) | eqxi.unvmap_any(save_left(r) == k)
 
         return jax.lax.while_loop(left, partial(turn, first, state_before), carry)
 
@@ -260,14 +260,14 @@ def adjoint_sweep(
         return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
 
     most = eqxi.unvmap_max(record.turns)  # shared by lanes
-    rows_left = zero
-    if record.row_turn is not None:
-        rows_left = jnp.sum(record.row_turn < record.turns, dtype=jnp.int32)
+    saves_left = zero
+    if record.save_turn is not None:
+        saves_left = jnp.sum(record.save_turn < record.turns, dtype=jnp.int32)
     bar = _add(wanted.last, end_bar)
     owed = None if between is None else jax.tree.map(jnp.zeros_like, bar)
-    ended = path.native(all_back, (most, rows_left, bar, owed, bars))
+    ended = path.native(all_back, (most, saves_left, bar, owed, bars))
     _, _, bar, _, (args_bar, anchors_bar, dues_bar) = ended
-    bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.rows))
+    bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.saved))
     saves_bar = None
     if moves:
         ends = jnp.zeros_like(clock.times.saves[:1])
@@ -276,7 +276,7 @@ def adjoint_sweep(
 
 
 def _added(bar: Array, more: Array, start: Array | None) -> Array:
-    """The cotangent of a leaf with more of it, of two rows of a table at their place."""
+    """The cotangent of a leaf with more of it, of two entries of a table at their place."""
     if start is None:
         return bar + more
     for k in range(more.shape[0]):

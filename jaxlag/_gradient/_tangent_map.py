@@ -144,14 +144,14 @@ def _transposed(function: Callable, like: Any, y: Any) -> Any:
     ends = np.cumsum([leaf.size for leaf in leaves])
     widest = max((leaf.dtype for leaf in leaves), key=lambda dtype: dtype.itemsize)
 
-    def split(row: Array) -> Any:
-        parts = jnp.split(row, ends[:-1])
+    def split(x: Array) -> Any:
+        parts = jnp.split(x, ends[:-1])
         pairs = zip(parts, leaves, strict=True)
         shaped = [part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in pairs]
         return jax.tree.unflatten(tree, shaped)
 
-    def component(row: Array) -> Array:
-        pairs = zip(jax.tree.leaves(function(split(row))), jax.tree.leaves(y), strict=True)
+    def component(x: Array) -> Array:
+        pairs = zip(jax.tree.leaves(function(split(x))), jax.tree.leaves(y), strict=True)
         parts = [jnp.sum(a * b).astype(widest) for a, b in pairs]
         return jnp.sum(jnp.stack(parts))
 
@@ -185,7 +185,7 @@ def path_of(
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(stepper.solver, "tableau", None), "num_stages", 0)
     clock, start = StepTimes(times, record), (y0, memory)
-    plain = not (lanes and record.row_turn is not None)
+    plain = not (lanes and record.save_turn is not None)
     return RecordedMotion(step, start, leaves, tree, moving, stepper.windows, clock, stages, plain)
 
 

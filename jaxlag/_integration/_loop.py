@@ -1,11 +1,11 @@
-"""The one loop: steps, step-size control, landing on knots, rows to save, record, status.
+"""The integration loop: steps, step-size control, knots, save times, the record, the status.
 
 Integration runs forwards in a time tau = sigma (t - ts[0]), sigma = +1 or -1, so that nothing here
 knows about direction, and times are as fine as the span allows.
 
-A turn of the loop is a step, or it reaches a row: a row that lies inside the last step is reached
-by a step of its own from where that one started, which is at least as accurate, whatever the
-solver; its interpolant need not be. So the program holds one step.
+Each turn takes one step, or one step to a save time. A save time that lies inside the last accepted
+step is reached by a separate step from its start, not by interpolation: this is as accurate as the
+method is, and the loop body contains one step only.
 """
 
 from collections.abc import Callable
@@ -70,7 +70,7 @@ def integrate(
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    # Turns in which any lane takes a step: at most those in which one attempts it or goes to rows.
+    # Turns in which any lane takes a step: at most those in which one attempts it or goes to a save time.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
     room = (room if room < max_steps else size) if record and not stepper.remembers else 0
     if stepper.controller is not None:
@@ -89,12 +89,12 @@ def integrate(
     start = StepStart(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
-    rows = kept = None
+    saved = kept = None
     if not at_most(count, 2):
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = buffer(count - 1, y0, jnp.nan)
         reaches = jnp.zeros_like(places) if reaches_beyond and places is not None else None
-        rows = SaveProgress(start, zero, zero, values, places, reaches, zero)
+        saved = SaveProgress(start, zero, zero, values, places, reaches, zero)
     if record:
         kept = RecordBuffers(
             offsets=buffer(size, t0, 0.0),
@@ -115,7 +115,7 @@ def integrate(
         accepted=zero,
         attempted=zero,
         turn=zero,
-        rows=rows,
+        saved=saved,
         kept=kept,
         reach=zero if reaches_beyond else None,
     )
@@ -146,35 +146,35 @@ def _outcome(c: LoopState, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     arrived = allowed & (times.saves[-1] <= c.at.t)
     last = jax.tree.map(lambda y: jnp.where(arrived, y, jnp.nan), c.at.y)
     parts = [jax.tree.map(lambda y: y[None], y0)]
-    if c.rows is not None:
-        parts.append(jax.tree.map(lambda x: x[:-1], c.rows.values))
+    if c.saved is not None:
+        parts.append(jax.tree.map(lambda x: x[:-1], c.saved.values))
     parts.append(jax.tree.map(lambda y: y[None], last))
-    rows = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    saved = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     record = None
     if c.kept is not None:
-        row_turn = None if c.rows is None else c.rows.turns
-        row_reach = None if c.rows is None else c.rows.reaches
-        record = Record(*c.kept, c.turn, row_turn, row_reach, c.reach)
+        save_turn = None if c.saved is None else c.saved.turns
+        save_reach = None if c.saved is None else c.saved.reaches
+        record = Record(*c.kept, c.turn, save_turn, save_reach, c.reach)
     ends = (c.status, c.at.t, c.at.y, c.tried, c.accepted, c.attempted)
-    missed = jnp.zeros((), jnp.int32) if c.rows is None else c.rows.missed
-    return Outcome(*ends, rows, missed, record, jnp.zeros((), jnp.int32))
+    missed = jnp.zeros((), jnp.int32) if c.saved is None else c.saved.missed
+    return Outcome(*ends, saved, missed, record, jnp.zeros((), jnp.int32))
 
 
 def _is_due(loop: Loop, c: Any) -> Array:
-    """Whether a row lies inside the last accepted step."""
-    if c.rows is None:
+    """Whether a save time lies inside the last accepted step."""
+    if c.saved is None:
         return jnp.array(False)
-    return (loop.dues[c.rows.next] <= c.at.t) & (c.accepted > 0)
+    return (loop.dues[c.saved.next] <= c.at.t) & (c.accepted > 0)
 
 
 def _turn(loop: Loop, c: LoopState) -> LoopState:
-    """One attempted step, or one that reaches a row."""
+    """One attempted step, or one to a save time."""
     stepper, times, t = loop.stepper, loop.times, c.at.t
     # Where the step would end, and whether it lands on a knot or on the stop instead.
     fixed = stepper.controller is None
     h = c.h
     if c.at.crossing is not None and not fixed:
-        following = jnp.inf if c.rows is None else loop.dues[c.rows.next]
+        following = jnp.inf if c.saved is None else loop.dues[c.saved.next]
         h = c.at.crossing.step(t, c.h, stepper.gap, times.stop, following)
     goal = (c.mark + 1).astype(t.dtype) * loop.dt if fixed else t + h
     boundary, boundary_anchor = _next_boundary(times, t)
@@ -182,18 +182,18 @@ def _turn(loop: Loop, c: LoopState) -> LoopState:
     lands = goal >= boundary - slack
     t1, cut = jnp.where(lands, boundary, goal), lands | (h < c.h)
 
-    begin, to_row, due = c.at, jnp.array(False), None
-    if c.rows is not None:
-        due = loop.dues[c.rows.next]
-        to_row = _is_due(loop, c)
-        begin = select(to_row, c.rows.base, c.at)
-        t1 = jnp.where(to_row, due, t1)
+    begin, to_save, due = c.at, jnp.array(False), None
+    if c.saved is not None:
+        due = loop.dues[c.saved.next]
+        to_save = _is_due(loop, c)
+        begin = select(to_save, c.saved.base, c.at)
+        t1 = jnp.where(to_save, due, t1)
     end, reach = t1, None  # of the step, and how the state at t1 follows from it
     if c.reach is not None:
-        # A motion may end at such a place: rows of its last step are then reached alike.
+        # A motion may end at such a place: saves of its last step are then reached alike.
         assert begin.crossing is not None
         there = (t1 >= times.stop) & begin.crossing.is_at(begin.t, t1)
-        beyond = jnp.where(to_row, c.reach == Reach.beyond, there)
+        beyond = jnp.where(to_save, c.reach == Reach.beyond, there)
         reach = jnp.where(beyond, int(Reach.beyond), int(Reach.step))
         end = reached_time(reach, begin.t, t1, t1)
     jumped = False if begin.jump is None else begin.jump
@@ -201,7 +201,7 @@ def _turn(loop: Loop, c: LoopState) -> LoopState:
     step = (begin.t, end, begin.y, args, begin.memory, jumped, begin.crossing)
     y1, estimate, memory, solved = stepper.step(*step)
     finite = all_finite(y1)
-    ends = (begin.t, end, begin.y, y1, args, estimate, begin.crossing, lands | to_row)
+    ends = (begin.t, end, begin.y, y1, args, estimate, begin.crossing, lands | to_save)
     settled, checks, estimate, crossing = stepper.settled_with_error(*ends)
     step = (begin.t, end, begin.y, settled, args, estimate.turn)
     passage = stepper.passage(*step, begin.determinants)
@@ -214,26 +214,26 @@ def _turn(loop: Loop, c: LoopState) -> LoopState:
         stands = begin.crossing.stands | (crossing.stands if fixed else False)
         met = fixed & ~finite & (begin.crossing.time < t1 + (t1 - begin.t))
         crossable, independent = crossing.passes & ~stands & ~met, ~crossing.depends
-    good = finite & solved & ((regular & crossable) | to_row) & checks.good
-    rest = (estimate, good, cut, share, regular | to_row)
+    good = finite & solved & ((regular & crossable) | to_save) & checks.good
+    rest = (estimate, good, cut, share, regular | to_save)
     keep, h, control, jump, stuck = _next_step(loop, c, t1, y1, *rest)
     across = jnp.array(False)
     if reach is not None:
         sound = good & stepper.is_small(begin.y, y1, estimate.error, UNLIKE)
         known = cast(tuple[Crossing, Crossing, Crossing], (begin.crossing, c.at.crossing, crossing))
-        across = to_row & (reach == Reach.step) & is_across(*known, sound) & finite
+        across = to_save & (reach == Reach.step) & is_across(*known, sound) & finite
         reach = jnp.where(across, int(Reach.within), reach)
         end, last = jnp.where(across, c.at.t, end), select(across, c.at.y, settled)
         settled = stepper.reached(begin.t, begin.y, end, last, t1, reach != Reach.step, args)
 
-    active = ~c.done & ~to_row
+    active = ~c.done & ~to_save
     take = active & keep
     attempted = c.attempted + active.astype(jnp.int32)
     arrived = take & (t1 >= times.stop)
     failure = jnp.full((), int(Status.step_below_resolution))
     smooth = jnp.array(True)
-    if c.rows is not None:
-        smooth = ~to_row | across | stepper.is_small(begin.y, y1, estimate.error, SINGULAR)
+    if c.saved is not None:
+        smooth = ~to_save | across | stepper.is_small(begin.y, y1, estimate.error, SINGULAR)
     for right, kind in (
         (smooth | (not stepper.moves), Status.projection_failed),
         (checks.contacts_valid, Status.no_reaction_solution),
@@ -249,30 +249,30 @@ def _turn(loop: Loop, c: LoopState) -> LoopState:
     status = jnp.where(active & stuck, failure, c.status)
     status = jnp.where(exhausted, int(Status.max_steps), status).astype(jnp.int32)
 
-    rows = c.rows
-    if rows is not None:
+    saved = c.saved
+    if saved is not None:
         assert due is not None
-        if rows.turns is None:  # for derivatives a row must move with its own time
-            to_row = to_row | (take & (jnp.abs(due - t1) <= resolution(t1)))
-        slot = jnp.where(to_row, rows.next, times.saves.shape[0] - 2)
+        if saved.turns is None:  # for derivatives a save must move with its own time
+            to_save = to_save | (take & (jnp.abs(due - t1) <= resolution(t1)))
+        slot = jnp.where(to_save, saved.next, times.saves.shape[0] - 2)
         known = (good & smooth) | across
         value = jax.tree.map(lambda y: jnp.where(known, y, jnp.nan), settled)
-        turns, reaches = rows.turns, rows.reaches
+        turns, reaches = saved.turns, saved.reaches
         if reaches is not None:
             assert reach is not None
-            reaches = set_entry(reaches, slot, jnp.where(to_row, reach, 0))
+            reaches = set_entry(reaches, slot, jnp.where(to_save, reach, 0))
         if turns is not None:
-            # The slot after the last row is that of nothing: it stays beyond all turns.
+            # The slot after the last save is that of nothing: it stays beyond all turns.
             beyond = turns[-1]
-            turns = set_entry(turns, slot, jnp.where(to_row, rows.turn, beyond))
-        rows = SaveProgress(
-            base=select(take, c.at, rows.base),
-            turn=jnp.where(take, c.turn, rows.turn),
-            next=rows.next + to_row.astype(jnp.int32),
-            values=set_entry(rows.values, slot, value),
+            turns = set_entry(turns, slot, jnp.where(to_save, saved.turn, beyond))
+        saved = SaveProgress(
+            base=select(take, c.at, saved.base),
+            turn=jnp.where(take, c.turn, saved.turn),
+            next=saved.next + to_save.astype(jnp.int32),
+            values=set_entry(saved.values, slot, value),
             turns=turns,
             reaches=reaches,
-            missed=jnp.where(to_row & ~known, failure, rows.missed).astype(jnp.int32),
+            missed=jnp.where(to_save & ~known, failure, saved.missed).astype(jnp.int32),
         )
 
     passed = t1 >= goal - slack
@@ -294,7 +294,7 @@ def _turn(loop: Loop, c: LoopState) -> LoopState:
         accepted=c.accepted + take.astype(jnp.int32),
         attempted=attempted,
         turn=c.turn + eqxi.unvmap_any(take).astype(jnp.int32),
-        rows=rows,
+        saved=saved,
         kept=kept,
         reach=None if reach is None else select(take, reach, c.reach),
     )

@@ -25,11 +25,11 @@ class StepStart(NamedTuple):
 
 
 class SaveProgress(NamedTuple):
-    """Rows between the first and the last."""
+    """States at the save times between the first and the last."""
 
     base: StepStart  # where the last accepted step started
     turn: Array  # that took it
-    next: Array  # index of the row that is due next
+    next: Array  # index of the next save time
     values: PyTree  # one more for what is not kept
     turns: Array | None  # `Record.row_turn`
     reaches: Array | None  # `Record.row_reach`
@@ -58,7 +58,7 @@ class LoopState(NamedTuple):
     accepted: Array
     attempted: Array
     turn: Array  # number of those in which any lane took a step
-    rows: SaveProgress | None
+    saved: SaveProgress | None
     kept: RecordBuffers | None
     reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
 

@@ -13,7 +13,7 @@ class Times(NamedTuple):
     Attributes:
         stop: where integration ends: the last save time, or the end of an input's table before it.
         knots: where inputs jump, sorted.
-        saves: when rows are saved, the first one at the start.
+        saves: the save times, the first one at the start.
     """
 
     stop: Float[Array, ""]
@@ -21,12 +21,12 @@ class Times(NamedTuple):
     saves: Float[Array, " s"]
 
     def anchors(self) -> Float[Array, " a"]:
-        """Start, stop and knots in one row; `Record.anchors` index it."""
+        """Start, stop and knots in one array; `Record.anchors` index it."""
         ends = jnp.stack([jnp.zeros_like(self.stop), self.stop])
         return ends if self.knots is None else jnp.concatenate([ends, self.knots])
 
     def dues(self) -> Float[Array, " r"]:
-        """Times of the rows between the first and the last, and then never."""
+        """Save times between the first and the last, and then never."""
         never = jnp.full((1,), jnp.finfo(self.saves.dtype).max, self.saves.dtype)
         return jnp.concatenate([self.saves[1:-1], never])
 
@@ -68,10 +68,10 @@ class Record(NamedTuple):
         points: states before turn 0, `stride`, 2 `stride`, ...; None where nobody needs them.
         stride: a power of 2.
         turns: how many there were.
-        row_turn: row i + 1 is reached from the state before this turn; beyond all of them for rows
-            that were not reached and after the last. None where there are no rows between the
+        save_turn: save time i + 1 is reached from the state before this turn; beyond all turns where
+            it was not reached, and after the last. None where there are no save times between the
             first and the last.
-        row_reach: how, see `Reach`; None where no change points are passed.
+        save_reach: how, see `Reach`; None where no change points are passed.
         last_reach: the same of the last turn.
     """
 
@@ -81,13 +81,13 @@ class Record(NamedTuple):
     points: PyTree | None
     stride: Int[Array, ""]
     turns: Int[Array, ""]
-    row_turn: Int[Array, " r"] | None
-    row_reach: Int[Array, " r"] | None = None
+    save_turn: Int[Array, " r"] | None
+    save_reach: Int[Array, " r"] | None = None
     last_reach: Int[Array, ""] | None = None
 
 
 class Outcome(NamedTuple):
-    """Where a drive ended, and its rows."""
+    """Where integration ended, and the states at the save times."""
 
     status: Int[Array, ""]
     time: Float[Array, ""]
@@ -95,7 +95,7 @@ class Outcome(NamedTuple):
     tried: Float[Array, ""]  # end of the last attempted step
     accepted: Int[Array, ""]
     attempted: Int[Array, ""]
-    rows: PyTree  # leaves (s, ...), NaN where not reached
+    saved: PyTree  # leaves (s, ...), NaN where not reached
     missed: Int[Array, ""]  # how the step to one of them failed: a Status
     record: Record | None
     gradient: Int[Array, ""]  # a GradientMode
