@@ -68,19 +68,19 @@ def in_lanes(
 
 
 def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
-    """(own, shared) -> results of `size` trajectories; own leaves have one row for each.
+    """(own, shared) -> results of `size` trajectories; own leaves have one lane for each.
 
-    A further vmap makes more rows.
+    A further vmap makes more lanes.
     """
 
     @custom_vmap
-    def rows(own: PyTree, shared: PyTree) -> PyTree:
+    def lanes(own: PyTree, shared: PyTree) -> PyTree:
         def one(own: PyTree) -> PyTree:
             return vmapped(*eqx.combine(own, shared))
 
         return in_batches(one, own, size, at_once, even)
 
-    @rows.def_vmap
+    @lanes.def_vmap
     def _(outer: Any, mapped: list, own: PyTree, shared: PyTree) -> tuple:
         def flat(leaf: Any, is_mapped: bool) -> Any:
             leaf = leaf if is_mapped else jnp.broadcast_to(leaf, (outer, *leaf.shape))
@@ -95,34 +95,34 @@ def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
         results = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), results)
         return results, jax.tree.map(lambda _: True, results)
 
-    return rows
+    return lanes
 
 
 def in_batches(
-    function: Callable, rows: PyTree, count: Any, at_once: Any, even: bool = True
+    function: Callable, lanes: PyTree, count: Any, at_once: Any, even: bool = True
 ) -> PyTree:
-    """The vmapped function over `count` rows, up to `at_once` at a time.
+    """The vmapped function over `count` lanes, up to `at_once` at a time.
 
     Args:
-        function: of one row.
-        rows: leaves (count, ...).
-        count: number of rows.
+        function: of one lane.
+        lanes: leaves (count, ...).
+        count: number of lanes.
         at_once: the largest batch.
         even: whether batches may be smaller to be equal; else, and where their number is a symbol
-            of `jax.export`, all have `at_once` rows. The last row fills the last batch up.
+            of `jax.export`, all have `at_once` lanes. The last lane fills the last batch up.
     """
     if at_most(count, at_once):
-        return jax.vmap(function)(rows)
+        return jax.vmap(function)(lanes)
     batches = -(-count // at_once)
     size = -(-count // batches) if even and isinstance(count, int) else at_once
     filled = jnp.minimum(jnp.arange(batches * size), count - 1)
-    parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), rows)
+    parts = jax.tree.map(lambda x: x[filled].reshape(batches, size, *x.shape[1:]), lanes)
     results = lax.map(jax.vmap(function), parts)
     return jax.tree.map(lambda x: x.reshape(batches * size, *x.shape[2:])[:count], results)
 
 
 def at_most(count: Any, most: Any) -> bool:
-    """Whether a number of rows is known to be no larger; either may be a symbol of `jax.export`."""
+    """Whether a number of lanes is known to be no more; either may be a symbol of `jax.export`."""
     try:
         return bool(count <= most)
     except jax.errors.InconclusiveDimensionOperation:

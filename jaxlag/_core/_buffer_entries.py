@@ -1,8 +1,9 @@
-"""Rows of a buffer written where each of several trajectories says.
+"""Entries of a buffer written where each of several trajectories says.
 
-What `jax.vmap` makes of a row written at an index of its own is a scatter, and a loop with one is
+What `jax.vmap` makes of an entry written at an index of its own is a scatter, and a loop with one is
 no native function on CPU. A few trajectories write one after the other instead. (256 double
-pendulums, microseconds each: with 11 rows 214 | 50, 101 rows 307 | 72, 1001 rows 1262 | 296.)
+pendulums, microseconds each: with 11 entries 214 | 50, 101 entries 307 | 72, 1001 entries 1262 |
+296.)
 """
 
 from collections.abc import Callable
@@ -18,87 +19,87 @@ from jaxlag._core._batching import LANES, at_most
 from jaxlag._core._custom_jvp import CustomJVP
 
 
-def set_entry(buffer: PyTree, index: Array, row: PyTree) -> PyTree:
-    """buffer[index] = row in every leaf. Not to be transposed."""
-    return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, row)
+def set_entry(buffer: PyTree, index: Array, entry: PyTree) -> PyTree:
+    """buffer[index] = entry in every leaf. Not to be transposed."""
+    return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, entry)
 
 
 @CustomJVP
-def _put(buffer: Array, row: Array, index: Array) -> Array:
-    return _place(buffer, row, index)
+def _put(buffer: Array, entry: Array, index: Array) -> Array:
+    return _place(buffer, entry, index)
 
 
 @_put.defjvp
 def _(primals: tuple, tangents: tuple) -> tuple:
-    (*_, index), (buffer_dot, row_dot, _) = primals, tangents
+    (*_, index), (buffer_dot, entry_dot, _) = primals, tangents
     result = _put(*primals)
     if not jnp.issubdtype(result.dtype, jnp.inexact):
         return result, None
-    return result, _put(buffer_dot, row_dot, index)
+    return result, _put(buffer_dot, entry_dot, index)
 
 
-def _write(buffer: Array, row: Array, *index: Array | None) -> Array:
-    """buffer[index] = row; None for all of an axis."""
+def _write(buffer: Array, entry: Array, *index: Array | None) -> Array:
+    """buffer[index] = entry; None for all of an axis."""
     axes = [axis for axis, k in enumerate(index) if k is not None]
     start = [0 if k is None else k for k in (*index, *[None] * (buffer.ndim - len(index)))]
     start = [jnp.asarray(k, jnp.int32) for k in start]
-    return lax.dynamic_update_slice(buffer, jnp.expand_dims(row, axes), start)
+    return lax.dynamic_update_slice(buffer, jnp.expand_dims(entry, axes), start)
 
 
 @custom_vmap
-def _place(buffer: Array, row: Array, index: Array) -> Array:
-    return _write(buffer, row, index)
+def _place(buffer: Array, entry: Array, index: Array) -> Array:
+    return _write(buffer, entry, index)
 
 
 @_place.def_vmap
-def _(size: Any, mapped: list, buffer: Array, row: Array, index: Array) -> tuple[Array, bool]:
-    buffer, row = _each(size, mapped, buffer, row)
+def _(size: Any, mapped: list, buffer: Array, entry: Array, index: Array) -> tuple[Array, bool]:
+    buffer, entry = _each(size, mapped, buffer, entry)
     if mapped[2]:
-        return _places(0)(buffer, row, index), True
-    return _places(1)(buffer[None], row[None], index[None])[0], True
+        return _places(0)(buffer, entry, index), True
+    return _places(1)(buffer[None], entry[None], index[None])[0], True
 
 
 def _each(size: Any, mapped: list, *arrays: Array) -> list[Array]:
-    """The arrays with a row for each of `size`."""
+    """The arrays with an entry for each of `size`."""
     pairs = zip(arrays, mapped, strict=False)
     return [x if has else jnp.broadcast_to(x, (size, *x.shape)) for x, has in pairs]
 
 
 def _places(shared: int) -> Callable:
-    """(buffers, rows, indices) -> buffers with a row each.
+    """(buffers, entries, indices) -> buffers with an entry each.
 
     Args:
-        shared: number of axes after the first one over which buffers and rows share an index.
+        shared: number of axes after the first one over which buffers and entries share an index.
     """
     whole = [None] * shared
 
-    def one(buffer: Array, row: Array, index: Array) -> Array:
-        return _write(buffer, row, *whole, index)
+    def one(buffer: Array, entry: Array, index: Array) -> Array:
+        return _write(buffer, entry, *whole, index)
 
     @custom_vmap
-    def place(buffers: Array, rows: Array, indices: Array) -> Array:
+    def place(buffers: Array, entries: Array, indices: Array) -> Array:
         count = indices.shape[0]
         if count == 1:
-            return one(buffers[0], rows[0], indices[0])[None]
+            return one(buffers[0], entries[0], indices[0])[None]
         if not at_most(count, LANES) or jax.default_backend() != "cpu":
-            return jax.vmap(one)(buffers, rows, indices)
+            return jax.vmap(one)(buffers, entries, indices)
 
         def write(k: Array, buffers: Array) -> Array:
-            return _write(buffers, rows[k], k, *whole, indices[k])
+            return _write(buffers, entries[k], k, *whole, indices[k])
 
         return lax.fori_loop(0, count, write, buffers)
 
     @place.def_vmap
     def _(size: Any, mapped: list, *args: Array) -> tuple[Array, bool]:
-        buffers, rows, indices = args
+        buffers, entries, indices = args
         count = indices.shape[-1]
-        buffers, rows = _each(size, mapped, buffers, rows)
+        buffers, entries = _each(size, mapped, buffers, entries)
         if count == 1 and not mapped[2]:  # (size, 1, ...) is (1, size, ...) in memory
-            swapped = (jnp.swapaxes(x, 0, 1) for x in (buffers, rows))
+            swapped = (jnp.swapaxes(x, 0, 1) for x in (buffers, entries))
             return jnp.swapaxes(_places(shared + 1)(*swapped, indices), 0, 1), True
         flat = (
             x.reshape(size * count, *x.shape[2:])
-            for x in (buffers, rows, *_each(size, mapped[2:], indices))
+            for x in (buffers, entries, *_each(size, mapped[2:], indices))
         )
         return _places(shared)(*flat).reshape(buffers.shape), True
 

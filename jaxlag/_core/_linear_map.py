@@ -39,7 +39,7 @@ class LinearMap:
         plain: A(r) x by a program that JAX differentiates in any mode and to any order.
         plain_backward: A(r)^T y in the same way; None for the transpose of `plain`.
         in_lanes: the same map in the form to be vmapped over r; None for this one.
-        at_once: rows of a vmap that are taken together; None for all.
+        at_once: lanes of a vmap that are taken together; None for all.
     """
 
     forward: Callable[[PyTree, PyTree], PyTree]
@@ -148,23 +148,23 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
 
 
 def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
-    """The map for `size` rows of x, y and the leaves of r that are mapped."""
+    """The map for `size` lanes of x, y and the leaves of r that are mapped."""
     in_lanes = form.in_lanes
     if any(mapped) and in_lanes is not None:
         form, in_lanes = in_lanes, None
 
-    def rows(function: Callable | None, at_once: Any) -> Any:
+    def lanes(function: Callable | None, at_once: Any) -> Any:
         if function is None:
             return None
 
         def of(r: Leaves, x: Leaves) -> list:
             own = [leaf for leaf, is_mapped in zip(r, mapped, strict=True) if is_mapped]
 
-            def one(row: tuple) -> list:
-                mine = iter(row[0])
+            def one(lane: tuple) -> list:
+                mine = iter(lane[0])
                 pairs = zip(r, mapped, strict=True)
                 merged = [next(mine) if is_mapped else leaf for leaf, is_mapped in pairs]
-                return list(function(merged, row[1]))
+                return list(function(merged, lane[1]))
 
             return in_batches(one, (own, list(x)), size, at_once, even=not any(mapped))
 
@@ -172,10 +172,10 @@ def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
 
     at_once = form.at_once or size
     return LinearMap(
-        rows(form.forward, at_once),
-        rows(form.backward, at_once),
-        rows(form.plain, size),
-        rows(form.plain_backward, size),
+        lanes(form.forward, at_once),
+        lanes(form.backward, at_once),
+        lanes(form.plain, size),
+        lanes(form.plain_backward, size),
         None if in_lanes is None else _batched(in_lanes, size, mapped),
         form.at_once,
     )
@@ -233,12 +233,12 @@ def _transpose(cotangents: Leaves, *args: Any, form: LinearMap, count: int) -> l
 ad.primitive_transposes[_linear_map] = _transpose
 
 
-def _rows(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
+def _lanes(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     sizes = [x.shape[i] for x, i in zip(args, axes, strict=True) if i is not None]
     pairs = zip(args, axes, strict=True)
     args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]
     mapped = [i is not None for i in axes]
-    # Rows of x for all: the sum over them that a shared x has as its cotangent is JAX's then.
+    # Lanes of x for all: the sum over them that a shared x has as its cotangent is JAX's then.
     x = [
         leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *leaf.shape))
         for leaf, is_mapped in zip(args[count:], mapped[count:], strict=True)
@@ -247,4 +247,4 @@ def _rows(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     return results, [0] * len(results)
 
 
-batching.primitive_batchers[_linear_map] = _rows
+batching.primitive_batchers[_linear_map] = _lanes

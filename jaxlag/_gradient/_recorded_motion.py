@@ -106,7 +106,8 @@ class RecordedMotion(NamedTuple):
         clock: times of the steps.
         stages: number of them in a step, 0 where it has none.
         plain: whether XLA may compile a sweep to one native function. Not where lanes gather at
-            different indices: it overestimates the cost of such a gather, and splits it over threads.
+            different indices: it overestimates the cost of such a gather, and splits it over
+            threads.
     """
 
     step: Callable

@@ -1,9 +1,9 @@
 """The differentiable solve: states at the save times, with one derivative for every transform.
 
-The derivative is that of the map from (state, args, times) to the saved states at the FROZEN sequence of
-accepted steps: step ends keep their distance from the start, knot or stop they are anchored to,
-and move with it. The loop of steps is never differentiated; under any derivative it records where
-it went, and the derivative goes the same way again.
+The derivative is that of the map from (state, args, times) to the saved states at the FROZEN
+sequence of accepted steps: step ends keep their distance from the start, knot or stop they are
+anchored to, and move with it. The loop of steps is never differentiated; under any derivative it
+records where it went, and the derivative goes the same way again.
 """
 
 from functools import partial

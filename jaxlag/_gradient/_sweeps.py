@@ -4,11 +4,12 @@ With y_{k+1} = step(y_k, args, t_k, t_{k+1}) at recorded times the derivative is
 
     dy_{k+1} = J_k dy_k + B_k dargs + c_k dt_k + e_k dt_{k+1},
 
-and the same for a saved state, which a step from y_k reaches at its own time: a linear map from (dy_0, dargs,
-danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the saved states. Forwards dy is carried
-beside y. Backwards the transposed steps are taken from the last to the first, at the recorded
-points, or at states found anew from them where points are further apart than a step. Neither
-depends on the step-size control, whose error estimates round differently in another program.
+and the same for a saved state, which a step from y_k reaches at its own time: a linear map from
+(dy_0, dargs, danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the saved states.
+Forwards dy is carried beside y. Backwards the transposed steps are taken from the last to the
+first, at the recorded points, or at states found anew from them where points are further apart than
+a step. Neither depends on the step-size control, whose error estimates round differently in another
+program.
 
 Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.6 (variational
 equations); Griewank, Walther, Evaluating Derivatives, ch. 12 (checkpoints).

@@ -16,8 +16,8 @@ def unreached(reached: Bool[Array, " s"], given: PyTree, change: PyTree, saved: 
 
     Args:
         reached: whether a save time was reached.
-        given: what the saved states are functions of: derivatives of these derivatives are not known,
-            either.
+        given: what the saved states are functions of: derivatives of these derivatives are not
+            known, either.
         change: directions in it, None for what does not move.
         saved: their derivative, leaves (s, ...).
     """

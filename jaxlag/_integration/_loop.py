@@ -70,7 +70,8 @@ def integrate(
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    # Turns in which any lane takes a step: at most those in which one attempts it or goes to a save time.
+    # Turns in which any lane takes a step: at most those in which one attempts it or goes to a save
+    # time.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
     room = (room if room < max_steps else size) if record and not stepper.remembers else 0
     if stepper.controller is not None:

@@ -68,9 +68,9 @@ class Record(NamedTuple):
         points: states before turn 0, `stride`, 2 `stride`, ...; None where nobody needs them.
         stride: a power of 2.
         turns: how many there were.
-        save_turn: save time i + 1 is reached from the state before this turn; beyond all turns where
-            it was not reached, and after the last. None where there are no save times between the
-            first and the last.
+        save_turn: save time i + 1 is reached from the state before this turn; beyond all turns
+            where it was not reached, and after the last. None where there are no save times between
+            the first and the last.
         save_reach: how, see `Reach`; None where no change points are passed.
         last_reach: the same of the last turn.
     """

@@ -49,7 +49,7 @@ class Stepper(eqx.Module):
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController | None
     term: diffrax.AbstractTerm
-    # (args, tau) -> (args of a step from tau, where rows of tables begin in them)
+    # (args, tau) -> (args of a step from tau, where entries of tables begin in them)
     windows: Callable = eqx.field(static=True)
     # (tau, y, args, differentiable) -> (the end of a step as it is kept, Verdict)
     step_end: Callable | None = eqx.field(static=True, default=None)
@@ -285,10 +285,10 @@ class Stepper(eqx.Module):
     def is_small(
         self, y0: PyTree, y1: PyTree, error: PyTree | None, tolerances: float
     ) -> Bool[Array, ""]:
-        """Whether the error of a step that no control rejects, to a row, is below so many.
+        """Whether the error of a step to a save time, which no control rejects, is below so many.
 
         It is part of one that was accepted: an error estimate of `SINGULAR` times what is allowed
-        is that of a field which is singular, or jumps, where the row lies.
+        is that of a field which is singular, or jumps, at the save time.
         """
         controller = self.controller
         if error is None or not isinstance(controller, diffrax.PIDController):

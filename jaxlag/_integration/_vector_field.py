@@ -50,7 +50,7 @@ class VectorField(eqx.Module):
         direction: sigma, +1 or -1, where known while tracing; else None.
         power: terms of dH/dt to integrate along; None for none.
         sample: values of the params, where known.
-        lanes: whether all this is vmapped, so that elements are rows of numbers.
+        lanes: whether all this is vmapped, so that elements are arrays of numbers.
         in_loop: whether it is evaluated in a loop over one trajectory or a few lanes.
         rows: the constraint rows.
         formulation: how accelerations are solved for under constraints; "quasi" for a state of
@@ -233,20 +233,20 @@ class VectorField(eqx.Module):
         return -x if args.sigma is None else x * args.sigma.astype(x.dtype)
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
-        """(params, inputs) as the user passed them; within a step of each table two rows."""
+        """(params, inputs) as the user passed them; within a step of each table two entries."""
         return (
             _params.join(args.params, self.params.tree),
             eqx.combine(args.inputs, self.inputs.tree),
         )
 
     def within(self, args: Arguments, tau: Float[Array, ""]) -> Arguments:
-        """Arguments for a step that starts at tau: of every table the rows of one interval."""
+        """Arguments for a step that starts at tau: of every table the entries of one interval."""
         return self.windows(args, tau)[0]
 
     def windows(
         self, args: Arguments, tau: Float[Array, ""]
     ) -> tuple[Arguments, list[Array | None]]:
-        """The same, and for each leaf of the arguments where its rows start, None for all."""
+        """The same, and for each leaf of the arguments where its entries start, None for all."""
         _, inputs = self.given(args)
         starts: dict[str, Array] = {}
         located = args

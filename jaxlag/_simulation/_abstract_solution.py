@@ -73,7 +73,7 @@ class AbstractSolution(eqx.Module):
     @property
     @abstractmethod
     def energy(self) -> Array:
-        """H at the rows."""
+        """H at the save times."""
 
     @abstractmethod
     def __getitem__(self, name: Any) -> Any:
@@ -88,5 +88,5 @@ class AbstractSolution(eqx.Module):
         """How it ended, in words."""
 
     @abstractmethod
-    def _rows(self, rows: list[int]) -> "AbstractSolution":
-        """The same with these rows only."""
+    def _at_saves(self, indices: list[int]) -> "AbstractSolution":
+        """The same at these save times only."""

@@ -3,8 +3,8 @@
 A force that is switched on at the time b jumps there. Derivatives are taken at frozen steps, and
 see no jump move with b. So operations whose outcome jumps, and which read both the time and a
 number that moves, are looked for in the program. Along the time the equations are then compared on
-both sides of every change of outcome: where they only bend, as between the rows of a table that is
-interpolated, derivatives are right.
+both sides of every change of outcome: where they only bend, as between the entries of a table that
+is interpolated, derivatives are right.
 """
 
 import warnings
@@ -185,7 +185,7 @@ class Jumps:
         return found, own
 
     def _terms(self, leaves: Sequence[Array], t: Array) -> Array:
-        """What the equations of motion are made of, as numbers in a row."""
+        """What the equations of motion are made of, as one array of numbers."""
         tree = jax.tree.structure((*self._moving, self._traced))
         _, q, v, *rest = jax.tree.unflatten(tree, leaves)
 

@@ -226,7 +226,9 @@ def grad_growth(
         i = int(np.argmax(np.asarray(statuses) != int(Status.ok)))
         status = Status(int(statuses[i]))
         was = f"from t = {motion.ts[i]} to {motion.ts[i + 1]} the status was {status.name}"
-        raise invalid("grad_growth: motion", "be solvable from each of its rows", was, _fix(status))
+        raise invalid(
+            "grad_growth: motion", "be solvable from each of its save times", was, _fix(status)
+        )
     if concrete(growth.horizon):
         _warn_beyond(growth)
     return growth
@@ -368,8 +370,8 @@ def _transitions(
         controller = diffrax.ClipStepSizeController(controller, jump_ts=knots.astype(outside))
     solver, term = diffrax.Dopri8(), diffrax.ODETerm(rates)
 
-    def segment(row: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-        begin, end, *state = row
+    def segment(part: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        begin, end, *state = part
         state = tuple(x.astype(outside) for x in state)
         found = diffrax.diffeqsolve(
             term,
@@ -389,10 +391,10 @@ def _transitions(
         good = (found.result == diffrax.RESULTS.successful) & jnp.all(jnp.isfinite(Y))
         return Y, jnp.where(good, int(Status.ok), failure).astype(jnp.int32)
 
-    rows = (ts[:-1], ts[1:], y[:-1], directions[:-1])
+    parts = (ts[:-1], ts[1:], y[:-1], directions[:-1])
     stages = len(solver.tableau.b_sol) * y.shape[1] * (y.shape[1] + 1) * ts.dtype.itemsize
     at_once = min(SEGMENTS_AT_ONCE, max(1, STAGES_IN_BYTES // stages))
-    return in_batches(segment, rows, ts.shape[0] - 1, at_once)
+    return in_batches(segment, parts, ts.shape[0] - 1, at_once)
 
 
 def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, Array]:
@@ -401,8 +403,8 @@ def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, 
     All products steps[j - 1] ... steps[i] starts[i] are carried along, each rescaled to norm 1.
     """
 
-    def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], Any]:
-        (products, logs), (j, step, start, scale) = carry, row
+    def turn(carry: tuple[Array, Array], part: tuple) -> tuple[tuple[Array, Array], Any]:
+        (products, logs), (j, step, start, scale) = carry, part
         products = (step @ products).at[j].set(start)
         norms = jnp.linalg.norm(products, ord=2, axis=(-2, -1))
         begun = jnp.arange(len(norms)) <= j
@@ -413,9 +415,9 @@ def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, 
 
     count = starts.shape[0]
     begin = jnp.zeros_like(starts), jnp.zeros((count,), starts.dtype)
-    into = jnp.concatenate([starts[:1], steps])  # nothing has begun before the first row
-    rows = (jnp.arange(count), into, starts, scale)
-    return jax.lax.scan(turn, begin, rows)[1]
+    into = jnp.concatenate([starts[:1], steps])  # nothing has begun before the first save time
+    parts = (jnp.arange(count), into, starts, scale)
+    return jax.lax.scan(turn, begin, parts)[1]
 
 
 def _exponent(tau: Array, log_size: Array) -> tuple[Array, Array]:
@@ -430,7 +432,7 @@ def _exponent(tau: Array, log_size: Array) -> tuple[Array, Array]:
 
 
 def _horizon(tau: Array, log_kappa: Array, exponent: Array, error: Array, level: Array) -> Array:
-    """The time at which log_kappa first reaches the level, between rows or beyond the last."""
+    """The time at which log_kappa reaches the level, between save times or beyond the last."""
     over = log_kappa >= level
     i = jnp.maximum(jnp.argmax(over), 1)
     slope = (log_kappa[i] - log_kappa[i - 1]) / (tau[i] - tau[i - 1])

@@ -187,7 +187,7 @@ def stop_gradient_unless(moves: Array, tree: Any) -> Any:
 def velocities_at(
     dynamics: VectorField, ts: Array, y: Array, args: Arguments, moved: Array
 ) -> tuple[Array, Array]:
-    """(q, v) at every row of one motion; NaN where the motion did not get.
+    """(q, v) at every save time of one motion; NaN where the motion did not get.
 
     A motion that took no step, as its kinematics may be singular at the start, lends no
     derivatives.
@@ -196,7 +196,7 @@ def velocities_at(
     if dynamics.quasi is None:
         return q, w
     reached = jnp.isfinite(q[:, :1])
-    # Rows not reached are NaN: look at the start instead, so that derivatives stay finite.
+    # States not reached are NaN: look at the start instead, so that derivatives stay finite.
     safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
     ts, safe, args = stop_gradient_unless(moved, (ts, safe, args))
     v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)

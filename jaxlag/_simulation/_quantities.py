@@ -33,7 +33,7 @@ _BY_QUASI = {
 }
 
 
-def over_rows(
+def at_saves(
     name: str,
     system: System,
     formulation: str,
@@ -43,14 +43,15 @@ def over_rows(
     params: Any,
     inputs: Any,
 ) -> Any:
-    """A quantity at every row of one motion; NaN where the motion did not get."""
+    """A quantity at every save time of one motion; NaN where the motion did not get."""
     reached = jnp.isfinite(q[:, 0])
     quantity = QUANTITIES[name]
     if formulation == "quasi":
         quantity = _BY_QUASI.get(name, quantity)
 
     def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
-        # Rows not reached are NaN: evaluate at the start instead, so that derivatives stay finite.
+        # States not reached are NaN: evaluate at the start instead, so that derivatives stay
+        # finite.
         unknown = q[0]  # NaN there, with NaN for its derivatives
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
         value = quantity(system, t, q, v, params, inputs)

@@ -1,4 +1,4 @@
-"""States of a motion between its rows."""
+"""States of a motion between its save times: solved anew from the last one before."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from jaxlag._core._arrays import concrete, real
 from jaxlag._core._errors import invalid
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
-_ASK = "Ask for it as a row: ts=jnp.linspace(0, 10, 501)."
+_ASK = "Ask for it as a save time: ts=jnp.linspace(0, 10, 501)."
 
 
 def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
@@ -36,7 +36,9 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         raise invalid("at: motion", must, was, _ASK)
     asked = np.atleast_1d(np.asarray(real("at: t", t)))
     if asked.ndim != 1:
-        raise invalid("at: t", "be a number or one row of numbers", f"its shape was {asked.shape}")
+        raise invalid(
+            "at: t", "be a number or a sequence of numbers", f"its shape was {asked.shape}"
+        )
     ts = np.asarray(motion.ts)
     sense = 1.0 if ts[-1] >= ts[0] else -1.0
     last = float(motion.last_time)
@@ -45,19 +47,19 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         was = f"one was {asked[outside][0]}"
         raise invalid("at: t", f"lie within the motion, from {ts[0]} to {last} s", was)
     times = np.unique(sense * asked)
-    row = int(np.searchsorted(sense * ts, times[0], side="right")) - 1
-    times = sense * times[times > sense * ts[row]]
+    before = int(np.searchsorted(sense * ts, times[0], side="right")) - 1
+    times = sense * times[times > sense * ts[before]]
     if not len(times):
-        return motion._rows([row] * len(asked))
+        return motion._at_saves([before] * len(asked))
     project: Any = motion.stabilization or False
     if project == "projection" or not motion.system.constraints:
         project = True
     plain = not motion.system.constraints and motion.system.quasi is None
     further = solve(
         motion.system,
-        motion.q[row],
-        motion.v[row],
-        np.concatenate([ts[row : row + 1], times]),
+        motion.q[before],
+        motion.v[before],
+        np.concatenate([ts[before : before + 1], times]),
         motion.params,
         inputs=motion.inputs,
         method=motion.method,
@@ -71,8 +73,8 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         throw=False,
     )
     if "work" in motion.saved:
-        done = {name: work[row] for name, work in motion.saved["work"].items()}
+        done = {name: work[before] for name, work in motion.saved["work"].items()}
         since = jax.tree.map(jnp.add, further.saved["work"], done)
         further = eqx.tree_at(lambda x: x.saved["work"], further, since)
     places = np.searchsorted(sense * np.asarray(further.ts), sense * asked)
-    return further._rows(places.tolist())
+    return further._at_saves(places.tolist())

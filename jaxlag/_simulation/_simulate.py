@@ -39,7 +39,7 @@ from jaxlag._simulation._failure import final_status
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._simulation._problem import ProgramKey, Values, build_problem, velocities_at
-from jaxlag._simulation._quantities import over_rows
+from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
 from jaxlag._simulation._step_diagnosis import is_stiff
@@ -189,9 +189,9 @@ def simulate(
             `jl.assemble`; else it ends in the status inconsistent_start.
         estimate_error: whether to solve once more with a tenth of the tolerance and, where there
             is one, a method of higher order, or else with half the step dt, and give in
-            `motion.error` what follows for the errors of q and v at every row (of the same method,
-            up to every row; not below 32 eps sqrt(steps) |y|, what rounding leaves): global ones,
-            where rtol and atol bound those of a step.
+            `motion.error` what follows for the errors of q and v at every save time (of the same
+            method, up to every save time; not below 32 eps sqrt(steps) |y|, what rounding leaves):
+            global ones, where rtol and atol bound those of a step.
         throw: raise `SimulationError` where a concrete result has a status other than ok.
 
     Raises:
@@ -361,15 +361,15 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
     stepper: Stepper = eqx.combine(problem.setup.stepper, problem.stepper)
     name = name_of(stepper.solver)
     known = name in METHODS
-    rows, outcome = solve(problem)
+    solved, outcome = solve(problem)
     ending = final_status(dynamics, problem.times, problem.y0, problem.args, outcome, start)
     params = _params.join(values.params, plan.params.tree)
     inputs = eqx.combine(values.inputs, plan.inputs.tree)
     moved = outcome.accepted > 0
-    arrived = rows.time >= problem.times.saves[-1]
-    last_time = jnp.where(arrived, values.ts[-1], dynamics.clock(rows.time, problem.args))
+    arrived = solved.time >= problem.times.saves[-1]
+    last_time = jnp.where(arrived, values.ts[-1], dynamics.clock(solved.time, problem.args))
     at = jnp.concatenate([values.ts, last_time[None].astype(values.ts.dtype)])
-    states = jnp.concatenate([rows.saved, rows.state[None]])
+    states = jnp.concatenate([solved.saved, solved.state[None]])
     q, v = velocities_at(dynamics, at, states, problem.args, moved)
     (q, last_q), (v, last_v) = ((x[:-1], x[-1]) for x in (q, v))
     hold, row = rows_hold_after(dynamics, values.ts, q, v, params)
@@ -379,12 +379,12 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         where=jnp.where(broken, row, ending.where),
     )
     saved = {
-        name: over_rows(name, plan.system, plan.formulation, values.ts, q, v, params, inputs)
+        name: at_saves(name, plan.system, plan.formulation, values.ts, q, v, params, inputs)
         for name in plan.save
         if name != "work"
     }
     if "work" in plan.save:
-        saved["work"] = dynamics.work(rows.saved)
+        saved["work"] = dynamics.work(solved.saved)
     return Solution(
         system=plan.system,
         ts=values.ts,

@@ -16,7 +16,7 @@ from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import Ending, MotionKey, diagnose_failure, is_open
 from jaxlag._simulation._methods import METHODS
-from jaxlag._simulation._quantities import over_rows
+from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._resolve_between import states_at
 from jaxlag._simulation._solution_views import as_dataset, as_dict, counted, described, plotted
 from jaxlag._simulation._step_diagnosis import advice, explain
@@ -30,7 +30,7 @@ class Solution(AbstractSolution):
     """A motion at the requested times, and how it ended.
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
-    the batch axes in front. Rows not reached are NaN, and so are derivatives of them: a loss over a
+    the batch axes in front. States not reached are NaN, and so are their derivatives: a loss over a
     batch leaves failed motions out by `jnp.where(motion.ok, loss, 0.0)`.
 
     Attributes:
@@ -49,8 +49,8 @@ class Solution(AbstractSolution):
         tolerances: (rtol, atol) of the step-size control; None with fixed steps.
         dt_max: bound on adaptive steps, s; None where none was given.
         change_points: whether places where constraint rows depend on one another are passed.
-        error: with `estimate_error=True` the errors of (q, v) about to be expected at each row,
-            each (s, n), in their units; else None.
+        error: with `estimate_error=True` the errors of (q, v) about to be expected at each save
+            time, each (s, n), in their units; else None.
     """
 
     system: System
@@ -152,7 +152,9 @@ class Solution(AbstractSolution):
         if not isinstance(name, str):
             if self.ts.ndim == 1:
                 must, was = "be a name, for a single motion", f"it was {name!r}"
-                raise invalid("name", must, was, "Rows are those of motion.ts, motion.q, motion.v.")
+                raise invalid(
+                    "name", must, was, "For a save time index motion.ts, motion.q, motion.v."
+                )
             return jax.tree.map(lambda x: x[name], self)
         quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
@@ -168,7 +170,7 @@ class Solution(AbstractSolution):
 
     @property
     def a(self) -> Float[Array, "*batch s n"]:
-        """Accelerations (s, n), m/s^2 or rad/s^2, from M a + h = Q + A^T lam at the rows."""
+        """Accelerations (s, n), m/s^2 or rad/s^2, from M a + h = Q + A^T lam at the save times."""
         return self._quantity("a")
 
     @property
@@ -304,10 +306,10 @@ class Solution(AbstractSolution):
     def explain(self) -> str:
         """Why the solve took as many steps as it did, and what to change; for a single motion.
 
-        Looks at up to 8 of the rows: the fastest rates of the linear equations there (stiffness),
-        rejected steps, cond(M), and, of an explicit step of order 8 from there as long as the
-        motion's were, the component with the largest error and the number of turns in which it is
-        moved back onto the constraints.
+        Looks at up to 8 of the save times: the fastest rates of the linear equations there
+        (stiffness), rejected steps, cond(M), and, of an explicit step of order 8 from there as long
+        as the motion's were, the component with the largest error and the number of turns in which
+        it is moved back onto the constraints.
 
         Returns:
             A few lines of text, the last of them advice.
@@ -318,25 +320,26 @@ class Solution(AbstractSolution):
         return explain(self)
 
     def at(self, t: Any) -> "Solution":
-        """The motion at times between its rows, as accurate as its rows.
+        """The motion between its save times, as accurate as there.
 
-        The equations are solved anew from the last row before, by the same method and tolerances.
+        The equations are solved anew from the last save time before, by the same method and
+        tolerances.
 
         Args:
-            t: a number or a row of them in any order, from ts[0] to last_time, s.
+            t: a number or several in any order, (k,), from ts[0] to last_time, s.
 
         Returns:
-            A Solution with one row for every time, and what was saved there; work from ts[0] on.
+            A Solution at these times, and what was saved there; work from ts[0] on.
 
         Raises:
             ValueError: times outside of the motion; a batch, fixed steps or a method without a
-                name: there rows have to be asked for when simulating.
+                name: there times have to be asked for when simulating.
         """
         return states_at(self, t, self._solve)
 
-    def _rows(self, rows: list[int]) -> "Solution":
-        """The same with these rows only, in this order."""
-        index = np.array(rows)
+    def _at_saves(self, indices: list[int]) -> "Solution":
+        """The same at these save times only, in this order."""
+        index = np.array(indices)
         parts = lambda s: (s.ts, s.q, s.v, s.saved, s.error)  # noqa: E731
         chosen = jax.tree.map(lambda x: x[index], parts(self))
         return eqx.tree_at(parts, self, chosen, is_leaf=lambda x: x is None)
@@ -353,7 +356,7 @@ class Solution(AbstractSolution):
         """What `to_dict` has as an `xarray.Dataset` over "t"; needs the extra "xarray".
 
         Of a batch over "motion" as well (or "motion_0", ...); where its motions have times of their
-        own, over "row" in place of "t". "status" is a variable.
+        own, over "save" in place of "t". "status" is a variable.
 
         Raises:
             ValueError: xarray is not installed.
@@ -393,7 +396,7 @@ def _derived(name: str, system: System, formulation: str, key: Any, batch: int, 
         ts, q, v, params, inputs = traced
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
-        return over_rows(name, system, formulation, ts, q, v, params, inputs)
+        return at_saves(name, system, formulation, ts, q, v, params, inputs)
 
     for _ in range(batch):
         one = jax.vmap(one)

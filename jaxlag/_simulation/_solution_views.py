@@ -16,9 +16,9 @@ LINES = 16
 
 def described(motion: AbstractSolution) -> str:
     """A motion, or a batch of them, in one line."""
-    system, (*batch, rows) = motion.system, motion.ts.shape
+    system, (*batch, count) = motion.system, motion.ts.shape
     names = ", ".join(system.coordinates.names)
-    times, many = f"{rows} times", f"batch {tuple(batch)} of " if batch else ""
+    times, many = f"{count} times", f"batch {tuple(batch)} of " if batch else ""
     if not concrete(motion.ts, motion.raw_status):
         return f"Solution({names}: {many}{times}, traced)"
     if not batch:
@@ -85,14 +85,14 @@ def as_dataset(motion: AbstractSolution) -> Any:
     ts = np.asarray(motion.ts)
     first = ts[(0,) * batch]
     common = bool(np.all(ts == first))
-    rows = "t" if common else "row"
+    along = "t" if common else "save"
     variables = {}
     for name, value in as_dict(motion).items():
         if name != "t":
             more = [f"{name}_{i}" for i in range(value.ndim - batch - 1)]
-            variables[name] = ((*axes, rows, *more), value)
+            variables[name] = ((*axes, along, *more), value)
     variables["status"] = (axes, np.asarray(motion.status))
-    time = ("t", first) if common else ((*axes, "row"), ts)
+    time = ("t", first) if common else ((*axes, "save"), ts)
     return xarray.Dataset(variables, {"t": time})
 
 
@@ -110,11 +110,11 @@ def plotted(motion: AbstractSolution) -> Any:
     shapes = motion.system.coordinates.shapes
     paths = _paths(shapes)
     panels = [*shapes, "energy"]
-    width, rows = (9.0, 6.0)[not paths], len(panels)
-    figure = Figure(figsize=(width, 0.6 + 1.8 * rows), dpi=120, layout="constrained")
-    grid = figure.add_gridspec(rows, 2 if paths else 1)
+    width, count = (9.0, 6.0)[not paths], len(panels)
+    figure = Figure(figsize=(width, 0.6 + 1.8 * count), dpi=120, layout="constrained")
+    grid = figure.add_gridspec(count, 2 if paths else 1)
     axes = [figure.add_subplot(grid[0, 0])]
-    axes += [figure.add_subplot(grid[i, 0], sharex=axes[0]) for i in range(1, rows)]
+    axes += [figure.add_subplot(grid[i, 0], sharex=axes[0]) for i in range(1, count)]
     plane = None
     if paths:
         plane = figure.add_subplot(grid[:, 1], aspect="equal", xlabel="x", ylabel="y")

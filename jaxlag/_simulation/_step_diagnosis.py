@@ -20,7 +20,7 @@ from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
 from jaxlag._system._row_advice import advice_on_rows
 
-ROWS = 8  # states looked at, evenly along the motion
+LOOKED_AT = 8  # states looked at, evenly along the motion
 STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
 FOLLOWED = (1.5, 25.0)  # steps per turn of an oscillation that they follow
 OFTEN = 1000  # turns within ts from which on following each is a reason to be slow
@@ -307,8 +307,8 @@ def _rates(looks: Look) -> Rates | None:
 
 def _look(motion: AbstractSolution, h: float, last: bool = False) -> Look:
     reached = np.flatnonzero(np.all(np.isfinite(np.asarray(motion.q)), axis=1))
-    rows = reached[np.unique(np.linspace(0, len(reached) - 1, ROWS).round().astype(int))]
-    ts, q, v = (np.asarray(x)[rows] for x in (motion.ts, motion.q, motion.v))
+    chosen = reached[np.unique(np.linspace(0, len(reached) - 1, LOOKED_AT).round().astype(int))]
+    ts, q, v = (np.asarray(x)[chosen] for x in (motion.ts, motion.q, motion.v))
     end = [np.asarray(x)[None] for x in (motion.last_time, *motion.last_state)]
     if last:
         ts, q, v = end
@@ -326,8 +326,8 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
     given, _ = dynamics.given(args)
     solver = diffrax.Dopri8(scan_kind="lax")
 
-    def at(row: tuple[Array, Array, Array]) -> Look:
-        tau, y = dynamics.tau(row[0], args), dynamics.state_of(*row, given)
+    def at(place: tuple[Array, Array, Array]) -> Look:
+        tau, y = dynamics.tau(place[0], args), dynamics.state_of(*place, given)
         here = dynamics.within(args, tau)
         term = term_of(dynamics, tau, y, here)
         _, rates = linearized(lambda y: dynamics(tau, y, here), y)

@@ -83,7 +83,7 @@ def test_a_dataset_is_labelled(motion, batch):
             SYSTEM, Q0, 0.0 * Q0, jnp.array([0.0, 0.5, 1.0]) * end, 1.0, dt=0.25, method="heun"
         )
     )(jnp.array([1.0, 2.0]))
-    assert own.to_xarray()["t"].dims == ("motion", "row")
+    assert own.to_xarray()["t"].dims == ("motion", "save")
 
 
 def test_a_figure_shows_coordinates_energy_and_paths(motion, batch):
