@@ -88,7 +88,7 @@ def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
 
 
 def elements(array: Array) -> list[Array]:
-    """All elements of an array in one row, by static slices."""
+    """All elements of an array as a list, by static slices."""
     flat = jnp.reshape(array, (-1,))
     return [
         jax.lax.squeeze(jax.lax.slice_in_dim(flat, i, i + 1), (0,)) for i in range(flat.shape[0])

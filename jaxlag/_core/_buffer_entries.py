@@ -1,7 +1,7 @@
 """Entries of a buffer written where each of several trajectories says.
 
-What `jax.vmap` makes of an entry written at an index of its own is a scatter, and a loop with one is
-no native function on CPU. A few trajectories write one after the other instead. (256 double
+What `jax.vmap` makes of an entry written at an index of its own is a scatter, and a loop with one
+is no native function on CPU. A few trajectories write one after the other instead. (256 double
 pendulums, microseconds each: with 11 entries 214 | 50, 101 entries 307 | 72, 1001 entries 1262 |
 296.)
 """

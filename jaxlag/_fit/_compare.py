@@ -98,14 +98,14 @@ class Comparison(eqx.Module):
     def __str__(self) -> str:
         channels = self.best.prediction.channels
         head = ["model", "params", "error", *(f"rms of {name}" for name in channels)]
-        rows = [head]
+        lines = [head]
         for model in self.models:
             shown = [_numbers(model.prediction.rms(name)) for name in channels]
-            rows.append([model.name, str(len(model.fit.names)), f"{model.error:.4g}", *shown])
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            lines.append([model.name, str(len(model.fit.names)), f"{model.error:.4g}", *shown])
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in rows
+            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+            for line in lines
         ]
         return "\n".join(lines)
 
@@ -268,9 +268,9 @@ def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:
         return float("inf")
     shares = []
     for name in predicted.channels:
-        rows = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
-        shares.append(predicted.rms(name) / spreads(rows))
-    # A channel may have no number in the rows that were predicted.
+        values = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
+        shares.append(predicted.rms(name) / spreads(values))
+    # A channel may have no number in the samples that were predicted.
     known = np.concatenate(shares)
     known = known[np.isfinite(known)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")

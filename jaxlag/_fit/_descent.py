@@ -125,8 +125,8 @@ def cost_of(
     """Half the sum of squares over all segments, guessed from some of them; and of the priors."""
     segments = jax.tree.map(lambda x: x[which], shooting.segments)
     seen = SegmentOutputs(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
-    rows = shooting.weighed(guess.x[which], segments, seen.residuals)
-    total = jnp.sum(rows**2)
+    weighed = shooting.weighed(guess.x[which], segments, seen.residuals)
+    total = jnp.sum(weighed**2)
     if shooting.chained:
         after = (which + 1) % guess.x.shape[0]
         following = jax.tree.map(lambda x: x[after], shooting.segments)

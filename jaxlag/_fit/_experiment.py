@@ -129,9 +129,9 @@ class Experiment(eqx.Module):
         check_range(found, self.ts, f"ts of {self.name}")
         return found
 
-    def part(self, rows: slice | np.ndarray, name: str | None = None) -> "Experiment":
-        """Some of its rows, as an experiment whose start is free unless it is the same start."""
-        indices = np.arange(len(self.ts))[rows]
+    def part(self, samples: slice | np.ndarray, name: str | None = None) -> "Experiment":
+        """Some of its samples, as an experiment whose start is free unless it is the same start."""
+        indices = np.arange(len(self.ts))[samples]
 
         def of(x: np.ndarray | None) -> np.ndarray | None:
             if x is None or (x.ndim == 1 and indices[0] > 0):
@@ -152,26 +152,27 @@ class Experiment(eqx.Module):
     def windows(self, seconds: float | int) -> tuple["Experiment", ...]:
         """Pieces of equal length side by side, each with a start of its own.
 
-        A remainder that is shorter is left out, and so are pieces in gaps, of less than two rows.
+        A remainder that is shorter is left out, and so are pieces in gaps, of less than two
+        samples.
 
         Raises:
-            ValueError: the recording is shorter than that, or a piece would have one row.
+            ValueError: the recording is shorter than that, or a piece would have one sample.
         """
         if not 0 < seconds < np.inf:
             raise invalid("seconds", "be a positive number", f"it was {seconds!r}")
-        per_row = np.median(np.diff(self.ts))
-        count = int(np.floor((self.ts[-1] - self.ts[0] + per_row) / seconds * (1 + 1e-9)))
+        per_sample = np.median(np.diff(self.ts))
+        count = int(np.floor((self.ts[-1] - self.ts[0] + per_sample) / seconds * (1 + 1e-9)))
         if count < 1:
             length = self.ts[-1] - self.ts[0]
-            must = f"be at most the {length + per_row:g} s of {self.name}"
+            must = f"be at most the {length + per_sample:g} s of {self.name}"
             raise invalid("seconds", must, f"it was {seconds:g}")
-        edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_row
-        rows = np.searchsorted(self.ts, edges)
-        if seconds < 2 * per_row:
+        edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_sample
+        samples = np.searchsorted(self.ts, edges)
+        if seconds < 2 * per_sample:
             raise invalid("seconds", "be two samples or more", f"it was {seconds:g}")
         return tuple(
             self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
-            for a, b in pairwise(rows)
+            for a, b in pairwise(samples)
             if b - a >= 2  # none where the recording has a gap
         )
 
@@ -179,20 +180,24 @@ class Experiment(eqx.Module):
 def _times(name: str, ts: Any) -> np.ndarray:
     ts = np.asarray(ts, float)
     if ts.ndim != 1 or len(ts) < 2:
-        raise invalid(f"{name}: ts", "be one row of two times or more", f"its shape was {ts.shape}")
+        raise invalid(
+            f"{name}: ts", "be an array of two times or more", f"its shape was {ts.shape}"
+        )
     if not np.all(np.isfinite(ts)):
         raise invalid(f"{name}: ts", "be finite", "some were nan or inf")
     if not np.all(np.diff(ts) > 0):
         i = int(np.argmin(np.diff(ts) > 0))
         was = f"ts[{i}] = {ts[i]:g} and ts[{i + 1}] = {ts[i + 1]:g}"
-        raise invalid(f"{name}: ts", "increase strictly", was, "Sort the rows, drop repeated ones.")
+        raise invalid(
+            f"{name}: ts", "increase strictly", was, "Sort the samples, drop repeated ones."
+        )
     return ts
 
 
 def _channel(name: str, key: str, x: Any, count: int) -> np.ndarray:
     x = np.asarray(x, float)
     if x.ndim not in (1, 2) or x.shape[0] != count:
-        must = f"have one row per time, {count}"
+        must = f"have one sample per time, {count}"
         raise invalid(f"{name}: channels[{key!r}]", must, f"its shape was {x.shape}")
     if not np.any(np.isfinite(x)):
         fix = "Leave the channel out."

@@ -93,8 +93,8 @@ def fit(
         params0: all params; where the search starts.
         free: names of leaves to be found: "m", "link.mass", "links[0].mass"; a branch stands for
             all leaves below it.
-        channels: name -> function of a `Solution` to what was measured at its rows, (s,) or (s, k);
-            beside those that names mean by themselves.
+        channels: name -> function of a `Solution` to what was measured at its save times, (s,) or
+            (s, k); beside those that names mean by themselves.
         segments: per experiment; 1 is single shooting.
         transforms: name -> transform of a free leaf.
         priors: name -> `Prior` of a free leaf, in its own unit.

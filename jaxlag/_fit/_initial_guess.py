@@ -13,19 +13,19 @@ from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
 
 FEWEST = 5
-"""Rows through which a parabola is laid to find a value and a slope, at the least."""
+"""Samples through which a parabola is laid to find a value and a slope, at the least."""
 SHARE = 50
-"""A parabola spans this part of the rows of a recording."""
+"""A parabola spans this part of the samples of a recording."""
 
 
 def initial_states(
     system: System,
     experiment: Experiment,
-    rows: Sequence[int],
+    samples: Sequence[int],
     params: Any,
     options: dict[str, Any],
 ) -> np.ndarray:
-    """(q, v), or (q, u) of those that are not constrained, at some rows, (r, d).
+    """(q, v), or (q, u) of those that are not constrained, at some samples, (r, d).
 
     Coordinates and rates as q0 and v0 along the recording say, or else as measured, rates from
     slopes; what was not measured, by a simulation from q0 and v0 with the params of the guess.
@@ -35,21 +35,21 @@ def initial_states(
             there is no q0 or v0 to simulate from.
     """
     _check(system, experiment)
-    q, v = (_along(system, experiment, rows, kind) for kind in ("q0", "v0"))
+    q, v = (_along(system, experiment, samples, kind) for kind in ("q0", "v0"))
     if np.isnan(q).any() or np.isnan(v).any():
         motion = _simulated(system, experiment, params, options, q, v)
-        q = np.where(np.isnan(q), np.asarray(motion.q)[rows], q)
-        v = np.where(np.isnan(v), np.asarray(motion.v)[rows], v)
+        q = np.where(np.isnan(q), np.asarray(motion.q)[samples], q)
+        v = np.where(np.isnan(v), np.asarray(motion.v)[samples], v)
     if system.quasi is None:
         return np.concatenate([q, v], axis=1)
     given = experiment.v0
     if given is not None and given.ndim == 2:
-        u = given[list(rows)]
+        u = given[list(samples)]
     else:
-        times = jnp.asarray(experiment.ts[list(rows)])
+        times = jnp.asarray(experiment.ts[list(samples)])
         of = jax.vmap(lambda q, v, t: system.quasi_velocities(params, q, v, t))
         u = np.array(of(jnp.asarray(q), jnp.asarray(v), times))
-        if given is not None and rows[0] == 0:
+        if given is not None and samples[0] == 0:
             u[0] = given
     return np.concatenate([q, u[:, list(system.quasi.free)]], axis=1)
 
@@ -83,15 +83,15 @@ def _check(system: System, experiment: Experiment) -> None:
         raise invalid(f"{name}: start_sigma", must, f"its shape was {sigma.shape}")
 
 
-def _along(system: System, experiment: Experiment, rows: Sequence[int], kind: str) -> np.ndarray:
-    """Coordinates ("q0") or velocities ("v0") at the rows; NaN where they are not known."""
+def _along(system: System, experiment: Experiment, samples: Sequence[int], kind: str) -> np.ndarray:
+    """Coordinates ("q0") or velocities ("v0") at the samples; NaN where they are not known."""
     given = experiment.q0 if kind == "q0" else experiment.v0
     if kind == "v0" and system.quasi is not None:
         given = None  # those are quasi-velocities
     n = system.size
     if given is not None and given.ndim == 2:
-        return given[list(rows)]
-    found = np.full((len(rows), n), np.nan)
+        return given[list(samples)]
+    found = np.full((len(samples), n), np.nan)
     place = 0
     for name, shape in system.coordinates.shapes.items():
         width = int(np.prod(shape))
@@ -100,17 +100,17 @@ def _along(system: System, experiment: Experiment, rows: Sequence[int], kind: st
         rate = experiment.channels.get(f"{name}'")
         value = experiment.channels.get(name)
         if kind == "v0" and rate is not None:
-            found[:, part] = [_parabola(experiment.ts, rate, row)[0] for row in rows]
+            found[:, part] = [_parabola(experiment.ts, rate, sample)[0] for sample in samples]
         elif value is not None:
             which = 0 if kind == "q0" else 1
-            found[:, part] = [_parabola(experiment.ts, value, row)[which] for row in rows]
-    if given is not None and rows and rows[0] == 0:
+            found[:, part] = [_parabola(experiment.ts, value, sample)[which] for sample in samples]
+    if given is not None and samples and samples[0] == 0:
         found[0] = given
     return found
 
 
-def _parabola(ts: np.ndarray, x: np.ndarray, row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Value and slope at a row, of parabolas through the nearest rows that were measured.
+def _parabola(ts: np.ndarray, x: np.ndarray, sample: int) -> tuple[np.ndarray, np.ndarray]:
+    """Value and slope at a sample, of parabolas through the nearest samples that were measured.
 
     NaN in columns without any.
     """
@@ -119,9 +119,9 @@ def _parabola(ts: np.ndarray, x: np.ndarray, row: int) -> tuple[np.ndarray, np.n
         known = np.flatnonzero(np.isfinite(own))
         if len(known):
             count = min(len(known), max(FEWEST, len(ts) // SHARE))
-            near = known[np.argsort(np.abs(known - row), kind="stable")[:count]]
+            near = known[np.argsort(np.abs(known - sample), kind="stable")[:count]]
             degree = min(2, len(near) - 1)
-            coefficients = np.polyfit(ts[near] - ts[row], own[near], degree)
+            coefficients = np.polyfit(ts[near] - ts[sample], own[near], degree)
             found[:, column] = coefficients[-1], coefficients[-2] if degree else 0.0
     return found[0], found[1]
 

@@ -149,7 +149,7 @@ class MultipleShooting(eqx.Module):
         end = jnp.concatenate([motion.q[-1], rates])
         residuals = jnp.where(ok, residuals, far)
         end = jnp.where(ok, end, start)
-        # Rows beyond those that were measured hold nothing, not even NaN.
+        # Samples beyond those that were measured hold nothing, not even NaN.
         return jnp.where(measured, residuals, 0.0), end, status
 
     def linearized(self, guess: FitVariables) -> tuple[Any, Any]:
@@ -161,8 +161,8 @@ class MultipleShooting(eqx.Module):
 
         derivatives = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
 
-        def one(row: tuple[Array, Segments]) -> tuple[Any, Any]:
-            return derivatives(guess.z, *row)
+        def one(segment: tuple[Array, Segments]) -> tuple[Any, Any]:
+            return derivatives(guess.z, *segment)
 
         count, d = guess.x.shape
         at_once = max(1, MOVED_AT_ONCE // (guess.z.shape[0] + d))
@@ -404,8 +404,8 @@ def search(
 def moved(shooting: MultipleShooting, guess: FitVariables) -> SegmentOutputs:
     """What segments do, without derivatives."""
 
-    def one(row: tuple[Array, Segments]) -> tuple[Array, Array, Array]:
-        return shooting.one(guess.z, *row)
+    def one(segment: tuple[Array, Segments]) -> tuple[Array, Array, Array]:
+        return shooting.one(guess.z, *segment)
 
     count = guess.x.shape[0]
     return SegmentOutputs(*in_batches(one, (guess.x, shooting.segments), count, AT_ONCE))

@@ -25,7 +25,7 @@ def plotted(
     Args:
         experiments: what was measured.
         residuals: of each, channel -> motion less measurement, (s, k).
-        predicted: of each, (s,), rows beyond those that its start was fitted to; a line is drawn
+        predicted: of each, (s,), samples beyond those that its start was fitted to; a line is drawn
             where they begin.
 
     Raises:

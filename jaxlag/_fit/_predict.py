@@ -37,7 +37,7 @@ class Prediction(eqx.Module):
     Attributes:
         residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
             NaN where nothing was measured or the motion failed.
-        predicted: of each experiment, (s,): rows that the start was not fitted to; all of them
+        predicted: of each experiment, (s,): samples that the start was not fitted to; all of them
             where it was fitted to all.
         starts: of each experiment, (q, v) or (q, u) at its first time.
         failed: experiments whose motion failed, each with its status.
@@ -58,9 +58,9 @@ class Prediction(eqx.Module):
         return channels_of(self.residuals)
 
     def rms(self, channel: str) -> Float[np.ndarray, " k"]:
-        """Root mean square of a channel over all rows that were predicted, in its own unit."""
+        """Root mean square of a channel over all samples that were predicted, in its own unit."""
         own = zip(self.residuals, self.predicted, strict=True)
-        parts = [{name: x[rows] for name, x in each.items()} for each, rows in own]
+        parts = [{name: x[samples] for name, x in each.items()} for each, samples in own]
         return rms_of(parts, channel)
 
     def plot(self) -> Any:
@@ -109,8 +109,8 @@ def predict(
             measurements than a start has numbers.
 
     Warns:
-        where the search for the starts did not converge, and of each motion that failed: its rows
-        do not count.
+        where the search for the starts did not converge, and of each motion that failed: its
+        samples do not count.
 
     Example:
         >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
@@ -161,13 +161,13 @@ def predict(
     )
     for text in failed:
         warnings.warn(f"{text}: it does not count.", stacklevel=2)
-    rows = tuple(
+    samples = tuple(
         np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)
         for each, first in zip(experiments, early, strict=True)
     )
     return Prediction(
         residuals_of(whole, np.asarray(seen.residuals), status, experiments, where),
-        rows,
+        samples,
         tuple(np.asarray(found.starts)),
         failed,
         bool(found.converged),
@@ -176,21 +176,21 @@ def predict(
 
 
 def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> Experiment:
-    """The rows that a start is fitted to."""
+    """The samples that a start is fitted to."""
     if settle is None:
         return experiment
     if not settle > 0:
         raise invalid("settle", "be a positive number of seconds, or None", f"it was {settle!r}")
-    rows = int(np.searchsorted(experiment.ts, experiment.ts[0] + settle, side="right"))
-    if rows >= len(experiment.ts):
+    samples = int(np.searchsorted(experiment.ts, experiment.ts[0] + settle, side="right"))
+    if samples >= len(experiment.ts):
         was = f"it was {settle:g} s of {experiment.ts[-1] - experiment.ts[0]:g} s"
-        raise invalid("settle", f"leave rows of {experiment.name} to be predicted", was)
+        raise invalid("settle", f"leave samples of {experiment.name} to be predicted", was)
     known = experiment.start_sigma is not None
-    numbers = sum(int(np.isfinite(x[:rows]).sum()) for x in experiment.channels.values())
-    if rows < 2 or (not known and numbers < fewest):
+    numbers = sum(int(np.isfinite(x[:samples]).sum()) for x in experiment.channels.values())
+    if samples < 2 or (not known and numbers < fewest):
         must = f"hold {fewest} numbers or more of {experiment.name}, as many as a start"
         raise invalid("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
-    return experiment.part(slice(0, rows))
+    return experiment.part(slice(0, samples))
 
 
 def residuals_of(
@@ -208,6 +208,6 @@ def residuals_of(
     found = []
     for i, each in enumerate(experiments):
         own = np.flatnonzero(where.owner == i)
-        rows = np.concatenate([raw[k, where.places[k]] for k in own])
-        found.append({name: rows[:, where.columns[name]] for name in each.channels})
+        samples = np.concatenate([raw[k, where.places[k]] for k in own])
+        found.append({name: samples[:, where.columns[name]] for name in each.channels})
     return tuple(found)

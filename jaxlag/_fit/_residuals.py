@@ -18,7 +18,7 @@ def channels_of(residuals: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, ...
 
 
 def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float[np.ndarray, " k"]:
-    """Root mean square of a channel over all rows that have a number; NaN where none has.
+    """Root mean square of a channel over all samples that have a number; NaN where none has.
 
     Raises:
         ValueError: a channel that nobody measured.
@@ -26,9 +26,9 @@ def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float
     known = channels_of(residuals)
     if channel not in known:
         raise invalid("channel", f"be one of {list(known)}", f"it was {channel!r}")
-    rows = np.concatenate([each[channel] for each in residuals if channel in each])
-    count = np.count_nonzero(np.isfinite(rows), axis=0)
-    total = np.nansum(rows**2, axis=0)
+    values = np.concatenate([each[channel] for each in residuals if channel in each])
+    count = np.count_nonzero(np.isfinite(values), axis=0)
+    total = np.nansum(values**2, axis=0)
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
@@ -41,7 +41,7 @@ Reader = Callable[[Solution], Array]
 def readers(
     system: System, names: tuple[str, ...], own: Mapping[str, Reader], rows: tuple[str, ...]
 ) -> dict[str, Reader]:
-    """name -> function of a motion that gives the channel at its rows, (s,) or (s, k).
+    """name -> function of a motion that gives the channel at its save times, (s,) or (s, k).
 
     Args:
         system: what moves.
@@ -89,7 +89,7 @@ def read(
         motion: what is seen.
 
     Raises:
-        ValueError: a channel shows another number of rows or columns.
+        ValueError: a channel shows another number of times or columns.
     """
     count, shown = motion.ts.shape[0], []
     for (name, function), width in zip(channels.items(), widths, strict=True):

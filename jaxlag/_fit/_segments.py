@@ -16,10 +16,10 @@ from jaxlag._system._system import System
 
 
 class Segments(NamedTuple):
-    """k segments of s rows each.
+    """k segments of s samples each.
 
-    The last row is where a segment ends: its last measurement, or where the next one starts. Those
-    that have fewer rows are filled up with times before it, of weight 0.
+    The last sample is where a segment ends: its last measurement, or where the next one starts.
+    Those that have fewer samples are filled up with times before it, of weight 0.
 
     Attributes:
         ts: (k, s), s.
@@ -41,14 +41,14 @@ class Segments(NamedTuple):
 
 
 class SegmentLayout(NamedTuple):
-    """Where rows of experiments stand.
+    """Where samples of experiments stand.
 
     Attributes:
         owner: (k,), the experiment of each segment.
-        first: (k,), the first row of it.
-        count: (k,), how many rows.
+        first: (k,), the first sample of it.
+        count: (k,), how many samples.
         follows: (k,), whether the next segment goes on where this one ends.
-        places: where the rows of each segment stand among its s.
+        places: where the samples of each segment stand among its s.
         columns: name -> the channel's columns among m.
     """
 
@@ -61,14 +61,14 @@ class SegmentLayout(NamedTuple):
 
 
 def layout(experiments: Sequence[Experiment], segments: int) -> SegmentLayout:
-    """At most `segments` per experiment, of equally many rows as far as that goes."""
+    """At most `segments` per experiment, of equally many samples as far as that goes."""
     owner, first, count = [], [], []
     for i, experiment in enumerate(experiments):
-        rows = len(experiment.ts)
-        if segments > rows // 2:
-            was = f"it was {segments}, and {experiment.name} has {rows} rows"
-            raise invalid("segments", "leave two rows or more to each", was)
-        edges = np.round(np.linspace(0, rows, segments + 1)).astype(int)
+        samples = len(experiment.ts)
+        if segments > samples // 2:
+            was = f"it was {segments}, and {experiment.name} has {samples} samples"
+            raise invalid("segments", "leave two samples or more to each", was)
+        edges = np.round(np.linspace(0, samples, segments + 1)).astype(int)
         owner += [i] * segments
         first += edges[:-1].tolist()
         count += np.diff(edges).tolist()
@@ -104,7 +104,7 @@ def pack(
     Args:
         system: what moves.
         experiments: what was measured.
-        where: rows of each segment.
+        where: samples of each segment.
         sigma: of channels whose experiment gives none.
         guess: states where the segments start, (k, d).
     """
@@ -121,9 +121,9 @@ def pack(
         ts[k, : len(times) - 1] = times[:-1]
         ts[k, len(times) - 2 :] = np.linspace(times[-2], times[-1], length - len(times) + 2)
         for name, x in experiment.channels.items():
-            part, rows = where.columns[name], x[a:b]
-            known = np.isfinite(rows)
-            values[k, place, part] = np.where(known, rows, 0.0)
+            part, samples = where.columns[name], x[a:b]
+            known = np.isfinite(samples)
+            values[k, place, part] = np.where(known, samples, 0.0)
             noise = experiment.sigma[name][a:b] if name in experiment.sigma else sigma[name]
             weights[k, place, part] = known / noise
         if a == 0 and experiment.start_sigma is not None:
@@ -142,7 +142,7 @@ def pack(
 
 
 def _inputs_between(inputs: Any, start: float, end: float) -> Any:
-    """The inputs with only those rows of their tables that are read from start to end.
+    """The inputs with only those samples of their tables that are read from start to end.
 
     All of those that depend on params.
     """

@@ -136,11 +136,11 @@ def build_shooting(
     guesses, spread = [], []
     params = free.params0
     for i, each in enumerate(experiments):
-        rows = where.first[where.owner == i].tolist()
+        firsts = where.first[where.owner == i].tolist()
         some = np.linspace(0, len(each.ts) - 1, STATES_FOR_RANGE).astype(int).tolist()
-        states = initial_states(system, each, rows + some, params, dict(options))
-        guesses.append(states[: len(rows)])
-        spread.append(states[len(rows) :])
+        states = initial_states(system, each, firsts + some, params, dict(options))
+        guesses.append(states[: len(firsts)])
+        spread.append(states[len(firsts) :])
     segments = pack(system, experiments, where, noise, np.concatenate(guesses))
     problem = MultipleShooting(
         system,

@@ -81,9 +81,9 @@ def _after(signal: Any, ts: Array) -> Any:
 
     Else nothing would show that it moves where one segment ends and the next begins.
     """
-    if not isinstance(signal, AbstractInput) or not signal.rowed:
+    if not isinstance(signal, AbstractInput) or not signal.tabulated:
         return signal
-    field = signal.rowed[0]
+    field = signal.tabulated[0]
     times = getattr(signal, field)
     if times is None:
         return signal
@@ -186,8 +186,8 @@ def stacked(inputs: Sequence[dict[str, Any]], ends: Sequence[float]) -> StackedI
         was = " or ".join(sorted({str(sorted(each)) for each in inputs}))
         raise invalid("names of the inputs", "be the same in every experiment", f"they were {was}")
     columns = {name: _alike(name, [each[name] for each in inputs], ends) for name in inputs[0]}
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    halves = [eqx.partition(row, _params.is_array) for row in rows or [{}] * len(inputs)]
+    each = [dict(zip(columns, x, strict=True)) for x in zip(*columns.values(), strict=True)]
+    halves = [eqx.partition(x, _params.is_array) for x in each or [{}] * len(inputs)]
     arrays = jax.tree.map(lambda *x: jnp.stack(list(map(jnp.asarray, x))), *(a for a, _ in halves))
     return StackedInputs(arrays, _params.Static(halves[0][1]))
 
@@ -214,8 +214,8 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
         plain = [_choice(name, one, among, of_state) for one in plain]
     if not most:
         return plain
-    rows = (_later(times, most, end) for times, end in zip(knots, ends, strict=True))
-    return [Function(x.f, times) for x, times in zip(plain, rows, strict=True)]
+    later = (_later(times, most, end) for times, end in zip(knots, ends, strict=True))
+    return [Function(x.f, times) for x, times in zip(plain, later, strict=True)]
 
 
 def _choice(name: str, signal: Any, among: list[Any], of_state: bool) -> Function | Feedback:

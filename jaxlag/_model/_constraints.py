@@ -168,7 +168,7 @@ def _names(kind: str, names: Any) -> str | tuple[str, ...]:
 
 
 def _rows(constraint: AbstractConstraint, function: str, value: Any, dtype: Any) -> Array:
-    """What a residual returned, as one row of numbers; raises in our form while tracing."""
+    """What a residual returned, as a flat array; raises in our form while tracing."""
     argument = f"constraint {constraint.names!r}: {function}"
     if not eqx.is_array_like(value):
         raise invalid(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")

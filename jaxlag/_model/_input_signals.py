@@ -22,10 +22,11 @@ class AbstractInput(eqx.Module):
     """A signal u(t, q, v, params) of any fixed shape.
 
     Attributes:
-        rowed: the fields of which a step reads two rows, first the times that it lies between.
+        tabulated: the fields of which a step reads two entries, first the times that it lies
+            between.
     """
 
-    rowed: ClassVar[tuple[str, ...]] = ()
+    tabulated: ClassVar[tuple[str, ...]] = ()
 
     def knots(self) -> Float[Array, " k"] | None:
         """Times (s, increasing) at which steps must end; None if there are none."""
@@ -57,7 +58,7 @@ class AbstractTable(AbstractInput):
 
     times: eqx.AbstractVar[Array]
     values: eqx.AbstractVar[Array]
-    rowed = ("times", "values")
+    tabulated = ("times", "values")
 
     def knots(self) -> Float[Array, " k"] | None:
         """The table's times."""
@@ -91,7 +92,7 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
 def _increasing(argument: str, times: Array, least: int) -> Array:
     """Times as they are; raises unless there are so many and they increase, as far as is known."""
     if times.ndim != 1 or times.shape[0] < least:
-        must = f"be one row of at least {least} times"
+        must = f"be an array of at least {least} times"
         raise invalid(argument, must, f"its shape was {times.shape}")
     if concrete(times):
         steps = np.diff(np.asarray(times, float))
@@ -217,10 +218,10 @@ class Function(AbstractInput):
             derivatives of f there.
 
     Raises:
-        ValueError: `f` is not callable in either form; knots that are no row of increasing numbers.
+        ValueError: `f` is not callable in either form; knots that are no increasing numbers.
     """
 
-    rowed = ("ends",)
+    tabulated = ("ends",)
 
     f: Callable
     takes_params: bool = eqx.field(static=True)

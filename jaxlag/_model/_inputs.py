@@ -2,7 +2,7 @@
 
 Inputs have knots where the signal or its slope jumps. The driver ends a step on every knot, and
 evaluates a table throughout one step in the one interval that the step lies in, so that no stage
-ever reads the wrong side of a jump. All that a step reads of a table is two rows.
+ever reads the wrong side of a jump. All that a step reads of a table is two entries.
 """
 
 from collections.abc import Mapping
@@ -109,41 +109,42 @@ def tables(inputs: Mapping[str, Any]) -> dict[str, AbstractTable]:
 def at_interval(
     inputs: Mapping[str, Any], t: Float[Array, ""]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The inputs with the two rows of each around a time, and where these begin.
+    """The inputs with the two entries of each around a time, and where these begin.
 
     In the tables the interval is the first one; functions are those of the interval between knots.
     """
     starts = {}
     cuts = dict(inputs)
     for name, signal in inputs.items():
-        rows = _rows(signal)
-        if rows:
-            starts[name] = start = interval_at(rows[0], t, rows[0].shape[0] - 2)
+        entries = _entries(signal)
+        if entries:
+            starts[name] = start = interval_at(entries[0], t, entries[0].shape[0] - 2)
             cut = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=2)
-            cuts[name] = _with_rows(signal, *map(cut, rows))
+            cuts[name] = _with_entries(signal, *map(cut, entries))
     return cuts, starts
 
 
 def marked(signal: Any, start: Array) -> Any:
-    """The index where its rows begin in place of each leaf of an input that is read by rows."""
-    cut = {id(x) for x in _rows(signal)}
+    """The index where its entries begin in place of each leaf of an input that is a table."""
+    cut = {id(x) for x in _entries(signal)}
     return jax.tree.map(lambda x: start if id(x) in cut else None, signal)
 
 
-def _rows(signal: Any) -> list[Array]:
-    """What a step reads two rows of."""
-    fields = signal.rowed if isinstance(signal, AbstractInput) else ()
+def _entries(signal: Any) -> list[Array]:
+    """What a step reads two entries of."""
+    fields = signal.tabulated if isinstance(signal, AbstractInput) else ()
     return [x for x in (getattr(signal, name) for name in fields) if x is not None]
 
 
-def _with_rows(signal: Any, *rows: Array) -> Any:
-    """The same signal from other rows."""
-    return eqx.tree_at(lambda s: [getattr(s, name) for name in s.rowed], signal, rows)
+def _with_entries(signal: Any, *entries: Array) -> Any:
+    """The same signal from other entries."""
+    return eqx.tree_at(lambda s: [getattr(s, name) for name in s.tabulated], signal, entries)
 
 
 def counted_from(origin: Float[Array, ""], inputs: Mapping[str, Any]) -> dict[str, Any]:
     """The inputs, the times of tables counted from another one: small differences of late times."""
-    moved = {name: _with_rows(x, x.times - origin, x.values) for name, x in tables(inputs).items()}
+    given = tables(inputs).items()
+    moved = {name: _with_entries(x, x.times - origin, x.values) for name, x in given}
     return dict(inputs) | moved
 
 

@@ -159,12 +159,12 @@ def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
 def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
         raise invalid("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
-    ts = _number("ts", "be one row of times", ts, jnp.result_type(float))
+    ts = _number("ts", "be an array of times", ts, jnp.result_type(float))
     if ts.ndim != 1 or not at_most(2, ts.shape[0]):
         fix = ""
         if ts.ndim == 1 and not isinstance(ts.shape[0], int):
             fix = f'Write jax.export.symbolic_shape("k", constraints=["{ts.shape[0]} >= 2"]).'
-        raise invalid("ts", "be one row of at least 2 times", f"its shape was {ts.shape}", fix)
+        raise invalid("ts", "be an array of at least 2 times", f"its shape was {ts.shape}", fix)
     if not concrete(ts):
         return ts, None
     if not np.all(np.isfinite(ts)):

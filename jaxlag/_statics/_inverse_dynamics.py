@@ -45,7 +45,7 @@ def inverse_dynamics(
         v: velocities dq/dt, in the same form; m/s or rad/s.
         a: accelerations dv/dt, in the same form; m/s^2 or rad/s^2.
         params: as the Lagrangian takes them.
-        t: the instant in s, or the (s,) instants of the rows.
+        t: the instant in s, or the (s,) instants of the states.
         inputs: dict from names to input objects or arrays, as in `simulate`.
 
     Returns:
@@ -53,9 +53,9 @@ def inverse_dynamics(
         larger q_i.
 
     Raises:
-        ValueError: q, v, a not real numbers of shape (n,) or (s, n), not one row at least, or,
+        ValueError: q, v, a not real numbers of shape (n,) or (s, n), not one state at least, or,
             where they have values, not finite (the coordinate is named); t not one instant for
-            each row; inputs that no force reads.
+            each state; inputs that no force reads.
 
     Source: Pila, secs. 2.7, 2.8 (motion prescribed, forces asked) and eq. 3.53.
 
@@ -101,12 +101,12 @@ def prescribed_motion(
 
     Raises:
         ValueError: `motion` is no function of t, or does not return real numbers of shape (n,);
-            t is neither a number nor a row of them.
+            t is neither a number nor an array (s,).
     """
     require_arity("prescribed_motion: motion", motion, ("t",))
     t = real("prescribed_motion: t", t).astype(jnp.result_type(float))
     if t.ndim > 1:
-        must, was = "be an instant or a row of them", f"its shape was {t.shape}"
+        must, was = "be an instant or an array of them", f"its shape was {t.shape}"
         raise invalid("prescribed_motion: t", must, was)
 
     def coordinates(t: Array) -> Array:
@@ -149,25 +149,27 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
             raise invalid(argument, "hold at least one instant", f"its shape was {x.shape}")
         _check_finite(argument, x, labels)
         vectors.append(x)
-    rows = vectors[0].shape[:-1]
+    batch = vectors[0].shape[:-1]
     t = real("inverse_dynamics: t", t)
-    if t.shape not in ((), rows):
-        raise invalid("inverse_dynamics: t", f"have shape () or {rows}", f"its shape was {t.shape}")
+    if t.shape not in ((), batch):
+        raise invalid(
+            "inverse_dynamics: t", f"have shape () or {batch}", f"its shape was {t.shape}"
+        )
     if concrete(t) and not np.all(np.isfinite(t)):
         raise invalid("inverse_dynamics: t", "be finite", f"it was {t}")
     q, v, a = of_state("q, v and a", *vectors)
-    return q, v, a, jnp.broadcast_to(t, rows).astype(jnp.result_type(float))
+    return q, v, a, jnp.broadcast_to(t, batch).astype(jnp.result_type(float))
 
 
 def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
-    """Raise unless a vector or rows of them with values are finite."""
+    """Raise unless a vector or several with values are finite."""
     if not concrete(x) or np.all(np.isfinite(x)):
         return
     values = np.asarray(x)
-    *row, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
-    where = f"{argument.split()[-1]}[{', '.join(map(str, (*row, i)))}] ({labels[i]!r})"
-    fix = "Rows that a motion did not reach are NaN: leave them out." if row else ""
-    raise invalid(argument, "be finite", f"{where} was {values[(*row, i)]}", fix)
+    *index, i = (int(k) for k in np.argwhere(~np.isfinite(values))[0])
+    where = f"{argument.split()[-1]}[{', '.join(map(str, (*index, i)))}] ({labels[i]!r})"
+    fix = "States that a motion did not reach are NaN: leave them out." if index else ""
+    raise invalid(argument, "be finite", f"{where} was {values[(*index, i)]}", fix)
 
 
 @partial(jax.jit, static_argnums=0)

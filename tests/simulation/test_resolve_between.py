@@ -66,7 +66,7 @@ def adaptive():
     [
         (fixed, 0.3, "adaptive steps, but its steps were fixed"),
         (adaptive, 1.5, r"lie within the motion, from 0.0 to 1.0 s, but one was 1.5"),
-        (adaptive, [[0.1]], r"be a number or one row of numbers, but its shape was \(1, 1\)"),
+        (adaptive, [[0.1]], r"be a number or a sequence of numbers, but its shape was \(1, 1\)"),
         (
             lambda: jax.vmap(lambda k: adaptive())(jnp.ones(2)),
             0.3,

@@ -19,7 +19,7 @@ from jaxlag._tracing import _params
 # Code of more lines is one function that XLA does not inline: copied into every stage of a solver
 # it compiles in many times the time, and XLA's fusion computes shared lines anew in each use.
 INLINE_UP_TO = 60
-# In a loop over one trajectory or a few lanes. On wider rows XLA may want to split the work of a
+# In a loop over one trajectory or a few lanes. On wider arrays XLA may want to split the work of a
 # function among threads, which it cannot do inside a loop that is one native function.
 INLINE_IN_LOOP = 14
 
@@ -32,7 +32,7 @@ def prelude(
     there: Array | None = None,
     sense: Array | float = 1.0,
 ) -> Float[Array, " k"]:
-    """What the body needs of what does not change during a solve, in one row.
+    """What the body needs of what does not change during a solve, as one array.
 
     Args:
         program: straight-line code.
@@ -75,7 +75,7 @@ def body(
         q: coordinates.
         v: velocities.
         inputs: values of the inputs by name.
-        lanes: whether this is vmapped: every scalar is a row of numbers.
+        lanes: whether this is vmapped: every scalar is an array of numbers.
         in_loop: whether this is in a loop over one trajectory or a few lanes.
     """
     names, dtype = {name for name, _ in program.inputs}, q.dtype

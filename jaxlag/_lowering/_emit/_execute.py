@@ -123,7 +123,7 @@ def _line(line: Line, args: list[Any]) -> Any:
 
 
 def _by_rule(rule: Rule, args: Sequence[Any]) -> Array:
-    """All results of a function with a derivative rule of its own, in one row."""
+    """All results of a function with a derivative rule of its own, as one array."""
     operands, start = [], 0
     for aval in rule.avals:
         part = [jnp.asarray(x, aval.dtype) for x in args[start : start + aval.size]]
@@ -140,7 +140,7 @@ def numbers(program: Program, dtype: Any) -> dict[int, Any]:
 
 
 def stacked(numbers: Sequence[Array], dtype: Any) -> Array:
-    """Numbers in one row, which may be empty: the inverse of `elements`."""
+    """Numbers as one array, which may be empty: the inverse of `elements`."""
     return jnp.stack(numbers) if numbers else jnp.zeros((0,), dtype)
 
 

@@ -21,35 +21,37 @@ from jaxlag._core._xla import not_inlined
 from jaxlag._lowering._emit._execute import Pairs, is_trig, stacked, straight
 from jaxlag._lowering._graph._straight_line import Program
 
-Row = tuple[Array, Array]  # (what does not change during a solve, state and inputs)
+Halves = tuple[Array, Array]  # (what does not change during a solve, state and inputs)
 
 
 @lru_cache(maxsize=256)
 def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array], Array]:
-    """(what does not change, state and inputs) -> results, each in one row."""
+    """(what does not change, state and inputs) -> results, each as one array."""
     slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
 
-    def both(row: Row, kept: Array | None = None) -> tuple[Array, Array]:
+    def both(numbers: Halves, kept: Array | None = None) -> tuple[Array, Array]:
         """Results, and the sines and cosines they are made from, which may be known."""
         pairs: Pairs = {}
         known: Pairs | None = None
         if kept is not None:
             x = elements(kept)
             known = {slot: (x[2 * i], x[2 * i + 1]) for i, slot in enumerate(slots)}
-        given = elements(row[0]), elements(row[1])
+        given = elements(numbers[0]), elements(numbers[1])
         found = jnp.stack(straight(program, dtype, *given, lanes, pairs, known))
         trig = [x for slot in slots for x in pairs[slot]]
         return found, stacked(trig, dtype)
 
-    def results(row: Row) -> Array:
-        return jnp.stack(straight(program, dtype, elements(row[0]), elements(row[1]), lanes))
+    def results(numbers: Halves) -> Array:
+        return jnp.stack(
+            straight(program, dtype, elements(numbers[0]), elements(numbers[1]), lanes)
+        )
 
     @CustomJVP
     def call(carried: Array, given: Array) -> Array:
         return apart((carried, given))
 
     @partial(call.defjvp, symbolic_zeros=True)
-    def _(primals: Row, tangents: tuple) -> tuple:
+    def _(primals: Halves, tangents: tuple) -> tuple:
         found, kept = keeping(*primals)
         return found, _derivative(of_results, (primals, kept), tangents)
 
@@ -58,32 +60,32 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
         return both_apart((carried, given))
 
     @partial(keeping.defjvp, symbolic_zeros=True)
-    def _(primals: Row, tangents: tuple) -> tuple:
+    def _(primals: Halves, tangents: tuple) -> tuple:
         found, kept = keeping(*primals)
         return (found, kept), _derivative(of_both, (primals, kept), tangents)
 
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
     apart, both_apart = boundary(results), boundary(both)
-    of_results, of_both = _maps(lambda row, kept: both(row, kept)[0]), _maps(both)
+    of_results, of_both = _maps(lambda numbers, kept: both(numbers, kept)[0]), _maps(both)
     return call
 
 
 def _by_numbers(function: Callable, dtype: Any) -> Callable:
-    """A function of rows that is not inlined; every number comes in and goes out by itself.
+    """A function of arrays that is not inlined; every number comes in and goes out by itself.
 
-    In lanes each is a row of its own. Code for a table of them would find out for every number of
-    it which row that is in, and compute all rows for each.
+    In lanes each is an array of its own. Code for a table of them would find out for every number
+    of it which array that is in, and compute all arrays for each.
     """
 
-    def whole(rows: Any) -> Any:
+    def whole(arrays: Any) -> Any:
         one = partial(stacked, dtype=dtype)
-        return jax.tree.map(one, rows, is_leaf=lambda x: isinstance(x, list))
+        return jax.tree.map(one, arrays, is_leaf=lambda x: isinstance(x, list))
 
     def separate(*numbers: Any) -> Any:
         return jax.tree.map(elements, function(*whole(numbers)))
 
     inner = not_inlined(separate)
-    return lambda *rows: whole(inner(*jax.tree.map(elements, rows)))
+    return lambda *arrays: whole(inner(*jax.tree.map(elements, arrays)))
 
 
 def _derivative(maps: dict, at: tuple, tangents: tuple) -> Any:
@@ -95,14 +97,15 @@ def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
     """The derivative of function(row, kept) in the row, by which halves of it move."""
 
     def pushed(at: tuple, dot: tuple) -> Any:
-        row, kept = at
-        filled = tuple(jnp.zeros_like(x) if d is None else d for x, d in zip(row, dot, strict=True))
-        return jax.jvp(lambda row: function(row, kept), (row,), (filled,))[1]
+        numbers, kept = at
+        pairs = zip(numbers, dot, strict=True)
+        filled = tuple(jnp.zeros_like(x) if d is None else d for x, d in pairs)
+        return jax.jvp(lambda x: function(x, kept), (numbers,), (filled,))[1]
 
     def pulled(which: tuple[bool, bool]) -> Callable:
         def of(at: tuple, bar: Any) -> tuple:
-            row, kept = at
-            parts = jax.vjp(lambda row: function(row, kept), row)[1](bar)[0]
+            numbers, kept = at
+            parts = jax.vjp(lambda numbers: function(numbers, kept), numbers)[1](bar)[0]
             return tuple(x if moves else None for x, moves in zip(parts, which, strict=True))
 
         return of
