@@ -249,7 +249,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
     def straight(t: Any, q: Any, v: Any, params: Any) -> Any:
         """v' = B u' + s from the rates (v, u') of the scalar program."""
         w = speeds(t, q, v, params)
-        prepared: Any = scalars.prepare(q, params, {}, kept=choice.kept, reacting=choice)
+        prepared: Any = scalars.precompute(q, params, {}, kept=choice.kept, reacting=choice)
         rates = scalars.rates(t, q, w, params, {}, prepared)
         du = rates[q.shape[0] :]
 

@@ -95,7 +95,7 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
         terms = replace(terms, in_loop=True)
 
     def equations(params: Any) -> Field:
-        prepared = terms.prepare(like, params, {})
+        prepared = terms.precompute(like, params, {})
 
         def on_scalars(q: Parts, v: Parts) -> Parts:
             assert isinstance(terms, ScalarTerms)

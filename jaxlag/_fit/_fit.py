@@ -49,7 +49,7 @@ UNITS = 3
 """Searches of one stage, with units that fit better each time."""
 FAR_OFF = 1e3
 """By which an unknown's unit may be wrong."""
-ASTRAY = 0.3
+MAX_NEWTON_DISTANCE = 0.3
 """Standard deviations, within which estimates are to be where their derivatives lead."""
 LARGEST_COVARIANCE = 200
 """Numbers, beyond which a covariance costs more than the descent that found them."""
@@ -362,7 +362,7 @@ def _warn_after(result: FitResult) -> None:
             text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
             text += f"{result.costs[-1]:.3g}: take a lower learning rate."
         warnings.warn(text, stacklevel=3)
-    if result.converged and result.distance > ASTRAY:
+    if result.converged and result.distance > MAX_NEWTON_DISTANCE:
         text = (
             f"The search stopped {result.distance:.2g} standard deviations from where derivatives"
         )

@@ -28,7 +28,7 @@ from jaxlag._system._system import System
 
 SHOWN = 40
 """Estimates in a result's text."""
-UNTOLD = 1e-12
+INSENSITIVE = 1e-12
 """A column of round-off, over the largest, of unknowns of order one: nothing measured depends on
 its number."""
 
@@ -305,7 +305,7 @@ def _uncertainty(
     factor, by_z, at_first = map(np.asarray, linearised(problem.free, found))
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
-    told = np.linalg.norm(factor, axis=0) > UNTOLD * np.linalg.norm(factor)
+    told = np.linalg.norm(factor, axis=0) > INSENSITIVE * np.linalg.norm(factor)
     held = problem.free.at_limit(found.guess.z) & told
     moves = ~(saturated(factor, by_z, at_first) | held)
     own = np.ix_(moves, moves)

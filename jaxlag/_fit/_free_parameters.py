@@ -16,7 +16,7 @@ NO_PRIOR = np.zeros(0, int), np.zeros(0), np.zeros(0)
 """Of which numbers, means, standard deviations: nothing is known beforehand."""
 
 
-IDLE = 1e-3
+SATURATED = 1e-3
 """An unknown that moves its numbers by this part of what it did at first, and weighted residuals by
 this much, has run off: the numbers are on a bound, within this part of a standard deviation."""
 

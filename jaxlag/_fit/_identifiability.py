@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._status import Status
-from jaxlag._fit._free_parameters import IDLE, Unknowns
+from jaxlag._fit._free_parameters import SATURATED, Unknowns
 from jaxlag._fit._linear_least_squares import LinearRows, eliminate
 from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 
@@ -93,7 +93,7 @@ def saturated(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.
         at_first: (e, e), likewise where the search began.
     """
     sizes, before, moved = (np.linalg.norm(x, axis=0) for x in (by_z, at_first, factor))
-    idle = (sizes <= IDLE * before) & (moved <= IDLE)
+    idle = (sizes <= SATURATED * before) & (moved <= SATURATED)
     tied = (by_z != 0) | (at_first != 0)
     tied |= tied.T
     for _ in range(len(idle)):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._core._batching import in_batches
 from jaxlag._core._status import Status
 from jaxlag._fit._bounded_least_squares import box_least_squares
-from jaxlag._fit._free_parameters import IDLE, Unknowns
+from jaxlag._fit._free_parameters import SATURATED, Unknowns
 from jaxlag._fit._linear_least_squares import LinearRows, condense, eliminate, sizes_of, states_of
 from jaxlag._fit._residuals import Reader, read
 from jaxlag._fit._segments import Segments
@@ -307,7 +307,7 @@ class Eliminating(optx.AbstractDescent):
         if free.plain:
             return _Condensed(rows, None, None)
         speeds, p = free.speeds(y.z), y.z.shape[0]
-        idle = (speeds <= IDLE) & (sizes_of(rows)[-p - 1 : -1] <= IDLE)
+        idle = (speeds <= SATURATED) & (sizes_of(rows)[-p - 1 : -1] <= SATURATED)
         reach = jnp.where(idle, 0.0, free.reach)
         down, up = jnp.maximum(-reach, free.low - y.z), jnp.minimum(reach, free.high - y.z)
         return _Condensed(rows, jnp.minimum(speeds, 1.0), (down, up))

@@ -53,7 +53,7 @@ def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
     @CustomJVP
     def run(inexact: Any, rest: Any, setup: Setup) -> tuple[SavedStates, Outcome]:
         outcome = _driven(inexact, rest, setup, static, record=False)
-        return _told(outcome)
+        return _ended(outcome)
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
@@ -64,17 +64,17 @@ def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
         if static[1].remembers:
             function = partial(_replay, rest, setup, static, outcome)
             states, states_dot = jax.jvp(function, (inexact,), (filled(change, inexact),))
-            told = _told(outcome)[1]
+            ended = _ended(outcome)[1]
         else:
             walk = changed(inexact, rest, setup, static, outcome.record, change)
-            states, told = _told(outcome)
+            states, ended = _ended(outcome)
             states_dot = SavedStates(walk.saved[0], walk.last[0], walk.time)
-        told = told._replace(gradient=_mode(outcome, static))
+        ended = ended._replace(gradient=_mode(outcome, static))
         reached = jnp.all(jnp.isfinite(outcome.saved), axis=tuple(range(1, outcome.saved.ndim)))
         states_dot = states_dot._replace(
             saved=unreached(reached, inexact, change, states_dot.saved)
         )
-        return (states, told), (states_dot, jax.tree.map(lambda _: None, told))
+        return (states, ended), (states_dot, jax.tree.map(lambda _: None, ended))
 
     return run(inexact, rest, setup)
 
@@ -86,7 +86,7 @@ def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
     return inexact, rest, problem.setup, (static, problem.stepper, problem.max_steps, problem.keep)
 
 
-def _told(outcome: Outcome) -> tuple[SavedStates, Outcome]:
+def _ended(outcome: Outcome) -> tuple[SavedStates, Outcome]:
     """The saved states, and what is said of a solve without what was kept on the way."""
     lost = (outcome.missed != int(Status.ok)) & (outcome.status == int(Status.ok))
     status = jnp.where(lost, outcome.missed, outcome.status).astype(jnp.int32)

@@ -46,7 +46,7 @@ def _zeros(state: PyTree, size: Any) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
 
 
-def _turn_of_save(record: Record, r: Array) -> Array:
+def _turn_of_save_time(record: Record, r: Array) -> Array:
     """The turn of save time r between the first and the last; none beyond these."""
     assert record.save_turn is not None
     return jnp.where(r < 0, -1, at(record.save_turn, r))
@@ -79,7 +79,7 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
             kept = set_entry(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
         before = (y, dy)
         if saved is not None:
-            j = _turn_of_save(record, r)
+            j = _turn_of_save_time(record, r)
             left = (j < k) & (j < record.turns)
             to_save = eqxi.unvmap_any(left & use)
             use, save = use & ~to_save, left & (~use | to_save)
@@ -115,14 +115,14 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
         y, dy = pick(use, (y1, dy1), (y, dy))
         return k + (~to_save).astype(jnp.int32), r, y, dy, base, saved, kept
 
-    def goes_on(carry: tuple) -> Array:
+    def cond_fun(carry: tuple) -> Array:
         k, r, *_ = carry
         left = k < record.turns
         if saved is not None:
-            left = left | (_turn_of_save(record, r) < record.turns)
+            left = left | (_turn_of_save_time(record, r) < record.turns)
         return eqxi.unvmap_any(left)
 
-    loop = partial(jax.lax.while_loop, goes_on, turn)
+    loop = partial(jax.lax.while_loop, cond_fun, turn)
     *_, dy, _, saved, kept = path.native(loop, begin)
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
@@ -158,7 +158,7 @@ def adjoint_sweep(
 
     def save_left(r: Array) -> Array:
         """The turn of the last save time that is left."""
-        return jnp.array(-1) if between is None else _turn_of_save(record, r - 1)
+        return jnp.array(-1) if between is None else _turn_of_save_time(record, r - 1)
 
     def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
         """One turn back: turn k - 1, or save times reached from the state before turn k.
@@ -166,7 +166,7 @@ def adjoint_sweep(
         The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
         a save time reached from the state before its last step; `owed` is what that adds there.
         """
-        k, r, bar, owed, (args_bar, anchors_bar, dues_bar) = carry
+        k, r, bar, pending, (args_bar, anchors_bar, dues_bar) = carry
         j, now = save_left(r), clock.time(k - 1, anchors)
         here = j == k
         to_save = eqxi.unvmap_any(here)
@@ -206,14 +206,14 @@ def adjoint_sweep(
             bar = pick(use, before, bar)
         else:
             zeros = jax.tree.map(jnp.zeros_like, bar)
-            summed = _add(before, pick(here, bar, owed))
+            summed = _add(before, pick(here, bar, pending))
             bar = pick(use | here, summed, bar)
-            owed = pick(use, zeros, pick(save & ~here, summed, owed))
+            pending = pick(use, zeros, pick(save & ~here, summed, pending))
             r = r - save.astype(jnp.int32)
         if wanted.points is not None:
             at_point = ~to_save & (k % record.stride == 0) & (k < record.turns)
             bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
-        return k, r, bar, owed, (args_bar, anchors_bar, dues_bar)
+        return k, r, bar, pending, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
         """All turns after the first, that one and its save times."""
@@ -265,8 +265,8 @@ def adjoint_sweep(
     if record.save_turn is not None:
         saves_left = jnp.sum(record.save_turn < record.turns, dtype=jnp.int32)
     bar = _add(wanted.last, end_bar)
-    owed = None if between is None else jax.tree.map(jnp.zeros_like, bar)
-    ended = path.native(all_back, (most, saves_left, bar, owed, bars))
+    pending = None if between is None else jax.tree.map(jnp.zeros_like, bar)
+    ended = path.native(all_back, (most, saves_left, bar, pending, bars))
     _, _, bar, _, (args_bar, anchors_bar, dues_bar) = ended
     bar = _add(bar, jax.tree.map(lambda x: x[0], wanted.saved))
     saves_bar = None

@@ -136,7 +136,7 @@ def _rows_consistent(
         bad = jnp.where(near, bad / floor, 0.0)
         found = _consistency(off, bad, near, phi, rate)
         return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
-    K = terms.correction(t, q, v, params, args.prepared, args.kept)
+    K = terms.correction(t, q, v, params, args.constants, args.kept)
 
     def left(c: Array) -> Array:
         return jnp.abs(c - A @ (K @ c)) / unit

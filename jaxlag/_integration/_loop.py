@@ -129,15 +129,15 @@ def integrate(
         c = _turn(loop, eqx.combine(dynamic, static))
         return eqx.partition(c, eqx.is_array)[0]
 
-    def goes_on(c: Any) -> Array:
+    def cond_fun(c: Any) -> Array:
         return eqxi.unvmap_any(~c.done | _is_due(loop, c))
 
     def turns(dynamic: Any) -> Any:
         if room in (0, size):
-            return jax.lax.while_loop(goes_on, turn, dynamic)
-        until_full = lambda c: goes_on(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
+            return jax.lax.while_loop(cond_fun, turn, dynamic)
+        until_full = lambda c: cond_fun(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
         fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
-        return jax.lax.while_loop(goes_on, lambda c: fill(thin(c, room)), dynamic)
+        return jax.lax.while_loop(cond_fun, lambda c: fill(thin(c, room)), dynamic)
 
     final = turns(dynamic) if native is None else native(turns, dynamic)
     return _outcome(eqx.combine(final, static), times, y0, allowed)

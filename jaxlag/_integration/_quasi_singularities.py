@@ -95,13 +95,13 @@ def determinants(
     if _by_program(args):
         assert isinstance(terms, ScalarTerms)
         values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
-        return terms.determinants(t, q, params, values, args.prepared)
+        return terms.determinants(t, q, params, values, args.constants)
     return quasi.determinant(t, q, params)[None]
 
 
 def _by_program(args: Arguments) -> bool:
     return (
-        isinstance(args.prepared, ScalarSolveConstants) and args.prepared.determinants is not None
+        isinstance(args.constants, ScalarSolveConstants) and args.constants.determinants is not None
     )
 
 

@@ -69,7 +69,7 @@ class Arguments(NamedTuple):
     origin: Float[Array, ""]  # the start, in the user's time
     end: Float[Array, ""]  # beyond which no time is read
     gaps: KnotIntervals | None  # None without tables
-    prepared: Any  # what accelerations need of what depends on params alone
+    constants: Any  # what accelerations need of what depends on params alone
     rows: RowSelection | None = None  # None where there is no choice
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     usual: Float[Array, " b"] | None = None  # see `_quasi_singularities.usual`

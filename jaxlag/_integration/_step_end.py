@@ -84,12 +84,12 @@ class StepEnd(eqx.Module):
         t, q, v, params, values = self.dynamics.at(tau, y, args)
         right, terms = [], self.dynamics.terms
         if self._contacts:
-            if isinstance(args.prepared, ScalarSolveConstants) and isinstance(terms, ScalarTerms):
-                lam = terms.multipliers(t, q, v, params, values, args.prepared)
+            if isinstance(args.constants, ScalarSolveConstants) and isinstance(terms, ScalarTerms):
+                lam = terms.multipliers(t, q, v, params, values, args.constants)
             else:
-                array, prepared = self.dynamics.array, args.prepared
-                assert isinstance(prepared, SolveConstants)
-                lam = array.multipliers(t, q, v, params, values, prepared, args.reacting)
+                array, constants = self.dynamics.array, args.constants
+                assert isinstance(constants, SolveConstants)
+                lam = array.multipliers(t, q, v, params, values, constants, args.reacting)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
             assert args.senses is not None

@@ -59,7 +59,7 @@ class VectorField(eqx.Module):
         regular: whether M is positive definite without the constraints; None where that shows at
             the start of a solve alone.
         apart: whether rows whose multipliers forces read are known to be independent.
-        onwards: whether the method has stages beyond the end of a step.
+        extrapolates: whether the method has stages beyond the end of a step.
         crossing: whether rows that come to depend on others on the way are left out there.
     """
 
@@ -76,7 +76,7 @@ class VectorField(eqx.Module):
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool | None = eqx.field(static=True, default=False)
     apart: bool = eqx.field(static=True, default=False)
-    onwards: bool = eqx.field(static=True, default=False)
+    extrapolates: bool = eqx.field(static=True, default=False)
     crossing: bool = eqx.field(static=True, default=False)
 
     @property
@@ -145,7 +145,9 @@ class VectorField(eqx.Module):
     def _traced(self, inputs: Any) -> Any:
         return eqx.filter(inputs, _params.is_array)
 
-    def prepare(self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments) -> Arguments:
+    def precompute(
+        self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
+    ) -> Arguments:
         """The arguments with all that accelerations need of what depends on params alone."""
         t, q, v, params, values = self.at(tau, y, args)
         args = args._replace(rows=self._choice(t, q, v, params, values))
@@ -156,16 +158,16 @@ class VectorField(eqx.Module):
         sense = self.turned(jnp.ones_like(tau), args)
         rows = args.kept, args.reacting
         given = q, params, values, self.sample, *rows, sense
-        prepared = self.terms.prepare(*given)
+        constants = self.terms.precompute(*given)
         either = self.regular is None and self.formulation != "null_space"
-        if either and isinstance(prepared, ScalarSolveConstants):
+        if either and isinstance(constants, ScalarSolveConstants):
             terms = self.terms
             assert isinstance(terms, ScalarTerms)
-            alone = terms.regular().prepare(*given)
+            alone = terms.regular().precompute(*given)
             if isinstance(alone, ScalarSolveConstants):
                 definite = self._definite(t, q, v, params)
-                prepared = prepared._replace(definite=definite, alone=alone)
-        return args._replace(prepared=prepared)
+                constants = constants._replace(definite=definite, alone=alone)
+        return args._replace(constants=constants)
 
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
@@ -217,7 +219,7 @@ class VectorField(eqx.Module):
             bounded = (jnp.minimum if self.direction == 1 else jnp.maximum)(t, end)
         else:
             bounded = jnp.clip(t, *(f(args.origin, end) for f in (jnp.minimum, jnp.maximum)))
-        if not self.onwards:
+        if not self.extrapolates:
             return bounded
         rounding = 4 * jnp.finfo(t.dtype).eps * (jnp.abs(args.origin) + jnp.abs(end))
         return jnp.where(jnp.abs(t - end) > rounding, t, bounded)
@@ -268,16 +270,16 @@ class VectorField(eqx.Module):
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
         t, q, v, params, values = self.at(tau, y, args)
-        return self.terms.acceleration(t, q, v, params, values, args.prepared, args.reacting)
+        return self.terms.acceleration(t, q, v, params, values, args.constants, args.reacting)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
         terms, (q, w) = self.terms, self.parts(y)
         if isinstance(terms, ScalarTerms):
-            if isinstance(args.prepared, ScalarSolveConstants):
+            if isinstance(args.constants, ScalarSolveConstants):
                 t, (params, _) = self.clock(tau, args), self.given(args)
                 values = self._values(tau, q, w, args)
-                return terms.rates(t, q, w, params, values, args.prepared)
+                return terms.rates(t, q, w, params, values, args.constants)
             terms = terms.array
         assert isinstance(terms, ArrayTerms)
         t, q, _, params, values = self.at(tau, y, args)
@@ -310,7 +312,7 @@ class VectorField(eqx.Module):
 
     def velocities_of(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
         """The same, by the scalar program where there is one."""
-        if self.quasi is None or not isinstance(args.prepared, ScalarSolveConstants):
+        if self.quasi is None or not isinstance(args.constants, ScalarSolveConstants):
             return self.velocities(t, q, w, self.given(args)[0])
         return self._by_program(t, q, w, args)
 
@@ -319,7 +321,7 @@ class VectorField(eqx.Module):
         terms, (params, _) = self.terms, self.given(args)
         assert isinstance(terms, ScalarTerms)
         values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
-        return terms.velocities(t, q, w, params, values, args.prepared)
+        return terms.velocities(t, q, w, params, values, args.constants)
 
     def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
         """(t, q, v, params, values of the inputs) at (tau, y)."""
@@ -331,7 +333,9 @@ class VectorField(eqx.Module):
         args = self.within(args, tau)
         (params, inputs), since = self.given(args), self.turned(tau, args)
         first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
-        return evaluate(inputs, self.clock(tau, args), q, v, params, first, since, self.onwards)
+        return evaluate(
+            inputs, self.clock(tau, args), q, v, params, first, since, self.extrapolates
+        )
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -356,15 +360,15 @@ class VectorField(eqx.Module):
         """The constraints near a predicted state."""
         t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
         params, _ = self.given(args)
-        if isinstance(args.prepared, ScalarSolveConstants):
+        if isinstance(args.constants, ScalarSolveConstants):
             assert isinstance(terms, ScalarTerms)
             values = self._values(tau, q, v, args)
-            return terms.surface(t, q, v, params, values, args.prepared)
+            return terms.surface(t, q, v, params, values, args.constants)
         v = self.velocities(t, q, v, params)
         holonomic = np.flatnonzero(self.rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
-            return self.array.corrections(t, q, v, params, args.prepared, args.kept, chosen)
+            return self.array.corrections(t, q, v, params, args.constants, args.kept, chosen)
 
         def position(q: Array) -> Array:
             return terms.position(t, q, params)

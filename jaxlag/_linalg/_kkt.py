@@ -330,8 +330,8 @@ def _iterated(newton: Callable, lam: Array) -> Array:
         found = newton(lam)[1]
         return found, jnp.max(jnp.abs(found - lam) / (1.0 + jnp.abs(found))), count + 1
 
-    def goes_on(state: tuple[Array, Array, Array]) -> Array:
+    def cond_fun(state: tuple[Array, Array, Array]) -> Array:
         return (state[1] > 8 * eps) & (state[2] < MAX_NEWTON)
 
     begin = (lam, jnp.full((), jnp.inf, lam.dtype), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(goes_on, turn, begin)[0]
+    return jax.lax.while_loop(cond_fun, turn, begin)[0]

@@ -145,7 +145,7 @@ def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
     """
     target = TARGET * _eps(start)
 
-    def goes_on(state: Any) -> Array:
+    def cond_fun(state: Any) -> Array:
         _, _, size, count = state
         return (size > target) & (count < MAX_TURNS)
 
@@ -159,7 +159,7 @@ def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
     left = equation.left(start, first)
     size = _size(equation.correct(left), start)
     begin = (first, left, size, jnp.ones((), jnp.int32))
-    mu, _, size, count = jax.lax.while_loop(goes_on, turn, begin)
+    mu, _, size, count = jax.lax.while_loop(cond_fun, turn, begin)
     return mu, size, count
 
 

@@ -174,10 +174,10 @@ class ArrayTerms(Terms):
         rows = layout(self.constraints, params, q.shape[0], q.dtype)
         named = rows.unflatten(jnp.zeros((rows.size,), q.dtype))
 
-        def push(parts: list[Array]) -> Array:
+        def jvp_fn(parts: list[Array]) -> Array:
             return self._reactive(t, q, v, params, inputs, dict(zip(named, parts, strict=True)))
 
-        program = jax.make_jaxpr(push)(list(named.values())).jaxpr
+        program = jax.make_jaxpr(jvp_fn)(list(named.values())).jaxpr
         (reached,) = outputs_depend_on(program, [frozenset({name}) for name in named])
         reached |= {force.contact for force in self.forces if reads_lam(force) and force.contact}
         return tuple(name in reached for name in rows.names)
@@ -203,8 +203,8 @@ class ArrayTerms(Terms):
             return self.velocity(t, q, v, params)
 
         rest = jnp.zeros_like(v)
-        b, pull = jax.vjp(along, rest)
-        return jax.vmap(lambda e: pull(e)[0])(jnp.eye(b.shape[0], dtype=q.dtype)), b
+        b, vjp_fn = jax.vjp(along, rest)
+        return jax.vmap(lambda e: vjp_fn(e)[0])(jnp.eye(b.shape[0], dtype=q.dtype)), b
 
     def gamma(
         self,
@@ -243,7 +243,7 @@ class ArrayTerms(Terms):
         keys = _params.Static(avals), _params.Static(static)
         return _structure(self.lagrangian, *keys, size, jnp.dtype(dtype))
 
-    def prepare(
+    def precompute(
         self,
         q: Float[Array, " n"],
         params: Any,
@@ -270,15 +270,15 @@ class ArrayTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: Any = None,
+        constants: Any = None,
         reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
-        prepared = self.prepare(q, params, inputs) if prepared is None else prepared
-        M, right = self._balance(t, q, v, params, inputs, prepared)
+        constants = self.precompute(q, params, inputs) if constants is None else constants
+        M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
-            return solve_mass(M, right, prepared.factor)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[0]
+            return solve_mass(M, right, constants.factor)
+        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.sense)[0]
 
     def reactions(
         self,
@@ -289,7 +289,7 @@ class ArrayTerms(Terms):
         inputs: Mapping[str, Any],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """(a, lam), of least norm where rows depend on one another; NaN where rows contradict."""
-        M, right = self._balance(t, q, v, params, inputs, self.prepare(q, params, inputs))
+        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params, inputs))
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
@@ -325,12 +325,12 @@ class ArrayTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: SolveConstants,
+        constants: SolveConstants,
         reacting: RowChoice | None,
     ) -> Float[Array, " m"]:
         """The multipliers as forces see them, solved with these rows."""
-        M, right = self._balance(t, q, v, params, inputs, prepared)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, prepared.sense)[1]
+        M, right = self._balance(t, q, v, params, inputs, constants)
+        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.sense)[1]
 
     def _solved(
         self,
@@ -356,12 +356,12 @@ class ArrayTerms(Terms):
                 return lam
             return shared(A, lam, *reacting, read, units_of(M, A))
 
-        def push(lam: Array) -> Array:
+        def jvp_fn(lam: Array) -> Array:
             return self.reactive(t, q, v, params, inputs, lam)
 
-        slopes = jax.make_jaxpr(jax.jacfwd(push))(gamma).jaxpr
+        slopes = jax.make_jaxpr(jax.jacfwd(jvp_fn))(gamma).jaxpr
         (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
-        felt = lambda lam: push(seen(lam))  # noqa: E731
+        felt = lambda lam: jvp_fn(seen(lam))  # noqa: E731
         a, lam = solve_reactions(M, A, right, felt, gamma, kept, affine=not reached)
         return a, seen(lam)
 
@@ -371,11 +371,11 @@ class ArrayTerms(Terms):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        prepared: Any = None,
+        constants: Any = None,
         kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, "n m"]:
         """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero."""
-        return self.corrections(t, q, v, params, prepared, kept)[0]
+        return self.corrections(t, q, v, params, constants, kept)[0]
 
     def corrections(
         self,
@@ -383,7 +383,7 @@ class ArrayTerms(Terms):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        prepared: Any = None,
+        constants: Any = None,
         kept: Bool[Array, " m"] | None = None,
         chosen: Sequence[int] | None = None,
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
@@ -391,7 +391,11 @@ class ArrayTerms(Terms):
 
         Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
         """
-        M = self.mass(t, q, v, params) if getattr(prepared, "mass", None) is None else prepared.mass
+        M = (
+            self.mass(t, q, v, params)
+            if getattr(constants, "mass", None) is None
+            else constants.mass
+        )
         A, b = self.rows(t, q, v, params)
         if chosen is not None:
             if not self.regular:
@@ -409,11 +413,11 @@ class ArrayTerms(Terms):
         return K, jnp.diagonal(masses)
 
     def _balance(
-        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], prepared: Any
+        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], constants: Any
     ) -> tuple[Array, Array]:
         """(M, Q - h)."""
-        M = self.mass(t, q, v, params) if prepared.mass is None else prepared.mass
-        right = jnp.zeros_like(q) if prepared.bias_zero else -self.bias(t, q, v, params)
+        M = self.mass(t, q, v, params) if constants.mass is None else constants.mass
+        right = jnp.zeros_like(q) if constants.bias_zero else -self.bias(t, q, v, params)
         if self.forces:
             right = self.force(t, q, v, params, inputs) + right
         return M, right

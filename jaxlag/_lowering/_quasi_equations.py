@@ -33,8 +33,8 @@ class QuasiState:
         assert terms.quasi is not None
         self.terms, self.quasi = terms, terms.quasi
         self.t, self.q, self.u, self.params, self.inputs = t, q, u, params, inputs
-        self.v, self._push = jax.linearize(lambda u: self._velocities(t, q, u), u)
-        self._pull = jax.linear_transpose(self._push, u)
+        self.v, self._jvp_fn = jax.linearize(lambda u: self._velocities(t, q, u), u)
+        self._vjp_fn = jax.linear_transpose(self._jvp_fn, u)
 
     def _velocities(self, t: Array, q: Array, u: Array) -> Array:
         return self.quasi.velocities(t, q, self.quasi.full(u), self.params)
@@ -63,11 +63,11 @@ class QuasiState:
         """(B^T M B, B^T (Q - (M s + h))): M s + h is Lagrange's left side at a = s."""
         terms, t, q, v, params = self.terms, self.t, self.q, self.v, self.params
         s = self._along(lambda t, q: self._velocities(t, q, self.u))
-        (right,) = self._pull(self._force() - terms.euler_lagrange(t, q, v, s, params))
+        (right,) = self._vjp_fn(self._force() - terms.euler_lagrange(t, q, v, s, params))
 
         def column(e: Array) -> Array:
-            momentum = jax.jvp(lambda v: terms.momentum(t, q, v, params), (v,), (self._push(e),))
-            return self._pull(momentum[1])[0]
+            momentum = jax.jvp(lambda v: terms.momentum(t, q, v, params), (v,), (self._jvp_fn(e),))
+            return self._vjp_fn(momentum[1])[0]
 
         return jax.vmap(column)(jnp.eye(self.u.shape[0], dtype=q.dtype)), right
 
@@ -101,7 +101,7 @@ class QuasiState:
             return jax.jvp(lambda u: momentum(t, q, u)[free], (self.u,), (e,))[1]
 
         mass = jax.vmap(column)(jnp.eye(self.u.shape[0], dtype=q.dtype))
-        return mass, self._pull(effort)[0] - rate
+        return mass, self._vjp_fn(effort)[0] - rate
 
     def reactions(self) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """(a, lam) with A^T lam = M a + h - Q, lam of least norm where rows depend on others."""

@@ -83,7 +83,7 @@ class ScalarTerms(Terms):
         key = key_of(self.array, q, params, inputs, self.limit)
         return lower(key, _params.sample(_params.split(params)[0], sample))
 
-    def prepare(
+    def precompute(
         self,
         q: Float[Array, " n"],
         params: Any,
@@ -96,7 +96,7 @@ class ScalarTerms(Terms):
         """All that accelerations and projections need of what depends on params alone."""
         equations = self.lowered(q, params, inputs, sample).equations
         if equations is None:
-            return self.array.prepare(q, params, inputs, sample, kept, reacting, sense)
+            return self.array.precompute(q, params, inputs, sample, kept, reacting, sense)
 
         def before(
             code: Program | None, kept: Array | None, there: Array | None = None
@@ -125,7 +125,7 @@ class ScalarTerms(Terms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: Any = None,
+        constants: Any = None,
         reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Acceleration a; NaN, whole, where M is not positive definite.
@@ -134,10 +134,10 @@ class ScalarTerms(Terms):
         their values: the step fails by the one that is NaN.
         """
         if self.lowered(q, params, inputs).equations is None:
-            return self.array.acceleration(t, q, v, params, inputs, prepared, reacting)
-        if prepared is not None:
-            return self.rates(t, q, v, params, inputs, prepared)
-        own: Any = self.prepare(q, params, inputs, reacting=reacting)
+            return self.array.acceleration(t, q, v, params, inputs, constants, reacting)
+        if constants is not None:
+            return self.rates(t, q, v, params, inputs, constants)
+        own: Any = self.precompute(q, params, inputs, reacting=reacting)
         a = self.rates(t, q, v, params, inputs, own)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
@@ -148,10 +148,10 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> Array:
         """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
-        return self._run("acceleration", t, q, v, params, inputs, prepared)
+        return self._run("acceleration", t, q, v, params, inputs, constants)
 
     def velocities(
         self,
@@ -160,10 +160,10 @@ class ScalarTerms(Terms):
         u: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> Array:
         """v at (q, u) of quasi-velocities."""
-        return self._run("rates", t, q, u, params, inputs, prepared)
+        return self._run("rates", t, q, u, params, inputs, constants)
 
     def determinants(
         self,
@@ -171,14 +171,14 @@ class ScalarTerms(Terms):
         q: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> Array:
         """What vanishes where quasi-velocities are singular, without what never changes."""
         code = self._equations(q, params, inputs).determinants
         assert code is not None
         if not code.results:
             return jnp.zeros((0,), q.dtype)
-        return self._run("determinants", t, q, q, params, inputs, prepared)  # no speed is read
+        return self._run("determinants", t, q, q, params, inputs, constants)  # no speed is read
 
     def _run(
         self,
@@ -188,13 +188,13 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> Array:
         """The results of one of the programs, whose prelude has this name."""
 
-        def by(terms: "ScalarTerms", prepared: ScalarSolveConstants) -> Array:
+        def by(terms: "ScalarTerms", constants: ScalarSolveConstants) -> Array:
             program = terms._equations(q, params, inputs).code(name)
-            carried = getattr(prepared, name)
+            carried = getattr(constants, name)
             assert program is not None
             assert carried is not None
             read = inputs if name in _WITH_INPUTS else {}
@@ -202,10 +202,10 @@ class ScalarTerms(Terms):
 
         # Equations in quasi-velocities are projected: of them the projection alone divides by M.
         projected = self.array.quasi is not None and name == "acceleration"
-        if prepared.alone is None or name not in _BY_MASS or projected:
-            return by(self, prepared)
-        alone = partial(by, self.regular(), prepared.alone)
-        return lax.cond(prepared.definite, alone, partial(by, self, prepared))
+        if constants.alone is None or name not in _BY_MASS or projected:
+            return by(self, constants)
+        alone = partial(by, self.regular(), constants.alone)
+        return lax.cond(constants.definite, alone, partial(by, self, constants))
 
     def regular(self) -> "ScalarTerms":
         """The same where M is positive definite without the constraints."""
@@ -223,14 +223,14 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> ConstraintProjector:
         """The constraints near the state (q, v); positions alone near a (q, u)."""
         code = self._equations(q, params, inputs).surface
         assert code is not None
 
         def run(name: str, q: Array, v: Array) -> Array:
-            return self._run(name, t, q, v, params, inputs, prepared)
+            return self._run(name, t, q, v, params, inputs, constants)
 
         n = q.shape[0]
 
@@ -259,10 +259,10 @@ class ScalarTerms(Terms):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: ScalarSolveConstants,
+        constants: ScalarSolveConstants,
     ) -> Array:
         """The multipliers that forces depend on, at (q, v)."""
-        return self._run("lam", t, q, v, params, inputs, prepared)
+        return self._run("lam", t, q, v, params, inputs, constants)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -345,7 +345,7 @@ class ScalarTerms(Terms):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        prepared: Any = None,
+        constants: Any = None,
         kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, "n m"]:
         """M^-1 A^T (A M^-1 A^T)^-1."""

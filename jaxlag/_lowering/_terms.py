@@ -85,7 +85,7 @@ class Terms(eqx.Module):
         """Vector gamma = A' v + b', so that A a + gamma = 0."""
 
     @abstractmethod
-    def prepare(
+    def precompute(
         self,
         q: Float[Array, " n"],
         params: Any,
@@ -110,7 +110,7 @@ class Terms(eqx.Module):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        prepared: Any = None,
+        constants: Any = None,
         reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """a, with one factorisation; NaN where M is not positive definite where A a = 0.
@@ -140,7 +140,7 @@ class Terms(eqx.Module):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        prepared: Any = None,
+        constants: Any = None,
         kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, "n m"]:
         """M^-1 A^T (A M^-1 A^T)^-1: takes residuals c to the x nearest to 0 with A x = c."""

@@ -189,7 +189,7 @@ class PointForce(AbstractForce):
     ) -> Float[Array, " n"]:
         """(dr/dq)^T F, shape (n,)."""
         argument = f"force {self.name!r}: position"
-        r, pull = jax.vjp(lambda q: _real(argument, self.position(t, q, params)), q)
+        r, vjp_fn = jax.vjp(lambda q: _real(argument, self.position(t, q, params)), q)
         if r.ndim == 0 or r.shape[-1] not in (1, 2, 3):
             raise invalid(
                 argument,
@@ -199,7 +199,7 @@ class PointForce(AbstractForce):
             )
         state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
         F = _like(f"force {self.name!r}: force", self.force(*state), r)
-        return pull(F)[0]
+        return vjp_fn(F)[0]
 
 
 class Couple(AbstractForce):
@@ -255,7 +255,7 @@ class Couple(AbstractForce):
         def rate(v: Array) -> Array:
             return _real(argument, self.angular_velocity(t, q, v, params))
 
-        w, pull = jax.vjp(rate, v)
+        w, vjp_fn = jax.vjp(rate, v)
         if w.ndim > 0 and w.shape[-1] != 3:
             raise invalid(
                 argument, "return 3 components or a scalar", f"it returned shape {w.shape}"
@@ -270,7 +270,7 @@ class Couple(AbstractForce):
             )
         state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
         torque = _like(f"couple {self.name!r}: torque", self.torque(*state), w)
-        return pull(torque)[0]
+        return vjp_fn(torque)[0]
 
 
 def _affine(function: Callable, v: Array, like: Array) -> bool:

@@ -163,8 +163,8 @@ class QuasiVelocities(eqx.Module):
             return self.of(t, q, v, params)
 
         rest = jnp.zeros((n,), u.dtype)
-        theta_0, push = jax.linearize(along, rest)
-        theta = jax.vmap(push)(jnp.eye(n, dtype=u.dtype))  # Theta_ij: of v_i in u_j
+        theta_0, jvp_fn = jax.linearize(along, rest)
+        theta = jax.vmap(jvp_fn)(jnp.eye(n, dtype=u.dtype))  # Theta_ij: of v_i in u_j
         size, Q, R = _factored(theta)
         fine = jnp.all(jnp.abs(jnp.diagonal(R)) > _floor(theta))
 
@@ -301,8 +301,8 @@ class QuasiVelocities(eqx.Module):
         def along(u: Array) -> Array:
             return self.velocities(t, q, u, params)
 
-        c, push = jax.linearize(along, jnp.zeros((self.size,), dtype))
-        return jax.vmap(push, out_axes=1)(jnp.eye(self.size, dtype=dtype)), c
+        c, jvp_fn = jax.linearize(along, jnp.zeros((self.size,), dtype))
+        return jax.vmap(jvp_fn, out_axes=1)(jnp.eye(self.size, dtype=dtype)), c
 
     def _checked(self, function: str, value: Any, size: int, dtype: Any) -> Array:
         argument = f"QuasiVelocities: {function}"

@@ -121,7 +121,7 @@ def dynamics_of(
     given, _ = dynamics.given(args)
     dynamics = replace(dynamics, rows=dynamics.system.rows(given, q.dtype))
     y = dynamics.state_of(t, q, v, given)
-    return dynamics, dynamics.prepare(dynamics.tau(t, args), y, args)
+    return dynamics, dynamics.precompute(dynamics.tau(t, args), y, args)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -284,7 +284,7 @@ def _lost(
     """
     lengths = (tried - time) * jnp.asarray(_PARTS, time.dtype)
 
-    def goes_on(carry: tuple) -> Array:
+    def cond_fun(carry: tuple) -> Array:
         k, _, y, rates = carry
         sound = jnp.all(jnp.isfinite(y)) & jnp.all(jnp.isfinite(rates))
         return wanted & sound & (k < _PARTS.size)
@@ -298,7 +298,7 @@ def _lost(
         return k + 1, tau, y, new
 
     begin = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
-    _, tau, y, rates = jax.lax.while_loop(goes_on, ahead, begin)
+    _, tau, y, rates = jax.lax.while_loop(cond_fun, ahead, begin)
     # Where the state has grown beyond all numbers, so has all that depends on it.
     found = wanted & ~jnp.all(jnp.isfinite(rates)) & jnp.all(jnp.isfinite(y))
     return found, tau, y

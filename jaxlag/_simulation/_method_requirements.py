@@ -88,11 +88,11 @@ def _separable(
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     for force in system.forces:
 
-        def push(t: Any, q: Any, v: Any, traced: Any, force: Any = force) -> Any:
+        def applied(t: Any, q: Any, v: Any, traced: Any, force: Any = force) -> Any:
             params = _params.join(traced, static)
             return components(force, t, q, v, params, evaluate(inputs, t, q, v, params))
 
-        program = jax.make_jaxpr(push)(t, q, q, traced).jaxpr
+        program = jax.make_jaxpr(applied)(t, q, q, traced).jaxpr
         given = [frozenset({"t"}), frozenset({"q"}), frozenset({"v"})]
         given += [frozenset()] * (len(program.invars) - 3)
         if "v" in frozenset().union(*outputs_depend_on(program, given)):

@@ -103,7 +103,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     if plan.auto and controller is None:
         splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
         solver = Splitting(8) if splitting else solver
-    dynamics = replace(dynamics, onwards=looks_ahead(solver))
+    dynamics = replace(dynamics, extrapolates=looks_ahead(solver))
     check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
 
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
@@ -127,7 +127,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
         args = args._replace(params=known)
     y0 = dynamics.start(q0, w0)
     start = jnp.zeros_like(args.origin)
-    args = dynamics.prepare(start, y0, args)
+    args = dynamics.precompute(start, y0, args)
     if dynamics.quasi is not None:
         args = args._replace(usual=usual(dynamics, *stop_gradient((start, q0, args))))
     consistent = start_consistent(dynamics, t0, q0, v0, params, args)

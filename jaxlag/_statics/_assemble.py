@@ -303,8 +303,8 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
 
     def F(z: tuple[Array, Array], kept: Array) -> tuple[Array, Array]:
         q, lam = z
-        _, pull = jax.vjp(phi, q)
-        above = W @ (q - start) - jnp.where(free, pull(lam)[0], 0.0)
+        _, vjp_fn = jax.vjp(phi, q)
+        above = W @ (q - start) - jnp.where(free, vjp_fn(lam)[0], 0.0)
         return above, jnp.where(kept, phi(q), lam)
 
     frozen = jax.lax.stop_gradient((W, start))
@@ -359,13 +359,13 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
         moved = jnp.where(tiny, 1.0, best) * step
         return _Search(s.q + moved, lam, step, s.count + 1)
 
-    def goes_on(s: _Search) -> Array:
+    def cond_fun(s: _Search) -> Array:
         far = jnp.max(jnp.abs(s.step) / (1.0 + jnp.abs(s.q))) > 4 * eps
         return far & (s.count < MAX_TURNS)
 
     lam = jnp.zeros_like(phi(start))
     begin = _Search(start, lam, jnp.full_like(start, jnp.inf), jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(goes_on, turn, begin)
+    end = jax.lax.while_loop(cond_fun, turn, begin)
     return end.q, end.lam
 
 

@@ -255,10 +255,10 @@ def _closed(
         )
         return chosen._replace(count=s.count + 1)
 
-    def goes_on(s: _Closing) -> Array:
+    def cond_fun(s: _Closing) -> Array:
         return ~s.closed & (s.fraction > 1e-3) & (s.count < CLOSING_STEPS)
 
     one = jnp.ones((), q0.dtype)
     begin = _Closing(q0, one, 0 * q0, jnp.array(False), one, jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(goes_on, body, begin)
+    end = jax.lax.while_loop(cond_fun, body, begin)
     return end.q + c * end.d, end.closed

@@ -83,13 +83,13 @@ def find_rest(
         spent = jnp.where(s.count == 0, 0, s.spent + now.steps)
         return _State(rest, spread, spent, s.count + 1)
 
-    def goes_on(s: _State) -> Bool[Array, ""]:
+    def cond_fun(s: _State) -> Bool[Array, ""]:
         return ~s.rest.balance.found & (s.count <= STARTS) & (s.spent < max_steps)
 
     z, no = jnp.zeros((n + m,), q0.dtype), jnp.zeros((), bool)
     none = Rest(z, Balance(no, no, z, jnp.outer(z, z), z), jnp.zeros((), jnp.int32))
     begin = _State(none, jnp.abs(q0), none.steps, none.steps)
-    return jax.lax.while_loop(goes_on, body, begin).rest
+    return jax.lax.while_loop(cond_fun, body, begin).rest
 
 
 def _directions(n: int) -> np.ndarray:

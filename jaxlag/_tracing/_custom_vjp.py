@@ -58,7 +58,7 @@ class _Pulled(AbstractRule):
         given = [x.aval for x in self.eqn.invars]
         moving = [i for i, x in enumerate(given) if _is_inexact(x)]
 
-        def pull(args: list, y: list) -> Any:
+        def vjp_fn(args: list, y: list) -> Any:
             def along(*moved: Any) -> list:
                 whole = list(args)
                 for i, x in zip(moving, moved, strict=True):
@@ -71,7 +71,7 @@ class _Pulled(AbstractRule):
 
         like = [x.aval for x in self.eqn.outvars if _is_inexact(x.aval)]
         shapes = [[jax.ShapeDtypeStruct(x.shape, x.dtype) for x in some] for some in (given, like)]
-        return with_rules_kept(with_forward_derivatives(jax.make_jaxpr(pull)(*shapes)))
+        return with_rules_kept(with_forward_derivatives(jax.make_jaxpr(vjp_fn)(*shapes)))
 
     @property
     def key(self) -> Any:

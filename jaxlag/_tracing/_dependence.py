@@ -141,9 +141,9 @@ def _while(params: Any, operands: list[Names]) -> list[Names]:
     same = [x is y for x, y in zip(body.invars[second - first :], body.outvars, strict=True)]
 
     def turn(carry: list[Names]) -> list[Names]:
-        (goes_on,) = outputs_depend_on(condition, [*asked, *carry])
+        (cond_fun,) = outputs_depend_on(condition, [*asked, *carry])
         after = outputs_depend_on(body, [*fixed, *carry])
-        return [x if is_same else x | goes_on for x, is_same in zip(after, same, strict=True)]
+        return [x if is_same else x | cond_fun for x, is_same in zip(after, same, strict=True)]
 
     return _fixpoint(turn, carry)
 

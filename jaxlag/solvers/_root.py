@@ -80,12 +80,12 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
             stopped = stopped | (size <= eps * scale) | ~(new < 0.5 * least[0])
             return z, jnp.stack([*least[1:], new]), stopped, small, k + 1
 
-        def goes_on(carry: tuple) -> Array:
+        def cond_fun(carry: tuple) -> Array:
             return ~jnp.all(carry[2]) & (carry[4] < EACH)
 
         unknown = jnp.full((MEMORY, count), jnp.inf, guess.dtype)
         begin = (z, unknown, jnp.zeros(count, bool), no, zero)
-        z, _, stopped, small, _ = jax.lax.while_loop(goes_on, turn, begin)
+        z, _, stopped, small, _ = jax.lax.while_loop(cond_fun, turn, begin)
         return z, jnp.all(stopped) & jnp.all(jnp.isfinite(z)), small
 
     def anew(carry: tuple) -> tuple:
@@ -96,12 +96,12 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
         z, stopped, small = iterate(factor, z)
         return z, new, stopped & (small | (unlike < 0.5)), k + 1
 
-    def goes_on(carry: tuple) -> Array:
+    def cond_fun(carry: tuple) -> Array:
         z, _, done, k = carry
         return ~done & (k < MOST) & jnp.all(jnp.isfinite(z))
 
     unknown = jnp.zeros((guess.shape[0], guess.shape[0]), guess.dtype)
-    z, _, done, _ = jax.lax.while_loop(goes_on, anew, (guess, unknown, no, zero))
+    z, _, done, _ = jax.lax.while_loop(cond_fun, anew, (guess, unknown, no, zero))
     there = jnp.all(jnp.isfinite(residual(guess)))
     z = jnp.where(done, z, jnp.where(there, guess, jnp.nan))
     return z, done.astype(z.dtype)

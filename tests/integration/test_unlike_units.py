@@ -99,7 +99,7 @@ def test_kinematics_of_unlike_units():
     scalars = ScalarTerms(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system.in_u), None)
     given = jnp.asarray(q), None, {}
     rates = scalars.rates(
-        jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.prepare(*given)
+        jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.precompute(*given)
     )
     np.testing.assert_allclose(rates[:2], v, rtol=1e-14)
     turning = jax.jvp(

@@ -49,19 +49,19 @@ def floats(values):
 def prelude(case):
     """The operations done once per solve."""
     system, params, q, inputs = case
-    return operations(lambda params: system.terms.prepare(q, params, inputs), params)
+    return operations(lambda params: system.terms.precompute(q, params, inputs), params)
 
 
 def evaluation(case, regular=False):
     """The operations of one acceleration inside a solve; whether M is known to be regular."""
     system, params, q, inputs = case
     terms = system.terms.regular() if regular else system.terms
-    prepared = terms.prepare(q, params, inputs)
+    constants = terms.precompute(q, params, inputs)
 
-    def acceleration(prepared, params, t, q, v, inputs):
-        return terms.acceleration(t, q, v, params, inputs, prepared)
+    def acceleration(constants, params, t, q, v, inputs):
+        return terms.acceleration(t, q, v, params, inputs, constants)
 
-    return operations(acceleration, prepared, params, jnp.zeros(()), q, q, inputs)
+    return operations(acceleration, constants, params, jnp.zeros(()), q, q, inputs)
 
 
 def solve(case):

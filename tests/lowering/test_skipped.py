@@ -105,7 +105,7 @@ def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(defin
     """The other one is not read: it is poisoned."""
     system, params, q, _ = case("double_pendulum_cartesian")
     terms, given = system.terms, (jnp.zeros(()), q, 0.1 * q, params, {})
-    longer, shorter = (x.prepare(q, params, {}) for x in (terms, terms.regular()))
+    longer, shorter = (x.precompute(q, params, {}) for x in (terms, terms.regular()))
     expected = terms.acceleration(*given, longer)
     poison = lambda unread: jax.tree.map(lambda x: jnp.nan * x, unread)  # noqa: E731
     longer, shorter = (poison(longer), shorter) if definite else (longer, poison(shorter))
@@ -121,13 +121,13 @@ def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     system, params, q, _ = case(name)
     array = replace(system.terms.array, quasi=system.quasi, in_u=system.in_u)
     terms = replace(system.terms, array=array)
-    prepared = terms.prepare(q, params, {})
+    constants = terms.precompute(q, params, {})
     u = jnp.zeros(len(system.quasi.free))
 
-    def rates(prepared, params, t, q, u):
-        return terms.rates(t, q, u, params, {}, prepared)
+    def rates(constants, params, t, q, u):
+        return terms.rates(t, q, u, params, {}, constants)
 
-    program = operations(rates, prepared, params, jnp.zeros(()), q, u)
+    program = operations(rates, constants, params, jnp.zeros(()), q, u)
     functions, divisions = QUASI[name]
     assert count(program, "sincos") <= functions
     assert count(program, "div") <= divisions

@@ -287,19 +287,19 @@ def test_the_factor_is_made_where_the_solve_is_prepared():
     """Once per solve: M's columns and its elimination, and not one more evaluation of L for M."""
     n, system = SMALL, of(coupled, SMALL)
     q = v = jnp.linspace(0.1, 1.0, n)
-    prepared = system.terms.prepare(q, INERTIA, {})
+    constants = system.terms.precompute(q, INERTIA, {})
 
     def once(params):
-        return system.terms.prepare(q, params, {})
+        return system.terms.precompute(q, params, {})
 
-    def each(prepared, q, v):
-        return system.terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+    def each(constants, q, v):
+        return system.terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, constants)
 
     def bias(params, q, v):
         return system.bias(params, q, v)
 
     assert count(operations(once, INERTIA), "div") == n * (n - 1) // 2
-    inside = operations(each, prepared, q, v)
+    inside = operations(each, constants, q, v)
     products = count(inside, "dot_general", without=("custom_linear_solve",))
     assert products == count(operations(bias, INERTIA, q, v), "dot_general")
     assert count(inside, "div") == 2 * n
@@ -311,15 +311,15 @@ def test_no_bias_is_computed_where_it_is_zero():
     for lagrangian, left in ((free, set()), (coupled, {"dot_general", "mul"})):
         terms = of(lagrangian, n).terms
         q = v = jnp.linspace(0.1, 1.0, n)
-        prepared = terms.prepare(q, INERTIA, {})
+        constants = terms.precompute(q, INERTIA, {})
 
-        def each(prepared, q, v, terms=terms):
-            return terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, prepared)
+        def each(constants, q, v, terms=terms):
+            return terms.acceleration(jnp.zeros(()), q, v, INERTIA, {}, constants)
 
-        program = operations(each, prepared, q, v)
+        program = operations(each, constants, q, v)
         outside = [o for o in program if "custom_linear_solve" not in o.inside]
         assert names(outside) & {"dot_general", "mul"} == left
-        assert bool(np.any(each(prepared, q, v))) == (lagrangian is coupled)
+        assert bool(np.any(each(constants, q, v))) == (lagrangian is coupled)
 
 
 DERIVATIVES = {
@@ -349,8 +349,8 @@ def test_derivatives_of_one_acceleration_go_through_the_factor(n):
 
     def total(lagrangian, a):
         params, system = INERTIA | {"a": a}, of(lagrangian, n, (HELD,))
-        prepared = system.terms.prepare(q, params, {})
-        return jnp.sum(system.terms.acceleration(jnp.zeros(()), q, q, params, {}, prepared) ** 2)
+        constants = system.terms.precompute(q, params, {})
+        return jnp.sum(system.terms.acceleration(jnp.zeros(()), q, q, params, {}, constants) ** 2)
 
     def orders(f):
         first, second = jax.jacrev(f), jax.jacfwd(jax.jacrev(f))

@@ -36,8 +36,8 @@ def momentum_form(scene: SymbolicSystem, L: Node) -> list[Node]:
     momentum = gradient(graph, L, scene.v)
     seeds = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: graph.one}
     rate = tangents(graph, momentum, seeds)
-    pull = gradient(graph, L, scene.q)
-    return [graph.sub(a, b) for a, b in zip(rate, pull, strict=True)]
+    dL_dq = gradient(graph, L, scene.q)
+    return [graph.sub(a, b) for a, b in zip(rate, dL_dq, strict=True)]
 
 
 def christoffel_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
@@ -64,10 +64,10 @@ def christoffel_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]
     M_t = full(tangents(graph, flat, {scene.t: graph.one}))
     c_q = [tangents(graph, c, {q: graph.one}) for q in scene.q]  # [k][i]
     c_t = tangents(graph, c, {scene.t: graph.one})
-    pull = gradient(graph, L_0, scene.q)
+    dL_dq = gradient(graph, L_0, scene.q)
     v, h = scene.v, []
     for i in range(n):
-        terms: list[tuple[Node, float]] = [(pull[i], -1.0), (c_t[i], 1.0)]
+        terms: list[tuple[Node, float]] = [(dL_dq[i], -1.0), (c_t[i], 1.0)]
         for j in range(n):
             symbol: list[tuple[Node, float]] = [(M_t[i][j], 1.0)]
             symbol += [(c_q[j][i], 1.0), (c_q[i][j], -1.0)]
@@ -89,12 +89,12 @@ def rate_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> li
     seeds = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: graph.one}
     flat = [M[i][j] for i in range(n) for j in range(i + 1)]
     rates = tangents(graph, [*flat, *c], seeds)
-    pull = gradient(graph, L, scene.q)
+    dL_dq = gradient(graph, L, scene.q)
     h = []
     for i in range(n):
         row = [rates[max(i, j) * (max(i, j) + 1) // 2 + min(i, j)] for j in range(n)]
         terms = [(graph.mul(rate, v), 1.0) for rate, v in zip(row, scene.v, strict=True)]
-        h.append(graph.sum([*terms, (rates[len(flat) + i], 1.0), (pull[i], -1.0)]))
+        h.append(graph.sum([*terms, (rates[len(flat) + i], 1.0), (dL_dq[i], -1.0)]))
     return h
 
 

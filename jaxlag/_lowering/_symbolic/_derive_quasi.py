@@ -182,8 +182,8 @@ def _projected(
     momentum = gradient(graph, L, v)
     seeds = dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one}
     rate = tangents(graph, momentum, seeds | dict(zip(v, moved.s, strict=True)))
-    pull = gradient(graph, L, scene.q)
-    left = [graph.sub(*pair) for pair in zip(rate, pull, strict=True)]
+    dL_dq = gradient(graph, L, scene.q)
+    left = [graph.sub(*pair) for pair in zip(rate, dL_dq, strict=True)]
     M = mass_matrix(graph, L, v)
     at = dict(zip(v, moved.v, strict=True))
     effort = [graph.scale(x, -1.0) for x in left]
@@ -217,10 +217,10 @@ def _hamel(
     along = dict(zip(q, v, strict=True)) | {scene.t: graph.one}
     turning = tangents(graph, gradient(graph, weighted, v), along)
     bending = gradient(graph, weighted, q)
-    pull = gradient(graph, L, q)
+    dL_dq = gradient(graph, L, q)
     effort = [
         graph.sum([(a, -1.0), (b, 1.0), (c, 1.0)])
-        for a, b, c in zip(turning, bending, pull, strict=True)
+        for a, b, c in zip(turning, bending, dL_dq, strict=True)
     ]
     if scene.force is not None:
         effort = [graph.add(*pair) for pair in zip(scene.force, effort, strict=True)]

@@ -309,10 +309,10 @@ def _slopes(key: Key, terms: ArrayTerms) -> Any:
     """The jaxpr of (Q_0, G) of the forces Q_0 + G lam."""
 
     def affine(t: Any, q: Any, v: Any, params: Any, inputs: Any, lam: Any) -> Any:
-        def push(lam: Any) -> Any:
+        def jvp_fn(lam: Any) -> Any:
             return terms.reactive(t, q, v, params, inputs, lam)
 
-        return push(lam), jax.jacfwd(push)(lam)
+        return jvp_fn(lam), jax.jacfwd(jvp_fn)(lam)
 
     m = layout_of(key.constraints, key.params, key.static, key.size, key.dtype).size
     return traced(key, affine, True, m)
