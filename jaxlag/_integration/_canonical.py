@@ -30,7 +30,7 @@ class Canonical(eqx.Module):
 
     def span(self, tau0: Float[Array, ""], tau1: Float[Array, ""]) -> Float[Array, ""]:
         """The user's time between two times, negative where it runs backwards."""
-        return self.dynamics.turned(tau1 - tau0, self.args)
+        return self.dynamics.signed(tau1 - tau0, self.args)
 
     @property
     def rows(self) -> int:

@@ -65,7 +65,7 @@ class Arguments(NamedTuple):
 
     params: Any
     inputs: Any  # within a step two rows of each table, in time from the start
-    sigma: Float[Array, ""] | None  # direction of time where it is traced
+    time_direction: Float[Array, ""] | None  # direction of time where it is traced
     origin: Float[Array, ""]  # the start, in the user's time
     end: Float[Array, ""]  # beyond which no time is read
     gaps: KnotIntervals | None  # None without tables

@@ -48,9 +48,9 @@ class Term(diffrax.ODETerm):
         """Whether the state is (q, v): dq/dtau = sigma v, dv/dtau = sigma a."""
         return self.dynamics.quasi is None and not self.works
 
-    def turned(self, x: Any, args: Arguments) -> Any:
+    def signed(self, x: Any, args: Arguments) -> Any:
         """Sigma x, of a tree."""
-        return jax.tree.map(lambda x: self.dynamics.turned(x, args), x)
+        return jax.tree.map(lambda x: self.dynamics.signed(x, args), x)
 
     def sections(self, y: Any) -> tuple[Any, Any, Any]:
         """(q, v, work) of a state or of its rates."""

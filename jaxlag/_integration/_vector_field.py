@@ -47,7 +47,7 @@ class VectorField(eqx.Module):
         system: what moves.
         params: static half of the params.
         inputs: static half of the inputs.
-        direction: sigma, +1 or -1, where known while tracing; else None.
+        time_direction: sigma, +1 or -1, where known while tracing; else None.
         power: terms of dH/dt to integrate along; None for none.
         sample: values of the params, where known.
         lanes: whether all this is vmapped, so that elements are arrays of numbers.
@@ -66,7 +66,7 @@ class VectorField(eqx.Module):
     system: System
     params: _params.Static = eqx.field(static=True)
     inputs: _params.Static = eqx.field(static=True)
-    direction: int | None = eqx.field(static=True)
+    time_direction: int | None = eqx.field(static=True)
     power: Power | None
     sample: _params.Sample = eqx.field(static=True)
     lanes: bool = eqx.field(static=True, default=False)
@@ -126,10 +126,10 @@ class VectorField(eqx.Module):
 
     def arguments(self, params: Any, inputs: Any, ts: Float[Array, " s"]) -> Arguments:
         """Arguments outside any step, from the traced halves of params and inputs."""
-        sigma = None
-        if self.direction is None:
-            sigma = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
-        args = Arguments(params, inputs, sigma, ts[0], ts[-1], None, None)
+        time_direction = None
+        if self.time_direction is None:
+            time_direction = jnp.where(ts[-1] >= ts[0], 1.0, -1.0).astype(ts.dtype)
+        args = Arguments(params, inputs, time_direction, ts[0], ts[-1], None, None)
         knots = all_knots(eqx.combine(inputs, self.inputs.tree))
         if knots is None:
             return args
@@ -138,7 +138,7 @@ class VectorField(eqx.Module):
         never = jnp.full((1,), jnp.finfo(ts.dtype).min, ts.dtype)
         ahead = KnotIntervals(self.tau(knots, args), jnp.concatenate([never, knots]))
         back = KnotIntervals(ahead.knots[::-1], jnp.concatenate([knots[::-1], never]))
-        onwards = self.turned(jnp.ones_like(ts[0]), args) > 0
+        onwards = self.signed(jnp.ones_like(ts[0]), args) > 0
         gaps = jax.tree.map(partial(jnp.where, onwards), ahead, back)
         return args._replace(gaps=stop_gradient(gaps))
 
@@ -155,9 +155,9 @@ class VectorField(eqx.Module):
             speeds = [slide(t, q, v, params) for slide in slides]
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
             args = args._replace(senses=jax.lax.stop_gradient(senses))
-        sense = self.turned(jnp.ones_like(tau), args)
+        time_direction = self.signed(jnp.ones_like(tau), args)
         rows = args.kept, args.reacting
-        given = q, params, values, self.sample, *rows, sense
+        given = q, params, values, self.sample, *rows, time_direction
         constants = self.terms.precompute(*given)
         either = self.regular is None and self.formulation != "null_space"
         if either and isinstance(constants, ScalarSolveConstants):
@@ -214,9 +214,9 @@ class VectorField(eqx.Module):
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
-        t, end = args.origin + self.turned(tau, args), args.end
-        if self.direction is not None:
-            bounded = (jnp.minimum if self.direction == 1 else jnp.maximum)(t, end)
+        t, end = args.origin + self.signed(tau, args), args.end
+        if self.time_direction is not None:
+            bounded = (jnp.minimum if self.time_direction == 1 else jnp.maximum)(t, end)
         else:
             bounded = jnp.clip(t, *(f(args.origin, end) for f in (jnp.minimum, jnp.maximum)))
         if not self.extrapolates:
@@ -226,13 +226,13 @@ class VectorField(eqx.Module):
 
     def tau(self, t: Array, args: Arguments) -> Array:
         """Tau = sigma (t - t0)."""
-        return self.turned(t - args.origin, args)
+        return self.signed(t - args.origin, args)
 
-    def turned(self, x: Array, args: Arguments) -> Array:
+    def signed(self, x: Array, args: Arguments) -> Array:
         """Sigma x."""
-        if self.direction == 1:
+        if self.time_direction == 1:
             return x
-        return -x if args.sigma is None else x * args.sigma.astype(x.dtype)
+        return -x if args.time_direction is None else x * args.time_direction.astype(x.dtype)
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
         """(params, inputs) as the user passed them; within a step of each table two entries."""
@@ -331,7 +331,7 @@ class VectorField(eqx.Module):
     def inputs_at(self, tau: Array, q: Array, v: Array, args: Arguments) -> Any:
         """Values of the inputs within a step; else in the interval that starts at tau."""
         args = self.within(args, tau)
-        (params, inputs), since = self.given(args), self.turned(tau, args)
+        (params, inputs), since = self.given(args), self.signed(tau, args)
         first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
         return evaluate(
             inputs, self.clock(tau, args), q, v, params, first, since, self.extrapolates
@@ -354,7 +354,7 @@ class VectorField(eqx.Module):
         if self.power is not None and self.power.names:
             t, q, v, params, values = self.at(tau, y, args)
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
-        return self.turned(jnp.concatenate(rates), args)
+        return self.signed(jnp.concatenate(rates), args)
 
     def surface(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
         """The constraints near a predicted state."""

@@ -43,13 +43,13 @@ class SolveConstants(eqx.Module):
         mass: M where it depends on params alone, else None.
         factor: its factor.
         bias_zero: whether h = 0 in every state.
-        sense: -1 where time runs backwards.
+        time_direction: -1 where time runs backwards.
     """
 
     mass: Float[Array, "n n"] | None
     factor: MassFactor | None
     bias_zero: bool = eqx.field(static=True)
-    sense: Array | float = 1.0
+    time_direction: Array | float = 1.0
 
 
 class ArrayTerms(Terms):
@@ -212,7 +212,7 @@ class ArrayTerms(Terms):
         q: Float[Array, " n"],
         v: Float[Array, " n"],
         params: Any,
-        sense: Array | float = 1.0,
+        time_direction: Array | float = 1.0,
     ) -> Float[Array, " m"]:
         """One derivative of A v + b along (t', q') = (1, v), and Baumgarte's terms if asked for.
 
@@ -225,8 +225,8 @@ class ArrayTerms(Terms):
         residual, gamma = jax.jvp(along, (t, q), (jnp.ones_like(t), v))
         if self.baumgarte is None:
             return gamma
-        sense = jnp.asarray(sense, residual.dtype)
-        gamma = gamma + 2.0 * self.baumgarte.alpha * sense * residual
+        time_direction = jnp.asarray(time_direction, residual.dtype)
+        gamma = gamma + 2.0 * self.baumgarte.alpha * time_direction * residual
         phi = position_or_zero(self.constraints, t, q, params)
         return gamma + self.baumgarte.beta**2 * phi
 
@@ -251,17 +251,17 @@ class ArrayTerms(Terms):
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
         reacting: RowChoice | None = None,
-        sense: Array | float = 1.0,
+        time_direction: Array | float = 1.0,
     ) -> SolveConstants:
         """M and its factor where M depends on params alone."""
         structure = self.structure(params, q.shape[0], q.dtype)
         if not structure.mass_constant:
-            return SolveConstants(None, None, structure.bias_zero, sense)
+            return SolveConstants(None, None, structure.bias_zero, time_direction)
         anywhere = jnp.ones(q.shape, q.dtype)
         M = self.mass(jnp.zeros((), jnp.result_type(float)), anywhere, anywhere, params)
         # Derivatives with respect to params go through M, never through the elimination.
         factor = None if self.constraints else factor_mass(jax.lax.stop_gradient(M))
-        return SolveConstants(M, factor, structure.bias_zero, sense)
+        return SolveConstants(M, factor, structure.bias_zero, time_direction)
 
     def acceleration(
         self,
@@ -278,7 +278,9 @@ class ArrayTerms(Terms):
         M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
             return solve_mass(M, right, constants.factor)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.sense)[0]
+        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.time_direction)[
+            0
+        ]
 
     def reactions(
         self,
@@ -330,7 +332,9 @@ class ArrayTerms(Terms):
     ) -> Float[Array, " m"]:
         """The multipliers as forces see them, solved with these rows."""
         M, right = self._balance(t, q, v, params, inputs, constants)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.sense)[1]
+        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.time_direction)[
+            1
+        ]
 
     def _solved(
         self,
@@ -342,10 +346,10 @@ class ArrayTerms(Terms):
         params: Any,
         inputs: Mapping[str, Any],
         reacting: RowChoice | None,
-        sense: Array | float = 1.0,
+        time_direction: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """(a, lam) under constraints; lam as forces read it where some do."""
-        (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, sense)
+        (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, time_direction)
         kept = None if reacting is None else reacting.kept
         if not any(map(reads_lam, self.forces)):
             return solve_kkt(M, A, right, gamma, kept, self.formulation, crossing=self.crossing)

@@ -91,19 +91,19 @@ class ScalarTerms(Terms):
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
         reacting: RowChoice | None = None,
-        sense: Array | float = 1.0,
+        time_direction: Array | float = 1.0,
     ) -> ScalarSolveConstants | SolveConstants:
         """All that accelerations and projections need of what depends on params alone."""
         equations = self.lowered(q, params, inputs, sample).equations
         if equations is None:
-            return self.array.precompute(q, params, inputs, sample, kept, reacting, sense)
+            return self.array.precompute(q, params, inputs, sample, kept, reacting, time_direction)
 
         def before(
             code: Program | None, kept: Array | None, there: Array | None = None
         ) -> Array | None:
             if code is None:
                 return None
-            return _emit.prelude(code, params, q.dtype, kept, there, sense)
+            return _emit.prelude(code, params, q.dtype, kept, there, time_direction)
 
         solving = (None, None) if reacting is None else reacting
         first = before(equations.program, *solving)

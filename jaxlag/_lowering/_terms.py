@@ -93,7 +93,7 @@ class Terms(eqx.Module):
         sample: _params.Sample = _params.UNKNOWN,
         kept: Bool[Array, " m"] | None = None,
         reacting: RowChoice | None = None,
-        sense: Array | float = 1.0,
+        time_direction: Array | float = 1.0,
     ) -> Any:
         """What accelerations need of what depends on params alone, to be computed once per solve.
 

@@ -170,16 +170,16 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
     if not np.all(np.isfinite(ts)):
         raise invalid("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(ts)))}] was not")
     steps = np.diff(ts)
-    direction = 1 if ts[-1] >= ts[0] else -1
-    if not np.all(steps * direction > 0):
-        i = int(np.argmin(steps * direction > 0))
+    time_direction = 1 if ts[-1] >= ts[0] else -1
+    if not np.all(steps * time_direction > 0):
+        i = int(np.argmin(steps * time_direction > 0))
         raise invalid(
             "ts",
             "be strictly monotone",
             f"ts[{i}] = {ts[i]}, ts[{i + 1}] = {ts[i + 1]}",
             "Sort the times and drop repeated ones.",
         )
-    return ts, direction
+    return ts, time_direction
 
 
 def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:

@@ -46,7 +46,7 @@ class ProgramKey(NamedTuple):
     params: _params.Static
     inputs: _params.Static
     stepper: _params.Static
-    direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
+    time_direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
     max_steps: int
     save: tuple[str, ...]
     sample: _params.Sample
@@ -86,7 +86,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
         plan.system,
         plan.params,
         plan.inputs,
-        plan.direction,
+        plan.time_direction,
         power,
         plan.sample,
         formulation=plan.formulation,
@@ -160,7 +160,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
     given = jnp.concatenate([values.q0, speeds])
-    saves = dynamics.turned(values.ts, args)
+    saves = dynamics.signed(values.ts, args)
     steps = (values.step, values.longest)
     valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
     valid = valid & knots_increase(inputs)

@@ -40,15 +40,15 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
             "at: t", "be a number or a sequence of numbers", f"its shape was {asked.shape}"
         )
     ts = np.asarray(motion.ts)
-    sense = 1.0 if ts[-1] >= ts[0] else -1.0
+    time_direction = 1.0 if ts[-1] >= ts[0] else -1.0
     last = float(motion.last_time)
-    outside = ~((sense * (asked - ts[0]) >= 0) & (sense * (last - asked) >= 0))
+    outside = ~((time_direction * (asked - ts[0]) >= 0) & (time_direction * (last - asked) >= 0))
     if np.any(outside):
         was = f"one was {asked[outside][0]}"
         raise invalid("at: t", f"lie within the motion, from {ts[0]} to {last} s", was)
-    times = np.unique(sense * asked)
-    before = int(np.searchsorted(sense * ts, times[0], side="right")) - 1
-    times = sense * times[times > sense * ts[before]]
+    times = np.unique(time_direction * asked)
+    before = int(np.searchsorted(time_direction * ts, times[0], side="right")) - 1
+    times = time_direction * times[times > time_direction * ts[before]]
     if not len(times):
         return motion._at_saves([before] * len(asked))
     project: Any = motion.stabilization or False
@@ -76,5 +76,5 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         done = {name: work[before] for name, work in motion.saved["work"].items()}
         since = jax.tree.map(jnp.add, further.saved["work"], done)
         further = eqx.tree_at(lambda x: x.saved["work"], further, since)
-    places = np.searchsorted(sense * np.asarray(further.ts), sense * asked)
+    places = np.searchsorted(time_direction * np.asarray(further.ts), time_direction * asked)
     return further._at_saves(places.tolist())

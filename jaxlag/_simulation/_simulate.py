@@ -220,7 +220,7 @@ def simulate(
     check_method(method, rtol, atol, dt)
     check_estimate(estimate_error, method)
     q0, v0, u0 = check_start(system, q0, v0, u0)
-    ts, direction = check_times(ts)
+    ts, time_direction = check_times(ts)
     inputs = check_inputs(inputs)
     check_range(inputs, ts)
     rtol, atol = check_tolerances(system, method, rtol, atol, q0.dtype)
@@ -258,7 +258,7 @@ def simulate(
         params=_params.Static(params_static),
         inputs=_params.Static(inputs_static),
         stepper=_params.Static(stepper_static),
-        direction=direction,
+        time_direction=time_direction,
         max_steps=max_steps,
         save=tuple(save),
         sample=_params.sample(params_traced),

@@ -289,7 +289,7 @@ def _nystrom(
         drifts = [] if c == 0.0 else [_scaled(c, y[1])]
         if np.any(squared):
             drifts.append(_scaled(h, _sum(squared, kicks)))
-        return terms.turned(reduce(_added, drifts), args), _sum(row, kicks)
+        return terms.signed(reduce(_added, drifts), args), _sum(row, kicks)
 
     def whole(gain: Any) -> Any:
         """h times it. What a step returns is read in many places: XLA computes divisions once."""

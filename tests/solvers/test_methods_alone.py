@@ -67,7 +67,7 @@ class Halves(diffrax.ODETerm):
     def sections(self, y):
         return y[:2], y[2:], y[4:]
 
-    def turned(self, x, args):
+    def signed(self, x, args):
         return jax.tree.map(lambda x: self.sense * x, x)
 
 

@@ -30,7 +30,7 @@ def prelude(
     dtype: Any,
     kept: Array | None = None,
     there: Array | None = None,
-    sense: Array | float = 1.0,
+    time_direction: Array | float = 1.0,
 ) -> Float[Array, " k"]:
     """What the body needs of what does not change during a solve, as one array.
 
@@ -40,12 +40,12 @@ def prelude(
         dtype: of the results.
         kept: for every constraint row whether it is solved with; None for all.
         there: for every one whether it is more than rounding; None for all.
-        sense: -1 where time runs backwards.
+        time_direction: -1 where time runs backwards.
     """
     slots = numbers(program, dtype)
     for given in FIXED:
         wanted = {index: slot for (name, index), slot in program.inputs.items() if name == given}
-        values = {"kept": kept, "there": there, "sense": sense}
+        values = {"kept": kept, "there": there, "time_direction": time_direction}
         if given in values and values[given] is None:
             slots |= {slot: jnp.ones((), dtype) for slot in wanted.values()}
         elif wanted:

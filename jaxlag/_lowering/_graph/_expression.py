@@ -21,7 +21,7 @@ Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
 
-FIXED = ("params", "kept", "there", "sense")
+FIXED = ("params", "kept", "there", "time_direction")
 """Names of the inputs that do not change during a solve: parameters, the rows solved with, and
 whether time runs forwards (+1) or backwards (-1)."""
 

@@ -64,9 +64,9 @@ def rows(
     gamma = tangents(graph, c.velocity, dict(zip(q, v, strict=True)) | {t: graph.one})
     if c.damping is not None:
         twice_alpha, beta_squared = c.damping
-        positions, sense = iter(c.position), graph.input("sense", 0)
+        positions, direction = iter(c.position), graph.input("time_direction", 0)
         for k, residual in enumerate(c.velocity):
-            terms = [(gamma[k], 1.0), (graph.mul(sense, residual), twice_alpha)]
+            terms = [(gamma[k], 1.0), (graph.mul(direction, residual), twice_alpha)]
             if c.holonomic[k]:
                 terms.append((next(positions), beta_squared))
             gamma[k] = graph.sum(terms)

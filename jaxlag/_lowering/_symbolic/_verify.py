@@ -88,7 +88,7 @@ def compare(
                 for x in known
             ]
         inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
-        values: dict[tuple[str, int], Any] = {("t", 0): t, ("sense", 0): 1.0}
+        values: dict[tuple[str, int], Any] = {("t", 0): t, ("time_direction", 0): 1.0}
         for name, rows in (("q", [q]), ("v", [v]), ("params", params), ("inputs", inputs)):
             flat = np.concatenate([np.ravel(x) for x in rows]) if rows else []
             values |= {(name, i): x for i, x in enumerate(flat)}
