@@ -319,7 +319,7 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
 
     def found(flat: Callable, z: Array) -> Array:
         z = _polished(flat, z)
-        return z.at[:n].set(_closed(stop_gradient, rows, frozen[0], z[:n]))
+        return z.at[:n].set(_closed(constant, rows, frozen[0], z[:n]))
 
     def tangent(linear: Callable, y: Array) -> Array:
         return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(y)), y)

@@ -207,12 +207,12 @@ def test_a_bias_of_the_other_sign_is_found(monkeypatch):
 
 
 def test_a_contradiction_that_is_not_told_is_found(monkeypatch):
-    monkeypatch.setattr(_array_terms, "rows_hold", lambda *_: jnp.array(True))
+    monkeypatch.setattr(_array_terms, "redundant_rows_hold", lambda *_: jnp.array(True))
     assert found_in(BENT) == ["arrays: a number where rows or masses are contradictory"]
 
 
 def test_a_solution_that_is_refused_is_found(monkeypatch):
-    monkeypatch.setattr(_array_terms, "rows_hold", lambda *_: jnp.array(False))
+    monkeypatch.setattr(_array_terms, "redundant_rows_hold", lambda *_: jnp.array(False))
     assert found_in(DOUBLED) == ["arrays: a is no number"]
 
 

@@ -42,8 +42,8 @@ NAN = np.full(len(TS), np.nan)
     ("ts", "channels", "options", "message"),
     [
         (TS[::-1], {"x": TS}, {}, r"ts must increase strictly, but ts\[0\] = 3 and"),
-        (TS[:1], {"x": TS[:1]}, {}, r"one row of two times or more"),
-        (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one row per time, 151"),
+        (TS[:1], {"x": TS[:1]}, {}, r"an array of two times or more"),
+        (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one sample per time, 151"),
         (TS, {"x": NAN}, {}, r"channels\['x'\] must hold some numbers, but all were NaN"),
         (TS, {}, {}, r"one channel or more"),
         (TS, {"x": np.where(TS > 1, np.inf, TS)}, {}, r"finite, or NaN where nothing was measured"),

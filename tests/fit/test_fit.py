@@ -259,7 +259,7 @@ def test_bad_priors_are_named(mean, sigma, message):
         ({"free": ("k",)}, r"free must name parameters among \['c', 'g', 'l', 'm'\], but one was"),
         ({"free": "l"}, r"Write free=\('l',\)"),
         ({"segments": 0}, r"segments must be a positive integer"),
-        ({"segments": 100}, r"leave two rows or more to each"),
+        ({"segments": 100}, r"leave two samples or more to each"),
         ({"loss": "abs"}, r"loss must be one of"),
         ({"optimiser": "adam"}, r"optimiser must be None or a jl\.Descent, .*optax"),
         ({"rtol": np.ones(2)}, r"rtol must be one number, a name or an object without arrays"),

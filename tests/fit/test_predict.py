@@ -97,7 +97,7 @@ def test_figures_show_what_was_measured(tmp_path):
     ("options", "message"),
     [
         ({"settle": 0.0}, r"settle must be a positive number of seconds, or None, but it was 0"),
-        ({"settle": 5.0}, r"settle must leave rows of experiment to be predicted.*5 s of 3 s"),
+        ({"settle": 5.0}, r"settle must leave samples of experiment to be predicted.*5 s of 3 s"),
         ({"settle": 1e-3}, r"settle must hold 2 numbers or more.*hold 1.*Make it longer"),
         ({"save": ("a",)}, r"save must be left to jl\.predict"),
     ],

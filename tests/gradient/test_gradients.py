@@ -102,7 +102,7 @@ def recorded(motion: Motion, x):
             params=x["params"],
             inputs=base.inputs if x["inputs"] is None else x["inputs"],
         )
-        inexact, rest, setup, static = _solve.halves(_simulate.pose(plan, values)[2])
+        inexact, rest, setup, static = _solve.halves(_simulate.build_problem(plan, values)[2])
         if outcome is None:
             return _solve._recorded(inexact, rest, setup, static)
         rows = _solve._replay(rest, setup, static, outcome, inexact)
@@ -374,9 +374,9 @@ def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
 def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
     """The comparison of forward with reverse fails when the transposed map is wrong in sign."""
     _, x, dx, (_, dy, weights, _) = derivatives("central_motion")
-    right = _tangent_map.backwards
+    right = _tangent_map.adjoint_sweep
     monkeypatch.setattr(
-        _tangent_map, "backwards", lambda *args: jax.tree.map(jnp.negative, right(*args))
+        _tangent_map, "adjoint_sweep", lambda *args: jax.tree.map(jnp.negative, right(*args))
     )
     state, _ = end(MOTIONS["central_motion"], max_steps=4098)  # another program: nothing cached
     pulled = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)

@@ -91,7 +91,7 @@ def step_ends(options):
 
     @jax.jit
     def record(values):
-        inexact, rest, setup, static = _solve.halves(_simulate.pose(plan, values)[2])
+        inexact, rest, setup, static = _solve.halves(_simulate.build_problem(plan, values)[2])
         return _solve._recorded(inexact, rest, setup, static).record
 
     kept = record(values)

@@ -184,8 +184,8 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     ("knots", "message"),
     [
         ([2.0, 1.0], r"increase strictly, but knots\[0\] = 2.0"),
-        (1.0, "be one row of at least 1 times"),
-        ([], "be one row of at least 1 times"),
+        (1.0, "be an array of at least 1 times"),
+        ([], "be an array of at least 1 times"),
     ],
 )
 def test_bad_knots_of_a_function_are_refused(knots, message):
@@ -315,12 +315,12 @@ def test_a_run_beyond_its_tables_is_refused(ts, cover):
 @pytest.mark.parametrize(
     ("times", "values", "message"),
     [
-        ([0.0], [1.0], "times must be one row of at least 2 times, but its shape was (1,)."),
-        (0.0, [1.0], "times must be one row of at least 2 times, but its shape was ()."),
+        ([0.0], [1.0], "times must be an array of at least 2 times, but its shape was (1,)."),
+        (0.0, [1.0], "times must be an array of at least 2 times, but its shape was ()."),
         (
             [[0.0, 1.0]],
             [1.0],
-            "times must be one row of at least 2 times, but its shape was (1, 2)",
+            "times must be an array of at least 2 times, but its shape was (1, 2)",
         ),
         ([0.0, 1.0, 2.0], [1.0], "values must have one entry per time, 3, but its shape was (1,)"),
         ([0.0, 1.0], 3.0, "values must have one entry per time, 2, but its shape was ()."),

@@ -170,7 +170,7 @@ def wrong():
         "nan",
         (rows, np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]]), rows),
         {},
-        "v must be finite, but v[1, 1] ('theta2') was nan. Rows that a motion did not reach are",
+        "v must be finite, but v[1, 1] ('theta2') was nan. States that a motion did not reach are",
     )
     yield "inf", ([0.0, 1.0], [0.0, 1.0], [np.inf, 0.0]), {}, "a must be finite, but a[0] ('theta1"
     yield "t nan", (rows, rows, rows), {"t": np.nan}, "t must be finite, but it was nan"
@@ -228,7 +228,7 @@ def test_what_is_no_system_is_refused():
         (lambda t: t * jnp.ones(2), "now", "t must be real numbers, but it was 'now'"),
         (lambda t: t * jnp.ones(2), None, "t must be real numbers, but it was None"),
         (lambda t: t * jnp.ones(2), 1j, "t must be real, but its dtype was complex128"),
-        (lambda t: t * jnp.ones(2), np.ones((2, 2)), "t must be an instant or a row of them, but"),
+        (lambda t: t * jnp.ones(2), np.ones((2, 2)), "t must be an instant or an array of them"),
     ],
 )
 def test_a_motion_that_cannot_be_led_is_refused(motion, t, message):
