@@ -240,7 +240,7 @@ def test_wrong_rates_of_quasi_velocities_are_found(monkeypatch):
     """What is left of v' at u' = 0, forgotten."""
 
     def velocity_rate(self, du):
-        return self._push(du)
+        return self._jvp_fn(du)
 
     monkeypatch.setattr(Rates, "velocity_rate", velocity_rate)
     (what,) = found_in(IN_QUASI)
