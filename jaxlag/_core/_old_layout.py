@@ -21,9 +21,9 @@ def refuse(name: str) -> NoReturn:
         ImportError: always.
     """
     raise ImportError(
-        f"{name} must be a name of this version of jaxlag, but it was of another, as those in "
-        "pickles are that were made by one. Make them anew; of motions keep `to_dict()`, which "
-        "every version reads.",
+        f"{name} must be a module or a name of this version of jaxlag, but it was of an older one, "
+        "as those in older pickles are. Make the pickle anew; of motions keep `to_dict()`: arrays "
+        "by name, which every version reads.",
         name=name,
     )
 
