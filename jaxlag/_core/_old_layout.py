@@ -49,5 +49,5 @@ class _Finder(MetaPathFinder):
 
 def install() -> None:
     """Have Python ask, once."""
-    if not any(type(finder).__qualname__ == _Finder.__qualname__ for finder in sys.meta_path):
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.append(_Finder())

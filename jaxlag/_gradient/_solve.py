@@ -41,7 +41,7 @@ class Problem(NamedTuple):
     args: Any
     times: Times
     setup: Setup
-    stepper: Any  # static half of the Scheme
+    stepper: Any  # static half of the Stepper
     max_steps: int
     keep: CheckpointPlan
 

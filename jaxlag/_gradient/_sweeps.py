@@ -164,7 +164,7 @@ def adjoint_sweep(
         """One turn back: turn k - 1, or save times reached from the state before turn k.
 
         The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
-        a save time reached from the state before its last step; `owed` is what that adds there.
+        a save time reached from the state before its last step; `pending` is what that adds there.
         """
         k, r, bar, pending, (args_bar, anchors_bar, dues_bar) = carry
         j, now = save_left(r), clock.time(k - 1, anchors)

@@ -30,7 +30,7 @@ class Setup(NamedTuple):
 
     first_step: Array | None
     allowed: Bool[Array, ""]
-    stepper: Any  # traced half of the Scheme
+    stepper: Any  # traced half of the Stepper
 
 
 def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:

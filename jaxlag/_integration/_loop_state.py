@@ -31,8 +31,8 @@ class SaveProgress(NamedTuple):
     turn: Array  # that took it
     next: Array  # index of the next save time
     values: PyTree  # one more for what is not kept
-    turns: Array | None  # `Record.row_turn`
-    reaches: Array | None  # `Record.row_reach`
+    turns: Array | None  # `Record.save_turn`
+    reaches: Array | None  # `Record.save_reach`
     missed: Array
 
 

@@ -51,7 +51,7 @@ class Stepper(eqx.Module):
     term: diffrax.AbstractTerm
     # (args, tau) -> (args of a step from tau, where entries of tables begin in them)
     windows: Callable = eqx.field(static=True)
-    # (tau, y, args, differentiable) -> (the end of a step as it is kept, Verdict)
+    # (tau, y, args, differentiable) -> (the end of a step as it is kept, StepChecks)
     step_end: Callable | None = eqx.field(static=True, default=None)
     moves: bool = eqx.field(static=True, default=False)  # whether `step_end` moves the state
     longest: Array | None = None  # bound on adaptive steps

@@ -8,24 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import real
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._independent_rows import row_sizes
+from jaxlag._linalg._refined_qr import (
+    factored,
+    inverse_of,
+    least_sine,
+    lengths,
+    nearest,
+    refined,
+    sines,
+)
 from jaxlag._model._constraints import Pfaffian
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import require_arity
 from jaxlag._tracing._traced_function import traced_function
-
-# Least sine of the angle between a row of dU/dv and those before it, in roundings.
-SINE = 64
-
-REFINED = 2
-"""Steps of refinement. Worst errors over |B^-1| (|B| |u| + |v|) eps of 3000 matrices of 2 to 5
-rows, half of their other entries 0, between units of 1e-6 to 1e6: of v by U 3e10 without, 4e5 with
-one, 6 with two; of u by kinematics 7e9, 12, 0.5. The medians are 0.1 with any."""
 
 
 class QuasiVelocities(eqx.Module):
@@ -138,8 +138,8 @@ class QuasiVelocities(eqx.Module):
             return self._checked("U", self.U(t, q, v, params), self.size, v.dtype)
         B, c = self._affine(t, q, v.dtype, params)
         # Rows of long units would leave nothing but rounding of those of short ones.
-        size = _lengths(B)
-        return _nearest(B / size[:, None], (v - c) / size)
+        size = lengths(B)
+        return nearest(B / size[:, None], (v - c) / size)
 
     def velocities(
         self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " k"], params: Any
@@ -165,20 +165,20 @@ class QuasiVelocities(eqx.Module):
         rest = jnp.zeros((n,), u.dtype)
         theta_0, jvp_fn = jax.linearize(along, rest)
         theta = jax.vmap(jvp_fn)(jnp.eye(n, dtype=u.dtype))  # Theta_ij: of v_i in u_j
-        size, Q, R = _factored(theta)
-        fine = jnp.all(jnp.abs(jnp.diagonal(R)) > _floor(theta))
+        size, Q, R = factored(theta)
+        fine = jnp.all(jnp.abs(jnp.diagonal(R)) > least_sine(theta.dtype))
 
         def regular(x: Array) -> Array:
             """So that derivatives of what is masked are finite."""
             return jnp.where(fine, x, jnp.eye(n, dtype=x.dtype))
 
         theta = regular(theta)
-        inverse = _inverse(jnp.where(fine, size, 1.0), regular(Q), regular(R))
+        inverse = inverse_of(jnp.where(fine, size, 1.0), regular(Q), regular(R))
         v = lax.custom_linear_solve(
             lambda v: v @ theta,
             u - theta_0,
-            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
-            lambda turned, b: _refined(lambda b: inverse @ b, turned, b),
+            lambda turned, b: refined(lambda b: b @ inverse, turned, b),
+            lambda turned, b: refined(lambda b: inverse @ b, turned, b),
         )
         return jnp.where(fine, v, jnp.nan)
 
@@ -201,7 +201,7 @@ class QuasiVelocities(eqx.Module):
 
         here = rows(q)
         there = row_sizes(rows, q, here).there
-        return jnp.where(there, jnp.nan_to_num(_sines(here.T), nan=0.0), 0.0)
+        return jnp.where(there, jnp.nan_to_num(sines(here.T), nan=0.0), 0.0)
 
     def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
         """Distance of every quasi-velocity's coefficients from the span of those before it.
@@ -214,7 +214,7 @@ class QuasiVelocities(eqx.Module):
             q: coordinates, shape (n,), m or rad.
             params: as U takes them.
         """
-        size, _, R = _factored(self._columns(t, q, params, q.dtype))
+        size, _, R = factored(self._columns(t, q, params, q.dtype))
         return size * jnp.abs(jnp.diagonal(R))
 
     def determinant(
@@ -256,7 +256,7 @@ class QuasiVelocities(eqx.Module):
             q: coordinates, shape (n,).
             params: as U takes them.
         """
-        return jnp.all(self.sines(t, q, params, q.dtype) > SINE * float(jnp.finfo(q.dtype).eps))
+        return jnp.all(self.sines(t, q, params, q.dtype) > least_sine(q.dtype))
 
     def vector(self, argument: str, u: Any) -> Float[Array, " k"]:
         """All quasi-velocities from k numbers, or a dict by name; constrained ones may be left out.
@@ -362,80 +362,6 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
         )
     if k > n:
         raise invalid("quasi: names", f"be no more than the {n} coordinates", f"there were {k}")
-
-
-def _sines(columns: Float[Array, "n k"]) -> Float[Array, " k"]:
-    """Sine of the angle between every column and the span of those before it."""
-    return jnp.abs(jnp.diagonal(_factored(columns)[2]))
-
-
-def _nearest(B: Float[Array, "n k"], b: Float[Array, " n"]) -> Float[Array, " k"]:
-    """The x with B x nearest to b; derivatives go through B x = b, not through its factors.
-
-    Of a B that is taller than wide it is found together with what is left, r = b - B x, B^T r = 0.
-
-    Source: Bjorck, BIT 7 (1967) 257.
-    """
-    n, k = B.shape
-    inverse, fixed = _inverse(*_factored(B)), lax.stop_gradient(B)
-    if n == k:
-        return lax.custom_linear_solve(
-            lambda x: B @ x,
-            b,
-            lambda product, b: _refined(lambda b: inverse @ b, product, b),
-            lambda turned, b: _refined(lambda b: b @ inverse, turned, b),
-        )
-
-    def bordered(z: Array) -> Array:
-        return jnp.concatenate([z[:n] + B @ z[n:], z[:n] @ B])
-
-    def solve(right: Array) -> Array:
-        given, out = right[:n], right[n:] @ inverse
-        left = given - fixed @ (inverse @ given) + out
-        return jnp.concatenate([left, inverse @ (given - out)])
-
-    right = jnp.concatenate([b, jnp.zeros((k,), b.dtype)])
-    found = lax.custom_linear_solve(
-        bordered, right, lambda product, b: _refined(solve, product, b), symmetric=True
-    )
-    return found[n:]
-
-
-def _refined(solve: Callable, product: Callable, b: Array) -> Array:
-    """The x with product(x) = b, with the residuals of the first ones solved for, too.
-
-    Between coordinates of unlike units rows are nearly parallel, and those of short units would be
-    left with the rounding of the others.
-
-    Source: Skeel, Math. Comp. 35 (1980) 817.
-    """
-    x = solve(b)
-    for _ in range(REFINED):
-        x = x + solve(b - product(x))
-    return x
-
-
-def _lengths(rows: Float[Array, "n k"]) -> Float[Array, " n"]:
-    """Lengths of rows, 1 of those that vanish; without derivatives."""
-    size = jnp.sqrt(jnp.sum(lax.stop_gradient(rows) ** 2, axis=1))
-    return jnp.where(size > 0, size, 1.0)
-
-
-def _factored(columns: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
-    """(s, Q, R) with Q R diag(s) the columns, s their lengths; without derivatives."""
-    columns = lax.stop_gradient(columns)
-    size = _lengths(columns.T)
-    Q, R = jnp.linalg.qr(columns / size[None])
-    return size, Q, R
-
-
-def _inverse(size: Array, Q: Array, R: Array) -> Float[Array, "k n"]:
-    """That of Q R diag(size) where it is square; where it is tall, the least-squares one."""
-    return solve_triangular(R, Q.T) / size[:, None]
-
-
-def _floor(columns: Array) -> float:
-    return SINE * float(jnp.finfo(columns.dtype).eps)
 
 
 def _names(argument: str, names: Any) -> tuple[str, ...]:

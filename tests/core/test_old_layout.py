@@ -11,7 +11,7 @@ from jaxlag._core import _old_layout
 
 @pytest.mark.parametrize(
     "name",
-    ["_solution.Solution", "_system.System", "_statics.Equilibrium", "_gradient.GradientMode"],
+    ["_solution.Solution", "_system.System", "_statics.Equilibrium", "_fit.fit"],
 )
 def test_a_pickle_of_the_old_layout_is_refused(name):
     module, _, kind = name.rpartition(".")

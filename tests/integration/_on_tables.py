@@ -1,4 +1,4 @@
-"""A mass that is pushed by what a table says, with its closed form."""
+"""A mass that is pushed by what a table says."""
 
 import jaxlag as jl
 

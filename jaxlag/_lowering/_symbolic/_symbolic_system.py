@@ -76,7 +76,7 @@ class Equations(NamedTuple):
     determinants: Program | None = None
 
     def code(self, name: str) -> Program | None:
-        """The code whose prelude has this name in `ScalarPrepared`."""
+        """The code whose prelude has this name in `ScalarSolveConstants`."""
         own = {
             "acceleration": self.program,
             "rates": self.velocity,
