@@ -23,9 +23,10 @@ Leaves = Sequence[Any]
 
 
 _TWICE = (
-    "Reverse derivatives of reverse derivatives must be taken through explicit methods: JAX does "
-    "not transpose the loops in which implicit ones solve their equations. Take second derivatives "
-    "forward over reverse, jax.hessian(f) or jax.jacfwd(jax.grad(f)), which all methods have."
+    "Reverse derivatives of reverse derivatives must be taken through explicit methods or those of "
+    "jaxlag.solvers: JAX does not transpose the loops in which others solve their equations. Take "
+    "second derivatives forward over reverse, jax.hessian(f) or jax.jacfwd(jax.grad(f)), which all "
+    "methods have."
 )
 
 

@@ -47,7 +47,7 @@ class AbstractPartitioned(AbstractFixedStep):
     The equations are solved for the velocities V_i until the increments stop falling; a step
     where they do not is reported as not solved, and velocities are NaN where d2L/dv2 is not
     positive definite. Work that is asked for follows by the weights b.
-    Second derivatives are taken forward over reverse, as by `jax.hessian`.
+    Second derivatives are taken in every order of modes.
 
     The terms have the methods `sections`, `joined` (as for `Splitting`) and `canonical(args)`, an
     object with
