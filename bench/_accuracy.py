@@ -1,6 +1,6 @@
 """Whether the errors of a motion are what its tolerance promises: formulas and verdicts.
 
-Errors are measured as `jl.grad_growth` measures growth: |e / w|, the Euclidean norm over (q, v) of
+Errors are measured as `jl.lyapunov` measures growth: |e / w|, the Euclidean norm over (q, v) of
 the error in units of w = atol + rtol |y|.
 """
 

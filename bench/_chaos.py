@@ -61,7 +61,7 @@ def exact() -> Exact:
     motions = solved_to(3e-14, "auto")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the horizon
-        growth = jl.grad_growth(motions)
+        growth = jl.lyapunov(motions)
     statuses = names(motions.status) + names(growth.status)
     return Exact(
         np.asarray(motions.q),

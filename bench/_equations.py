@@ -165,7 +165,7 @@ class _Declared:
     def lagrangian(self, t: Any, q: Any, v: Any, params: Any) -> Any:
         system = self.system
         if system.written_in == "u":
-            return system.in_u(t, q, system.quasi.U(t, q, v, params), params)
+            return system._in_u(t, q, system.quasi.U(t, q, v, params), params)
         return system.lagrangian(t, q, v, params)
 
     def mass(self, *at: Any) -> Any:
@@ -193,7 +193,7 @@ class _Declared:
         if isinstance(force, jl.PointForce):
             J = jax.jacfwd(force.position, 1)(t, q, params)
             return jnp.sum(J * force.force(*at)[..., None], axis=tuple(range(J.ndim - 1)))
-        if isinstance(force, jl.Couple):
+        if isinstance(force, jl.Torque):
             J = jax.jacfwd(force.angular_velocity, 2)(*at)
             torque = jnp.asarray(force.torque(*at))
             return jnp.sum(J * torque[..., None], axis=tuple(range(J.ndim - 1)))

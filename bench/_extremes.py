@@ -156,6 +156,6 @@ def used_up(quick: bool) -> Found:
 
 @rows.row("beyond the table of an input", "-", 0.0, ("input_range",))
 def out_of_range(quick: bool) -> Found:
-    table = {"f": jl.Linear(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))}
+    table = {"f": jl.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 1.0]))}
     solve = jax.jit(lambda t: run(PUSHED, [0.0], [0.0], t, {"m": 1.0, "k": 0.0}, inputs=table))
     return must_end(solve(jnp.array([0.0, 2.0])))

@@ -32,9 +32,9 @@ from bench._harness import Reference
 G = 9.81  # m/s^2
 GEAR = 6.0
 EVERY = 5  # rows of 2 ms
-OPTIONS = {"method": "tsit5", "rtol": 1e-6, "atol": 1e-6, "max_steps": 4096}
+OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-6, "atol": 1e-6, "max_steps": 4096}}
 STEEP = 100.0  # s/rad, how fast dry friction changes its sign
-LOSS = jl.Bounded(0.0, np.inf)  # friction takes energy
+LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction takes energy
 
 # ---- One arm -------------------------------------------------------------------------------------
 
@@ -118,7 +118,7 @@ def recording(path: Path, columns: tuple[str, ...], torques: tuple[str, ...], ev
     return jl.Experiment(
         t[::every],
         {"q": angles[::every]},
-        inputs={"torque": jl.Linear(t, torque)},
+        inputs={"torque": jl.LinearInterpolation(t, torque)},
         name=path.name.removesuffix(".csv.gz"),
     )
 

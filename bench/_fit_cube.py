@@ -21,7 +21,7 @@ HALF = 0.0524  # m, of an edge
 CLEAR = 8e-3  # m, between the lowest corner and the board
 FEWEST = 6  # rows
 TRAINING = 90  # tosses
-OPTIONS = {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}
+OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}}
 START = {"g": 9.81, "I2": 1.0, "I3": 1.0}
 # g by parabolas through the heights; the ratios of a cube.
 OTHERS = {"g": 9.61, "I2": 1.0, "I3": 1.0}

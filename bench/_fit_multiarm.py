@@ -30,14 +30,14 @@ EVERY = 10  # milliseconds: rows that are fitted to and compared
 EVERY_EARLY = 2  # where a start is fitted to 0.1 s
 SETTLE = 0.1  # s
 PIECES = 4  # of recordings of one arm, joined in the fit
-OPTIONS = {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}
+OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}}
 SLIP = 0.05  # rad/s, over which dry friction changes its sign
 ANGLE = 0.05  # rad, likewise the restoring moment
 # Of a fit to all segments, mrad: what is to be beaten (single: whole segments; else 1 s).
 REFITTED = {1: (2.05,), 2: (1.1, 1.5), 3: (1.2, 1.2, 1.1)}
 MARGIN = 1.1
-BOUNDS = {"u": jl.Bounded(0.3, 30.0)}  # rad/s
-LOSS = jl.Bounded(0.0, np.inf)  # friction takes energy
+BOUNDS = {"u": jl.transforms.Bounded(0.3, 30.0)}  # rad/s
+LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction takes energy
 # Published estimates: of the arms a (joint to mass centre), L (joint to joint), I (about the mass
 # centre), m, and k of the joints, SI units.
 PUBLISHED: Mapping[int, dict[str, float]] = {
@@ -207,9 +207,11 @@ def _chosen(
     held_out = fitted(train[1::3], arms)
     rest = fitted([x for i, x in enumerate(train) if i % 3 != 1], arms)
     # A search in whole recordings of one arm ends in minima on the way.
-    options = {"free": tuple(params0), "segments": PIECES if arms == 1 else 1} | OPTIONS
+    options, free = {"segments": PIECES if arms == 1 else 1} | OPTIONS, tuple(params0)
     begun = perf_counter()
-    compared = jl.compare(system, rest, params0, models, held_out=held_out, **options)
+    compared = jl.select_model(
+        system, rest, params0, models, held_out=held_out, free=free, fit_options=options
+    )
     spent = perf_counter() - begun
     figures = []
     for model in compared.models:
@@ -223,10 +225,10 @@ def _chosen(
     best, term = compared.best, models.get(compared.best.name)
     if term is not None:
         system = system.with_forces(*term.forces)
-        options |= {"free": (*params0, *term.params0), "transforms": term.transforms}
+        free, options = (*params0, *term.params0), options | {"transforms": term.transforms}
     return (
         best.name,
-        partial(jl.fit, system, fitted(train, arms), best.fit.params, **options),
+        partial(jl.fit, system, fitted(train, arms), best.fit.params, free=free, **options),
         figures,
     )
 

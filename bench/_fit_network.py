@@ -66,7 +66,7 @@ def measured(path: Path, quick: bool) -> Part:
 
     def fit() -> jl.FitResult:
         start = physics.params | {"net": network}
-        return jl.fit(both, train, start, free=(*free, "net"), optimiser=descent, **options)
+        return jl.fit(both, train, start, free=(*free, "net"), optimizer=descent, **options)
 
     found, figures = timed(name, model, fit, turns=1)
     figures.append(Figure(name, model, "numbers trained", "1", float(len(found.names))))

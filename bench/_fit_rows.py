@@ -30,7 +30,9 @@ def searched(system: jl.System, data: jl.Experiment, guess: dict[str, float]) ->
     """All params free."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a search that stopped short: the row says so
-        return jl.fit(system, data, guess, free=tuple(guess), rtol=1e-12, atol=1e-12)
+        return jl.fit(
+            system, data, guess, free=tuple(guess), simulate_options={"rtol": 1e-12, "atol": 1e-12}
+        )
 
 
 def ending(found: jl.FitResult) -> tuple[str, ...]:

@@ -33,7 +33,7 @@ RATE = 100.0  # 1/s
 START = np.array([2.0, 2.6])  # rad, at rest
 TIMES = 5.0  # Lyapunov times
 SEGMENTS = 10
-OPTIONS = {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}
+OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}}
 TRUTH = {"rtol": 1e-11, "atol": 1e-11}
 SETTLING, STRETCHES = 20, 400  # s
 NEAR = 0.01
@@ -119,7 +119,7 @@ def recovered(ts: np.ndarray, seeds: int, segments: int) -> Tally:
             wrong(seed),
             free=FREE,
             segments=segments,
-            transforms=dict.fromkeys(FREE, jl.Positive()),
+            transforms=dict.fromkeys(FREE, jl.transforms.Positive()),
             **OPTIONS,
         )
         error = max(abs(fitted.params[x] / TRUE[x] - 1) for x in FREE)

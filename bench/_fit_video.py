@@ -24,7 +24,7 @@ from bench._fit_part import Part, errors, estimates, missed, timed
 RATE = 400.0  # 1/s
 WINDOW = 0.3  # s: longer ones are chaotic
 TRAIN, TEST = ("2", "13"), ("17",)
-OPTIONS = {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}
+OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}}
 START = {"B": 0.1, "C": 0.15, "P": 100.0, "Q": 10.0, "k1": 0.02, "k2": 0.02}
 # Middles of the ranges over seven runs, each fitted alone.
 OTHERS = {"B": 0.076, "C": 0.1034, "P": 69.2, "Q": 7.06, "k2": 0.008}
@@ -61,7 +61,7 @@ def measured(path: Path, quick: bool) -> Part:
         train, test = train[::40], test[::40]
 
     def fit() -> jl.FitResult:
-        transforms = dict.fromkeys(("k1", "k2"), jl.Bounded(0.0, np.inf))
+        transforms = dict.fromkeys(("k1", "k2"), jl.transforms.Bounded(0.0, np.inf))
         return jl.fit(PENDULUM, train, START, free=tuple(START), transforms=transforms, **OPTIONS)
 
     found, figures = timed(name, model, fit)

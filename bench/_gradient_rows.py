@@ -141,7 +141,7 @@ def turning(system: jl.System, start: Any, rates: Any, map_: Any) -> Found:
     def last(w: Any) -> tuple[Array, jl.Solution]:
         options = {"rtol": 1e-11, "atol": 1e-11, "throw": False}
         ball = {"I": np.ones(3)}
-        motion = jl.simulate(system, start, u0=w, ts=[0.0, t], params=ball, **options)
+        motion = jl.simulate(system, start, None, u0=w, ts=[0.0, t], params=ball, **options)
         return map_.matrix(motion.q[-1]), motion
 
     def cross(w: Any) -> np.ndarray:

@@ -167,7 +167,7 @@ def _step(looped: Looped, system: jl.System) -> Callable:
             ts = jnp.asarray([0.0, 0.05]) + looped.t
             motion = jl.simulate(system, q, v, ts, p, throw=False, max_steps=200)
             return jnp.concatenate([motion.q[-1] / units, motion.v[-1] / units])
-        a = system.acceleration(p, q, v, looped.t) / units
+        a = system.acceleration(q, v, p, t=looped.t) / units
         v = x[n:] + h * k * a
         return jnp.concatenate([x[:n] + h * k * v, v])
 

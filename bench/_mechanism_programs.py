@@ -230,7 +230,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
     quasi = system.quasi
     assert quasi is not None
     given = system.lagrangian, system.forces, system.constraints
-    terms = ArrayTerms(*given, quasi=quasi, in_u=system.in_u)
+    terms = ArrayTerms(*given, quasi=quasi, in_u=system._in_u)
     scalars = ScalarTerms(terms, OPERATIONS)
 
     def speeds(t: Any, q: Any, v: Any, params: Any) -> Any:
@@ -270,7 +270,7 @@ def has_scalars(mechanism: Mechanism, name: str) -> bool:
     if name == "scalars":
         terms = ArrayTerms(*given)
     else:
-        terms = ArrayTerms(*given, quasi=system.quasi, in_u=system.in_u)
+        terms = ArrayTerms(*given, quasi=system.quasi, in_u=system._in_u)
     like = jax.ShapeDtypeStruct((mechanism.drawn.n,), dtype)
     scalars = ScalarTerms(terms, OPERATIONS)
     return scalars.lowered(like, values(mechanism.drawn), {}).equations is not None

@@ -101,7 +101,7 @@ def four_bar() -> Mechanism:
 def _started(
     system: jl.System, q0: np.ndarray, v0: np.ndarray, params: Mapping[str, float]
 ) -> Mechanism:
-    T = 0.5 * v0 @ np.asarray(system.mass_matrix(params, q0)) @ v0
+    T = 0.5 * v0 @ np.asarray(system.mass_matrix(q0, params=params)) @ v0
     return Mechanism(system, q0, v0, params, float(T))
 
 
@@ -126,7 +126,7 @@ def sprung_snakeboard() -> Mechanism:
     )
     q0 = np.array([0.0, 0.0, 0.0, 0.0, 0.4])
     u0 = {"xi": 2.0, "psidot": 6.0, "phidot": 0.5}
-    return _started(system, q0, np.asarray(system.velocities(BOARD, q0, u0)), BOARD)
+    return _started(system, q0, np.asarray(system.velocities(q0, u0, BOARD)), BOARD)
 
 
 DISK = {"m": 1.5, "R": 0.25, "I_d": 0.025, "I_a": 0.045, "g": G}
@@ -135,7 +135,7 @@ DISK = {"m": 1.5, "R": 0.25, "I_d": 0.025, "I_a": 0.045, "g": G}
 def disk() -> Mechanism:
     """It leans and wobbles as it rolls about, fast enough not to fall."""
     system, q0 = rolling_disk.system, np.array([0.0, 0.0, 0.0, 1.2, 0.0])
-    v0 = np.asarray(system.velocities(DISK, q0, {"w1": 0.3, "w2": 1.0, "w3": 12.0}))
+    v0 = np.asarray(system.velocities(q0, {"w1": 0.3, "w2": 1.0, "w3": 12.0}, DISK))
     return _started(system, q0, v0, DISK)
 
 

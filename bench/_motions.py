@@ -202,7 +202,7 @@ def _disk() -> Motion:
         system=rolling_disk.system,
         params=DISKS,
         q0=q0,
-        v0=np.asarray(rolling_disk.system.velocities(DISKS, q0, u0)),
+        v0=np.asarray(rolling_disk.system.velocities(q0, u0, DISKS)),
         t1=5.0,
         rates=_explicit.rolling_disk,
         lagrangian=_lagrangian(rolling_disk),

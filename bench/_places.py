@@ -155,7 +155,7 @@ INERTIA = np.array([1.0, 2.0, 3.0])
 
 def tumble(system: jl.System, start: Any, w: Any, t: float, **options: Any) -> jl.Solution:
     options = {"throw": False} | (options or {"rtol": 1e-11, "atol": 1e-11})
-    return jl.simulate(system, start, u0=w, ts=[0.0, t], params={"I": INERTIA}, **options)
+    return jl.simulate(system, start, None, u0=w, ts=[0.0, t], params={"I": INERTIA}, **options)
 
 
 def attitude(map_: Any, motion: jl.Solution) -> np.ndarray:
@@ -307,5 +307,5 @@ def residual(quick: bool) -> Found:
         dt=0.01,
         max_steps=2 * steps,
     )
-    phi = BOBS.terms.position(motion.ts[-1], motion.q[-1], {})
+    phi = BOBS._terms.position(motion.ts[-1], motion.q[-1], {})
     return Found(float(jnp.max(jnp.abs(phi)) / 4.0), names(motion.status))

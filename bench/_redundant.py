@@ -47,10 +47,10 @@ def imbalance(dtype: Any) -> Found:
             constraints=constraints,
         )
         for radius in 10.0 ** -np.arange(9):
-            at = jnp.asarray(radius, dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype)
-            a, M, h = system.acceleration(*at), system.mass_matrix(*at[:2]), system.bias(*at)
+            at = jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.asarray(radius, dtype)
+            a, M, h = system.acceleration(*at), system.mass_matrix(*at), system.bias(*at)
             lam = jnp.concatenate([jnp.ravel(x) for x in system.multipliers(*at).values()])
-            A = system.terms.rows(jnp.zeros(()), *at[1:], at[0])[0]
+            A = system._terms.rows(jnp.zeros(()), *at)[0]
             a, M, h, lam, A = (np.asarray(x, np.float64) for x in (a, M, h, lam, A))
             terms = np.abs(M @ a) + np.abs(h) + np.abs(lam) @ np.abs(A)
             off = float(np.max(np.abs(M @ a + h - lam @ A) / terms)) / float(jnp.finfo(dtype).eps)

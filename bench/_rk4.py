@@ -88,7 +88,7 @@ def system(scene: Scene, lowering: str = "auto") -> jl.System:
 
 def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
     """jaxlag's equations, and whether they are on scalars, as `jl.simulate` takes them."""
-    terms = system(scene, lowering).terms
+    terms = system(scene, lowering)._terms
     like, t = jnp.asarray(scene.q0), jnp.zeros(())
     scalar = isinstance(terms, ScalarTerms) and operations(scene, lowering) is not None
     if isinstance(terms, ScalarTerms):
@@ -112,7 +112,7 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
 
 def operations(scene: Scene, lowering: str = "auto") -> int | None:
     """Operations of the scalar program; None where there is none."""
-    terms = system(scene, lowering).terms
+    terms = system(scene, lowering)._terms
     if isinstance(terms, ArrayTerms):
         return None
     assert isinstance(terms, ScalarTerms)

@@ -64,7 +64,7 @@ def residual(quick: bool) -> Found:
     start, steps = np.array([0.6, -0.8, 1.6, -0.8], np.float32), 5_000
     options: dict[str, Any] = {"method": "dopri5", "dt": 0.01, "max_steps": 2 * steps}
     motion = run(BOBS, start, np.zeros(4, np.float32), [0.0, 0.01 * steps], {}, **options)
-    phi = BOBS.terms.position(motion.ts[-1], motion.q[-1].astype(float), {})
+    phi = BOBS._terms.position(motion.ts[-1], motion.q[-1].astype(float), {})
     return single(motion, Found(float(jnp.max(jnp.abs(phi)) / 4.0), names(motion.status)))
 
 

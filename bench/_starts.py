@@ -1,6 +1,6 @@
 """Two starts of every system that moves: its example's, and one of more energy.
 
-The second is chaotic where the system can be: `jl.grad_growth` finds an exponent beyond three of
+The second is chaotic where the system can be: `jl.lyapunov` finds an exponent beyond three of
 its errors. Systems that cannot (one freedom, linear, integrable, short) are only livelier. Spans
 are such that errors grow less than a million times. Values are guesses where there are constraints:
 the state nearest to them is taken.

@@ -15,6 +15,7 @@ from bench._compared import DIFFERS, EQUAL, SLACK, Compared
 from bench._random_systems import Drawn
 from bench._rounding import evaluated
 from jaxlag._lowering import ArrayTerms, ScalarTerms
+from jaxlag._system._inspection import check_traceable
 
 NUDGES = 4  # runs with other roundings
 MORE = 60  # where they differ by those: a floor may turn at one rounding in ten
@@ -34,7 +35,7 @@ def compared(drawn: Drawn) -> Compared:
     scalars = ScalarTerms(arrays, 1500)
     try:
         like = jax.ShapeDtypeStruct((drawn.n,), dtype)
-        system.check_traceable(params, dtype, {})
+        check_traceable(system, params, dtype, {})
     except (TypeError, ValueError):
         return Compared("no Lagrangian")
     lowered = scalars.lowered(like, params, {})

@@ -1,7 +1,7 @@
 """Accuracy: every system to 1e-4 ... 1e-11 against references of 20 digits and more.
 
 A row is one motion to one tolerance, rtol = atol, by the method that `jl.simulate` chooses. With
-w = atol + rtol |y|, kappa from `jl.grad_growth` and norms as there:
+w = atol + rtol |y|, kappa from `jl.lyapunov` and norms as there:
 
     |error / w| <= 10 kappa + floor, floor = 10 eps kappa sqrt(steps) |y / w|, at every time;
     |error / w| >= 1e-3 for the largest, from 20 steps on and above the floor;
@@ -60,7 +60,7 @@ def rows_of(
 ) -> list[dict[str, Any]]:
     """The rows of one motion."""
     motion = Run(name, params, reference)
-    growth = jl.grad_growth(motion.to(FINE))  # of weights atol = rtol, as in the rows
+    growth = jl.lyapunov(motion.to(FINE))  # of weights atol = rtol, as in the rows
     kappa = np.asarray(growth.kappa)[1:]
     rows = []
     for rtol in tolerances:

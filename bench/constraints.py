@@ -40,7 +40,7 @@ STEP = 0.01  # s
 METHOD = "dopri8"
 GAIN = 0.1 / STEP  # 1/s
 NONE, BAUMGARTE, PROJECTION = "none", "Baumgarte", "projection"
-STABILISATIONS = {NONE: False, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: True}
+STABILISATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
 FORMULATIONS = ("multipliers", "null_space")
 QUASI = "quasi"
 STEPS, ROWS = 1_000_000, 1001
@@ -144,7 +144,7 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
             dt=STEP,
             max_steps=steps + 1,  # the times of steps are rounded, and may leave a short last one
             formulation=case.formulation,
-            project=STABILISATIONS[case.stabilisation],
+            stabilization=STABILISATIONS[case.stabilisation],
             throw=False,
         )
         return motion.q, motion.v
@@ -156,7 +156,7 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
     """Of states (q, v), the first at the start and the last after `steps` steps."""
 
     def rows(q: Array, v: Array) -> tuple[Array, Array]:
-        position, velocity = mechanism.system.residuals(mechanism.params, q, v)
+        position, velocity = mechanism.system.residuals(q, v, mechanism.params)
         rates = jnp.concatenate([jnp.ravel(x) for x in velocity.values()])
         if not position:  # rows without phi
             return jnp.zeros_like(rates), rates
@@ -167,7 +167,7 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
     def each(q: Array, v: Array) -> tuple[Array, Array, Array]:
         A = jax.jacfwd(lambda v: rows(q, v)[1])(v)
         position, velocity = (jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in rows(q, v))
-        return position, velocity, mechanism.system.energy(mechanism.params, q, v)
+        return position, velocity, mechanism.system.energy(q, v, mechanism.params)
 
     position, velocity, H = (np.asarray(x) for x in each(q, v))
     return Record(

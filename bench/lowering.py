@@ -126,7 +126,7 @@ def chain(n: int, quick: bool) -> list[Row]:
         calls[words], cost = _timed(scene, *_rk4.by_jaxlag(scene, lowering), steps)
         rows[words], lanes[words] = {**cost}, _rk4.STAGES * steps
         rows[words]["operations"] = _rk4.operations(scene, lowering)
-        values[words] = np.asarray(_rk4.system(scene, lowering).acceleration(scene.params, q, v))
+        values[words] = np.asarray(_rk4.system(scene, lowering).acceleration(q, v, scene.params))
     for words, peer in _chains.neighbours(scene, steps).items():
         calls[words], rows[words], lanes[words] = peer.call, {}, peer.evaluations
         values[words] = peer.acceleration(q, v)

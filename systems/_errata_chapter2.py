@@ -163,7 +163,7 @@ ERRATA = (
         place="2.21, third line, T of the lamina",
         wrong="y' xb + x' yb for y' xb - x' yb",
         draw=around_example(lamina_two_forces.entry),
-        engine=lambda s: lamina_two_forces.system.kinetic(s.params, s.q, s.v, s.t),
+        engine=lambda s: lamina_two_forces.system.kinetic(s.q, s.v, s.params, t=s.t),
         printed=lambda s: _lamina_kinetic(s, +1),
         right=lambda s: _lamina_kinetic(s, -1),
     ),
@@ -171,7 +171,7 @@ ERRATA = (
         place="2.22, Q_x and Q_y of forces along the body axes",
         wrong="body components, not turned into the fixed axes",
         draw=around_example(lamina_two_forces.entry),
-        engine=lambda s: lamina_two_forces.system.generalized_force(s.params, s.q, s.v, s.t)[:2],
+        engine=lambda s: lamina_two_forces.system.generalized_force(s.q, s.v, s.params, t=s.t)[:2],
         printed=_following_printed,
         right=_following_right,
     ),
@@ -180,7 +180,7 @@ ERRATA = (
         wrong="arms are not turned with the body",
         draw=around_example(lamina_two_forces_fixed_direction.entry),
         engine=lambda s: lamina_two_forces_fixed_direction.system.generalized_force(
-            s.params, s.q, s.v, s.t
+            s.q, s.v, s.params, t=s.t
         )[2],
         printed=_fixed_printed,
         right=_fixed_right,

@@ -92,7 +92,7 @@ def _second_equation(s: State, power: int):
 
 def _string_forces(s: State):
     """Forces of the strings on the swinging bobs, (4,)."""
-    a = _DOUBLE.acceleration(s.params, s.q, s.v, s.t)
+    a = _DOUBLE.acceleration(s.q, s.v, s.params, t=s.t)
     return jl.inverse_dynamics(_BOBS, *motion(_bobs, s, a), s.params)
 
 
@@ -132,7 +132,7 @@ _BOB = jl.System(
 
 
 def _string_force(s: State):
-    a = simple_pendulum.system.acceleration(s.params, s.q, s.v, s.t)
+    a = simple_pendulum.system.acceleration(s.q, s.v, s.params, t=s.t)
     return jl.inverse_dynamics(_BOB, *motion(_bob, s, a), s.params)
 
 
@@ -178,7 +178,7 @@ ERRATA = (
         place="3.67, T of the double pendulum",
         wrong="y1' for y1'^2",
         draw=around_example(double_pendulum.entry),
-        engine=lambda s: _DOUBLE.kinetic(s.params, s.q, s.v, s.t),
+        engine=lambda s: _DOUBLE.kinetic(s.q, s.v, s.params, t=s.t),
         printed=lambda s: _bob_energy(s, 1),
         right=lambda s: _bob_energy(s, 2),
     ),

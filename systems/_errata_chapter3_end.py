@@ -22,7 +22,7 @@ from systems._erratum import Erratum, State, around, around_example, motion, rat
 
 
 def _pulls(s: State, *names: str):
-    return double_pendulum_forces.system.generalized_force(s.params, s.q, s.v, s.t, names=names)
+    return double_pendulum_forces.system.generalized_force(s.q, s.v, s.params, t=s.t, names=names)
 
 
 def _Q2(s: State, sign: int):
@@ -54,11 +54,11 @@ def _steady(rod: float):
 
 
 def _support_torque(s: State):
-    return rotating_cylinder_disk.system.multipliers(s.params, s.q, s.v, s.t)["level"]
+    return rotating_cylinder_disk.system.multipliers(s.q, s.v, s.params, t=s.t)["level"]
 
 
 def _momentum_about_vertical(s: State):
-    return rotating_cylinder_disk.system.momentum(s.params, s.q, s.v, s.t)[0]
+    return rotating_cylinder_disk.system.momentum(s.q, s.v, s.params, t=s.t)[0]
 
 
 def _disk_inertia(s: State):
@@ -71,7 +71,7 @@ def _disk_inertia(s: State):
 
 def _cart_lagrangian(s: State):
     K1, K2 = s.values("K1", "K2")
-    T = disk_on_moving_cart.system.kinetic(s.params, s.q, s.v, s.t)
+    T = disk_on_moving_cart.system.kinetic(s.q, s.v, s.params, t=s.t)
     return T - energy.spring(K1, s.q[1:]) - energy.spring(K2, s.q[:1])
 
 
@@ -143,7 +143,7 @@ def _friction_moment(s: State):
     """What the friction adds to the generalized force on theta."""
     q = _stick(s.t, s.q, s.params)
     rough, smooth = s.params, {**s.params, "mu": 0.0 * s.params["mu"]}
-    Q, Q_smooth = (_STICK.generalized_force(p, q, jnp.zeros(3)) for p in (rough, smooth))
+    Q, Q_smooth = (_STICK.generalized_force(q, jnp.zeros(3), p) for p in (rough, smooth))
     return (Q - Q_smooth)[2]
 
 
@@ -203,9 +203,9 @@ _varying = around(
 
 def _swinging_power(s: State):
     return rate(
-        lambda t, q, v: _VARYING.energy(s.params, q, v, t),
+        lambda t, q, v: _VARYING.energy(q, v, s.params, t=t),
         s,
-        _VARYING.acceleration(s.params, s.q, s.v, s.t),
+        _VARYING.acceleration(s.q, s.v, s.params, t=s.t),
     )
 
 
@@ -239,8 +239,8 @@ def _swinging_energy(s: State, sign: int):
 
 def _radial_momentum_rate(s: State):
     system = central_motion.system
-    a = system.acceleration(s.params, s.q, s.v, s.t)
-    return rate(lambda t, q, v: system.momentum(s.params, q, v, t), s, a)[0]
+    a = system.acceleration(s.q, s.v, s.params, t=s.t)
+    return rate(lambda t, q, v: system.momentum(q, v, s.params, t=t), s, a)[0]
 
 
 def _radial_formula(s: State, divisor: float):
@@ -311,7 +311,7 @@ ERRATA = (
         place="Ch. 3, Example 12, dL/dx1' of disk and cart",
         wrong="1/2 + m x1' for 1/2 m x1'",
         draw=around_example(disk_on_moving_cart.entry),
-        engine=lambda s: disk_on_moving_cart.system.momentum(s.params, s.q, s.v, s.t)[1],
+        engine=lambda s: disk_on_moving_cart.system.momentum(s.q, s.v, s.params, t=s.t)[1],
         printed=lambda s: _disk_momentum(s, 0.5 + s.params["m"] * s.v[1]),
         right=lambda s: _disk_momentum(s, 0.5 * s.params["m"] * s.v[1]),
     ),
@@ -319,7 +319,7 @@ ERRATA = (
         place="3.159-3.160, moment of the force on the sleeve",
         wrong="arm x1 for x1 + L2/2",
         draw=around_example(sleeve_pendulum.entry),
-        engine=lambda s: _SLEEVE.generalized_force(s.params, s.q, s.v, s.t)[1],
+        engine=lambda s: _SLEEVE.generalized_force(s.q, s.v, s.params, t=s.t)[1],
         printed=lambda s: _sleeve_moment(s, s.q[0]),
         right=lambda s: _sleeve_moment(s, s.q[0] + 0.5 * s.params["L2"]),
     ),
@@ -327,7 +327,7 @@ ERRATA = (
         place="Secs. 3.11-3.12, pull of an unwinding cord",
         wrong="turns with the puck",
         draw=around_example(hockey_puck_cord.entry),
-        engine=lambda s: hockey_puck_cord.system.generalized_force(s.params, s.q, s.v, s.t)[1:],
+        engine=lambda s: hockey_puck_cord.system.generalized_force(s.q, s.v, s.params, t=s.t)[1:],
         printed=lambda s: s.params["F1"] * array([cos(s.q[0]), sin(s.q[0])]),
         right=lambda s: s.params["F1"] * array([cos(s.params["gamma"]), sin(s.params["gamma"])]),
     ),
@@ -359,7 +359,7 @@ ERRATA = (
         place="3.207, H of a rheonomic system",
         wrong="T + V for T_2 - T_0 + V",
         draw=_varying,
-        engine=lambda s: _VARYING.energy(s.params, s.q, s.v, s.t),
+        engine=lambda s: _VARYING.energy(s.q, s.v, s.params, t=s.t),
         printed=lambda s: _swinging_energy(s, +1),
         right=lambda s: _swinging_energy(s, -1),
     ),

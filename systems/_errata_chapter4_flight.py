@@ -42,14 +42,14 @@ _AIRCRAFT = jl.System(
     forces=(
         jl.PointForce(lambda t, q, params: q[:3], _force, "at O"),
         jl.PointForce(body.centre, _force, "at the mass centre"),
-        jl.Couple(_body_rates, _torque, "torque"),
+        jl.Torque(_body_rates, _torque, "torque"),
     ),
 )
 
 
 def _applied(s: State, *names: str):
     """Torque about O, body components, of the forces with these names."""
-    Q = _AIRCRAFT.generalized_force(s.params, s.q, s.v, s.t, names=names)
+    Q = _AIRCRAFT.generalized_force(s.q, s.v, s.params, t=s.t, names=names)
     return attitude.body_torque(s.q[3:], Q[3:])
 
 
@@ -166,7 +166,7 @@ _LIFTED = jl.System(
 
 def _lift_torque(s: State):
     """Torque of the rotors' thrusts about body x and y."""
-    Q = _LIFTED.generalized_force(s.params, s.q, s.v, s.t)
+    Q = _LIFTED.generalized_force(s.q, s.v, s.params, t=s.t)
     return attitude.body_torque(s.q[3:], Q[3:])[:2]
 
 

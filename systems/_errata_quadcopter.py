@@ -41,7 +41,7 @@ _BODY = jl.System(
     potential=quadcopter.potential,
     forces=(
         jl.PointForce(_hubs, _lifts, "lift"),
-        jl.Couple(quadcopter.angular_velocity, _drag, "drag"),
+        jl.Torque(quadcopter.angular_velocity, _drag, "drag"),
     ),
 )
 
@@ -74,7 +74,7 @@ def _force_of_translation(s: State):
 
 def _rotational_force(s: State):
     """Generalized force of lift and drag on (psi, theta, phi)."""
-    return _BODY.generalized_force(s.params, s.q, s.v, s.t)[3:]
+    return _BODY.generalized_force(s.q, s.v, s.params, t=s.t)[3:]
 
 
 def _gyroscopic_torque(s: State):
@@ -86,7 +86,7 @@ def _gyroscopic_torque(s: State):
 
 def _velocity_terms(s: State):
     """J' eta' less half the gradient of eta'.J eta', for the angles eta."""
-    return _BODY.bias(s.params, s.q, s.v, s.t)[3:]
+    return _BODY.bias(s.q, s.v, s.params, t=s.t)[3:]
 
 
 # The formulas' side.
@@ -232,7 +232,7 @@ ERRATA = (
         place="Ch. 3, Example 5, psi'', theta'', phi'' in hover",
         wrong="torque_z/Ix and torque_x/Iz, moments interchanged",
         draw=_hover,
-        engine=lambda s: _BODY.acceleration(s.params, s.q, s.v, s.t)[3:],
+        engine=lambda s: _BODY.acceleration(s.q, s.v, s.params, t=s.t)[3:],
         printed=lambda s: _body_torque(s)[::-1] / s.values("Ix", "Iy", "Iz"),
         right=lambda s: _body_torque(s)[::-1] / s.values("Iz", "Iy", "Ix"),
     ),

@@ -91,7 +91,7 @@ _RIGID = _tricycle(
 
 def _accelerations(system: jl.System, s: State):
     """(v', phi'') of the motion."""
-    a = system.acceleration(s.params, s.q, s.v, s.t)
+    a = system.acceleration(s.q, s.v, s.params, t=s.t)
     along = rate(lambda t, q, v: _front_velocity(t, q, v, s.params)[0], s, a)
     return jnp.stack([along, a[3]])
 

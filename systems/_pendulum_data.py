@@ -88,7 +88,7 @@ def segment(
         q: angles, rad, 0 hanging.
         torque: on the shaft, N m; None for a free swing.
     """
-    inputs = None if torque is None else {"torque": jl.Linear(t, torque)}
+    inputs = None if torque is None else {"torque": jl.LinearInterpolation(t, torque)}
     return jl.Experiment(t, {"q": q}, inputs=inputs, name=name)
 
 

@@ -129,7 +129,7 @@ def fit(
     system = driven if experiments[0].inputs else free
     told = [name for name in params0 if system is driven or name != "J"]
     priors = {name: PRESENT if name in MODELS[model] else ABSENT for name in FRICTION}
-    return jl.fit(system, experiments, params0, free=told, priors=priors, **OPTIONS)
+    return jl.fit(system, experiments, params0, free=told, priors=priors, simulate_options=OPTIONS)
 
 
 def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:

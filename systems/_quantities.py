@@ -31,15 +31,15 @@ def quantities(
         `invariants.*`.
     """
     system = entry.system
-    a = system.acceleration(params, q, v, t)
-    T = system.kinetic(params, q, v, t)
-    V = system.potential(params, q, t=t)
+    a = system.acceleration(q, v, params, t=t)
+    T = system.kinetic(q, v, params, t=t)
+    V = system.potential(q, params=params, t=t)
 
     def momentum(t: Array, q: Array, v: Array) -> Array:
-        return system.momentum(params, q, v, t)
+        return system.momentum(q, v, params, t=t)
 
     p, p_dot = jax.jvp(momentum, (t, q, v), (jnp.ones_like(t), v, a))
-    H = system.energy(params, q, v, t)
+    H = system.energy(q, v, params, t=t)
     groups = {
         "energy": {"T": T, "V": V, "E": T + V},
         "extras": {"H": H, "p": p, "p_dot": p_dot}
@@ -48,7 +48,7 @@ def quantities(
     }
     state = {"q": q, "v": v, "a": a}
     if entry.quasi_velocities:
-        state["u"] = system.quasi_velocities(params, q, v, t)
+        state["u"] = system.quasi_velocities(q, v, params, t=t)
     return state | _reactions(entry, params, t, q, v) | _named(groups)
 
 
@@ -127,10 +127,10 @@ def _reactions(
     """`lambda`, one for each of the entry's constraints, and `constraint_force`, if any."""
     if not entry.constraints:
         return {}
-    lam = entry.system.multipliers(params, q, v, t)
+    lam = entry.system.multipliers(q, v, params, t=t)
     return {
         "lambda": jnp.stack([lam[name] for name in entry.constraints]),
-        "constraint_force": entry.system.constraint_force(params, q, v, t),
+        "constraint_force": entry.system.constraint_force(q, v, params, t=t),
     }
 
 

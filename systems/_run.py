@@ -157,10 +157,12 @@ def _free_quasi_velocities(
 
 
 def _constraint_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
-    along = jax.jit(jax.vmap(partial(entry.system.residuals, entry.example.params)))
-    positions, velocities = along(motion.q, motion.v, motion.ts)
+    def residuals(q: jax.Array, v: jax.Array, t: jax.Array) -> tuple[dict, dict]:
+        return entry.system.residuals(q, v, entry.example.params, t=t)
+
+    positions, velocities = jax.jit(jax.vmap(residuals))(motion.q, motion.v, motion.ts)
     kept = {"position": positions, "velocity": velocities}
-    multipliers = motion.lam
+    multipliers = motion.multipliers
     yield f"{'constraint':<12}{'lambda at the end':>24}  largest residuals"
     for name, unit in entry.multiplier_units.items():
         last = f"{float(multipliers[name][-1]):.6g} {unit}"
@@ -170,7 +172,7 @@ def _constraint_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
 
 def _constraint_panels(entry: Entry, motion: jl.Solution) -> list[Panel]:
     """The multipliers over time."""
-    multipliers = motion.lam
+    multipliers = motion.multipliers
     lam = jnp.stack([multipliers[name] for name in entry.constraints], axis=-1)
     units = tuple(entry.multiplier_units.values())
     panels = by_unit(entry.constraints, motion.ts, lam, units)

@@ -76,7 +76,7 @@ def centripetal_acceleration(t, q, v, a, params):
 
 def angular_momentum(t, q, v, a, params):
     """Angular momentum h = m r^2 theta' about the axis [kg m^2/s], the momentum of theta."""
-    return system.momentum(params, q, v, t)[1]
+    return system.momentum(q, v, params, t=t)[1]
 
 
 system = jl.System(coordinates=("r", "theta"), kinetic=kinetic, potential=potential)

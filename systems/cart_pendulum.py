@@ -76,7 +76,7 @@ def dissipation(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q of the two drives (N, N m), without the damper."""
-    return system.generalized_force(params, q, v, t, names=("cart", "rod end"))
+    return system.generalized_force(q, v, params, t=t, names=("cart", "rod end"))
 
 
 system = jl.System(

@@ -83,7 +83,7 @@ def friction(t, q, v, a, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q of the drive (N), without the damper."""
-    return system.generalized_force(params, q, v, t, names=("drive",))
+    return system.generalized_force(q, v, params, t=t, names=("drive",))
 
 
 system = jl.System(

@@ -107,12 +107,12 @@ def particle_velocity(t, q, v, a, params):
 def shaft_momentum_less_impulse(t, q, v, a, params):
     """p_psi - (tau0/Omega) sin(Omega t) [N m s]: only the drive changes p_psi."""
     impulse = params["tau0"] / params["Omega"] * jnp.sin(params["Omega"] * t)
-    return system.momentum(params, q, v, t)[0] - impulse
+    return system.momentum(q, v, params, t=t)[0] - impulse
 
 
 def disk_momentum_plus_drag(t, q, v, a, params):
     """p_phi + c phi [N m s]: only the drag -c phi' changes p_phi."""
-    return system.momentum(params, q, v, t)[1] + params["c"] * q[1]
+    return system.momentum(q, v, params, t=t)[1] + params["c"] * q[1]
 
 
 system = jl.System(

@@ -53,7 +53,7 @@ def squared_length_excesses(t, q, params):
 
 def tensions(t, q, v, a, params):
     """Tensions of the strings, (-2 lambda1 h1, -2 lambda2 h2) [N]."""
-    lam = system.multipliers(params, q, v, t)
+    lam = system.multipliers(q, v, params, t=t)
     return -2 * jnp.stack([lam["string1"] * params["h1"], lam["string2"] * params["h2"]])
 
 

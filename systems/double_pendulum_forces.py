@@ -79,7 +79,7 @@ def end_force(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q of both (N m)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 system = jl.System(

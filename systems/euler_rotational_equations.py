@@ -61,7 +61,7 @@ system = jl.System(
     kinetic=free_body.kinetic,
     potential=free_body.potential,
     forces=(
-        jl.Couple(free_body.angular_velocity, torque, "torque"),
+        jl.Torque(free_body.angular_velocity, torque, "torque"),
         jl.Rayleigh(dissipation, "damping"),
     ),
     quasi=jl.QuasiVelocities(free_body.angular_velocity, ("wx", "wy", "wz")),

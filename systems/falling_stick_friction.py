@@ -60,7 +60,7 @@ def friction(t, q, v, params, lam):
 
 def normal_force(t, q, v, a, params):
     """N = lambda [N]."""
-    return system.multipliers(params, q, v, t)["ground"]
+    return system.multipliers(q, v, params, t=t)["ground"]
 
 
 def friction_force(t, q, v, a, params):

@@ -119,7 +119,7 @@ def synthetic(
     t = np.arange(500) / 100.0
     u = 0.4 * values["mgl"] * (np.sin(2.1 * t) + np.sin(5.3 * t)) if torque else None
     system = driven if torque else free
-    inputs = None if u is None else {"torque": jl.Linear(t, u)}
+    inputs = None if u is None else {"torque": jl.LinearInterpolation(t, u)}
     params = dict.fromkeys(NAMES, 0.0) | dict(values)
     pieces = {}
     for number in range(segments):

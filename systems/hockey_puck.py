@@ -60,7 +60,7 @@ def push(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q of the push (N m, N, N)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 def initial_spin(t, q, v, a, params):

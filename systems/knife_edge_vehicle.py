@@ -97,7 +97,7 @@ system = jl.System(
     coordinates=("X_A", "Y_A", "theta"),
     kinetic=kinetic,
     potential=potential,
-    forces=(jl.PointForce(edge, drive, "drive"), jl.Couple(turning, torque, "torque")),
+    forces=(jl.PointForce(edge, drive, "drive"), jl.Torque(turning, torque, "torque")),
     constraints=(jl.Pfaffian(sideways_velocity, "edge"),),
 )
 

@@ -81,7 +81,7 @@ def following_forces(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q (N, N, N m)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 def spin_less_impulse(t, q, v, a, params):

@@ -54,19 +54,19 @@ def fixed_forces(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q (N, N, N m)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 def momentum_less_impulse(t, q, v, a, params):
     """(p_x, p_y) less the resultant times t [N s]."""
     impulse = jnp.sum(fixed_forces(t, q, v, params), axis=0) * t
-    return system.momentum(params, q, v, t)[:2] - impulse[:2]
+    return system.momentum(q, v, params, t=t)[:2] - impulse[:2]
 
 
 def energy_less_work(t, q, v, a, params):
     """H - F1 . r1 - F2 . r2 [J]."""
     work = jnp.sum(fixed_forces(t, q, v, params) * points(t, q, params))
-    return system.energy(params, q, v, t) - work
+    return system.energy(q, v, params, t=t) - work
 
 
 system = jl.System(

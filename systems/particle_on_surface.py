@@ -54,7 +54,7 @@ def height_above_surface(t, q, params):
 
 def reaction(t, q, v, a, params):
     """Force of the surface on the particle, lambda grad f [N] (3.10)."""
-    return system.constraint_force(params, q, v, t)
+    return system.constraint_force(q, v, params, t=t)
 
 
 system = jl.System(

@@ -49,7 +49,7 @@ def speed(t, q, v, a, params):
 
 def bottom_speed(t, q, v, a, params):
     """Speed at the bottom by the energy at this state, sqrt(2 g (T + V)/W) [m/s]."""
-    return jnp.sqrt(2 * params["g"] * system.energy(params, q, v, t) / params["W"])
+    return jnp.sqrt(2 * params["g"] * system.energy(q, v, params, t=t) / params["W"])
 
 
 system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)

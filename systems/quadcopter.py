@@ -115,7 +115,7 @@ def body_torque(t, q, v, a, params):
 
 def applied_force(t, q, v, a, params):
     """Generalized force Q of the rotors (N, N m)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 system = jl.System(
@@ -124,7 +124,7 @@ system = jl.System(
     potential=potential,
     forces=(
         jl.PointForce(centre, thrust_force, "thrust"),
-        jl.Couple(angular_velocity, torque, "rotor torque"),
+        jl.Torque(angular_velocity, torque, "rotor torque"),
     ),
 )
 

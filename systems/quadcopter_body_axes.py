@@ -99,8 +99,8 @@ system = jl.System(
     potential=potential,
     forces=(
         jl.PointForce(centre, thrust, "thrust"),
-        jl.Couple(_attitude.angular_velocity, rotor_torque, "rotor torque"),
-        jl.Couple(_attitude.angular_velocity, gyroscopic_torque, "gyroscopic torque"),
+        jl.Torque(_attitude.angular_velocity, rotor_torque, "rotor torque"),
+        jl.Torque(_attitude.angular_velocity, gyroscopic_torque, "gyroscopic torque"),
     ),
     quasi=jl.QuasiVelocities(_attitude.body_velocities, ("u", "v", "w", "p", "q", "r")),
     written_in="u",

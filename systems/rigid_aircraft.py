@@ -96,7 +96,7 @@ system = jl.System(
     potential=potential,
     forces=(
         jl.PointForce(origin, force, "force"),
-        jl.Couple(_attitude.angular_velocity, moment, "moment"),
+        jl.Torque(_attitude.angular_velocity, moment, "moment"),
     ),
     quasi=jl.QuasiVelocities(_attitude.body_velocities, ("u", "v", "w", "p", "q", "r")),
     written_in="u",

@@ -77,7 +77,7 @@ system = jl.System(
     coordinates=("phi", "theta", "psi"),
     kinetic=kinetic,
     potential=potential,
-    forces=(jl.Couple(angular_velocity, torque, "torque"),),
+    forces=(jl.Torque(angular_velocity, torque, "torque"),),
     quasi=jl.QuasiVelocities(angular_velocity, ("wx", "wy", "wz")),
     written_in="u",
 )

@@ -100,12 +100,12 @@ def particle_velocity(t, q, v, a, params):
 
 def momentum_less_impulse(t, q, v, a, params):
     """p_psi - tau t [N m s]: only the drive changes p_psi."""
-    return system.momentum(params, q, v, t)[0] - params["tau"] * t
+    return system.momentum(q, v, params, t=t)[0] - params["tau"] * t
 
 
 def energy_less_work(t, q, v, a, params):
     """H - tau psi [J]: only the drive does work."""
-    return system.energy(params, q, v, t) - params["tau"] * q[0]
+    return system.energy(q, v, params, t=t) - params["tau"] * q[0]
 
 
 system = jl.System(

@@ -94,7 +94,7 @@ def tilt(t, q, params):
 
 def support_torque(t, q, v, a, params):
     """Torque about x that holds the rod level [N m]."""
-    return system.multipliers(params, q, v, t)["level"]
+    return system.multipliers(q, v, params, t=t)["level"]
 
 
 def support_torque_by_hand(t, q, v, a, params):

@@ -73,7 +73,7 @@ def drive(t, q, v, params):
 
 def applied_force(t, q, v, a, params):
     """Applied generalized force Q (N, N m)."""
-    return system.generalized_force(params, q, v, t)
+    return system.generalized_force(q, v, params, t=t)
 
 
 system = jl.System(

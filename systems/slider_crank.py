@@ -72,7 +72,7 @@ def gap(t, q, params):
 
 def guide_force(t, q, v, a, params):
     """Force of the guide on the slider, upward [N]."""
-    return params["m3"] * params["g"] + system.multipliers(params, q, v, t)["pin_y"]
+    return params["m3"] * params["g"] + system.multipliers(q, v, params, t=t)["pin_y"]
 
 
 system = jl.System(

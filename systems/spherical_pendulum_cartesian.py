@@ -47,7 +47,7 @@ def squared_length_excess(t, q, params):
 
 def tension(t, q, v, a, params):
     """Tension of the string, -2 lambda L [N]."""
-    return -2 * params["L"] * system.multipliers(params, q, v, t)["string"]
+    return -2 * params["L"] * system.multipliers(q, v, params, t=t)["string"]
 
 
 def angular_momentum(t, q, v, a, params):

@@ -51,7 +51,7 @@ def length_excess(t, q, params):
 
 def tension(t, q, v, a, params):
     """Tension of the string, -lambda [N]."""
-    return -system.multipliers(params, q, v, t)["length"]
+    return -system.multipliers(q, v, params, t=t)["length"]
 
 
 system = jl.System(

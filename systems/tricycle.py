@@ -114,7 +114,7 @@ system = jl.System(
     coordinates=("x", "y", "theta", "phi"),
     kinetic=kinetic,
     potential=potential,
-    forces=(jl.PointForce(front, drive, "drive"), jl.Couple(steering, torque, "steering")),
+    forces=(jl.PointForce(front, drive, "drive"), jl.Torque(steering, torque, "steering")),
     quasi=jl.QuasiVelocities(velocities, ("v", "v_Y", "v_R", "phidot"), constrained=("v_Y", "v_R")),
 )
 

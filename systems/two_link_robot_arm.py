@@ -119,8 +119,8 @@ system = jl.System(
     kinetic=kinetic,
     potential=potential,
     forces=(
-        jl.Couple(lambda t, q, v, params: v[0], torque_O, "motor at O"),
-        jl.Couple(lambda t, q, v, params: v[1] - v[0], torque_A, "motor at A"),
+        jl.Torque(lambda t, q, v, params: v[0], torque_O, "motor at O"),
+        jl.Torque(lambda t, q, v, params: v[1] - v[0], torque_A, "motor at A"),
     ),
 )
 

@@ -8,10 +8,10 @@ def onto_constraints(system, params, t, q, v):
     """(q, v) by steps of least norm: Newton's for the positions, then one for the velocities."""
 
     def position(q):
-        return jnp.hstack([*system.residuals(params, q, v, t)[0].values(), jnp.zeros(0)])
+        return jnp.hstack([*system.residuals(q, v, params, t=t)[0].values(), jnp.zeros(0)])
 
     def velocity(v):
-        return jnp.hstack([*system.residuals(params, q, v, t)[1].values()])
+        return jnp.hstack([*system.residuals(q, v, params, t=t)[1].values()])
 
     def nearer(_, q):
         return q - jnp.linalg.pinv(jax.jacfwd(position)(q)) @ position(q)

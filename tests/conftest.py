@@ -97,13 +97,13 @@ def lowering(request):
     wanted = getattr(request, "param", "auto")
     with pytest.MonkeyPatch.context() as patch:
         if wanted == "array":
-            as_declared = jl.System.terms
+            as_declared = jl.System._terms
 
             def terms(system):
                 if system.lowering == "auto":
                     return ArrayTerms(system.lagrangian, system.forces, system.constraints)
                 return as_declared.fget(system)
 
-            patch.setattr(jl.System, "terms", property(terms))
+            patch.setattr(jl.System, "_terms", property(terms))
         yield wanted
     drop()

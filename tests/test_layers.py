@@ -35,6 +35,7 @@ ALLOWED = {
     "_gradient": ("_core", "_integration"),
     "_simulation": (*_TO_SYSTEM, "_statics", "_integration", "_gradient"),
     "_fit": ("_core", "_tracing", "_model", "_system", "_simulation"),
+    "transforms": ("_fit",),
 }
 WITHIN_LOWERING = {
     "_graph": (),

@@ -1,5 +1,14 @@
 """One sentence form for every error: argument, requirement, what it was, likely fix."""
 
+import re
+from typing import Any
+
+_MANY = 8
+"""Numbers of an array that are shown; of more than these the first and the last three are."""
+_EXPRESSION = re.compile(r"[A-Za-z_]\w*(\.\w+|\[[^\]]+\])*(=\S+)?")
+_NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf|True|False)"
+_ARRAY = re.compile(rf"\[[\[\]\s,]*{_NUMBER}(?:[\[\]\s,]+{_NUMBER}){{{_MANY},}}[\[\]\s,]*\]")
+
 
 class SimulationError(RuntimeError):
     """A simulation ended in a status other than `Status.ok`.
@@ -38,10 +47,38 @@ class AssemblyError(RuntimeError):
 
 
 def requirement(argument: str, must: str, was: str, fix: str = "") -> str:
-    """`<argument> must <must>, but <was>. <fix>`."""
-    return f"{argument} must {must}, but {was}." + (f" {fix}" if fix else "")
+    """`<argument> must <must>, but <was>. <fix>`; arrays in it are shortened.
+
+    An argument that is a name, or an expression of one, stands in back-ticks; words in front of a
+    colon say whose argument it is.
+    """
+    return shortened(f"{_ticked(argument)} must {must}, but {was}.") + (f" {fix}" if fix else "")
 
 
 def invalid(argument: str, must: str, was: str, fix: str = "") -> ValueError:
     """A `ValueError` in the form of `requirement`, to be raised by the caller."""
     return ValueError(requirement(argument, must, was, fix))
+
+
+def unsupported(what: str, why: str, fix: str = "") -> ValueError:
+    """`<what> is not supported: <why>. <fix>`, a `ValueError` to be raised by the caller."""
+    return ValueError(shortened(f"{what} is not supported: {why}.") + (f" {fix}" if fix else ""))
+
+
+def shortened(text: Any) -> str:
+    """The text, of arrays of more than 8 numbers the first and the last three alone."""
+
+    def few(array: re.Match) -> str:
+        numbers = re.findall(_NUMBER, array[0])
+        first, last = ", ".join(numbers[:3]), ", ".join(numbers[-3:])
+        return f"[{first}, ..., {last}] ({len(numbers)} numbers)"
+
+    return _ARRAY.sub(few, str(text))
+
+
+def _ticked(argument: str) -> str:
+    owner, colon, own = argument.rpartition(": ")
+    names = own.split(" and ")
+    if all(_EXPRESSION.fullmatch(name) for name in names):
+        own = " and ".join(f"`{name}`" for name in names)
+    return f"{owner}{colon}{own}"

@@ -1,4 +1,4 @@
-"""Fits of many numbers by gradients of few segments at a time, with any optimiser of optax."""
+"""Fits of many numbers by gradients of few segments at a time, with any optimizer of optax."""
 
 from typing import Any, final
 
@@ -20,7 +20,7 @@ class Descent(eqx.Module):
     least squares takes a derivative in the direction of each.
 
     Args:
-        optimiser: of optax, such as `optax.adam(1e-3)`. It moves a leaf of params in units of the
+        optimizer: of optax, such as `optax.adam(1e-3)`. It moves a leaf of params in units of the
             root mean square that it starts with (of 1 where that is 0, and for logarithms), starts
             of segments in units of how far states range.
         epochs: how often all segments are used.
@@ -29,10 +29,10 @@ class Descent(eqx.Module):
         gap: standard deviation of the gaps between joined segments, over how far states range.
 
     Raises:
-        ValueError: an optimiser without `init` and `update`, numbers that are not positive.
+        ValueError: an optimizer without `init` and `update`, numbers that are not positive.
     """
 
-    optimiser: Any
+    optimizer: Any
     epochs: int = eqx.field(static=True)
     batch: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
@@ -40,26 +40,26 @@ class Descent(eqx.Module):
 
     def __init__(
         self,
-        optimiser: Any,
+        optimizer: Any,
         *,
         epochs: Any = 100,
         batch: Any = 16,
         seed: int = 0,
         gap: float | int = 1e-2,
     ) -> None:
-        if not callable(getattr(optimiser, "init", None)) or not callable(
-            getattr(optimiser, "update", None)
+        if not callable(getattr(optimizer, "init", None)) or not callable(
+            getattr(optimizer, "update", None)
         ):
-            must = "have init and update, as the optimisers of optax"
+            must = "have init and update, as the optimizers of optax"
             raise invalid(
-                "Descent: optimiser", must, f"it was {optimiser!r}", "Try optax.adam(1e-3)."
+                "Descent: optimizer", must, f"it was {optimizer!r}", "Try optax.adam(1e-3)."
             )
         for name, value in (("epochs", epochs), ("batch", batch)):
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise invalid(f"Descent: {name}", "be a positive integer", f"it was {value!r}")
         if not gap > 0:
             raise invalid("Descent: gap", "be positive", f"it was {gap!r}")
-        self.optimiser, self.epochs, self.batch = optimiser, epochs, batch
+        self.optimizer, self.epochs, self.batch = optimizer, epochs, batch
         self.seed, self.gap = seed, float(gap)
 
     def steps(self, segments: int) -> tuple[int, int]:
@@ -81,10 +81,10 @@ def descend(
 
     Unsound are steps some of whose derivatives were not finite; they move nothing by those.
     """
-    # An extra: whoever has one of its optimisers has it.
+    # An extra: whoever has one of its optimizers has it.
     from optax import with_extra_args_support
 
-    update = with_extra_args_support(descent.optimiser).update
+    update = with_extra_args_support(descent.optimizer).update
     count = guess.x.shape[0]
     steps, batch = descent.steps(count)
     join = jnp.asarray(descent.gap)
@@ -114,7 +114,7 @@ def descend(
         return carry, (jnp.mean(costs), jnp.sum(unsound))
 
     keys = jax.random.split(jax.random.key(descent.seed), descent.epochs)
-    begin = guess, descent.optimiser.init(guess)
+    begin = guess, descent.optimizer.init(guess)
     (guess, _), (costs, unsound) = jax.lax.scan(epoch, begin, keys)
     return guess, costs, jnp.sum(unsound)
 

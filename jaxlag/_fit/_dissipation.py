@@ -99,7 +99,7 @@ def _states(
     if system.quasi is None:
         return _States(t, q, w)
     u = jnp.zeros((len(t), system.quasi.size)).at[:, np.asarray(system.quasi.free)].set(w)
-    return _States(t, q, jax.vmap(lambda t, q, u: system.velocities(params, q, u, t))(t, q, u))
+    return _States(t, q, jax.vmap(lambda t, q, u: system.velocities(q, u, params, t=t))(t, q, u))
 
 
 def _powers(

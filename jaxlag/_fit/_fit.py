@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
@@ -26,6 +27,8 @@ from jaxlag._fit._multiple_shooting import (
 from jaxlag._fit._residuals import LOSSES, Reader, squares
 from jaxlag._fit._segments import SegmentLayout, layout
 from jaxlag._fit._setup import (
+    FORMER,
+    NO_OPTIONS,
     build_shooting,
     check_search,
     estimated_noise,
@@ -53,10 +56,13 @@ MAX_NEWTON_DISTANCE = 0.3
 """Standard deviations, within which estimates are to be where their derivatives lead."""
 LARGEST_COVARIANCE = 200
 """Numbers, beyond which a covariance costs more than the descent that found them."""
+LOOSE = 1e-4
+"""Tolerance of searches that only lead to the next one."""
 NOISE_ROUNDS = 3
 """How often noise that was not given is estimated, and the fit repeated with it."""
 
 
+@renamed(optimiser="optimizer=", **FORMER)
 def fit(
     system: System,
     experiments: Any,
@@ -68,10 +74,11 @@ def fit(
     transforms: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
     loss: str = "squares",
-    optimiser: Any = None,
-    tolerance: float = 1e-6,
-    max_iterations: int = 100,
-    **options: Any,
+    optimizer: Any = None,
+    rtol: float = 1e-6,
+    atol: float = 1e-6,
+    max_steps: int = 100,
+    simulate_options: Mapping[str, Any] = NO_OPTIONS,
 ) -> FitResult:
     r"""Params, and starts of experiments, for which motions come closest to what was measured.
 
@@ -101,12 +108,13 @@ def fit(
         loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less: residuals beyond
             about one sigma. The covariance is that of least squares with weights that fall with the
             residuals; of Gaussian noise it is too large by up to a third (cauchy, soft_l1).
-        optimiser: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
+        optimizer: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
             There may then be more of them than measurements; no covariance is computed of more than
             200.
-        tolerance: relative and absolute, of unknowns and residuals, both of order one.
-        max_iterations: of Levenberg and Marquardt's method, in each stage.
-        options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
+        rtol: relative tolerance of unknowns and residuals, both of order one.
+        atol: absolute tolerance of the same.
+        max_steps: bound on the steps of Levenberg and Marquardt's method, in each stage.
+        simulate_options: of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
 
     Raises:
         ValueError: an argument of wrong form or value, named; fewer measurements than unknowns.
@@ -136,9 +144,9 @@ def fit(
         4.00 True
     """
     experiments = experiments_of(experiments)
-    _check(system, segments, loss, optimiser)
-    check_search(tolerance, max_iterations)
-    options = plain_options(options, "jl.fit")
+    _check(system, segments, loss, optimizer)
+    check_search(rtol, atol, max_steps)
+    options = plain_options(simulate_options, "jl.fit")
     unknown = unknowns(params0, free, dict(transforms or {}))
     own = dict(channels or {})
     check_keys(params0)
@@ -147,7 +155,7 @@ def fit(
     shown = readers_of(system, experiments, own, params0)
     where = layout(experiments, segments)
     prior = prior_rows(unknown, dict(priors or {}))
-    if optimiser is None:
+    if optimizer is None:
         _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
     _warn_before(experiments, unknown)
     compared = _compared(system, experiments, unknown)
@@ -155,34 +163,34 @@ def fit(
         system, experiments, where, unknown, shown, prior, LOSSES[loss], options
     )
     costs = np.zeros(0)
-    if optimiser is None:
-        problem, found, turns = _stages(problem, tolerance, max_iterations)
+    if optimizer is None:
+        problem, found, turns = _stages(problem, (rtol, atol), max_steps)
         problem, noise, found, more = _with_its_noise(
-            problem, noise, found, where, tolerance, max_iterations
+            problem, noise, found, where, (rtol, atol), max_steps
         )
         solves = (turns + more) * len(where.owner)
     else:
-        guess, costs, solves = _downhill(problem, optimiser, max_iterations)
+        guess, costs, solves = _downhill(problem, optimizer, max_steps)
         if noise:
-            seen = _judged(problem, guess, optimiser, costs, linear=False)
+            seen = _judged(problem, guess, optimizer, costs, linear=False)
             noise = estimated_noise(seen, problem, where, noise)
             problem = with_noise(problem, where, noise)
         linear = len(unknown.u0) <= LARGEST_COVARIANCE
-        found = _judged(problem, guess, optimiser, costs, linear)
+        found = _judged(problem, guess, optimizer, costs, linear)
     told = (where, noise, own, costs, solves, compared)
     result = summarised(problem, found, experiments, *told)
     _warn_after(result)
     return result
 
 
-def _check(system: Any, segments: Any, loss: Any, optimiser: Any) -> None:
+def _check(system: Any, segments: Any, loss: Any, optimizer: Any) -> None:
     if not isinstance(system, System):
         raise invalid("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(segments, int | np.integer) or segments < 1:
         raise invalid("segments", "be a positive integer", f"it was {segments!r}")
-    if optimiser is not None and not isinstance(optimiser, Descent):
+    if optimizer is not None and not isinstance(optimizer, Descent):
         fix = "Write jl.Descent(optax.adam(1e-3))."
-        raise invalid("optimiser", "be None or a jl.Descent", f"it was {optimiser!r}", fix)
+        raise invalid("optimizer", "be None or a jl.Descent", f"it was {optimizer!r}", fix)
     if loss not in LOSSES:
         raise invalid("loss", f"be one of {list(LOSSES)}", f"it was {loss!r}")
 
@@ -225,7 +233,7 @@ def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns)
 
 
 def _stages(
-    problem: MultipleShooting, tolerance: float, max_iterations: int
+    problem: MultipleShooting, tolerances: tuple[float, float], max_steps: int
 ) -> tuple[MultipleShooting, SearchResult, int]:
     """(the problem in units that fit, what is found from loosely joined segments on, all steps).
 
@@ -239,9 +247,9 @@ def _stages(
     gaps = (*(gap for gap in GAPS if gap > last), last) if problem.chained else (last,)
     for gap in gaps:
         final = gap == last and loss is squares
-        rough = jnp.asarray(tolerance if final else max(tolerance, 1e-4))
+        rough = jnp.asarray([x if final else max(x, LOOSE) for x in tolerances])
         for again in range(UNITS):
-            found = search(by_squares, guess, jnp.asarray(gap), rough, max_iterations)
+            found = search(by_squares, guess, jnp.asarray(gap), rough, max_steps)
             guess, turns = found.guess, turns + int(found.steps)
             scale = _units(by_squares, found)
             if np.array_equal(scale, by_squares.free.scale) or again == UNITS - 1:
@@ -250,7 +258,7 @@ def _stages(
             by_squares = replace(by_squares, free=by_squares.free.rescaled(scale))
     problem = replace(by_squares, loss=loss)
     if loss is not squares:
-        found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerance), max_iterations)
+        found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerances), max_steps)
         turns += int(found.steps)
     return problem, found, turns
 
@@ -294,8 +302,8 @@ def _with_its_noise(
     noise: dict[str, float],
     found: SearchResult,
     where: SegmentLayout,
-    tolerance: float,
-    max_iterations: int,
+    tolerances: tuple[float, float],
+    max_steps: int,
 ) -> tuple[MultipleShooting, dict[str, float], SearchResult, int]:
     """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
     turns = 0
@@ -303,8 +311,8 @@ def _with_its_noise(
         changed = estimated_noise(found, problem, where, noise)
         settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
         noise, problem = changed, with_noise(problem, where, changed)
-        join, own = jnp.asarray(last_gap(problem)), jnp.asarray(tolerance)
-        found = search(problem, found.guess, join, own, max_iterations)
+        join, own = jnp.asarray(last_gap(problem)), jnp.asarray(tolerances)
+        found = search(problem, found.guess, join, own, max_steps)
         turns += int(found.steps)
         if settled:
             break
@@ -312,16 +320,16 @@ def _with_its_noise(
 
 
 def _downhill(
-    problem: MultipleShooting, descent: Descent, max_iterations: int
+    problem: MultipleShooting, descent: Descent, max_steps: int
 ) -> tuple[FitVariables, Float[np.ndarray, " epochs"], int]:
     """(where a descent ends, its costs, solves); starts by least squares before and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
-    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_iterations)
+    before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
     guess, costs, unsound = descend(problem, FitVariables(z, before.guess.x), descent)
     if int(unsound):
         text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
         warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
-    after = _starts(problem, guess.z, guess.x, join, max_iterations)
+    after = _starts(problem, guess.z, guess.x, join, max_steps)
     count = len(guess.x)
     solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
     return FitVariables(guess.z, after.guess.x), np.asarray(costs), solves
@@ -332,11 +340,11 @@ def _join(problem: MultipleShooting, descent: Descent) -> Float[Array, ""]:
 
 
 def _starts(
-    problem: MultipleShooting, z: Array, x: Array, join: Array, max_iterations: int
+    problem: MultipleShooting, z: Array, x: Array, join: Array, max_steps: int
 ) -> SearchResult:
     """Starts by least squares, params as they are at z."""
     held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
-    return search(held, FitVariables(jnp.zeros(0), x), join, jnp.asarray(1e-4), max_iterations)
+    return search(held, FitVariables(jnp.zeros(0), x), join, jnp.full(2, LOOSE), max_steps)
 
 
 def _judged(
@@ -355,7 +363,7 @@ def _judged(
 def _warn_after(result: FitResult) -> None:
     if not result.converged:
         text = f"The search did not converge in {result.iterations} iterations: raise "
-        text += "max_iterations, take more segments, or start closer."
+        text += "max_steps, take more segments, or start closer."
         if not result.freedom:
             text = "No segment has a solution at the estimates: start closer."
         elif result.costs.size:

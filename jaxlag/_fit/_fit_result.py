@@ -76,7 +76,7 @@ class FitResult(eqx.Module):
         distance: from the estimates to where derivatives lead, in standard deviations, all numbers
             together; NaN where there is no covariance. Far below 1 where a search has converged;
             more, where errors of the solver hide what params do.
-        converged: whether the optimiser met its tolerance; of a `Descent`, whether costs are finite
+        converged: whether the optimizer met its tolerance; of a `Descent`, whether costs are finite
             and lower than at first.
         iterations: how many it took in the last stage; of a `Descent`, epochs.
         solves: motions of segments, each with its derivatives, that the search took in all; line
@@ -128,7 +128,7 @@ class FitResult(eqx.Module):
             settle=settle,
             channels=dict(model.channels),
             noise=self.noise,
-            **dict(model.options),
+            simulate_options=dict(model.options),
         )
 
     def plot(self) -> Any:

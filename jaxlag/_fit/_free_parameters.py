@@ -1,4 +1,4 @@
-"""Which numbers of params are to be found, and how the unknowns of an optimiser make them."""
+"""Which numbers of params are to be found, and how the unknowns of an optimizer make them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -219,7 +219,7 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
                 "transforms", f"be of free parameters {free_names}", f"one was of {name!r}"
             )
         if not isinstance(transform, AbstractTransform):
-            must = "be a transform such as jl.Positive()"
+            must = "be a transform such as jl.transforms.Positive()"
             raise invalid(f"transforms[{name!r}]", must, f"it was {transform!r}")
     leaves, on_bound = [], []
     columns: list[np.ndarray] = [np.zeros((7, 0))]

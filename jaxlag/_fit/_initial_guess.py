@@ -47,7 +47,7 @@ def initial_states(
         u = given[list(samples)]
     else:
         times = jnp.asarray(experiment.ts[list(samples)])
-        of = jax.vmap(lambda q, v, t: system.quasi_velocities(params, q, v, t))
+        of = jax.vmap(lambda q, v, t: system.quasi_velocities(q, v, params, t=t))
         u = np.array(of(jnp.asarray(q), jnp.asarray(v), times))
         if given is not None and samples[0] == 0:
             u[0] = given
@@ -61,7 +61,7 @@ def start_size(system: System) -> int:
 
 def start_freedom(system: System, params: Any) -> int:
     """Numbers of a state that constraints leave, if all their rows are independent."""
-    rows = system.rows(params, jnp.dtype(float)).holonomic if system.constraints else ()
+    rows = system._rows(params, jnp.dtype(float)).holonomic if system.constraints else ()
     return max(0, start_size(system) - sum(2 if holonomic else 1 for holonomic in rows))
 
 
@@ -146,7 +146,7 @@ def _simulated(
         raise invalid("coordinates", must, f"{labels[missing].tolist()} were not", fix)
     start: dict[str, Any] = {"v0": v0}
     if system.quasi is not None and given is not None:
-        start = {"u0": v0}
+        start = {"v0": None, "u0": v0}
     elif np.isnan(v0).any():
         fix = f"Pass {experiment.name} a v0."
         raise invalid("velocities", "follow from the channels or v0", "some did not", fix)

@@ -41,7 +41,7 @@ digits for what else is summed up."""
 
 
 class FitVariables(NamedTuple):
-    """What the optimiser moves: z (p,) of the params, x (k, d) of the states, all of order one."""
+    """What the optimizer moves: z (p,) of the params, x (k, d) of the states, all of order one."""
 
     z: Float[Array, " p"]
     x: Float[Array, "k d"]
@@ -116,7 +116,7 @@ class MultipleShooting(eqx.Module):
             rates = {"v0": start[n:]}
         else:
             full = jnp.zeros(len(quasi.names), start.dtype).at[jnp.array(quasi.free)].set(start[n:])
-            rates = {"u0": full}
+            rates = {"v0": None, "u0": full}
         return simulate(
             self.system,
             start[:n],
@@ -225,7 +225,7 @@ class MultipleShooting(eqx.Module):
         return (self.free.numbers(z)[jnp.asarray(which)] - mean) / deviation
 
 
-# The optimiser: optimistix' Levenberg-Marquardt, its linear steps by elimination.
+# The optimizer: optimistix' Levenberg-Marquardt, its linear steps by elimination.
 
 
 def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> LinearRows:
@@ -345,7 +345,7 @@ def _quiet(**_: Any) -> None:
 
 
 class SearchResult(NamedTuple):
-    """Where the optimiser ended.
+    """Where the optimizer ended.
 
     Attributes:
         guess: the unknowns.
@@ -368,9 +368,12 @@ class SearchResult(NamedTuple):
 
 @eqx.filter_jit
 def search(
-    shooting: MultipleShooting, guess: FitVariables, join: Array, tolerance: Array, max_steps: int
+    shooting: MultipleShooting, guess: FitVariables, join: Array, tolerances: Array, max_steps: int
 ) -> SearchResult:
-    """Least squares from a guess, with gaps of `join` times the range of the states."""
+    """Least squares from a guess, with gaps of `join` times the range of the states.
+
+    Converged to (rtol, atol).
+    """
 
     def function(
         guess: FitVariables, args: tuple[MultipleShooting, Array]
@@ -380,14 +383,14 @@ def search(
 
     solution = optx.least_squares(
         function,
-        Shooter(shooting, tolerance, tolerance),
+        Shooter(shooting, tolerances[0], tolerances[1]),
         guess,
         args=(shooting, join),
         has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    # What the optimiser knows of the last point that it accepted; nothing is solved once more.
+    # What the optimizer knows of the last point that it accepted; nothing is solved once more.
     state = solution.state
     return SearchResult(
         solution.value,

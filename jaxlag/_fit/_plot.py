@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import unsupported
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._residuals import channels_of, rms_of
 
@@ -34,8 +34,8 @@ def plotted(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise invalid(
-            "plot()", "find matplotlib", "it is not installed", 'pip install "jaxlag[plot]"'
+        raise unsupported(
+            "`plot`", "matplotlib is not installed", 'pip install "jaxlag[plot]"'
         ) from error
     shown = np.arange(len(residuals))
     if len(shown) > MOST:

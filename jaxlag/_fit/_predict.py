@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxlag._core._arguments import renamed
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
@@ -19,6 +20,8 @@ from jaxlag._fit._plot import plotted
 from jaxlag._fit._residuals import Reader, channels_of, rms_of, squares
 from jaxlag._fit._segments import SegmentLayout, layout
 from jaxlag._fit._setup import (
+    FORMER,
+    NO_OPTIONS,
     build_shooting,
     check_search,
     experiments_of,
@@ -75,6 +78,7 @@ class Prediction(eqx.Module):
         return "\n".join([*lines, *self.failed])
 
 
+@renamed(**FORMER)
 def predict(
     system: System,
     experiments: Any,
@@ -83,9 +87,10 @@ def predict(
     settle: float | int | None = None,
     channels: Mapping[str, Reader] | None = None,
     noise: Mapping[str, float] | None = None,
-    tolerance: float = 1e-6,
-    max_iterations: int = 100,
-    **options: Any,
+    rtol: float = 1e-6,
+    atol: float = 1e-6,
+    max_steps: int = 100,
+    simulate_options: Mapping[str, Any] = NO_OPTIONS,
 ) -> Prediction:
     """How well params predict experiments, of which none need have been used to find them.
 
@@ -100,9 +105,10 @@ def predict(
         channels: as for `jl.fit`.
         noise: channel -> standard deviation, where the experiments state none: by which channels
             are weighed when starts are fitted.
-        tolerance: of the starts, over how far states range.
-        max_iterations: of the optimiser.
-        options: of `jl.simulate`: method, rtol, atol, dt, max_steps, formulation and others.
+        rtol: relative tolerance of the starts and residuals, both of order one.
+        atol: absolute tolerance of the same.
+        max_steps: bound on the steps of Levenberg and Marquardt's method.
+        simulate_options: of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
 
     Raises:
         ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
@@ -125,8 +131,8 @@ def predict(
         0.000 0.031
     """
     experiments = experiments_of(experiments)
-    options = plain_options(options, "jl.predict")
-    check_search(tolerance, max_iterations)
+    options = plain_options(simulate_options, "jl.predict")
+    check_search(rtol, atol, max_steps)
     own = dict(channels or {})
     check_keys(params)
     check_keys(own, "channels")
@@ -145,10 +151,10 @@ def predict(
 
     whole, where = posed(early)
     nowhere = FitVariables(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
-    found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray(tolerance), max_iterations)
+    found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray((rtol, atol)), max_steps)
     if not found.converged:
         text = f"The search for starts did not converge in {int(found.steps)} iterations: raise "
-        warnings.warn(text + "max_iterations, or make settle longer.", stacklevel=2)
+        warnings.warn(text + "max_steps, or make settle longer.", stacklevel=2)
     seen = found.seen
     if settle is not None:
         whole, where = posed(experiments)

@@ -66,7 +66,7 @@ def standard(system: System, rows: tuple[str, ...]) -> dict[str, Reader]:
     """What names mean by themselves."""
     found: dict[str, Reader] = {"energy": lambda motion: motion.energy}
     for name in rows:
-        found[name] = lambda motion, name=name: motion.lam[name]
+        found[name] = lambda motion, name=name: motion.multipliers[name]
     if system.quasi is not None:
         for name in system.quasi.names:
             found[name] = lambda motion, name=name: motion[name]

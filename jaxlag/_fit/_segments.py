@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._stacked_inputs import AbstractStackedInputs, computed, stacked
-from jaxlag._model._input_signals import Linear, ZeroOrderHold
+from jaxlag._model._input_signals import LinearInterpolation, ZeroOrderHold
 from jaxlag._system._system import System
 
 
@@ -150,7 +150,7 @@ def _inputs_between(inputs: Any, start: float, end: float) -> Any:
         return inputs
 
     def cut(signal: Any) -> Any:
-        if not isinstance(signal, Linear | ZeroOrderHold):
+        if not isinstance(signal, LinearInterpolation | ZeroOrderHold):
             return signal
         times = np.asarray(signal.times)
         a = int(np.clip(np.searchsorted(times, start, side="right") - 1, 0, len(times) - 2))

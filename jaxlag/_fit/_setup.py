@@ -1,7 +1,9 @@
 """The least squares of a fit: experiments cut into segments, their noise, where a search starts."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import signature
 from statistics import NormalDist
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +20,7 @@ from jaxlag._fit._initial_guess import initial_states, typical
 from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._residuals import Reader, readers, squares
 from jaxlag._fit._segments import SegmentLayout, pack
+from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
 
 OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
@@ -44,22 +47,47 @@ def experiments_of(given: Any) -> tuple[Experiment, ...]:
     return found
 
 
-def check_search(tolerance: Any, max_iterations: Any) -> None:
-    """Raise where an optimiser could not work with these."""
-    if not isinstance(tolerance, int | float | np.number) or not 0 < tolerance < 1:
-        raise invalid("tolerance", "be a number between 0 and 1", f"it was {tolerance!r}")
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 1:
-        raise invalid("max_iterations", "be a positive integer", f"it was {max_iterations!r}")
+NO_OPTIONS: Mapping[str, Any] = MappingProxyType({})
+"""Of `simulate`, none."""
+
+
+FORMER = {
+    "tolerance": "rtol= and atol=",
+    "max_iterations": "max_steps=",
+    "project": "simulate_options={'stabilization': ...}",
+} | {
+    name: f"simulate_options={{{name!r}: ...}}"
+    for name in signature(simulate).parameters
+    if name not in (*OURS, "system", "rtol", "atol", "max_steps")
+}
+"""Keywords of `fit` and `predict` that were others once, or went straight to `simulate`."""
+
+
+def check_search(rtol: Any, atol: Any, max_steps: Any) -> None:
+    """Raise where an optimizer could not work with these."""
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        if not isinstance(value, int | float | np.number) or not 0 < value < 1:
+            raise invalid(name, "be a number between 0 and 1", f"it was {value!r}")
+    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
 
 
 def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
     """Options of `jl.simulate` by which compiled programs are keyed, numbers as Python's.
 
     Raises:
-        ValueError: one that the caller decides, or that holds an array.
+        ValueError: one that `simulate` does not know, that the caller decides, or that holds an
+            array.
     """
+    if not isinstance(options, Mapping):
+        must, was = "be a dict of options of jl.simulate", f"it was {options!r}"
+        raise invalid("simulate_options", must, was)
+    known = signature(simulate).parameters
     found = {}
     for name, value in options.items():
+        if name not in known or name == "system":
+            names = [key for key in known if key not in (*OURS, "system")]
+            raise invalid("simulate_options", f"be among {names}", f"one was {name!r}")
         if name in OURS:
             raise invalid(name, f"be left to {by}", "it was given")
         if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
@@ -85,7 +113,7 @@ def readers_of(
                     was = f"it had {each.channels[key].shape[1]}"
                     fix = "Fill columns that were not measured with NaN."
                     raise invalid(f"{each.name}: channels[{key!r}]", must, was, fix)
-    rows = tuple(system.rows(params, jnp.dtype(float)).labels) if system.constraints else ()
+    rows = tuple(system._rows(params, jnp.dtype(float)).labels) if system.constraints else ()
     return readers(system, names, own, rows)
 
 

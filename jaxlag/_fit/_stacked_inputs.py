@@ -16,8 +16,8 @@ from jaxlag._model._input_signals import (
     AbstractInput,
     AbstractTable,
     Feedback,
-    Function,
-    Linear,
+    LinearInterpolation,
+    TimeFunction,
     ZeroOrderHold,
 )
 from jaxlag._model._inputs import check_inputs
@@ -139,7 +139,7 @@ def _check_closures(inputs: dict[str, Any]) -> None:
             cells = getattr(function.function, "__closure__", None) or ()
             if not concrete([cell.cell_contents for cell in cells]):
                 must = "take params where experiments have functions of their own"
-                fix = "Write jl.Function(f) of f(t, params), jl.Feedback(f) of f(t, q, v, params)."
+                fix = "Write jl.TimeFunction(f(t, params)) or jl.Feedback(f(t, q, v, params))."
                 raise invalid(
                     f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix
                 )
@@ -199,30 +199,30 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
     must = "be tables of one kind in every experiment, or functions and constants in all"
     if tables and len(kinds) > 1:
         raise invalid(f"inputs[{name!r}]", must, f"they were {' and '.join(kinds)}")
-    if all(isinstance(signal, Linear | ZeroOrderHold) for signal in signals):
+    if all(isinstance(signal, LinearInterpolation | ZeroOrderHold) for signal in signals):
         longest = max(len(table.times) for table in signals)
         return [_filled(table, longest) for table in signals]
     of_state = any(isinstance(signal, Feedback) for signal in signals)
-    knots = [signal.knots() if isinstance(signal, Function) else None for signal in signals]
+    knots = [signal.knots() if isinstance(signal, TimeFunction) else None for signal in signals]
     most = max(0 if times is None else len(times) for times in knots)
     if of_state and most:
         must = "be without knots where another experiment has a Feedback in its place"
         raise invalid(f"inputs[{name!r}]", must, f"one had {most}")
-    plain = [Function(x.f) if isinstance(x, Function) else x for x in signals]
+    plain = [TimeFunction(x.f) if isinstance(x, TimeFunction) else x for x in signals]
     if not _equal(plain):
         among = _different(plain)
         plain = [_choice(name, one, among, of_state) for one in plain]
     if not most:
         return plain
     later = (_later(times, most, end) for times, end in zip(knots, ends, strict=True))
-    return [Function(x.f, times) for x, times in zip(plain, later, strict=True)]
+    return [TimeFunction(x.f, times) for x, times in zip(plain, later, strict=True)]
 
 
-def _choice(name: str, signal: Any, among: list[Any], of_state: bool) -> Function | Feedback:
+def _choice(name: str, signal: Any, among: list[Any], of_state: bool) -> TimeFunction | Feedback:
     """The same signal, where its structure stands among those of all experiments."""
     i = next(i for i, other in enumerate(among) if _equal([signal, other]))
     which = jnp.asarray(i, jnp.int32), (*among[:i], signal, *among[i + 1 :])
-    return Feedback(_OfState(name, *which)) if of_state else Function(_OfTime(name, *which))
+    return Feedback(_OfState(name, *which)) if of_state else TimeFunction(_OfTime(name, *which))
 
 
 def _kind(signal: Any) -> str:

@@ -1,6 +1,6 @@
 """Transforms: maps from all real numbers onto the values that a parameter may take.
 
-An optimiser moves freely in the unconstrained numbers u; the parameter is `value(u)`, valid
+An optimizer moves freely in the unconstrained numbers u; the parameter is `value(u)`, valid
 whatever u is.
 """
 
@@ -86,8 +86,10 @@ class Positive(AbstractTransform):
         """log(value); a value of 0 has none and raises."""
         x = np.ravel(np.asarray(value, float))
         if not np.all(x > 0):
-            fix = "Start it above 0, or bound it by jl.Bounded(0.0, np.inf)."
-            raise invalid(f"params0[{name!r}]", "be positive (jl.Positive)", f"it was {value}", fix)
+            fix = "Start it above 0, or bound it by jl.transforms.Bounded(0.0, np.inf)."
+            raise invalid(
+                f"params0[{name!r}]", "be positive (jl.transforms.Positive)", f"it was {value}", fix
+            )
         return np.log(x), False
 
 
@@ -204,7 +206,7 @@ class Inertia(AbstractTransform):
         """Of S; an inertia that no body has raises."""
         x = np.asarray(value, float)
         if x.shape not in ((3,), (3, 3)):
-            must = "be a matrix (3, 3) or three principal moments (jl.Inertia)"
+            must = "be a matrix (3, 3) or three principal moments (jl.transforms.Inertia)"
             raise invalid(f"params0[{name!r}]", must, f"its shape was {x.shape}")
         moments = x if x.ndim == 1 else np.linalg.eigvalsh(x)
         second = np.sum(moments) / 2 - moments
@@ -245,7 +247,7 @@ class PseudoInertia(AbstractTransform):
         """Of the pseudo-inertia; numbers that no body has raise."""
         x = np.asarray(value, float)
         if x.shape != (10,):
-            must = "be ten numbers (jl.PseudoInertia)"
+            must = "be ten numbers (jl.transforms.PseudoInertia)"
             raise invalid(f"params0[{name!r}]", must, f"its shape was {x.shape}")
         I = np.diag(x[4:7])  # noqa: E741
         I[[0, 0, 1], [1, 2, 2]] = I[[1, 2, 2], [0, 0, 1]] = x[7:]

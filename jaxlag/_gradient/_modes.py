@@ -13,7 +13,7 @@ ROOM = 512
 
 
 class GradientMode(IntEnum):
-    """How reverse derivatives go through the steps, stored as int32 in `stats["gradient"]`.
+    """How reverse derivatives go through the steps, stored as int32 in `Solution.gradient_mode`.
 
     `none` is that of a motion of which no derivative is taken.
     """

@@ -82,7 +82,7 @@ class VectorField(eqx.Module):
     @property
     def terms(self) -> Terms:
         """The lowered terms of the system."""
-        terms = self.system.terms
+        terms = self.system._terms
         if isinstance(terms, ScalarTerms):
             array = self._solved(terms.array)
             return replace(terms, array=array, lanes=self.lanes, in_loop=self.in_loop)
@@ -110,7 +110,7 @@ class VectorField(eqx.Module):
     def _solved(self, terms: ArrayTerms) -> ArrayTerms:
         """The terms with constraints solved for as asked."""
         if self.quasi is not None:
-            in_u = self.system.in_u
+            in_u = self.system._in_u
             return replace(terms, quasi=self.quasi, in_u=in_u, regular=bool(self.regular))
         if not self.rows.size:
             return terms
@@ -172,7 +172,7 @@ class VectorField(eqx.Module):
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
 
-        Looked at as by `System.mass_regular`; a lane without values is none to be careful for.
+        Looked at as by `mass_definite`; a lane without values is none to be careful for.
         """
         t, q, v, params = stop_gradient((t, q, v, params))
         elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
@@ -204,9 +204,9 @@ class VectorField(eqx.Module):
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise invalid(
-                "project",
-                "be True where forces read multipliers of Pfaffian rows beside holonomic ones, "
-                "whose phi would not be damped if they follow from these",
+                "stabilization",
+                "be 'projection' where forces read multipliers of Pfaffian rows beside holonomic "
+                "ones, whose phi would not be damped if they follow from these",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
         reacting = independent_rows(M, A, unread, there=there, mobile_first=True)

@@ -56,8 +56,8 @@ class Holonomic(AbstractConstraint):
 
     Args:
         phi: function `phi(t, q, params)` returning a scalar or shape (k,).
-        names: one name, under which `motion.lam[name]` has the shape of phi, or a name for each
-            of the k rows.
+        names: one name, under which `motion.multipliers[name]` has the shape of phi, or a
+            name for each of the k rows.
 
     Raises:
         ValueError: `phi` is not callable in this form; names that are empty or not distinct.
@@ -96,8 +96,8 @@ class Pfaffian(AbstractConstraint):
     Args:
         residual: function `residual(t, q, v, params)`, affine in v, returning a scalar or shape
             (k,). With a velocity of the contact point as residual, lam is the force on that point.
-        names: one name, under which `motion.lam[name]` has the shape of the residual, or a name
-            for each of the k rows.
+        names: one name, under which `motion.multipliers[name]` has the shape of the residual,
+            or a name for each of the k rows.
 
     Raises:
         ValueError: `residual` is not callable in this form; names that are empty or not distinct.

@@ -11,6 +11,9 @@ from jaxtyping import Array
 from jaxlag._core._arrays import of_state
 from jaxlag._core._errors import invalid
 
+ORDER = "The order of the arguments is (q, v, params)."
+"""Said where something else stands in the place of q or v."""
+
 
 class Coordinates:
     """Immutable, hashable table of coordinate names and shapes, in the order of flat q.
@@ -86,7 +89,9 @@ class Coordinates:
     def flatten(self, parts: Mapping[str, Any], argument: str = "q") -> Array:
         """Inverse of `unflatten` for a single state: dict of named values to shape (n,)."""
         if set(parts) != set(self.shapes):
-            raise invalid(argument, f"name exactly {list(self.shapes)}", f"it named {list(parts)}")
+            must, was = f"name exactly {list(self.shapes)}", f"it named {list(parts)}"
+            fix = ORDER if set(parts).isdisjoint(self.shapes) else ""
+            raise invalid(argument, must, was, fix)
         rows = []
         for name, shape in self.shapes.items():
             try:
@@ -134,6 +139,8 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     try:
         x = jnp.asarray(x)
     except (TypeError, ValueError) as error:
+        if not isinstance(x, str | Sequence):
+            fix = ORDER
         raise invalid(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
     if n == 1 and x.shape == ():
         x = x[None]

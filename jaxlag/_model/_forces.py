@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import required
 from jaxlag._core._errors import invalid
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import accepts, gradient, require_arity, wants
@@ -202,7 +203,7 @@ class PointForce(AbstractForce):
         return vjp_fn(F)[0]
 
 
-class Couple(AbstractForce):
+class Torque(AbstractForce):
     """A torque tau on a body of angular velocity w(t, q, v): `Q = (dw/dv)^T tau`.
 
     The virtual work of a couple is tau . dw/dv dq, since dw/dv maps virtual displacements dq to
@@ -231,7 +232,7 @@ class Couple(AbstractForce):
     takes_inputs: bool = eqx.field(static=True)
 
     def __init__(self, angular_velocity: Callable, torque: Callable, name: str) -> None:
-        _require_name("Couple", name)
+        _require_name("Torque", name)
         arguments = ("t", "q", "v", "params")
         require_arity(f"couple {name!r}: angular_velocity", angular_velocity, arguments)
         self.takes_inputs = _takes_inputs(f"couple {name!r}: torque", torque)
@@ -304,7 +305,8 @@ class Rayleigh(AbstractForce):
     R: Callable = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def __init__(self, R: Callable, name: str = "rayleigh") -> None:
+    @required(name='Write jl.Rayleigh(R, "drag").')
+    def __init__(self, R: Callable, name: str) -> None:
         _require_name("Rayleigh", name)
         require_arity(f"Rayleigh {name!r}: R", R, ("t", "q", "v", "params"))
         self.R, self.name = traced_function(R), name
@@ -336,7 +338,7 @@ def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
         if not isinstance(force, AbstractForce):
             raise invalid(
                 "forces",
-                "contain PointForce, Couple, GeneralizedForce and Rayleigh objects",
+                "contain PointForce, Torque, GeneralizedForce and Rayleigh objects",
                 f"one was {force!r}",
                 'Write jl.PointForce(position, force, "name"), jl.Rayleigh(R, "name") and so on.',
             )

@@ -154,7 +154,7 @@ class ZeroOrderHold(AbstractTable):
         return self.values[interval]
 
 
-class Linear(AbstractTable):
+class LinearInterpolation(AbstractTable):
     """A table interpolated linearly between its times; continuous, with kinks at the knots.
 
     Defined on [times[0], times[-1]]; a simulation that reaches beyond ends with
@@ -172,7 +172,7 @@ class Linear(AbstractTable):
     values: Array
 
     def __init__(self, times: Any, values: Any) -> None:
-        self.times, self.values = _table("Linear", times, values)
+        self.times, self.values = _table("LinearInterpolation", times, values)
 
     def locate(self, t: Float[Array, ""]) -> Int[Array, ""] | None:
         """Index i with times[i] <= t < times[i+1]."""
@@ -204,7 +204,7 @@ def _called(f: Callable, params: Any, *arguments: Any) -> Any:
     return f(*map(plain, arguments))
 
 
-class Function(AbstractInput):
+class TimeFunction(AbstractInput):
     """A signal u(t) given by a function of time, or of time and params, smooth between its knots.
 
     Where it jumps, or bends, name the times: steps end there, and each step sees the side that it
@@ -229,11 +229,11 @@ class Function(AbstractInput):
 
     def __init__(self, f: Callable, knots: Any = None) -> None:
         self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
-        require_arity("Function: f", f, ("t", "params") if self.takes_params else ("t",))
+        require_arity("TimeFunction: f", f, ("t", "params") if self.takes_params else ("t",))
         self.f = traced_unless_module(f)
         self.ends = None
         if knots is not None:
-            times = _increasing("Function: knots", _inexact(knots), 1)
+            times = _increasing("TimeFunction: knots", _inexact(knots), 1)
             joined = (np if concrete(times) else jnp).concatenate
             never = np.full((1,), np.inf, times.dtype)
             self.ends = _inexact(joined((-never, times, never)))

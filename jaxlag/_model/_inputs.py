@@ -21,7 +21,7 @@ from jaxlag._model._input_signals import (
     AbstractInput,
     AbstractTable,
     Feedback,
-    Function,
+    TimeFunction,
     interval_at,
 )
 from jaxlag._tracing._input_values import InputValues
@@ -45,7 +45,7 @@ def check_inputs(inputs: Any) -> dict[str, Any]:
                 f"inputs[{name!r}]",
                 "be an input object or an array",
                 f"it was the function {signal!r}",
-                "Wrap it in jl.Function (of time) or jl.Feedback (of the state).",
+                "Wrap it in jl.TimeFunction (of time) or jl.Feedback (of the state).",
             )
         try:
             checked[name] = jnp.asarray(signal)
@@ -91,7 +91,7 @@ def evaluate(
     def value(name: str, signal: Any) -> Any:
         if isinstance(signal, AbstractInput):
             clock = since if isinstance(signal, AbstractTable) else t
-            if onwards and isinstance(signal, Function):
+            if onwards and isinstance(signal, TimeFunction):
                 signal = signal.onwards(clock, params)
             else:
                 signal = signal.value(clock, q, v, params, intervals[name])

@@ -25,7 +25,7 @@ def check_options(
     system: Any,
     gradient: Any,
     gradient_memory: Any,
-    project: Any,
+    stabilization: Any,
     assemble: Any,
     save: Any,
     max_steps: Any,
@@ -43,11 +43,13 @@ def check_options(
         raise invalid("gradient_memory", "be a positive number of bytes or None", was)
     if not isinstance(assemble, bool):
         raise invalid("assemble", "be True or False", f"it was {assemble!r}")
-    if not isinstance(project, bool | Baumgarte):
-        must = "be True, False or a jl.Baumgarte(alpha, beta)"
-        raise invalid("project", must, f"it was {project!r}")
-    if isinstance(project, Baumgarte) and not system.constraints:
-        raise invalid("project", "be True for a system without constraints", f"it was {project!r}")
+    baumgarte = isinstance(stabilization, Baumgarte)
+    if not baumgarte and stabilization is not None and stabilization != "projection":
+        must = "be 'projection', None or a jl.Baumgarte(alpha, beta)"
+        raise invalid("stabilization", must, f"it was {stabilization!r}")
+    if baumgarte and not system.constraints:
+        must = "be left out for a system without constraints"
+        raise invalid("stabilization", must, f"it was {stabilization!r}")
     if isinstance(save, str):
         raise invalid(
             "save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},)."
@@ -57,7 +59,8 @@ def check_options(
     for name in save:
         if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
             known = [*QUANTITIES, "work"]
-            raise invalid("save", f"name quantities among {known}", f"one was {name!r}")
+            fix = "Write 'multipliers'." if name == "lam" else ""
+            raise invalid("save", f"name quantities among {known}", f"one was {name!r}", fix)
         if name == "u" and system.quasi is None:
             must, was = "name what the system has", "one was 'u' without quasi-velocities"
             raise invalid("save", must, was, "Declare the system with quasi=.")
@@ -80,7 +83,7 @@ def check_change_points(change_points: Any) -> None:
 
 
 def check_formulation(
-    system: System, formulation: Any, project: Any, params: Any, dtype: Any
+    system: System, formulation: Any, stabilization: Any, params: Any, dtype: Any
 ) -> str:
     """The formulation that is meant; raises where the system does not have it."""
     known = ["auto", *FORMULATIONS] if system.constraints or system.quasi is not None else ["auto"]
@@ -88,7 +91,7 @@ def check_formulation(
     why = "" if len(known) > 1 else "This system has no constraints: its state is (q, v)."
     left: list[str] = []
     if quasi is not None:
-        rows = system.rows(params, dtype)
+        rows = system._rows(params, dtype)
         if quasi.kinematics is None:
             left = [label for label in rows.labels if label not in quasi.constrained]
         if any(map(reads_lam, system.forces)):
@@ -98,7 +101,7 @@ def check_formulation(
                 f"Quasi-velocities do not take care of the rows {left}: name the quasi-velocities "
                 "that vanish in constrained=, or use formulation='multipliers'."
             )
-        elif isinstance(project, Baumgarte):
+        elif isinstance(stabilization, Baumgarte):
             why = "Baumgarte's terms belong to formulation='multipliers'."
         else:
             known.append("quasi")
@@ -110,7 +113,7 @@ def check_formulation(
     if quasi is None or "quasi" not in known:
         return FORMULATIONS[0]
     # Kinematics that leave more freedoms than the rows do not satisfy these by themselves.
-    fitting = len(quasi.free) + system.rows(params, dtype).size <= system.size
+    fitting = len(quasi.free) + system._rows(params, dtype).size <= system.size
     return "quasi" if fitting or quasi.kinematics is None else FORMULATIONS[0]
 
 
@@ -158,7 +161,7 @@ def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
 
 def check_times(ts: Any) -> tuple[Any, int | None]:
     if ts is None:
-        raise invalid("ts", "be given", "it was left out", "Pass ts=jnp.linspace(0, 10, 501).")
+        raise invalid("ts", "be given", "it was None", "Pass ts=jnp.linspace(0, 10, 501).")
     ts = _number("ts", "be an array of times", ts, jnp.result_type(float))
     if ts.ndim != 1 or not at_most(2, ts.shape[0]):
         fix = ""
@@ -199,7 +202,7 @@ def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
                 "method[1]",
                 "leave times to the inputs",
                 f"it had {name}",
-                "Steps end on the knots of ZeroOrderHold and Linear inputs.",
+                "Steps end on the knots of ZeroOrderHold and LinearInterpolation inputs.",
             )
 
 

@@ -47,7 +47,7 @@ def _words(system: System, seconds: float) -> str:
     names = system.coordinates.labels
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
     advice = "JAX_COMPILATION_CACHE_DIR keeps what is compiled for the next process"
-    if isinstance(system.terms, ScalarTerms):
+    if isinstance(system._terms, ScalarTerms):
         advice += "; lowering='array' compiles long equations in less time, and runs slower"
     return (
         f"Compiling the motion of {len(names)} coordinates ({shown}) took {seconds:.0f} s, once "

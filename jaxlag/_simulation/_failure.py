@@ -119,7 +119,7 @@ def dynamics_of(
     )
     args = dynamics.arguments(params, inputs, ts)
     given, _ = dynamics.given(args)
-    dynamics = replace(dynamics, rows=dynamics.system.rows(given, q.dtype))
+    dynamics = replace(dynamics, rows=dynamics.system._rows(given, q.dtype))
     y = dynamics.state_of(t, q, v, given)
     return dynamics, dynamics.precompute(dynamics.tau(t, args), y, args)
 

@@ -230,7 +230,7 @@ def warn(jumps: Iterable[Jump]) -> None:
             f"Derivatives by {leaf} leave out how the time moves at which the equations jump, as "
             f"it is compared with t at {line}. Make that time a knot: pass inputs={{name: "
             "jl.ZeroOrderHold(times, values)}, where the times depend on the params, or "
-            "jl.Function(f, knots=times), and read it in the force.",
+            "jl.TimeFunction(f, knots=times), and read it in the force.",
             UserWarning,
             stacklevel=1,
         )

@@ -1,7 +1,7 @@
 """Growth of perturbations along a motion, and how far a gradient along it says anything."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlag._core._arguments import renamed
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._batching import in_batches
 from jaxlag._core._custom_jvp import CustomJVP
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import invalid, unsupported
 from jaxlag._core._status import ADVICE, Status
 from jaxlag._linalg._mass_solve import rank_floor
 from jaxlag._model._inputs import all_knots
@@ -34,7 +35,7 @@ BLOCKS = 8  # that the rest is divided into, at most
 SURE = 3.0  # errors by which an exponent must exceed zero
 
 
-class GradientGrowth(eqx.Module):
+class PerturbationGrowth(eqx.Module):
     """How much perturbations of a motion y = (q, v) grow, Phi' = df/dy Phi along y' = f(t, y).
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
@@ -81,7 +82,11 @@ class GradientGrowth(eqx.Module):
     def message(self) -> str:
         """What the growth along a single motion is, and what to do about it, in words."""
         if self.ts.ndim != 1:
-            raise invalid("message", "be asked of a single motion", f"batch {self.ts.shape[:-1]}")
+            raise unsupported(
+                "`message` of a batch",
+                f"its shape is {self.ts.shape[:-1]}",
+                "Take one of them, as batch[3].",
+            )
         status = Status(int(self.status))
         if status is not Status.ok:
             return f"{status.name}: the motion, or a segment of it, could not be followed."
@@ -116,17 +121,19 @@ class GradientGrowth(eqx.Module):
         return self.message() if self.ts.ndim == 1 else repr(self)
 
     def __repr__(self) -> str:
-        return f"GradientGrowth(exponent {self.exponent} 1/s, horizon {self.horizon} s)"
+        return f"PerturbationGrowth(exponent {self.exponent} 1/s, horizon {self.horizon} s)"
 
 
-def grad_growth(
+@renamed(tol="step_rtol= and step_atol=")
+def lyapunov(
     motion: Solution,
     *,
     rtol: Any = None,
     atol: Any = None,
-    tol: Any = None,
+    step_rtol: Any = None,
+    step_atol: Any = None,
     max_steps: int = 1024,
-) -> GradientGrowth:
+) -> PerturbationGrowth:
     """Growth of perturbations along a motion: conditioning, Lyapunov exponent, horizon.
 
     With y = (q, v), y' = f(t, y) and Phi(t, s) = dy(t)/dy(s), that is Phi' = df/dy Phi,
@@ -159,10 +166,12 @@ def grad_growth(
         rtol: of the weights, not negative; by default that of `simulate`, 1e-9 in float64, 1e-5 in
             float32. kappa depends on atol / rtol alone, the horizon on rtol.
         atol: of the weights, positive, m or rad and m/s or rad/s; by default 1e-9 and 1e-6.
-        tol: rtol and atol of the steps between save times; by default 1e-10, 1e-5 in float32. Each
-            part of Phi is wrong by about tol of its own size, or of 1 where that is larger, and
-            products by the sum over their parts. To this comes that Phi follows the saved states,
-            which have errors of their own.
+        step_rtol: relative tolerance of the steps between save times; by default 1e-10, 1e-5 in
+            float32. Each part of Phi is wrong by about that of its own size, or of 1 where that is
+            larger, and products by the sum over their parts. To this comes that Phi follows the
+            saved states, which have errors of their own.
+        step_atol: absolute tolerance of the same steps, m or rad and m/s or rad/s; by default
+            1e-10, 1e-5 in float32.
         max_steps: bound on steps from one save time to the next.
 
     Raises:
@@ -190,7 +199,7 @@ def grad_growth(
         ...     return 0.5 * v[0] ** 2 - jnp.cos(q[0])
         >>> pendulum = jl.System(lagrangian, coordinates=("theta",))
         >>> motion = jl.simulate(pendulum, [0.0], [0.0], jnp.linspace(0.0, 10.0, 21))
-        >>> growth = jl.grad_growth(motion)
+        >>> growth = jl.lyapunov(motion)
         >>> print(f"{growth.exponent:.4f} 1/s, kappa {growth.kappa[-1]:.1f}")
         1.0000 1/s, kappa 22026.5
         >>> print(f"horizon {growth.horizon:.3f} s")
@@ -198,36 +207,37 @@ def grad_growth(
     """
     if not isinstance(motion, Solution):
         fix = "Pass what jl.simulate returns."
-        raise invalid("grad_growth: motion", "be a jl.Solution", f"it was {motion!r}", fix)
+        raise invalid("lyapunov: motion", "be a jl.Solution", f"it was {motion!r}", fix)
     if motion.ts.shape[-1] < 3:
         must, was = "have at least 3 save times", f"it had {motion.ts.shape[-1]}"
         fix = "Simulate it with ts=jnp.linspace(t0, t1, 101)."
-        raise invalid("grad_growth: motion", must, was, fix)
+        raise invalid("lyapunov: motion", must, was, fix)
     single = motion.ts.ndim == 1 and concrete(motion.status)
     if single and int(motion.status) != int(Status.ok):
         was = f"it ended with status {motion.message()}"
-        raise invalid("grad_growth: motion", "have reached its last time", was)
+        raise invalid("lyapunov: motion", "have reached its last time", was)
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise invalid("grad_growth: max_steps", "be a positive integer", f"it was {max_steps!r}")
+        raise invalid("lyapunov: max_steps", "be a positive integer", f"it was {max_steps!r}")
     dtype = motion.q.dtype
     defaults = default_tolerances(dtype)
     finest = 1e-10 if jnp.finfo(dtype).bits == 64 else defaults[0]
     rtol = _not_negative("rtol", rtol, defaults[0], dtype)
     atol = _not_negative("atol", atol, defaults[1], dtype, zero=False)
-    tol = _not_negative("tol", tol, finest, dtype, zero=False)
+    step_rtol = _not_negative("step_rtol", step_rtol, finest, dtype, zero=False)
+    step_atol = _not_negative("step_atol", step_atol, finest, dtype, zero=False)
 
     warn_of_changes(motion.system, motion.inputs)
     static = motion._params_static, motion._inputs_static
     key = motion.system, *static, motion.formulation, max_steps, motion.ts.ndim - 1
     given = (motion.ts, motion.q, motion.v, motion._params_traced, motion._inputs_traced)
     traced = _not_differentiated(given)
-    growth, statuses = _growth(key, traced, motion.status, (rtol, atol, tol))
+    growth, statuses = _growth(key, traced, motion.status, (rtol, atol, step_rtol, step_atol))
     if single and int(growth.status) != int(Status.ok):
         i = int(np.argmax(np.asarray(statuses) != int(Status.ok)))
         status = Status(int(statuses[i]))
         was = f"from t = {motion.ts[i]} to {motion.ts[i + 1]} the status was {status.name}"
         raise invalid(
-            "grad_growth: motion", "be solvable from each of its save times", was, _fix(status)
+            "lyapunov: motion", "be solvable from each of its save times", was, _fix(status)
         )
     if concrete(growth.horizon):
         _warn_beyond(growth)
@@ -244,11 +254,11 @@ def _not_differentiated(x: Any) -> Any:
 def _refused(primals: tuple, tangents: tuple) -> Any:
     if jax.tree.leaves(tangents):
         fix = "Pass jax.lax.stop_gradient of the motion's start and params."
-        raise invalid("grad_growth", "be left out of what is differentiated", "it was not", fix)
+        raise unsupported("A derivative of `lyapunov`", "its results have none", fix)
     return primals[0], None
 
 
-def _warn_beyond(growth: GradientGrowth) -> None:
+def _warn_beyond(growth: PerturbationGrowth) -> None:
     """Say where motions go on beyond their horizon; Python shows it once for each caller."""
     span, horizon = np.abs(growth.ts[..., -1] - growth.ts[..., 0]), np.asarray(growth.horizon)
     beyond = np.asarray(span) > horizon
@@ -261,24 +271,24 @@ def _warn_beyond(growth: GradientGrowth) -> None:
 
 def _not_negative(name: str, x: Any, default: float, dtype: Any, zero: bool = True) -> Array:
     must = "be a number that is not negative" if zero else "be a positive number"
-    x = number(f"grad_growth: {name}", must, default if x is None else x, dtype)
+    x = number(f"lyapunov: {name}", must, default if x is None else x, dtype)
     if concrete(x) and not (x >= 0 if zero else x > 0):
-        raise invalid(f"grad_growth: {name}", must, f"it was {x}")
+        raise invalid(f"lyapunov: {name}", must, f"it was {x}")
     return x
 
 
 def _fix(status: Status) -> str:
     if status is Status.max_steps:
-        return "Save the motion at more times, raise max_steps, or loosen tol."
+        return "Save the motion at more times, raise max_steps, or loosen step_rtol and step_atol."
     return ADVICE.get(status, "")
 
 
 @partial(jax.jit, static_argnums=0)
 def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
     system, params_static, inputs_static, formulation, max_steps, batch = key
-    rtol, atol, tol = tolerances
+    rtol, atol, *of_steps = tolerances
 
-    def one(traced: Any, status: Array) -> tuple[GradientGrowth, Array]:
+    def one(traced: Any, status: Array) -> tuple[PerturbationGrowth, Array]:
         ts, q, v, params, inputs = traced
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
@@ -288,7 +298,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         rate = partial(_rate, system, formulation, params, inputs)
         tangent = jax.vmap(partial(_tangent, system, params))
         knots, allowed = all_knots(inputs), tangent(ts, y, jnp.ones_like(y))
-        Phi, statuses = _transitions(rate, ts, y, allowed, knots, tol, max_steps)
+        Phi, statuses = _transitions(rate, ts, y, allowed, knots, of_steps, max_steps)
 
         w = atol + rtol * jnp.abs(y)
         kept = tangent(ts, y, w)
@@ -304,7 +314,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         status = jnp.where(status == int(Status.ok), jnp.max(statuses), status)
         found = (Phi, log_kappa, log_norm, exponent, error, horizon)
         found = [jnp.where(status == int(Status.ok), x, jnp.nan) for x in found]
-        return GradientGrowth(ts, *found, rtol=rtol, atol=atol, status=status), statuses
+        return PerturbationGrowth(ts, *found, rtol=rtol, atol=atol, status=status), statuses
 
     for _ in range(batch):
         one = jax.vmap(one)
@@ -315,9 +325,9 @@ def _rate(system: System, formulation: str, params: Any, inputs: Any, t: Array, 
     """f(t, y) = (v, a)."""
     q, v = jnp.split(y, 2)
     if formulation == "quasi":
-        a = system.quasi_reactions(params, q, v, t, inputs)["a"]
+        a = system._quasi_reactions(q, v, params, t=t, inputs=inputs)["a"]
     else:
-        a = system.acceleration(params, q, v, t, inputs)
+        a = system.acceleration(q, v, params, t=t, inputs=inputs)
     return jnp.concatenate([v, a])
 
 
@@ -332,8 +342,8 @@ def _tangent(system: System, params: Any, t: Array, y: Array, w: Array) -> Array
         return one
 
     def conditions(y: Array) -> Array:
-        phi = system.terms.position(t, y[:n], params)
-        return jnp.concatenate([phi, system.terms.velocity(t, y[:n], y[n:], params)])
+        phi = system._terms.position(t, y[:n], params)
+        return jnp.concatenate([phi, system._terms.velocity(t, y[:n], y[n:], params)])
 
     C = jax.jacfwd(conditions)(y) * w
     size = jnp.linalg.norm(C, axis=1, keepdims=True)
@@ -349,7 +359,7 @@ def _transitions(
     y: Array,
     directions: Array,
     knots: Array | None,
-    tol: Array,
+    tolerances: Sequence[Array],
     max_steps: int,
 ) -> tuple[Array, Array]:
     """(Phi(ts[i + 1], ts[i]) directions[i], status) of every segment: y' = f, Y' = df/dy Y.
@@ -364,8 +374,8 @@ def _transitions(
         f, along = jax.linearize(partial(rate, t), y)
         return f.astype(outside), jax.vmap(along, in_axes=1, out_axes=1)(Y).astype(outside)
 
-    tol = tol.astype(outside)
-    controller = diffrax.PIDController(rtol=tol, atol=tol)
+    rtol, atol = (x.astype(outside) for x in tolerances)
+    controller = diffrax.PIDController(rtol=rtol, atol=atol)
     if knots is not None:
         controller = diffrax.ClipStepSizeController(controller, jump_ts=knots.astype(outside))
     solver, term = diffrax.Dopri8(), diffrax.ODETerm(rates)

@@ -50,7 +50,7 @@ def check_requirements(
     for force in filter(reads_lam, system.forces):
         must = "be used without forces that depend on multipliers"
         raise invalid(name, must, f"{force.name!r} does", "Choose another method.")
-    rows = system.rows(params, dtype)
+    rows = system._rows(params, dtype)
     if rows.size and isinstance(solver, GaussLegendre):
         must, fix = "be used without constraints", "Choose 'variational2' or 'variational4'."
         raise invalid(name, must, f"there were the rows {list(rows.labels)}", fix)
@@ -64,7 +64,7 @@ def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
     """Whether it is T(v) - V(t, q) with nothing else that accelerates."""
     if formulation != "multipliers" or system.constraints or system.forces:
         return False
-    structure = system.structure(params, dtype)
+    structure = system._structure(params, dtype)
     return not (structure.mass & {"t", "q", "v"} or "v" in structure.bias)
 
 
@@ -74,11 +74,11 @@ def _separable(
     """Raise unless M is constant and nothing that accelerates depends on v."""
     fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
     if system.constraints:
-        was = f"it has constraints ({', '.join(map(repr, system.rows(params, dtype).labels))})"
+        was = f"it has constraints ({', '.join(map(repr, system._rows(params, dtype).labels))})"
         fix = "Choose 'variational2' or 'variational4', which hold holonomic constraints."
         raise invalid(name, "split a system without constraints", was, fix)
     traced, static = _params.split(params)
-    structure = system.structure(params, dtype)
+    structure = system._structure(params, dtype)
     must = "split a Lagrangian T(v) - V(t, q) with constant mass matrix"
     for what, found in (("mass matrix", structure.mass), ("bias", structure.bias)):
         depends = sorted(found & ({"t", "q", "v"} if what == "mass matrix" else {"v"}))

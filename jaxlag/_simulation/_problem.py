@@ -33,7 +33,8 @@ from jaxlag._model._inputs import all_knots, common_range, knots_increase
 from jaxlag._simulation._method_requirements import check_requirements, splits
 from jaxlag._simulation._methods import for_state
 from jaxlag._statics._assemble import assembled
-from jaxlag._system._system import System, check_declaration
+from jaxlag._system._inspection import check_declaration
+from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages
@@ -81,7 +82,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     power = None
     if "work" in plan.save:
         params = _params.join(values.params, plan.params.tree)
-        power = plan.system.power_terms(params, values.q0.dtype)
+        power = plan.system._power_terms(params, values.q0.dtype)
     dynamics = VectorField(
         plan.system,
         plan.params,
@@ -96,7 +97,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     )
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
-    dynamics = replace(dynamics, rows=plan.system.rows(params, values.q0.dtype))
+    dynamics = replace(dynamics, rows=plan.system._rows(params, values.q0.dtype))
     crossing = plan.change_points == "pass" and may_cross(dynamics)
     dynamics = replace(dynamics, crossing=crossing)
     solver, controller = eqx.combine(values.stepper, plan.stepper.tree)
@@ -108,7 +109,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
 
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
     if v0 is None:
-        v0 = plan.system.velocities(params, q0, u0, t0)
+        v0 = plan.system.velocities(q0, u0, params, t=t0)
     check_declaration(plan.system, params, inputs, t0, q0, v0)
     if plan.assemble and dynamics.rows.size:
         found = assembled(plan.system, q0, v0, params, t0)

@@ -9,28 +9,41 @@ from jaxtyping import Array
 
 from jaxlag._system._system import System
 
-QUANTITIES: dict[str, Callable[[System, Any, Any, Any, Any, Any], Any]] = {
-    "a": lambda system, t, q, v, params, inputs: system.acceleration(params, q, v, t, inputs),
-    "u": lambda system, t, q, v, params, inputs: system.quasi_velocities(params, q, v, t),
-    "p": lambda system, t, q, v, params, inputs: system.momentum(params, q, v, t),
-    "energy": lambda system, t, q, v, params, inputs: system.energy(params, q, v, t),
-    "kinetic": lambda system, t, q, v, params, inputs: system.kinetic(params, q, v, t),
-    "potential": lambda system, t, q, v, params, inputs: system.potential(params, q, v, t),
-    "power": lambda system, t, q, v, params, inputs: system.power(params, q, v, t, inputs),
-    "lam": lambda system, t, q, v, params, inputs: system.multipliers(params, q, v, t, inputs),
-    "constraint_force": lambda system, t, q, v, params, inputs: system.constraint_force(
-        params, q, v, t, inputs
-    ),
-    "Q": lambda system, t, q, v, params, inputs: system.generalized_force(params, q, v, t, inputs),
+Quantity = Callable[..., Any]
+"""(system, q, v, params, t=, inputs=) -> the quantity, as the method of `System` gives it."""
+
+
+def _without_inputs(method: Quantity) -> Quantity:
+    def quantity(system: System, q: Any, v: Any, params: Any, *, t: Any, inputs: Any) -> Any:
+        return method(system, q, v, params, t=t)
+
+    return quantity
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "a": System.acceleration,
+    "u": _without_inputs(System.quasi_velocities),
+    "p": _without_inputs(System.momentum),
+    "energy": _without_inputs(System.energy),
+    "kinetic": _without_inputs(System.kinetic),
+    "potential": _without_inputs(System.potential),
+    "power": System.power,
+    "multipliers": System.multipliers,
+    "constraint_force": System.constraint_force,
+    "Q": System.generalized_force,
 }
 """Quantities of one state, by the name `save=` and the Solution know them under."""
+
+
+def _from_quasi(name: str) -> Quantity:
+    def quantity(system: System, q: Any, v: Any, params: Any, *, t: Any, inputs: Any) -> Any:
+        return system._quasi_reactions(q, v, params, t=t, inputs=inputs)[name]
+
+    return quantity
+
+
 # The same without multipliers solved for, from the equations in quasi-velocities.
-_BY_QUASI = {
-    name: lambda system, t, q, v, params, inputs, name=name: system.quasi_reactions(
-        params, q, v, t, inputs
-    )[name]
-    for name in ("a", "lam", "constraint_force")
-}
+_BY_QUASI = {name: _from_quasi(name) for name in ("a", "multipliers", "constraint_force")}
 
 
 def at_saves(
@@ -54,7 +67,7 @@ def at_saves(
         # finite.
         unknown = q[0]  # NaN there, with NaN for its derivatives
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
-        value = quantity(system, t, q, v, params, inputs)
+        value = quantity(system, q, v, params, t=t, inputs=inputs)
         return jax.tree.map(lambda x: jnp.where(reached, x, unknown.astype(x.dtype)), value)
 
     t0, q0, v0 = ts[0], q[0], v[0]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlag._core._arrays import concrete, real
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import invalid, unsupported
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
 _ASK = "Ask for it as a save time: ts=jnp.linspace(0, 10, 501)."
@@ -24,16 +24,17 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         solve: `simulate`.
     """
     if motion.ts.ndim != 1:
-        was = f"it was one of a batch {motion.ts.shape[:-1]}"
-        raise invalid("at: motion", "be a single one", was, "Take one of them, as batch[3].")
+        raise unsupported(
+            "`at` of a batch",
+            f"its shape is {motion.ts.shape[:-1]}",
+            "Take one of them, as batch[3].",
+        )
     if not concrete(motion.ts, motion.q, t):
-        raise invalid("at", "be asked outside of jit, vmap and derivatives", "it was traced", _ASK)
+        raise unsupported("`at` inside jit, vmap or a derivative", "it looks at numbers", _ASK)
     if motion.tolerances is None:
-        must = "be that of a motion with adaptive steps"
-        raise invalid("at: motion", must, "its steps were fixed, and end elsewhere", _ASK)
+        raise unsupported("`at` of a motion with fixed steps", "they end elsewhere", _ASK)
     if motion._solver:
-        must, was = "have been made by a method that has a name", f"it was {motion._solver}"
-        raise invalid("at: motion", must, was, _ASK)
+        raise unsupported(f"`at` of a motion by {motion._solver}", "its method has no name", _ASK)
     asked = np.atleast_1d(np.asarray(real("at: t", t)))
     if asked.ndim != 1:
         raise invalid(
@@ -51,9 +52,6 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
     times = time_direction * times[times > time_direction * ts[before]]
     if not len(times):
         return motion._at_saves([before] * len(asked))
-    project: Any = motion.stabilization or False
-    if project == "projection" or not motion.system.constraints:
-        project = True
     plain = not motion.system.constraints and motion.system.quasi is None
     further = solve(
         motion.system,
@@ -67,7 +65,7 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         rtol=motion.tolerances[0],
         atol=motion.tolerances[1],
         save=tuple(motion.saved),
-        project=project,
+        stabilization=motion.stabilization,
         change_points=motion.change_points,
         dt_max=motion.dt_max,
         throw=False,

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 from jax.core import Tracer
 
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import unsupported
 
 
 def check_placement(function: str, values: Any) -> None:
@@ -23,17 +23,15 @@ def check_placement(function: str, values: Any) -> None:
             continue
         varying, explicit = _axes(leaf)
         if varying:
-            raise invalid(
-                f"{function} inside shard_map",
-                "be called with check_vma=False",
+            raise unsupported(
+                f"`{function}` inside shard_map with check_vma=True",
                 f"an argument varies over the axes {sorted(varying)}",
                 "Write jax.shard_map(f, mesh=mesh, in_specs=..., out_specs=..., check_vma=False).",
             )
         if explicit:
-            raise invalid(
-                function,
-                "get arrays of a mesh whose axes are of type Auto",
-                f"one lies along the explicit axes {sorted(explicit)}",
+            raise unsupported(
+                f"`{function}` of arrays along explicit axes",
+                f"one lies along {sorted(explicit)}",
                 "Write jax.make_mesh(shape, names, axis_types=(jax.sharding.AxisType.Auto,) * n).",
             )
 

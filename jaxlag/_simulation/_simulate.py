@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlag._core import _xla
-from jaxlag._core._arrays import concrete, stop_gradient
-from jaxlag._core._errors import SimulationError, invalid
+from jaxlag._core._arguments import renamed, required
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._gradient._modes import choose_gradient
 from jaxlag._gradient._solve import solve
@@ -44,6 +45,7 @@ from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
 from jaxlag._simulation._step_diagnosis import is_stiff
 from jaxlag._system._closure import check_params, lift_closure_tracers
+from jaxlag._system._inspection import contact_rows_independent, mass_definite
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -55,14 +57,15 @@ _MAY_BE_SINGULAR = (
     Status.nonfinite,
     Status.step_below_resolution,
 )
-_PROJECTION = {True: "projection", False: None}
 
 
+@renamed(project="stabilization='projection', None or a jl.Baumgarte")
+@required(v0="Pass v0=None beside u0=.", ts="Pass ts=jnp.linspace(0, 10, 501).")
 def simulate(
     system: System,
     q0: Any,
-    v0: Any = None,
-    ts: Any = None,
+    v0: Any,
+    ts: Any,
     params: Any = None,
     *,
     u0: Any = None,
@@ -78,7 +81,7 @@ def simulate(
     save: tuple[str, ...] = (),
     gradient: str = "auto",
     gradient_memory: int | float | None = None,
-    project: bool | Baumgarte = True,
+    stabilization: str | Baumgarte | None = "projection",
     change_points: str = "pass",
     assemble: bool = False,
     estimate_error: bool = False,
@@ -115,8 +118,8 @@ def simulate(
         u0: quasi-velocities at ts[0], for systems that declare them: (k,) numbers in the order of
             their names, or a dict by name; constrained ones are zero, and may be left out of a
             dict; m/s or rad/s.
-        inputs: dict from names to `ZeroOrderHold`, `Linear`, `Function`, `Feedback` or arrays
-            (constant), read by the forces. Steps end on the knots of tables.
+        inputs: dict from names to `ZeroOrderHold`, `LinearInterpolation`, `TimeFunction`,
+            `Feedback` or arrays (constant), read by the forces. Steps end on the knots of tables.
         method: "auto", a name such as "tsit5", any diffrax solver, or a pair (solver, step-size
             controller). "auto" is "dopri8"; "tsit5" where rtol is known and at least 1e-3;
             "prince9" where it is at most 1e-12; with fixed steps "splitting8" for T(v) - V(t, q)
@@ -131,7 +134,7 @@ def simulate(
             (`solvers.Splitting`) where M is constant and nothing that accelerates depends on v;
             "gauss2" to "gauss8" (`solvers.GaussLegendre`) for any L without constraints;
             "variational2" and "variational4" (`solvers.LobattoIIIAB`) for any L, with holonomic
-            constraints held inside the step, so that `project` has nothing to do.
+            constraints held inside the step, so that `stabilization` has nothing to do.
         formulation: what the state is and how accelerations are found.
             "quasi" ("auto" where quasi-velocities are declared and take care of all rows): (q, u)
             with the quasi-velocities that are not constrained, no multipliers. Kinematics do so
@@ -151,28 +154,29 @@ def simulate(
             land on ts[-1].
         dt0: first step in s of an adaptive solve, positive; by default chosen from the start.
         dt_max: bound on the steps of an adaptive solve in s, positive; None for none. A pulse, of a
-            `Function` or of explicit time, that is shorter than a step and between two of its
+            `TimeFunction` or of explicit time, that is shorter than a step and between two of its
             stages is not seen: bound the steps by its length, or say where it begins and ends
-            (`Function(f, knots=)`).
+            (`TimeFunction(f, knots=)`).
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
-            "potential", "Q", "power", "lam", "constraint_force", which the Solution computes on
-            demand without it; and "work", the integral of each term of dH/dt since ts[0], which
-            exists only here. It is integrated along with the motion, its local error bounded like
-            that of q and v.
+            "potential", "Q", "power", "multipliers", "constraint_force", which the Solution
+            computes on demand without it; and "work", the integral of each term of dH/dt since
+            ts[0], which exists only here. It is integrated along with the motion, its local error
+            bounded like that of q and v.
         gradient: a hint on the cost of reverse derivatives, never on their value.
             "recorded" keeps the state at the start of every step. "checkpoints" keeps about the
             square root as many and takes the steps between two again, one more solve. "forward"
             keeps none: reverse derivatives are put together from forward ones, the dearer the
             more numbers move. "auto" keeps up to 512 states, which is "recorded" up to 512 steps,
             and where `gradient_memory` is less than that the fastest mode that fits. All keep the
-            times of max_steps steps. What was done is in `motion.stats["gradient"]`. Forward
+            times of max_steps steps. What was done is in `motion.gradient_mode`. Forward
             derivatives need the times alone.
         gradient_memory: bound on what reverse derivatives of one motion keep, bytes; None for
             none.
-        project: True: accepted steps and saved states are moved onto the constraints, q along
-            M^-1 A^T, then v (with quasi-velocities there is nothing to move but q). False: they are
-            left to drift. `Baumgarte(alpha, beta)`: residuals are damped instead.
+        stabilization: "projection": accepted steps and saved states are moved onto the
+            constraints, q along M^-1 A^T, then v (with quasi-velocities there is nothing to move
+            but q). None: they are left to drift. `Baumgarte(alpha, beta)`: residuals are damped
+            instead.
         change_points: what becomes of a motion where constraint rows that are independent elsewhere
             depend on one another, as in a linkage that lies flat: there it may go on in more than
             one way, and reactions may be infinite. "pass": it goes on along the tangent that it
@@ -192,7 +196,9 @@ def simulate(
             `motion.error` what follows for the errors of q and v at every save time (of the same
             method, up to every save time; not below 32 eps sqrt(steps) |y|, what rounding leaves):
             global ones, where rtol and atol bound those of a step.
-        throw: raise `SimulationError` where a concrete result has a status other than ok.
+        throw: raise `SimulationError` where a motion ends in a status other than ok; under `jit`,
+            `vmap` and `grad` of them nothing can be raised: ask the result, `motion.ok`,
+            or call `motion.check()` outside.
 
     Raises:
         ValueError: an argument of wrong form or value, named.
@@ -215,7 +221,7 @@ def simulate(
         >>> print(f"{motion.rate('x')[-1]:.6f} {motion.energy[-1]:.6f} {motion.message()}")
         -0.300000 0.090000 ok at t = 1.5707963267948966
     """
-    check_options(system, gradient, gradient_memory, project, assemble, save, max_steps)
+    check_options(system, gradient, gradient_memory, stabilization, assemble, save, max_steps)
     check_change_points(change_points)
     check_method(method, rtol, atol, dt)
     check_estimate(estimate_error, method)
@@ -228,7 +234,7 @@ def simulate(
     check_params(system, params, q0, inputs)
     check_placement("simulate", (q0, v0, u0, ts, params, inputs))
     asked = formulation
-    formulation = check_formulation(system, formulation, project, params, q0.dtype)
+    formulation = check_formulation(system, formulation, stabilization, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":
         must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
         raise invalid("atol", must, was, "Or pass formulation='multipliers'.")
@@ -239,9 +245,9 @@ def simulate(
         jumps = Jumps(system, params, q0, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     stepper = choose(method, dt is None, rtol, atol)
-    if isinstance(stepper[0], AbstractPartitioned) and isinstance(project, Baumgarte):
+    if isinstance(stepper[0], AbstractPartitioned) and isinstance(stabilization, Baumgarte):
         must = f"be left out for {type(stepper[0]).__name__}, whose steps hold the constraints"
-        raise invalid("project", must, f"it was {project!r}")
+        raise invalid("stabilization", must, f"it was {stabilization!r}")
     if gradient_memory is not None and remembers(stepper[0]):
         must = (
             f"be left out for {type(stepper[0]).__name__}, which keeps every step for derivatives"
@@ -251,7 +257,7 @@ def simulate(
         )
     size = 2 * system.size
     if gradient_memory is not None and "work" in save:
-        size += len(system.power_terms(params, q0.dtype).names)
+        size += len(system._power_terms(params, q0.dtype).names)
     stepper_traced, stepper_static = eqx.partition(stepper, _params.is_array)
     plan = ProgramKey(
         system=system,
@@ -263,10 +269,10 @@ def simulate(
         save=tuple(save),
         sample=_params.sample(params_traced),
         formulation=formulation,
-        stabilization=project if isinstance(project, Baumgarte) else _PROJECTION[project],
+        stabilization=stabilization,
         assemble=assemble,
-        regular=system.mass_regular(params, ts[0], q0, v0),
-        apart=not assemble and system.contacts_apart(params, ts[0], q0, v0, inputs),
+        regular=mass_definite(system, params, ts[0], q0, v0),
+        apart=not assemble and contact_rows_independent(system, params, ts[0], q0, v0, inputs),
         keep=choose_gradient(
             gradient,
             gradient_memory,
@@ -284,7 +290,7 @@ def simulate(
     _xla.warn_if_late()
     warn_of_changes(system, inputs)
     motion = timed(_simulate, system, plan, values)
-    either = asked == "auto" and system.in_u is None
+    either = asked == "auto" and system._in_u is None
     if either:
         plan, motion = _past_singular(plan, values, motion)
     if method == "auto" and dt is None and _ran_out(motion) and is_stiff(motion):
@@ -305,7 +311,7 @@ def simulate(
         beside = _simulate(*_with_method(room, values, better, *steps, fixed=dt is not None))
         motion = with_error(motion, beside, 1.0 if better is method else LEFT)
     if throw and concrete(motion.raw_status):
-        _raise_unless_ok(motion)
+        motion.check()
     return motion
 
 
@@ -395,8 +401,8 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         stats={
             "accepted": outcome.accepted,
             "rejected": outcome.attempted - outcome.accepted,
-            "gradient": outcome.gradient,
         },
+        gradient_mode=outcome.gradient,
         saved=saved,
         _params_traced=values.params,
         _inputs_traced=values.inputs,
@@ -406,7 +412,7 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         _method=jnp.asarray(list(METHODS).index(name) if known else -1, jnp.int32),
         _solver="" if known else name,
         _ending=ending,
-        _kinematic=dynamics.quasi is not None or plan.system.in_u is not None or values.v0 is None,
+        _kinematic=dynamics.quasi is not None or plan.system._in_u is not None or values.v0 is None,
         _implicit=stepper.implicit,
         _solve=simulate,
         stabilization=dynamics.stabilization if dynamics.rows.size else None,
@@ -414,12 +420,3 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         tolerances=None if stepper.controller is None else (values.rtol, values.atol),
         dt_max=values.longest,
     )
-
-
-def _raise_unless_ok(motion: Solution) -> None:
-    status = motion.raw_status
-    if np.ndim(status) == 0 and int(status) != int(Status.ok):
-        motion = stop_gradient(
-            motion
-        )  # under grad its numbers are traced, and have values all the same
-        raise SimulationError(f"Simulation ended with status {motion.message()}", motion)

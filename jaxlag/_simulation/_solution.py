@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import invalid
+from jaxlag._core._arrays import concrete, stop_gradient
+from jaxlag._core._errors import SimulationError, invalid, unsupported
 from jaxlag._core._status import CONCERNS_ROW, Status
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
@@ -40,8 +40,9 @@ class Solution(AbstractSolution):
         v: velocities (s, n), m/s or rad/s.
         last_time: last time reached, s.
         last_state: (q, v) there, each (n,).
-        stats: counts of "accepted" and "rejected" steps; "gradient", a `GradientMode`: how reverse
-            derivatives of this motion go through the steps.
+        stats: counts of "accepted" and "rejected" steps.
+        gradient_mode: a `GradientMode`: how reverse derivatives of this motion go through the
+            steps.
         saved: quantities named in `save=`, by name.
         formulation: "quasi" where the state was (q, u), else how accelerations were found.
         stabilization: "projection", a `Baumgarte`, or None: what kept states on the constraints
@@ -60,6 +61,7 @@ class Solution(AbstractSolution):
     last_time: Float[Array, "*batch"]
     last_state: tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]
     stats: dict[str, Int[Array, "*batch"]]
+    gradient_mode: Int[Array, "*batch"]
     saved: dict[str, Any]
     _params_traced: Any
     _inputs_traced: Any
@@ -124,7 +126,7 @@ class Solution(AbstractSolution):
         if self._solver:
             return self._solver
         if not concrete(self._method):
-            raise invalid("method", "be asked for outside jit and vmap", "the motion is traced")
+            raise unsupported("`method` inside jit or vmap", "the motion has no values there")
         return list(METHODS)[int(np.ravel(self._method)[0])]
 
     @property
@@ -208,14 +210,19 @@ class Solution(AbstractSolution):
         return self._quantity("Q")
 
     @property
-    def lam(self) -> dict[str, Float[Array, "..."]]:
+    def multipliers(self) -> dict[str, Float[Array, "..."]]:
         """Multipliers by the name of the row, each (s,) or (s, its shape).
 
         See `System.multipliers` for sign, unit and what holds where rows depend on one another.
         """
-        found = self._quantity("lam")
+        found = self._quantity("multipliers")
         names = [name for c in self.system.constraints for name in c.all_names]
         return {name: found[name] for name in names}
+
+    @property
+    def lam(self) -> dict[str, Float[Array, "..."]]:
+        """Short for `multipliers`."""
+        return self.multipliers
 
     @property
     def constraint_force(self) -> Float[Array, "*batch s n"]:
@@ -237,13 +244,29 @@ class Solution(AbstractSolution):
             ValueError: it was not asked for with `simulate(..., save=("work",))`.
         """
         if "work" not in self.saved:
-            raise invalid(
-                "work",
-                "be asked for when simulating",
-                f"save was {tuple(self.saved)!r}",
-                'Write simulate(..., save=("work",)): work is integrated along with the motion.',
+            raise unsupported(
+                f"`work` of a motion with save={tuple(self.saved)!r}",
+                "it is integrated along with the motion",
+                'Write simulate(..., save=("work",)).',
             )
         return in_order(self.saved["work"], self.system.forces, self.system.constraints)
+
+    def check(self) -> "Solution":
+        """The motion itself, where it is ok; raises where it, or one of a batch, is not.
+
+        Under `jit` and `vmap` nothing can be raised: there it does nothing, states not reached are
+        NaN, and `ok` says so.
+
+        Raises:
+            SimulationError: a status other than ok, of a motion with concrete values; its `motion`
+                attribute holds the part that was reached.
+        """
+        if concrete(self.raw_status) and np.any(np.asarray(self.raw_status) != int(Status.ok)):
+            # Under grad the numbers are traced, and have values all the same.
+            motion = stop_gradient(self)
+            ended = "Simulation" if self.ts.ndim == 1 else "Simulations"
+            raise SimulationError(f"{ended} ended with status {motion.message()}", motion)
+        return self
 
     def message(self) -> str:
         """How a motion ended, in words, with the coordinate and the likely remedy.
@@ -266,7 +289,7 @@ class Solution(AbstractSolution):
             else:
                 more = f" {self._fallen(index)}"
         if status in CONCERNS_ROW:
-            rows = self.system.rows(self._given, self.q.dtype)
+            rows = self.system._rows(self._given, self.q.dtype)
             labels = rows.labels
             if status is Status.contradictory_rows:
                 more = rows.contradiction(self.system.size)

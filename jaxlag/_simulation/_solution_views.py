@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import unsupported
 from jaxlag._core._status import Status
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
@@ -77,8 +77,8 @@ def as_dataset(motion: AbstractSolution) -> Any:
     try:
         import xarray
     except ImportError as error:
-        raise invalid(
-            "to_xarray()", "find xarray", "it is not installed", 'pip install "jaxlag[xarray]"'
+        raise unsupported(
+            "`to_xarray`", "xarray is not installed", 'pip install "jaxlag[xarray]"'
         ) from error
     batch = motion.ts.ndim - 1
     axes = ("motion",) if batch == 1 else tuple(f"motion_{i}" for i in range(batch))
@@ -101,8 +101,8 @@ def plotted(motion: AbstractSolution) -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise invalid(
-            "plot()", "find matplotlib", "it is not installed", 'pip install "jaxlag[plot]"'
+        raise unsupported(
+            "`plot`", "matplotlib is not installed", 'pip install "jaxlag[plot]"'
         ) from error
     every = list(np.ndindex(motion.ts.shape[:-1]))
     count = len(every)

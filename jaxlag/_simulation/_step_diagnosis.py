@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxlag._core._arrays import concrete, stop_gradient
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import unsupported
 from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
@@ -119,9 +119,15 @@ def explain(motion: AbstractSolution) -> str:
         ValueError: a batch of motions, or a traced one.
     """
     if motion.ts.ndim != 1:
-        raise invalid("explain", "be asked of a single motion", f"batch {motion.ts.shape[:-1]}")
+        raise unsupported(
+            "`explain` of a batch",
+            f"its shape is {motion.ts.shape[:-1]}",
+            "Take one of them, as batch[3].",
+        )
     if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
-        raise invalid("explain", "be asked outside jit and vmap", "the motion is traced")
+        raise unsupported(
+            "`explain` inside jit or vmap", "it looks at numbers, and the motion is traced"
+        )
     accepted, rejected = _counts(motion)
     how = "fixed steps"
     if motion.tolerances is not None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arrays import concrete, number, real, stop_gradient
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import AssemblyError, invalid
+from jaxlag._core._errors import AssemblyError, invalid, unsupported
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import independent_rows, row_sizes, without_rounding
 from jaxlag._linalg._kkt import augmented, solve_kkt
@@ -65,8 +65,8 @@ class Assembly(eqx.Module):
     def dependent(self) -> tuple[str, ...]:
         """Names of the rows that follow from the others, of a single assembly."""
         if self.independent.ndim != 1:
-            raise invalid(
-                "dependent", "be asked of a single assembly", f"batch {self.q.shape[:-1]}"
+            raise unsupported(
+                "`dependent` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
             )
         return tuple(
             name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
@@ -75,7 +75,9 @@ class Assembly(eqx.Module):
     def message(self) -> str:
         """How a single assembly ended, in words."""
         if self.q.ndim != 1:
-            raise invalid("message", "be asked of a single assembly", f"batch {self.q.shape[:-1]}")
+            raise unsupported(
+                "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
+            )
         status = Status(int(self.status))
         if status is Status.ok:
             more = f"; dependent rows: {', '.join(self.dependent)}" if self.dependent else ""
@@ -209,7 +211,7 @@ def _assembled(
     rates_held: tuple[bool, ...],
     diagonal: Array | None,
 ) -> Assembly:
-    rows = system.rows(params, q.dtype)
+    rows = system._rows(params, q.dtype)
     terms = ArrayTerms(system.lagrangian, (), system.constraints)
     fixed, rates_fixed = np.array(held), np.array(rates_held)
 

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlag._core._arguments import renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import EquilibriumError, invalid
+from jaxlag._core._errors import EquilibriumError, invalid, unsupported
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm, row_sizes, without_rounding
 from jaxlag._model._constraints import ConstraintRows
@@ -23,8 +24,9 @@ from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._statics._rest_search import Rest, find_rest
 from jaxlag._statics._root_search import differentiable_if, solve_tangent
 from jaxlag._system._closure import lift_closure_tracers
+from jaxlag._system._inspection import check_declaration
 from jaxlag._system._row_advice import advice_on_rows
-from jaxlag._system._system import System, check_declaration
+from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
 
@@ -48,8 +50,6 @@ class Equilibrium(eqx.Module):
             direction, eps^0.4 of what q and the distance searched are, or what is left
             open in q.
         rows: A of the constraints, (m, n).
-        multipliers: lam, (m,), with Q - h + A^T lam = 0; see `lam` for parts by name. Where rows
-            depend on one another those of least norm sum_k (|A_k| lam_k)^2.
         status: int32, see `Status`: ok, implicit_solve_failed or nonfinite.
         iterations: int32, steps of the search that led to q, with those of its relaxation.
     """
@@ -62,15 +62,23 @@ class Equilibrium(eqx.Module):
     damping: Float[Array, "*batch n n"]
     variation: Float[Array, "*batch n n"]
     rows: Float[Array, "*batch m n"]
-    multipliers: Float[Array, "*batch m"]
+    _lam: Float[Array, "*batch m"]
     status: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     _layout: ConstraintRows = eqx.field(static=True)
 
     @property
-    def lam(self) -> dict[str, Float[Array, "..."]]:
-        """Multipliers by the name of the row; A^T lam is what the constraints exert."""
-        return self._layout.unflatten(self.multipliers)
+    def multipliers(self) -> dict[str, Float[Array, "..."]]:
+        """Multipliers lam by the name of the row, with Q - h + A^T lam = 0.
+
+        Where rows depend on one another those of least norm sum_k (|A_k| lam_k)^2.
+        """
+        return self._layout.unflatten(self._lam)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "lam":
+            raise AttributeError("Equilibrium.lam is Equilibrium.multipliers now")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __getitem__(self, name: str) -> Array:
         """A coordinate by its name, in its declared shape."""
@@ -134,8 +142,8 @@ class Equilibrium(eqx.Module):
     def message(self) -> str:
         """How a single search ended, in words."""
         if self.q.ndim != 1:
-            raise invalid(
-                "message", "be asked of a single equilibrium", f"batch {self.q.shape[:-1]}"
+            raise unsupported(
+                "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
             )
         labels = self.system.coordinates.labels
         status = Status(int(self.status))
@@ -155,6 +163,7 @@ class Equilibrium(eqx.Module):
         )
 
 
+@renamed(tol="rtol=")
 def equilibrium(
     system: System,
     q0: Any,
@@ -162,7 +171,7 @@ def equilibrium(
     *,
     t: Any = 0.0,
     inputs: Mapping[str, Any] | None = None,
-    tol: Any = None,
+    rtol: Any = None,
     max_steps: int = 256,
     throw: bool = True,
 ) -> Equilibrium:
@@ -193,7 +202,7 @@ def equilibrium(
         params: as the Lagrangian takes them.
         t: instant, s.
         inputs: dict from names to input objects or arrays, as in `simulate`.
-        tol: Newton steps must be below tol (|q_j| + |q_j - q0_j|), or below tol times the
+        rtol: Newton steps must be below rtol (|q_j| + |q_j - q0_j|), or below rtol times the
             length over which K changes; less than 1, by default 1e-10 in float64, 1e-4 in
             float32.
         max_steps: bound on the steps of the first search. What follows it is begun only while it
@@ -201,7 +210,7 @@ def equilibrium(
         throw: raise where a concrete result has a status other than ok.
 
     Raises:
-        ValueError: q0 of wrong length or not finite; t not a finite number; tol not a number
+        ValueError: q0 of wrong length or not finite; t not a finite number; rtol not a number
             between 0 and 1; max_steps not positive; constraints that are not holonomic, or forces
             that depend on multipliers.
         EquilibriumError: none was found; says how near, and what force is left. With
@@ -239,13 +248,13 @@ def equilibrium(
         raise invalid("q0", "be finite", f"it was {q0}")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
         raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
-    if tol is None:
-        tol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
-    tol = number("tol", "be a positive number", tol, q0.dtype)
-    if concrete(tol) and not tol > 0:
-        raise invalid("tol", "be a positive number", f"it was {tol}")
-    if concrete(tol) and not tol < 1:
-        raise invalid("tol", "be less than 1", f"it was {tol}")
+    if rtol is None:
+        rtol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
+    rtol = number("rtol", "be a positive number", rtol, q0.dtype)
+    if concrete(rtol) and not rtol > 0:
+        raise invalid("rtol", "be a positive number", f"it was {rtol}")
+    if concrete(rtol) and not rtol < 1:
+        raise invalid("rtol", "be less than 1", f"it was {rtol}")
     t = number("t", "be a number", t, jnp.result_type(float))
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
@@ -253,7 +262,7 @@ def equilibrium(
     traced, static = _params.split(lift_closure_tracers(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
-    found = _search(key, (q0, t, tol, traced, inputs_traced))
+    found = _search(key, (q0, t, rtol, traced, inputs_traced))
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
         found = stop_gradient(
             found
@@ -268,11 +277,11 @@ def equilibrium(
 @partial(jax.jit, static_argnums=0)
 def _search(key: Any, values: Any) -> Equilibrium:
     system, params_static, inputs_static, max_steps = key
-    q0, t, tol, *given = values
+    q0, t, rtol, *given = values
     n, rest = q0.shape[0], jnp.zeros_like(q0)
     params = _params.join(given[0], params_static.tree)
     check_declaration(system, params, eqx.combine(given[1], inputs_static.tree), t, q0, rest)
-    rows = system.rows(params, q0.dtype)
+    rows = system._rows(params, q0.dtype)
     nothing = jnp.zeros((0,), q0.dtype)
 
     def idle_rows(t: Array, params: Any) -> Array:
@@ -280,10 +289,10 @@ def _search(key: Any, values: Any) -> Equilibrium:
         params = _params.join(params, params_static.tree)
 
         def of(q: Array) -> Array:
-            return system.terms.rows(t, q, rest, params)[0]
+            return system._terms.rows(t, q, rest, params)[0]
 
         def phi(q: Array) -> tuple[Array]:
-            return (system.terms.position(t, q, params),)
+            return (system._terms.position(t, q, params),)
 
         _, void, size = row_sizes(of, *jax.lax.stop_gradient((q0, of(q0))))
         (here,) = without_rounding(phi, void, size, q0)
@@ -298,8 +307,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
         def parts(q: Array, v: Array) -> tuple[Array, Array, Array]:
             given = evaluate(inputs, t, q, v, params)
-            Q, h = system.terms.force(t, q, v, params, given), system.terms.bias(t, q, v, params)
-            A = system.terms.rows(t, q, jnp.zeros_like(q), params)[0]
+            Q, h = system._terms.force(t, q, v, params, given), system._terms.bias(t, q, v, params)
+            A = system._terms.rows(t, q, jnp.zeros_like(q), params)[0]
             return Q, h, jnp.where(idle[:, None], 0.0, A)
 
         def unbalanced(q: Array, v: Array, lam: Array) -> Array:
@@ -307,7 +316,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
             return Q - h + lam @ A if rows.size else Q - h
 
         def phi(q: Array) -> Array:
-            return jnp.where(idle, 0.0, system.terms.position(t, q, params))
+            return jnp.where(idle, 0.0, system._terms.position(t, q, params))
 
         def whole(z: Array) -> Array:
             q, lam = z[:n], z[n:]
@@ -318,16 +327,16 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
         return parts, unbalanced, phi if rows.size else lambda _: jnp.zeros((0,), q0.dtype), whole
 
-    def searched(q0: Array, tol: Array, *given: Any) -> Rest:
+    def searched(q0: Array, rtol: Array, *given: Any) -> Rest:
         parts, _, phi, whole = forces(*given)
 
         def at_rest(q: Array) -> tuple[tuple[Array, Array], Array]:
             Q, h, A = parts(q, jnp.zeros_like(q))
             return (Q, h), A
 
-        return find_rest(at_rest, phi, whole, q0, tol, max_steps)
+        return find_rest(at_rest, phi, whole, q0, rtol, max_steps)
 
-    constant = jax.lax.stop_gradient((q0, tol, idle, t, *given))
+    constant = jax.lax.stop_gradient((q0, rtol, idle, t, *given))
     if jax.default_backend() == "cpu":
         found = in_lanes(searched, searched, *constant, at_once=at_once_implicit(n + rows.size))
     else:
@@ -362,7 +371,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
         damping=-slopes[:, n:],
         variation=balance.variation[:n, :n],
         rows=parts(q, rest)[2],
-        multipliers=lam,
+        _lam=lam,
         status=jnp.where(balance.found, int(Status.ok), failure).astype(jnp.int32),
         iterations=steps,
         _layout=rows,

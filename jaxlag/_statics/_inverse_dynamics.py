@@ -14,7 +14,8 @@ from jaxlag._core._arrays import concrete, of_state, real
 from jaxlag._core._errors import invalid
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
-from jaxlag._system._system import System, check_declaration
+from jaxlag._system._inspection import check_declaration
+from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._signature import require_arity
 from jaxlag._tracing._traced_function import warn_of_changes
@@ -182,10 +183,10 @@ def _needed(key: Any, values: Any) -> Array:
     check_declaration(system, params, inputs, *first)
 
     def at(t: Array, q: Array, v: Array, a: Array) -> Array:
-        needed = system.terms.euler_lagrange(t, q, v, a, params)
+        needed = system._terms.euler_lagrange(t, q, v, a, params)
         if not system.forces:
             return needed
         given = evaluate(inputs, t, q, v, params)
-        return needed - system.terms.force(t, q, v, params, given)
+        return needed - system._terms.force(t, q, v, params, given)
 
     return at(t, q, v, a) if q.ndim == 1 else jax.vmap(at)(t, q, v, a)

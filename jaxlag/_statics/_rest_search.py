@@ -34,7 +34,7 @@ def find_rest(
     phi: Callable,
     whole: Callable,
     q0: Float[Array, " n"],
-    tol: Float[Array, ""],
+    rtol: Float[Array, ""],
     max_steps: int,
 ) -> Rest:
     """The root of all equations near q0, else one at the end of a relaxation.
@@ -48,7 +48,7 @@ def find_rest(
         phi: q -> residuals of the constraints.
         whole: z -> all equations at z = (q, lam).
         q0: start.
-        tol: see `equilibrium`.
+        rtol: see `equilibrium`.
         max_steps: bound on the steps of the first search, and of all that is made after it.
     """
     n, m = q0.shape[0], phi(q0).shape[0]
@@ -64,7 +64,7 @@ def find_rest(
         (Q, h), A = forces(z[:n])
         present = jnp.abs(Q) + jnp.abs(h) + jnp.abs(z[n:]) @ jnp.abs(A)
         present = jnp.concatenate([present, jnp.zeros_like(z[n:])])
-        balance = judge(whole, present, z, jnp.concatenate([q0, lam]), tol)
+        balance = judge(whole, present, z, jnp.concatenate([q0, lam]), rtol)
         return Rest(z, balance, steps.astype(jnp.int32))
 
     def body(s: _State) -> _State:

@@ -219,14 +219,14 @@ def judge(
     present: Float[Array, " n"],
     q: Float[Array, " n"],
     q0: Float[Array, " n"],
-    tol: Float[Array, ""],
+    rtol: Float[Array, ""],
 ) -> Balance:
     """Whether q is a root of F, judged at q alone: forces at the start have no say.
 
     A root is where every component of the Newton step s is small against the coordinate or the
-    distance searched, or so small that F is linear over it up to `tol`: at a place where F only
+    distance searched, or so small that F is linear over it up to `rtol`: at a place where F only
     dies away, s is as long as F takes to change. Where only rounding is left of F, as it is
-    around a root of higher order, tol^0.4 will do. Besides, nothing but rounding may be left
+    around a root of higher order, rtol^0.4 will do. Besides, nothing but rounding may be left
     in directions in which J is singular, and the search must not have come along these, as it
     does towards forces that vanish at infinity. J is singular where it is so up to what moving q
     by its rounding changes.
@@ -236,7 +236,7 @@ def judge(
         present: |Q| + |h| at q, the forces that balance.
         q: the point.
         q0: start of the search.
-        tol: see `equilibrium`.
+        rtol: see `equilibrium`.
     """
     n, eps = q.shape[0], float(jnp.finfo(q.dtype).eps)
     nudged = q * jnp.asarray(1 + 4 * eps * (-1.0) ** np.arange(n), q.dtype)
@@ -252,8 +252,8 @@ def judge(
     beside = jax.lax.map(forces, jnp.stack([q + slack, q - slack]))
     rounding = 8 * n * eps * scale + 4 * jnp.max(jnp.abs(beside - F[None]), axis=0)
     balanced = jnp.all(jnp.abs(F) <= rounding)
-    near = jnp.where(balanced, tol**0.4, tol) * reach
-    settled = (jnp.abs(s) <= near) | (bend <= tol * jnp.abs(s))
+    near = jnp.where(balanced, rtol**0.4, rtol) * reach
+    settled = (jnp.abs(s) <= near) | (bend <= rtol * jnp.abs(s))
     across = jnp.where(here.regular, 0, here.left.T @ (here.c * here.F))
     moved = (q - q0) / here.c
     adrift = jnp.linalg.norm(jnp.where(here.regular, 0, here.right.T @ moved))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import state_first
 from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, QuasiState
 from jaxlag._model._forces import reads_lam
@@ -19,11 +20,13 @@ from jaxlag._tracing._input_values import InputValues
 class AbstractReactions(AbstractQuantities):
     """What M a + h = Q + A^T lam, A a + gamma = 0 gives at one state, besides its terms."""
 
+    @state_first
     def generalized_force(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
         names: Sequence[str] | None = None,
@@ -31,9 +34,9 @@ class AbstractReactions(AbstractQuantities):
         """Q(t, q, v, inputs, lam), shape (n,), N or N m: the sum of the applied forces.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,).
             v: shape (n,).
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
             names: only these forces; by default all, dissipation included.
@@ -43,7 +46,7 @@ class AbstractReactions(AbstractQuantities):
         Raises:
             ValueError: wrong lengths, unknown force names, missing inputs.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         known = [force.name for force in self.forces]
         for name in known if names is None else names:
             if name not in known:
@@ -56,11 +59,13 @@ class AbstractReactions(AbstractQuantities):
         terms = ArrayTerms(self.lagrangian, chosen, self.constraints)
         return terms.force(t, q, v, params, values, lam)
 
+    @state_first
     def acceleration(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
@@ -70,25 +75,27 @@ class AbstractReactions(AbstractQuantities):
         no acceleration satisfies all rows, as in turning through a dead point.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,).
             v: shape (n,).
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
 
         Source: Pila, eq. 3.118.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         if self.constraints:
             return self._reactions(t, q, v, params, values)[0]
-        return self.terms.acceleration(t, q, v, params, values)
+        return self._terms.acceleration(t, q, v, params, values)
 
+    @state_first
     def multipliers(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
@@ -103,23 +110,25 @@ class AbstractReactions(AbstractQuantities):
         over that of the row's residual, for a `Pfaffian` W over it: N for a length or a velocity.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,), consistent with the constraints.
             v: shape (n,), likewise.
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
 
         Source: Pila, eq. 3.118.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
-        return self.rows(params, q.dtype).unflatten(self._reactions(t, q, v, params, values)[1])
+        return self._rows(params, q.dtype).unflatten(self._reactions(t, q, v, params, values)[1])
 
+    @state_first
     def constraint_force(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
@@ -128,40 +137,41 @@ class AbstractReactions(AbstractQuantities):
         Unique even where rows depend on one another.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,), consistent with the constraints.
             v: shape (n,), likewise.
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
 
         Source: Pila, eq. 3.118.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         if not self.constraints:
             return jnp.zeros_like(q)
         _, lam, A = self._reactions(t, q, v, params, values)
         return lam @ A
 
-    def quasi_reactions(
+    def _quasi_reactions(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
         """Accelerations and reactions from the equations in quasi-velocities, by name.
 
-        "a", shape (n,), from u' and v = B u + c; "lam", by the name of the row, from
+        "a", shape (n,), from u' and v = B u + c; "multipliers", by the name of the row, from
         A^T lam = M a + h - Q, of least norm as in `multipliers`; "constraint_force", A^T lam. To
         rounding these are `acceleration`, `multipliers` and `constraint_force`, which solve for
         the multipliers.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,), consistent with the constraints.
             v: shape (n,), likewise.
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
 
@@ -171,31 +181,32 @@ class AbstractReactions(AbstractQuantities):
             ValueError: the system has no quasi-velocities.
         """
         self._with_quasi("quasi_reactions")
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
-        rows = self.rows(params, q.dtype)
+        rows = self._rows(params, q.dtype)
         traced, static = _params.split(params)
         found = _quasi_reactions(self, _params.Static(static), t, q, v, traced, dict(values))
         a, lam, force = found
-        return {"a": a, "lam": rows.unflatten(lam), "constraint_force": force}
+        return {"a": a, "multipliers": rows.unflatten(lam), "constraint_force": force}
 
+    @state_first
     def residuals(
-        self, params: Any, q: Any, v: Any, t: Any = 0.0
+        self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0
     ) -> tuple[dict[str, Float[Array, "..."]], dict[str, Float[Array, "..."]]]:
         """(phi(t, q) of the holonomic rows, A v + b of all rows), each by name.
 
         Source: Pila, eqs. 3.10, 3.14.
         """
-        t, q, v, params = self._state(params, q, v, t)
-        rows = self.rows(params, q.dtype)
-        rates = rows.unflatten(self.terms.velocity(t, q, v, params))
-        return rows.holonomic_only(self.terms.position(t, q, params)), rates
+        t, q, v, params = self._state(q, v, params, t)
+        rows = self._rows(params, q.dtype)
+        rates = rows.unflatten(self._terms.velocity(t, q, v, params))
+        return rows.holonomic_only(self._terms.position(t, q, params)), rates
 
     def _reactions(
         self, t: Array, q: Array, v: Array, params: Any, values: Mapping[str, Any]
     ) -> tuple[Array, Array, Array]:
         """(a, lam, A), compiled as one: there are many small operations."""
-        self.rows(params, q.dtype)
+        self._rows(params, q.dtype)
         traced, static = _params.split(params)
         return _reactions(self, _params.Static(static), t, q, v, traced, dict(values))
 
@@ -210,7 +221,7 @@ def _reactions(
     traced: Any,
     values: dict[str, Any],
 ) -> tuple[Array, Array, Array]:
-    params, terms = _params.join(traced, static.tree), system.terms
+    params, terms = _params.join(traced, static.tree), system._terms
     a, lam = terms.reactions(t, q, v, params, InputValues(values))
     return a, lam, terms.rows(t, q, v, params)[0]
 
@@ -229,7 +240,7 @@ def _quasi_reactions(
     params, quasi = _params.join(traced, static.tree), system.quasi
     assert quasi is not None
     terms = ArrayTerms(
-        system.lagrangian, system.forces, system.constraints, quasi=quasi, in_u=system.in_u
+        system.lagrangian, system.forces, system.constraints, quasi=quasi, in_u=system._in_u
     )
     w = quasi.of(t, q, v, params)[quasi.free]
     moving = QuasiState(terms, t, q, w, params, InputValues(values))

@@ -48,11 +48,11 @@ def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
     if not system.constraints:
         return []
     t, q = jnp.asarray(t, float), jnp.asarray(q)
-    rows = system.rows(params, q.dtype)
+    rows = system._rows(params, q.dtype)
     here = np.flatnonzero(rows.holonomic)
     if not len(here) or not np.all(np.isfinite(q)):
         return []
-    residuals = jax.jit(jax.vmap(lambda q: system.terms.position(t, q, params)))
+    residuals = jax.jit(jax.vmap(lambda q: system._terms.position(t, q, params)))
     ways = _ways(q)
     vanish = np.zeros(len(here), bool)
     for power in (0.0625, 0.125, 0.25):
@@ -75,8 +75,8 @@ def is_singular(system: Any, params: Any, t: Any, q: Any) -> bool:
 
     def sizes(q: Array) -> Array:
         v = jnp.zeros_like(q)
-        A = system.terms.rows(t, q, v, params)[0]
-        A = A * units_of(system.terms.mass(t, q, v, params), A)[None]
+        A = system._terms.rows(t, q, v, params)[0]
+        A = A * units_of(system._terms.mass(t, q, v, params), A)[None]
         norms = jnp.linalg.norm(A, axis=1, keepdims=True)
         return jnp.linalg.svd(A / jnp.where(norms > 0, norms, 1.0), compute_uv=False)
 

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import state_first
 from jaxlag._core._arrays import common
-from jaxlag._core._errors import invalid
+from jaxlag._core._errors import invalid, unsupported
 from jaxlag._lowering import ArrayTerms, Structure
 from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
@@ -26,7 +27,7 @@ from jaxlag._tracing._traced_function import warn_of_changes
 
 
 class AbstractQuantities(eqx.Module):
-    """Quantities of a declared system as functions of (params, q, v, t).
+    """Quantities of a declared system as functions of (q, v, params, t).
 
     `params` is any pytree, q and v have shape (n,), in SI units (m or rad, and per s), t is in s.
 
@@ -36,7 +37,6 @@ class AbstractQuantities(eqx.Module):
         forces: applied forces.
         constraints: constraints, those of quasi-velocities first.
         quasi: quasi-velocities, if any.
-        in_u: L(t, q, u, params), where it was written so.
     """
 
     lagrangian: eqx.AbstractVar[Callable]
@@ -44,7 +44,7 @@ class AbstractQuantities(eqx.Module):
     forces: eqx.AbstractVar[tuple[AbstractForce, ...]]
     constraints: eqx.AbstractVar[tuple[AbstractConstraint, ...]]
     quasi: eqx.AbstractVar[QuasiVelocities | None]
-    in_u: eqx.AbstractVar[Callable | None]
+    _in_u: eqx.AbstractVar[Callable | None]
     _kinetic: eqx.AbstractVar[Callable | None]
     _potential: eqx.AbstractVar[Callable | None]
 
@@ -55,18 +55,21 @@ class AbstractQuantities(eqx.Module):
 
     @property
     @abstractmethod
-    def terms(self) -> Terms:
+    def _terms(self) -> Terms:
         """The lowered terms of the equations of motion."""
 
     @abstractmethod
-    def rows(self, params: Any, dtype: Any) -> ConstraintRows:
+    def _rows(self, params: Any, dtype: Any) -> ConstraintRows:
         """Names and shapes of the constraint rows, for params like these."""
 
     @abstractmethod
-    def structure(self, params: Any, dtype: Any) -> Structure:
+    def _structure(self, params: Any, dtype: Any) -> Structure:
         """Dependencies of M, h and L."""
 
-    def mass_matrix(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, "n n"]:
+    @state_first
+    def mass_matrix(
+        self, q: Any, v: Any = None, params: Any = None, *, t: Any = 0.0
+    ) -> Float[Array, "n n"]:
         """M(t, q, v) = d2L/dv2, shape (n, n), kg, kg m or kg m^2 by the pair of coordinates.
 
         Symmetric; `v` may be left out where M does not depend on it.
@@ -76,19 +79,20 @@ class AbstractQuantities(eqx.Module):
         Raises:
             ValueError: q or v of wrong length; v left out although M depends on it.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         if v is None:
-            if not self.structure(params, q.dtype).quadratic:
+            if not self._structure(params, q.dtype).quadratic:
                 raise invalid(
                     "mass_matrix: v",
                     "be given, since M depends on the velocities",
                     "it was left out",
-                    "Call mass_matrix(params, q, v).",
+                    "Call mass_matrix(q, v, params).",
                 )
             v = jnp.zeros_like(q)
-        return self.terms.mass(t, q, v, params)
+        return self._terms.mass(t, q, v, params)
 
-    def bias(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
+    @state_first
+    def bias(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, " n"]:
         """h(t, q, v) = (dp/dq) v + dp/dt - dL/dq, shape (n,), N or N m.
 
         The generalized force needed to hold a = 0; gravity and explicit time included, applied
@@ -96,10 +100,13 @@ class AbstractQuantities(eqx.Module):
 
         Source: d/dt(dL/dv) - dL/dq (Pila, eq. 3.53) less M a.
         """
-        t, q, v, params = self._state(params, q, v, t)
-        return self.terms.bias(t, q, v, params)
+        t, q, v, params = self._state(q, v, params, t)
+        return self._terms.bias(t, q, v, params)
 
-    def coriolis_matrix(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, "n n"]:
+    @state_first
+    def coriolis_matrix(
+        self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0
+    ) -> Float[Array, "n n"]:
         """C(t, q, v) from the Christoffel symbols of M, shape (n, n).
 
         C_ij = sum_k 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k, so that
@@ -112,17 +119,16 @@ class AbstractQuantities(eqx.Module):
             ValueError: M depends on the velocities (L is not quadratic in v), where Christoffel
                 symbols do not exist.
         """
-        t, q, v, params = self._state(params, q, v, t)
-        if not self.structure(params, q.dtype).quadratic:
-            raise invalid(
-                "coriolis_matrix",
-                "get a Lagrangian quadratic in the velocities",
+        t, q, v, params = self._state(q, v, params, t)
+        if not self._structure(params, q.dtype).quadratic:
+            raise unsupported(
+                "`coriolis_matrix` of a Lagrangian that is not quadratic in the velocities",
                 "its mass matrix d2L/dv2 depends on v",
-                "Use bias(params, q, v), which holds for every Lagrangian.",
+                "Use bias(q, v, params), which holds for every Lagrangian.",
             )
 
         def mass(q: Array) -> Array:
-            return self.terms.mass(t, q, v, params)
+            return self._terms.mass(t, q, v, params)
 
         def momentum_along_v(q: Array) -> Array:
             return mass(q) @ v
@@ -131,7 +137,10 @@ class AbstractQuantities(eqx.Module):
         gradient = jax.jacfwd(momentum_along_v)(q)  # d(M v)_i / dq_j at fixed v
         return 0.5 * (M_dot + gradient - gradient.T)
 
-    def quasi_velocities(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " k"]:
+    @state_first
+    def quasi_velocities(
+        self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0
+    ) -> Float[Array, " k"]:
         """u = U(t, q, v), shape (k,), m/s or rad/s, constrained ones included.
 
         Source: Pila, eq. 4.30.
@@ -139,10 +148,11 @@ class AbstractQuantities(eqx.Module):
         Raises:
             ValueError: the system has no quasi-velocities.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         return self._with_quasi("quasi_velocities").of(t, q, v, params)
 
-    def velocities(self, params: Any, q: Any, u: Any, t: Any = 0.0) -> Float[Array, " n"]:
+    @state_first
+    def velocities(self, q: Any, u: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, " n"]:
         """v = B u + c, shape (n,), m/s or rad/s, from all quasi-velocities u, shape (k,).
 
         NaN where dU/dv is singular. `u` may be a dict by name, constrained ones left out.
@@ -154,38 +164,44 @@ class AbstractQuantities(eqx.Module):
         """
         quasi = self._with_quasi("velocities")
         u = quasi.vector("u", u)
-        t, q, _, params = self._state(params, q, None, t)
+        t, q, _, params = self._state(q, None, params, t)
         q, u = common(q, u)
         v = quasi.velocities(t, q, u, params)
         return jnp.where(quasi.regular(t, q, params), v, jnp.nan)
 
     def _with_quasi(self, method: str) -> QuasiVelocities:
         if self.quasi is None:
-            must = "be called on a system with quasi-velocities"
-            raise invalid(f"System.{method}", must, "this one was declared without quasi=")
+            raise unsupported(
+                f"`System.{method}` without quasi-velocities",
+                "the system was declared without quasi=",
+            )
         return self.quasi
 
-    def momentum(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
+    @state_first
+    def momentum(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, " n"]:
         """Momentum p = dL/dv, shape (n,), kg m/s or kg m^2/s (Pila, sec. 3.13)."""
-        t, q, v, params = self._state(params, q, v, t)
-        return self.terms.momentum(t, q, v, params)
+        t, q, v, params = self._state(q, v, params, t)
+        return self._terms.momentum(t, q, v, params)
 
-    def energy(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
+    @state_first
+    def energy(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, ""]:
         """H = v . dL/dv - L, scalar, J.
 
         T + V where T is homogeneous quadratic in v (Pila, eq. 3.207); constant along a motion
         without applied forces if L does not contain t.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         lagrangian = real_scalar("lagrangian", self.lagrangian)
         L, p = jax.value_and_grad(lagrangian, argnums=2)(t, q, v, params)
         return p @ v - L
 
+    @state_first
     def power(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, ""]]:
@@ -197,26 +213,27 @@ class AbstractQuantities(eqx.Module):
         at fixed q.
 
         Args:
-            params: as the Lagrangian takes them.
             q: shape (n,).
             v: shape (n,).
+            params: as the Lagrangian takes them.
             t: s.
             inputs: dict from names to input objects or arrays.
 
         Source: Goldstein, Classical Mechanics, sec. 2.7, with applied forces.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
-        return self.power_terms(params, q.dtype)(t, q, v, params, values)
+        return self._power_terms(params, q.dtype)(t, q, v, params, values)
 
-    def power_terms(self, params: Any, dtype: Any) -> Power:
+    def _power_terms(self, params: Any, dtype: Any) -> Power:
         """The terms of dH/dt that this system has."""
-        explicit_time = self.structure(params, dtype).explicit_time
+        explicit_time = self._structure(params, dtype).explicit_time
         array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
-        rows = self.rows(params, dtype)
+        rows = self._rows(params, dtype)
         return Power(self.lagrangian, self.forces, explicit_time, array, rows)
 
-    def kinetic(self, params: Any, q: Any, v: Any, t: Any = 0.0) -> Float[Array, ""]:
+    @state_first
+    def kinetic(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, ""]:
         """T(t, q, v), scalar, J, as declared by `kinetic=`.
 
         Source: L = T - V (Pila, ch. 3).
@@ -224,10 +241,13 @@ class AbstractQuantities(eqx.Module):
         Raises:
             ValueError: the system was declared by its Lagrangian alone.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         return self._declared("kinetic", self._kinetic)(t, q, v, params)
 
-    def potential(self, params: Any, q: Any, v: Any = None, t: Any = 0.0) -> Float[Array, ""]:
+    @state_first
+    def potential(
+        self, q: Any, v: Any = None, params: Any = None, *, t: Any = 0.0
+    ) -> Float[Array, ""]:
         """V(t, q), scalar, J, as declared by `potential=`; `v` is accepted and not used.
 
         Source: L = T - V (Pila, ch. 3).
@@ -235,19 +255,18 @@ class AbstractQuantities(eqx.Module):
         Raises:
             ValueError: the system was declared by its Lagrangian alone.
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         return self._declared("potential", self._potential)(t, q, params)
 
     def _declared(self, name: str, function: Callable | None) -> Callable:
         if function is None:
-            raise invalid(
-                f"System.{name}",
-                "be called on a system declared by kinetic= and potential=",
-                "this one was declared by its Lagrangian alone",
+            raise unsupported(
+                f"`System.{name}` of a Lagrangian alone",
+                "only a system declared by kinetic= and potential= knows them apart",
             )
         return function
 
-    def _state(self, params: Any, q: Any, v: Any, t: Any) -> tuple[Array, Array, Any, Any]:
+    def _state(self, q: Any, v: Any, params: Any, t: Any) -> tuple[Array, Array, Any, Any]:
         warn_of_changes(self)
         traced, static = _params.halves(params)
         q, v = state_vectors(self.coordinates, q, v)

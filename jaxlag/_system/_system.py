@@ -1,16 +1,14 @@
 """System: the declaration of a mechanical system."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from jaxlag._core._arrays import concrete
+from jaxlag._core._arguments import state_first
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._kkt import augmented
 from jaxlag._linalg._mass_solve import first_unhealthy
@@ -31,13 +29,12 @@ from jaxlag._model._constraints import (
 )
 from jaxlag._model._coordinates import Coordinates
 from jaxlag._model._forces import AbstractForce, check_forces
-from jaxlag._model._inputs import evaluate
 from jaxlag._model._quasi_velocities import InQuasiVelocities, QuasiVelocities, check_quasi
 from jaxlag._system._explain import explain
+from jaxlag._system._inspection import check_traceable
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._system._row_advice import vanishing_rows
 from jaxlag._tracing import _params
-from jaxlag._tracing._index_check import check_indices
 from jaxlag._tracing._signature import require_arity
 from jaxlag._tracing._traced_function import as_written, traced_function
 
@@ -60,7 +57,7 @@ class System(AbstractReactions):
     quadratic in v; M must be positive definite where A v = 0, so that links without mass are
     possible. What needs no params is checked here, everything else at first use or by `check`.
 
-    Methods that take a state are called as (params, q, v, t): `params` any pytree, q and v of
+    Methods that take a state are called as (q, v, params, t=t): `params` any pytree, q and v of
     shape (n,) in SI units (m or rad, and per s), t in s. Of params arrays and floats are traced,
     with derivatives in the real ones; Python ints, truth values, text and functions are part of the
     program, which compiles anew for each of their values. They compose with jit, vmap and every
@@ -77,7 +74,7 @@ class System(AbstractReactions):
             and v flat, `unflatten` gives the parts.
         kinetic: scalar function `T(t, q, v, params)`, in J; then L = T - V.
         potential: scalar function `V(t, q, params)`, in J.
-        forces: applied forces, each with its own name: `PointForce`, `Couple`,
+        forces: applied forces, each with its own name: `PointForce`, `Torque`,
             `GeneralizedForce`, `Rayleigh`.
         constraints: `Holonomic` and `Pfaffian` constraints, each row with its own name.
         quasi: `QuasiVelocities` to move by in place of v; the constrained ones among them are
@@ -103,7 +100,7 @@ class System(AbstractReactions):
     quasi: QuasiVelocities | None
     written_in: str = eqx.field(static=True)
     lowering: str = eqx.field(static=True)
-    in_u: Callable | None = eqx.field(static=True)
+    _in_u: Callable | None = eqx.field(static=True)
     _kinetic: Callable | None = eqx.field(static=True)
     _potential: Callable | None = eqx.field(static=True)
 
@@ -165,10 +162,10 @@ class System(AbstractReactions):
         else:
             require_arity("lagrangian", lagrangian, form)
             whole = traced_function(lagrangian)
-        self.in_u = None
+        self._in_u = None
         if written_in == "u":
             assert quasi is not None
-            self.in_u = whole
+            self._in_u = whole
             kinetic = None if kinetic is None else InQuasiVelocities(kinetic, quasi)
             whole = InQuasiVelocities(whole, quasi)
         self.lagrangian = whole
@@ -196,7 +193,7 @@ class System(AbstractReactions):
         return isinstance(other, System) and self._key == other._key
 
     @property
-    def terms(self) -> Terms:
+    def _terms(self) -> Terms:
         """The lowered terms of the equations of motion."""
         array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
         if self.lowering == "array":
@@ -224,65 +221,7 @@ class System(AbstractReactions):
         """Flat vector, shape (n,), from a dict of named values."""
         return self.coordinates.flatten(parts)
 
-    def mass_regular(self, params: Any, t: Any, q: Array, v: Array | None) -> bool | None:
-        """Whether M is positive definite for these params without the help of constraints.
-
-        Looked at in the given state, where it is known, and in one other, as the mass of a link is
-        zero everywhere or nowhere; where the state is traced and M depends on it, in some where
-        inertias vanish, as that of polar coordinates does at r = 0. None where the params have no
-        values, since they are traced. Of use to a system with constraints alone.
-        """
-        if not self.constraints:
-            return False
-        if not concrete(params):
-            return None
-        n = self.size
-        states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
-        v = jnp.zeros_like(q) if v is None else v
-        if concrete((t, q, v)):
-            states.append((t, q, v))
-        elif self.structure(params, q.dtype).mass & {"t", "q", "v"}:
-            states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
-        floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
-        for state in states:
-            with jax.ensure_compile_time_eval():
-                traced, static = _params.split(params)
-                at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
-                M = _mass(self, _params.Static(static), *at, traced)
-            if not concrete(M):
-                return None  # the Lagrangian closes over a traced value
-            M = np.asarray(M, np.float64)
-            units = np.sqrt(np.abs(np.diagonal(M)))
-            if not np.all(units > 0) or not np.all(np.isfinite(M)):
-                return False
-            if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
-                return False
-        return True
-
-    def contacts_apart(
-        self, params: Any, t: Any, q: Array, v: Array | None, inputs: Mapping[str, Any]
-    ) -> bool:
-        """Whether rows whose multipliers forces read are clearly independent of one another.
-
-        In the given state, where all has values; else False.
-        """
-        v = jnp.zeros_like(q) if v is None else v
-        if not self.constraints or not concrete(params, t, q, v, inputs):
-            return False
-        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
-        t = jnp.asarray(t, float)
-        chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
-        if len(chosen) < 2:
-            return True
-        traced, static = _params.split(params)
-        with jax.ensure_compile_time_eval():
-            A = np.asarray(_rows(self, _params.Static(static), t, q, v, traced), np.float64)[chosen]
-        sizes = np.linalg.norm(A, axis=1, keepdims=True)
-        if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
-            return False
-        return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
-
-    def rows(self, params: Any, dtype: Any) -> ConstraintRows:
+    def _rows(self, params: Any, dtype: Any) -> ConstraintRows:
         """Names and shapes of the constraint rows, for params like these.
 
         Raises:
@@ -301,11 +240,13 @@ class System(AbstractReactions):
             )
         return rows
 
+    @state_first
     def check(
         self,
-        params: Any,
         q: Any,
         v: Any,
+        params: Any = None,
+        *,
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> None:
@@ -321,16 +262,16 @@ class System(AbstractReactions):
             ValueError: L not a real scalar or not finite, a force of wrong shape, missing
                 inputs, a coordinate without inertia (named).
         """
-        t, q, v, params = self._state(params, q, v, t)
+        t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
-        self.check_traceable(params, q.dtype, values)
+        check_traceable(self, params, q.dtype, values)
         L = as_written(self.lagrangian)(t, q, v, params)
         if not bool(jnp.isfinite(L)):
             raise invalid("lagrangian", "be finite at the given state", f"it was {L}")
-        M = self.terms.mass(t, q, v, params)
+        M = self._terms.mass(t, q, v, params)
         if self.constraints:
-            self.rows(params, q.dtype)
-            M, _ = augmented(M, self.terms.rows(t, q, v, params)[0])
+            self._rows(params, q.dtype)
+            M, _ = augmented(M, self._terms.rows(t, q, v, params)[0])
         vanishing = vanishing_rows(self, params, t, q)
         if vanishing:
             must = "have a gradient where it holds"
@@ -345,7 +286,7 @@ class System(AbstractReactions):
                 f"its pivot was not positive at q = {q}, v = {v}",
                 "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
             )
-        a = self.acceleration(params, q, v, t, inputs)
+        a = self.acceleration(q, v, params, t=t, inputs=inputs)
         if not bool(jnp.all(jnp.isfinite(a))):
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
             raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
@@ -360,72 +301,17 @@ class System(AbstractReactions):
         traced, static = _params.split(params)
         params = _params.join(traced, static)
         dtype = jnp.result_type(float)
-        self.check_traceable(params, dtype, None)
-        terms, lowered = self.terms, None
+        check_traceable(self, params, dtype, None)
+        terms, lowered = self._terms, None
         if isinstance(terms, ScalarTerms):
             free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
             whole = ArrayTerms(
-                self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self.in_u
+                self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self._in_u
             )
             terms = ScalarTerms(whole, terms.limit)
             lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
-        return explain(self, self.structure(params, dtype), lowered, self.rows(params, dtype))
+        return explain(self, self._structure(params, dtype), lowered, self._rows(params, dtype))
 
-    def structure(self, params: Any, dtype: Any) -> Structure:
+    def _structure(self, params: Any, dtype: Any) -> Structure:
         """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes)."""
         return ArrayTerms(self.lagrangian, ()).structure(params, self.size, dtype)
-
-    def check_traceable(self, params: Any, dtype: Any, values: Any) -> None:
-        """Trace L and the forces at abstract states; raise if a shape or dtype is wrong.
-
-        Args:
-            params: as the Lagrangian takes them.
-            dtype: of the state.
-            values: values of the inputs by name; None to leave the forces out.
-        """
-        t = jax.ShapeDtypeStruct((), jnp.result_type(float))
-        q = v = jax.ShapeDtypeStruct((self.size,), dtype)
-        traced, static = _params.split(params)
-        terms = self.terms
-
-        def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Array:
-            params = _params.join(traced, static)
-            p = terms.momentum(t, q, v, params)
-            return p if values is None else p + terms.force(t, q, v, params, values)
-
-        closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
-        check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
-
-
-APART = 1e-3
-"""Least singular value of rows of unit length that count as clearly independent."""
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _rows(
-    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
-) -> Array:
-    return system.terms.rows(t, q, v, _params.join(traced, static.tree))[0]
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _mass(
-    system: System, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
-) -> Array:
-    return system.terms.mass(t, q, v, _params.join(traced, static.tree))
-
-
-def check_declaration(
-    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
-) -> None:
-    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
-    values = evaluate(inputs, t, q, v, params)
-    system.check_traceable(params, q.dtype, values)
-    for name in inputs:
-        if name not in values.read:
-            raise invalid(
-                "inputs",
-                "hold only signals that a force reads",
-                f"no force read {name!r}",
-                "Drop it, or read inputs[name] in a GeneralizedForce.",
-            )

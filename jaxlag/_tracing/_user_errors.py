@@ -57,7 +57,7 @@ def translate(function: Callable, arguments: Sequence[Any], error: Exception) ->
             return invalid(name, must, f"{place} {was}", fix)
     if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str):
         return _missing(name, place, named, error.args[0])
-    if isinstance(error, TypeError | AttributeError):
+    if isinstance(error, TypeError | AttributeError | IndexError):
         return _of_params(name, place, named)
     return None
 
@@ -85,6 +85,14 @@ def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | N
     if params is None:
         was = f"they were left out: {place}"
         return invalid("params", f"be given, since {name} reads them", was, "Pass params={...}.")
+    shape = getattr(params, "shape", None)
+    if (shape is not None or isinstance(params, list | tuple)) and re.search(
+        r"""\[\s*["']""", place
+    ):
+        must = f"have the entries that {name} reads by name"
+        what = f"a {type(params).__name__}" if shape is None else f"an array of shape {shape}"
+        fix = "The order of the arguments is (q, v, params)."
+        return invalid("params", must, f"they were {what}: {place}", fix)
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
         if isinstance(leaf, str):
             leaf_name = f"params{jax.tree_util.keystr(path)}"

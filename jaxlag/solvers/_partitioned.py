@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from numpy.polynomial import legendre
 
+from jaxlag._core._errors import invalid
 from jaxlag.solvers._fixed import AbstractFixedStep
 from jaxlag.solvers._root import root
 
@@ -194,9 +195,8 @@ class LobattoIIIAB(AbstractPartitioned):
 def _at_least(least: int, name: str, stages: Any) -> int:
     whole = isinstance(stages, int | np.integer) and not isinstance(stages, bool)
     if not whole or stages < least:
-        raise ValueError(
-            f"{name}: stages must be an integer of at least {least}, but it was {stages!r}."
-        )
+        must = f"be an integer of at least {least}"
+        raise invalid(f"{name}: stages", must, f"it was {stages!r}")
     return int(stages)
 
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jaxlag._core._errors import invalid
 from jaxlag.solvers._fixed import AbstractFixedStep
 
 
@@ -41,10 +42,8 @@ class Splitting(AbstractFixedStep):
 
     def __init__(self, order: int = 2) -> None:
         if not isinstance(order, int | np.integer) or order not in _COEFFICIENTS:
-            raise ValueError(
-                f"Splitting: order must be one of {', '.join(map(str, _COEFFICIENTS))}, "
-                f"but it was {order!r}."
-            )
+            must = f"be one of {', '.join(map(str, _COEFFICIENTS))}"
+            raise invalid("Splitting: order", must, f"it was {order!r}")
         self.accuracy = int(order)
 
     def order(self, terms: Any) -> int:

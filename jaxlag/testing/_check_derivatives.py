@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxlag._core._arguments import state_first
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._errors import invalid
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
+from jaxlag._system._inspection import check_traceable
 from jaxlag._system._system import System
 from jaxlag.testing import _compare_modes as _check
 from jaxlag.testing import _declared_functions
@@ -142,14 +144,15 @@ class Report:
         return "\n".join(lines)
 
 
+@state_first
 def check_derivatives(
     system: System,
-    params: Any,
     q: Any,
     v: Any,
+    params: Any = None,
+    *,
     t: Any = 0.0,
     inputs: Mapping[str, Any] | None = None,
-    *,
     states: Sequence[str] = STATES,
 ) -> Report:
     """Look for derivatives of a system's functions that are not finite, or wrong.
@@ -194,9 +197,9 @@ def check_derivatives(
 
     Args:
         system: the declaration.
-        params: as its functions take them.
         q: coordinates, shape (n,), m or rad; not needed to satisfy constraints.
         v: generalized velocities, shape (n,), m/s or rad/s.
+        params: as its functions take them.
         t: s.
         inputs: dict from names to input objects or arrays, as far as forces read them.
         states: which of the states to look at: leave out "zero" where a coordinate cannot be 0.
@@ -220,8 +223,8 @@ def check_derivatives(
         _require_numbers(name, values)
     whole, inputs = own.join(own.leaves), check_inputs(inputs)
     check_range(inputs, t, "t")
-    system.check_traceable(whole, q.dtype, evaluate(inputs, t, q, v, whole))
-    rows = system.rows(whole, q.dtype)
+    check_traceable(system, whole, q.dtype, evaluate(inputs, t, q, v, whole))
+    rows = system._rows(whole, q.dtype)
     fixed = {
         "t": t,
         "params": own.leaves,

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxlag._core._errors import invalid
 from jaxlag._model._constraints import Holonomic, Pfaffian
-from jaxlag._model._forces import Couple, GeneralizedForce, PointForce, Rayleigh, reads_lam
+from jaxlag._model._forces import GeneralizedForce, PointForce, Rayleigh, Torque, reads_lam
 from jaxlag._model._input_signals import AbstractInput
 from jaxlag._model._inputs import evaluate
 from jaxlag._model._quasi_velocities import InQuasiVelocities, Vanishing
@@ -87,7 +87,7 @@ def declared(
 
     speeds = system.written_in
     if system._kinetic is None:
-        L = system.lagrangian if system.in_u is None else system.in_u
+        L = system.lagrangian if system._in_u is None else system._in_u
         add("lagrangian", L, f"t q {speeds} params", _ENERGY)
     else:
         T = system._kinetic
@@ -103,7 +103,7 @@ def declared(
         elif isinstance(force, PointForce):
             add(f"{name}: position", force.position, "t q params", _CONJUGATE)
             add(f"{name}: force", force.force, "t q v params", _FORCE, force.takes_inputs)
-        elif isinstance(force, Couple):
+        elif isinstance(force, Torque):
             rate = force.angular_velocity
             add(f"{name}: angular_velocity", rate, "t q v params", _CONJUGATE)
             add(f"{name}: torque", force.torque, "t q v params", _FORCE, force.takes_inputs)

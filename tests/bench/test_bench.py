@@ -199,7 +199,7 @@ def test_workers_start_under_their_own_settings_alone(monkeypatch):
 def test_all_equations_compared_are_those_of_the_system(field):
     y = jnp.array([0.7, -1.1, 0.4, 1.3])
     params = {name: value * (1.0 + 0.1 * i) for i, (name, value) in enumerate(params_of_bench())}
-    expected = jnp.concatenate([y[2:], system.acceleration(params, y[:2], y[2:])])
+    expected = jnp.concatenate([y[2:], system.acceleration(y[:2], y[2:], params)])
     # Round-off of an acceleration of about 10 rad/s^2 through a 2 x 2 solve.
     assert jnp.max(jnp.abs(field(0.0, y, params) - expected)) < 1e-13
 

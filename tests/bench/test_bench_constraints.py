@@ -35,7 +35,7 @@ def test_mechanisms_start_consistent(name):
     assert record.position[0] < 1e-15
     assert record.velocity[0] < 1e-14
     at_rest, moving = (
-        float(mechanism.system.energy(mechanism.params, mechanism.q0, k * mechanism.v0))
+        float(mechanism.system.energy(mechanism.q0, k * mechanism.v0, mechanism.params))
         for k in (0, 1)
     )
     assert math.isclose(moving - at_rest, mechanism.energy, rel_tol=1e-14)

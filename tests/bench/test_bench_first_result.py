@@ -17,7 +17,7 @@ def expected(motion, y):
     """dy/dt from the declared system."""
     n = motion.q0.size
     q, v = jnp.asarray(y[:n]), jnp.asarray(motion.v0)
-    a = motion.system.acceleration(motion.params, q, v)
+    a = motion.system.acceleration(q, v, motion.params)
     if motion.turning is None:
         return jnp.concatenate([v, a])
     return jnp.concatenate([v, jax.jvp(motion.turning, (q, v), (v, a))[1]])

@@ -83,7 +83,7 @@ def test_neighbours_compute_the_accelerations_of_the_chain(name, n):
     pytest.importorskip(_chains.MODULES[name])
     scene = links(n)
     q, v = np.array(scene.q0), np.linspace(0.5, -0.4, n)
-    expected = _rk4.system(scene).acceleration(scene.params, q, v)
+    expected = _rk4.system(scene).acceleration(q, v, scene.params)
     neighbour = _chains.MAKERS[name](scene, 3)
     found = neighbour.acceleration(q, v)
     assert np.max(np.abs(found - expected)) < lowering.PEER_AGREEMENT * np.max(np.abs(expected))

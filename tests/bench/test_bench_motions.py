@@ -41,7 +41,7 @@ def acceleration(motion, y):
     """(q, v, a): velocities by the explicit kinematics, accelerations by jaxlag."""
     n = len(motion.q0)
     q, v = jnp.asarray(y[:n]), jnp.asarray(motion.evaluate(y)[:n])
-    return q, v, jnp.asarray(motion.system.acceleration(motion.params, q, v))
+    return q, v, jnp.asarray(motion.system.acceleration(q, v, motion.params))
 
 
 @pytest.mark.parametrize("name", mostly_full(SINGLE, "heavy top"))

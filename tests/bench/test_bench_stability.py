@@ -49,11 +49,11 @@ def test_verdicts_on_stress(case, verdict):
 
 def test_a_stress_row_that_breaks_off_fails_alone():
     def run(quick):
-        raise ValueError("q0 must be finite")
+        raise ValueError("`q0` must be finite")
 
     row = stability.judged(_stress.Case("row", "figure", 1.0, (), run), quick=True)
     assert row["verdict"] == "failed"
-    assert row["statuses"] == "raised ValueError: q0 must be finite"
+    assert row["statuses"] == "raised ValueError: `q0` must be finite"
 
 
 def test_stress_rows_are_named_once_and_quick_ones_exist():

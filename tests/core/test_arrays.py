@@ -34,16 +34,16 @@ ROLLING = jl.System(
 @pytest.mark.parametrize(
     ("ask", "message"),
     [
-        (lambda q, v: run(q0=q, v0=v), "q0 and v0 must"),
-        (lambda q, v: run(q0={"x": q[0], "y": q[1]}, v0=v), "q0 and v0 must"),
-        (lambda q, v: run(q0=q, v0=v, dt=0.1, method="euler"), "q0 and v0 must"),
-        (lambda q, v: jax.jit(lambda q: run(q0=q, v0=v).q)(q), "q0 and v0 must"),
-        (lambda q, v: run(ROLLING, q0=q, v0=None, u0=v), "q0 and u0 must"),
-        (lambda q, v: jl.equilibrium(SYSTEM, q, PARAMS), "q0 must"),
-        (lambda q, v: jl.assemble(SYSTEM, q, v, PARAMS), "q and v must"),
+        (lambda q, v: run(q0=q, v0=v), "`q0` and `v0` must"),
+        (lambda q, v: run(q0={"x": q[0], "y": q[1]}, v0=v), "`q0` and `v0` must"),
+        (lambda q, v: run(q0=q, v0=v, dt=0.1, method="euler"), "`q0` and `v0` must"),
+        (lambda q, v: jax.jit(lambda q: run(q0=q, v0=v).q)(q), "`q0` and `v0` must"),
+        (lambda q, v: run(ROLLING, q0=q, v0=None, u0=v), "`q0` and `u0` must"),
+        (lambda q, v: jl.equilibrium(SYSTEM, q, PARAMS), "`q0` must"),
+        (lambda q, v: jl.assemble(SYSTEM, q, v, PARAMS), "`q` and `v` must"),
         (lambda q, v: jl.inverse_dynamics(SYSTEM, q, v, v, PARAMS), "q, v and a must"),
-        (lambda q, v: SYSTEM.acceleration(PARAMS, q, v), "q and v must"),
-        (lambda q, v: SYSTEM.mass_matrix(PARAMS, q), "q must"),
+        (lambda q, v: SYSTEM.acceleration(q, v, PARAMS), "`q` and `v` must"),
+        (lambda q, v: SYSTEM.mass_matrix(q, params=PARAMS), "`q` must"),
     ],
 )
 def test_states_of_16_bits_are_refused(ask, message, dtype):

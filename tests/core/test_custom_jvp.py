@@ -118,7 +118,7 @@ def test_reverse_derivatives_of_single_precision_in_loops():
 
     def end(p):
         def step(_, x):
-            a = system.acceleration(p, x[:1], x[1:])
+            a = system.acceleration(x[:1], x[1:], p)
             return x + 0.01 * jnp.concatenate([x[1:], a])
 
         return jnp.sum(jax.lax.fori_loop(0, 3, step, jnp.ones(2, p.dtype)))
@@ -282,7 +282,7 @@ def swung(start, params):
 
 def accelerated(start, params):
     q = (start * params[0])[None]
-    return pendulum(users).acceleration(params**2, q, jnp.ones(1))[0]
+    return pendulum(users).acceleration(q, jnp.ones(1), params**2)[0]
 
 
 def lengths(start, params):

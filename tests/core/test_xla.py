@@ -183,7 +183,7 @@ def test_only_plain_operations_are_marked():
 
 def test_scalar_programs_are_plain():
     """Else every loop would run operation by operation where XLA's setting came too late."""
-    terms, params = double_pendulum.system.terms, dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0)
+    terms, params = double_pendulum.system._terms, dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0)
     q = jnp.ones((3, 2))
     one = jax.make_jaxpr(lambda q: terms.acceleration(jnp.zeros(()), q, q, params, {}))
     lanes = jax.make_jaxpr(jax.vmap(lambda q: terms.acceleration(jnp.zeros(()), q, q, params, {})))

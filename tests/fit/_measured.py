@@ -8,7 +8,13 @@ import jaxlag as jl
 NOISE = 2e-3
 TRUE = {"m": 1.0, "l": 0.7, "g": 9.81, "c": 0.05}
 TS = np.linspace(0.0, 3.0, 151)
-OPTIONS = {"method": "tsit5", "dt": 0.02}
+STEPS = {"method": "tsit5", "dt": 0.02}
+OPTIONS = {"simulate_options": STEPS}
+
+
+def tight(tolerance, **options):
+    """Options of a motion of this tolerance."""
+    return {"rtol": tolerance, "atol": tolerance} | options
 
 
 def lagrangian(t, q, v, p):

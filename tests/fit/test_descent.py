@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from _measured import NOISE, OPTIONS, TRUE, angles, experiment, pendulum
+from _measured import NOISE, OPTIONS, STEPS, TRUE, angles, experiment, pendulum
 from _silence import no_warning
 
 import jaxlag as jl
@@ -23,7 +23,7 @@ def test_a_descent_finds_what_least_squares_finds():
     pieces = experiment(sigma={"x": NOISE}).windows(1.0)
     start = TRUE | {"l": 0.68, "c": 0.08}
     descent = jl.Descent(optax.adam(3e-3), epochs=400, batch=2)
-    down = jl.fit(pendulum, pieces, start, free=("l", "c"), optimiser=descent, **OPTIONS)
+    down = jl.fit(pendulum, pieces, start, free=("l", "c"), optimizer=descent, **OPTIONS)
     squares = jl.fit(pendulum, pieces, start, free=("l", "c"), **OPTIONS)
     assert down.converged
     assert down.costs.shape == (400,)
@@ -42,7 +42,7 @@ def test_the_cost_is_guessed_without_bias(segments):
     free = unknowns(TRUE, ("l",), {})
     where = layout(data, segments)
     shown = readers_of(pendulum, data, {}, TRUE)
-    problem, _ = build_shooting(pendulum, data, where, free, shown, NO_PRIOR, squares, OPTIONS)
+    problem, _ = build_shooting(pendulum, data, where, free, shown, NO_PRIOR, squares, STEPS)
     rng = np.random.default_rng(0)
     x = jnp.asarray(0.01 * rng.normal(size=problem.segments.guess.shape))
     guess = FitVariables(jnp.asarray([0.02]), x)
@@ -85,7 +85,7 @@ def test_a_network_in_the_potential_is_found():
         training,
         {"k": plain.params["k"], "net": network},
         free=("net",),
-        optimiser=jl.Descent(optax.lbfgs(memory_size=20), epochs=100, batch=3),
+        optimizer=jl.Descent(optax.lbfgs(memory_size=20), epochs=100, batch=3),
     )
     assert len(found.names) == 8 + 8 + 8 + 1
     worse, better = (x.predict(held_out, settle=0.3).rms("x")[0] for x in (plain, found))
@@ -111,7 +111,7 @@ def test_a_segment_that_fails_moves_nothing():
     descent = jl.Descent(optax.adam(1e-2), epochs=300, batch=1)
     with pytest.warns(UserWarning, match="segment of broken that starts at t = 0 s ended with"):
         found = jl.fit(
-            spring, (good, broken), {"k": 2.0}, free=("k",), optimiser=descent, **OPTIONS
+            spring, (good, broken), {"k": 2.0}, free=("k",), optimizer=descent, **OPTIONS
         )
     np.testing.assert_allclose(found.params["k"], 2.25, rtol=1e-5)
 
@@ -128,7 +128,7 @@ def test_derivatives_that_are_not_finite_are_counted():
         pytest.warns(UserWarning, match=r"3 steps of the descent met derivatives that are not"),
         pytest.warns(UserWarning, match=no_covariance),
     ):
-        found = jl.fit(spring, data, {"k": 0.0}, free=("k",), optimiser=descent, **OPTIONS)
+        found = jl.fit(spring, data, {"k": 0.0}, free=("k",), optimizer=descent, **OPTIONS)
     assert np.isnan(found.covariance).all()
     assert np.isfinite(found.cost)
     with pytest.warns(UserWarning, match=no_covariance):
@@ -146,7 +146,7 @@ def test_of_more_than_200_numbers_no_covariance_is_computed():
     descent = jl.Descent(optax.adam(1e-3), epochs=5)
     system = jl.System(lagrangian, ("x",))
     with no_warning():
-        found = jl.fit(system, data, {"net": network}, free=("net",), optimiser=descent, **OPTIONS)
+        found = jl.fit(system, data, {"net": network}, free=("net",), optimizer=descent, **OPTIONS)
     assert len(found.names) == 2 * 16 + 16 * 17 + 17
     assert np.isnan(found.covariance).all()
     assert "no covariance" in str(found)
@@ -164,10 +164,10 @@ def test_motions_of_a_descent_are_counted():
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [
-        (("adam",), {}, r"optimiser must have init and update.*'adam'.*Try optax\.adam"),
-        ((optax.sgd(1.0),), {"epochs": 0}, r"epochs must be a positive integer, but it was 0"),
-        ((optax.sgd(1.0),), {"batch": 1.5}, r"batch must be a positive integer, but it was 1\.5"),
-        ((optax.sgd(1.0),), {"gap": 0.0}, r"gap must be positive, but it was 0"),
+        (("adam",), {}, r"`optimizer` must have init and update.*'adam'.*Try optax\.adam"),
+        ((optax.sgd(1.0),), {"epochs": 0}, r"`epochs` must be a positive integer, but it was 0"),
+        ((optax.sgd(1.0),), {"batch": 1.5}, r"`batch` must be a positive integer, but it was 1\.5"),
+        ((optax.sgd(1.0),), {"gap": 0.0}, r"`gap` must be positive, but it was 0"),
     ],
 )
 def test_bad_arguments_are_named(arguments, options, message):

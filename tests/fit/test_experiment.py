@@ -23,11 +23,11 @@ def test_windows_and_parts():
 @pytest.mark.parametrize(
     ("seconds", "message"),
     [
-        (0, r"seconds must be a positive number, but it was 0"),
-        (np.nan, r"seconds must be a positive number, but it was nan"),
-        (-1, r"seconds must be a positive number, but it was -1"),
+        (0, r"`seconds` must be a positive number, but it was 0"),
+        (np.nan, r"`seconds` must be a positive number, but it was nan"),
+        (-1, r"`seconds` must be a positive number, but it was -1"),
         (4.0, r"at most the 3\.02 s of experiment, but it was 4"),
-        (0.03, r"seconds must be two samples or more, but it was 0\.03"),
+        (0.03, r"`seconds` must be two samples or more, but it was 0\.03"),
     ],
 )
 def test_bad_windows_are_named(seconds, message):
@@ -41,13 +41,13 @@ NAN = np.full(len(TS), np.nan)
 @pytest.mark.parametrize(
     ("ts", "channels", "options", "message"),
     [
-        (TS[::-1], {"x": TS}, {}, r"ts must increase strictly, but ts\[0\] = 3 and"),
+        (TS[::-1], {"x": TS}, {}, r"`ts` must increase strictly, but ts\[0\] = 3 and"),
         (TS[:1], {"x": TS[:1]}, {}, r"an array of two times or more"),
-        (TS, {"x": TS[:-1]}, {}, r"channels\['x'\] must have one sample per time, 151"),
-        (TS, {"x": NAN}, {}, r"channels\['x'\] must hold some numbers, but all were NaN"),
+        (TS, {"x": TS[:-1]}, {}, r"`channels\['x'\]` must have one sample per time, 151"),
+        (TS, {"x": NAN}, {}, r"`channels\['x'\]` must hold some numbers, but all were NaN"),
         (TS, {}, {}, r"one channel or more"),
         (TS, {"x": np.where(TS > 1, np.inf, TS)}, {}, r"finite, or NaN where nothing was measured"),
-        (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"sigma\['x'\] must be positive"),
+        (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"`sigma\['x'\]` must be positive"),
         (TS, {"x": TS}, {"sigma": {"x": np.inf}}, r"positive and finite, .* Write NaN into the"),
         (
             TS,
@@ -56,7 +56,7 @@ NAN = np.full(len(TS), np.nan)
             r"a number, 151 of them, or of shape \(151, 1",
         ),
         (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
-        (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"q0 must be \(n,\) numbers at ts\[0\]"),
+        (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"`q0` must be \(n,\) numbers at ts\[0\]"),
         (TS, {"x": TS}, {"start_sigma": 0.0}, r"come with the start it is about"),
     ],
 )

@@ -3,7 +3,20 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _measured import NOISE, OPTIONS, TRUE, TS, angles, driven, experiment, fit, pendulum, within
+from _measured import (
+    NOISE,
+    OPTIONS,
+    STEPS,
+    TRUE,
+    TS,
+    angles,
+    driven,
+    experiment,
+    fit,
+    pendulum,
+    tight,
+    within,
+)
 from _silence import no_warning
 
 import jaxlag as jl
@@ -29,7 +42,7 @@ def test_parameters_start_and_noise_are_found(segments):
 def test_segments_find_what_one_motion_does():
     """Joined ever more tightly they are one motion: the same estimates, within a hundredth of
     their standard deviations."""
-    one, many = (fit(experiment(), segments=k, tolerance=1e-7) for k in (1, 5))
+    one, many = (fit(experiment(), segments=k, rtol=1e-7, atol=1e-7) for k in (1, 5))
     for name in ("l", "c"):
         assert abs(one.params[name] - many.params[name]) < 1e-2 * one.std[name]
         np.testing.assert_allclose(one.std[name], many.std[name], rtol=1e-2)
@@ -43,7 +56,7 @@ def test_the_covariance_is_that_of_the_dense_derivatives():
 
     def residuals(x):
         params = TRUE | {"l": x[0], "c": x[1]}
-        motion = jl.simulate(pendulum, x[2:3], x[3:4], TS, params, **OPTIONS)
+        motion = jl.simulate(pendulum, x[2:3], x[3:4], TS, params, **STEPS)
         return np.asarray(motion["x"]) / NOISE
 
     x = np.concatenate([[found.params["l"], found.params["c"]], found.starts[0]])
@@ -80,7 +93,7 @@ def test_several_experiments_with_gaps_and_other_rates():
 def test_a_driven_motion_and_its_rate():
     """Torque from a table, in segments; a measured rate and a channel of one's own."""
     times = np.linspace(0.0, 3.0, 61)
-    torque = jl.Linear(times, 0.8 * np.sin(3.0 * times))
+    torque = jl.LinearInterpolation(times, 0.8 * np.sin(3.0 * times))
     motion = jl.simulate(driven, [0.2], [0.0], TS, TRUE, inputs={"torque": torque})
     rng = np.random.default_rng(3)
     rate = np.asarray(motion.v[:, 0]) + 0.02 * rng.normal(size=len(TS))
@@ -136,13 +149,15 @@ def test_a_search_that_errors_of_the_solver_stop_is_said():
     motion = jl.simulate(system, [1.0], [0.0], ts, true, rtol=1e-10, atol=1e-10)
     noise = 1e-4 * np.random.default_rng(0).normal(size=len(ts))
     data = jl.Experiment(ts, {"x": np.asarray(motion["x"]) + noise}, sigma={"x": 1e-4})
-    options = {"free": ("l", "c", "f"), "method": "tsit5"}
+    free = ("l", "c", "f")
     start = true | {"l": 0.69, "c": 0.02, "f": 0.15}
     with pytest.warns(UserWarning, match=r"standard deviations from where derivatives lead: lower"):
-        found = jl.fit(system, data, start, rtol=1e-5, atol=1e-5, **options)
+        found = jl.fit(system, data, start, free=free, simulate_options=tight(1e-5, method="tsit5"))
     assert found.distance > 0.3
     with no_warning():
-        found = jl.fit(system, data, start, rtol=1e-10, atol=1e-10, **options)
+        found = jl.fit(
+            system, data, start, free=free, simulate_options=tight(1e-10, method="tsit5")
+        )
     assert found.distance < 0.05
     for name in ("l", "c", "f"):
         assert abs(found.params[name] - true[name]) < 3.5 * found.std[name]
@@ -222,11 +237,17 @@ def test_a_channel_that_is_not_finite_is_named():
 @pytest.mark.full
 def test_warnings_name_what_they_are_about():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
-        fit(experiment(), params0=TRUE | {"c": 0.0}, transforms={"c": jl.Bounded(0.0, 1.0)})
+        fit(
+            experiment(),
+            params0=TRUE | {"c": 0.0},
+            transforms={"c": jl.transforms.Bounded(0.0, 1.0)},
+        )
     with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
         found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0})
     assert found.params["spare"] == 1.0
-    spare = {"transforms": {"spare": jl.Bounded(0.0, 1.0)}}  # on its bound, but not held there
+    spare = {
+        "transforms": {"spare": jl.transforms.Bounded(0.0, 1.0)}
+    }  # on its bound, but not held there
     with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
         found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0}, **spare)
     assert found.on_bound == ()
@@ -243,9 +264,9 @@ def test_no_warning_without_reason():
 @pytest.mark.parametrize(
     ("mean", "sigma", "message"),
     [
-        (np.nan, 1.0, r"mean must be finite, but it was nan"),
-        (1.0, 0.0, r"sigma must be positive and finite, but it was 0"),
-        (1.0, np.inf, r"sigma must be positive and finite, .* Leave the prior out"),
+        (np.nan, 1.0, r"`mean` must be finite, but it was nan"),
+        (1.0, 0.0, r"`sigma` must be positive and finite, but it was 0"),
+        (1.0, np.inf, r"`sigma` must be positive and finite, .* Leave the prior out"),
     ],
 )
 def test_bad_priors_are_named(mean, sigma, message):
@@ -256,45 +277,55 @@ def test_bad_priors_are_named(mean, sigma, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"free": ("k",)}, r"free must name parameters among \['c', 'g', 'l', 'm'\], but one was"),
+        (
+            {"free": ("k",)},
+            r"`free` must name parameters among \['c', 'g', 'l', 'm'\], but one was",
+        ),
         ({"free": "l"}, r"Write free=\('l',\)"),
-        ({"segments": 0}, r"segments must be a positive integer"),
+        ({"segments": 0}, r"`segments` must be a positive integer"),
         ({"segments": 100}, r"leave two samples or more to each"),
-        ({"loss": "abs"}, r"loss must be one of"),
-        ({"optimiser": "adam"}, r"optimiser must be None or a jl\.Descent, .*optax"),
-        ({"rtol": np.ones(2)}, r"rtol must be one number, a name or an object without arrays"),
-        ({"transforms": {"m": jl.Positive()}}, r"transforms must be of free parameters"),
-        ({"transforms": {"l": 3}}, r"transforms\['l'\] must be a transform"),
-        ({"priors": {"m": jl.Prior(1.0, 1.0)}}, r"priors must be of free parameters"),
+        ({"loss": "abs"}, r"`loss` must be one of"),
+        ({"optimizer": "adam"}, r"`optimizer` must be None or a jl\.Descent, .*optax"),
+        (
+            {"simulate_options": {"rtol": np.ones(2)}},
+            r"`rtol` must be one number, a name or an object without arrays",
+        ),
+        (
+            {"transforms": {"m": jl.transforms.Positive()}},
+            r"`transforms` must be of free parameters",
+        ),
+        ({"transforms": {"l": 3}}, r"`transforms\['l'\]` must be a transform"),
+        ({"priors": {"m": jl.Prior(1.0, 1.0)}}, r"`priors` must be of free parameters"),
         ({"params0": TRUE | {"l": 1}}, r"hold real numbers to be found, but it was 1"),
-        ({"priors": {"l": (1.0, 1.0)}}, r"priors\['l'\] must be a jl\.Prior, .* Write jl\.Prior"),
+        ({"priors": {"l": (1.0, 1.0)}}, r"`priors\['l'\]` must be a jl\.Prior, .* Write jl\.Prior"),
         (
             {"priors": {"l": jl.Prior(1.0, [1.0, 2.0])}},
             r"shape \(\), but its mean had \(\), its sigma \(2,\)",
         ),
-        ({"tolerance": -1.0}, r"tolerance must be a number between 0 and 1"),
-        ({"max_iterations": 0}, r"max_iterations must be a positive integer, but it was 0"),
-        ({"save": ("a",)}, r"save must be left to jl\.fit"),
+        ({"rtol": -1.0}, r"`rtol` must be a number between 0 and 1"),
+        ({"atol": 1.0}, r"`atol` must be a number between 0 and 1"),
+        ({"max_steps": 0}, r"`max_steps` must be a positive integer, but it was 0"),
+        ({"simulate_options": {"save": ("a",)}}, r"`save` must be left to jl\.fit"),
         (
             {"data": None},
-            r"experiments must be a jl\.Experiment or a sequence of them, but it was N",
+            r"`experiments` must be a jl\.Experiment or a sequence of them, but it was N",
         ),
         (
             {"data": jl.Experiment(TS, {"x": np.stack([TS, TS], axis=1)})},
-            r"channels\['x'\] must have 1 columns.* but it had 2\. Fill columns",
+            r"`channels\['x'\]` must have 1 columns.* but it had 2\. Fill columns",
         ),
         (
             {
                 "data": jl.Experiment(TS, {"x": TS, "r": TS}),
                 "channels": {"r": lambda motion: motion.q[:, [0, 0]]},
             },
-            r"channels\['r'\] must have as many columns as were measured, 1, .* shows \(151, 2\)",
+            r"`channels\['r'\]` must have as many columns as were measured, 1, .* shows \(151, 2\)",
         ),
         (
             {"data": experiment(q0=[1.0], v0=[0.0], start_sigma=np.ones(3))},
-            r"start_sigma must be one number or 2, of all coordinates and velocities that are free",
+            r"`start_sigma` must be one number or 2, of all coordinates and velocities that are",
         ),
-        ({"data": ()}, r"experiments must be a jl\.Experiment or a sequence"),
+        ({"data": ()}, r"`experiments` must be a jl\.Experiment or a sequence"),
         ({"data": jl.Experiment(TS, {"y": TS})}, r"be named as one of .*, but one was 'y'"),
         ({"data": jl.Experiment(TS, {"energy": TS})}, r"be among the channels or in q0"),
         ({"data": jl.Experiment(TS[:2], {"x": TS[:2]})}, r"at least as many numbers as there are"),

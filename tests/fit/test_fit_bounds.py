@@ -12,7 +12,10 @@ from jaxlag._fit import _multiple_shooting
 @pytest.mark.full
 def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
     plain = fit(experiment())
-    held = fit(experiment(), transforms={"l": jl.Positive(), "c": jl.Bounded(0.0, 1.0)})
+    held = fit(
+        experiment(),
+        transforms={"l": jl.transforms.Positive(), "c": jl.transforms.Bounded(0.0, 1.0)},
+    )
     np.testing.assert_allclose(held.values, plain.values, rtol=1e-4)
     np.testing.assert_allclose(held.covariance, plain.covariance, rtol=1e-3)
 
@@ -30,7 +33,7 @@ def test_a_search_does_not_depend_on_the_size_that_a_number_starts_at(start):
 @pytest.mark.full
 def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
     """From a third, so that rounding would show; and a search that begins there leaves it again."""
-    bound = jl.Bounded(0.1 + 0.2, 1.0)
+    bound = jl.transforms.Bounded(0.1 + 0.2, 1.0)
     with pytest.warns(UserWarning, match="c ended on its bound"):
         found = fit(
             experiment(), params0=TRUE | {"l": 0.5, "c": 0.7 / 0.9}, transforms={"c": bound}
@@ -38,7 +41,9 @@ def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
     assert float(found.params["c"]) == 0.1 + 0.2
     with pytest.warns(UserWarning, match="c starts on its bound"):
         again = fit(
-            experiment(), params0=found.params, transforms={"c": jl.Bounded(0.0, 0.1 + 0.2)}
+            experiment(),
+            params0=found.params,
+            transforms={"c": jl.transforms.Bounded(0.0, 0.1 + 0.2)},
         )
     within(again, ("l", "c"))
 
@@ -54,10 +59,10 @@ def test_without_bounds_no_box_is_compiled(monkeypatch):
     data = experiment().part(slice(0, 77))  # of a shape that no other test has compiled
     fit(data)
     with pytest.raises(AssertionError, match="a box"):
-        fit(data, transforms={"l": jl.Positive()})
+        fit(data, transforms={"l": jl.transforms.Positive()})
 
 
-BOUNDS = [jl.Bounded(0.1, 1.0), jl.Bounded(0.1, np.inf)]
+BOUNDS = [jl.transforms.Bounded(0.1, 1.0), jl.transforms.Bounded(0.1, np.inf)]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +87,7 @@ def test_a_parameter_that_ends_on_its_bound_is_named_and_the_others_are_known(bo
 @pytest.mark.full
 def test_a_parameter_comes_back_from_its_bound():
     """It starts there, or is driven there by a length that is far off."""
-    bounds = {"c": jl.Bounded(0.0, np.inf)}
+    bounds = {"c": jl.transforms.Bounded(0.0, np.inf)}
     with pytest.warns(UserWarning, match=r"c starts on its bound\."):
         found = fit(experiment(), params0=TRUE | {"l": 0.5, "c": 0.0}, transforms=bounds)
     within(found, ("l", "c"))
@@ -99,7 +104,9 @@ def test_friction_that_is_not_there_ends_at_zero():
     y = np.asarray(motion["x"]) * (1.0 + 2e-3 * TS)
     start = TRUE | {"l": 0.5, "c": 0.3}
     with pytest.warns(UserWarning, match=r"c ended on its bound, .*e-\d+: widen the bound"):
-        found = fit(jl.Experiment(TS, {"x": y}), params0=start, transforms={"c": jl.Positive()})
+        found = fit(
+            jl.Experiment(TS, {"x": y}), params0=start, transforms={"c": jl.transforms.Positive()}
+        )
     assert found.converged
     assert 0.0 < found.params["c"] < 1e-5
     np.testing.assert_allclose(found.params["l"], TRUE["l"], rtol=1e-2)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from _measured import NOISE, OPTIONS, TRUE, TS, angles, experiment, fit, pendulum
+from _measured import NOISE, OPTIONS, TRUE, TS, angles, experiment, fit, pendulum, tight
 from _silence import no_warning
 
 import jaxlag as jl
@@ -26,7 +26,7 @@ def test_segments_are_one_motion_however_precise_measurements_are(noise):
     spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
     ts = np.linspace(0.0, 10.0, 101)
     x = 0.3 * np.cos(2.0 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
-    options = {"free": ("k",), "rtol": 1e-11, "atol": 1e-11, "tolerance": 1e-8}
+    options = {"free": ("k",), "rtol": 1e-8, "atol": 1e-8, "simulate_options": tight(1e-11)}
     data = jl.Experiment(ts, {"x": x})
     one, many = (jl.fit(spring, data, {"k": 3.9}, segments=n, **options) for n in (1, 10))
     assert abs(one.params["k"] - many.params["k"]) < 1e-2 * one.std["k"]
@@ -42,7 +42,7 @@ def test_a_number_that_is_zero_is_known_as_well_as_any():
         lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * (q[0] - p["x0"]) ** 2, ("x",)
     )
     ts = np.linspace(0.0, 30.0, 301)
-    options = {"free": ("k", "x0"), "rtol": 1e-9, "atol": 1e-9}
+    options = {"free": ("k", "x0"), "simulate_options": tight(1e-9)}
     start = {"k": 3.9, "x0": 0.01}
     with no_warning():
         found = jl.fit(spring, jl.Experiment(ts, {"x": 0.3 * np.cos(2 * ts)}), start, **options)
@@ -92,7 +92,7 @@ def test_starts_on_a_rod_are_two_numbers_each():
         x = np.asarray(motion["x"])
         r = TRUE["l"] * np.stack([np.sin(x), -np.cos(x)], axis=1)
         data.append(jl.Experiment(ts, {"r": r + 5e-3 * rng.normal(size=r.shape)}))
-    found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), rtol=1e-7, atol=1e-7)
+    found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), simulate_options=tight(1e-7))
     np.testing.assert_allclose(found.freedom, 80 - 21, atol=1e-4)
     # 59 numbers tell it to 9 %.
     np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
@@ -122,7 +122,7 @@ def test_intervals_of_few_measurements_are_those_of_student():
     low, high = found.interval()["l"]
     # The quantile 0.975 of Student's t with 2 degrees of freedom, from a table.
     np.testing.assert_allclose(high - low, 2 * 4.3027 * found.std["l"], rtol=1e-4)
-    with pytest.raises(ValueError, match=r"level must be between 0 and 1, but it was 95.*0\.95"):
+    with pytest.raises(ValueError, match=r"`level` must be between 0 and 1, but it was 95.*0\.95"):
         found.interval(95)
 
 

@@ -34,10 +34,10 @@ def test_accelerations_are_the_equation_of_motion():
         friction = 0.03 * v + 0.1 * np.tanh(v / pendulum.V_S) + 0.02 * v * abs(v)
         torque = -3.0 * np.sin(q - 0.3) - friction
         state = jnp.array([q]), jnp.array([v])
-        free = pendulum.free.acceleration(params, *state, 0.0)
+        free = pendulum.free.acceleration(*state, params)
         np.testing.assert_allclose(free, [torque / 0.2], rtol=1e-13)
         inputs = {"torque": jnp.array(u)}
-        driven = pendulum.driven.acceleration(params, *state, 0.0, inputs)
+        driven = pendulum.driven.acceleration(*state, params, inputs=inputs)
         np.testing.assert_allclose(driven, [(torque + u + 0.05) / 0.2], rtol=1e-13)
 
 

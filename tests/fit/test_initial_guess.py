@@ -73,9 +73,9 @@ def test_a_column_without_numbers_is_simulated():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"q0": [0.3]}, r"q0 must hold 2 numbers at each time, one for each of the coordinates,"),
-        ({"v0": [0.3]}, r"v0 must hold 2 numbers .* of the quasi-velocities, but its shape was"),
-        ({"q0": np.ones((151, 3))}, r"q0 must hold 2 numbers .* shape was \(151, 3\)"),
+        ({"q0": [0.3]}, r"`q0` must hold 2 numbers at each time, one for each of the coordinates,"),
+        ({"v0": [0.3]}, r"`v0` must hold 2 numbers .* of the quasi-velocities, but its shape was"),
+        ({"q0": np.ones((151, 3))}, r"`q0` must hold 2 numbers .* shape was \(151, 3\)"),
     ],
 )
 def test_starts_of_another_length_are_named(given, message):

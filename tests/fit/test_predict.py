@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _measured import NOISE, OPTIONS, TRUE, TS, angles, experiment, pendulum
+from _measured import NOISE, OPTIONS, STEPS, TRUE, TS, angles, experiment, pendulum
 
 import jaxlag as jl
 
@@ -25,7 +25,7 @@ def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
     assert wrong.rms("x")[0] > 20 * NOISE
     assert "rms of x: " in str(found)
     assert found.converged
-    with pytest.raises(ValueError, match=r"channel must be one of \['x'\], but it was 'y'"):
+    with pytest.raises(ValueError, match=r"`channel` must be one of \['x'\], but it was 'y'"):
         found.rms("y")
 
 
@@ -36,7 +36,7 @@ def test_a_start_fitted_to_all_rows():
     assert found.predicted[0].all()
 
     def size(start):
-        motion = jl.simulate(pendulum, start[:1], start[1:], TS, TRUE, **OPTIONS)
+        motion = jl.simulate(pendulum, start[:1], start[1:], TS, TRUE, **STEPS)
         return np.sum((np.asarray(motion["x"]) - angles()) ** 2)
 
     start = np.asarray(found.starts[0])
@@ -61,7 +61,7 @@ def test_a_search_that_did_not_converge_is_said():
     with pytest.warns(
         UserWarning, match=r"search for starts did not converge in 1 iterations: raise"
     ):
-        found = predict(experiment(), settle=0.5, max_iterations=1)
+        found = predict(experiment(), settle=0.5, max_steps=1)
     assert not found.converged
 
 
@@ -96,10 +96,10 @@ def test_figures_show_what_was_measured(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"settle": 0.0}, r"settle must be a positive number of seconds, or None, but it was 0"),
-        ({"settle": 5.0}, r"settle must leave samples of experiment to be predicted.*5 s of 3 s"),
-        ({"settle": 1e-3}, r"settle must hold 2 numbers or more.*hold 1.*Make it longer"),
-        ({"save": ("a",)}, r"save must be left to jl\.predict"),
+        ({"settle": 0.0}, r"`settle` must be a positive number of seconds, or None, but it was 0"),
+        ({"settle": 5.0}, r"`settle` must leave samples of experiment to be predicted.*5 s of 3 s"),
+        ({"settle": 1e-3}, r"`settle` must hold 2 numbers or more.*hold 1.*Make it longer"),
+        ({"simulate_options": {"save": ("a",)}}, r"`save` must be left to jl\.predict"),
     ],
 )
 def test_bad_arguments_are_named(options, message):

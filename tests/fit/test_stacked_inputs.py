@@ -43,19 +43,22 @@ def two_jumps(t):
     return jnp.where(t < 0.3, 1.0, jnp.where(t < 0.6, 0.0, -2.0))
 
 
-WAVES = [jl.Function(Wave(jnp.array(rate))) for rate in (3.0, 5.0)]
-TABLES = [jl.Linear([0.0, 1.0], [0.0, 1.0]), jl.Linear([0.0, 0.4, 1.0], [1.0, 2.0, 0.0])]
-JUMPS = [jl.Function(jump, knots=[0.5]), jl.Function(two_jumps, knots=[0.3, 0.6])]
+WAVES = [jl.TimeFunction(Wave(jnp.array(rate))) for rate in (3.0, 5.0)]
+TABLES = [
+    jl.LinearInterpolation([0.0, 1.0], [0.0, 1.0]),
+    jl.LinearInterpolation([0.0, 0.4, 1.0], [1.0, 2.0, 0.0]),
+]
+JUMPS = [jl.TimeFunction(jump, knots=[0.5]), jl.TimeFunction(two_jumps, knots=[0.3, 0.6])]
 ALIKE = {
-    "functions": [jl.Function(ramp), jl.Function(jnp.sin)],
+    "functions": [jl.TimeFunction(ramp), jl.TimeFunction(jnp.sin)],
     "modules of one class": WAVES,
     "functions, modules and constants": [
-        *(jl.Function(ramp), *WAVES, jl.Function(scaled)),
+        *(jl.TimeFunction(ramp), *WAVES, jl.TimeFunction(scaled)),
         *(jnp.array(2.0), jnp.array(3.0)),
     ],
-    "feedback": [jl.Feedback(held_back), jl.Function(ramp), jnp.array(2.0)],
+    "feedback": [jl.Feedback(held_back), jl.TimeFunction(ramp), jnp.array(2.0)],
     "tables": TABLES,
-    "knots": [*JUMPS, jl.Function(ramp), jnp.array(2.0)],
+    "knots": [*JUMPS, jl.TimeFunction(ramp), jnp.array(2.0)],
 }
 
 
@@ -84,11 +87,14 @@ def test_knots_that_an_experiment_lacks_lie_beyond_its_end():
     ("inputs", "message"),
     [
         (
-            [{"u": jl.Function(ramp)}, {"u": TABLES[0]}],
-            r"\['u'\] must be tables .* Function and Li",
+            [{"u": jl.TimeFunction(ramp)}, {"u": TABLES[0]}],
+            r"\['u'\]` must be tables .* LinearInterpolation and TimeF",
         ),
-        ([{"u": TABLES[0]}, {"u": jl.ZeroOrderHold(TS, TS)}], r"Linear and ZeroOrderHold"),
-        ([{"u": JUMPS[0]}, {"u": jl.Feedback(held_back)}], r"\['u'\] must be without knots"),
+        (
+            [{"u": TABLES[0]}, {"u": jl.ZeroOrderHold(TS, TS)}],
+            r"LinearInterpolation and ZeroOrderHold",
+        ),
+        ([{"u": JUMPS[0]}, {"u": jl.Feedback(held_back)}], r"\['u'\]` must be without knots"),
         ([{"u": TABLES[0]}, {}], r"names of the inputs must be the same .* \['u'\] or \[\]"),
     ],
 )
@@ -98,9 +104,9 @@ def test_what_no_batch_can_be_made_of_is_named(inputs, message):
 
 
 def test_shapes_that_differ_are_named():
-    row = stacked([{"u": jl.Function(ramp)}, {"u": jnp.ones(2)}], [1.0, 1.0])
+    row = stacked([{"u": jl.TimeFunction(ramp)}, {"u": jnp.ones(2)}], [1.0, 1.0])
     one = jax.tree.map(lambda x: x[0], row).at({"m": 1.5}, jnp.asarray(TS))
-    with pytest.raises(ValueError, match=r"inputs\['u'\] .* one shape .* had \[\(\), \(2,\)\]"):
+    with pytest.raises(ValueError, match=r"inputs\['u'\]` .* one shape .* had \[\(\), \(2,\)\]"):
         evaluate(one, jnp.array(0.5), jnp.ones(1), jnp.ones(1), {})
 
 
@@ -113,16 +119,16 @@ def recorded(signal):
 
 
 def test_a_fit_of_experiments_with_functions_of_their_own():
-    records = [recorded(x) for x in (*JUMPS, jl.Function(ramp))]
+    records = [recorded(x) for x in (*JUMPS, jl.TimeFunction(ramp))]
     found = jl.fit(SYSTEM, records, {"m": 1.0}, free=("m",))
     np.testing.assert_allclose(found.params["m"], 2.0, rtol=1e-8)
 
 
 def test_predictions_and_descents_with_feedback():
-    records = [recorded(x) for x in (jl.Feedback(held_back), jl.Function(jnp.sin))]
+    records = [recorded(x) for x in (jl.Feedback(held_back), jl.TimeFunction(jnp.sin))]
     np.testing.assert_allclose(jl.predict(SYSTEM, records, {"m": 2.0}).rms("x"), 0.0, atol=1e-8)
     descent = jl.Descent(optax.sgd(1e-6), epochs=2)
     with pytest.warns(UserWarning, match="take more epochs"):
-        found = jl.fit(SYSTEM, records, {"m": 2.1}, free=("m",), optimiser=descent)
+        found = jl.fit(SYSTEM, records, {"m": 2.1}, free=("m",), optimizer=descent)
     assert 2.0 < found.params["m"] < 2.1
     assert found.costs[1] < found.costs[0]

@@ -12,14 +12,14 @@ SPD = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [-0.1, 0.2, 1.0]])
 BODY = np.array([2.0, 0.2, -0.1, 0.4, 1.1, 1.3, 0.9, 0.05, -0.02, 0.03])
 CASES = {
     "free": (Free(), np.array([1.0, -2.0])),
-    "positive": (jl.Positive(), np.array([0.3, 40.0])),
-    "bounded": (jl.Bounded(-1.0, 3.0), np.array([-0.9, 2.5])),
-    "from below": (jl.Bounded(2.0, np.inf), np.array([2.1, 9.0])),
-    "from above": (jl.Bounded(-np.inf, 2.0), np.array([1.9, -9.0])),
-    "spd": (jl.SPD(), SPD),
-    "inertia": (jl.Inertia(), SPD),
-    "moments": (jl.Inertia(), np.array([1.0, 1.5, 2.0])),
-    "body": (jl.PseudoInertia(), BODY),
+    "positive": (jl.transforms.Positive(), np.array([0.3, 40.0])),
+    "bounded": (jl.transforms.Bounded(-1.0, 3.0), np.array([-0.9, 2.5])),
+    "from below": (jl.transforms.Bounded(2.0, np.inf), np.array([2.1, 9.0])),
+    "from above": (jl.transforms.Bounded(-np.inf, 2.0), np.array([1.9, -9.0])),
+    "spd": (jl.transforms.SPD(), SPD),
+    "inertia": (jl.transforms.Inertia(), SPD),
+    "moments": (jl.transforms.Inertia(), np.array([1.0, 1.5, 2.0])),
+    "body": (jl.transforms.PseudoInertia(), BODY),
 }
 
 
@@ -60,14 +60,18 @@ def test_whatever_the_unknowns_the_value_is_valid(name):
 @pytest.mark.parametrize(
     ("transform", "value", "message"),
     [
-        (jl.Positive(), 0.0, r"params0\['x'\] must be positive"),
-        (jl.Bounded(0.0, 1.0), 1.5, r"lie between its bounds 0 and 1, but it was 1\.5"),
-        (jl.SPD(), np.diag([1.0, -1.0]), r"positive definite, but its smallest eigenvalue was -1"),
-        (jl.SPD(), np.ones(3), r"symmetric matrix, but its shape was \(3,\)"),
-        (jl.Inertia(), np.array([1.0, 1.0, 3.0]), r"triangle inequalities"),
-        (jl.Inertia(), np.ones(4), r"three principal moments"),
-        (jl.PseudoInertia(), np.ones(9), r"ten numbers"),
-        (jl.PseudoInertia(), np.ones(10), r"positive density"),
+        (jl.transforms.Positive(), 0.0, r"`params0\['x'\]` must be positive"),
+        (jl.transforms.Bounded(0.0, 1.0), 1.5, r"lie between its bounds 0 and 1, but it was 1\.5"),
+        (
+            jl.transforms.SPD(),
+            np.diag([1.0, -1.0]),
+            r"positive definite, but its smallest eigenvalue was -1",
+        ),
+        (jl.transforms.SPD(), np.ones(3), r"symmetric matrix, but its shape was \(3,\)"),
+        (jl.transforms.Inertia(), np.array([1.0, 1.0, 3.0]), r"triangle inequalities"),
+        (jl.transforms.Inertia(), np.ones(4), r"three principal moments"),
+        (jl.transforms.PseudoInertia(), np.ones(9), r"ten numbers"),
+        (jl.transforms.PseudoInertia(), np.ones(10), r"positive density"),
     ],
 )
 def test_an_invalid_start_is_named(transform, value, message):
@@ -84,17 +88,17 @@ def test_an_invalid_start_is_named(transform, value, message):
 )
 def test_crossed_bounds_are_named(lower, upper, message):
     with pytest.raises(ValueError, match=message):
-        jl.Bounded(lower, upper)
+        jl.transforms.Bounded(lower, upper)
 
 
 def test_a_start_on_a_bound_stays_there():
-    u, on_bound = jl.Bounded(0.0, 2.0).start("x", 0.0)
+    u, on_bound = jl.transforms.Bounded(0.0, 2.0).start("x", 0.0)
     assert on_bound
     assert u.tolist() == [0.0]
 
 
 def test_beyond_a_bound_the_value_is_on_it_and_the_derivative_leads_back():
-    bounded = jl.Bounded(0.0, 2.0)
+    bounded = jl.transforms.Bounded(0.0, 2.0)
     value, slope = jax.value_and_grad(lambda u: bounded.value(u, (3,))[0])(jnp.array([-1.0, 0, 3]))
     assert value == 0.0
     assert slope.tolist() == [1.0, 0.0, 0.0]

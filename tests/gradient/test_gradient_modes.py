@@ -45,7 +45,7 @@ class Case:
         if quasi is None:
             self.x["v0"] = v0
         else:
-            self.x["u0"] = self.system.quasi_velocities(params, q0, v0, 0.1)
+            self.x["u0"] = self.system.quasi_velocities(q0, v0, params, t=0.1)
         self.dx = direction(self.x)
         if quasi is not None:
             free = np.zeros(len(quasi.names))
@@ -65,10 +65,10 @@ class Case:
             throw=False,
             max_steps=2048,
             method=self.method,
-            **x,
+            **({"v0": None} | x),
         )
         found = jnp.concatenate([motion.q[-1], motion.v[-1], motion.q[1]])
-        return jnp.where(motion.status == 0, found, jnp.nan), motion.stats["gradient"]
+        return jnp.where(motion.status == 0, found, jnp.nan), motion.gradient_mode
 
     @property
     def weights(self):
@@ -167,7 +167,7 @@ def test_points_are_thinned_out_on_long_motions():
             gradient=mode,
             max_steps=max_steps,
         )
-        return motion.q[-1, 0] + motion.q[1, 0], motion.stats["gradient"]
+        return motion.q[-1, 0] + motion.q[1, 0], motion.gradient_mode
 
     found = {}
     for mode, max_steps in (("recorded", 320), ("checkpoints", 320), ("auto", 32768)):
@@ -253,26 +253,26 @@ def test_memory_decides():
     [
         (
             {"gradient": "recorded", "gradient_memory": 150_000},
-            r"gradient_memory must be at least \d+ bytes for gradient='recorded' and "
+            r"`gradient_memory` must be at least \d+ bytes for gradient='recorded' and "
             r"max_steps=16384, but it was 150000. Use gradient='checkpoints' \(\d+ bytes\) or "
             r"'forward' \(131072 bytes\).",
         ),
         (
             {"gradient": "checkpoints", "gradient_memory": 1000},
-            r"gradient_memory must be at least \d+ bytes .* but it was 1000. Lower max_steps.",
+            r"`gradient_memory` must be at least \d+ bytes .* but it was 1000. Lower max_steps.",
         ),
         (
             {"gradient_memory": 1000},
-            "gradient_memory must be at least 131072 bytes for max_steps=16384, but it was 1000. "
+            "`gradient_memory` must be at least 131072 bytes for max_steps=16384, but it was 1000. "
             "Lower max_steps.",
         ),
         (
             {"gradient_memory": -1},
-            "gradient_memory must be a positive number of bytes or None, but it was -1.",
+            "`gradient_memory` must be a positive number of bytes or None, but it was -1.",
         ),
         (
             {"gradient_memory": 1e9, "method": diffrax.LeapfrogMidpoint(), "dt": 0.1},
-            "gradient_memory must be left out for LeapfrogMidpoint, which keeps every step",
+            "`gradient_memory` must be left out for LeapfrogMidpoint, which keeps every step",
         ),
     ],
 )
@@ -287,7 +287,7 @@ def test_memory_counts_the_terms_of_work():
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(push,))
     solve = partial(jl.simulate, system, [0.0], [1.0], [0.0, 1.0], gradient="recorded")
     assert solve(gradient_memory=400_000).status == jl.Status.ok
-    with pytest.raises(ValueError, match="gradient_memory must be at least 524336 bytes"):
+    with pytest.raises(ValueError, match="`gradient_memory` must be at least 524336 bytes"):
         solve(gradient_memory=400_000, save=("work",))
 
 

@@ -137,7 +137,7 @@ def variational(motion: Motion, dx):
     @jax.jit
     def rate(t, y, dy):
         def field(y, params):
-            a = motion.system.acceleration(params, y[:n], y[n:], t, motion.inputs)
+            a = motion.system.acceleration(y[:n], y[n:], params, t=t, inputs=motion.inputs)
             return jnp.concatenate([y[n:], a])
 
         params = jax.tree.map(jnp.asarray, motion.params)
@@ -199,7 +199,7 @@ def test_rows_move_with_their_own_time():
         """The row at `at` under a force 5 t / knot, up to the knot."""
         force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
         system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
-        table = jl.Linear(jnp.stack([0.0, knot, 1.0]), jnp.array([0.0, 5.0, 1.0]))
+        table = jl.LinearInterpolation(jnp.stack([0.0, knot, 1.0]), jnp.array([0.0, 5.0, 1.0]))
         ts = jnp.stack([0.0, at, 1.0])
         return jl.simulate(system, [0.0], [0.0], ts, inputs={"u": table}).q[1, 0]
 
@@ -214,7 +214,7 @@ def test_dependence_on_the_start_under_a_table(mode):
     from in between."""
     force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
-    table = jl.Linear([0.0, 1.0, 2.0, 3.0], [1.0, 3.0, 5.0, 7.0])
+    table = jl.LinearInterpolation([0.0, 1.0, 2.0, 3.0], [1.0, 3.0, 5.0, 7.0])
 
     def end(t0):
         ts = jnp.stack([t0, 2.5])

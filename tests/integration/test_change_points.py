@@ -112,7 +112,7 @@ def test_the_row_is_named():
 
 
 def test_another_word_is_an_error():
-    with pytest.raises(ValueError, match=r"change_points must be one of 'pass', 'stop'.*'go'"):
+    with pytest.raises(ValueError, match=r"`change_points` must be one of 'pass', 'stop'.*'go'"):
         moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="go")
 
 
@@ -284,11 +284,11 @@ def test_all_forms_pass(lowering, formulation, method):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("project", [False, jl.Baumgarte(5.0, 5.0)])
-def test_without_a_projection_it_stops(project):
+@pytest.mark.parametrize("stabilization", [None, jl.Baumgarte(5.0, 5.0)])
+def test_without_a_projection_it_stops(stabilization):
     """Beyond the place nothing would move the state back to the way that it came on."""
     for rtol in (1e-6, 1e-9, 1e-12):
-        found = moved(jnp.ones(()), [0.0, 1.0], rtol, project=project)
+        found = moved(jnp.ones(()), [0.0, 1.0], rtol, stabilization=stabilization)
         assert found.status == jl.Status.rank_change
         assert abs(found.last_time - 0.7084487865) < 1e-6
 

@@ -111,7 +111,7 @@ def test_rows_cost_no_steps(reference):
     assert many.stats["rejected"] == few.stats["rejected"]
     np.testing.assert_array_equal(many.last_state[0], many.q[-1])
     # Two programs, which round in two ways: 1.2e-14, below what the motion makes of roundings.
-    growth, steps = jl.grad_growth(many), int(many.stats["accepted"])
+    growth, steps = jl.lyapunov(many), int(many.stats["accepted"])
     floor = np.finfo(float).eps * float(growth.kappa[-1]) * np.sqrt(steps)
     np.testing.assert_allclose(many.q[-1], few.q[-1], rtol=floor)
 
@@ -201,7 +201,7 @@ def test_linear_input_is_exact():
     times = jnp.array([0.0, 0.3, 0.5, 1.2])
     values = jnp.array([1.0, -2.0, 0.5, 3.0])
     ts = np.linspace(0.0, 1.2, 25)
-    motion = torque_motion(jl.Linear(times, values), ts)
+    motion = torque_motion(jl.LinearInterpolation(times, values), ts)
 
     def twice_integrated(t):
         theta, rate = 0.1, 0.2

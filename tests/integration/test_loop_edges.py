@@ -13,7 +13,7 @@ import jaxlag as jl
 EPS = np.finfo(float).eps
 
 
-KINDS = {"hold": jl.ZeroOrderHold, "line": jl.Linear}
+KINDS = {"hold": jl.ZeroOrderHold, "line": jl.LinearInterpolation}
 
 
 def closed_form(kind, times, values, ts, start=(0.1, 0.2)):
@@ -147,7 +147,7 @@ def test_traced_tables_out_of_order_are_bad_values(times):
 
     @jax.jit
     def status(times):
-        return moved(jl.Linear(times, jnp.ones(4)), [0.0, 1.0]).status
+        return moved(jl.LinearInterpolation(times, jnp.ones(4)), [0.0, 1.0]).status
 
     assert status(jnp.array([0.0, 0.3, 0.7, 1.0])) == jl.Status.ok
     assert status(jnp.array(times)) == jl.Status.bad_value
@@ -162,7 +162,7 @@ def test_rows_far_from_the_origin_of_time_stay_apart(options):
     start = 1.7e9
     steps = np.array([0.0, 5e-7, 1e-6, 3e-6, 1e-2, 1e-2 + 1e-6, 1.0])
     ts = start + steps
-    table = jl.Linear([start, start + 0.5, start + 1.0], [0.0, 0.0, 0.0])
+    table = jl.LinearInterpolation([start, start + 0.5, start + 1.0], [0.0, 0.0, 0.0])
     motion = moved(table, ts, **options)
     np.testing.assert_allclose(motion.q[:, 0], 0.1 + 0.2 * (ts - ts[0]), rtol=0, atol=8 * EPS)
     assert np.all(np.diff(motion.q[:, 0]) > 0)
@@ -180,7 +180,7 @@ def test_a_row_in_the_last_step_of_a_full_record(options):
     ts = np.array([0.0, (count - 0.5) * h, count * h])
 
     def x(k):
-        table = jl.Linear([0.0, 10.0], [0.3, 0.0])
+        table = jl.LinearInterpolation([0.0, 10.0], [0.3, 0.0])
         motion = moved(table, ts, params={"k": k}, method="dopri5", dt=h, **options)
         return motion.q[1, 0] + motion.q[2, 0], motion.stats["accepted"]
 
@@ -195,7 +195,7 @@ def test_times_that_differ_less_than_they_do_from_the_start():
     """Two knots, and two rows, whose distance from ts[0] is the same number."""
     pair = [0.5, np.nextafter(0.5, 1)]
     assert pair[0] + 10.0 == pair[1] + 10.0
-    jump = jl.Linear([-10.0, *pair, 2.0], [0.0, 0.0, 1.0, 1.0])
+    jump = jl.LinearInterpolation([-10.0, *pair, 2.0], [0.0, 0.0, 1.0, 1.0])
     motion = moved(jump, [-10.0, *pair, 1.0], dt=0.25)
     assert motion.status == jl.Status.ok
     x, v = 0.1 + 0.2 * 10.5, 0.2
@@ -208,7 +208,7 @@ def test_times_that_differ_less_than_they_do_from_the_start():
 def test_no_time_beyond_the_last_is_read(ts, options):
     """t0 + (t1 - t0) may be more than t1, where this force has no value."""
     sense, end = np.sign(ts[1] - ts[0]), ts[1]
-    falling = jl.Function(lambda t: jnp.sqrt(sense * (end - t)))
+    falling = jl.TimeFunction(lambda t: jnp.sqrt(sense * (end - t)))
     for of in (lambda f: f, jax.jit):
         motion = of(lambda ts: moved(falling, ts, **options))(jnp.array(ts))
         assert motion.status == jl.Status.ok
@@ -254,7 +254,7 @@ def test_a_stiff_motion_backwards_in_time_is_recognised():
 def test_tables_far_from_the_origin_are_read_to_the_last_digit(method):
     """A slope of 1e9 N/s over a millisecond, seconds since 1901."""
     start, length = 2.0**31, 2.0**-10
-    table = jl.Linear([start, start + length], [0.0, 1e6])
+    table = jl.LinearInterpolation([start, start + length], [0.0, 1e6])
     motion = moved(table, [start, start + length], method=method, dt=1e-6, max_steps=2000)
     np.testing.assert_allclose(motion.v[-1, 0], 0.2 + 0.5e6 * length, rtol=1e-12)
 
@@ -271,7 +271,7 @@ def test_the_gradient_in_a_table_takes_the_same_for_each_step():
     size = 777
 
     def end(values):
-        table = jl.Linear(jnp.linspace(0.0, 1.0, size), values)
+        table = jl.LinearInterpolation(jnp.linspace(0.0, 1.0, size), values)
         return moved(table, [0.0, 0.5, 1.0]).q[-1, 0]
 
     program = loop(operations(jax.grad(end), jnp.zeros(size), turns=1))

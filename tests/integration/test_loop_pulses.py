@@ -32,7 +32,7 @@ def pulse(t):
 def test_a_pulse_that_is_named_is_met(options, sense):
     """x' = 1 after a pulse of 1 ms, to rounding: no stage reads the wrong side of its edges."""
     ts = np.array([0.0, 10.0])[:: int(sense)]
-    motion = kicked(jl.Function(pulse, knots=[START, END]), ts, **options)
+    motion = kicked(jl.TimeFunction(pulse, knots=[START, END]), ts, **options)
     np.testing.assert_allclose(motion.v[-1, 0], sense, rtol=1e-12)
     way = 10.0 - 0.5 * (START + END) if sense > 0 else 0.5 * (START + END)
     np.testing.assert_allclose(motion.q[-1, 0], way, rtol=1e-12)
@@ -43,7 +43,7 @@ def test_a_pulse_moves_with_its_knots():
 
     @jax.jit
     def end(start):
-        signal = jl.Function(
+        signal = jl.TimeFunction(
             lambda t, params: jnp.where((t >= params["s"]) & (t < params["s"] + 0.5), 2.0, 0.0),
             knots=jnp.stack([start, start + 0.5]),
         )
@@ -66,7 +66,7 @@ def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
 
     @jax.jit
     def end(knot, stop):
-        signal = jl.Function(
+        signal = jl.TimeFunction(
             lambda t, params: jnp.where(t < params["s"], jnp.sin(5 * t), jnp.cos(3 * t)),
             knots=knot[None],
         )
@@ -94,7 +94,7 @@ def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
 @pytest.mark.parametrize("derivatives", [False, True])
 def test_a_row_where_the_force_is_singular_is_none(derivatives):
     """A spike that steps pass by and the step to a row meets: nothing is made up there."""
-    spike = jl.Function(lambda t: jnp.where(jnp.abs(t - 0.5) < 1e-9, 1e6, 0.0))
+    spike = jl.TimeFunction(lambda t: jnp.where(jnp.abs(t - 0.5) < 1e-9, 1e6, 0.0))
     ts = np.array([0.0, 0.5, 1.0])
 
     def rows(x0):
@@ -112,7 +112,7 @@ def test_a_row_where_the_force_is_singular_is_none(derivatives):
 
 def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
     """Stepped over without a word of it; met by steps no longer than itself."""
-    wide = jl.Function(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
+    wide = jl.TimeFunction(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
     ts = np.array([0.0, 10.0])
     assert kicked(wide, ts, dt0=5.0, method="tsit5").v[-1, 0] < 0.5
     found = kicked(wide, ts, dt_max=0.1, method="tsit5")

@@ -24,10 +24,10 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 def test_equations_are_those_of_lagrange(lagrangian, written_in):
     """a from u' and v = B u + c is a from M a + h = Q, at random states."""
     system = declared(lagrangian, written_in)
-    found = jax.jit(lambda *z: system.quasi_reactions(PARAMS, *z)["a"])
-    expected = jax.jit(lambda *z: system.acceleration(PARAMS, *z))
+    found = jax.jit(lambda q, v, t: system._quasi_reactions(q, v, PARAMS, t=t)["a"])
+    expected = jax.jit(lambda q, v, t: system.acceleration(q, v, PARAMS, t=t))
     theta = jax.jit(lambda t, q: jax.jacfwd(lambda v: skewed(t, q, v, PARAMS))(q))
-    mass = jax.jit(lambda *z: system.mass_matrix(PARAMS, *z))
+    mass = jax.jit(lambda q, v, t: system.mass_matrix(q, v, PARAMS, t=t))
     for t, q, v in random_states():
         kappa = cond(theta(t, q)) ** 2 * cond(mass(q, v, t))
         a, right = found(q, v, t), expected(q, v, t)
@@ -45,18 +45,18 @@ def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
     system = declared(lagrangian, written_in, tuple(constrained))
     bound = [NAMES.index(name) for name in constrained]
     for t, q, v in random_states(3):
-        u = np.array(system.quasi_velocities(PARAMS, q, v, t))
+        u = np.array(system.quasi_velocities(q, v, PARAMS, t=t))
         u[bound] = 0.0
-        v = system.velocities(PARAMS, q, u, t)
-        found = system.quasi_reactions(PARAMS, q, v, t)
-        a, lam = system.acceleration(PARAMS, q, v, t), system.multipliers(PARAMS, q, v, t)
+        v = system.velocities(q, u, PARAMS, t=t)
+        found = system._quasi_reactions(q, v, PARAMS, t=t)
+        a, lam = system.acceleration(q, v, PARAMS, t=t), system.multipliers(q, v, PARAMS, t=t)
         scale = 1.0 + norm(a) + max(abs(x) for x in lam.values())
         # Measured worst 2026-11-22: 2e-14 of the scale.
         assert norm(found["a"] - a) <= 1e-12 * scale
-        assert set(found["lam"]) == set(lam) == set(constrained)
+        assert set(found["multipliers"]) == set(lam) == set(constrained)
         for name, value in lam.items():
-            assert abs(found["lam"][name] - value) <= 1e-12 * scale
-        force = system.constraint_force(PARAMS, q, v, t)
+            assert abs(found["multipliers"][name] - value) <= 1e-12 * scale
+        force = system.constraint_force(q, v, PARAMS, t=t)
         assert norm(found["constraint_force"] - force) <= 1e-12 * scale
 
 
@@ -66,7 +66,7 @@ def test_one_motion_by_both_formulations(lagrangian, backwards):
     """q, v, u to 1e-10, lam to 1e-9, with explicit time, an affine U and a force."""
     system = declared(lagrangian, "v" if lagrangian is in_v else "u", ("b",))
     ts = np.linspace(0.2, 1.5, 4)[:: -1 if backwards else 1]
-    start = {"q0": [0.3, -0.2, 0.5], "u0": {"a": 0.7, "c": -0.4}}
+    start = {"q0": [0.3, -0.2, 0.5], "v0": None, "u0": {"a": 0.7, "c": -0.4}}
     one, other = (
         jl.simulate(system, ts=ts, params=PARAMS, formulation=f, **start, **TIGHT)
         for f in ("quasi", "multipliers")
@@ -110,7 +110,7 @@ def test_the_direction_of_time_may_be_traced():
     @jax.jit
     def end(ts):
         motion = jl.simulate(
-            system, [0.3, -0.2, 0.5], u0=[0.7, 0.0, -0.4], ts=ts, params=PARAMS, **TIGHT
+            system, [0.3, -0.2, 0.5], None, u0=[0.7, 0.0, -0.4], ts=ts, params=PARAMS, **TIGHT
         )
         return motion.q[-1], motion.v[-1]
 
@@ -128,6 +128,7 @@ def end_of(system, formulation="quasi", **options):
         motion = jl.simulate(
             system,
             x["q0"],
+            None,
             u0=x["u0"],
             ts=jnp.array([0.0, 0.5, 1.0]),
             params=params,
@@ -187,6 +188,7 @@ def test_lanes_equal_single_runs():
         motion = jl.simulate(
             system,
             X["q0"],
+            None,
             u0={"a": a, "c": -0.4},
             ts=jnp.array([0.0, 1.0]),
             params=PARAMS,
@@ -220,8 +222,14 @@ def test_save_equals_on_demand_and_the_books_close():
         "thrust": jl.ZeroOrderHold(jnp.array([0.0, 0.4, 2.0]), jnp.array([1.0, -0.5, 0.0])),
         "brake": jl.Feedback(brake),
     }
-    names = ("a", "lam", "u", "constraint_force", "energy")
-    arguments = {"u0": X["u0"], "ts": np.linspace(0.0, 1.0, 3), "params": PARAMS, "inputs": inputs}
+    names = ("a", "multipliers", "u", "constraint_force", "energy")
+    arguments = {
+        "v0": None,
+        "u0": X["u0"],
+        "ts": np.linspace(0.0, 1.0, 3),
+        "params": PARAMS,
+        "inputs": inputs,
+    }
     motion = jl.simulate(system, X["q0"], save=(*names, "work"), **arguments, **TIGHT)
     other = jl.simulate(system, X["q0"], formulation="multipliers", **arguments, **TIGHT)
     for name in names:
@@ -250,6 +258,8 @@ def test_a_lagrangian_with_a_loop():
     ends = []
     for lagrangian in (looped, plain):
         system = declared(lagrangian, "v", ("b",), forces=())
-        motion = jl.simulate(system, X["q0"], u0=X["u0"], ts=[0.0, 1.0], params=PARAMS, **TIGHT)
+        motion = jl.simulate(
+            system, X["q0"], None, u0=X["u0"], ts=[0.0, 1.0], params=PARAMS, **TIGHT
+        )
         ends.append(np.concatenate([motion.q[-1], motion.u[-1], [motion.lam["b"][-1]]]))
     np.testing.assert_allclose(*ends, atol=1e-10)

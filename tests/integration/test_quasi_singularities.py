@@ -123,7 +123,7 @@ def test_auto_goes_on_with_multipliers_and_says_so():
     ts, steps = np.array([0.0, 1.0, 3.0]), {"method": "dopri5", "dt": 0.05}
     at = singular_at(Q0[1], V0[1])
     u0 = {"a": np.cos(Q0[1]) * V0[0], "b": V0[1]}
-    motion = jl.simulate(CROSSING, Q0, u0=u0, ts=ts, save=("u",), **steps)
+    motion = jl.simulate(CROSSING, Q0, None, u0=u0, ts=ts, save=("u",), **steps)
     assert motion.formulation == "multipliers"
     assert f"dU/dv is singular at t = {0.05 * (at // 0.05 - 1):.6g} ('a')" in motion.message()
     assert "formulation   by multipliers" in motion.explain()

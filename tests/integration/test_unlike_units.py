@@ -26,8 +26,8 @@ def test_a_contradiction_is_told_beside_large_numbers():
     """The accelerations that two rows ask of y are 2e-5 apart, that of z is 1000."""
     system = jl.System(falling, ("x", "y", "z"), constraints=(jl.Holonomic(bending, "rows"),))
     state = [1.0, 1e-5, 0.0], [1.0, 1e-5, 0.0]
-    assert np.all(np.isnan(system.acceleration(1.0, *state)))
-    np.testing.assert_allclose(system.acceleration(0.0, *state), [0.0, 0.0, -1000.0], atol=1e-12)
+    assert np.all(np.isnan(system.acceleration(*state, 1.0)))
+    np.testing.assert_allclose(system.acceleration(*state, 0.0), [0.0, 0.0, -1000.0], atol=1e-12)
 
 
 def pressed(t, q, v, params):
@@ -44,7 +44,7 @@ def led(t, q, params):
 def test_what_rows_hold_still_has_an_acceleration():
     """Forces of 1e4 in units of inertia leave accelerations their rounding, no contradiction."""
     system = jl.System(pressed, ("x", "y", "z"), constraints=(jl.Holonomic(led, "rows"),))
-    at_rest = None, np.zeros(3), np.zeros(3)
+    at_rest = np.zeros(3), np.zeros(3)
     units = np.array([1.0, 1e9, 1e-9]) ** -0.5
     a = np.asarray(system.acceleration(*at_rest))
     # Measured 2026-11-26: 2e-16 of the forces 0.3 / 1e-9^(1/2), three orders within the bound.
@@ -90,13 +90,13 @@ def test_kinematics_of_unlike_units():
     units, speeds = np.array([1e5, 1e-6]), np.array([1.0, 1e-6])
     x, y = np.array([0.4, 0.1]), np.array([0.3, -0.7])
     q, u = x * units, y * speeds
-    right, v = plainly(x, y), system.velocities(None, q, u)
-    np.testing.assert_allclose(system.quasi_velocities(None, q, v), u, rtol=1e-14)
+    right, v = plainly(x, y), system.velocities(q, u)
+    np.testing.assert_allclose(system.quasi_velocities(q, v), u, rtol=1e-14)
     # As a function of v, by multipliers, and in u.
-    state = None, q, v
-    for a in (system.acceleration(*state), system.quasi_reactions(*state)["a"]):
+    state = q, v
+    for a in (system.acceleration(*state), system._quasi_reactions(*state)["a"]):
         np.testing.assert_allclose(a / units, right, rtol=1e-13)
-    scalars = ScalarTerms(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system.in_u), None)
+    scalars = ScalarTerms(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system._in_u), None)
     given = jnp.asarray(q), None, {}
     rates = scalars.rates(
         jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.precompute(*given)
@@ -117,6 +117,7 @@ def test_motions_of_unlike_units():
         jl.simulate(
             jl.System(swinging, ("x", "y"), quasi=quasi, written_in="u", lowering=lowering),
             [0.4e5, 0.1e-6],
+            None,
             ts=[0.0, 0.5],
             u0=[0.3, -0.7e-6],
             atol=1e-15,
@@ -241,5 +242,5 @@ def test_quasi_velocities_may_read_arrays_from_outside():
 
     system = jl.System(energy, ("x", "y"), quasi=jl.QuasiVelocities(U, ("a", "b"), ("b",)))
     np.testing.assert_allclose(
-        system.velocities(None, [0.0, 0.0], {"a": 1.0}), np.array([0.25, -2.0]) / 2.125
+        system.velocities([0.0, 0.0], {"a": 1.0}), np.array([0.25, -2.0]) / 2.125
     )

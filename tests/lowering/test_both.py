@@ -16,7 +16,7 @@ PARAMS = dict(DOUBLE.example.params)
 @jax.jit
 def acceleration(q, v):
     """Compiled at module level, as a test may have it."""
-    return DOUBLE.system.acceleration(PARAMS, q, v)
+    return DOUBLE.system.acceleration(q, v, PARAMS)
 
 
 @pytest.mark.parametrize("turn", [1, 2])
@@ -41,4 +41,4 @@ def test_only_systems_left_at_auto_follow(lowering):
     kinds = {"auto": ArrayTerms if lowering == "array" else ScalarTerms}
     for chosen, kind in (kinds | {"scalar": ScalarTerms, "array": ArrayTerms}).items():
         system = jl.System(DOUBLE.system.lagrangian, ("a", "b"), lowering=chosen)
-        assert type(system.terms) is kind
+        assert type(system._terms) is kind

@@ -70,7 +70,7 @@ def test_the_reason_reaches_the_user_and_the_array_program_takes_over():
 
     system = jl.System(lagrangian, ("x", "y"))
     assert re.search(r"array program.*sort.*test_probes\.py", system.explain(None))
-    a = system.acceleration(None, [0.3, -0.2], [0.0, 0.0])
+    a = system.acceleration([0.3, -0.2], [0.0, 0.0])
     np.testing.assert_array_equal(a, [0.0, -1.0])
 
 

@@ -17,6 +17,7 @@ from _jaxprs import count, loop, names, operations
 from _programs import PACKING, SCALAR, STEP, Case, case, evaluation, solve
 
 import jaxlag as jl
+from jaxlag._system._inspection import mass_definite
 from systems._catalogue import ENTRIES
 
 STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
@@ -88,9 +89,9 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
     """Every row costs one division where M is known to be regular."""
     whole = case(name)
     start, known = (whole.q0, jnp.zeros_like(whole.q0)), dict(ENTRIES[name].example.params)
-    assert whole.system.mass_regular(known, 0.0, *start)
+    assert mass_definite(whole.system, known, 0.0, *start)
     traced = []  # where the state is traced, it is looked at elsewhere
-    jax.eval_shape(lambda *z: traced.append(whole.system.mass_regular(known, 0.0, *z)), *start)
+    jax.eval_shape(lambda *z: traced.append(mass_definite(whole.system, known, 0.0, *z)), *start)
     assert traced == [True]
     program = evaluation(whole, regular=True)
     functions, divisions = CONSTRAINED[name]
@@ -104,7 +105,7 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
 def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
     """The other one is not read: it is poisoned."""
     system, params, q, _ = case("double_pendulum_cartesian")
-    terms, given = system.terms, (jnp.zeros(()), q, 0.1 * q, params, {})
+    terms, given = system._terms, (jnp.zeros(()), q, 0.1 * q, params, {})
     longer, shorter = (x.precompute(q, params, {}) for x in (terms, terms.regular()))
     expected = terms.acceleration(*given, longer)
     poison = lambda unread: jax.tree.map(lambda x: jnp.nan * x, unread)  # noqa: E731
@@ -119,8 +120,8 @@ def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(defin
 def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     """No multipliers, no matrix, and no division but by what may vanish: cos(theta), 1 + y^2."""
     system, params, q, _ = case(name)
-    array = replace(system.terms.array, quasi=system.quasi, in_u=system.in_u)
-    terms = replace(system.terms, array=array)
+    array = replace(system._terms.array, quasi=system.quasi, in_u=system._in_u)
+    terms = replace(system._terms, array=array)
     constants = terms.precompute(q, params, {})
     u = jnp.zeros(len(system.quasi.free))
 
@@ -148,7 +149,7 @@ def test_a_step_in_quasi_velocities_has_no_constraint(name):
 
     def end(params, q0, u0):
         motion = jl.simulate(
-            system, q0, u0=u0, ts=jnp.array([0.0, 1.0]), params=params, throw=False
+            system, q0, None, u0=u0, ts=jnp.array([0.0, 1.0]), params=params, throw=False
         )
         return motion.q[-1]
 

@@ -16,13 +16,13 @@ PAIR = ("x", "y")
 
 
 def structure(lagrangian, params=None, coordinates=PAIR):
-    return jl.System(lagrangian, coordinates).structure(params, jnp.float64)
+    return jl.System(lagrangian, coordinates)._structure(params, jnp.float64)
 
 
 def of(name):
     if name in ENTRIES:
-        return ENTRIES[name].system.structure(dict(ENTRIES[name].example.params), jnp.float64)
-    return GENERAL[name].system.structure(GENERAL[name].params, jnp.float64)
+        return ENTRIES[name].system._structure(dict(ENTRIES[name].example.params), jnp.float64)
+    return GENERAL[name].system._structure(GENERAL[name].params, jnp.float64)
 
 
 # ---- What depends on what ------------------------------------------------------------------------
@@ -89,8 +89,8 @@ def test_nothing_unlisted_moves_a_term(name):
 
     @jax.jit
     def terms(t, q, v):
-        M = system.mass_matrix(params, q, v, t)
-        return {"mass": M, "bias": system.bias(params, q, v, t)}
+        M = system.mass_matrix(q, v, params, t=t)
+        return {"mass": M, "bias": system.bias(q, v, params, t=t)}
 
     here = terms(**state)
     for argument, value in state.items():
@@ -299,20 +299,20 @@ def test_structure_is_traced_once_per_kind_of_params():
         return 0.5 * params["m"] * v @ v
 
     system = jl.System(lagrangian, PAIR)
-    system.structure({"m": 1.0}, jnp.float64)
+    system._structure({"m": 1.0}, jnp.float64)
     first = len(traces)
-    system.structure({"m": 7.0}, jnp.float64)
-    jl.System(lagrangian, PAIR).structure({"m": 3.0}, jnp.float64)
+    system._structure({"m": 7.0}, jnp.float64)
+    jl.System(lagrangian, PAIR)._structure({"m": 3.0}, jnp.float64)
     assert len(traces) == first > 0
-    system.structure({"m": 2}, jnp.float64)  # static: another program
+    system._structure({"m": 2}, jnp.float64)  # static: another program
     assert len(traces) > first
 
 
 def test_python_numbers_take_the_precision_of_the_state():
     """Weakly typed in the structure as in the program: no promotion that strict JAX refuses."""
     system = jl.System(lambda t, q, v, params: 0.5 * params["m"] * v @ v, PAIR)
-    assert system.structure({"m": 2.0}, jnp.float32).quadratic
-    M = system.mass_matrix({"m": 2.0}, np.zeros(2, np.float32))
+    assert system._structure({"m": 2.0}, jnp.float32).quadratic
+    M = system.mass_matrix(np.zeros(2, np.float32), params={"m": 2.0})
     np.testing.assert_array_equal(M, 2 * np.eye(2, dtype=np.float32))
     assert M.dtype == jnp.float32
 
@@ -380,6 +380,6 @@ def test_explain_says_that_a_constant_mass_matrix_is_factored_once():
 def test_explain_refuses_what_is_no_lagrangian():
     system = jl.System(lambda t, q, v, params: 0.5 * v**2, PAIR)
     with pytest.raises(
-        ValueError, match=r"^lagrangian must return a real scalar, but it returned "
+        ValueError, match=r"^`lagrangian` must return a real scalar, but it returned "
     ):
         system.explain(None)

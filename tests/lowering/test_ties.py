@@ -41,7 +41,7 @@ def accelerations(reduced, lowering):
         return 0.5 * v @ v - reduced(q)
 
     system = jl.System(lagrangian, ("a", "b", "c", "d"), lowering=lowering)
-    return lambda q: system.acceleration(None, q, jnp.zeros(4))
+    return lambda q: system.acceleration(q, jnp.zeros(4))
 
 
 PLAIN = {"max", "axis 0", "nested", "the same twice", "constants", "cummin", "scatter"}

@@ -67,19 +67,19 @@ def test_equal_tables_are_one_key():
 @pytest.mark.parametrize(
     ("declared", "message"),
     [
-        ((), "coordinates must name at least one coordinate, but it was empty. Write"),
-        ({}, "coordinates must name at least one coordinate, but it was empty."),
-        ("theta", "coordinates must be names, or names with shapes, but it was 'theta'. Write"),
-        (2, "coordinates must be names, or names with shapes, but it was 2."),
-        ({"x", "y"}, "coordinates must be names, or names with shapes, but it was {"),
-        (("x", ""), "coordinates must be non-empty strings, but one was ''."),
-        (("x", 3), "coordinates must be non-empty strings, but one was 3."),
-        (("x", "y", "x"), "coordinates must be distinct, but 'x' occurs 2 times."),
-        ({"x": -3}, "coordinates['x'] must be a tuple of sizes, but it was -3."),
-        ({"x": [3]}, "coordinates['x'] must be a tuple of sizes, but it was [3]."),
-        ({"x": (3, 0)}, "coordinates['x'] must be a tuple of sizes, but it was (3, 0)."),
-        ({"x": (-1,)}, "coordinates['x'] must be a tuple of sizes, but it was (-1,)."),
-        ({"x": (2.0,)}, "coordinates['x'] must be a tuple of sizes, but it was (2.0,)."),
+        ((), "`coordinates` must name at least one coordinate, but it was empty. Write"),
+        ({}, "`coordinates` must name at least one coordinate, but it was empty."),
+        ("theta", "`coordinates` must be names, or names with shapes, but it was 'theta'. Write"),
+        (2, "`coordinates` must be names, or names with shapes, but it was 2."),
+        ({"x", "y"}, "`coordinates` must be names, or names with shapes, but it was {"),
+        (("x", ""), "`coordinates` must be non-empty strings, but one was ''."),
+        (("x", 3), "`coordinates` must be non-empty strings, but one was 3."),
+        (("x", "y", "x"), "`coordinates` must be distinct, but 'x' occurs 2 times."),
+        ({"x": -3}, "`coordinates['x']` must be a tuple of sizes, but it was -3."),
+        ({"x": [3]}, "`coordinates['x']` must be a tuple of sizes, but it was [3]."),
+        ({"x": (3, 0)}, "`coordinates['x']` must be a tuple of sizes, but it was (3, 0)."),
+        ({"x": (-1,)}, "`coordinates['x']` must be a tuple of sizes, but it was (-1,)."),
+        ({"x": (2.0,)}, "`coordinates['x']` must be a tuple of sizes, but it was (2.0,)."),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -91,13 +91,13 @@ def test_a_bad_declaration_is_refused(declared, message):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"x": 1.0}, "q must name exactly ['x', 'theta'], but it named ['x']."),
+        ({"x": 1.0}, "`q` must name exactly ['x', 'theta'], but it named ['x']."),
         (
             {"x": 1.0, "theta": 0.0, "phi": 0.0},
-            "q must name exactly ['x', 'theta'], but it named ['x', 'theta', 'phi'].",
+            "`q` must name exactly ['x', 'theta'], but it named ['x', 'theta', 'phi'].",
         ),
-        ({"x": [1.0], "theta": 0.0}, "q['x'] must have shape (), but it was (1,)."),
-        ({"x": 1.0, "theta": [[0.0]]}, "q['theta'] must have shape (), but it was (1, 1)."),
+        ({"x": [1.0], "theta": 0.0}, "`q['x']` must have shape (), but it was (1,)."),
+        ({"x": 1.0, "theta": [[0.0]]}, "`q['theta']` must have shape (), but it was (1, 1)."),
     ],
 )
 def test_bad_parts_are_refused(parts, message):
@@ -110,14 +110,17 @@ def test_bad_parts_are_refused(parts, message):
 @pytest.mark.parametrize(
     ("x", "message"),
     [
-        ([1.0], "q must have shape (2,), but its shape was (1,). Give one entry per coordinate, "),
-        ([1.0, 2.0, 3.0], "q must have shape (2,), but its shape was (3,)."),
-        (1.0, "q must have shape (2,), but its shape was ()."),
-        ([[1.0, 2.0]], "q must have shape (2,), but its shape was (1, 2)."),
-        (["one", "two"], "q must be 2 numbers, but it was ['one', 'two']."),
-        (None, "q must be 2 numbers, but it was None."),
-        ([1.0, [2.0]], "q must be 2 numbers, but it was [1.0, [2.0]]."),
-        ([1.0, 2.0j], "q must be real, but its dtype was complex128."),
+        (
+            [1.0],
+            "`q` must have shape (2,), but its shape was (1,). Give one entry per coordinate, ",
+        ),
+        ([1.0, 2.0, 3.0], "`q` must have shape (2,), but its shape was (3,)."),
+        (1.0, "`q` must have shape (2,), but its shape was ()."),
+        ([[1.0, 2.0]], "`q` must have shape (2,), but its shape was (1, 2)."),
+        (["one", "two"], "`q` must be 2 numbers, but it was ['one', 'two']."),
+        (None, "`q` must be 2 numbers, but it was None."),
+        ([1.0, [2.0]], "`q` must be 2 numbers, but it was [1.0, [2.0]]."),
+        ([1.0, 2.0j], "`q` must be real, but its dtype was complex128."),
     ],
 )
 def test_a_bad_vector_is_refused(x, message):

@@ -54,7 +54,7 @@ def test_a_force_takes_inputs_or_leaves_them_out():
 def test_a_rayleigh_force_is_the_gradient_of_its_function():
     """Also where it is not quadratic: R = c (1 + t)(1 + x^2) sum |v|^3/3."""
     np.testing.assert_allclose(DRAG(T, Q, V, PARAMS, {}), PARTS["drag"], rtol=8 * EPS)
-    assert jl.Rayleigh(dissipation).name == "rayleigh"
+    assert jl.Rayleigh(dissipation, "rayleigh").name == "rayleigh"
 
 
 def test_dissipation_of_degree_k_takes_k_times_its_function():
@@ -68,7 +68,7 @@ def test_dissipation_of_degree_k_takes_k_times_its_function():
 )
 def test_forces_add_up_by_name(names):
     inputs = {"torque": jnp.array(5.0)}
-    force = jax.jit(lambda: SYSTEM.generalized_force(PARAMS, Q, V, T, inputs, names))
+    force = jax.jit(lambda: SYSTEM.generalized_force(Q, V, PARAMS, t=T, inputs=inputs, names=names))
     expected = sum((PARTS[name] for name in (PARTS if names is None else names)), np.zeros(2))
     np.testing.assert_allclose(force(), expected, rtol=16 * EPS, atol=16 * EPS)
 
@@ -76,7 +76,7 @@ def test_forces_add_up_by_name(names):
 def test_forces_reach_the_acceleration():
     """M = 1: a = Q."""
     inputs = {"torque": jnp.array(5.0)}
-    a = jax.jit(lambda: SYSTEM.acceleration(PARAMS, Q, V, T, inputs))()
+    a = jax.jit(lambda: SYSTEM.acceleration(Q, V, PARAMS, t=T, inputs=inputs))()
     np.testing.assert_allclose(a, sum(PARTS.values()), rtol=16 * EPS)
 
 
@@ -113,33 +113,33 @@ def test_methods_and_partials_are_counted_without_what_is_bound():
     [
         (
             lambda: jl.GeneralizedForce(lambda t, q, v: q, "f"),
-            "force 'f': Q must be callable as (t, q, v, params, inputs), but its signature was "
+            "force 'f': `Q` must be callable as (t, q, v, params, inputs), but its signature was "
             "(t, q, v). Add or drop arguments",
         ),
         (
             lambda: jl.GeneralizedForce(lambda t, q, v, params, inputs, lam: q, "f"),
-            "force 'f': Q must be callable as (t, q, v, params, inputs), but its signature was "
+            "force 'f': `Q` must be callable as (t, q, v, params, inputs), but its signature was "
             "(t, q, v, params, inputs, lam).",
         ),
         (
             lambda: jl.Rayleigh(lambda t, q, v: 0.0, "r"),
-            "Rayleigh 'r': R must be callable as (t, q, v, params), but its signature was",
+            "Rayleigh 'r': `R` must be callable as (t, q, v, params), but its signature was",
         ),
         (
             lambda: jl.GeneralizedForce(spring, ""),
-            "GeneralizedForce: name must be a non-empty string, but it was ''.",
+            "GeneralizedForce: `name` must be a non-empty string, but it was ''.",
         ),
         (
             lambda: jl.Rayleigh(dissipation, ""),
-            "Rayleigh: name must be a non-empty string, but it was ''.",
+            "Rayleigh: `name` must be a non-empty string, but it was ''.",
         ),
         (
             lambda: jl.System(free, ("x",), forces=(SPRING, MOTOR, SPRING)),
-            "forces must have distinct names, but 'spring' occurs 2 times.",
+            "`forces` must have distinct names, but 'spring' occurs 2 times.",
         ),
         (
-            lambda: SYSTEM.generalized_force(PARAMS, Q, V, names=("sprin",)),
-            "generalized_force: names must be among ['spring', 'motor', 'drag'], but one was "
+            lambda: SYSTEM.generalized_force(Q, V, PARAMS, names=("sprin",)),
+            "generalized_force: `names` must be among ['spring', 'motor', 'drag'], but one was "
             "'sprin'.",
         ),
     ],
@@ -155,23 +155,23 @@ def test_a_bad_declaration_is_refused(make, message):
     [
         (
             lambda: jl.GeneralizedForce(3.0, "f"),
-            "force 'f': Q must be a function of (t, q, v, params",
+            "force 'f': `Q` must be a function of (t, q, v, params",
         ),
         (
             lambda: jl.Rayleigh(None, "r"),
-            "Rayleigh 'r': R must be a function of (t, q, v, params), but it was None.",
+            "Rayleigh 'r': `R` must be a function of (t, q, v, params), but it was None.",
         ),
         (
             lambda: jl.GeneralizedForce(spring, 3),
-            "GeneralizedForce: name must be a non-empty string, but it was 3.",
+            "GeneralizedForce: `name` must be a non-empty string, but it was 3.",
         ),
         (
             lambda: jl.System(free, ("x",), forces=SPRING),
-            "forces must be a sequence, but it was a single force. Write forces=(force,).",
+            "`forces` must be a sequence, but it was a single force. Write forces=(force,).",
         ),
         (
             lambda: jl.System(free, ("x",), forces=(spring,)),
-            "forces must contain PointForce, Couple, GeneralizedForce and Rayleigh objects, but",
+            "`forces` must contain PointForce, Torque, GeneralizedForce and Rayleigh objects, but",
         ),
     ],
 )
@@ -204,21 +204,21 @@ def test_a_force_must_have_one_real_component_per_coordinate(force, was, ask):
         "check": system.check,
         "acceleration": system.acceleration,
         "generalized_force": system.generalized_force,
-        "simulate": lambda _, q, v: jl.simulate(system, q, v, [0.0, 1.0], method="euler", dt=0.5),
+        "simulate": lambda q, v: jl.simulate(system, q, v, [0.0, 1.0], method="euler", dt=0.5),
     }
     with pytest.raises(ValueError, match="^" + re.escape(must + was)):
-        asked[ask](None, Q, V)
+        asked[ask](Q, V)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_a_force_must_return_an_array():
     system = pushed_by(lambda t, q, v, params: [q[0], q[1]])
     with pytest.raises(ValueError, match=r"^force 'push' must return an array, but it returned \["):
-        system.check(None, Q, V)
+        system.check(Q, V)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_a_rayleigh_function_must_be_a_real_scalar():
     system = jl.System(free, ("x", "y"), forces=(jl.Rayleigh(lambda t, q, v, params: v**2, "r"),))
-    with pytest.raises(ValueError, match=r"^Rayleigh 'r': R must return a real scalar, but "):
-        system.check(None, Q, V)
+    with pytest.raises(ValueError, match=r"^Rayleigh 'r': `R` must return a real scalar, but "):
+        system.check(Q, V)

@@ -19,13 +19,16 @@ T = jnp.array(0.4)
         (np.diag([1.0, 2.0, -0.5]), "its eigenvalue about the axis (0, 0, 1) was -0.5 kg m^2"),
         ([[1, 0.9, 0], [0.9, 0.5, 0], [0, 0, 1]], "was -0.184077 kg m^2. Products of inertia"),
         ([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]], "be symmetric, but element (0, 1) was 0.1 and (1, 0"),
-        (np.eye(3) * np.nan, "inertia must be finite"),
-        ([1.0, np.inf, 1.0], "inertia must be finite"),
-        ([1.0, 1.0, 1j], "inertia must be real, but its dtype was complex128"),
-        (None, "inertia must be real numbers, but it was None"),
-        ([[1, 2], [3]], "inertia must be real numbers, but it was [[1, 2], [3]]"),
-        (np.eye(2), "inertia must be (3, 3), or (3,) principal moments, but its shape was (2, 2)"),
-        (1.0, "inertia must be (3, 3), or (3,) principal moments, but its shape was ()"),
+        (np.eye(3) * np.nan, "`inertia` must be finite"),
+        ([1.0, np.inf, 1.0], "`inertia` must be finite"),
+        ([1.0, 1.0, 1j], "`inertia` must be real, but its dtype was complex128"),
+        (None, "`inertia` must be real numbers, but it was None"),
+        ([[1, 2], [3]], "`inertia` must be real numbers, but it was [[1, 2], [3]]"),
+        (
+            np.eye(2),
+            "`inertia` must be (3, 3), or (3,) principal moments, but its shape was (2, 2)",
+        ),
+        (1.0, "`inertia` must be (3, 3), or (3,) principal moments, but its shape was ()"),
     ],
     ids=str,
 )
@@ -43,9 +46,9 @@ def test_check_finds_it_in_a_declared_system():
 
     system = jl.System(kinetic, ("x", "y", "z"))
     state = [0.1, 0.2, 0.3], [0.0, 0.0, 1.0]
-    system.check({"I": 0.4}, *state)
+    system.check(*state, {"I": 0.4})
     with pytest.raises(ValueError, match="have no negative principal moment, but its eigenvalue"):
-        system.check({"I": -0.4}, *state)
+        system.check(*state, {"I": -0.4})
 
 
 def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
@@ -60,8 +63,8 @@ def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
         (lambda m: kinetic(1.0, [1.0, 2.0, -3.0]), 1.0, principal),
         (lambda m: kinetic(1.0, energy.inertia_matrix(1.0, 2.0, -3.0)), 1.0, principal),
         (lambda m: kinetic(m, energy.inertia_matrix(1, 1, 1, 3)), 1.0, principal),
-        (lambda inertia: kinetic(-1.0, inertia), np.ones(3), "mass must not be negative"),
-        (lambda m: kinetic(m, [1, 1, 1], [0, 0, np.nan]), 1.0, "centre must be finite"),
+        (lambda inertia: kinetic(-1.0, inertia), np.ones(3), "`mass` must not be negative"),
+        (lambda m: kinetic(m, [1, 1, 1], [0, 0, np.nan]), 1.0, "`centre` must be finite"),
         (lambda m: kinetic(1.0, [0.1, 0.1, 0.1], [1, 0, 0]), 1.0, central),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -76,9 +79,9 @@ def test_an_inertia_about_the_mass_centre_is_refused(dtype):
     """I_G given for I_O: T = -0.45 J for a motion of 1 m/s and 1 rad/s, were it taken."""
     central, c = np.full(3, 0.1, dtype), np.array([1.0, 0.0, 0.0], dtype)
     message = (
-        "RigidBody: inertia must be at least that of the mass at its centre, m (|c|^2 E - c c^T), "
-        "but what is left, the inertia about the mass centre, has the eigenvalue -0.9 kg m^2 about "
-        "the axis (0, "
+        "RigidBody: `inertia` must be at least that of the mass at its centre, m (|c|^2 E - c c^T)"
+        ", but what is left, the inertia about the mass centre, has the eigenvalue -0.9 kg m^2 "
+        "about the axis (0, "
     )
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         energy.RigidBody(1.0, central, c)

@@ -23,7 +23,7 @@ from jaxlag._model._inputs import (
 EPS = np.finfo(float).eps
 TIMES = [0.0, 0.5, 2.0, 2.25]
 VALUES = [3.0, -1.0, 4.0, 10.0]
-HOLD, LINE = jl.ZeroOrderHold(TIMES, VALUES), jl.Linear(TIMES, VALUES)
+HOLD, LINE = jl.ZeroOrderHold(TIMES, VALUES), jl.LinearInterpolation(TIMES, VALUES)
 Q, V, PARAMS = jnp.array([0.4, -0.7]), jnp.array([1.5, -2.0]), {"w": 3.0}
 
 
@@ -89,7 +89,7 @@ def test_a_step_reads_the_interval_it_is_told():
 
 def test_locate_finds_the_interval_that_begins_at_or_before():
     times = [0.0, 0.25, 0.5, 1.0, 2.0, 2.25]
-    signals = {"hold": HOLD, "line": LINE, "wave": jl.Function(jnp.sin), "gain": jnp.array(1.0)}
+    signals = {"hold": HOLD, "line": LINE, "wave": jl.TimeFunction(jnp.sin), "gain": jnp.array(1.0)}
     found = [locate(signals, jnp.array(t)) for t in times]
     assert [int(row["hold"]) for row in found] == [0, 0, 1, 1, 2, 3]
     assert [int(row["line"]) for row in found] == [0, 0, 1, 1, 2, 2]
@@ -97,22 +97,22 @@ def test_locate_finds_the_interval_that_begins_at_or_before():
 
 
 def test_tables_may_hold_vectors_and_whole_numbers():
-    table = jl.Linear([0, 1, 2], [[0, 10], [2, 20], [4, 0]])
+    table = jl.LinearInterpolation([0, 1, 2], [[0, 10], [2, 20], [4, 0]])
     np.testing.assert_allclose(at(table, [0.5, 1.5]), [[1.0, 15.0], [3.0, 10.0]], rtol=4 * EPS)
     assert table.times.dtype == table.values.dtype == jnp.float64
 
 
 def test_a_table_in_single_precision_stays_so():
-    table = jl.Linear([0.0, 1.0], np.array([1.0, 2.0], np.float32))
+    table = jl.LinearInterpolation([0.0, 1.0], np.array([1.0, 2.0], np.float32))
     assert read(table, jnp.array(0.5)).dtype == jnp.float32
 
 
 def test_knots_and_range_are_those_of_all_tables():
     late = jl.ZeroOrderHold([0.25, 1.0, 3.0], [1.0, 2.0, 3.0])
-    signals = {"a": HOLD, "f": jl.Function(jnp.sin), "b": late, "gain": jnp.array(1.0)}
+    signals = {"a": HOLD, "f": jl.TimeFunction(jnp.sin), "b": late, "gain": jnp.array(1.0)}
     np.testing.assert_array_equal(all_knots(signals), [*TIMES, 0.25, 1.0, 3.0])
     assert [float(x) for x in common_range(signals)] == [0.25, 2.25]
-    for without in ({}, {"f": jl.Function(jnp.sin), "gain": jnp.array(1.0)}):
+    for without in ({}, {"f": jl.TimeFunction(jnp.sin), "gain": jnp.array(1.0)}):
         assert all_knots(without) is None
         assert common_range(without) is None
 
@@ -136,16 +136,16 @@ class Controller(eqx.Module):
 
 def test_a_function_takes_time_or_time_and_params():
     t = jnp.array(0.7)
-    np.testing.assert_allclose(read(jl.Function(lambda t: t**2), t), 0.49, rtol=4 * EPS)
-    wave = jl.Function(lambda t, params: jnp.sin(params["w"] * t))
+    np.testing.assert_allclose(read(jl.TimeFunction(lambda t: t**2), t), 0.49, rtol=4 * EPS)
+    wave = jl.TimeFunction(lambda t, params: jnp.sin(params["w"] * t))
     np.testing.assert_allclose(read(wave, t), np.sin(2.1), rtol=4 * EPS)
-    np.testing.assert_allclose(read(jl.Function(jnp.sin), t), np.sin(0.7), rtol=4 * EPS)
-    assert read(jl.Function(lambda t: 2.0), t) == 2.0
+    np.testing.assert_allclose(read(jl.TimeFunction(jnp.sin), t), np.sin(0.7), rtol=4 * EPS)
+    assert read(jl.TimeFunction(lambda t: 2.0), t) == 2.0
 
 
 def test_a_default_of_a_function_is_no_place_for_params():
     """The usual way to bind a value early."""
-    signals = [jl.Function(lambda t, w=w: w * t) for w in (2.0, 3.0)]
+    signals = [jl.TimeFunction(lambda t, w=w: w * t) for w in (2.0, 3.0)]
     assert [float(read(signal, jnp.array(0.5))) for signal in signals] == [1.0, 1.5]
 
 
@@ -165,7 +165,7 @@ def around(signal, t):
 
 def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     """Up to the knot, and from it on; its derivative in time is that of the function."""
-    step = jl.Function(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
+    step = jl.TimeFunction(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
     np.testing.assert_array_equal(step.knots(), [1.0, 2.0])
     before, after = around(step, 0.3), around(step, 1.0)
     knot = jnp.array(1.0)
@@ -189,8 +189,8 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     ],
 )
 def test_bad_knots_of_a_function_are_refused(knots, message):
-    with pytest.raises(ValueError, match=f"^Function: knots must {message}"):
-        jl.Function(lambda t: t, knots=knots)
+    with pytest.raises(ValueError, match=f"^TimeFunction: `knots` must {message}"):
+        jl.TimeFunction(lambda t: t, knots=knots)
 
 
 def test_feedback_sees_the_state():
@@ -200,7 +200,7 @@ def test_feedback_sees_the_state():
 
 def test_modules_inside_signals_are_traced_and_differentiable():
     t = jnp.array(0.7)
-    slope = jax.jit(jax.grad(read))(jl.Function(Wave(jnp.array(2.0))), t)
+    slope = jax.jit(jax.grad(read))(jl.TimeFunction(Wave(jnp.array(2.0))), t)
     np.testing.assert_allclose(slope.f.amplitude, np.sin(0.7), rtol=4 * EPS)
     slope = jax.jit(jax.grad(read))(jl.Feedback(Controller(jnp.array(2.0))), t)
     np.testing.assert_allclose(slope.f.gain, -(0.4 + 3.0 * -2.0), rtol=4 * EPS)
@@ -243,15 +243,15 @@ PUSHED = pushed(lambda inputs: inputs["u"])
 
 def test_a_missing_input_is_named():
     message = (
-        r"^inputs must have an entry 'u', which a force reads, but its names were \['w'\]\. "
+        r"^`inputs` must have an entry 'u', which a force reads, but its names were \['w'\]\. "
         r"Pass inputs="
     )
     other = {"w": jnp.array(1.0)}
     for ask in (
         lambda: run(PUSHED, other),
-        lambda: PUSHED.acceleration(None, Q, V, inputs=other),
-        lambda: PUSHED.generalized_force(None, Q, V, inputs=other),
-        lambda: PUSHED.check(None, Q, V, inputs=other),
+        lambda: PUSHED.acceleration(Q, V, inputs=other),
+        lambda: PUSHED.generalized_force(Q, V, inputs=other),
+        lambda: PUSHED.check(Q, V, inputs=other),
     ):
         with pytest.raises(ValueError, match=message):
             ask()
@@ -264,7 +264,7 @@ def test_a_missing_input_is_named():
 def test_an_input_that_nothing_reads_is_refused():
     signals = {"u": HOLD, "torque": LINE}
     message = (
-        r"^inputs must hold only signals that a force reads, but no force read 'torque'\. Drop"
+        r"^`inputs` must hold only signals that a force reads, but no force read 'torque'\. Drop"
     )
     with pytest.raises(ValueError, match=message):
         run(PUSHED, signals)
@@ -294,8 +294,8 @@ def test_every_way_of_reading_a_dict_counts_as_reading(reading):
 @pytest.mark.parametrize("t", [-0.5, 2.5])
 def test_a_table_asked_outside_its_range_is_refused(t):
     for ask in (PUSHED.acceleration, PUSHED.generalized_force, PUSHED.check):
-        with pytest.raises(ValueError, match=r"^inputs.*cover.* 0\.0 to 2\.25"):
-            ask(None, Q, V, t, {"u": LINE})
+        with pytest.raises(ValueError, match=r"^`inputs`.*cover.* 0\.0 to 2\.25"):
+            ask(Q, V, t=t, inputs={"u": LINE})
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,9 @@ def test_a_table_asked_outside_its_range_is_refused(t):
     [([-1.0, 1.0], "-1.0 to 1.0 s"), ([0.0, 3.0], "0.0 to 3.0 s"), ([1.0, -0.1], "-0.1 to 1.0 s")],
 )
 def test_a_run_beyond_its_tables_is_refused(ts, cover):
-    message = rf"^inputs must cover ts, from {cover}, but their tables cover 0\.0 to 2\.25 s\. Ext"
+    message = (
+        rf"^`inputs` must cover ts, from {cover}, but their tables cover 0\.0 to 2\.25 s\. Ext"
+    )
     with pytest.raises(ValueError, match=message):
         jl.simulate(PUSHED, Q, V, ts, inputs={"u": LINE})
 
@@ -311,32 +313,40 @@ def test_a_run_beyond_its_tables_is_refused(ts, cover):
 # ---- Refused -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.Linear])
+@pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.LinearInterpolation])
 @pytest.mark.parametrize(
     ("times", "values", "message"),
     [
-        ([0.0], [1.0], "times must be an array of at least 2 times, but its shape was (1,)."),
-        (0.0, [1.0], "times must be an array of at least 2 times, but its shape was ()."),
+        ([0.0], [1.0], "`times` must be an array of at least 2 times, but its shape was (1,)."),
+        (0.0, [1.0], "`times` must be an array of at least 2 times, but its shape was ()."),
         (
             [[0.0, 1.0]],
             [1.0],
-            "times must be an array of at least 2 times, but its shape was (1, 2)",
+            "`times` must be an array of at least 2 times, but its shape was (1, 2)",
         ),
-        ([0.0, 1.0, 2.0], [1.0], "values must have one entry per time, 3, but its shape was (1,)"),
-        ([0.0, 1.0], 3.0, "values must have one entry per time, 2, but its shape was ()."),
+        (
+            [0.0, 1.0, 2.0],
+            [1.0],
+            "`values` must have one entry per time, 3, but its shape was (1,)",
+        ),
+        ([0.0, 1.0], 3.0, "`values` must have one entry per time, 2, but its shape was ()."),
         (
             [0.0, 1.0, 1.0, 2.0],
             [0.0] * 4,
-            "times must increase strictly, but times[1] = 1.0 and times[2] = 1.0. Sort the times",
+            "`times` must increase strictly, but times[1] = 1.0 and times[2] = 1.0. Sort the times",
         ),
         (
             [0.0, 2.0, 1.0],
             [0.0] * 3,
-            "times must increase strictly, but times[1] = 2.0 and times[2]",
+            "`times` must increase strictly, but times[1] = 2.0 and times[2]",
         ),
-        ([0.0, np.nan], [0.0] * 2, "times must increase strictly, but times[0] = 0.0 and times[1]"),
-        ([0.0, 1.0], [0.0, np.nan], "values must be finite, but some were nan or inf."),
-        ([0.0, 1.0], [0.0, np.inf], "values must be finite, but some were nan or inf."),
+        (
+            [0.0, np.nan],
+            [0.0] * 2,
+            "`times` must increase strictly, but times[0] = 0.0 and times[1]",
+        ),
+        ([0.0, 1.0], [0.0, np.nan], "`values` must be finite, but some were nan or inf."),
+        ([0.0, 1.0], [0.0, np.inf], "`values` must be finite, but some were nan or inf."),
     ],
 )
 def test_a_bad_table_is_refused(kind, times, values, message):
@@ -344,16 +354,16 @@ def test_a_bad_table_is_refused(kind, times, values, message):
         kind(times, values)
 
 
-@pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.Linear])
+@pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.LinearInterpolation])
 @pytest.mark.parametrize("array", [list, np.array, jnp.array])
 def test_known_tables_are_as_good_under_a_transform(kind, array):
     """Built of arrays from outside while JAX traces what is around them."""
     times, values, worse = array(TIMES), array(VALUES), array([3.0, np.nan, 4.0, 10.0])
     found = jax.jit(lambda t: read(kind(times, values), t))(1.25)
     assert found == read(kind(TIMES, VALUES), jnp.array(1.25))
-    with pytest.raises(ValueError, match="values must be finite, but some were nan or inf"):
+    with pytest.raises(ValueError, match="`values` must be finite, but some were nan or inf"):
         jax.jit(lambda t: read(kind(times, worse), t))(1.25)
-    with pytest.raises(ValueError, match="times must increase strictly"):
+    with pytest.raises(ValueError, match="`times` must increase strictly"):
         jax.jit(lambda t: read(kind(values, values), t))(1.25)
 
 
@@ -361,28 +371,28 @@ def test_known_tables_are_as_good_under_a_transform(kind, array):
     ("make", "message"),
     [
         (
-            lambda: jl.Function(lambda: 1.0),
-            "Function: f must be callable as (t), but its signature was (). Add or drop arguments",
+            lambda: jl.TimeFunction(lambda: 1.0),
+            "TimeFunction: `f` must be callable as (t), but its signature was (). Add or drop ",
         ),
         (
-            lambda: jl.Function(lambda t, q, v: 1.0),
-            "Function: f must be callable as (t), but its signature was (t, q, v).",
+            lambda: jl.TimeFunction(lambda t, q, v: 1.0),
+            "TimeFunction: `f` must be callable as (t), but its signature was (t, q, v).",
         ),
         (
             lambda: jl.Feedback(lambda t: 1.0),
-            "Feedback: f must be callable as (t, q, v, params), but its signature was (t).",
+            "Feedback: `f` must be callable as (t, q, v, params), but its signature was (t).",
         ),
         (
             lambda: check_inputs({"u": lambda t: t}),
-            "inputs['u'] must be an input object or an array, but it was the function <function",
+            "`inputs['u']` must be an input object or an array, but it was the function <function",
         ),
         (
             lambda: check_inputs([1.0]),
-            "inputs must be a dict from names to input objects or arrays, but it was [1.0].",
+            "`inputs` must be a dict from names to input objects or arrays, but it was [1.0].",
         ),
         (
             lambda: check_inputs({1: 2.0}),
-            "inputs must be a dict from names to input objects or arrays, but it was {1: 2.0}.",
+            "`inputs` must be a dict from names to input objects or arrays, but it was {1: 2.0}.",
         ),
     ],
 )
@@ -392,7 +402,9 @@ def test_a_bad_signal_is_refused(make, message):
 
 
 def test_a_function_for_an_input_is_told_how_to_be_wrapped():
-    with pytest.raises(ValueError, match=r"Wrap it in jl\.Function \(of time\) or jl\.Feedback"):
+    with pytest.raises(
+        ValueError, match=r"Wrap it in jl\.TimeFunction \(of time\) or jl\.Feedback"
+    ):
         run(PUSHED, {"u": jnp.sin})
 
 
@@ -400,14 +412,23 @@ def test_a_function_for_an_input_is_told_how_to_be_wrapped():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: jl.Function(3.0), "Function: f must be a function of (t), but it was 3.0."),
+        (
+            lambda: jl.TimeFunction(3.0),
+            "TimeFunction: `f` must be a function of (t), but it was 3.0.",
+        ),
         (
             lambda: jl.Feedback("u"),
-            "Feedback: f must be a function of (t, q, v, params), but it was 'u'.",
+            "Feedback: `f` must be a function of (t, q, v, params), but it was 'u'.",
         ),
-        (lambda: run(PUSHED, [HOLD]), "inputs must be a dict from names to input objects or arr"),
-        (lambda: run(PUSHED, {"u": "on"}), "inputs['u'] must be an input object or an array, but"),
-        (lambda: run(PUSHED, {"u": None}), "inputs['u'] must be an input object or an array, but"),
+        (lambda: run(PUSHED, [HOLD]), "`inputs` must be a dict from names to input objects or arr"),
+        (
+            lambda: run(PUSHED, {"u": "on"}),
+            "`inputs['u']` must be an input object or an array, but",
+        ),
+        (
+            lambda: run(PUSHED, {"u": None}),
+            "`inputs['u']` must be an input object or an array, but",
+        ),
     ],
 )
 def test_a_bad_type_is_refused(make, message):
@@ -419,8 +440,8 @@ def test_tables_may_be_written_as_lists_of_traced_numbers():
     @jax.jit
     def read(end, value):
         table = jl.ZeroOrderHold([0.0, end, 3.0], [value, 0.0])
-        line = jl.Linear([0.0, end], [value, 0.0])
-        knots = jl.Function(lambda t: t, knots=[end]).knots()
+        line = jl.LinearInterpolation([0.0, end], [value, 0.0])
+        knots = jl.TimeFunction(lambda t: t, knots=[end]).knots()
         return table.times, table.values, line.times, line.values, knots
 
     found = read(1.0, 2.0)

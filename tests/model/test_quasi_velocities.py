@@ -37,7 +37,13 @@ def test_singular_kinematics_are_named():
 
     def status(pitch):
         motion = jl.simulate(
-            system, [0.1, pitch, 0.2], u0=[0.1, 0.2, 0.3], ts=[0.0, 0.1], params={}, throw=False
+            system,
+            [0.1, pitch, 0.2],
+            None,
+            u0=[0.1, 0.2, 0.3],
+            ts=[0.0, 0.1],
+            params={},
+            throw=False,
         )
         return motion.status, motion.where, motion.q
 
@@ -46,8 +52,10 @@ def test_singular_kinematics_are_named():
     assert int(where[1]) == 2
     assert np.all(np.isfinite(q[0]))
     with pytest.raises(SimulationError, match=r"kinematics_singular \('wz'\).*dU/dv is singular"):
-        jl.simulate(system, [0.1, np.pi / 2, 0.2], u0=[0.1, 0.2, 0.3], ts=[0.0, 0.1], params={})
-    assert np.all(np.isnan(system.velocities({}, [0.1, np.pi / 2, 0.2], [0.1, 0.2, 0.3])))
+        jl.simulate(
+            system, [0.1, np.pi / 2, 0.2], None, u0=[0.1, 0.2, 0.3], ts=[0.0, 0.1], params={}
+        )
+    assert np.all(np.isnan(system.velocities([0.1, np.pi / 2, 0.2], [0.1, 0.2, 0.3], {})))
 
 
 def leaning(t, q, v, params):
@@ -64,12 +72,12 @@ def swinging(t, q, v, params):
 def test_a_rate_that_rounding_leaves_is_none(pitch):
     """Without roll the third rate is 6e-17 yaw' and nothing else."""
     system, q, v = angles(), [0.0, pitch, 0.0], [0.1, 0.2, 0.3]
-    for start in ({"u0": v}, {"v0": v}):
+    for start in ({"v0": None, "u0": v}, {"v0": v}):
         motion = jl.simulate(system, q, ts=[0.0, 0.1], throw=False, **start)
         assert motion.status == Status.kinematics_singular
         assert "'wz'" in motion.message()
-    assert np.all(np.isnan(system.velocities({}, q, v)))
-    assert np.all(np.isnan(system.quasi_reactions({}, q, v)["a"]))
+    assert np.all(np.isnan(system.velocities(q, v, {})))
+    assert np.all(np.isnan(system._quasi_reactions(q, v, {})["a"]))
 
 
 @pytest.mark.full
@@ -82,6 +90,7 @@ def test_a_lane_with_singular_kinematics_spoils_no_derivative():
             motion = jl.simulate(
                 system,
                 [0.1, 0.2],
+                None,
                 u0=jnp.array([0.3, 0.2]),
                 ts=jnp.array([0.0, 1.0]),
                 params={"m": m, "d": d},
@@ -142,7 +151,7 @@ def system_of(quasi, lagrangian=in_v, **options):
 
 
 def run(quasi, **options):
-    options = {"u0": np.zeros(quasi.size), "ts": [0.0, 1.0], "params": PARAMS} | options
+    options = {"v0": None, "u0": np.zeros(quasi.size), "ts": [0.0, 1.0], "params": PARAMS} | options
     constraints = options.pop("constraints", ())
     return jl.simulate(system_of(quasi, constraints=constraints), np.zeros(3), **options)
 
@@ -171,12 +180,12 @@ def run(quasi, **options):
             "'a' is a force, too",
         ),
         (lambda: jl.System(in_v, ("x", "y", "z"), written_in="u"), "has quasi-velocities"),
-        (lambda: system_of(one(), written_in="w"), "written_in must be 'v' or 'u'"),
-        (lambda: run(one(U=bent)), "'a': U must be affine in v"),
-        (lambda: run(one(U=lambda t, q, v, p: v[:2])), r"U must return 3 numbers.*shape \(2,\)"),
+        (lambda: system_of(one(), written_in="w"), "`written_in` must be 'v' or 'u'"),
+        (lambda: run(one(U=bent)), "'a': `U` must be affine in v"),
+        (lambda: run(one(U=lambda t, q, v, p: v[:2])), r"`U` must return 3 numbers.*shape \(2,\)"),
         (
             lambda: run(one(U=lambda t, q, v, p: v.at[1].set(q[1]))),
-            "'b': U must contain a velocity",
+            "'b': `U` must contain a velocity",
         ),
         (
             lambda: run(jl.QuasiVelocities(kinematics=sleigh_rates, names=("a", "b"))),
@@ -184,33 +193,36 @@ def run(quasi, **options):
         ),
         (
             lambda: run(jl.QuasiVelocities(kinematics=bent_kinematics, names=NAMES)),
-            r"kinematics must be affine in u, but the slope of v\[1\]",
+            r"`kinematics` must be affine in u, but the slope of v\[1\]",
         ),
-        (lambda: run(one(), u0=[0.0, 1.0]), r"u0 must have shape \(3,\), but its shape was \(2,\)"),
-        (lambda: run(one(), u0={"a": 0.0}), r"u0 must name \['a', 'b', 'c'\].*named \['a'\]"),
+        (
+            lambda: run(one(), u0=[0.0, 1.0]),
+            r"`u0` must have shape \(3,\), but its shape was \(2,\)",
+        ),
+        (lambda: run(one(), u0={"a": 0.0}), r"`u0` must name \['a', 'b', 'c'\].*named \['a'\]"),
         (lambda: run(one(), u0=[0.0, np.nan, 1.0]), r"u0\[1\] \('b'\) was nan"),
-        (lambda: run(one(), v0=np.zeros(3)), "v0 and u0 must be given one at a time"),
+        (lambda: run(one(), v0=np.zeros(3)), "`v0` and `u0` must be given one at a time"),
         (
             lambda: run(one(), formulation="quasi", constraints=(BLADE,)),
-            r"formulation must be among .*take care of the rows \['v_n'\]",
+            r"`formulation` must be among .*take care of the rows \['v_n'\]",
         ),
         (
             lambda: run(
-                one(constrained=("b",)), formulation="quasi", project=jl.Baumgarte(1.0, 1.0)
+                one(constrained=("b",)), formulation="quasi", stabilization=jl.Baumgarte(1.0, 1.0)
             ),
             "Baumgarte's terms belong to",
         ),
         (
-            lambda: jl.simulate(PLAIN, [0.0] * 3, u0=[0.0] * 3, ts=[0.0, 1.0], params=PARAMS),
-            "u0 must be given for a system with quasi-velocities",
+            lambda: jl.simulate(PLAIN, [0.0] * 3, None, u0=[0.0] * 3, ts=[0.0, 1.0], params=PARAMS),
+            "`u0` must be given for a system with quasi-velocities",
         ),
         (
             lambda: jl.simulate(PLAIN, [0.0] * 3, [0.0] * 3, [0.0, 1.0], PARAMS, save=("u",)),
-            "save must name what the system has, but one was 'u'",
+            "`save` must name what the system has, but one was 'u'",
         ),
         (
-            lambda: PLAIN.quasi_velocities(PARAMS, [0.0] * 3, [0.0] * 3),
-            "called on a system with quasi-velocities",
+            lambda: PLAIN.quasi_velocities([0.0] * 3, [0.0] * 3, PARAMS),
+            r"^`System\.quasi_velocities` without quasi-velocities is not supported",
         ),
     ],
 )
@@ -244,13 +256,13 @@ def test_a_force_may_read_what_holds_a_quasi_velocity():
     force = jl.GeneralizedForce(braked, "brake", reaction=True)
     quasi = one(constrained=("b",))
     system = system_of(quasi, forces=(force,))
-    start = {"u0": {"a": 0.4, "c": -0.3}, "ts": [0.0, 0.2], "params": PARAMS, "dt": 0.1}
+    start = {"v0": None, "u0": {"a": 0.4, "c": -0.3}, "ts": [0.0, 0.2], "params": PARAMS, "dt": 0.1}
     motion = jl.simulate(system, np.zeros(3), method="tsit5", **start)
     assert motion.formulation == "multipliers"
     np.testing.assert_allclose(motion["b"], 0.0, atol=64 * EPS)
-    a, force = motion.a[-1], system.constraint_force(PARAMS, motion.q[-1], motion.v[-1], 0.2)
+    a, force = motion.a[-1], system.constraint_force(motion.q[-1], motion.v[-1], PARAMS, t=0.2)
     push = braked(0.2, motion.q[-1], motion.v[-1], PARAMS, {"b": motion.lam["b"][-1]})
-    M, h = (f(PARAMS, motion.q[-1], motion.v[-1], 0.2) for f in (system.mass_matrix, system.bias))
+    M, h = (f(motion.q[-1], motion.v[-1], PARAMS, t=0.2) for f in (system.mass_matrix, system.bias))
     np.testing.assert_allclose(M @ a + h, push + force, atol=1e-13)
     with pytest.raises(ValueError, match=r"need formulation='multipliers'"):
         jl.simulate(system, np.zeros(3), formulation="quasi", **start)
@@ -267,10 +279,10 @@ def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
     start = {"ts": [0.0, 1.0], "dt": 0.1, "method": "tsit5"}
     q = [0.0, 0.0, 0.3]
     system = jl.System(sleigh, ("x", "y", "theta"), quasi=body, constraints=(BLADE,))
-    motion = jl.simulate(system, q, u0=[1.0, 0.4, 0.0], **start)
+    motion = jl.simulate(system, q, None, u0=[1.0, 0.4, 0.0], **start)
     assert motion.formulation == "multipliers"
     tall, _ = sleighs()
-    other = jl.simulate(tall, q, u0=[1.0, 0.4], formulation="multipliers", **start)
+    other = jl.simulate(tall, q, None, u0=[1.0, 0.4], formulation="multipliers", **start)
     np.testing.assert_allclose(motion.q, other.q, atol=1e-14)
 
 

@@ -105,12 +105,12 @@ def test_forces_and_torques_read_inputs():
         return inputs["pull"] * params["F"]
 
     force = jl.PointForce(corner, pull, "pull")
-    couple = jl.Couple(body_rates, pull, "motor")
+    couple = jl.Torque(body_rates, pull, "motor")
     assert force.takes_inputs
     assert couple.takes_inputs
     for one, plain in (
         (force, jl.PointForce(corner, constant, "pull")),
-        (couple, jl.Couple(body_rates, constant, "motor")),
+        (couple, jl.Torque(body_rates, constant, "motor")),
     ):
         assert not plain.takes_inputs
         found = force_of(one, {"pull": jnp.array(3.0)})
@@ -119,7 +119,7 @@ def test_forces_and_torques_read_inputs():
 
 def test_body_torques_act_on_euler_angles_by_the_transposed_rate_matrix():
     """Q = W^T tau with w = W (psi', theta', phi'), nothing on the position."""
-    found = force_of(jl.Couple(body_rates, constant, "motor"))
+    found = force_of(jl.Torque(body_rates, constant, "motor"))
     W = np.asarray(rotation.yaw_pitch_roll.body_rate_matrix(Q[3:]))
     np.testing.assert_array_equal(found[:3], 0)
     np.testing.assert_allclose(found[3:], W.T @ np.asarray(PARAMS["F"]), atol=16 * EPS)
@@ -131,13 +131,13 @@ def test_a_torque_may_be_given_in_body_or_inertial_components():
     def turned(t, q, v, params):
         return orientation(q) @ params["F"]
 
-    body = force_of(jl.Couple(body_rates, constant, "motor"))
-    space = force_of(jl.Couple(space_rates, turned, "motor"))
+    body = force_of(jl.Torque(body_rates, constant, "motor"))
+    space = force_of(jl.Torque(space_rates, turned, "motor"))
     np.testing.assert_allclose(body, space, atol=32 * EPS)
 
 
 def test_a_plane_couple_is_a_scalar():
-    couple = jl.Couple(
+    couple = jl.Torque(
         lambda t, q, v, params: v[1] - v[0] + 2.0 * t, lambda t, q, v, params: params["F"][0], "m"
     )
     np.testing.assert_array_equal(force_of(couple), [-2.0, 2.0, 0, 0, 0, 0])
@@ -151,7 +151,7 @@ def test_a_force_is_worth_one_elsewhere_with_a_couple():
 
     at_corner = force_of(jl.PointForce(corner, constant, "pull"))
     at_centre = force_of(jl.PointForce(centre, constant, "pull"))
-    couple = force_of(jl.Couple(space_rates, moment, "moment"))
+    couple = force_of(jl.Torque(space_rates, moment, "moment"))
     np.testing.assert_allclose(at_corner, at_centre + couple, atol=32 * EPS)
     assert np.max(np.abs(couple)) > 0.1
 
@@ -162,8 +162,8 @@ def test_a_moving_frame_adds_nothing_to_the_torque():
     def carried(t, q, v, params):
         return body_rates(t, q, v, params) + jnp.array([0.0, 0.0, 7.0]) * jnp.sin(t)
 
-    expected = force_of(jl.Couple(body_rates, constant, "motor"))
-    np.testing.assert_array_equal(force_of(jl.Couple(carried, constant, "motor")), expected)
+    expected = force_of(jl.Torque(body_rates, constant, "motor"))
+    np.testing.assert_array_equal(force_of(jl.Torque(carried, constant, "motor")), expected)
 
 
 def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
@@ -173,8 +173,8 @@ def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
         R, R_rate = jax.jvp(orientation, (q,), (v,))
         return rotation.body_rates(R, R_rate)
 
-    found = force_of(jl.Couple(rates, constant, "motor"))
-    np.testing.assert_allclose(found, force_of(jl.Couple(body_rates, constant, "m")), atol=32 * EPS)
+    found = force_of(jl.Torque(rates, constant, "motor"))
+    np.testing.assert_allclose(found, force_of(jl.Torque(body_rates, constant, "m")), atol=32 * EPS)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
 def test_an_angular_velocity_may_come_from_loops_and_choices(rates):
     """Affine in v however it is written: dw/dv at one v is that at another."""
     tau = jnp.ones_like(rates(T, Q, V, PARAMS))
-    found = force_of(jl.Couple(rates, lambda t, q, v, params: tau, "motor"))
+    found = force_of(jl.Torque(rates, lambda t, q, v, params: tau, "motor"))
     expected = jnp.tensordot(tau, jax.jacfwd(lambda v: rates(T, Q, v, PARAMS))(0 * V + 1), tau.ndim)
     np.testing.assert_allclose(found, expected, atol=8 * EPS)
     assert np.max(np.abs(found)) > 0.1
@@ -219,11 +219,13 @@ def test_an_angular_velocity_that_is_not_affine_is_refused(rates):
     system = jl.System(
         lambda t, q, v, params: 0.5 * v @ v,
         {"q": (N,)},
-        forces=(jl.Couple(rates, torque, "motor"),),
+        forces=(jl.Torque(rates, torque, "motor"),),
     )
-    message = r"couple 'motor': angular_velocity must be affine in v, but its derivative dw/dv depe"
+    message = (
+        r"couple 'motor': `angular_velocity` must be affine in v, but its derivative dw/dv depe"
+    )
     with pytest.raises(ValueError, match=message):
-        system.acceleration(PARAMS, Q, V)
+        system.acceleration(Q, V, PARAMS)
     with pytest.raises(ValueError, match=message):
         jl.simulate(system, Q, V, jnp.array([0.0, 1.0]), PARAMS)
 
@@ -235,13 +237,13 @@ def test_both_keep_the_precision_of_the_state():
         return jnp.stack([jnp.cos(t), jnp.sin(t), t])
 
     single = {"arm": PARAMS["arm"].astype(jnp.float32)}
-    for force in (jl.PointForce(corner, waving, "f"), jl.Couple(body_rates, waving, "c")):
+    for force in (jl.PointForce(corner, waving, "f"), jl.Torque(body_rates, waving, "c")):
         assert force(T, q, v, single, {}).dtype == jnp.float32
 
 
 def test_derivatives_pass_through_both():
     """d Q / d params: forward, reverse and by the closed form (Q is linear in F)."""
-    for force in (jl.PointForce(corner, constant, "f"), jl.Couple(space_rates, constant, "c")):
+    for force in (jl.PointForce(corner, constant, "f"), jl.Torque(space_rates, constant, "c")):
 
         def Q_of(F, force=force):
             return force_of(force, params=PARAMS | {"F": F})
@@ -259,14 +261,14 @@ def test_a_position_of_wrong_shape_is_refused(was, position):
     force = jl.PointForce(position, constant, "pull")
     with pytest.raises(
         ValueError,
-        match=r"force 'pull': position must return 1, 2 or 3 components along its last axis, but",
+        match=r"force 'pull': `position` must return 1, 2 or 3 components along its last axis, but",
     ):
         force_of(force)
 
 
 def test_an_angular_velocity_of_wrong_shape_is_refused():
-    couple = jl.Couple(lambda t, q, v, params: v[:2], lambda t, q, v, params: v[:2], "motor")
-    message = "couple 'motor': angular_velocity must return 3 components or a scalar, but it ret"
+    couple = jl.Torque(lambda t, q, v, params: v[:2], lambda t, q, v, params: v[:2], "motor")
+    message = "couple 'motor': `angular_velocity` must return 3 components or a scalar, but it ret"
     with pytest.raises(ValueError, match=message):
         force_of(couple)
 
@@ -275,16 +277,16 @@ def test_force_and_torque_must_match_what_they_act_on():
     def two(t, q, v, params):
         return jnp.ones(2)
 
-    message = r"force 'pull': force must return shape \(3,\), but it returned \(2,\)\."
+    message = r"force 'pull': `force` must return shape \(3,\), but it returned \(2,\)\."
     with pytest.raises(ValueError, match=message):
         force_of(jl.PointForce(corner, two, "pull"))
-    message = r"couple 'motor': torque must return shape \(3,\), but it returned \(2,\)\."
+    message = r"couple 'motor': `torque` must return shape \(3,\), but it returned \(2,\)\."
     with pytest.raises(ValueError, match=message):
-        force_of(jl.Couple(body_rates, two, "motor"))
-    message = "force 'pull': force must return an array, but it returned None"
+        force_of(jl.Torque(body_rates, two, "motor"))
+    message = "force 'pull': `force` must return an array, but it returned None"
     with pytest.raises(ValueError, match=message):
         force_of(jl.PointForce(corner, lambda t, q, v, params: None, "pull"))
-    message = "force 'pull': position must return real numbers, but it returned int"
+    message = "force 'pull': `position` must return real numbers, but it returned int"
     with pytest.raises(ValueError, match=message):
         force_of(jl.PointForce(lambda t, q, params: jnp.arange(3), constant, "pull"))
 
@@ -295,20 +297,21 @@ def declarations():
 
     yield "force 'f': position", lambda: jl.PointForce(short, constant, "f")
     yield "force 'f': force", lambda: jl.PointForce(corner, short, "f")
-    yield "couple 'c': angular_velocity", lambda: jl.Couple(short, constant, "c")
-    yield "couple 'c': torque", lambda: jl.Couple(body_rates, short, "c")
+    yield "couple 'c': angular_velocity", lambda: jl.Torque(short, constant, "c")
+    yield "couple 'c': torque", lambda: jl.Torque(body_rates, short, "c")
 
 
 @pytest.mark.parametrize(("argument", "declare"), list(declarations()), ids=lambda x: str(x)[:24])
 def test_functions_must_take_the_standard_arguments(argument, declare):
-    with pytest.raises(ValueError, match=re.escape(f"{argument} must be callable as (t, q,")):
+    owner, _, own = argument.partition(": ")
+    with pytest.raises(ValueError, match=re.escape(f"{owner}: `{own}` must be callable as (t, q,")):
         declare()
 
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", ["", None, "explicit time"])
 def test_names_must_be_free(name):
-    with pytest.raises(ValueError, match="PointForce: name must"):
+    with pytest.raises(ValueError, match="PointForce: `name` must"):
         jl.PointForce(corner, constant, name)
-    with pytest.raises(ValueError, match="Couple: name must"):
-        jl.Couple(body_rates, constant, name)
+    with pytest.raises(ValueError, match="Torque: `name` must"):
+        jl.Torque(body_rates, constant, name)

@@ -212,9 +212,9 @@ def test_a_declared_system_uses_them():
     built = jl.System(coordinates=("theta", "phi"), kinetic=kinetic, potential=potential)
     hand = jl.System(by_hand, ("theta", "phi"))
     params = {"m": 0.8, "L": 1.1, "g": 9.81}
-    state = (params, [0.3, 0.9], [1.2, -0.4])
+    state = ([0.3, 0.9], [1.2, -0.4], params)
     np.testing.assert_allclose(built.acceleration(*state), hand.acceleration(*state), rtol=64 * EPS)
-    assert built.structure(params, jnp.float64) == hand.structure(params, jnp.float64)
+    assert built._structure(params, jnp.float64) == hand._structure(params, jnp.float64)
 
 
 def test_bodies_may_be_params_and_fitted():
@@ -274,36 +274,56 @@ def wrong():
     def flat(t, q, params):
         return rotation.about_z(q[0]), q[:2]
 
-    yield "mass", lambda: energy.RigidBody(-1.0, unit), "mass must not be negative, but it was -1.0"
-    yield "masses", lambda: energy.RigidBody(np.ones(2), unit), "mass must be a number, but its sh"
-    yield "centre", lambda: energy.RigidBody(1.0, unit, [0.1, 0.2]), "centre must be a vector of 3"
-    yield "g", lambda: energy.gravity(1.0, zero, 9.81), "gravity: g must be a vector with one comp"
-    yield "g2", lambda: energy.gravity(1.0, zero, jnp.ones(2)), "gravity: g must be a vector with"
-    yield "spring", lambda: energy.spring(1.0, jnp.eye(2)), "spring: r must be one vector, but its"
+    yield (
+        "mass",
+        lambda: energy.RigidBody(-1.0, unit),
+        "`mass` must not be negative, but it was -1.0",
+    )
+    yield (
+        "masses",
+        lambda: energy.RigidBody(np.ones(2), unit),
+        "`mass` must be a number, but its sh",
+    )
+    yield (
+        "centre",
+        lambda: energy.RigidBody(1.0, unit, [0.1, 0.2]),
+        "`centre` must be a vector of 3",
+    )
+    yield (
+        "g",
+        lambda: energy.gravity(1.0, zero, 9.81),
+        "gravity: `g` must be a vector with one comp",
+    )
+    yield "g2", lambda: energy.gravity(1.0, zero, jnp.ones(2)), "gravity: `g` must be a vector with"
+    yield (
+        "spring",
+        lambda: energy.spring(1.0, jnp.eye(2)),
+        "spring: `r` must be one vector, but its",
+    )
     yield (
         "particles",
         lambda: energy.particles(lambda t, q, p: q, jnp.ones(2), T, zero, zero, None),
-        "mass must be a number, or one for each of the positions",
+        "`mass` must be a number, or one for each of the positions",
     )
     yield (
         "pose",
         lambda: energy.body_velocity(flat, T, zero, zero, None),
-        "pose must return R of shape (3, 3) and r_O of shape (3,), but the shapes were (3, 3) and",
+        "`pose` must return R of shape (3, 3) and r_O of shape (3,), but the shapes were (3, 3)",
     )
     yield (
         "pair",
         lambda: energy.body_velocity(lambda t, q, p: q, T, zero, zero, None),
-        "pose must return the pair (R, r_O), but it returned JVPTracer",
+        "`pose` must return the pair (R, r_O), but it returned JVPTracer",
     )
     yield (
         "pose numbers",
         lambda: energy.body_velocity(lambda t, q, p: ("R", q), T, zero, zero, None),
-        "pose: R must be real numbers, but it was 'R'",
+        "pose: `R` must be real numbers, but it was 'R'",
     )
     yield (
         "pose arity",
         lambda: energy.body_velocity(lambda t, q: (unit, q), T, zero, zero, None),
-        "pose must be callable as (t, q, params), but its signature was (t, q)",
+        "`pose` must be callable as (t, q, params), but its signature was (t, q)",
     )
 
     def along(position, q=zero, v=zero, t=T):
@@ -312,72 +332,84 @@ def wrong():
     yield (
         "scalar",
         along(lambda t, q, p: q[0]),
-        "position must return a vector of shape (d,), or (k, d) for k particles, but it returned "
+        "`position` must return a vector of shape (d,), or (k, d) for k particles, but it returned "
         "shape (). Return jnp.stack([x, y])",
     )
     yield (
         "list",
         along(lambda t, q, p: [q[0], q[1]]),
-        "position must return an array, but it returned list. Return jnp.stack([x, y])",
+        "`position` must return an array, but it returned list. Return jnp.stack([x, y])",
     )
-    yield "none", along(lambda t, q, p: None), "position must return an array, but it returned None"
+    yield (
+        "none",
+        along(lambda t, q, p: None),
+        "`position` must return an array, but it returned None",
+    )
     yield (
         "complex",
         along(lambda t, q, p: jax.lax.complex(q, q)),
-        "position must be real, but its dtype was compl",
+        "`position` must be real, but its dtype was compl",
     )
-    yield "arity", along(lambda t, q: q), "position must be callable as (t, q, params), but its sig"
+    yield (
+        "arity",
+        along(lambda t, q: q),
+        "`position` must be callable as (t, q, params), but its sig",
+    )
     here = along(lambda t, q, p: q, v=[1.0, 2.0])
-    yield "v", here, "v must have the shape of q, but their shapes were (2,) and (3,). Give one"
-    yield "q", along(lambda t, q, p: q, q="abc"), "q must be real numbers, but it was 'abc'."
-    yield "t", along(lambda t, q, p: q, t=zero), "t must be a number, but its shape was (3,)."
+    yield "v", here, "`v` must have the shape of q, but their shapes were (2,) and (3,). Give one"
+    yield "q", along(lambda t, q, p: q, q="abc"), "`q` must be real numbers, but it was 'abc'."
+    yield "t", along(lambda t, q, p: q, t=zero), "`t` must be a number, but its shape was (3,)."
     body = energy.RigidBody(1.0, unit)
-    yield "V", lambda: body.kinetic_from_rates(1.0, zero), "V must have shape (3,), but its shape"
-    yield "w", lambda: body.kinetic_from_rates(zero, None), "w must be real numbers, but it was No"
-    yield "nan", lambda: energy.RigidBody(np.nan, unit), "RigidBody: mass must be finite, but it"
-    yield "text", lambda: energy.RigidBody("1", unit), "RigidBody: mass must be real numbers, but"
-    yield "1j", lambda: energy.RigidBody(1j, unit), "RigidBody: mass must be real, but its dtype"
+    yield "V", lambda: body.kinetic_from_rates(1.0, zero), "`V` must have shape (3,), but its shape"
+    yield (
+        "w",
+        lambda: body.kinetic_from_rates(zero, None),
+        "`w` must be real numbers, but it was No",
+    )
+    yield "nan", lambda: energy.RigidBody(np.nan, unit), "RigidBody: `mass` must be finite, but it"
+    yield "text", lambda: energy.RigidBody("1", unit), "RigidBody: `mass` must be real numbers, but"
+    yield "1j", lambda: energy.RigidBody(1j, unit), "RigidBody: `mass` must be real, but its dtype"
     yield (
         "infinite",
         lambda: energy.RigidBody(1.0, unit, [0, np.inf, 0]),
-        "RigidBody: centre must be finite, but it was [0.0, inf, 0.0]",
+        "RigidBody: `centre` must be finite, but it was [0.0, inf, 0.0]",
     )
     yield (
         "axis centre",
         lambda: energy.parallel_axis(unit, 1.0, [1.0, 2.0]),
-        "parallel_axis: centre must be a vector of 3 components, but its shape was (2,)",
+        "parallel_axis: `centre` must be a vector of 3 components, but its shape was (2,)",
     )
     yield (
         "axis mass",
         lambda: energy.parallel_axis(unit, -1.0, zero),
-        "parallel_axis: mass must not be negative, but it was -1.0 kg",
+        "parallel_axis: `mass` must not be negative, but it was -1.0 kg",
     )
     yield (
         "axis masses",
         lambda: energy.parallel_axis(unit, np.ones(3), zero),
-        "parallel_axis: mass must be a number, but its shape was (3,)",
+        "parallel_axis: `mass` must be a number, but its shape was (3,)",
     )
     yield (
         "products",
         lambda: energy.inertia_matrix(1.0, 2.0, 3.0, Ixz=[0.1]),
-        "inertia_matrix: Ixz must be a number, but its shape was (1,)",
+        "inertia_matrix: `Ixz` must be a number, but its shape was (1,)",
     )
     yield (
         "stiffness",
         lambda: energy.spring(np.ones(3), zero),
-        "spring: stiffness must be a number, but its shape was (3,)",
+        "spring: `stiffness` must be a number, but its shape was (3,)",
     )
     yield (
         "length",
         lambda: energy.spring(1.0, zero, np.ones(3)),
-        "spring: length must be a number, but its shape was (3,)",
+        "spring: `length` must be a number, but its shape was (3,)",
     )
     yield (
         "negative",
         lambda: energy.spring(1.0, zero, -0.1),
-        "spring: length must not be negative, but it was -0.1 m",
+        "spring: `length` must not be negative, but it was -0.1 m",
     )
-    yield "gravity r", lambda: energy.gravity(1.0, None, zero), "gravity: r must be real numbers"
+    yield "gravity r", lambda: energy.gravity(1.0, None, zero), "gravity: `r` must be real numbers"
 
 
 @pytest.mark.parametrize(("call", "message"), [w[1:] for w in wrong()], ids=[w[0] for w in wrong()])

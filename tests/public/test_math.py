@@ -386,19 +386,19 @@ def test_numbers_and_integers_among_vectors_and_pairs():
 
 @pytest.mark.parametrize("name", ELEMENTWISE)
 def test_complex_numbers_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name}: . must be real, but its dtype was complex128"):
+    with pytest.raises(ValueError, match=f"{name}: `.` must be real, but its dtype was complex128"):
         getattr(math, name)(1j)
 
 
 def test_wrong_vectors_are_refused():
     for function in (math.norm, math.unit):
-        with pytest.raises(ValueError, match="x must be a vector, but it was a scalar"):
+        with pytest.raises(ValueError, match="`x` must be a vector, but it was a scalar"):
             function(1.0)
-    with pytest.raises(ValueError, match="b must be a vector"):
+    with pytest.raises(ValueError, match="`b` must be a vector"):
         math.angle_between([1.0, 0.0], 1.0)
     with pytest.raises(ValueError, match="same number of components, but they had 2 and 1"):
         math.angle_between([1.0, 0.0], [1.0])
-    with pytest.raises(ValueError, match="atan2: x must be real"):
+    with pytest.raises(ValueError, match="atan2: `x` must be real"):
         math.atan2(1.0, 1j)
 
 

@@ -326,39 +326,39 @@ def test_quaternions_of_half_turns():
 
 E = np.eye(3)
 WRONG = {
-    "a must have shape (3,), but its shape was (4,).": lambda: rotation.skew(np.ones(4)),
-    "S must have shape (3, 3), but its shape was (3,).": lambda: rotation.unskew(np.ones(3)),
-    "angle must have shape (), but its shape was (2,). Use jax.vmap": lambda: rotation.about_x(
+    "`a` must have shape (3,), but its shape was (4,).": lambda: rotation.skew(np.ones(4)),
+    "`S` must have shape (3, 3), but its shape was (3,).": lambda: rotation.unskew(np.ones(3)),
+    "`angle` must have shape (), but its shape was (2,). Use jax.vmap": lambda: rotation.about_x(
         np.ones(2)
     ),
-    "rotations must hold at least one matrix, but none was given.": lambda: rotation.compose(),
-    "rotations[1] must have shape (3, 3), but its shape was (2, 2).": lambda: rotation.compose(
+    "`rotations` must hold at least one matrix, but none was given.": lambda: rotation.compose(),
+    "`rotations[1]` must have shape (3, 3), but its shape was (2, 2).": lambda: rotation.compose(
         E, np.eye(2)
     ),
-    "R must have shape (3, 3), but its shape was (3, 2).": lambda: rotation.direction_cosines(
+    "`R` must have shape (3, 3), but its shape was (3, 2).": lambda: rotation.direction_cosines(
         E[:, :2]
     ),
-    "R_dot must have shape (3, 3), but its shape was (3,).": lambda: rotation.body_rates(E, E[0]),
-    "R must have shape (3, 3), but its shape was (5, 3, 3). Use jax.vmap": (
+    "`R_dot` must have shape (3, 3), but its shape was (3,).": lambda: rotation.body_rates(E, E[0]),
+    "`R` must have shape (3, 3), but its shape was (5, 3, 3). Use jax.vmap": (
         lambda: rotation.space_rates(np.ones((5, 3, 3)), E)
     ),
-    "x must have shape (3,), but its shape was (4,).": lambda: zxz.matrix(np.ones(4)),
-    "x must have shape (4,), but its shape was (3,).": lambda: quaternion.space_rates(E[0], E[0]),
-    "x_dot must have shape (4,), but its shape was (3,).": lambda: quaternion.body_rates(
+    "`x` must have shape (3,), but its shape was (4,).": lambda: zxz.matrix(np.ones(4)),
+    "`x` must have shape (4,), but its shape was (3,).": lambda: quaternion.space_rates(E[0], E[0]),
+    "`x_dot` must have shape (4,), but its shape was (3,).": lambda: quaternion.body_rates(
         np.ones(4), E[0]
     ),
-    "w must have shape (3,), but its shape was (4,).": lambda: quaternion.from_space_rates(
+    "`w` must have shape (3,), but its shape was (4,).": lambda: quaternion.from_space_rates(
         np.ones(4), np.ones(4)
     ),
-    "R must have shape (3, 3), but its shape was (4, 4).": lambda: quaternion.from_matrix(
+    "`R` must have shape (3, 3), but its shape was (4, 4).": lambda: quaternion.from_matrix(
         np.eye(4)
     ),
-    "b must have shape (4,), but its shape was (3,).": lambda: quaternion.multiply(
+    "`b` must have shape (4,), but its shape was (3,).": lambda: quaternion.multiply(
         np.ones(4), np.ones(3)
     ),
-    "a must have shape (4,), but its shape was ().": lambda: quaternion.conjugate(1.0),
-    "x must be real numbers, but it was 'yaw'.": lambda: yaw_pitch_roll.matrix("yaw"),
-    "x must be real, but its dtype was complex128.": lambda: yaw_pitch_roll.body_rate_matrix(
+    "`a` must have shape (4,), but its shape was ().": lambda: quaternion.conjugate(1.0),
+    "`x` must be real numbers, but it was 'yaw'.": lambda: yaw_pitch_roll.matrix("yaw"),
+    "`x` must be real, but its dtype was complex128.": lambda: yaw_pitch_roll.body_rate_matrix(
         np.ones(3) * 1j
     ),
 }

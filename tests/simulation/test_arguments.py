@@ -36,30 +36,30 @@ NOT_SCALAR = [
 @pytest.mark.parametrize(("lagrangian", "was"), NOT_SCALAR)
 def test_the_lagrangian_must_be_a_real_scalar(lagrangian, was):
     system = jl.System(lagrangian, ("x", "y"))
-    message = f"lagrangian must return a real scalar, but it returned {was}. Sum with"
+    message = f"`lagrangian` must return a real scalar, but it returned {was}. Sum with"
     refused(message, system=system)
-    for ask in (system.check, lambda *state: system.explain(state[0])):
+    for ask in (system.check, lambda *state: system.explain(state[2])):
         with pytest.raises(ValueError, match="^" + re.escape(message)):
-            ask(PARAMS, Q0, V0)
+            ask(Q0, V0, PARAMS)
 
 
 @pytest.mark.parametrize("method", ["acceleration", "bias", "mass_matrix", "momentum", "energy"])
 def test_every_method_says_so(method):
     system = jl.System(NOT_SCALAR[0][0], ("x", "y"))
     with pytest.raises(
-        ValueError, match=r"^lagrangian must return a real scalar, but it returned "
+        ValueError, match=r"^`lagrangian` must return a real scalar, but it returned "
     ):
-        getattr(system, method)(PARAMS, Q0, V0)
+        getattr(system, method)(Q0, V0, PARAMS)
 
 
 def test_the_lagrangian_must_be_an_array():
     system = jl.System(lambda t, q, v, params: [v @ v], ("x", "y"))
-    refused("lagrangian must return an array, but it returned [", system=system)
+    refused("`lagrangian` must return an array, but it returned [", system=system)
     system = jl.System(lambda t, q, v, params: None, ("x", "y"))
-    refused("lagrangian must return an array, but it returned None", system=system)
+    refused("`lagrangian` must return an array, but it returned None", system=system)
 
 
-EITHER = "System must get either lagrangian, or both kinetic and potential, but it got "
+EITHER = "`System` must get either lagrangian, or both kinetic and potential, but it got "
 
 
 @pytest.mark.parametrize(
@@ -67,32 +67,32 @@ EITHER = "System must get either lagrangian, or both kinetic and potential, but 
     [
         (
             {"lagrangian": lambda q, v: v @ v},
-            "lagrangian must be callable as (t, q, v, params), but its signature was (q, v). Add "
+            "`lagrangian` must be callable as (t, q, v, params), but its signature was (q, v). Add "
             "or drop arguments so that it takes exactly these, in this order.",
         ),
         (
             {"lagrangian": lambda t, q, v, params, inputs: v @ v},
-            "lagrangian must be callable as (t, q, v, params), but its signature was (t, q, v, p",
+            "`lagrangian` must be callable as (t, q, v, params), but its signature was (t, q, v, p",
         ),
         (
             {"kinetic": lambda q, v, params: v @ v, "potential": potential},
-            "kinetic must be callable as (t, q, v, params), but its signature was (q, v, params).",
+            "`kinetic` must be callable as (t, q, v, params), but its signature was (q, v, params)",
         ),
         (
             {"kinetic": kinetic, "potential": kinetic},
-            "potential must be callable as (t, q, params), but its signature was (t, q, v, ",
+            "`potential` must be callable as (t, q, params), but its signature was (t, q, v, ",
         ),
         (
             {},
-            "System must get either lagrangian, or both kinetic and potential, but it got none of",
+            "`System` must get either lagrangian, or both kinetic and potential, but it got none",
         ),
         (
             {"kinetic": kinetic},
-            "System must get either lagrangian, or both kinetic and potential, but",
+            "`System` must get either lagrangian, or both kinetic and potential, but",
         ),
         (
             {"potential": potential},
-            "System must get either lagrangian, or both kinetic and potential",
+            "`System` must get either lagrangian, or both kinetic and potential",
         ),
         (
             {"lagrangian": kinetic, "kinetic": kinetic, "potential": potential},
@@ -108,15 +108,17 @@ def test_the_functions_must_take_their_arguments(parts, message):
 
 @pytest.mark.usefixtures("unchecked")
 def test_the_lagrangian_must_be_a_function():
-    message = r"^lagrangian must be a function of \(t, q, v, params\), but it was 3\.0\.$"
+    message = r"^`lagrangian` must be a function of \(t, q, v, params\), but it was 3\.0\.$"
     with pytest.raises(ValueError, match=message):
         jl.System(3.0, ("x",))
 
 
 def test_coordinates_must_have_distinct_names():
-    with pytest.raises(ValueError, match=r"^coordinates must be distinct, but 'x' occurs 2 times"):
+    with pytest.raises(
+        ValueError, match=r"^`coordinates` must be distinct, but 'x' occurs 2 times"
+    ):
         jl.System(kinetic, ("x", "y", "x"))
-    with pytest.raises(ValueError, match=r"^coordinates must name at least one coordinate, but"):
+    with pytest.raises(ValueError, match=r"^`coordinates` must name at least one coordinate, but"):
         jl.System(kinetic)
 
 
@@ -139,9 +141,9 @@ EULER = {"method": "euler", "dt": 0.5}
 def test_a_lagrangian_that_is_nan_at_the_start_is_refused():
     system = jl.System(logarithmic, ("x", "y"))
     with pytest.raises(
-        ValueError, match=r"^lagrangian must be finite at the given state, but it was"
+        ValueError, match=r"^`lagrangian` must be finite at the given state, but it was"
     ):
-        system.check(PARAMS, [-1.0, 2.0], V0)
+        system.check([-1.0, 2.0], V0, PARAMS)
     with pytest.raises(
         jl.SimulationError, match=r"status nonfinite.*last good state at t = 0\.0 .*Lagrangian or a"
     ) as caught:
@@ -162,7 +164,7 @@ def test_a_coordinate_without_inertia_is_named_by_check(n):
             r"pivot was not positive at q = .*, v = .* Add its kinetic energy to L"
         )
         with pytest.raises(ValueError, match=message):
-            system.check(params, np.ones(n), np.zeros(n))
+            system.check(np.ones(n), np.zeros(n), params)
 
 
 @pytest.mark.parametrize("n", [3, 9])
@@ -189,81 +191,99 @@ def test_a_coordinate_without_inertia_is_named_by_simulate(n):
     [
         (
             {"q0": [1.0]},
-            "q0 must have shape (2,), but its shape was (1,). Give one entry per c",
+            "`q0` must have shape (2,), but its shape was (1,). Give one entry per c",
         ),
-        ({"v0": [0.0] * 3}, "v0 must have shape (2,), but its shape was (3,). Give one entry per"),
-        ({"q0": [[1.0, 2.0]]}, "q0 must have shape (2,), but its shape was (1, 2)."),
-        ({"q0": {"x": 1.0}}, "q0 must name exactly ['x', 'y'], but it named ['x']."),
-        ({"v0": {"x": [1.0], "y": 0.0}}, "v0['x'] must have shape (), but it was (1,)."),
-        ({"v0": {"x": "one", "y": 0.0}}, "v0['x'] must "),
-        ({"q0": None}, "q0 must be 2 numbers, but it was None."),
-        ({"q0": ["one", "two"]}, "q0 must be 2 numbers, but it was ['one', 'two']."),
-        ({"v0": [1.0, 2.0j]}, "v0 must be real, but its dtype was complex128."),
-        ({"q0": [1.0, np.nan]}, "q0 must be finite, but q0[1] ('y') was nan."),
-        ({"v0": [np.inf, np.nan]}, "v0 must be finite, but v0[0] ('x') was inf."),
+        (
+            {"v0": [0.0] * 3},
+            "`v0` must have shape (2,), but its shape was (3,). Give one entry per",
+        ),
+        ({"q0": [[1.0, 2.0]]}, "`q0` must have shape (2,), but its shape was (1, 2)."),
+        ({"q0": {"x": 1.0}}, "`q0` must name exactly ['x', 'y'], but it named ['x']."),
+        ({"v0": {"x": [1.0], "y": 0.0}}, "`v0['x']` must have shape (), but it was (1,)."),
+        ({"v0": {"x": "one", "y": 0.0}}, "`v0['x']` must "),
+        ({"q0": None}, "`q0` must be 2 numbers, but it was None."),
+        ({"q0": ["one", "two"]}, "`q0` must be 2 numbers, but it was ['one', 'two']."),
+        ({"v0": [1.0, 2.0j]}, "`v0` must be real, but its dtype was complex128."),
+        ({"q0": [1.0, np.nan]}, "`q0` must be finite, but q0[1] ('y') was nan."),
+        ({"v0": [np.inf, np.nan]}, "`v0` must be finite, but v0[0] ('x') was inf."),
         (
             {"v0": None},
-            "v0 and u0 must be given one at a time, but neither was given. Pass v0=, the",
+            "`v0` and `u0` must be given one at a time, but neither was given. Pass v0=, the",
         ),
-        ({"u0": V0}, "v0 and u0 must be given one at a time, but both were given."),
+        ({"u0": V0}, "`v0` and `u0` must be given one at a time, but both were given."),
         (
             {"v0": None, "u0": V0},
-            "u0 must be given for a system with quasi-velocities only, but this system has none. "
+            "`u0` must be given for a system with quasi-velocities only, but this system has none. "
             "Pass v0= instead.",
         ),
-        ({"ts": None}, "ts must be given, but it was left out. Pass ts=jnp.linspace(0, 10, 501)."),
-        ({"ts": [0.0]}, "ts must be an array of at least 2 times, but its shape was (1,)."),
-        ({"ts": []}, "ts must be an array of at least 2 times, but its shape was (0,)."),
-        ({"ts": 1.0}, "ts must be an array of at least 2 times, but its shape was ()."),
-        ({"ts": [TS]}, "ts must be an array of at least 2 times, but its shape was (1, 2)."),
+        (
+            {"ts": None},
+            "`ts` must be given, but it was None. Pass ts=jnp.linspace(0, 10, 501).",
+        ),
+        ({"ts": [0.0]}, "`ts` must be an array of at least 2 times, but its shape was (1,)."),
+        ({"ts": []}, "`ts` must be an array of at least 2 times, but its shape was (0,)."),
+        ({"ts": 1.0}, "`ts` must be an array of at least 2 times, but its shape was ()."),
+        ({"ts": [TS]}, "`ts` must be an array of at least 2 times, but its shape was (1, 2)."),
         (
             {"ts": [0.0, 1.0, 1.0]},
-            "ts must be strictly monotone, but ts[1] = 1.0, ts[2] = 1.0. Sort the times and drop",
+            "`ts` must be strictly monotone, but ts[1] = 1.0, ts[2] = 1.0. Sort the times and drop",
         ),
-        ({"ts": [0.0, 2.0, 1.0]}, "ts must be strictly monotone, but ts[1] = 2.0, ts[2] = 1.0."),
-        ({"ts": [1.0, 2.0, 0.0]}, "ts must be strictly monotone, but ts[0] = 1.0, ts[1] = 2.0."),
-        ({"ts": [0.0, 0.0]}, "ts must be strictly monotone, but ts[0] = 0.0, ts[1] = 0.0."),
-        ({"ts": [0.0, np.nan, 1.0]}, "ts must be finite, but ts[1] was not."),
-        ({"ts": [0.0, np.inf]}, "ts must be finite, but ts[1] was not."),
-        ({"rtol": -1e-6}, "rtol must be finite and not negative, but it was -1e-06."),
-        ({"atol": -1e-6}, "atol must be finite and not negative, but it was -1e-06."),
-        ({"rtol": np.nan}, "rtol must be finite and not negative, but it was nan."),
-        ({"atol": np.inf}, "atol must be finite and not negative, but it was inf."),
+        ({"ts": [0.0, 2.0, 1.0]}, "`ts` must be strictly monotone, but ts[1] = 2.0, ts[2] = 1.0."),
+        ({"ts": [1.0, 2.0, 0.0]}, "`ts` must be strictly monotone, but ts[0] = 1.0, ts[1] = 2.0."),
+        ({"ts": [0.0, 0.0]}, "`ts` must be strictly monotone, but ts[0] = 0.0, ts[1] = 0.0."),
+        ({"ts": [0.0, np.nan, 1.0]}, "`ts` must be finite, but ts[1] was not."),
+        ({"ts": [0.0, np.inf]}, "`ts` must be finite, but ts[1] was not."),
+        ({"rtol": -1e-6}, "`rtol` must be finite and not negative, but it was -1e-06."),
+        ({"atol": -1e-6}, "`atol` must be finite and not negative, but it was -1e-06."),
+        ({"rtol": np.nan}, "`rtol` must be finite and not negative, but it was nan."),
+        ({"atol": np.inf}, "`atol` must be finite and not negative, but it was inf."),
         (
             {"atol": [1e-6, 1e-3, 1e-3]},
-            "atol must be a number, or one for each of 2 coordinates, but its shape was (3,).",
+            "`atol` must be a number, or one for each of 2 coordinates, but its shape was (3,).",
         ),
-        ({"atol": [1e-6, -1e-3]}, "atol must be finite and not negative, but it was [ 1.e-06"),
-        ({"atol": {"x": 1e-6}}, "atol must name exactly ['x', 'y'], but it named ['x']."),
-        ({"rtol": [1e-6, 1e-6]}, "rtol must be a number, but its shape was (2,)."),
-        ({"rtol": "tight"}, "rtol must be a number, but it was 'tight'."),
-        ({"rtol": 0.0, "atol": 0}, "rtol and atol must not both be zero, but both were."),
+        ({"atol": [1e-6, -1e-3]}, "`atol` must be finite and not negative, but it was [ 1.e-06"),
+        ({"atol": {"x": 1e-6}}, "`atol` must name exactly ['x', 'y'], but it named ['x']."),
+        ({"rtol": [1e-6, 1e-6]}, "`rtol` must be a number, but its shape was (2,)."),
+        ({"rtol": "tight"}, "`rtol` must be a number, but it was 'tight'."),
+        ({"rtol": 0.0, "atol": 0}, "`rtol` and `atol` must not both be zero, but both were."),
         (
             {"rtol": 9 * EPS},
-            "rtol must be 0 or at least 2.2e-15, ten roundings of float64, but it was 1.99",
+            "`rtol` must be 0 or at least 2.2e-15, ten roundings of float64, but it was 1.99",
         ),
         (
             {"rtol": 1e-7, "q0": single(1, 2), "v0": single(0, 1)},
-            "rtol must be 0 or at least 1.2e-06, ten roundings of float32, but it was 1e-07. "
+            "`rtol` must be 0 or at least 1.2e-06, ten roundings of float32, but it was 1e-07. "
             'Loosen it, or compute in float64: jax.config.update("jax_enable_x64", True)',
         ),
         (
             {"dt": 0.1, "rtol": 1e-6},
-            "rtol and atol must be left out with fixed steps, but dt was given too.",
+            "`rtol` and `atol` must be left out with fixed steps, but dt was given too.",
         ),
-        ({"dt": 0.1, "atol": 1e-6}, "rtol and atol must be left out with fixed steps, but dt was"),
-        ({"dt": -0.1}, "dt must be positive, whichever way time runs, but it was -0.1."),
-        ({"dt": 0.0}, "dt must be positive, whichever way time runs, but it was 0.0."),
-        ({"dt": np.nan}, "dt must be positive, whichever way time runs, but it was nan."),
-        ({"dt": [0.1, 0.2]}, "dt must be a number, but its shape was (2,)."),
-        ({"dt": "small"}, "dt must be a number, but it was 'small'."),
-        ({"dt0": -0.1}, "dt0 must be positive, whichever way time runs, but it was -0.1."),
-        ({"dt": 0.1, "dt0": 0.1}, "dt and dt0 must be given one at a time, but both were given."),
-        ({"ts": [0.0, 1.0j]}, "ts must be an array of times, but it was [0.0, 1j]. Only real"),
-        ({"rtol": "1e-6"}, "rtol must be a number, but it was '1e-6'. Only real numbers will do."),
-        ({"rtol": 1e-6j}, "rtol must be a number, but it was 1e-06j. Only real numbers will do."),
-        ({"dt_max": 0.0}, "dt_max must be positive, whichever way time runs, but it was 0.0."),
-        ({"dt": 0.1, "dt_max": 0.1}, "dt_max must be left out with fixed steps, but dt was given"),
+        (
+            {"dt": 0.1, "atol": 1e-6},
+            "`rtol` and `atol` must be left out with fixed steps, but dt was",
+        ),
+        ({"dt": -0.1}, "`dt` must be positive, whichever way time runs, but it was -0.1."),
+        ({"dt": 0.0}, "`dt` must be positive, whichever way time runs, but it was 0.0."),
+        ({"dt": np.nan}, "`dt` must be positive, whichever way time runs, but it was nan."),
+        ({"dt": [0.1, 0.2]}, "`dt` must be a number, but its shape was (2,)."),
+        ({"dt": "small"}, "`dt` must be a number, but it was 'small'."),
+        ({"dt0": -0.1}, "`dt0` must be positive, whichever way time runs, but it was -0.1."),
+        (
+            {"dt": 0.1, "dt0": 0.1},
+            "`dt` and `dt0` must be given one at a time, but both were given.",
+        ),
+        ({"ts": [0.0, 1.0j]}, "`ts` must be an array of times, but it was [0.0, 1j]. Only real"),
+        (
+            {"rtol": "1e-6"},
+            "`rtol` must be a number, but it was '1e-6'. Only real numbers will do.",
+        ),
+        ({"rtol": 1e-6j}, "`rtol` must be a number, but it was 1e-06j. Only real numbers will do."),
+        ({"dt_max": 0.0}, "`dt_max` must be positive, whichever way time runs, but it was 0.0."),
+        (
+            {"dt": 0.1, "dt_max": 0.1},
+            "`dt_max` must be left out with fixed steps, but dt was given",
+        ),
     ],
 )
 def test_a_bad_value_is_refused(changes, message):
@@ -359,7 +379,9 @@ def growing(t, q, v, params):
 def test_loops_without_a_number_of_turns_are_named_by_their_line(lowering):
     system = jl.System(growing, ("x",), lowering=lowering)
     line = growing.__code__.co_firstlineno + 1
-    message = rf"^lagrangian must have reverse derivatives.*test_arguments.py:{line}:.*\(growing\)"
+    message = (
+        rf"^`lagrangian` must have reverse derivatives.*test_arguments.py:{line}:.*\(growing\)"
+    )
     for ask in (jl.equilibrium, lambda system, q: jl.simulate(system, q, [0.0], [0.0, 1.0])):
         with pytest.raises(ValueError, match=message):
             ask(system, [1.0])
@@ -374,5 +396,5 @@ def test_params_that_nothing_reads_may_be_anything(unread):
     options = {"method": "euler", "dt": 0.5}
     motion = jl.simulate(system, [0.0], [1.0], [0.0, 1.0], {"m": 1.0, "limit": unread}, **options)
     assert motion.q[-1] == 1.0
-    with pytest.raises(ValueError, match=r"^params\['m'\] must be finite, but it was inf\."):
+    with pytest.raises(ValueError, match=r"^`params\['m'\]` must be finite, but it was inf\."):
         jl.simulate(system, [0.0], [1.0], [0.0, 1.0], {"m": np.inf, "limit": unread}, **options)

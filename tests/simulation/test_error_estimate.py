@@ -98,9 +98,13 @@ def test_lanes_and_jit():
 def test_what_cannot_be_estimated(unchecked):  # noqa: F811
     controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     method = (diffrax.Tsit5(), controller)
-    with pytest.raises(ValueError, match=r"estimate_error must be False for a method with a cont"):
+    with pytest.raises(
+        ValueError, match=r"`estimate_error` must be False for a method with a cont"
+    ):
         jl.simulate(*PENDULUM, method=method, estimate_error=True)
-    with pytest.raises(ValueError, match=r"estimate_error must be True or False, but it was 1e-06"):
+    with pytest.raises(
+        ValueError, match=r"`estimate_error` must be True or False, but it was 1e-06"
+    ):
         jl.simulate(*PENDULUM, estimate_error=1e-6)
 
 

@@ -142,9 +142,9 @@ def test_jumps_within_inputs():
     def feedback(t, q, v, params):
         return step(t, params) * q[0]
 
-    assert leaves(system, PARAMS, {"u": jl.Function(step)}) == {"params['b']"}
+    assert leaves(system, PARAMS, {"u": jl.TimeFunction(step)}) == {"params['b']"}
     assert leaves(system, PARAMS, {"u": jl.Feedback(feedback)}) == {"params['b']"}
-    knots = jl.Function(step, knots=[PARAMS["b"]])
+    knots = jl.TimeFunction(step, knots=[PARAMS["b"]])
     assert leaves(system, PARAMS, {"u": knots}) == set()
     table = jl.ZeroOrderHold([0.0, PARAMS["b"], 3.0], [1.0, 0.0])
     names = ("params['b']", "inputs['u'].times")
@@ -250,7 +250,7 @@ def test_signals_may_close_over_params_where_all_have_one_function():
     ts = np.linspace(0.0, 1.0, 11)
 
     def turned(params):
-        return {"push": jl.Function(lambda t: jnp.sin(params["w"] * t))}
+        return {"push": jl.TimeFunction(lambda t: jnp.sin(params["w"] * t))}
 
     x = jl.simulate(DRIVEN, Q0, [0.1], ts, {"w": 1.5, "k": 2.0}, inputs=turned({"w": 1.5})).q
     channels = {"x": np.asarray(x)}
@@ -258,7 +258,9 @@ def test_signals_may_close_over_params_where_all_have_one_function():
     found = jl.fit(DRIVEN, one, {"w": 1.4, "k": 2.0}, free=("w",))
     assert abs(found.params["w"] - 1.5) < 1e-4
     other = jl.Experiment(ts, channels, inputs=lambda p: turned(p), sigma={"x": 1e-3})
-    with pytest.raises(ValueError, match=r"inputs\['push'\] must take params .* Write jl.Function"):
+    with pytest.raises(
+        ValueError, match=r"`inputs\['push'\]` must take params .* Write jl.TimeFunction"
+    ):
         jl.fit(DRIVEN, [one, other], {"w": 1.4, "k": 2.0}, free=("w",))
 
 
@@ -268,12 +270,14 @@ def nothing():
 
 def test_inputs_of_params_are_checked():
     ts, x = np.linspace(0.0, 3.0, 4), {"x": np.arange(4.0)}
-    with pytest.raises(ValueError, match=r"inputs must be callable as \(params\)"):
+    with pytest.raises(ValueError, match=r"`inputs` must be callable as \(params\)"):
         jl.Experiment(ts, x, inputs=nothing)
-    late = jl.Experiment(ts, x, inputs=lambda p: {"push": jl.Linear([p["b"], 3.0], [0.0, 1.0])})
-    with pytest.raises(ValueError, match="inputs must cover ts of experiment, from 0"):
+    late = jl.Experiment(
+        ts, x, inputs=lambda p: {"push": jl.LinearInterpolation([p["b"], 3.0], [0.0, 1.0])}
+    )
+    with pytest.raises(ValueError, match="`inputs` must cover ts of experiment, from 0"):
         late.inputs_at({"b": 1.0})
     wrong = jl.Experiment(ts, x, inputs=lambda p: p["b"])
-    with pytest.raises(ValueError, match="inputs must be a dict from names to input objects"):
+    with pytest.raises(ValueError, match="`inputs` must be a dict from names to input objects"):
         wrong.inputs_at({"b": 1.0})
     assert late.part(slice(1, 3)).inputs is late.inputs

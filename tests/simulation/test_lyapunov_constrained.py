@@ -62,7 +62,7 @@ def test_constrained_growth_is_that_of_the_angle(X):
     options = TIGHT | {"method": "tsit5"}
     motion = jl.simulate(held, q, v, ts, params, **options)
     reduced = jl.simulate(angle, z0[:1], z0[1:], ts, params, **options)
-    growth, expected = jl.grad_growth(motion), jl.grad_growth(reduced)
+    growth, expected = jl.lyapunov(motion), jl.lyapunov(reduced)
 
     z, y = states(reduced), states(motion)
     np.testing.assert_allclose(jax.vmap(lambda *at: on_rod(*at, params))(z, ts), y, atol=1e-9)
@@ -104,7 +104,7 @@ def test_growth_on_a_knife_edge():
         return jnp.stack([*z[:3], z[3] * jnp.cos(z[2]), z[3] * jnp.sin(z[2]), z[4]])
 
     y0 = state(z0)
-    growth = jl.grad_growth(jl.simulate(skate, y0[:3], y0[3:], ts, SKATE, method="tsit5", **TIGHT))
+    growth = jl.lyapunov(jl.simulate(skate, y0[:3], y0[3:], ts, SKATE, method="tsit5", **TIGHT))
     start, end = jax.jacfwd(state)(z0), jax.jacfwd(lambda z: state(flow(z, 6.0)))(z0)
     np.testing.assert_allclose(product(growth) @ start, end, atol=1e-8)
     assert np.linalg.matrix_rank(growth.transition[0], tol=1e-6) == 5
@@ -118,7 +118,7 @@ def test_quasi_velocities_do_not_change_growth():
     v0 = jnp.array([0.8 * np.cos(0.3), 0.8 * np.sin(0.3), 1.3])
     _, system = sleighs()
     parts = [
-        jl.grad_growth(jl.simulate(system, q0, v0, ts, formulation=name, **TIGHT)).transition
+        jl.lyapunov(jl.simulate(system, q0, v0, ts, formulation=name, **TIGHT)).transition
         for name in ("multipliers", "quasi")
     ]
     # Measured 2026-11-22: 3e-14.
@@ -135,7 +135,7 @@ def test_rows_that_follow_from_others_change_nothing():
     _, q0, v0, params = double_pendulum()
     ts = np.linspace(0.0, 1.5, 21)
     parts = [
-        jl.grad_growth(jl.simulate(system, q0, v0, ts, params, **TIGHT)).transition
+        jl.lyapunov(jl.simulate(system, q0, v0, ts, params, **TIGHT)).transition
         for system in (cartesian, more)
     ]
     assert (np.linalg.matrix_rank(parts[1], tol=1e-6) == 4).all()

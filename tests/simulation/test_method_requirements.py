@@ -34,10 +34,14 @@ held = jl.System(spring, ("x",), constraints=(jl.Holonomic(lambda t, q, p: q[0] 
 
 @pytest.mark.parametrize("method", ["splitting4", "gauss4", "variational2"])
 def test_steps_are_equal(method):
-    with pytest.raises(ValueError, match=r"dt must be given for \w+, but it was left out.*dt=0.01"):
+    with pytest.raises(
+        ValueError, match=r"`dt` must be given for \w+, but it was left out.*dt=0.01"
+    ):
         solve(particle, method, dt=None)
     pair = (jl.solvers.Splitting(2), diffrax.PIDController(rtol=1e-6, atol=1e-6))
-    with pytest.raises(ValueError, match=r"dt must be given for Splitting, but a step-size contr"):
+    with pytest.raises(
+        ValueError, match=r"`dt` must be given for Splitting, but a step-size contr"
+    ):
         solve(particle, pair, dt=None)
 
 
@@ -72,8 +76,10 @@ def test_constraints_of_partitioned_methods():
 
 def test_damping_of_residuals_is_not_for_steps_without():
     system, *start = example(double_pendulum_cartesian)
-    with pytest.raises(ValueError, match=r"project must be left out for LobattoIIIAB, whose steps"):
-        solve(system, "variational2", *start, project=jl.Baumgarte(1.0, 1.0))
+    with pytest.raises(
+        ValueError, match=r"`stabilization` must be left out for LobattoIIIAB, whose steps"
+    ):
+        solve(system, "variational2", *start, stabilization=jl.Baumgarte(1.0, 1.0))
 
 
 def test_rolling_is_not_holonomic():

@@ -18,61 +18,66 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"system": kinetic}, "system must be a jl.System, but it was <function kinetic"),
-        ({"formulation": "quasi"}, "formulation must be 'auto', but it was 'quasi'."),
+        ({"system": kinetic}, "`system` must be a jl.System, but it was <function kinetic"),
+        ({"formulation": "quasi"}, "`formulation` must be 'auto', but it was 'quasi'."),
         (
             {"gradient": "adjoint"},
-            "gradient must be one of 'auto', 'forward', 'recorded', 'checkpoints', but it was "
+            "`gradient` must be one of 'auto', 'forward', 'recorded', 'checkpoints', but it was "
             "'adjoint'.",
         ),
         (
-            {"project": 1},
-            "project must be True, False or a jl.Baumgarte(alpha, beta), but it was 1.",
+            {"stabilization": 1},
+            "`stabilization` must be 'projection', None or a jl.Baumgarte(alpha, beta), but it was "
+            "1.",
         ),
-        ({"assemble": None}, "assemble must be True or False, but it was None."),
+        ({"assemble": None}, "`assemble` must be True or False, but it was None."),
         (
             {"save": ("a", "force")},
-            "save must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
-            "'power', 'lam', 'constraint_force', 'Q', 'work'], but one was 'force'.",
+            "`save` must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
+            "'power', 'multipliers', 'constraint_force', 'Q', 'work'], but one was 'force'.",
         ),
-        ({"save": "energy"}, "save must be a sequence of names, but it was 'energy'. Write save="),
-        ({"save": None}, "save must be a sequence of names, but it was None."),
+        (
+            {"save": "energy"},
+            "`save` must be a sequence of names, but it was 'energy'. Write save=",
+        ),
+        ({"save": None}, "`save` must be a sequence of names, but it was None."),
         (
             {"save": ("kinetic",), "system": WHOLE},
-            "save must name energies that the system declares, but one was 'kinetic'. Declare the",
+            "`save` must name energies that the system declares, but one was 'kinetic'. Declare",
         ),
-        ({"max_steps": 0}, "max_steps must be a positive integer, but it was 0."),
-        ({"max_steps": 10.0}, "max_steps must be a positive integer, but it was 10.0."),
-        ({"max_steps": True}, "max_steps must be a positive integer, but it was True."),
+        ({"max_steps": 0}, "`max_steps` must be a positive integer, but it was 0."),
+        ({"max_steps": 10.0}, "`max_steps` must be a positive integer, but it was 10.0."),
+        ({"max_steps": True}, "`max_steps` must be a positive integer, but it was True."),
         (
             {"method": "rk4"},
-            "method must be 'auto', one of ['bosh3', 'dopri5', 'dopri8', 'euler', ",
+            "`method` must be 'auto', one of ['bosh3', 'dopri5', 'dopri8', 'euler', ",
         ),
         (
             {"method": diffrax.Tsit5},
-            "method must be a name or a diffrax solver instance, but",
+            "`method` must be a name or a diffrax solver instance, but",
         ),
-        ({"method": 5}, "method must be a name or a diffrax solver instance, but it was 5."),
+        ({"method": 5}, "`method` must be a name or a diffrax solver instance, but it was 5."),
         (
             {"method": diffrax.ItoMilstein()},
-            "method must integrate an ordinary differential equation y' = f(t, y), but ItoMilstein",
+            "`method` must integrate an ordinary differential equation y' = f(t, y), but ItoMilst",
         ),
         (
             {"method": "euler"},
-            "method must estimate its error when dt is left out, but Euler has no error estimate. "
+            "`method` must estimate its error when dt is left out, but Euler has no error estimate."
+            " "
             "Give dt= for fixed steps",
         ),
         (
             {"method": (diffrax.Tsit5(), "pid")},
-            "method[1] must be a diffrax step-size controller",
+            "`method[1]` must be a diffrax step-size controller",
         ),
         (
             {"method": (diffrax.Tsit5(), diffrax.ConstantStepSize())},
-            "method[1] must adapt the step, but it was ConstantStepSize. Give dt= for fixed steps.",
+            "`method[1]` must adapt the step, but it was ConstantStepSize. Give dt= for fixed",
         ),
         (
             {"method": (diffrax.Tsit5(), STEPS), "dt": 0.1},
-            "dt must be left out when method brings its own controller, but both were given.",
+            "`dt` must be left out when method brings its own controller, but both were given.",
         ),
     ],
 )
@@ -82,7 +87,7 @@ def test_a_bad_option_is_refused(changes, message):
 
 
 def test_an_unknown_method_is_told_the_known_ones():
-    with pytest.raises(ValueError, match=r"^method .* but it was 'rk4'\.") as caught:
+    with pytest.raises(ValueError, match=r"^`method` .* but it was 'rk4'\.") as caught:
         run(method="rk4")
     for name in ("dopri8", "tsit5", "kvaerno5", "a diffrax solver or (solver, controller)"):
         assert name in str(caught.value)
@@ -107,10 +112,10 @@ def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
 
 def test_arguments_in_another_order_are_told():
     """Where the names say so: q, v, t, p."""
-    message = r"^lagrangian must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
+    message = r"^`lagrangian` must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
     with pytest.raises(ValueError, match=message):
         jl.System(lambda q, v, t, p: 0.5 * v @ v, ("x",))
-    with pytest.raises(ValueError, match=r"phi must take \(t, q, params\) in this order"):
+    with pytest.raises(ValueError, match=r"`phi` must take \(t, q, params\) in this order"):
         jl.Holonomic(lambda q, t, params: q[0], "row")
     jl.System(lambda time, x, v, p: 0.5 * v @ v, ("x",))
 
@@ -123,5 +128,5 @@ def test_a_parameter_of_one_entry_is_told():
 
 @pytest.mark.parametrize("parts", ["forces", "constraints"])
 def test_none_is_no_sequence(parts, unchecked):  # noqa: F811
-    with pytest.raises(ValueError, match=rf"^{parts} must be a sequence .*Leave it out"):
+    with pytest.raises(ValueError, match=rf"^`{parts}` must be a sequence .*Leave it out"):
         jl.System(SYSTEM.lagrangian, ("x", "y"), **{parts: None})

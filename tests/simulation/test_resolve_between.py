@@ -64,13 +64,13 @@ def adaptive():
 @pytest.mark.parametrize(
     ("make", "t", "message"),
     [
-        (fixed, 0.3, "adaptive steps, but its steps were fixed"),
+        (fixed, 0.3, "^`at` of a motion with fixed steps is not supported"),
         (adaptive, 1.5, r"lie within the motion, from 0.0 to 1.0 s, but one was 1.5"),
         (adaptive, [[0.1]], r"be a number or a sequence of numbers, but its shape was \(1, 1\)"),
         (
             lambda: jax.vmap(lambda k: adaptive())(jnp.ones(2)),
             0.3,
-            r"be a single one, .* batch \(2,\)\. Take one of them",
+            r"^`at` of a batch is not supported: its shape is \(2,\)\. Take one of them",
         ),
     ],
 )

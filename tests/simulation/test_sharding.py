@@ -70,6 +70,6 @@ def test_motions_go_along_where_they_can(found):
 
 
 def test_what_they_do_not_go_along_with_is_refused(found):
-    assert "simulate inside shard_map must be called with check_vma=False" in found["checked"]
+    assert "`simulate` inside shard_map with check_vma=True is not supported" in found["checked"]
     assert "['b']" in found["checked"]
-    assert "simulate must get arrays of a mesh whose axes are of type Auto" in found["explicit"]
+    assert "`simulate` of arrays along explicit axes is not supported" in found["explicit"]

@@ -66,7 +66,7 @@ def test_array_coordinates():
     motion = jl.simulate(system, {"x": np.eye(2), "theta": 0.3}, np.zeros(5), [0.0, 0.5, 1.0], 4.0)
     assert motion["x"].shape == (3, 2, 2)
     np.testing.assert_allclose(motion["x"][-1], np.cos(2.0) * np.eye(2), atol=1e-8)
-    with pytest.raises(ValueError, match=r"name must be one of \['x', 'theta'\], but it was 'y'"):
+    with pytest.raises(ValueError, match=r"`name` must be one of \['x', 'theta'\], but it was 'y'"):
         motion["y"]
 
 
@@ -230,7 +230,7 @@ def test_input_range():
     inputs = {"tau": steps()}
     with pytest.raises(
         ValueError,
-        match=r"inputs must cover ts, from 0.0 to 2.0 s, but their tables cover 0.0 to 1.6",
+        match=r"`inputs` must cover ts, from 0.0 to 2.0 s, but their tables cover 0.0 to 1.6",
     ):
         jl.simulate(*arguments, [0.0, 2.0], params, inputs=inputs)
     late = jax.jit(lambda ts: jl.simulate(*arguments, ts, params, inputs=inputs))
@@ -249,13 +249,13 @@ def test_input_range():
     ("signal", "x", "a"),
     [
         pytest.param(
-            jl.Function(lambda t: jnp.cos(t)),
+            jl.TimeFunction(lambda t: jnp.cos(t)),
             2 - np.cos(1.0),
             np.cos(1.0),
             marks=pytest.mark.full,
         ),
         pytest.param(
-            jl.Function(lambda t, params: params * jnp.cos(t)),
+            jl.TimeFunction(lambda t, params: params * jnp.cos(t)),
             3 - 2 * np.cos(1.0),
             2 * np.cos(1.0),
             marks=pytest.mark.full,
@@ -324,16 +324,18 @@ def test_explicit_controller():
     motion = run(method=(diffrax.Dopri5(), controller))
     np.testing.assert_allclose(motion.q, run().q, rtol=0, atol=1e-5)
     with pytest.raises(
-        ValueError, match="dt must be left out when method brings its own controller"
+        ValueError, match="`dt` must be left out when method brings its own controller"
     ):
         run(method=(diffrax.Dopri5(), controller), dt=0.1)
-    with pytest.raises(ValueError, match="rtol and atol must be left out when method brings"):
+    with pytest.raises(ValueError, match="`rtol` and `atol` must be left out when method brings"):
         run(method=(diffrax.Dopri5(), controller), rtol=1e-3)
     negative = diffrax.PIDController(rtol=-1.0, atol=1e-6)
-    with pytest.raises(ValueError, match=r"rtol must be finite and not negative, but it was -1\.0"):
+    with pytest.raises(
+        ValueError, match=r"`rtol` must be finite and not negative, but it was -1\.0"
+    ):
         run(method=(diffrax.Dopri5(), negative))
     clipped = diffrax.ClipStepSizeController(controller, jump_ts=jnp.array([0.5]))
-    with pytest.raises(ValueError, match=r"method\[1\] must leave times to the inputs"):
+    with pytest.raises(ValueError, match=r"`method\[1\]` must leave times to the inputs"):
         run(method=(diffrax.Dopri5(), clipped))
 
 

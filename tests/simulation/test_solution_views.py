@@ -48,7 +48,7 @@ def test_motions_of_a_batch_are_taken_by_index(batch, motion):
     assert one.message() == motion.message()
     np.testing.assert_array_equal(batch[1:]["x"], batch["x"][1:])
     np.testing.assert_array_equal(batch[np.array([3, 0])].energy, batch.energy[np.array([3, 0])])
-    with pytest.raises(ValueError, match=r"^name must be a name, for a single motion, .* was 3"):
+    with pytest.raises(ValueError, match=r"^`name` must be a name, for a single motion, .* was 3"):
         motion[3]
 
 

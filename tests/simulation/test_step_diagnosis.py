@@ -51,7 +51,7 @@ def test_a_motion_that_goes_well():
 def test_the_projection_is_told():
     text = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}).explain()
     assert line(text, "projection") in ("up to 1 turn per step", "up to 2 turns per step")
-    left = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, project=False)
+    left = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, stabilization=None)
     assert "projection" not in left.explain()
     far = jl.simulate(
         BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, method="tsit5", dt=0.6, throw=False
@@ -149,7 +149,7 @@ def test_fixed_steps_have_no_tolerance_to_loosen(method):
     slow = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),
-        forces=(jl.Rayleigh(lambda t, q, v, params: 0.5 * params * v[0] ** 2),),
+        forces=(jl.Rayleigh(lambda t, q, v, params: 0.5 * params * v[0] ** 2, "rayleigh"),),
     )
     text = jl.simulate(slow, [1.0], [0.0], TS, 300.0, method=method, dt=0.008).explain()
     assert "tolerance" not in text
@@ -197,7 +197,7 @@ def test_a_stiff_motion_is_told_so():
     slow = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),
-        forces=(jl.Rayleigh(sticky),),
+        forces=(jl.Rayleigh(sticky, "rayleigh"),),
     )
     stiff = jl.simulate(
         slow, [1.0], [0.0], [0.0, 100.0], 1e4, method="dopri8", max_steps=200, throw=False
@@ -237,7 +237,7 @@ def test_only_single_motions_explain_themselves():
         return jl.simulate(ANGLE, q0, [0.0], TS, {"g": 9.0})
 
     batch = jax.vmap(solve)(jnp.array([[0.1], [0.2]]))
-    with pytest.raises(ValueError, match="explain must be asked of a single motion, but batch"):
+    with pytest.raises(ValueError, match=r"^`explain` of a batch is not supported: its shape is"):
         batch.explain()
     for transform in (jax.jit, jax.grad):
         with pytest.raises(ValueError, match="outside jit and vmap"):

@@ -43,7 +43,7 @@ def symplectic_defect(system, q0, v0, params, method, dt, count):
 
     def momenta(y):
         t = jnp.array(0.0)
-        return jnp.concatenate([y[:n], system.terms.momentum(t, y[:n], y[n:], params)])
+        return jnp.concatenate([y[:n], system._terms.momentum(t, y[:n], y[n:], params)])
 
     y0 = jnp.concatenate([q0, v0])
     y1, slope = flow(y0), jax.jacfwd(flow)(y0)

@@ -141,8 +141,8 @@ def test_constraints_hold_inside_the_step(method):
     np.testing.assert_allclose(found[-1], order, atol=0.15)
     ts = np.linspace(0.0, 2.0, 21)
     motion = jl.simulate(bars, q0, v0, ts, BARS, method=method, dt=0.01)
-    phi = jax.vmap(lambda t, q: bars.terms.position(t, q, BARS))(motion.ts, motion.q)
-    rate = jax.vmap(lambda t, q, v: bars.terms.velocity(t, q, v, BARS))(
+    phi = jax.vmap(lambda t, q: bars._terms.position(t, q, BARS))(motion.ts, motion.q)
+    rate = jax.vmap(lambda t, q, v: bars._terms.velocity(t, q, v, BARS))(
         motion.ts, motion.q, motion.v
     )
     size = np.max(np.abs(motion.q)) ** 2
@@ -277,7 +277,9 @@ def test_lanes_are_single_motions():
     [("GaussLegendre", 0, 1), ("LobattoIIIAB", 1, 2), ("GaussLegendre", 2.5, 1)],
 )
 def test_stages_that_there_are_not(kind, stages, least, unchecked):  # noqa: F811
-    with pytest.raises(ValueError, match=rf"{kind}: stages must be an integer of at least {least}"):
+    with pytest.raises(
+        ValueError, match=rf"{kind}: `stages` must be an integer of at least {least}"
+    ):
         getattr(jl.solvers, kind)(stages)
 
 

@@ -156,6 +156,6 @@ def test_as_a_solver_of_diffrax():
 
 def test_an_order_that_there_is_not():
     with pytest.raises(
-        ValueError, match=r"Splitting: order must be one of 2, 4, 6, 8, but it was 3"
+        ValueError, match=r"Splitting: `order` must be one of 2, 4, 6, 8, but it was 3"
     ):
         jl.solvers.Splitting(3)

@@ -30,11 +30,15 @@ GUESS = (jnp.array([0.5, -0.7, 1.1, -1.0]), jnp.array([0.3, 0.0, 0.0, 0.1]))
 def test_nearest_state(weights):
     """W (q* - q) is a combination of rows, and so is W (v* - v): conditions of a minimum."""
     state = jl.assemble(cartesian, *GUESS, BOBS, weights=weights)
-    position, velocity = cartesian.residuals(BOBS, state.q, state.v)
+    position, velocity = cartesian.residuals(state.q, state.v, BOBS)
     for residual in (*position.values(), *velocity.values()):
         assert abs(residual) <= 10 * EPS
-    W = cartesian.mass_matrix(BOBS, state.q) if weights is None else jnp.diag(jnp.array(weights))
-    A, _ = cartesian.terms.rows(jnp.array(0.0), state.q, state.v, BOBS)
+    W = (
+        cartesian.mass_matrix(state.q, params=BOBS)
+        if weights is None
+        else jnp.diag(jnp.array(weights))
+    )
+    A, _ = cartesian._terms.rows(jnp.array(0.0), state.q, state.v, BOBS)
     tangent = np.linalg.svd(A)[2][2:]
     for moved in (state.q - GUESS[0], state.v - GUESS[1]):
         assert np.linalg.norm(moved) > 0.01
@@ -194,7 +198,7 @@ def test_nearer_than_all_consistent_states_around_it():
         state = jl.assemble(four_bar, guess, 0 * guess, FOUR_BAR, weights=weights, throw=False)
 
         def phi(q):
-            return four_bar.terms.position(jnp.array(0.0), q, FOUR_BAR)
+            return four_bar._terms.position(jnp.array(0.0), q, FOUR_BAR)
 
         A, moved = jax.jacobian(phi)(state.q), state.q - guess
         tangent = jnp.linalg.svd(A)[2][A.shape[0] :]
@@ -212,16 +216,16 @@ def test_nearer_than_all_consistent_states_around_it():
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [
-        (([0, 0], [0, 0, 0, 0]), {}, r"q must have shape \(4,\)"),
-        (([0, np.nan, 0, 0], [0, 0, 0, 0]), {}, "assemble: q must be finite"),
-        (GUESS, {"hold": ("z",)}, "assemble: hold must name coordinates among"),
-        (GUESS, {"hold": "x1"}, "assemble: hold must be a sequence of names"),
-        (GUESS, {"weights": [1.0, 1.0]}, r"assemble: weights must have shape \(4,\)"),
-        (GUESS, {"weights": [1.0, 0.0, 1.0, 1.0]}, "assemble: weights must be positive"),
-        (GUESS, {"weights": [1.0, np.inf, 1.0, 1.0]}, "weights must be positive and finite"),
-        (GUESS, {"t": [1.0, 2.0]}, r"assemble: t must be a number, but its shape was \(2,\)"),
-        (GUESS, {"t": np.nan}, "assemble: t must be finite, but it was nan"),
-        (GUESS, {"t": "now"}, "assemble: t must be a number, but it was 'now'"),
+        (([0, 0], [0, 0, 0, 0]), {}, r"`q` must have shape \(4,\)"),
+        (([0, np.nan, 0, 0], [0, 0, 0, 0]), {}, "assemble: `q` must be finite"),
+        (GUESS, {"hold": ("z",)}, "assemble: `hold` must name coordinates among"),
+        (GUESS, {"hold": "x1"}, "assemble: `hold` must be a sequence of names"),
+        (GUESS, {"weights": [1.0, 1.0]}, r"assemble: `weights` must have shape \(4,\)"),
+        (GUESS, {"weights": [1.0, 0.0, 1.0, 1.0]}, "assemble: `weights` must be positive"),
+        (GUESS, {"weights": [1.0, np.inf, 1.0, 1.0]}, "`weights` must be positive and finite"),
+        (GUESS, {"t": [1.0, 2.0]}, r"assemble: `t` must be a number, but its shape was \(2,\)"),
+        (GUESS, {"t": np.nan}, "assemble: `t` must be finite, but it was nan"),
+        (GUESS, {"t": "now"}, "assemble: `t` must be a number, but it was 'now'"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -232,5 +236,5 @@ def test_bad_arguments(arguments, options, message):
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_is_no_system():
-    with pytest.raises(ValueError, match=r"assemble: system must be a jl\.System"):
+    with pytest.raises(ValueError, match=r"assemble: `system` must be a jl\.System"):
         jl.assemble(None, [0.0], [0.0])

@@ -61,7 +61,7 @@ def test_applied_forces_and_inputs_take_part():
     rest = jl.equilibrium(BLOWN, {"theta": 0.0}, PARAMS, inputs={"wind": 3.0})
     np.testing.assert_allclose(rest.q[0], np.arctan2(3.0, 1.2 * 9.81), rtol=8 * EPS)
     np.testing.assert_allclose(rest.stiffness[0, 0], 0.7 * np.hypot(3.0, 1.2 * 9.81), rtol=8 * EPS)
-    table = {"wind": jl.Linear([0.0, 2.0], [0.0, 6.0])}
+    table = {"wind": jl.LinearInterpolation([0.0, 2.0], [0.0, 6.0])}
     then = jl.equilibrium(BLOWN, [0.0], PARAMS, t=1.0, inputs=table)
     np.testing.assert_allclose(then.q, rest.q, rtol=8 * EPS)
 
@@ -235,21 +235,21 @@ def test_what_is_not_finite_is_named():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"q0": [0.1, 0.2]}, "q0 must have shape (1,), but its shape was (2,)."),
-        ({"q0": [np.inf]}, "q0 must be finite, but it was [inf]"),
-        ({"max_steps": 0}, "max_steps must be a positive integer, but it was 0."),
-        ({"max_steps": True}, "max_steps must be a positive integer, but it was True."),
-        ({"tol": -1.0}, "tol must be a positive number, but it was -1.0."),
-        ({"tol": np.nan}, "tol must be finite, but it was nan."),
-        ({"tol": np.inf}, "tol must be finite, but it was inf."),
-        ({"tol": 1.0}, "tol must be less than 1, but it was 1.0."),
-        ({"tol": "a"}, "tol must be a positive number, but it was 'a'."),
-        ({"tol": [1e-3, 1e-3]}, "tol must be a positive number, but its shape was (2,)."),
-        ({"t": np.nan}, "t must be finite, but it was nan."),
-        ({"t": "a"}, "t must be a number, but it was 'a'."),
-        ({"t": [0.0, 1.0, 2.0]}, "t must be a number, but its shape was (3,)."),
-        ({"system": "pendulum"}, "system must be a jl.System, but it was 'pendulum'."),
-        ({"inputs": {"wind": 1.0}}, "inputs must hold only signals that a force reads"),
+        ({"q0": [0.1, 0.2]}, "`q0` must have shape (1,), but its shape was (2,)."),
+        ({"q0": [np.inf]}, "`q0` must be finite, but it was [inf]"),
+        ({"max_steps": 0}, "`max_steps` must be a positive integer, but it was 0."),
+        ({"max_steps": True}, "`max_steps` must be a positive integer, but it was True."),
+        ({"rtol": -1.0}, "`rtol` must be a positive number, but it was -1.0."),
+        ({"rtol": np.nan}, "`rtol` must be finite, but it was nan."),
+        ({"rtol": np.inf}, "`rtol` must be finite, but it was inf."),
+        ({"rtol": 1.0}, "`rtol` must be less than 1, but it was 1.0."),
+        ({"rtol": "a"}, "`rtol` must be a positive number, but it was 'a'."),
+        ({"rtol": [1e-3, 1e-3]}, "`rtol` must be a positive number, but its shape was (2,)."),
+        ({"t": np.nan}, "`t` must be finite, but it was nan."),
+        ({"t": "a"}, "`t` must be a number, but it was 'a'."),
+        ({"t": [0.0, 1.0, 2.0]}, "`t` must be a number, but its shape was (3,)."),
+        ({"system": "pendulum"}, "`system` must be a jl.System, but it was 'pendulum'."),
+        ({"inputs": {"wind": 1.0}}, "`inputs` must hold only signals that a force reads"),
     ],
     ids=str,
 )
@@ -259,10 +259,12 @@ def test_wrong_arguments_are_refused(changes, message):
         jl.equilibrium(**given)
 
 
-@pytest.mark.parametrize("name", ["t", "tol"])
+@pytest.mark.parametrize("name", ["t", "rtol"])
 def test_traced_arguments_of_wrong_shape_are_refused(name):
     def search(x):
         return jl.equilibrium(PENDULUM, [0.1], PARAMS, **{name: x}).q
 
-    with pytest.raises(ValueError, match=rf"^{name} must be a .*number, but its shape was \(2,\)"):
+    with pytest.raises(
+        ValueError, match=rf"^`{name}` must be a .*number, but its shape was \(2,\)"
+    ):
         jax.jit(search)(jnp.full(2, 1e-3))

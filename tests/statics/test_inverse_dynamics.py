@@ -28,13 +28,13 @@ def test_it_inverts_the_equations_of_motion(name):
     system, params, inputs = motion.system, motion.params, motion.inputs
     dq, v, a = draw(motion, np.random.default_rng(1))
     q, t = motion.q0 + 0.1 * dq, 0.37
-    M, h = system.mass_matrix(params, q, v, t), system.bias(params, q, v, t)
-    Q = system.generalized_force(params, q, v, t, inputs)
+    M, h = system.mass_matrix(q, v, params, t=t), system.bias(q, v, params, t=t)
+    Q = system.generalized_force(q, v, params, t=t, inputs=inputs)
     needed = jl.inverse_dynamics(system, q, v, a, params, t=t, inputs=inputs)
     size = np.abs(M) @ np.abs(a) + np.abs(h) + np.abs(Q)
     assert np.all(np.abs(needed - (M @ a + h - Q)) <= 32 * EPS * size)
 
-    free = system.acceleration(params, q, v, t, inputs)
+    free = system.acceleration(q, v, params, t=t, inputs=inputs)
     needed = jl.inverse_dynamics(system, q, v, free, params, t=t, inputs=inputs)
     size = np.abs(M) @ np.abs(free) + np.abs(h) + np.abs(Q)
     assert np.all(np.abs(needed) <= 32 * EPS * np.linalg.cond(M) * size)
@@ -46,8 +46,8 @@ def test_a_general_lagrangian_is_no_exception():
     for case in GENERAL.values():
         n = case.system.size
         q, v, a = (jnp.asarray(rng.uniform(-0.5, 0.5, n)) for _ in range(3))
-        M = case.system.mass_matrix(case.params, q, v, 0.2)
-        h = case.system.bias(case.params, q, v, 0.2)
+        M = case.system.mass_matrix(q, v, case.params, t=0.2)
+        h = case.system.bias(q, v, case.params, t=0.2)
         needed = jl.inverse_dynamics(case.system, q, v, a, case.params, t=0.2)
         assert np.all(np.abs(needed - (M @ a + h)) <= 32 * EPS * (np.abs(M) @ np.abs(a) + abs(h)))
 
@@ -156,27 +156,47 @@ def test_the_carnival_ride():
 
 
 def wrong():
-    yield "q", ([0.1], [0.0, 0.0], [0.0, 0.0]), {}, "q must have shape (2,) or (s, 2): theta1"
-    yield "v", ([0.1, 0.2], [0.0], [0.0, 0.0]), {}, "v must have shape (2,) or (s, 2), as q with"
+    yield "q", ([0.1], [0.0, 0.0], [0.0, 0.0]), {}, "`q` must have shape (2,) or (s, 2): theta1"
+    yield "v", ([0.1, 0.2], [0.0], [0.0, 0.0]), {}, "`v` must have shape (2,) or (s, 2), as q with"
     rows = np.zeros((3, 2))
-    yield "a", (rows, rows, np.zeros((4, 2))), {}, "a must have shape (2,) or (s, 2), as q with (3"
-    yield "t", (rows, rows, rows), {"t": np.zeros(4)}, "t must have shape () or (3,), but its shape"
-    yield "ndim", (rows[None],) * 3, {}, "q must have shape (2,) or (s, 2)"
-    yield "complex", (rows, rows * 1j, rows), {}, "v must be real, but its dtype was complex128"
-    yield "text", ("ab", rows, rows), {}, "q must be real numbers, but it was 'ab'."
-    yield "none", (rows, rows, None), {}, "a must be real numbers, but it was None."
-    yield "empty", (rows[:0],) * 3, {}, "q must hold at least one instant, but its shape was (0, 2)"
+    yield (
+        "a",
+        (rows, rows, np.zeros((4, 2))),
+        {},
+        "`a` must have shape (2,) or (s, 2), as q with (3",
+    )
+    yield (
+        "t",
+        (rows, rows, rows),
+        {"t": np.zeros(4)},
+        "`t` must have shape () or (3,), but its shape",
+    )
+    yield "ndim", (rows[None],) * 3, {}, "`q` must have shape (2,) or (s, 2)"
+    yield "complex", (rows, rows * 1j, rows), {}, "`v` must be real, but its dtype was complex128"
+    yield "text", ("ab", rows, rows), {}, "`q` must be real numbers, but it was 'ab'."
+    yield "none", (rows, rows, None), {}, "`a` must be real numbers, but it was None."
+    yield (
+        "empty",
+        (rows[:0],) * 3,
+        {},
+        "`q` must hold at least one instant, but its shape was (0, 2)",
+    )
     yield (
         "nan",
         (rows, np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]]), rows),
         {},
-        "v must be finite, but v[1, 1] ('theta2') was nan. States that a motion did not reach are",
+        "`v` must be finite, but v[1, 1] ('theta2') was nan. States that a motion did not reach",
     )
-    yield "inf", ([0.0, 1.0], [0.0, 1.0], [np.inf, 0.0]), {}, "a must be finite, but a[0] ('theta1"
-    yield "t nan", (rows, rows, rows), {"t": np.nan}, "t must be finite, but it was nan"
-    yield "t text", (rows, rows, rows), {"t": "now"}, "t must be real numbers, but it was 'now'"
+    yield (
+        "inf",
+        ([0.0, 1.0], [0.0, 1.0], [np.inf, 0.0]),
+        {},
+        "`a` must be finite, but a[0] ('theta1",
+    )
+    yield "t nan", (rows, rows, rows), {"t": np.nan}, "`t` must be finite, but it was nan"
+    yield "t text", (rows, rows, rows), {"t": "now"}, "`t` must be real numbers, but it was 'now'"
     named = {"theta1": 0.1, "theta3": 0.2}
-    yield "names", (named,) * 3, {}, "q must name exactly ['theta1', 'theta2'], but it named ['th"
+    yield "names", (named,) * 3, {}, "`q` must name exactly ['theta1', 'theta2'], but it named ['th"
 
 
 @pytest.mark.parametrize(
@@ -210,7 +230,9 @@ def test_precisions_are_brought_to_one():
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_is_no_system_is_refused():
-    with pytest.raises(ValueError, match=r"inverse_dynamics: system must be a jl\.System, but it "):
+    with pytest.raises(
+        ValueError, match=r"inverse_dynamics: `system` must be a jl\.System, but it "
+    ):
         jl.inverse_dynamics("S", [0.1], [0.1], [0.1])
 
 
@@ -218,17 +240,21 @@ def test_what_is_no_system_is_refused():
 @pytest.mark.parametrize(
     ("motion", "t", "message"),
     [
-        (jnp.zeros(2), 0.0, "motion must be a function of (t), but it was"),
-        (lambda t, params: t, 0.0, "motion must be callable as (t), but its signature was (t, par"),
+        (jnp.zeros(2), 0.0, "`motion` must be a function of (t), but it was"),
+        (
+            lambda t, params: t,
+            0.0,
+            "`motion` must be callable as (t), but its signature was (t, par",
+        ),
         (
             lambda t: jax.lax.complex(t, t)[None],
             0.0,
             "what motion returns must be real, but its dtype",
         ),
-        (lambda t: t * jnp.ones(2), "now", "t must be real numbers, but it was 'now'"),
-        (lambda t: t * jnp.ones(2), None, "t must be real numbers, but it was None"),
-        (lambda t: t * jnp.ones(2), 1j, "t must be real, but its dtype was complex128"),
-        (lambda t: t * jnp.ones(2), np.ones((2, 2)), "t must be an instant or an array of them"),
+        (lambda t: t * jnp.ones(2), "now", "`t` must be real numbers, but it was 'now'"),
+        (lambda t: t * jnp.ones(2), None, "`t` must be real numbers, but it was None"),
+        (lambda t: t * jnp.ones(2), 1j, "`t` must be real, but its dtype was complex128"),
+        (lambda t: t * jnp.ones(2), np.ones((2, 2)), "`t` must be an instant or an array of them"),
     ],
 )
 def test_a_motion_that_cannot_be_led_is_refused(motion, t, message):
@@ -238,14 +264,14 @@ def test_a_motion_that_cannot_be_led_is_refused(motion, t, message):
 
 @pytest.mark.parametrize("motion", [lambda t: t, lambda t: jnp.zeros((2, 2)), lambda t: None])
 def test_a_motion_that_is_no_vector_is_refused(motion):
-    message = "prescribed_motion: motion must return all coordinates as one vector of shape"
+    message = "prescribed_motion: `motion` must return all coordinates as one vector of shape"
     with pytest.raises(ValueError, match=message):
         jl.prescribed_motion(motion, 0.0)
 
 
 def test_inputs_that_no_force_reads_are_refused():
     motion = MOTIONS["double_pendulum"]
-    with pytest.raises(ValueError, match="inputs must hold only signals that a force reads"):
+    with pytest.raises(ValueError, match="`inputs` must hold only signals that a force reads"):
         jl.inverse_dynamics(
             motion.system, motion.q0, motion.v0, motion.v0, motion.params, inputs={"tau": 1.0}
         )

@@ -72,7 +72,7 @@ def test_whoever_meets_such_a_row_says_so():
     with pytest.raises(jl.EquilibriumError, match=SAID):
         jl.equilibrium(given, q)
     with pytest.raises(ValueError, match=r"constraint 'rod' must have a gradient .* Write the qu"):
-        given.check(None, q, [0.0, 0.0])
+        given.check(q, [0.0, 0.0])
     rooted, q = VANISHING["root of a square"]
     with pytest.raises(jl.AssemblyError, match=SAID):
         jl.assemble(system(rooted), q, [0.0, 0.0])
@@ -94,7 +94,7 @@ def test_messages_under_derivatives():
 def test_a_row_that_is_not_known_is_not_left_out():
     """The gradient of sqrt(y^2) is NaN at 0: so is what follows from it."""
     row, q = VANISHING["root of a square"]
-    a = system(row).acceleration(None, q, [0.0, 0.0])
+    a = system(row).acceleration(q, [0.0, 0.0])
     assert np.isnan(a).all()
     motion = jl.simulate(
         system(row), q, [0.0, 0.0], [0.0, 1.0], dt=0.5, method="bosh3", throw=False

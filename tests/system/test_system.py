@@ -67,10 +67,10 @@ def random_states(name):
 def quantities(system, quadratic, params, t, q, v, x, b):
     """All that the identities compare, at one state."""
     L = partial(system.lagrangian, params=params)
-    a = system.acceleration(params, q, v, t)
+    a = system.acceleration(q, v, params, t=t)
 
     def energy(t, q, v):
-        return system.energy(params, q, v, t)
+        return system.energy(q, v, params, t=t)
 
     def along(s):
         """(t, q, q') on the cubic with velocity v, acceleration x, jerk b at s = 0."""
@@ -79,11 +79,11 @@ def quantities(system, quadratic, params, t, q, v, x, b):
     momentum = jax.grad(L, argnums=2)
     _, p_dot = jax.jvp(lambda s: momentum(*along(s)), (0.0,), (1.0,))
     found = {
-        "M": system.mass_matrix(params, q, v, t),
-        "h": system.bias(params, q, v, t),
-        "Q": system.generalized_force(params, q, v, t),
-        "R": system.constraint_force(params, q, v, t),
-        "p": system.momentum(params, q, v, t),
+        "M": system.mass_matrix(q, v, params, t=t),
+        "h": system.bias(q, v, params, t=t),
+        "Q": system.generalized_force(q, v, params, t=t),
+        "R": system.constraint_force(q, v, params, t=t),
+        "p": system.momentum(q, v, params, t=t),
         "H": energy(t, q, v),
         "L": L(t, q, v),
         "a": a,
@@ -94,17 +94,17 @@ def quantities(system, quadratic, params, t, q, v, x, b):
         "L_q": jax.grad(L, argnums=1)(t, q, v),
     }
     if quadratic:
-        h = jax.vmap(lambda v: system.bias(params, q, v, t))(jnp.stack([-v, 0 * v]))
+        h = jax.vmap(lambda v: system.bias(q, v, params, t=t))(jnp.stack([-v, 0 * v]))
         found |= {
-            "C": system.coriolis_matrix(params, q, v, t),
-            "M_q": jax.jacfwd(lambda q: system.mass_matrix(params, q, t=t))(q),
+            "C": system.coriolis_matrix(q, v, params, t=t),
+            "M_q": jax.jacfwd(lambda q: system.mass_matrix(q, params=params, t=t))(q),
             "h_back": h[0],
             "h_rest": h[1],
         }
     if system._kinetic is not None:
         found |= {
-            "T": system.kinetic(params, q, v, t),
-            "V": system.potential(params, q, t=t),
+            "T": system.kinetic(q, v, params, t=t),
+            "V": system.potential(q, params=params, t=t),
         }
     return found
 
@@ -310,8 +310,8 @@ def test_a_relativistic_particle_gets_heavier(evaluate):
     along = {key: value[0] for key, value in params.items()}
     g3 = (1 - (1.5 / along["c"]) ** 2) ** -1.5
     q, v = jnp.zeros(2), jnp.array([1.5, 0.0])
-    M = jax.jit(RELATIVISTIC.mass_matrix)(along, q, v)
-    a = jax.jit(RELATIVISTIC.acceleration)(along, q, v)
+    M = jax.jit(RELATIVISTIC.mass_matrix)(q, v, along)
+    a = jax.jit(RELATIVISTIC.acceleration)(q, v, along)
     np.testing.assert_allclose(M[0, 0], g3 * along["m"], rtol=K * EPS)
     np.testing.assert_allclose(a, [-along["g"] / g3, 0.0], rtol=K * EPS)
 
@@ -320,26 +320,26 @@ def test_where_mass_depends_on_velocity_it_must_be_given():
     params = GENERAL["relativistic"].params
     with pytest.raises(
         ValueError,
-        match=r"^mass_matrix: v must be given, since M depends on the velocities, but it was "
-        r"left out\. Call mass_matrix\(params, q, v\)\.$",
+        match=r"^mass_matrix: `v` must be given, since M depends on the velocities, but it was "
+        r"left out\. Call mass_matrix\(q, v, params\)\.$",
     ):
-        RELATIVISTIC.mass_matrix(params, [0.0, 0.0])
+        RELATIVISTIC.mass_matrix([0.0, 0.0], params=params)
     with pytest.raises(
         ValueError,
-        match=r"^coriolis_matrix must get a Lagrangian quadratic in the velocities, but its mass "
-        r"matrix d2L/dv2 depends on v\. Use bias",
+        match=r"^`coriolis_matrix` of a Lagrangian that is not quadratic .* not supported: its "
+        r"mass matrix d2L/dv2 depends on v\. Use bias",
     ):
-        RELATIVISTIC.coriolis_matrix(params, [0.0, 0.0], [1.0, 0.0])
+        RELATIVISTIC.coriolis_matrix([0.0, 0.0], [1.0, 0.0], params)
 
 
 def test_time_reaches_every_method_and_starts_at_zero():
     params, q, v = GENERAL["bead"].params, jnp.array([0.3]), jnp.array([0.7])
     names = ("mass_matrix", "coriolis_matrix", "momentum", "energy", "bias", "acceleration")
 
-    def values(*t):
-        return [jnp.ravel(getattr(BEAD, name)(params, q, v, *t)) for name in names]
+    def values(**t):
+        return [jnp.ravel(getattr(BEAD, name)(q, v, params, **t)) for name in names]
 
-    silent, zero, later = jax.jit(lambda: (values(), values(0.0), values(10.0)))()
+    silent, zero, later = jax.jit(lambda: (values(), values(t=0.0), values(t=10.0)))()
     np.testing.assert_array_equal(silent, zero)
     growth = dict(zip(names, np.divide(later, zero), strict=True))
     for name in names[:4]:
@@ -353,7 +353,10 @@ def test_a_long_chain_hangs_at_rest():
     """n = 12, the library solve: hanging straight and at rest it stays; M_ij = m l^2 (n - max)."""
     n, params, zero = 12, {"m": 0.4, "l": 0.3, "g": 9.81}, np.zeros(12)
     a, M = jax.jit(
-        lambda: (chain(n).acceleration(params, zero, zero), chain(n).mass_matrix(params, zero))
+        lambda: (
+            chain(n).acceleration(zero, zero, params),
+            chain(n).mass_matrix(zero, params=params),
+        )
     )()
     np.testing.assert_array_equal(a, zero)
     index = np.arange(n)

@@ -19,7 +19,13 @@ CLOSE = 1e-11
 def move(name, params, q0, u0, times, **options):
     """The motion from coordinates q0 and quasi-velocities u0, those that vanish left out."""
     return jl.simulate(
-        ENTRIES[name].system, q0, ts=np.asarray(times), params=params, u0=u0, **(TIGHT | options)
+        ENTRIES[name].system,
+        q0,
+        None,
+        ts=np.asarray(times),
+        params=params,
+        u0=u0,
+        **(TIGHT | options),
     )
 
 

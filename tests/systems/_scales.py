@@ -4,5 +4,5 @@ import numpy as np
 
 
 def scale_of_T(system, params, t, q, v):
-    moments = np.diagonal(system.mass_matrix(params, q, v, t))
+    moments = np.diagonal(system.mass_matrix(q, v, params, t=t))
     return 0.5 * np.sum(np.sqrt(moments) * np.abs(v)) ** 2

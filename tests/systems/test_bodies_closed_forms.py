@@ -125,7 +125,7 @@ def accelerations(name):
 
     @jax.jit
     def at(t, q, v, params):
-        a = entry.system.acceleration(params, q, v, t)
+        a = entry.system.acceleration(q, v, params, t=t)
         along = (jnp.ones_like(t), v, a)
         return jax.jvp(partial(velocities, entry.system, params), (t, q, v), along)
 
@@ -135,7 +135,7 @@ def accelerations(name):
 
 
 def velocities(system, params, t, q, v):
-    return system.quasi_velocities(params, q, v, t)
+    return system.quasi_velocities(q, v, params, t=t)
 
 
 ROUNDING = 1e-13

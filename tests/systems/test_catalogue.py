@@ -147,7 +147,7 @@ def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
         q, v = entry.chart.state(0.7, *own, params)
         np.testing.assert_array_equal(q[entry.file_columns], own[0])
         np.testing.assert_array_equal(v[entry.file_columns], own[1])
-        positions, rates = entry.system.residuals(params, q, v, 0.7)
+        positions, rates = entry.system.residuals(q, v, params, t=0.7)
         for residual in (*positions.values(), *rates.values()):
             np.testing.assert_allclose(residual, 0.0, rtol=0, atol=1e-14)
 

@@ -105,7 +105,7 @@ def test_T_is_the_same_by_another_route(name):
 
     @jax.jit
     def both(params, t, q, v):
-        return entry.system.kinetic(params, q, v, t), KINETIC[name](t, q, v, **params)
+        return entry.system.kinetic(q, v, params, t=t), KINETIC[name](t, q, v, **params)
 
     for t, q, v, params in random_states(entry):
         T, other = both(params, t, q, v)
@@ -135,10 +135,10 @@ def test_the_pendulum_has_one_energy_from_three_origins():
 
             c = centre - origin
             body = jl.energy.RigidBody(p["M"], (0.0, 0.0, p["Ic"] + p["M"] * (c @ c)), c)
-            T = entry.system.kinetic(p, q, v, t)
+            T = entry.system.kinetic(q, v, p, t=t)
             tolerance = K * EPS * 0.5 * inertia * v[0] ** 2
             np.testing.assert_allclose(body.kinetic(pose, t, q, v, p), T, rtol=0, atol=tolerance)
-            V = entry.system.potential(p, q, t=t)
+            V = entry.system.potential(q, params=p, t=t)
             weight = body.gravity(pose, t, q, p, (0.0, -p["g"], 0.0))
             tolerance = K * EPS * p["M"] * p["g"] * lever
             np.testing.assert_allclose(weight, V, rtol=0, atol=tolerance)
@@ -171,7 +171,7 @@ def test_V_is_the_weight_by_hand(name, by_hand):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         V, scale = by_hand(t, q, **params)
-        found = entry.system.potential(params, q, t=t)
+        found = entry.system.potential(q, params=params, t=t)
         np.testing.assert_allclose(found, V, rtol=0, atol=K * EPS * scale)
 
 
@@ -200,7 +200,7 @@ def test_generalized_forces_are_those_by_hand(name, by_hand):
     entry = ENTRIES[name]
     for t, q, v, params in random_states(entry):
         terms = by_hand(t, q, **params)
-        found = entry.system.generalized_force(params, q, v, t)
+        found = entry.system.generalized_force(q, v, params, t=t)
         tolerance = K * EPS * np.sum(np.linalg.norm(terms, axis=1))
         np.testing.assert_allclose(found, np.sum(terms, axis=0), rtol=0, atol=tolerance)
 
@@ -255,7 +255,7 @@ def test_the_moment_on_the_load_is_the_closed_form():
     """m l2 [l2 theta2'' + l1 (theta1'' cos(d) + theta1'^2 sin(d))] with d = theta2 - theta1."""
     entry = ENTRIES["two_link_robot_arm"]
     for t, q, v, p in random_states(entry):
-        a = entry.system.acceleration(p, q, v, t)
+        a = entry.system.acceleration(q, v, p, t=t)
         m, l1, l2 = p["m"], p["l1"], p["l2"]
         d = q[1] - q[0]
         terms = m * l2 * np.array([l2 * a[1], l1 * a[0] * np.cos(d), l1 * v[0] ** 2 * np.sin(d)])

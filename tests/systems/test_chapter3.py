@@ -175,7 +175,7 @@ def test_T_is_the_same_by_another_route(name):
 
     @jax.jit
     def both(params, t, q, v):
-        return entry.system.kinetic(params, q, v, t), KINETIC[name](t, q, v, **params)
+        return entry.system.kinetic(q, v, params, t=t), KINETIC[name](t, q, v, **params)
 
     for t, q, v, params in random_states(entry):
         T, other = both(params, t, q, v)
@@ -198,7 +198,7 @@ def test_V_by_points_is_that_by_hand(name):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         terms = POTENTIAL[name](q, **params)
-        V = entry.system.potential(params, q, t=t)
+        V = entry.system.potential(q, params=params, t=t)
         np.testing.assert_allclose(V, sum(terms), rtol=0, atol=K * EPS * np.sum(np.abs(terms)))
 
 
@@ -248,7 +248,7 @@ def test_forces_at_points_have_the_hand_generalized_forces(name):
     drives = [force.name for force in entry.system.forces if not isinstance(force, jl.Rayleigh)]
     for t, q, v, params in random_states(entry):
         terms = np.array(FORCES[name](t, q, v, **params))
-        Q = entry.system.generalized_force(params, q, v, t, names=drives)
+        Q = entry.system.generalized_force(q, v, params, t=t, names=drives)
         tolerance = K * EPS * np.max(np.sum(np.abs(terms), axis=0))
         np.testing.assert_allclose(Q, np.sum(terms, axis=0), rtol=0, atol=tolerance)
 
@@ -281,7 +281,7 @@ def sleeve_end_force(t, q, v, params):
 def test_hand_generalized_forces_are_those_of_points(name, by_hand, by_point):
     system = ENTRIES[name].system
     for t, q, v, params in random_states(ENTRIES[name]):
-        Q = system.generalized_force(params, q, v, t, names=[by_hand])
+        Q = system.generalized_force(q, v, params, t=t, names=[by_hand])
         other = by_point(*map(jnp.asarray, (t, q, v)), params, {})
         tolerance = K * EPS * np.max(np.abs(Q))
         np.testing.assert_allclose(Q, other, rtol=0, atol=tolerance)

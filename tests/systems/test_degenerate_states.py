@@ -100,7 +100,7 @@ def derivatives(name):
     weights = jnp.cos(jnp.arange(1.0, 1.0 + n))
 
     def weighted(y):
-        return weights @ entry.system.acceleration(params, y[:n], y[n:], 0.3)
+        return weights @ entry.system.acceleration(y[:n], y[n:], params, t=0.3)
 
     @jax.jit
     def all_of(y):

@@ -137,11 +137,11 @@ def evaluate(entry, params, t, q, v):
     rows = quantities(entry, params, t, q, v)
 
     def energy(t, q, v):
-        return entry.system.energy(params, q, v, t)
+        return entry.system.energy(q, v, params, t=t)
 
     return rows | {
         "dL_dq": jax.grad(entry.system.lagrangian, argnums=1)(t, q, v, params),
-        "Q": entry.system.generalized_force(params, q, v, t),
+        "Q": entry.system.generalized_force(q, v, params, t=t),
         "H_dot": jax.jvp(energy, (t, q, v), (1.0, v, rows["a"]))[1],
     }
 
@@ -168,7 +168,7 @@ def test_every_system_has_its_hand_equations():
 def test_random_states_are_on_the_constraints(evaluated):
     entry, pairs = evaluated
     for (t, q, v, params), _ in pairs if entry.constraints else []:
-        positions, rates = entry.system.residuals(params, q, v, t)
+        positions, rates = entry.system.residuals(q, v, params, t=t)
         for rows, size in ((positions, 1 + norm(q)), (rates, 1 + norm(v))):
             for residual in rows.values():
                 np.testing.assert_allclose(residual, 0.0, rtol=0, atol=K * EPS * size**2)

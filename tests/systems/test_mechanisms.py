@@ -202,11 +202,11 @@ def test_the_loop_accelerates_as_in_cartesian_coordinates():
 
     @jax.jit
     def both(q, v):
-        a = ANGLES.acceleration(LOOP, q, v)
+        a = ANGLES.acceleration(q, v, LOOP)
         t, one = jnp.zeros(()), jnp.ones(())
         rate = jax.jvp(lambda *s: TO_JOINTS.state(*s, LOOP)[1], (t, q, v), (one, v, a))[1]
-        other = JOINTS.acceleration(LOOP, *TO_JOINTS.state(t, q, v, LOOP))
-        return a, ANGLES.multipliers(LOOP, q, v), rate, other
+        other = JOINTS.acceleration(*TO_JOINTS.state(t, q, v, LOOP), LOOP)
+        return a, ANGLES.multipliers(q, v, LOOP), rate, other
 
     for q, v in loop_states(8):
         a, lam, rate, other = both(q, v)
@@ -221,10 +221,10 @@ def test_the_loop_hangs_as_a_catenary_of_links():
     """tan(theta_k) = (k - (n + 1)/2) m g/H with the tension H; each pin bears half the weight."""
     guess = np.linspace(-0.9, 1.0, LINKS)
     rest = jl.equilibrium(ANGLES, guess, LOOP)
-    weight, H = LOOP["m"] * LOOP["g"], rest.lam["pin_x"]
+    weight, H = LOOP["m"] * LOOP["g"], rest.multipliers["pin_x"]
     slopes = (np.arange(1, LINKS + 1) - (LINKS + 1) / 2) * weight / H
     np.testing.assert_allclose(np.tan(rest.q), slopes, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(rest.lam["pin_y"], 0.5 * LINKS * weight, rtol=1e-12)
+    np.testing.assert_allclose(rest.multipliers["pin_y"], 0.5 * LINKS * weight, rtol=1e-12)
     assert rest.stable
 
 

@@ -36,7 +36,7 @@ def simulate(entry, formulation, q0, params, **options):
 def free_start(entry):
     """(q0, u0 of those that do not vanish) of the example."""
     q0, v0 = entry.start()
-    u0 = entry.system.quasi_velocities(entry.example.params, q0, v0)
+    u0 = entry.system.quasi_velocities(q0, v0, entry.example.params)
     vanish = [entry.quasi_velocities.index(name) for name in entry.constraints]
     return q0, jnp.delete(u0, np.array(vanish, int))
 
@@ -124,9 +124,9 @@ def test_derivatives_are_the_same_in_both_forms(name):
     def end(values, formulation):
         params, q0, u0 = values
         u0 = jnp.zeros(n).at[columns].set(u0)
-        start = {"u0": u0}
+        start = {"v0": None, "u0": u0}
         if formulation == "multipliers":
-            start = {"v0": system.velocities(params, q0, u0)}
+            start = {"v0": system.velocities(q0, u0, params)}
         motion = simulate(entry, formulation, q0, params, **start, **FEW_STAGES)
         return jnp.concatenate([motion.q[-1], motion.v[-1]]) @ weights
 

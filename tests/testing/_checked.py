@@ -24,7 +24,7 @@ def checked(potential):
 
 def check(potential, params=PARAMS, q=Q, v=V, **rest):
     """The report on L = v^2/2 - potential(q, params)."""
-    return testing.check_derivatives(system_of(potential, **rest), params, q, v)
+    return testing.check_derivatives(system_of(potential, **rest), q, v, params)
 
 
 def system_of(potential, **rest):

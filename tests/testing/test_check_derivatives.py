@@ -51,10 +51,10 @@ def test_states():
 
 def test_states_may_be_chosen():
     system = system_of(length)
-    report = testing.check_derivatives(system, PARAMS, Q, V, states=("given", "rest", "random"))
+    report = testing.check_derivatives(system, Q, V, PARAMS, states=("given", "rest", "random"))
     assert list(report.states) == ["given", "rest", "random 1", "random 2", "random 3"]
     assert report.ok
-    assert not testing.check_derivatives(system, PARAMS, Q, V, states=["zero"]).ok
+    assert not testing.check_derivatives(system, Q, V, PARAMS, states=["zero"]).ok
 
 
 def bad_arm(t, q, params):
@@ -97,8 +97,8 @@ def bad_signal(t, q, v, params):
 FORCES = {
     bad_arm: ("force 'f': position", "sqrt", 1, jl.PointForce(bad_arm, lambda *x: x[2], "f")),
     bad_push: ("force 'f': force", "div", 0, jl.PointForce(lambda t, q, p: q, bad_push, "f")),
-    bad_rate: ("force 'f': angular_velocity", "pow", 2, jl.Couple(bad_rate, bad_loss, "f")),
-    bad_torque: ("force 'f': torque", "atan2", 1, jl.Couple(lambda *x: x[2][0], bad_torque, "f")),
+    bad_rate: ("force 'f': angular_velocity", "pow", 2, jl.Torque(bad_rate, bad_loss, "f")),
+    bad_torque: ("force 'f': torque", "atan2", 1, jl.Torque(lambda *x: x[2][0], bad_torque, "f")),
     bad_loss: ("force 'f': R", "sqrt", 1, jl.Rayleigh(bad_loss, "f")),
 }
 
@@ -107,7 +107,7 @@ FORCES = {
 def test_functions_of_forces(function):
     name, primitive, order, force = FORCES[function]
     system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(force,))
-    report = testing.check_derivatives(system, {}, Q, V, inputs={"u": 2.0})
+    report = testing.check_derivatives(system, Q, V, {}, inputs={"u": 2.0})
     found = [f for f in report.findings if f.function == name]
     assert {(Path(f.file).name, f.line) for f in found} == {
         (file_of(function), line_of(function, "# wrong"))
@@ -123,11 +123,11 @@ def test_inputs_that_depend_on_the_state():
     force = jl.GeneralizedForce(push, "push")
     system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(force,))
     inputs = {"u": jl.Feedback(bad_signal)}
-    report = testing.check_derivatives(system, {}, Q, V, inputs=inputs)
+    report = testing.check_derivatives(system, Q, V, {}, inputs=inputs)
     assert places(report) == here("sqrt", bad_signal, "# wrong")
     assert {f.state for f in report.findings} == {"rest", "zero"}
-    with pytest.raises(ValueError, match="inputs must have an entry 'u'"):
-        testing.check_derivatives(system, {}, Q, V)
+    with pytest.raises(ValueError, match="`inputs` must have an entry 'u'"):
+        testing.check_derivatives(system, Q, V, {})
 
 
 def test_constraints_reactions_and_quasi_velocities():
@@ -144,7 +144,7 @@ def test_constraints_reactions_and_quasi_velocities():
         written_in="u",
     )
     inputs = {"mu": 0.3}
-    report = testing.check_derivatives(system, {"m": 2.0}, Q, [0.3, 0.4], inputs=inputs)
+    report = testing.check_derivatives(system, Q, [0.3, 0.4], {"m": 2.0}, inputs=inputs)
     assert dict(report.functions) == {
         "lagrangian": 3,
         "force 'friction': Q": 1,
@@ -168,7 +168,7 @@ def test_kinetic_and_potential_energy_apart():
         return jnp.sqrt(q @ q)  # wrong
 
     system = jl.System(coordinates=("x", "y"), kinetic=kinetic, potential=potential)
-    report = testing.check_derivatives(system, {}, Q, V)
+    report = testing.check_derivatives(system, Q, V, {})
     assert [name for name, _ in report.functions] == ["kinetic", "potential"]
     assert {f.function for f in report.findings} == {"potential"}
     assert places(report) == here("sqrt", potential, "# wrong")
@@ -199,14 +199,14 @@ CLEAN = (
 def test_systems_of_the_book_pass(name):
     """A dissipative one, one with friction by reactions, one in quasi-velocities among them."""
     entry = ENTRIES[name]
-    report = testing.check_derivatives(entry.system, entry.example.params, *entry.start())
+    report = testing.check_derivatives(entry.system, *entry.start(), entry.example.params)
     assert report.ok, report
     assert "all are finite and agree" in str(report)
 
 
 def test_a_potential_that_is_singular_is_said_to_be():
     entry = ENTRIES["central_motion"]
-    report = testing.check_derivatives(entry.system, entry.example.params, *entry.start())
+    report = testing.check_derivatives(entry.system, *entry.start(), entry.example.params)
     (finding,) = report.findings
     place = (finding.function, finding.state, finding.order, finding.primitive)
     assert place == ("potential", "zero", 0, "div")
@@ -243,35 +243,37 @@ def test_what_is_refused():
     system = system_of(length)
     fine = {"params": PARAMS, "q": Q, "v": V}
     for change, message in (
-        ({"q": [1.0]}, r"q must have shape \(2,\), but its shape was \(1,\)"),
-        ({"v": [1.0, 2.0, 3.0]}, r"v must have shape \(2,\)"),
-        ({"q": [1.0, np.nan]}, "check_derivatives: q must be finite"),
-        ({"v": [np.inf, 1.0]}, "check_derivatives: v must be finite"),
-        ({"params": {"k": np.inf}}, "check_derivatives: params must be finite"),
-        ({"t": np.nan}, "t must be finite"),
-        ({"t": "now"}, "t must be a number"),
-        ({"states": ("given", "moving")}, r"states must be names among \['given', 'rest'"),
+        ({"q": [1.0]}, r"`q` must have shape \(2,\), but its shape was \(1,\)"),
+        ({"v": [1.0, 2.0, 3.0]}, r"`v` must have shape \(2,\)"),
+        ({"q": [1.0, np.nan]}, "check_derivatives: `q` must be finite"),
+        ({"v": [np.inf, 1.0]}, "check_derivatives: `v` must be finite"),
+        ({"params": {"k": np.inf}}, "check_derivatives: `params` must be finite"),
+        ({"t": np.nan}, "`t` must be finite"),
+        ({"t": "now"}, "`t` must be a number"),
+        ({"states": ("given", "moving")}, r"`states` must be names among \['given', 'rest'"),
         ({"states": "given"}, r"Write states=\(\"given\", \"rest\"\)"),
-        ({"states": ()}, "states must be names"),
+        ({"states": ()}, "`states` must be names"),
     ):
         with pytest.raises(ValueError, match=message):
             testing.check_derivatives(system, **{**fine, **change})
-    with pytest.raises(ValueError, match=r"q must have values.*Call check_derivatives outside jit"):
-        jax.jit(lambda q: testing.check_derivatives(system, PARAMS, q, V))(jnp.array(Q))
+    with pytest.raises(
+        ValueError, match=r"`q` must have values.*Call check_derivatives outside jit"
+    ):
+        jax.jit(lambda q: testing.check_derivatives(system, q, V, PARAMS))(jnp.array(Q))
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_other_things_than_systems_are_refused():
-    with pytest.raises(ValueError, match=r"system must be a jl.System, but it was 3"):
-        testing.check_derivatives(3, PARAMS, Q, V)
-    with pytest.raises(ValueError, match="inputs must be a dict"):
-        testing.check_derivatives(system_of(length), PARAMS, Q, V, inputs=[1.0])
+    with pytest.raises(ValueError, match=r"`system` must be a jl.System, but it was 3"):
+        testing.check_derivatives(3, Q, V, PARAMS)
+    with pytest.raises(ValueError, match="`inputs` must be a dict"):
+        testing.check_derivatives(system_of(length), Q, V, PARAMS, inputs=[1.0])
 
 
 def test_functions_of_wrong_shapes_are_refused():
     system = jl.System(lambda t, q, v, params: v, ("x", "y"))
-    with pytest.raises(ValueError, match="lagrangian must return a real scalar"):
-        testing.check_derivatives(system, {}, Q, V)
+    with pytest.raises(ValueError, match="`lagrangian` must return a real scalar"):
+        testing.check_derivatives(system, Q, V, {})
 
 
 def test_a_kink_in_one_argument_excuses_no_other():

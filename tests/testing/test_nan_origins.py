@@ -248,7 +248,7 @@ def test_under_vmap_alone():
     system = jl.System(
         lambda t, q, v, params: v @ v, ("x", "y"), forces=[jl.GeneralizedForce(pull, "pull")]
     )
-    report = testing.check_derivatives(system, {}, Q, V)
+    report = testing.check_derivatives(system, Q, V, {})
     (finding,) = report.findings
     assert (finding.function, finding.order, finding.state) == ("force 'pull': Q", 0, "zero")
     assert finding.vmapped
@@ -263,13 +263,13 @@ def test_which_arguments_it_takes():
         return v @ v + jnp.sqrt(params["c"]) + jnp.sqrt(t) + jnp.sqrt(q[0] + v[1] ** 2)
 
     system = jl.System(lagrangian, ("x", "y"))
-    report = testing.check_derivatives(system, PARAMS, Q, V)
+    report = testing.check_derivatives(system, Q, V, PARAMS)
     found = {(f.line, f.variables) for f in report.findings if f.state == "zero"}
     line = line_of(lagrangian, "jnp.sqrt(t)")
     assert found == {(line, "t or q or v or params")}
     assert {f.variables for f in report.findings if f.state == "given"} == {"t or params"}
     # The derivative by v alone is 0 times infinity.
-    later = testing.check_derivatives(system, {**PARAMS, "c": 2.0}, Q, V, t=1.0)
+    later = testing.check_derivatives(system, Q, V, {**PARAMS, "c": 2.0}, t=1.0)
     assert {(f.state, f.variables) for f in later.findings} == {("zero", "q or v")}
 
 
@@ -290,6 +290,6 @@ def test_inside_loops_without_a_fixed_number_of_turns():
 
     force = jl.GeneralizedForce(pull, "pull")
     system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(force,))
-    report = testing.check_derivatives(system, {}, Q, V)
+    report = testing.check_derivatives(system, Q, V, {})
     assert places(report) == here("sqrt", shrink, "# wrong")
     assert [(f.state, f.order) for f in report.findings] == [("zero", 1), ("one", 1)]

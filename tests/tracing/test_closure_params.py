@@ -25,7 +25,7 @@ def swing(k):
         forces=(drag,),
     )
     inputs = {
-        "u": jl.Function(lambda t: k * t),
+        "u": jl.TimeFunction(lambda t: k * t),
         "w": jl.Feedback(lambda t, q, v, params: -k * params["one"] * q),
     }
     motion = jl.simulate(system, [1.0], [0.0], TS, {"one": 1.0}, inputs=inputs)
@@ -89,7 +89,7 @@ def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(force,))
 
     def check(times, values):
-        inputs = {"u": jl.Linear(times, values)}
+        inputs = {"u": jl.LinearInterpolation(times, values)}
         assert _closure.lift_closure_tracers(system, {}, jnp.zeros(1), inputs) == {}
         return jl.simulate(system, [0.0], [1.0], TS, {}, inputs=inputs).q[-1, 0]
 
@@ -145,7 +145,9 @@ def test_reverse_derivatives_are_written_without_tracing_again():
 
         drag = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * v, "drag")
         system = jl.System(lagrangian, ("x",), forces=(drag,))
-        return jl.simulate(system, [1.0], [0.0], TS, {}, inputs={"u": jl.Function(ramp)}).q[-1, 0]
+        return jl.simulate(system, [1.0], [0.0], TS, {}, inputs={"u": jl.TimeFunction(ramp)}).q[
+            -1, 0
+        ]
 
     _, pull = jax.vjp(end, 2.0)
     # Once to see what they close over, once for the motion.

@@ -86,7 +86,7 @@ def test_the_rule_counts_and_not_the_body():
     lone = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(push,))
 
     def a(q):
-        return lone.acceleration(None, q, jnp.zeros(1))
+        return lone.acceleration(q, jnp.zeros(1))
 
     q = jnp.array([3.0])
     for way in (jax.jacfwd, jax.jacrev):

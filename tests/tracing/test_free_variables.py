@@ -324,10 +324,10 @@ OUTSIDE = [
 def test_what_changes_outside_is_named_and_changes_nothing(declared):
     lagrangian, change, name = declared()
     system = jl.System(lagrangian, ("x",))
-    at = {}, [0.0], [0.0]
+    at = [0.0], [0.0], {}
     assert system.acceleration(*at) == -2.0
     change()
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
         assert system.acceleration(*at) == -2.0  # a compiled program says so as well
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
-        assert system.energy({}, [1.0], [0.0]) == 2.0
+        assert system.energy([1.0], [0.0], {}) == 2.0

@@ -264,13 +264,16 @@ def run(params):
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"m": NAN, "k": [1.0]}, r"^params\['m'\] must be finite, but it was nan\."),
-        ({"m": 1.0, "k": [np.inf]}, r"^params\['k'\]\[0\] must be finite, but it was inf\."),
+        ({"m": NAN, "k": [1.0]}, r"^`params\['m'\]` must be finite, but it was nan\."),
+        ({"m": 1.0, "k": [np.inf]}, r"^`params\['k'\]\[0\]` must be finite, but it was inf\."),
         (
             {"m": 1.0, "k": np.array([1.0, NAN])},
-            r"^params\['k'\]\[1\] must be finite, but it was nan\.",
+            r"^`params\['k'\]\[1\]` must be finite, but it was nan\.",
         ),
-        ({"m": 1.0, "k": [1.0], "s": {1, 2}}, r"^params\['s'\] must be .* that hashes, .*\{1, 2\}"),
+        (
+            {"m": 1.0, "k": [1.0], "s": {1, 2}},
+            r"^`params\['s'\]` must be .* that hashes, .*\{1, 2\}",
+        ),
     ],
 )
 def test_a_bad_leaf_is_named_by_its_path(params, message):
@@ -285,7 +288,7 @@ def test_a_bad_leaf_is_named_under_derivatives_too():
         def end(x, bad=bad):
             return run({"m": x, "k": [1.0]} if bad == "m" else {"m": x, "k": [NAN]}).q[-1, 0]
 
-        with pytest.raises(ValueError, match=rf"^params\['{bad}'\].* must be finite") as caught:
+        with pytest.raises(ValueError, match=rf"^`params\['{bad}'\].*` must be finite") as caught:
             jax.grad(end)(NAN if bad == "m" else 1.0)
         assert "racer" not in str(caught.value)
 

@@ -44,5 +44,5 @@ class Second(NamedTuple):
 def test_what_is_equal_and_not_alike_has_a_program_of_its_own(law, one, other):
     """Keys that compare equal: named tuples of two classes, True and 1, 0.0 and -0.0."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - law(p["x"].law) * q[0], ("x",))
-    found = [system.acceleration({"x": Static(x)}, [0.0], [0.0])[0] for x in (one, other)]
+    found = [system.acceleration([0.0], [0.0], {"x": Static(x)})[0] for x in (one, other)]
     assert found == [-2.0, -5.0]

@@ -52,18 +52,21 @@ WRONG = {
     "index": (lambda: run(with_index), r"^function 'with_index' must index .*jnp.take"),
     "missing": (
         lambda: run(params={"m": 1.0}),
-        r"^params must have an entry 'k', which function 'good' reads, but its names were \['m'\]",
+        r"^`params` must have an entry 'k', which function 'good' reads, but its names were",
     ),
-    "none": (lambda: run(params=None), r"^params must be given, since function 'good' reads them"),
+    "none": (
+        lambda: run(params=None),
+        r"^`params` must be given, since function 'good' reads them",
+    ),
     "text": (
         lambda: run(params={"m": "1", "k": 2.0}),
-        r"^params\['m'\] must be a number where function 'good' calculates .* the text '1'",
+        r"^`params\['m'\]` must be a number where function 'good' calculates .* the text '1'",
     ),
     "row": (
         lambda: run(
             constraints=(ROD,), forces=(jl.GeneralizedForce(pulled, "pull", reaction=True),)
         ),
-        r"^lam must have an entry 'rood', .* its names were \['rod'\]",
+        r"^`lam` must have an entry 'rood', .* its names were \['rod'\]",
     ),
 }
 

@@ -9,13 +9,14 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxlag._core._arguments import renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit import fit
 from jaxlag._fit._fit_result import FitResult
 from jaxlag._fit._free_parameters import Prior
 from jaxlag._fit._predict import Prediction
-from jaxlag._fit._setup import experiments_of, spreads
+from jaxlag._fit._setup import NO_OPTIONS, experiments_of, spreads
 from jaxlag._fit._transforms import AbstractTransform
 from jaxlag._model._forces import AbstractForce
 from jaxlag._system._system import System
@@ -26,7 +27,7 @@ class Candidate(eqx.Module):
     """A term that a system may need: one force or more, and the params that come with it.
 
     Args:
-        forces: `Rayleigh`, `GeneralizedForce`, `PointForce`, `Couple`.
+        forces: `Rayleigh`, `GeneralizedForce`, `PointForce`, `Torque`.
         params0: entries for the dict of params; all are found.
         transforms: as for `jl.fit`, of these entries.
         priors: likewise.
@@ -74,7 +75,7 @@ class Ranked(NamedTuple):
 
 
 @final
-class Comparison(eqx.Module):
+class ModelSelection(eqx.Module):
     """Models, the best first: by what they predict of experiments that were held out.
 
     Attributes:
@@ -114,7 +115,11 @@ def _numbers(values: np.ndarray) -> str:
     return ", ".join(f"{x:.3g}" for x in values)
 
 
-def compare(
+_OF_FIT = ("segments", "channels", "loss", "optimizer", "rtol", "atol", "max_steps")
+
+
+@renamed(**{name: f"fit_options={{{name!r}: ...}}" for name in (*_OF_FIT, "simulate_options")})
+def select_model(
     system: System,
     experiments: Any,
     params0: Mapping[str, Any],
@@ -126,8 +131,8 @@ def compare(
     settle: float | int | None = None,
     transforms: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> Comparison:
+    fit_options: Mapping[str, Any] = NO_OPTIONS,
+) -> ModelSelection:
     """Fit a system with and without candidate terms, and rank them by what they predict.
 
     Every combination of up to `most` candidates is added to the system and fitted to the
@@ -148,7 +153,7 @@ def compare(
         settle: s, as for `jl.predict`.
         transforms: as for `jl.fit`.
         priors: as for `jl.fit`.
-        options: of `jl.fit`.
+        fit_options: further arguments of `jl.fit`, such as segments and simulate_options.
 
     Raises:
         ValueError: an argument of wrong form or value, named; params of a candidate that the system
@@ -177,7 +182,7 @@ def compare(
                 free=(*free, *(name for term in terms for name in term.params0)),
                 transforms=transform,
                 priors=prior,
-                **options,
+                **fit_options,
             )
             predicted = found.predict(held_out, settle)
             error = _error(predicted, held_out)
@@ -186,7 +191,7 @@ def compare(
     if np.isinf(ranked[0].error):
         text = "No model predicts all that was held out: motions or searches for starts failed."
         warnings.warn(f"{text} See `prediction.failed` of each.", stacklevel=2)
-    return Comparison(ranked)
+    return ModelSelection(ranked)
 
 
 def _estimates(

@@ -8,7 +8,7 @@ import pytest
 from _measured import OPTIONS, TRUE, TS, angles
 
 import jaxlag as jl
-from jaxlag._fit._compare import Ranked, _estimates
+from jaxlag._fit._select_model import Ranked, _estimates
 
 
 def lagrangian(t, q, v, p):
@@ -30,13 +30,13 @@ def measured(q0, seed):
 
 
 def compare(candidates, **options):
-    return jl.compare(
+    return jl.select_model(
         bare,
         measured(1.0, 0),
         START,
         candidates,
         held_out=measured(0.4, 1),
-        **({"free": ("l",)} | OPTIONS | options),
+        **({"free": ("l",), "fit_options": OPTIONS} | options),
     )
 
 
@@ -61,7 +61,7 @@ def test_combinations_and_what_is_useless():
     assert len(found.models) == 4
     assert set(both.fit.names) == {"l", "c", "k"}
     np.testing.assert_allclose(both.error, found["viscous"].error, rtol=0.05)
-    with pytest.raises(ValueError, match=r"model must be one of .*'cubic \+ viscous'"):
+    with pytest.raises(ValueError, match=r"`model` must be one of .*'cubic \+ viscous'"):
         found["dry"]
 
 
@@ -110,9 +110,9 @@ def test_where_the_search_of_a_model_begins():
     # Neither do params of another form, or that a transform does not allow.
     other = ranked(1.0, {"l": 3.0, "c": 4.0, "k": np.ones(3)})
     assert start(other) == {"l": 3.0, "c": 4.0}
-    bounds = {"c": jl.Bounded(0.0, 2.0), "l": jl.Positive()}
+    bounds = {"c": jl.transforms.Bounded(0.0, 2.0), "l": jl.transforms.Positive()}
     assert start(better, transforms=bounds) == {"l": 3.0}
-    bounds = {"c": jl.Bounded(0.0, 4.0)}
+    bounds = {"c": jl.transforms.Bounded(0.0, 4.0)}
     assert start(better, transforms=bounds) == {"l": 3.0}
 
 
@@ -120,7 +120,7 @@ def test_forces_are_added_to_a_system():
     more = bare.with_forces(*viscous.forces)
     params = {"l": 0.5, "g": 0.0, "c": 0.3}
     q, v = jnp.array([0.2]), jnp.array([1.5])
-    np.testing.assert_allclose(more.acceleration(params, q, v), [-0.3 * 1.5 / 0.25], rtol=1e-14)
+    np.testing.assert_allclose(more.acceleration(q, v, params), [-0.3 * 1.5 / 0.25], rtol=1e-14)
     assert bare.forces == ()
     assert more.constraints == ()
     assert more.lagrangian is bare.lagrangian
@@ -131,15 +131,15 @@ def test_forces_are_added_to_a_system():
 @pytest.mark.parametrize(
     ("candidates", "options", "message"),
     [
-        ({}, {}, r"candidates must be a dict of jl\.Candidate by name, but it was \{\}"),
-        ({"a": 3}, {}, r"candidates\['a'\] must be a jl\.Candidate, but it was 3"),
+        ({}, {}, r"`candidates` must be a dict of jl\.Candidate by name, but it was \{\}"),
+        ({"a": 3}, {}, r"`candidates\['a'\]` must be a jl\.Candidate, but it was 3"),
         (
             {"a": viscous, "b": viscous},
             {"most": 2},
             r"names of its own, but candidate 'a' has 'c', too",
         ),
-        ({"a": viscous}, {"free": "l"}, r"free must be a sequence of names.*Write free=\('l',\)"),
-        ({"a": viscous}, {"most": 2}, r"most must be an integer from 1 to the 1 candidates"),
+        ({"a": viscous}, {"free": "l"}, r"`free` must be a sequence of names.*Write free=\('l',\)"),
+        ({"a": viscous}, {"most": 2}, r"`most` must be an integer from 1 to the 1 candidates"),
     ],
 )
 def test_bad_arguments_are_named(candidates, options, message):
@@ -148,5 +148,7 @@ def test_bad_arguments_are_named(candidates, options, message):
 
 
 def test_a_candidate_without_a_force_is_named():
-    with pytest.raises(ValueError, match=r"forces must be one force or more.*Write jl\.Candidate"):
+    with pytest.raises(
+        ValueError, match=r"`forces` must be one force or more.*Write jl\.Candidate"
+    ):
         jl.Candidate(params0={"k": 1.0})

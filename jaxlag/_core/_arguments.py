@@ -1,0 +1,83 @@
+"""Arguments of public functions: which of them go by position, which by name."""
+
+from collections.abc import Callable
+from functools import wraps
+from inspect import Parameter, signature
+from typing import ParamSpec, TypeVar
+
+from jaxlag._core._errors import invalid
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def state_first(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of functions of a state: more arguments by position than it has are refused.
+
+    The sentence says the order, (q, v, params) and the rest by name, which Python's does not.
+    """
+    parameters = list(signature(function).parameters.values())
+    positional = [p.name for p in parameters if p.kind is Parameter.POSITIONAL_OR_KEYWORD]
+    by_name = [p.name for p in parameters if p.kind is Parameter.KEYWORD_ONLY]
+    shown = [name for name in positional if name != "self"]
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        if len(args) > len(positional):
+            count = len(args) - (len(positional) - len(shown))
+            raise invalid(
+                function.__name__,
+                f"get {_listed(by_name)} by name",
+                f"it got {count} arguments by position",
+                f"The order is ({', '.join(shown)}), then {'=..., '.join(by_name)}=... .",
+            )
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _listed(names: list[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def renamed(**words: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator of functions whose keywords had other names: these are refused, with what to write.
+
+    Args:
+        **words: by the old name, what is written in its place.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            for old in words.keys() & kwargs.keys():
+                must, was = "be called by its present keywords", f"it got {old}="
+                raise invalid(function.__name__, must, was, f"Write {words[old]}.")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
+
+
+def required(**fixes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator of functions whose required arguments, left out, are asked for by a sentence.
+
+    Args:
+        **fixes: by the argument's name, what to write.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        places = {name: list(signature(function).parameters).index(name) for name in fixes}
+
+        @wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name, place in places.items():
+                if len(args) <= place and name not in kwargs:
+                    raise invalid(name, "be given", "it was left out", fixes[name])
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate

@@ -1,0 +1,141 @@
+"""Inspection of a declaration: its shapes by tracing, its mass matrix and rows by numbers."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid
+from jaxlag._lowering import ArrayTerms
+from jaxlag._model._inputs import evaluate
+from jaxlag._system._reactions import AbstractReactions
+from jaxlag._tracing import _params
+from jaxlag._tracing._index_check import check_indices
+
+APART = 1e-3
+"""Least singular value of rows of unit length that count as clearly independent."""
+
+
+def mass_definite(
+    system: AbstractReactions, params: Any, t: Any, q: Array, v: Array | None
+) -> bool | None:
+    """Whether M is positive definite for these params without the help of constraints.
+
+    Looked at in the given state, where it is known, and in one other, as the mass of a link is
+    zero everywhere or nowhere; where the state is traced and M depends on it, in some where
+    inertias vanish, as that of polar coordinates does at r = 0. None where the params have no
+    values, since they are traced. Of use to a system with constraints alone.
+    """
+    if not system.constraints:
+        return False
+    if not concrete(params):
+        return None
+    n = system.size
+    states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
+    v = jnp.zeros_like(q) if v is None else v
+    if concrete((t, q, v)):
+        states.append((t, q, v))
+    elif system._structure(params, q.dtype).mass & {"t", "q", "v"}:
+        states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
+    floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
+    for state in states:
+        with jax.ensure_compile_time_eval():
+            traced, static = _params.split(params)
+            at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
+            M = _mass(system, _params.Static(static), *at, traced)
+        if not concrete(M):
+            return None  # the Lagrangian closes over a traced value
+        M = np.asarray(M, np.float64)
+        units = np.sqrt(np.abs(np.diagonal(M)))
+        if not np.all(units > 0) or not np.all(np.isfinite(M)):
+            return False
+        if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
+            return False
+    return True
+
+
+def contact_rows_independent(
+    system: AbstractReactions,
+    params: Any,
+    t: Any,
+    q: Array,
+    v: Array | None,
+    inputs: Mapping[str, Any],
+) -> bool:
+    """Whether rows whose multipliers forces read are clearly independent of one another.
+
+    In the given state, where all has values; else False.
+    """
+    v = jnp.zeros_like(q) if v is None else v
+    if not system.constraints or not concrete(params, t, q, v, inputs):
+        return False
+    array = ArrayTerms(system.lagrangian, system.forces, system.constraints)
+    t = jnp.asarray(t, float)
+    chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
+    if len(chosen) < 2:
+        return True
+    traced, static = _params.split(params)
+    with jax.ensure_compile_time_eval():
+        A = np.asarray(_rows(system, _params.Static(static), t, q, v, traced), np.float64)[chosen]
+    sizes = np.linalg.norm(A, axis=1, keepdims=True)
+    if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
+        return False
+    return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
+
+
+def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: Any) -> None:
+    """Trace L and the forces at abstract states; raise if a shape or dtype is wrong.
+
+    Args:
+        system: whose functions are traced.
+        params: as the Lagrangian takes them.
+        dtype: of the state.
+        values: values of the inputs by name; None to leave the forces out.
+    """
+    t = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    q = v = jax.ShapeDtypeStruct((system.size,), dtype)
+    traced, static = _params.split(params)
+    terms = system._terms
+
+    def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Array:
+        params = _params.join(traced, static)
+        p = terms.momentum(t, q, v, params)
+        return p if values is None else p + terms.force(t, q, v, params, values)
+
+    closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
+    check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _rows(
+    system: AbstractReactions, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system._terms.rows(t, q, v, _params.join(traced, static.tree))[0]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _mass(
+    system: AbstractReactions, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
+) -> Array:
+    return system._terms.mass(t, q, v, _params.join(traced, static.tree))
+
+
+def check_declaration(
+    system: AbstractReactions, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
+) -> None:
+    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
+    values = evaluate(inputs, t, q, v, params)
+    check_traceable(system, params, q.dtype, values)
+    for name in inputs:
+        if name not in values.read:
+            raise invalid(
+                "inputs",
+                "hold only signals that a force reads",
+                f"no force read {name!r}",
+                "Drop it, or read inputs[name] in a GeneralizedForce.",
+            )
