@@ -12,7 +12,6 @@ class Status(IntEnum):
     """
 
     ok = 0
-    stopped_by_event = 1
     max_steps = 2
     step_below_resolution = 3
     nonfinite = 4

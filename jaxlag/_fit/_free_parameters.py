@@ -133,7 +133,15 @@ class Unknowns(eqx.Module):
         """No unknowns, and the params at z."""
         nothing = np.zeros(0)
         return Unknowns(
-            (), self.params(z), nothing, nothing, nothing, nothing, nothing, np.zeros((2, 0)), ()
+            leaves=(),
+            params0=self.params(z),
+            u0=nothing,
+            scale=nothing,
+            reach=nothing,
+            low=nothing,
+            high=nothing,
+            limits=np.zeros((2, 0)),
+            on_bound=(),
         )
 
     def rescaled(self, scale: np.ndarray) -> "Unknowns":

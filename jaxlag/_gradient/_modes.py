@@ -2,7 +2,7 @@
 
 import math
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxlag._core._errors import invalid
 
@@ -24,19 +24,7 @@ class GradientMode(IntEnum):
     checkpoints = 3
 
 
-class CheckpointPlan(NamedTuple):
-    """What is kept for derivatives.
-
-    Attributes:
-        mode: one of `MODES`.
-        room: for states on the way; 0 in forward mode.
-    """
-
-    mode: str
-    room: int
-
-
-def choose_gradient(
+def capacity_for(
     mode: str,
     memory: int | float | None,
     max_steps: int,
@@ -44,8 +32,8 @@ def choose_gradient(
     state: int,
     itemsize: int,
     knots: bool = False,
-) -> CheckpointPlan:
-    """What to keep of `max_steps` steps.
+) -> int:
+    """How many states to keep of `max_steps` steps; 0 where derivatives go forwards.
 
     Args:
         mode: as asked for.
@@ -59,7 +47,7 @@ def choose_gradient(
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
     if memory is None:
-        return CheckpointPlan(mode, min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode])
+        return min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode]
     if not isinstance(saves, int):
         was = f"it was {memory} for {saves} times"
         raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
@@ -71,10 +59,10 @@ def choose_gradient(
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
         if needed(room, turns, state, itemsize, knots) <= memory:
-            return CheckpointPlan(mode, room)
+            return room
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
-            return CheckpointPlan(mode, rooms[fitting[0]])
+            return rooms[fitting[0]]
         must = f"be at least {needs['forward']} bytes for max_steps={max_steps}"
         raise invalid("gradient_memory", must, f"it was {memory}", "Lower max_steps.")
     if needs[mode] > memory:
@@ -82,7 +70,7 @@ def choose_gradient(
         fix = f"Use gradient={' or '.join(fits)}." if fits else "Lower max_steps."
         must = f"be at least {needs[mode]} bytes for gradient={mode!r} and max_steps={max_steps}"
         raise invalid("gradient_memory", must, f"it was {memory}", fix)
-    return CheckpointPlan(mode, rooms[mode])
+    return rooms[mode]
 
 
 def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:

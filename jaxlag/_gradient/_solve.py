@@ -9,7 +9,6 @@ records where it went, and the derivative goes the same way again.
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -18,12 +17,14 @@ from jaxlag._core import _xla
 from jaxlag._core._batching import LANES, at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._status import Status
-from jaxlag._gradient._modes import CheckpointPlan, GradientMode
+from jaxlag._gradient._modes import GradientMode
 from jaxlag._gradient._rescan import again
-from jaxlag._gradient._tangent_map import Setup, changed, changes, filled, in_loops, path_of, unpack
+from jaxlag._gradient._split_problem import Problem, SplitProblem, split
+from jaxlag._gradient._tangent_map import changed, changes, filled, in_loops, path_of
 from jaxlag._gradient._unreached_saves import unreached
 from jaxlag._integration._loop import integrate
-from jaxlag._integration._record import Outcome, Times
+from jaxlag._integration._record import Outcome
+from jaxlag._integration._tableaus import remembers
 
 
 class SavedStates(NamedTuple):
@@ -34,56 +35,37 @@ class SavedStates(NamedTuple):
     time: Float[Array, ""]  # last good time
 
 
-class Problem(NamedTuple):
-    """A start, the vector field's arguments, the times, and how to solve."""
-
-    y0: PyTree
-    args: Any
-    times: Times
-    setup: Setup
-    stepper: Any  # static half of the Stepper
-    max_steps: int
-    keep: CheckpointPlan
-
-
 def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
     """Integrate and save; differentiable in y0, args and times."""
-    inexact, rest, setup, static = halves(problem)
+    whole = split(problem)
+    problem_static = whole.static
 
     @CustomJVP
-    def run(inexact: Any, rest: Any, setup: Setup) -> tuple[SavedStates, Outcome]:
-        outcome = _driven(inexact, rest, setup, static, record=False)
-        return _ended(outcome)
+    def run(*traced: Any) -> tuple[SavedStates, Outcome]:
+        return _ended(_integrated(SplitProblem._make((*traced, problem_static)), record=False))
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
-        inexact, rest, setup = primals
-        outcome = _recorded(inexact, rest, setup, static)
+        whole = SplitProblem._make((*primals, problem_static))
+        outcome = _recorded(whole)
         change = changes(tangents[0], outcome)
         assert outcome.record is not None
-        if static[1].remembers:
-            function = partial(_replay, rest, setup, static, outcome)
-            states, states_dot = jax.jvp(function, (inexact,), (filled(change, inexact),))
+        if remembers(whole.stepper.solver):
+            given, function = whole.differentiable, partial(_replay, whole, outcome)
+            states, states_dot = jax.jvp(function, (given,), (filled(change, given),))
             ended = _ended(outcome)[1]
         else:
-            walk = changed(inexact, rest, setup, static, outcome.record, change)
+            walk = changed(whole, outcome.record, change)
             states, ended = _ended(outcome)
             states_dot = SavedStates(walk.saved[0], walk.last[0], walk.time)
-        ended = ended._replace(gradient=_mode(outcome, static))
+        ended = ended._replace(gradient=_mode(outcome, whole))
         reached = jnp.all(jnp.isfinite(outcome.saved), axis=tuple(range(1, outcome.saved.ndim)))
         states_dot = states_dot._replace(
-            saved=unreached(reached, inexact, change, states_dot.saved)
+            saved=unreached(reached, whole.differentiable, change, states_dot.saved)
         )
         return (states, ended), (states_dot, jax.tree.map(lambda _: None, ended))
 
-    return run(inexact, rest, setup)
-
-
-def halves(problem: Problem) -> tuple[Any, Any, Setup, Any]:
-    """A problem as (differentiable leaves, other arrays, setup, static rest)."""
-    inexact, rest = eqx.partition(problem[:3], eqx.is_inexact_array)
-    rest, static = eqx.partition(rest, eqx.is_array)
-    return inexact, rest, problem.setup, (static, problem.stepper, problem.max_steps, problem.keep)
+    return run(*whole.traced)
 
 
 def _ended(outcome: Outcome) -> tuple[SavedStates, Outcome]:
@@ -94,75 +76,79 @@ def _ended(outcome: Outcome) -> tuple[SavedStates, Outcome]:
     return states, outcome._replace(status=status, saved=None, record=None)
 
 
-def _mode(outcome: Outcome, static: Any) -> Array:
+def _mode(outcome: Outcome, problem: SplitProblem) -> Array:
     """How reverse derivatives go through the steps."""
     assert outcome.record is not None
-    if static[3].room == 0 and not static[1].remembers:
+    if problem.static.capacity == 0 and not remembers(problem.stepper.solver):
         return jnp.full_like(outcome.gradient, int(GradientMode.forward))
     apart = outcome.record.stride > 1
     modes = int(GradientMode.checkpoints), int(GradientMode.recorded)
     return jnp.where(apart, *modes).astype(jnp.int32) + jnp.zeros_like(outcome.gradient)
 
 
-def _recorded(inexact: Any, rest: Any, setup: Setup, static: Any) -> Outcome:
+def _recorded(problem: SplitProblem) -> Outcome:
     """The loop with its record; states on the way and saved ones are differentiable."""
+    static = problem.static
 
     @CustomJVP
-    def run(inexact: Any, rest: Any, setup: Setup) -> Outcome:
-        return _driven(inexact, rest, setup, static, record=True)
+    def run(*traced: Any) -> Outcome:
+        return _integrated(SplitProblem._make((*traced, static)), record=True)
 
     @partial(run.defjvp, symbolic_zeros=True)
     def run_jvp(primals: Any, tangents: Any) -> Any:
-        inexact, rest, setup = primals
-        outcome = _recorded(inexact, rest, setup, static)
+        problem = SplitProblem._make((*primals, static))
+        outcome = _recorded(problem)
         dots = jax.tree.map(lambda _: None, outcome)
-        if not static[1].remembers:
+        if not remembers(problem.stepper.solver):
             change = changes(tangents[0], outcome)
             record = outcome.record
             assert record is not None
             kept = record.points is not None  # none where derivatives go forwards
-            walk = changed(inexact, rest, setup, static, record, change, points=kept)
+            walk = changed(problem, record, change, points=kept)
             record = dots.record._replace(points=walk.points)
             dots = dots._replace(
                 state=walk.last[0], time=walk.time, saved=walk.saved[0], record=record
             )
         return outcome, dots
 
-    outcome = run(inexact, rest, setup)
+    outcome = run(*problem.traced)
     assert outcome.record is not None
     # Times stay where they are, or move with their anchors.
     still = outcome.record._replace(offsets=jax.lax.stop_gradient(outcome.record.offsets))
     return outcome._replace(record=still)
 
 
-def _driven(inexact: Any, rest: Any, setup: Setup, static: Any, record: bool) -> Outcome:
+def _integrated(problem: SplitProblem, record: bool) -> Outcome:
     """The loop of steps; of scalar programs and implicit methods, vmapped, in chunks."""
+    static = problem.static
 
-    def single(inexact: Any, rest: Any, setup: Setup, lanes: bool = False) -> Outcome:
-        y0, args, times, stepper, max_steps = unpack(inexact, rest, setup, static)
+    def single(*traced: Any, lanes: bool = False) -> Outcome:
+        problem = SplitProblem._make((*traced, static))
+        (y0, args, times), setup, stepper = problem.motion, problem.setup, problem.stepper
         if record:
             stepper = stepper.for_derivatives(y0, args)
         fast = stepper.on_scalars(lanes)
         if record and lanes:  # written out, this half would take most of the time to compile
             fast = None if fast is None else in_loops(fast)
-        rest_of_it = setup.first_step, setup.allowed, max_steps, record, static[3].room
+        bounds = setup.first_step, setup.allowed, static.max_steps, record, static.capacity
         native = None if fast is None else _xla.native
-        return integrate(fast or stepper, y0, args, times, *rest_of_it, native)
+        return integrate(fast or stepper, y0, args, times, *bounds, native)
 
-    y0, _, _, stepper, _ = unpack(inexact, rest, setup, static)
+    y0, stepper = problem.motion[0], problem.stepper
     on_scalars = stepper.on_scalars() is not None
     if jax.default_backend() != "cpu" or not (on_scalars or stepper.implicit):
-        return single(inexact, rest, setup)
+        return single(*problem.traced)
     at_once = LANES if on_scalars else at_once_implicit(y0.size)
-    vmapped, given = partial(single, lanes=True), (inexact, rest, setup)
-    return in_lanes(single, vmapped, *given, at_once=at_once, even=not on_scalars)
+    vmapped = partial(single, lanes=True)
+    return in_lanes(single, vmapped, *problem.traced, at_once=at_once, even=not on_scalars)
 
 
-def _replay(rest: Any, setup: Setup, static: Any, outcome: Outcome, inexact: Any) -> SavedStates:
-    """The saved states as a function of `inexact` alone, all steps taken again."""
-    y0, args, times, stepper, _ = unpack(inexact, rest, setup, static)
+def _replay(problem: SplitProblem, outcome: Outcome, differentiable: Any) -> SavedStates:
+    """The saved states as a function of the differentiable leaves, all steps taken again."""
+    problem = problem._replace(differentiable=differentiable)
+    y0, args, times = problem.motion
     assert outcome.record is not None
-    path = path_of(stepper, y0, args, times, outcome.record, ())
+    path = path_of(problem.stepper, y0, args, times, outcome.record, ())
     walk = again(path, path.start, [], times.anchors(), times.saves, False)
     # What was not reached, or failed, is so again.
     found = jnp.isfinite(outcome.saved)

@@ -19,25 +19,11 @@ from jaxlag._gradient._recorded_motion import (
     StepTimes,
 )
 from jaxlag._gradient._rescan import again
+from jaxlag._gradient._split_problem import SplitProblem, Static
 from jaxlag._gradient._sweeps import adjoint_sweep, tangent_sweep
 from jaxlag._integration._record import Outcome, Record, Times
 from jaxlag._integration._stepper import Stepper
-from jaxlag._integration._tableaus import with_stages
-
-
-class Setup(NamedTuple):
-    """What a solve needs and no derivative is taken of."""
-
-    first_step: Array | None
-    allowed: Bool[Array, ""]
-    stepper: Any  # traced half of the Stepper
-
-
-def unpack(inexact: Any, rest: Any, setup: Setup, static: Any) -> Any:
-    """(start, arguments, times, stepper, bound on the steps) from the halves of a problem."""
-    static_problem, static_stepper, max_steps, _ = static
-    y0, args, times = eqx.combine(inexact, rest, static_problem)
-    return y0, args, times, eqx.combine(setup.stepper, static_stepper), max_steps
+from jaxlag._integration._tableaus import remembers, with_stages
 
 
 def changes(tangents: Any, outcome: Outcome) -> Any:
@@ -60,31 +46,25 @@ def filled(change: Any, like: Any) -> Any:
 
 
 def changed(
-    inexact: Any,
-    rest: Any,
-    setup: Setup,
-    static: Any,
-    record: Record,
-    change: Any,
-    points: bool = False,
+    problem: SplitProblem, record: Record, change: Any, points: bool = False
 ) -> SolveTangents:
     """The derivative of the states on the way, at the points of the record too if asked for."""
     y0_dot, args_dot, times_dot = change
     dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
     moving = tuple(i for i, dot in enumerate(dots) if dot is not None)
-    times, anchors_dot, saves_dot = eqx.combine(inexact, rest, static[0])[2], None, None
+    times, anchors_dot, saves_dot = problem.motion[2], None, None
     if jax.tree.leaves(times_dot):
         whole = filled(times_dot, times)
         anchors_dot, saves_dot = jax.jvp(Times.anchors, (times,), (whole,))[1], whole.saves
     x = InputTangents(y0_dot, [dots[i] for i in moving], anchors_dot, saves_dot)
-    kind = _Kind(static, moving, y0_dot is not None, anchors_dot is not None, points)
-    return linear(_map(kind), (inexact, rest, setup, record), x)
+    kind = _Kind(problem.static, moving, y0_dot is not None, anchors_dot is not None, points)
+    return linear(_map(kind), (*problem.traced, record), x)
 
 
 class _Kind(NamedTuple):
     """What moves, and what is wanted to move with it."""
 
-    static: Any
+    static: Static
     moving: tuple[int, ...]
     start: bool
     times: bool
@@ -95,8 +75,9 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
     """The variational equations as a linear map."""
 
     def path(r: Any) -> tuple[RecordedMotion, Any]:
-        inexact, rest, setup, record = r
-        y0, args, times, stepper, _ = unpack(inexact, rest, setup, kind.static)
+        differentiable, arrays, setup, record = r
+        problem = SplitProblem(differentiable, arrays, setup, kind.static)
+        (y0, args, times), stepper = problem.motion, problem.stepper
         fast = stepper.on_scalars(lanes)
         return path_of(stepper, y0, args, times, record, kind.moving, fast, lanes), y0
 
@@ -118,9 +99,10 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
         return _transposed(partial(forward, r), like(r)[1], y)
 
     def plain(r: Any, x: InputTangents) -> SolveTangents:
-        inexact, rest, setup, record = r
-        y0, args, times, stepper, _ = unpack(inexact, rest, setup, kind.static)
-        way = path_of(stepper, y0, args, times, record, kind.moving)
+        differentiable, arrays, setup, record = r
+        problem = SplitProblem(differentiable, arrays, setup, kind.static)
+        y0, args, times = problem.motion
+        way = path_of(problem.stepper, y0, args, times, record, kind.moving)
 
         def motion(y0: Array, moved: list, anchors: Array, saves: Array) -> SolveTangents:
             return again(way, (y0, None), moved, anchors, saves, kind.points)
@@ -134,7 +116,7 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
         return jax.jvp(motion, given, (y0_dot, list(x.args), *times_dot))[1]
 
     in_lanes = None if lanes else _map(kind, lanes=True)
-    reverse = backward if kind.static[3].room else by_directions
+    reverse = backward if kind.static.capacity else by_directions
     return LinearMap(forward, reverse, plain, in_lanes=in_lanes)
 
 
@@ -181,7 +163,7 @@ def path_of(
         return one_step(looped, args, t0, t1, state, jump, True, wanted)[0]
 
     zero = jnp.zeros_like(times.stop)
-    memory = stepper.begin(zero, times.stop, y0, args) if stepper.remembers else None
+    memory = stepper.begin(zero, times.stop, y0, args) if remembers(stepper.solver) else None
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(stepper.solver, "tableau", None), "num_stages", 0)
     clock, start = StepTimes(times, record), (y0, memory)
@@ -211,10 +193,10 @@ def one_step(
     y0, memory = y, _ = state
     args = stepper.within(args, t0)
     jumped: Any = jump
-    if not stepper.remembers:
+    if not remembers(stepper.solver):
         memory, jumped = stepper.afresh(t0, t1, y, args)
     y, _, memory, solved = stepper.step(t0, t1, y, args, memory, jumped)
     y, verdict = stepper.settled(t1, y, args, differentiable)
     if wanted is not None and args.lengths is not None:
         y = stepper.reached(t0, y0, t1, y, wanted, wanted != t1, args)
-    return (y, memory if stepper.remembers else None), solved & verdict.good
+    return (y, memory if remembers(stepper.solver) else None), solved & verdict.good

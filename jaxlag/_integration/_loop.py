@@ -36,6 +36,7 @@ from jaxlag._integration._loop_state import (
 )
 from jaxlag._integration._record import Outcome, Reach, Record, Times, reached_time
 from jaxlag._integration._stepper import SINGULAR, Estimate, Stepper, all_finite, resolution
+from jaxlag._integration._tableaus import remembers
 
 # The record is a whole number of chunks of this many turns.
 CHUNK = 64
@@ -73,7 +74,7 @@ def integrate(
     # Turns in which any lane takes a step: at most those in which one attempts it or goes to a save
     # time.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
-    room = (room if room < max_steps else size) if record and not stepper.remembers else 0
+    room = (room if room < max_steps else size) if record and not remembers(stepper.solver) else 0
     if stepper.controller is not None:
         memory, sound, h, control = stepper.start(t0, times.stop, y0, args, first_step)
         # The estimate is 0/0 where atol = 0 meets a component that is 0.

@@ -63,11 +63,6 @@ class Stepper(eqx.Module):
     stops: bool = eqx.field(static=True, default=False)
 
     @property
-    def remembers(self) -> bool:
-        """Whether the solver is a multistep method."""
-        return remembers(self.solver)
-
-    @property
     def implicit(self) -> bool:
         """Whether equations may be solved in a step."""
         return not isinstance(self.solver, AbstractExplicit | Splitting | diffrax.AbstractERK)
@@ -210,7 +205,7 @@ class Stepper(eqx.Module):
         if self.moves:
             # The state is not the one that the last step ended in: its last stage is of no use.
             jump = True if isinstance(self.solver, AbstractExplicit) else jnp.array(True)
-        if self.remembers and jump is not False:
+        if remembers(self.solver) and jump is not False:
             # What was remembered is of the other side.
             fresh = self.solver.init(self.term, t0, t1, y, args)
             memory = jax.tree.map(partial(jnp.where, jump), fresh, memory)

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag._core._arrays import stop_gradient
-from jaxlag._gradient._modes import CheckpointPlan
-from jaxlag._gradient._solve import Problem, Setup
+from jaxlag._gradient._split_problem import Problem, Setup
 from jaxlag._integration._change_points import lengths_of, may_cross, may_stop, scales_at
 from jaxlag._integration._initial_conditions import (
     Start,
@@ -56,7 +55,7 @@ class ProgramKey(NamedTuple):
     assemble: bool
     regular: bool | None
     apart: bool
-    keep: CheckpointPlan
+    capacity: int
     change_points: str
     auto: bool  # whether the method may be chosen by the structure of the system
 
@@ -171,7 +170,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     pressed = step_end.contacts_valid(start, y0, args)
     begun = Start(valid, in_range, finite, consistent, pressed)
     setup = Setup(values.step, begun.allowed, stepper_traced)
-    problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.keep)
+    problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.capacity)
     return dynamics, begun, problem
 
 

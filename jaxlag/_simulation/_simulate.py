@@ -15,7 +15,7 @@ from jaxlag._core._arguments import renamed, required
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
-from jaxlag._gradient._modes import choose_gradient
+from jaxlag._gradient._modes import capacity_for
 from jaxlag._gradient._solve import solve
 from jaxlag._integration._initial_conditions import rows_hold_after
 from jaxlag._integration._stepper import Stepper
@@ -273,7 +273,7 @@ def simulate(
         assemble=assemble,
         regular=mass_definite(system, params, ts[0], q0, v0),
         apart=not assemble and contact_rows_independent(system, params, ts[0], q0, v0, inputs),
-        keep=choose_gradient(
+        capacity=capacity_for(
             gradient,
             gradient_memory,
             max_steps,

@@ -110,7 +110,7 @@ def plotted(motion: AbstractSolution) -> Any:
     shapes = motion.system.coordinates.shapes
     paths = _paths(shapes)
     panels = [*shapes, "energy"]
-    width, count = (9.0, 6.0)[not paths], len(panels)
+    width, count = 9.0 if paths else 6.0, len(panels)
     figure = Figure(figsize=(width, 0.6 + 1.8 * count), dpi=120, layout="constrained")
     grid = figure.add_gridspec(count, 2 if paths else 1)
     axes = [figure.add_subplot(grid[0, 0])]

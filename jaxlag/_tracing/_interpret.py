@@ -152,11 +152,6 @@ def _whole(x: np.ndarray, y: np.ndarray) -> Any:
     return np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))
 
 
-def _integer_pow(eqn: Any, x: np.ndarray) -> Any:
-    exponent = eqn.params["y"]
-    return x ** (exponent if exponent >= 0 else float(exponent))
-
-
 NUMPY: dict[str, Callable] = {
     name: _plain(getattr(np, other))
     for name, other in {

@@ -10,7 +10,7 @@ import pytest
 from _directions import direction, dot
 
 import jaxlag as jl
-from jaxlag._gradient._modes import choose_gradient, needed
+from jaxlag._gradient._modes import capacity_for, needed
 from systems._catalogue import find
 
 # Seconds that each runs for. Starts are assembled where they have to stay on constraints.
@@ -239,13 +239,13 @@ def test_memory_decides():
     """The times of all steps take 8 bytes each, and 5 more with knots; states what is left."""
     state, size, steps = 4, 8, 16384
     times = 8 * steps
-    assert choose_gradient("auto", None, steps, 2, state, size).room == 512
-    room = choose_gradient("auto", times + 10_000, steps, 2, state, size).room
+    assert capacity_for("auto", None, steps, 2, state, size) == 512
+    room = capacity_for("auto", times + 10_000, steps, 2, state, size)
     assert room == 128
     assert needed(room, steps, state, size) <= times + 10_000
-    assert choose_gradient("auto", times, steps, 2, state, size).room == 0
+    assert capacity_for("auto", times, steps, 2, state, size) == 0
     assert needed(0, steps, state, size, knots=True) == 13 * steps
-    assert choose_gradient("recorded", None, 1000, 2, state, size).room >= 1000
+    assert capacity_for("recorded", None, 1000, 2, state, size) >= 1000
 
 
 @pytest.mark.parametrize(
