@@ -18,7 +18,7 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-from jaxlag._core._program_rewrite import rewritten
+from jaxlag._core._jaxprs import rewritten
 
 Leaves = Sequence[Any]
 NAME = "custom_jvp_call"

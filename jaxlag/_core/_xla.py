@@ -23,7 +23,7 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
-from jaxlag._core._nested_programs import equations
+from jaxlag._core._jaxprs import equations
 
 OPTION = "xla_cpu_small_while_loop_byte_threshold"
 BYTES = 10_000_000

@@ -19,7 +19,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
-from jaxlag._core._nested_programs import called
+from jaxlag._core._jaxprs import called
 
 RUNS = 4
 STRENGTH = 256.0

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._custom_jvp import CustomJVP
-from jaxlag._core._nested_programs import called, equations, within
+from jaxlag._core._jaxprs import called, equations, within
 from jaxlag._model._input_signals import AbstractInput, AbstractTable
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._closure import declared

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxlag._core._custom_jvp import AbstractRule, Leaves, bind_rule, with_rule, with_rules_kept
+from jaxlag._core._jaxprs import rewritten
 from jaxlag._core._linear_map import LinearMap, linear
-from jaxlag._core._program_rewrite import rewritten
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jaxlag._core._jaxprs import called, scan_sizes
+
 Names = frozenset[str]
 
 _NOTHING: Names = frozenset()
-
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"} | {
-    "custom_jvp_call",
-    "custom_vjp_call",
-}
-
 
 Seen = Callable[[Any, list[Names]], None]
 
@@ -75,25 +71,13 @@ def _is_inexact(atom: Any) -> bool:
 
 
 def _results(eqn: Any, operands: list[Names], seen: Seen | None, continuous: bool) -> list[Names]:
-    inner = _inner(eqn)
+    inner = called(eqn)
     if inner is not None:
-        return outputs_depend_on(inner, operands, seen, continuous)
+        return outputs_depend_on(inner.jaxpr, operands, seen, continuous)
     follow = _CONTROL_FLOW.get(eqn.primitive.name)
     if follow is not None:
         return follow(eqn.params, operands)
     return [_NOTHING.union(*operands)] * len(eqn.outvars)
-
-
-def _inner(eqn: Any) -> Jaxpr | None:
-    """The jaxpr of a call-like equation whose operands map one to one; else None."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        jaxpr = _open(eqn.params.get(key))
-        sizes = (len(eqn.invars), len(eqn.outvars))
-        if isinstance(jaxpr, Jaxpr) and (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
-            return jaxpr
-    return None
 
 
 def _open(jaxpr: Any) -> Any:
@@ -105,14 +89,6 @@ def _cond(params: Any, operands: list[Names]) -> list[Names]:
     index, *rest = operands
     branches = [outputs_depend_on(_open(branch), rest) for branch in params["branches"]]
     return [index.union(*outputs) for outputs in zip(*branches, strict=True)]
-
-
-def scan_sizes(params: Any) -> tuple[int, int]:
-    """How many operands of a scan are constants, and how many are carried; the rest are rows."""
-    if "num_consts" in params:
-        return params["num_consts"], params["num_carry"]
-    consts, carried, _ = params["ft_in"].unpack()  # jax 0.12
-    return len(consts), len(carried)
 
 
 def _scan(params: Any, operands: list[Names]) -> list[Names]:

@@ -10,6 +10,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import requirement
+from jaxlag._core._jaxprs import called
 from jaxlag._tracing._interpret import NUMPY, equation
 
 
@@ -60,8 +61,8 @@ def _walk(jaxpr: Jaxpr, vectors: dict[Any, str], known: dict[Any, Any], of: str)
         first = eqn.invars[0] if eqn.invars else None
         if not isinstance(first, Literal) and first in vectors:
             _check(eqn, vectors[first], values[1:], of)
-        inner = eqn.params.get("jaxpr")
-        if eqn.primitive.name in ("jit", "pjit", "checkpoint") and isinstance(inner, ClosedJaxpr):
+        inner = called(eqn)
+        if inner is not None:
             inside = list(zip(inner.jaxpr.invars, eqn.invars, values, strict=True))
             _walk(
                 inner.jaxpr,

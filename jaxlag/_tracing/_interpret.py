@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jaxlag._core._jaxprs import called
+
 
 def interpret(closed: ClosedJaxpr, *args: Any) -> list:
     """The results of a program at given arrays; overflows and the like give inf and nan."""
@@ -37,13 +39,9 @@ def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
 
 def equation(eqn: Any, operands: list) -> list:
     """The results of one equation at given numpy arrays."""
-    name = eqn.primitive.name
-    for key in ("jaxpr", "call_jaxpr"):
-        inner = eqn.params.get(key)
-        if name in _CALLS and inner is not None:
-            if isinstance(inner, ClosedJaxpr):
-                return _run(inner.jaxpr, list(map(held, inner.consts)), operands)
-            return _run(inner, [], operands)
+    name, inner = eqn.primitive.name, called(eqn)
+    if inner is not None:
+        return _run(inner.jaxpr, list(map(held, inner.consts)), operands)
     if name in NUMPY:
         out = np.asarray(NUMPY[name](eqn, *operands))
         kind = eqn.outvars[0].aval.dtype
@@ -59,10 +57,6 @@ def equation(eqn: Any, operands: list) -> list:
         ]
         out = eqn.primitive.bind(*given, **eqn.params)
     return [held(x) for x in (out if eqn.primitive.multiple_results else [out])]
-
-
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
-_CALLS |= {"custom_jvp_call"}
 
 
 def _plain(function: Callable) -> Callable:

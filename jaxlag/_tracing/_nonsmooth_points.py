@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.extend.core import ClosedJaxpr, Literal
 
-from jaxlag._core._nested_programs import called
+from jaxlag._core._jaxprs import called
 
 _SMOOTH = "jaxlag smooth"
 smooth = jax.named_scope(_SMOOTH)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._program_rewrite import rewritten
+from jaxlag._core._jaxprs import rewritten
 
 
 def copy_constants(code: ClosedJaxpr) -> ClosedJaxpr:

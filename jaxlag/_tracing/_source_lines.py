@@ -4,7 +4,7 @@ from typing import Any
 
 from jax.extend import source_info_util
 
-from jaxlag._core._nested_programs import equations
+from jaxlag._core._jaxprs import equations
 
 
 def line_of(program: Any, *primitives: str) -> str:

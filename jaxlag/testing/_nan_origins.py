@@ -18,7 +18,7 @@ import numpy as np
 from jax._src import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
-from jaxlag._tracing._dependence import scan_sizes
+from jaxlag._core._jaxprs import called, scan_sizes, within
 from jaxlag._tracing._interpret import equation
 
 _LABEL = re.compile(r"jaxlag equation (\d+)\.")
@@ -27,8 +27,6 @@ _NOT_THE_USERS = (
     *(str(Path(getfile(package)).parent) for package in (eqx, jaxtyping)),
 )
 _LONG = 64  # turns of a loop that is not run equation by equation, unless it has to be searched
-_CALLED = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-_PROGRAMS = {*_CALLED, "branches", "body_jaxpr"}
 _RULES = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
@@ -156,7 +154,7 @@ def _run(closed: ClosedJaxpr, args: list) -> dict:
     for eqn in jaxpr.eqns:
         operands = [np.asarray(a.val) if isinstance(a, Literal) else known[a] for a in eqn.invars]
         long = eqn.params.get("length", 0) > _LONG  # JAX compiles it
-        plain = long or _PROGRAMS.isdisjoint(eqn.params)
+        plain = long or next(within(eqn), None) is None
         nested = None if plain else _nested(eqn, operands)
         results = equation(eqn, operands) if nested is None else nested.results
         known.update(zip(eqn.outvars, results, strict=True))
@@ -309,15 +307,8 @@ def _nested(eqn: Any, operands: list) -> _Call | _Loop | None:
         return _scan(eqn, operands)
     if name == "while":
         return _while(params, operands)
-    for key in _CALLED:
-        inner = params.get(key)
-        inner = ClosedJaxpr(inner, ()) if isinstance(inner, Jaxpr) else inner
-        sizes = (len(eqn.invars), len(eqn.outvars))
-        if isinstance(inner, ClosedJaxpr) and not inner.jaxpr.constvars[len(inner.consts) :]:
-            jaxpr = inner.jaxpr
-            if (len(jaxpr.invars), len(jaxpr.outvars)) == sizes:
-                return _Call(inner, operands, 0)
-    return None
+    inner = called(eqn)
+    return None if inner is None else _Call(inner, operands, 0)
 
 
 def _scan(eqn: Any, operands: list) -> _Loop:

@@ -7,7 +7,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag._core._batching import MOST
-from jaxlag._core._nested_programs import equations, within
+from jaxlag._core._jaxprs import equations, within
 
 EPS = np.finfo(float).eps
 GRAVITY = 9.81

@@ -16,11 +16,11 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._custom_jvp import with_rule_kept
+from jaxlag._core._jaxprs import called, scan_sizes
 from jaxlag._lowering._graph._expression import Graph, Node, named
 from jaxlag._lowering._jaxpr._array_primitives import MOVES, SHIFTS, WHOLE, move
 from jaxlag._lowering._jaxpr._elementwise_primitives import ELEMENTWISE, elementwise
 from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, nodes
-from jaxlag._tracing._dependence import scan_sizes
 from jaxlag._tracing._interpret import NUMPY, held
 
 LIMIT = 50_000  # nodes of a graph: far beyond what a scalar program is good for
@@ -132,10 +132,11 @@ def _equation(graph: Graph, eqn: Any, operands: list) -> list:
     name = eqn.primitive.name
     if not any(array.dtype == object for array in operands) and name != "while":
         return _known(eqn, operands)
-    if name in _CALLS:
-        return _call(graph, eqn, operands)
     if name in _CONTROL:
         return _CONTROL[name](graph, eqn, operands)
+    inner = None if name.startswith("custom_vjp_call") else called(eqn)
+    if inner is not None:
+        return _read(graph, inner, *operands)
     _check_kinds(eqn, operands)
     if name in MOVES:
         return move(graph, eqn, operands)
@@ -176,16 +177,6 @@ _OF_INTEGERS |= {"stop_gradient", "cumsum", "clamp", "argmax", "argmin", *MOVES}
 
 
 # ---- Calls and control flow ------------------------------------------------------------------
-
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
-_CALLS |= {"remat": "jaxpr", "remat2": "jaxpr", "checkpoint": "jaxpr"}
-
-
-def _call(graph: Graph, eqn: Any, operands: list) -> list:
-    inner = eqn.params[_CALLS[eqn.primitive.name]]
-    if isinstance(inner, ClosedJaxpr):
-        return _read(graph, inner, *operands)
-    return _run(graph, inner, [], operands)
 
 
 def _custom_jvp(graph: Graph, eqn: Any, operands: list) -> list:
