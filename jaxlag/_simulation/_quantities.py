@@ -50,11 +50,11 @@ def at_saves(
     name: str,
     system: System,
     formulation: str,
+    params: Any,
+    inputs: Any,
     ts: Array,
     q: Array,
     v: Array,
-    params: Any,
-    inputs: Any,
 ) -> Any:
     """A quantity at every save time of one motion; NaN where the motion did not get."""
     reached = jnp.isfinite(q[:, 0])

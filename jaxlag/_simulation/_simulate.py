@@ -385,7 +385,7 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         where=jnp.where(broken, row, ending.where),
     )
     saved = {
-        name: at_saves(name, plan.system, plan.formulation, values.ts, q, v, params, inputs)
+        name: at_saves(name, plan.system, plan.formulation, params, inputs, values.ts, q, v)
         for name in plan.save
         if name != "work"
     }

@@ -1,7 +1,6 @@
 """Solution: a simulated motion."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -24,6 +23,7 @@ from jaxlag._system._power import in_order
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._closure_params import plain
+from jaxlag._tracing._compiled import Compiled
 
 
 class Solution(AbstractSolution):
@@ -403,24 +403,12 @@ class Solution(AbstractSolution):
     def _quantity(self, name: str) -> Any:
         if name in self.saved:
             return self.saved[name]
-        key = (self._params_static, self._inputs_static)
-        traced = (self.ts, self.q, self.v, self._params_traced, self._inputs_traced)
-        return _derived(name, self.system, self.formulation, key, self.ts.ndim - 1, traced)
+        key = (name, self.system, self.formulation), self._params_static, self._inputs_static
+        traced = self._params_traced, self._inputs_traced, self.ts, self.q, self.v
+        return _derived.program(*key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:
         return described(self)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
-def _derived(name: str, system: System, formulation: str, key: Any, batch: int, traced: Any) -> Any:
-    params_static, inputs_static = key
-
-    def one(traced: Any) -> Any:
-        ts, q, v, params, inputs = traced
-        params = _params.join(params, params_static.tree)
-        inputs = eqx.combine(inputs, inputs_static.tree)
-        return at_saves(name, system, formulation, ts, q, v, params, inputs)
-
-    for _ in range(batch):
-        one = jax.vmap(one)
-    return one(traced)
+_derived = Compiled(at_saves)

@@ -23,7 +23,7 @@ from jaxlag._model._coordinates import state_vectors
 from jaxlag._system._closure import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
-from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
 MAX_TURNS = 200
@@ -171,17 +171,18 @@ def assemble(
                 )
     check_params(system, params, q, None)
     warn_of_changes(system)
-    traced, static = _params.split(lift_closure_tracers(system, params, q, None))
+    params = lift_closure_tracers(system, params, q, None)
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
-    key = system, _params.Static(static), held, rates_held
-    found = _run(key, (q, v, traced, t, diagonal))
+    found = _run((system, held, rates_held), params, None, q, v, t, diagonal)
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
         found = stop_gradient(
             found
         )  # under grad its numbers are traced, and have values all the same
-        fix = _what_to_release(key, (q, v, traced, t, diagonal)) if hold else ""
+        fix = (
+            _what_to_release(system, (held, rates_held), params, q, v, t, diagonal) if hold else ""
+        )
         where = [t, found.q]
-        if np.ndim(found.status) == 0 and concrete(traced, where):
+        if np.ndim(found.status) == 0 and concrete(params, where):
             fix = f"{fix} {advice_on_rows(system, params, *where)}".rstrip()
         raise AssemblyError(f"Assembly ended with status {found.message()}{fix}", found)
     return found
@@ -193,11 +194,18 @@ def assembled(system: System, q: Array, v: Array, params: Any, t: Array) -> Asse
     return _assembled(system, q, v, params, t, free, free, None)
 
 
-@partial(jax.jit, static_argnums=0)
-def _run(key: Any, values: Any) -> Assembly:
-    system, static, held, rates_held = key
-    q, v, traced, t, diagonal = values
-    params = _params.join(traced, static.tree)
+@Compiled
+def _run(
+    system: System,
+    held: tuple[bool, ...],
+    rates_held: tuple[bool, ...],
+    params: Any,
+    _: None,
+    q: Array,
+    v: Array,
+    t: Array,
+    diagonal: Array | None,
+) -> Assembly:
     return _assembled(system, q, v, params, t, held, rates_held, diagonal)
 
 
@@ -419,20 +427,21 @@ def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]
     return tuple(held[0].tolist()), tuple(held[1].tolist())
 
 
-def _what_to_release(key: Any, values: Any) -> str:
+def _what_to_release(
+    system: System, held: tuple[tuple[bool, ...], tuple[bool, ...]], params: Any, *state: Any
+) -> str:
     """Which held coordinates or velocities are in the way, in words."""
-    system, static, *held = key
     labels = system.coordinates.labels
     free = (False,) * system.size
-    if int(_run((system, static, free, free), values).status) != int(Status.ok):
+    if int(_run((system, free, free), params, None, *state).status) != int(Status.ok):
         return " It cannot be satisfied with nothing held, either."
     culprits = []
     for rate in (0, 1):
         for i in np.flatnonzero(held[rate]):
             fewer = [list(x) for x in held]
             fewer[rate][i] = False
-            less = (system, static, tuple(fewer[0]), tuple(fewer[1]))
-            if int(_run(less, values).status) == int(Status.ok):
+            less = (system, tuple(fewer[0]), tuple(fewer[1]))
+            if int(_run(less, params, None, *state).status) == int(Status.ok):
                 culprits.append(labels[i] + "'" * rate)
     if culprits:
         return f" hold must leave the constraints solvable: release {' or '.join(culprits)}."

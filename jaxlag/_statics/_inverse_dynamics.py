@@ -16,7 +16,7 @@ from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._system._inspection import check_declaration
 from jaxlag._system._system import System
-from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._signature import require_arity
 from jaxlag._tracing._traced_function import warn_of_changes
 
@@ -82,10 +82,7 @@ def inverse_dynamics(
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     warn_of_changes(system, inputs)
-    traced, static = _params.split(params)
-    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
-    key = (system, _params.Static(static), _params.Static(inputs_static))
-    return _needed(key, (t, q, v, a, traced, inputs_traced))
+    return _needed((system,), params, inputs, t, q, v, a)
 
 
 def prescribed_motion(
@@ -173,12 +170,10 @@ def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
     raise invalid(argument, "be finite", f"{where} was {values[(*index, i)]}", fix)
 
 
-@partial(jax.jit, static_argnums=0)
-def _needed(key: Any, values: Any) -> Array:
-    system, params_static, inputs_static = key
-    t, q, v, a, params, inputs = values
-    params = _params.join(params, params_static.tree)
-    inputs = eqx.combine(inputs, inputs_static.tree)
+@Compiled
+def _needed(
+    system: System, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array, a: Array
+) -> Array:
     first = (t, q, v) if q.ndim == 1 else (t[0], q[0], v[0])
     check_declaration(system, params, inputs, *first)
 

@@ -1,7 +1,6 @@
 """Inspection of a declaration: its shapes by tracing, its mass matrix and rows by numbers."""
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +14,7 @@ from jaxlag._lowering import ArrayTerms
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
 
 APART = 1e-3
@@ -45,9 +45,8 @@ def mass_definite(
     floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
     for state in states:
         with jax.ensure_compile_time_eval():
-            traced, static = _params.split(params)
             at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
-            M = _mass(system, _params.Static(static), *at, traced)
+            M = _mass((system,), params, None, *at)
         if not concrete(M):
             return None  # the Lagrangian closes over a traced value
         M = np.asarray(M, np.float64)
@@ -79,9 +78,8 @@ def contact_rows_independent(
     chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
     if len(chosen) < 2:
         return True
-    traced, static = _params.split(params)
     with jax.ensure_compile_time_eval():
-        A = np.asarray(_rows(system, _params.Static(static), t, q, v, traced), np.float64)[chosen]
+        A = np.asarray(_rows((system,), params, None, t, q, v), np.float64)[chosen]
     sizes = np.linalg.norm(A, axis=1, keepdims=True)
     if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
         return False
@@ -111,18 +109,14 @@ def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: 
     check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _rows(
-    system: AbstractReactions, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
-) -> Array:
-    return system._terms.rows(t, q, v, _params.join(traced, static.tree))[0]
+@Compiled
+def _rows(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v: Array) -> Array:
+    return system._terms.rows(t, q, v, params)[0]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _mass(
-    system: AbstractReactions, static: _params.Static, t: Array, q: Array, v: Array, traced: Any
-) -> Array:
-    return system._terms.mass(t, q, v, _params.join(traced, static.tree))
+@Compiled
+def _mass(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v: Array) -> Array:
+    return system._terms.mass(t, q, v, params)
 
 
 def check_declaration(

@@ -1,10 +1,8 @@
 """Forces, accelerations and reactions of a system at one state."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -13,7 +11,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, QuasiState
 from jaxlag._model._forces import reads_lam
 from jaxlag._system._state_functions import AbstractQuantities
-from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._input_values import InputValues
 
 
@@ -184,9 +182,7 @@ class AbstractReactions(AbstractQuantities):
         t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         rows = self._rows(params, q.dtype)
-        traced, static = _params.split(params)
-        found = _quasi_reactions(self, _params.Static(static), t, q, v, traced, dict(values))
-        a, lam, force = found
+        a, lam, force = _quasi_reactions((self,), params, dict(values), t, q, v)
         return {"a": a, "multipliers": rows.unflatten(lam), "constraint_force": force}
 
     @state_first
@@ -207,37 +203,34 @@ class AbstractReactions(AbstractQuantities):
     ) -> tuple[Array, Array, Array]:
         """(a, lam, A), compiled as one: there are many small operations."""
         self._rows(params, q.dtype)
-        traced, static = _params.split(params)
-        return _reactions(self, _params.Static(static), t, q, v, traced, dict(values))
+        return _reactions((self,), params, dict(values), t, q, v)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@Compiled
 def _reactions(
     system: AbstractReactions,
-    static: _params.Static,
+    params: Any,
+    values: dict[str, Any],
     t: Array,
     q: Array,
     v: Array,
-    traced: Any,
-    values: dict[str, Any],
 ) -> tuple[Array, Array, Array]:
-    params, terms = _params.join(traced, static.tree), system._terms
+    terms = system._terms
     a, lam = terms.reactions(t, q, v, params, InputValues(values))
     return a, lam, terms.rows(t, q, v, params)[0]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@Compiled
 def _quasi_reactions(
     system: AbstractReactions,
-    static: _params.Static,
+    params: Any,
+    values: dict[str, Any],
     t: Array,
     q: Array,
     v: Array,
-    traced: Any,
-    values: dict[str, Any],
 ) -> tuple[Array, Array, Array]:
     """(a, lam, A^T lam), compiled as one."""
-    params, quasi = _params.join(traced, static.tree), system.quasi
+    quasi = system.quasi
     assert quasi is not None
     terms = ArrayTerms(
         system.lagrangian, system.forces, system.constraints, quasi=quasi, in_u=system._in_u
