@@ -1,9 +1,11 @@
-"""Arguments of public functions: which of them go by position, which by name."""
+"""Arguments of public functions: their order, their names, and checks that many share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
 from inspect import Parameter, signature
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
 
 from jaxlag._core._errors import invalid
 
@@ -81,3 +83,24 @@ def required(**fixes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         return checked
 
     return decorate
+
+
+def positive_integer(argument: str, x: Any) -> int:
+    """`x`, a whole number above 0; raises naming the argument where it is none."""
+    if isinstance(x, bool) or not isinstance(x, int | np.integer) or x < 1:
+        raise invalid(argument, "be a positive integer", f"it was {x!r}")
+    return int(x)
+
+
+def name_sequence(argument: str, x: Any, fix: str | None = None) -> tuple[str, ...]:
+    """`x`, a sequence of names; raises naming the argument where it is none, or one name alone."""
+    if isinstance(x, str):
+        raise invalid(
+            argument,
+            "be a sequence of names",
+            f"it was {x!r}",
+            fix or f"Write {argument.rpartition(': ')[2]}=({x!r},).",
+        )
+    if not isinstance(x, Sequence):
+        raise invalid(argument, "be a sequence of names", f"it was {x!r}", fix or "")
+    return tuple(x)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxlag._core._arguments import positive_integer
 from jaxlag._core._errors import invalid
 from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, SegmentOutputs
 
@@ -55,8 +56,7 @@ class Descent(eqx.Module):
                 "Descent: optimizer", must, f"it was {optimizer!r}", "Try optax.adam(1e-3)."
             )
         for name, value in (("epochs", epochs), ("batch", batch)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise invalid(f"Descent: {name}", "be a positive integer", f"it was {value!r}")
+            positive_integer(f"Descent: {name}", value)
         if not gap > 0:
             raise invalid("Descent: gap", "be positive", f"it was {gap!r}")
         self.optimizer, self.epochs, self.batch = optimizer, epochs, batch

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._arguments import renamed
+from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
@@ -186,8 +186,7 @@ def fit(
 def _check(system: Any, segments: Any, loss: Any, optimizer: Any) -> None:
     if not isinstance(system, System):
         raise invalid("system", "be a jl.System", f"it was {system!r}")
-    if not isinstance(segments, int | np.integer) or segments < 1:
-        raise invalid("segments", "be a positive integer", f"it was {segments!r}")
+    positive_integer("segments", segments)
     if optimizer is not None and not isinstance(optimizer, Descent):
         fix = "Write jl.Descent(optax.adam(1e-3))."
         raise invalid("optimizer", "be None or a jl.Descent", f"it was {optimizer!r}", fix)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._core._arguments import name_sequence
 from jaxlag._core._errors import invalid
 from jaxlag._fit._transforms import AbstractTransform, Free
 
@@ -204,10 +205,7 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         ValueError: a name of nothing, a leaf that holds no real numbers, or a transform of a leaf
             that is not free.
     """
-    if isinstance(free, str):
-        raise invalid(
-            "free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},)."
-        )
+    free = name_sequence("free", free)
     names, values = paths(params0), jax.tree.leaves(params0)
     chosen: dict[int, None] = {}
     for name in free:

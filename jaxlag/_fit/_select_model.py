@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxlag._core._arguments import renamed
+from jaxlag._core._arguments import name_sequence, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit import fit
@@ -241,10 +241,7 @@ def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool
 
 
 def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:
-    if isinstance(free, str):
-        raise invalid(
-            "free", "be a sequence of names", f"it was {free!r}", f"Write free=({free!r},)."
-        )
+    name_sequence("free", free)
     if not isinstance(system, System):
         raise invalid("system", "be a jl.System", f"it was {system!r}")
     if not isinstance(params0, Mapping):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxlag._core._arguments import positive_integer
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
@@ -68,8 +69,7 @@ def check_search(rtol: Any, atol: Any, max_steps: Any) -> None:
     for name, value in (("rtol", rtol), ("atol", atol)):
         if not isinstance(value, int | float | np.number) or not 0 < value < 1:
             raise invalid(name, "be a number between 0 and 1", f"it was {value!r}")
-    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
+    positive_integer("max_steps", max_steps)
 
 
 def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import real
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._independent_rows import row_sizes
@@ -367,11 +368,10 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
 def _names(argument: str, names: Any) -> tuple[str, ...]:
     fix = 'Write names=("wx", "wy", "wz").'
     argument = f"QuasiVelocities: {argument}"
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        raise invalid(argument, "be a sequence of names", f"it was {names!r}", fix)
+    names = name_sequence(argument, names, fix)
     for name in names:
         if not isinstance(name, str) or not name:
             raise invalid(argument, "be non-empty strings", f"one was {name!r}", fix)
         if names.count(name) > 1:
             raise invalid(argument, "be distinct", f"{name!r} occurs {names.count(name)} times")
-    return tuple(names)
+    return names

@@ -1,12 +1,13 @@
 """Checks of what `simulate` is given, before anything is compiled."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxlag._core._arguments import name_sequence, positive_integer
 from jaxlag._core._arrays import concrete, of_state
 from jaxlag._core._batching import at_most
 from jaxlag._core._errors import invalid
@@ -50,13 +51,7 @@ def check_options(
     if baumgarte and not system.constraints:
         must = "be left out for a system without constraints"
         raise invalid("stabilization", must, f"it was {stabilization!r}")
-    if isinstance(save, str):
-        raise invalid(
-            "save", "be a sequence of names", f"it was {save!r}", f"Write save=({save!r},)."
-        )
-    if not isinstance(save, Sequence):
-        raise invalid("save", "be a sequence of names", f"it was {save!r}")
-    for name in save:
+    for name in name_sequence("save", save):
         if not isinstance(name, str) or name not in (*QUANTITIES, "work"):
             known = [*QUANTITIES, "work"]
             fix = "Write 'multipliers'." if name == "lam" else ""
@@ -71,8 +66,7 @@ def check_options(
                 f"one was {name!r}",
                 "Declare the system with kinetic= and potential=.",
             )
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
+    positive_integer("max_steps", max_steps)
 
 
 def check_change_points(change_points: Any) -> None:

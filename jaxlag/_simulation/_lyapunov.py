@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arguments import renamed
+from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._batching import in_batches
 from jaxlag._core._custom_jvp import CustomJVP
@@ -216,8 +216,7 @@ def lyapunov(
     if single and int(motion.status) != int(Status.ok):
         was = f"it ended with status {motion.message()}"
         raise invalid("lyapunov: motion", "have reached its last time", was)
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise invalid("lyapunov: max_steps", "be a positive integer", f"it was {max_steps!r}")
+    max_steps = positive_integer("lyapunov: max_steps", max_steps)
     dtype = motion.q.dtype
     defaults = default_tolerances(dtype)
     finest = 1e-10 if jnp.finfo(dtype).bits == 64 else defaults[0]

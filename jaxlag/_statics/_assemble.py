@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import concrete, number, real, stop_gradient
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import AssemblyError, invalid, unsupported
@@ -406,8 +407,7 @@ def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
 
 def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     """For every coordinate, whether it is held, and whether its velocity is."""
-    if isinstance(hold, str) or not isinstance(hold, Sequence):
-        raise invalid("assemble: hold", "be a sequence of names", f"it was {hold!r}")
+    hold = name_sequence("assemble: hold", hold)
     coordinates = system.coordinates
     index = {label: [i] for i, label in enumerate(coordinates.labels)}
     start = 0

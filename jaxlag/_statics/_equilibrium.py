@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._arguments import renamed
+from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
@@ -246,8 +246,7 @@ def equilibrium(
     (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
     if concrete(q0) and not np.all(np.isfinite(q0)):
         raise invalid("q0", "be finite", f"it was {q0}")
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise invalid("max_steps", "be a positive integer", f"it was {max_steps!r}")
+    max_steps = positive_integer("max_steps", max_steps)
     if rtol is None:
         rtol = 1e-10 if q0.dtype == jnp.float64 else 1e-4
     rtol = number("rtol", "be a positive number", rtol, q0.dtype)
