@@ -102,10 +102,10 @@ def recorded(motion: Motion, x):
             params=x["params"],
             inputs=base.inputs if x["inputs"] is None else x["inputs"],
         )
-        inexact, rest, setup, static = _solve.halves(_simulate.build_problem(plan, values)[2])
+        problem = _solve.split(_simulate.build_problem(plan, values)[2])
         if outcome is None:
-            return _solve._recorded(inexact, rest, setup, static)
-        rows = _solve._replay(rest, setup, static, outcome, inexact)
+            return _solve._recorded(problem)
+        rows = _solve._replay(problem, outcome, problem.differentiable)
         n = motion.system.size
         return jnp.concatenate([rows.saved[-1], rows.saved[1, :n]])
 

@@ -91,8 +91,8 @@ def step_ends(options):
 
     @jax.jit
     def record(values):
-        inexact, rest, setup, static = _solve.halves(_simulate.build_problem(plan, values)[2])
-        return _solve._recorded(inexact, rest, setup, static).record
+        problem = _solve.split(_simulate.build_problem(plan, values)[2])
+        return _solve._recorded(problem).record
 
     kept = record(values)
     # A turn that was not accepted ends where the last one did; a negative one at the stop.
