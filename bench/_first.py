@@ -37,7 +37,7 @@ def of_jax(side: str, scene: str, case: str) -> dict[str, Any]:
 
     jax.config.update("jax_enable_x64", True)
     from bench._first_scenes import BEGINNINGS
-    from jaxlag._lowering import _scalar_terms
+    from jaxlag._lowering import _scalar_program
 
     motion = BEGINNINGS[scene]()
     jax.block_until_ready(jax.numpy.zeros(3) + 1.0)  # the backend is up
@@ -48,7 +48,7 @@ def of_jax(side: str, scene: str, case: str) -> dict[str, Any]:
             spent[EVENTS[event]] += seconds
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    lower = _scalar_terms.lower
+    lower = _scalar_program.lower
 
     def timed(*args: Any) -> Any:
         begin = perf_counter()
@@ -57,7 +57,7 @@ def of_jax(side: str, scene: str, case: str) -> dict[str, Any]:
         finally:
             spent["derive_s"] += perf_counter() - begin
 
-    _scalar_terms.lower = timed
+    _scalar_program.lower = timed
     solve, y0 = (_jaxlag if side == "jaxlag" else _diffrax)(motion, case)
     call = _program(solve, y0, _numbers(motion), case)
     begin = perf_counter()

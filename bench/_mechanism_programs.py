@@ -16,7 +16,7 @@ from bench._random_mechanisms import Mechanism, values
 from bench._reference import Equations, Solved, Terms, Unclear, terms_of
 from bench._rounding import evaluated
 from jaxlag._linalg._independent_rows import RowChoice
-from jaxlag._lowering import ArrayTerms, QuasiState, ScalarTerms
+from jaxlag._lowering import ArrayTerms, QuasiState, ScalarProgram
 
 NUDGES = 4
 NEARBY = 2  # to tell a contradiction from roundings
@@ -217,7 +217,7 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
         return found | _in_quasi(mechanism, choice)
     if prepared.equations.outcome == "contradictory":
         return found  # the others solve for the rows that they are given
-    found["scalars"] = by(ScalarTerms(array, OPERATIONS))
+    found["scalars"] = by(ScalarProgram(array, OPERATIONS))
     if round(1e3 * mechanism.t) % 3 == 0:  # by chance
         given = system.lagrangian, system.forces, system.constraints
         found["null space"] = by(ArrayTerms(*given, "null_space"))
@@ -231,7 +231,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
     assert quasi is not None
     given = system.lagrangian, system.forces, system.constraints
     terms = ArrayTerms(*given, quasi=quasi, in_u=system._in_u)
-    scalars = ScalarTerms(terms, OPERATIONS)
+    scalars = ScalarProgram(terms, OPERATIONS)
 
     def speeds(t: Any, q: Any, v: Any, params: Any) -> Any:
         return quasi.of(t, q, v, params)[quasi.free]
@@ -250,7 +250,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
         """v' = B u' + s from the rates (v, u') of the scalar program."""
         w = speeds(t, q, v, params)
         prepared: Any = scalars.precompute(q, params, {}, kept=choice.kept, reacting=choice)
-        rates = scalars.rates(t, q, w, params, {}, prepared)
+        rates = scalars.quasi_rates(t, q, w, params, {}, prepared)
         du = rates[q.shape[0] :]
 
         def velocity(t: Any, q: Any, w: Any) -> Any:
@@ -272,7 +272,7 @@ def has_scalars(mechanism: Mechanism, name: str) -> bool:
     else:
         terms = ArrayTerms(*given, quasi=system.quasi, in_u=system._in_u)
     like = jax.ShapeDtypeStruct((mechanism.drawn.n,), dtype)
-    scalars = ScalarTerms(terms, OPERATIONS)
+    scalars = ScalarProgram(terms, OPERATIONS)
     return scalars.lowered(like, values(mechanism.drawn), {}).equations is not None
 
 

@@ -14,7 +14,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 import jaxlag as jl
 from bench._scenes import Scene
-from jaxlag._lowering import ArrayTerms, ScalarTerms
+from jaxlag._lowering import ScalarProgram
 
 STEP = 1e-4  # s
 STAGES = 4  # evaluations in a step
@@ -88,22 +88,21 @@ def system(scene: Scene, lowering: str = "auto") -> jl.System:
 
 def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
     """jaxlag's equations, and whether they are on scalars, as `jl.simulate` takes them."""
-    terms = system(scene, lowering)._terms
+    program = system(scene, lowering)._program
     like, t = jnp.asarray(scene.q0), jnp.zeros(())
-    scalar = isinstance(terms, ScalarTerms) and operations(scene, lowering) is not None
-    if isinstance(terms, ScalarTerms):
-        terms = replace(terms, in_loop=True)
+    scalar = isinstance(program, ScalarProgram) and operations(scene, lowering) is not None
+    if isinstance(program, ScalarProgram):
+        program = replace(program, in_loop=True)
 
     def equations(params: Any) -> Field:
-        prepared = terms.precompute(like, params, {})
+        prepared = program.precompute(like, params, {})
 
         def on_scalars(q: Parts, v: Parts) -> Parts:
-            assert isinstance(terms, ScalarTerms)
-            rates = terms.rates(t, jnp.stack(q), jnp.stack(v), params, {}, prepared)
-            return _elements(rates)
+            a = program.acceleration(t, jnp.stack(q), jnp.stack(v), params, {}, prepared)
+            return _elements(a)
 
         def on_arrays(q: Parts, v: Parts) -> Parts:
-            return [terms.acceleration(t, *q, *v, params, {}, prepared)]
+            return [program.acceleration(t, *q, *v, params, {}, prepared)]
 
         return on_scalars if scalar else on_arrays
 
@@ -112,11 +111,10 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
 
 def operations(scene: Scene, lowering: str = "auto") -> int | None:
     """Operations of the scalar program; None where there is none."""
-    terms = system(scene, lowering)._terms
-    if isinstance(terms, ArrayTerms):
+    program = system(scene, lowering)._program
+    if not isinstance(program, ScalarProgram):
         return None
-    assert isinstance(terms, ScalarTerms)
-    lowered = terms.lowered(jnp.asarray(scene.q0), scene.params, {})
+    lowered = program.lowered(jnp.asarray(scene.q0), scene.params, {})
     return None if lowered.equations is None else lowered.equations.program.operations
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from bench._compared import DIFFERS, EQUAL, SLACK, Compared
 from bench._random_systems import Drawn
 from bench._rounding import evaluated
-from jaxlag._lowering import ArrayTerms, ScalarTerms
+from jaxlag._lowering import ArrayTerms, ScalarProgram
 from jaxlag._system._inspection import check_traceable
 
 NUDGES = 4  # runs with other roundings
@@ -32,7 +32,7 @@ def compared(drawn: Drawn) -> Compared:
     }
     params = leaves | {"k": _number(drawn)}
     arrays = ArrayTerms(system.lagrangian, system.forces)
-    scalars = ScalarTerms(arrays, 1500)
+    scalars = ScalarProgram(arrays, 1500)
     try:
         like = jax.ShapeDtypeStruct((drawn.n,), dtype)
         check_traceable(system, params, dtype, {})

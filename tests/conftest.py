@@ -23,7 +23,7 @@ import pytest
 from _footprint import BYTES, MAPS, Footprint, held, maps
 
 import jaxlag as jl  # before the first compilation: it sets XLA's bound on small loops
-from jaxlag._lowering import ArrayTerms
+from jaxlag._lowering import ArrayProgram
 
 # Traced programs are many small objects that live long: looking through them for cycles after every
 # 700 new ones takes 3 % of the time.
@@ -43,7 +43,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 # Tests that run under both lowerings, by module. That both give the same accelerations and
-# derivatives is tested for every system in test_scalar_terms.
+# derivatives is tested for every system in test_scalar_program.
 BOTH = {
     "test_batch": {"test_lanes_equal_single_runs"},
     "test_gradients": {"test_forward_equals_reverse_under_both_lowerings"},
@@ -97,13 +97,13 @@ def lowering(request):
     wanted = getattr(request, "param", "auto")
     with pytest.MonkeyPatch.context() as patch:
         if wanted == "array":
-            as_declared = jl.System._terms
+            as_declared = jl.System._program
 
-            def terms(system):
+            def program(system):
                 if system.lowering == "auto":
-                    return ArrayTerms(system.lagrangian, system.forces, system.constraints)
+                    return ArrayProgram(system._terms)
                 return as_declared.fget(system)
 
-            patch.setattr(jl.System, "_terms", property(terms))
+            patch.setattr(jl.System, "_program", property(program))
         yield wanted
     drop()

@@ -42,11 +42,11 @@ WITHIN_LOWERING = {
     "_jaxpr": ("_graph",),
     "_emit": ("_graph", "_jaxpr"),
     "_symbolic": ("_graph", "_jaxpr", "_array_terms", "_row_layout"),
-    "_terms": (),
     "_structure": (),
     "_row_layout": ("_graph", "_jaxpr"),
-    "_array_terms": ("_terms", "_structure", "_row_layout"),
-    "_quasi_equations": ("_terms", "_structure", "_row_layout", "_array_terms"),
+    "_array_terms": ("_structure", "_row_layout"),
+    "_quasi_equations": ("_structure", "_row_layout", "_array_terms"),
+    "_acceleration_program": ("_array_terms", "_quasi_equations"),
 }
 
 

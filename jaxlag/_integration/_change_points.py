@@ -364,12 +364,12 @@ def same_sense(
         args: arguments of the step.
         turn: h dy/dt at the start less that at the end; None where it is not known.
     """
-    columns, m = dynamics.surface(t0, y0, args).columns, dynamics.rows.size
+    columns, m = dynamics.projector(t0, y0, args).columns, dynamics.rows.size
     assert columns is not None
     fine = jnp.array(True)
     for tau, y in (midway(t0, t1, y0, y1, turn), (t1, y1)):
         t, (q, v), (params, _) = dynamics.clock(tau, args), dynamics.parts(y), dynamics.given(args)
-        A, _ = dynamics.array.rows(t, q, v, params)
+        A, _ = dynamics.terms.rows(t, q, v, params)
         turned = A @ columns.T
         if args.kept is not None:
             both = args.kept[:, None] & args.kept[None]

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._integration._step_arguments import Arguments, midway
 from jaxlag._integration._vector_field import VectorField
-from jaxlag._lowering import ScalarSolveConstants, ScalarTerms
 
 PART = 0.5  # of the least of three samples
 SPREAD = 8.0  # of samples within one step
@@ -89,20 +88,9 @@ def determinants(
     Determinants of the blocks of dU/dv, or of dv/du where that is given, without those that do not
     change, where there is a scalar program of them.
     """
-    quasi, terms = dynamics.quasi, dynamics.terms
-    assert quasi is not None
     t, (params, _) = dynamics.clock(tau, args), dynamics.given(args)
-    if _by_program(args):
-        assert isinstance(terms, ScalarTerms)
-        values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
-        return terms.determinants(t, q, params, values, args.constants)
-    return quasi.determinant(t, q, params)[None]
-
-
-def _by_program(args: Arguments) -> bool:
-    return (
-        isinstance(args.constants, ScalarSolveConstants) and args.constants.determinants is not None
-    )
+    values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
+    return dynamics.program.determinants(t, q, params, values, args.constants)
 
 
 def opening(dynamics: VectorField, found: Float[Array, " b"]) -> Float[Array, " b"]:
@@ -123,8 +111,6 @@ def usual(
     None where its determinants never change.
     """
     assert dynamics.quasi is not None
-    if not _by_program(args) and not dynamics.quasi.moves(q, dynamics.given(args)[0]):
-        return None
     here = determinants(dynamics, tau, q, args)
     if not here.size:
         return None

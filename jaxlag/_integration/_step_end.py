@@ -15,7 +15,6 @@ from jaxlag._integration._step_arguments import Arguments, StepChecks
 from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._mass_solve import closed_to
 from jaxlag._linalg._projection import ConstraintProjector, project, tangential
-from jaxlag._lowering import ScalarSolveConstants, ScalarTerms, SolveConstants
 from jaxlag._model._forces import reads_lam, sliding
 
 
@@ -68,7 +67,7 @@ class StepEnd(eqx.Module):
         elif args.rows is not None:
 
             def look() -> Array:
-                surface = self.dynamics.surface(*stop_gradient((tau, y, args)))
+                surface = self.dynamics.projector(*stop_gradient((tau, y, args)))
                 return self._closed(surface, *self.dynamics.parts(stop_gradient(y)), args)
 
             one = self.dynamics.rows.size == 1
@@ -82,14 +81,10 @@ class StepEnd(eqx.Module):
             return jnp.array(True)
         tau, y, args = stop_gradient((tau, y, args))
         t, q, v, params, values = self.dynamics.at(tau, y, args)
-        right, terms = [], self.dynamics.terms
+        right = []
         if self._contacts:
-            if isinstance(args.constants, ScalarSolveConstants) and isinstance(terms, ScalarTerms):
-                lam = terms.multipliers(t, q, v, params, values, args.constants)
-            else:
-                array, constants = self.dynamics.array, args.constants
-                assert isinstance(constants, SolveConstants)
-                lam = array.multipliers(t, q, v, params, values, constants, args.reacting)
+            given = t, q, v, params, values, args.constants, args.reacting
+            lam = self.dynamics.program.multipliers(*given)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
             assert args.senses is not None
@@ -144,7 +139,7 @@ class StepEnd(eqx.Module):
         around = self._near(*stop_gradient((tau, y, args)))
         near, apart = around.surface, around.apart
         assert apart is not None
-        surface = self.dynamics.surface(tau, y, args)
+        surface = self.dynamics.projector(tau, y, args)
         (q, v), velocity, kick = self.dynamics.parts(y), surface.velocity, near.kick
         if surface.position is not None:
             q = q - near.shift(surface.position(q))
@@ -168,9 +163,9 @@ class StepEnd(eqx.Module):
 
     def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
         """The constraints near a state, without rows that all but depend on one another."""
-        surface, frozen = self.dynamics.surface(tau, y, args), None
+        surface, frozen = self.dynamics.projector(tau, y, args), None
         if differentiable:
-            frozen = self.dynamics.surface(*stop_gradient((tau, y, args)))
+            frozen = self.dynamics.projector(*stop_gradient((tau, y, args)))
         if args.lengths is None:
             return _Near(surface, frozen, None)
         masses = (surface if frozen is None else frozen).masses

@@ -17,8 +17,7 @@ from jaxlag._integration._step_arguments import Arguments, KnotIntervals, RowSel
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, row_sizes
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._lowering import ArrayTerms, QuasiState, ScalarSolveConstants, ScalarTerms
-from jaxlag._lowering._terms import Terms
+from jaxlag._lowering import AccelerationProgram, ArrayTerms, ScalarProgram
 from jaxlag._model._constraints import NO_ROWS, Baumgarte, ConstraintRows
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import (
@@ -80,22 +79,17 @@ class VectorField(eqx.Module):
     crossing: bool = eqx.field(static=True, default=False)
 
     @property
-    def terms(self) -> Terms:
-        """The lowered terms of the system."""
-        terms = self.system._terms
-        if isinstance(terms, ScalarTerms):
-            array = self._solved(terms.array)
-            return replace(terms, array=array, lanes=self.lanes, in_loop=self.in_loop)
-        assert isinstance(terms, ArrayTerms)
-        return self._solved(terms)
+    def terms(self) -> ArrayTerms:
+        """The terms of the equations, on arrays."""
+        return self._solved(self.system._terms)
 
     @property
-    def array(self) -> ArrayTerms:
-        """The array program."""
-        terms = self.terms
-        array = terms.array if isinstance(terms, ScalarTerms) else terms
-        assert isinstance(array, ArrayTerms)
-        return array
+    def program(self) -> AccelerationProgram:
+        """The program of the accelerations."""
+        program = self.system._program
+        if isinstance(program, ScalarProgram):
+            program = replace(program, lanes=self.lanes, in_loop=self.in_loop)
+        return replace(program, array=self.terms)
 
     @property
     def quasi(self) -> QuasiVelocities | None:
@@ -157,17 +151,11 @@ class VectorField(eqx.Module):
             args = args._replace(senses=jax.lax.stop_gradient(senses))
         time_direction = self.signed(jnp.ones_like(tau), args)
         rows = args.kept, args.reacting
-        given = q, params, values, self.sample, *rows, time_direction
-        constants = self.terms.precompute(*given)
-        either = self.regular is None and self.formulation != "null_space"
-        if either and isinstance(constants, ScalarSolveConstants):
-            terms = self.terms
-            assert isinstance(terms, ScalarTerms)
-            alone = terms.regular().precompute(*given)
-            if isinstance(alone, ScalarSolveConstants):
-                definite = self._definite(t, q, v, params)
-                constants = constants._replace(definite=definite, alone=alone)
-        return args._replace(constants=constants)
+        definite = None
+        if self.regular is None and self.formulation != "null_space":
+            definite = partial(self._definite, t, q, v, params)
+        given = q, params, values, self.sample, *rows, time_direction, definite
+        return args._replace(constants=self.program.precompute(*given))
 
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
@@ -195,7 +183,7 @@ class VectorField(eqx.Module):
         if self.rows.size == 1:  # one that vanishes here alone is not to be done without
             return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
-        unread = np.logical_not(self.array.rows_read(t, q, v, params, values))
+        unread = np.logical_not(self.terms.rows_read(t, q, v, params, values))
         # Where multipliers are read, what is left out is told by those that are kept.
         reads = not np.all(unread)
         kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
@@ -270,21 +258,13 @@ class VectorField(eqx.Module):
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
         t, q, v, params, values = self.at(tau, y, args)
-        return self.terms.acceleration(t, q, v, params, values, args.constants, args.reacting)
+        return self.program.acceleration(t, q, v, params, values, args.constants, args.reacting)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
-        terms, (q, w) = self.terms, self.parts(y)
-        if isinstance(terms, ScalarTerms):
-            if isinstance(args.constants, ScalarSolveConstants):
-                t, (params, _) = self.clock(tau, args), self.given(args)
-                values = self._values(tau, q, w, args)
-                return terms.rates(t, q, w, params, values, args.constants)
-            terms = terms.array
-        assert isinstance(terms, ArrayTerms)
-        t, q, _, params, values = self.at(tau, y, args)
-        moving = QuasiState(terms, t, q, w, params, values)
-        return jnp.concatenate([moving.v, moving.accelerations()])
+        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
+        values = self._values(tau, q, w, args)
+        return self.program.quasi_rates(t, q, w, params, values, args.constants)
 
     def effort(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -311,17 +291,11 @@ class VectorField(eqx.Module):
         return self.quasi.velocities(t, q, self.quasi.full(w), params)
 
     def velocities_of(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
-        """The same, by the scalar program where there is one."""
-        if self.quasi is None or not isinstance(args.constants, ScalarSolveConstants):
-            return self.velocities(t, q, w, self.given(args)[0])
-        return self._by_program(t, q, w, args)
-
-    def _by_program(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
-        """Velocities of a state of quasi-velocities, which no input changes."""
-        terms, (params, _) = self.terms, self.given(args)
-        assert isinstance(terms, ScalarTerms)
+        """The same by the program; no input changes them."""
+        if self.quasi is None:
+            return w
         values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
-        return terms.velocities(t, q, w, params, values, args.constants)
+        return self.program.velocities(t, q, w, self.given(args)[0], values, args.constants)
 
     def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
         """(t, q, v, params, values of the inputs) at (tau, y)."""
@@ -356,45 +330,18 @@ class VectorField(eqx.Module):
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
         return self.signed(jnp.concatenate(rates), args)
 
-    def surface(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
-        """The constraints near a predicted state."""
-        t, (q, v), terms = self.clock(tau, args), self.parts(y), self.terms
-        params, _ = self.given(args)
-        if isinstance(args.constants, ScalarSolveConstants):
-            assert isinstance(terms, ScalarTerms)
-            values = self._values(tau, q, v, args)
-            return terms.surface(t, q, v, params, values, args.constants)
-        v = self.velocities(t, q, v, params)
-        holonomic = np.flatnonzero(self.rows.holonomic).tolist()
-
-        def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
-            return self.array.corrections(t, q, v, params, args.constants, args.kept, chosen)
-
-        def position(q: Array) -> Array:
-            return terms.position(t, q, params)
-
-        if self.quasi is not None:
-            near, _ = corrections(holonomic)
-            return ConstraintProjector(position, None, lambda c: near @ c, None)
-        K, masses = corrections(None)
-        K_of_position = K
-        if 0 < len(holonomic) < self.rows.size:
-            K_of_position, _ = corrections(holonomic)
-        return ConstraintProjector(
-            position if holonomic else None,
-            lambda q, v: terms.velocity(t, q, v, params),
-            lambda c: K_of_position @ c,
-            lambda c: K @ c,
-            K.T,
-            masses,
-        )
+    def projector(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
+        """The projection onto the constraints near a predicted state."""
+        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
+        given = t, q, w, params, self._values(tau, q, w, args), args.constants
+        return self.program.projector(*given, self.rows, args.kept)
 
     def _values(self, tau: Array, q: Array, w: Array, args: Arguments) -> Any:
         """Values of the inputs at a state."""
         if self.quasi is None:
             v = w
         elif reads_state(self.given(args)[1]):
-            v = self._by_program(self.clock(tau, args), q, w, args)
+            v = self.velocities_of(self.clock(tau, args), q, w, args)
         else:
             v = jnp.zeros_like(q)
         return self.inputs_at(tau, q, v, args)
@@ -421,9 +368,7 @@ class VectorField(eqx.Module):
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Lines of the scalar program for states and arguments like these, where there is one."""
-        _, q, _, params, values = self.at(tau, y, args)
-        terms = self.terms
-        if not isinstance(terms, ScalarTerms) or self.power is not None:
+        if self.power is not None:
             return None
-        equations = terms.lowered(q, params, values).equations
-        return None if equations is None else len(equations.program.body)
+        _, q, _, params, values = self.at(tau, y, args)
+        return self.program.lines(q, params, values)

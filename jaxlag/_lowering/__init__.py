@@ -1,13 +1,14 @@
 """From a declared system to the terms of its equations of motion."""
 
+from jaxlag._lowering._acceleration_program import AccelerationProgram as AccelerationProgram
+from jaxlag._lowering._acceleration_program import ArrayProgram as ArrayProgram
 from jaxlag._lowering._array_terms import ArrayTerms as ArrayTerms
 from jaxlag._lowering._array_terms import SolveConstants as SolveConstants
 from jaxlag._lowering._graph._straight_line import Program as Program
 from jaxlag._lowering._quasi_equations import QuasiState as QuasiState
 from jaxlag._lowering._row_layout import check_kinematics as check_kinematics
 from jaxlag._lowering._row_layout import layout as layout
-from jaxlag._lowering._scalar_terms import ScalarSolveConstants as ScalarSolveConstants
-from jaxlag._lowering._scalar_terms import ScalarTerms as ScalarTerms
+from jaxlag._lowering._scalar_program import ScalarProgram as ScalarProgram
 from jaxlag._lowering._structure import Structure as Structure
 from jaxlag._lowering._structure import find_structure as find_structure
 from jaxlag._lowering._symbolic._findings import find as find

@@ -21,7 +21,6 @@ from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._lowering._row_layout import layout
 from jaxlag._lowering._structure import Structure, find_structure
-from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import (
     AbstractConstraint,
     Baumgarte,
@@ -52,8 +51,13 @@ class SolveConstants(eqx.Module):
     time_direction: Array | float = 1.0
 
 
-class ArrayTerms(Terms):
-    """Terms of a system from its Lagrangian: works for any L that JAX differentiates twice.
+class ArrayTerms(eqx.Module):
+    """M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
+
+    The terms of a system from its Lagrangian, for any L that JAX differentiates twice. One state at
+    a time: t scalar (s), q and v of shape (n,), `inputs` the dict of input VALUES there. Everything
+    returned is in the units of the coordinates: M_ij a_j and h_i in N where q_i is in m, in N m
+    where it is in rad.
 
     M takes n forward-over-reverse columns in one batch, h a single forward derivative of the
     reverse pass, so the number of evaluations of L in h does not grow with n.
@@ -244,14 +248,7 @@ class ArrayTerms(Terms):
         return _structure(self.lagrangian, *keys, size, jnp.dtype(dtype))
 
     def precompute(
-        self,
-        q: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        sample: _params.Sample = _params.UNKNOWN,
-        kept: Bool[Array, " m"] | None = None,
-        reacting: RowChoice | None = None,
-        time_direction: Array | float = 1.0,
+        self, q: Float[Array, " n"], params: Any, time_direction: Array | float = 1.0
     ) -> SolveConstants:
         """M and its factor where M depends on params alone."""
         structure = self.structure(params, q.shape[0], q.dtype)
@@ -274,7 +271,7 @@ class ArrayTerms(Terms):
         reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
-        constants = self.precompute(q, params, inputs) if constants is None else constants
+        constants = self.precompute(q, params) if constants is None else constants
         M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
             return solve_mass(M, right, constants.factor)
@@ -291,7 +288,7 @@ class ArrayTerms(Terms):
         inputs: Mapping[str, Any],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """(a, lam), of least norm where rows depend on one another; NaN where rows contradict."""
-        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params, inputs))
+        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params))
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxlag._core._arrays import concrete
-from jaxlag._lowering import ScalarTerms
 from jaxlag._system._system import System
 
 LONG = 5.0  # s
@@ -47,7 +46,7 @@ def _words(system: System, seconds: float) -> str:
     names = system.coordinates.labels
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
     advice = "JAX_COMPILATION_CACHE_DIR keeps what is compiled for the next process"
-    if isinstance(system._terms, ScalarTerms):
+    if system.lowering != "array":
         advice += "; lowering='array' compiles long equations in less time, and runs slower"
     return (
         f"Compiling the motion of {len(names)} coordinates ({shown}) took {seconds:.0f} s, once "

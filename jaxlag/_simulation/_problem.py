@@ -134,7 +134,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     if dynamics.rows.size:
         y0, args = stop_gradient_unless(consistent.ok, (y0, args))
     if dynamics.crossing:
-        masses = dynamics.surface(*stop_gradient((start, y0, args))).masses
+        masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
         assert masses is not None
         units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
         lengths = lengths_of(masses, args.kept)

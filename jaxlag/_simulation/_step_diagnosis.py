@@ -341,7 +341,7 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
         y1, error, *_ = solver.step(term, tau, tau + h, y, here, memory, made_jump=False)
         turns = jnp.zeros((), jnp.int32)
         if dynamics.projects:
-            turns = turns_needed(dynamics.surface(tau + h, y1, here), *dynamics.parts(y1))
+            turns = turns_needed(dynamics.projector(tau + h, y1, here), *dynamics.parts(y1))
         allowed = atol if atol.ndim == 0 else jnp.tile(atol, 2)
         scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
         return Look(rates, dynamics.mass(tau, y, here), scaled, turns)

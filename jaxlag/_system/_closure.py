@@ -10,7 +10,6 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
-from jaxlag._lowering import ArrayTerms
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._system import System
@@ -50,7 +49,7 @@ def declared(
         values: of the inputs, by name; None without.
         lam: multipliers that forces read; None for zeros.
     """
-    terms = ArrayTerms(system.lagrangian, system.forces, system.constraints)
+    terms = system._terms
     L = real_scalar("lagrangian", system.lagrangian)(t, q, v, params)
     u = None if system.quasi is None else system.quasi.of(t, q, v, params)
     rows = jnp.zeros(0), jnp.zeros(0)

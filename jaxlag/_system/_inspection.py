@@ -10,7 +10,6 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
-from jaxlag._lowering import ArrayTerms
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._tracing import _params
@@ -73,7 +72,7 @@ def contact_rows_independent(
     v = jnp.zeros_like(q) if v is None else v
     if not system.constraints or not concrete(params, t, q, v, inputs):
         return False
-    array = ArrayTerms(system.lagrangian, system.forces, system.constraints)
+    array = system._terms
     t = jnp.asarray(t, float)
     chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
     if len(chosen) < 2:

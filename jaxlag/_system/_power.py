@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._lowering._terms import Terms
+from jaxlag._lowering import ArrayTerms
 from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
 from jaxlag._model._forces import EXPLICIT_TIME, AbstractForce, components, reads_lam
 from jaxlag._tracing._signature import gradient
@@ -26,7 +26,7 @@ class Power(eqx.Module):
     lagrangian: Callable = eqx.field(static=True)
     forces: tuple[AbstractForce, ...]
     explicit_time: bool = eqx.field(static=True)
-    terms: Terms
+    terms: ArrayTerms
     rows: ConstraintRows = eqx.field(static=True)
 
     @property

@@ -85,7 +85,7 @@ class AbstractReactions(AbstractQuantities):
         values = self._inputs_at(inputs, t, q, v, params)
         if self.constraints:
             return self._reactions(t, q, v, params, values)[0]
-        return self._terms.acceleration(t, q, v, params, values)
+        return self._program.acceleration(t, q, v, params, values)
 
     @state_first
     def multipliers(

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from jaxlag._core._arguments import state_first
 from jaxlag._core._arrays import common
 from jaxlag._core._errors import invalid, unsupported
-from jaxlag._lowering import ArrayTerms, Structure
-from jaxlag._lowering._terms import Terms
+from jaxlag._lowering import AccelerationProgram, ArrayTerms, Structure
 from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
 from jaxlag._model._coordinates import Coordinates, state_vectors
 from jaxlag._model._forces import AbstractForce
@@ -55,8 +54,13 @@ class AbstractQuantities(eqx.Module):
 
     @property
     @abstractmethod
-    def _terms(self) -> Terms:
-        """The lowered terms of the equations of motion."""
+    def _terms(self) -> ArrayTerms:
+        """The terms of the equations of motion, on arrays."""
+
+    @property
+    @abstractmethod
+    def _program(self) -> AccelerationProgram:
+        """The program of the accelerations."""
 
     @abstractmethod
     def _rows(self, params: Any, dtype: Any) -> ConstraintRows:
@@ -228,9 +232,8 @@ class AbstractQuantities(eqx.Module):
     def _power_terms(self, params: Any, dtype: Any) -> Power:
         """The terms of dH/dt that this system has."""
         explicit_time = self._structure(params, dtype).explicit_time
-        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
         rows = self._rows(params, dtype)
-        return Power(self.lagrangian, self.forces, explicit_time, array, rows)
+        return Power(self.lagrangian, self.forces, explicit_time, self._terms, rows)
 
     @state_first
     def kinetic(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, ""]:

@@ -14,13 +14,14 @@ from jaxlag._linalg._kkt import augmented
 from jaxlag._linalg._mass_solve import first_unhealthy
 from jaxlag._lowering import (
     OPERATIONS,
+    AccelerationProgram,
+    ArrayProgram,
     ArrayTerms,
-    ScalarTerms,
+    ScalarProgram,
     Structure,
     check_kinematics,
     layout,
 )
-from jaxlag._lowering._terms import Terms
 from jaxlag._model._constraints import (
     AbstractConstraint,
     ConstraintRows,
@@ -193,12 +194,16 @@ class System(AbstractReactions):
         return isinstance(other, System) and self._key == other._key
 
     @property
-    def _terms(self) -> Terms:
-        """The lowered terms of the equations of motion."""
-        array = ArrayTerms(self.lagrangian, self.forces, self.constraints)
+    def _terms(self) -> ArrayTerms:
+        """The terms of the equations of motion, on arrays."""
+        return ArrayTerms(self.lagrangian, self.forces, self.constraints)
+
+    @property
+    def _program(self) -> AccelerationProgram:
+        """The program of the accelerations."""
         if self.lowering == "array":
-            return array
-        return ScalarTerms(array, OPERATIONS if self.lowering == "auto" else None)
+            return ArrayProgram(self._terms)
+        return ScalarProgram(self._terms, OPERATIONS if self.lowering == "auto" else None)
 
     def with_forces(self, *forces: AbstractForce) -> "System":
         """The same system under further forces.
@@ -302,14 +307,14 @@ class System(AbstractReactions):
         params = _params.join(traced, static)
         dtype = jnp.result_type(float)
         check_traceable(self, params, dtype, None)
-        terms, lowered = self._terms, None
-        if isinstance(terms, ScalarTerms):
+        program, lowered = self._program, None
+        if isinstance(program, ScalarProgram):
             free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
             whole = ArrayTerms(
                 self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self._in_u
             )
-            terms = ScalarTerms(whole, terms.limit)
-            lowered = terms.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
+            program = ScalarProgram(whole, program.limit)
+            lowered = program.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
         return explain(self, self._structure(params, dtype), lowered, self._rows(params, dtype))
 
     def _structure(self, params: Any, dtype: Any) -> Structure:

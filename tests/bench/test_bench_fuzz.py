@@ -10,7 +10,7 @@ from bench import _system_programs, fuzz
 from bench._compared import Compared
 from bench._random_systems import ONE, TWO, Drawn, draw, smaller, text
 from bench._rounding import CALLS, NUMPY, evaluated
-from jaxlag._lowering import ScalarTerms
+from jaxlag._lowering import ScalarProgram
 from jaxlag._system._inspection import check_traceable
 
 SEEDS = range(40)
@@ -60,7 +60,7 @@ def test_smaller_systems_are_smaller_and_systems():
 
 
 def test_a_wrong_program_is_found_and_written_down(monkeypatch):
-    right = ScalarTerms.acceleration
+    right = ScalarProgram.acceleration
 
     def wrong(self, *args, **options):
         a = right(self, *args, **options)
@@ -69,7 +69,7 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
     kind = fuzz.FREE._replace(draw=lambda seed: SMALL)
     monkeypatch.setattr(fuzz, "kind_of", lambda seed: kind)
     assert _system_programs.compared(SMALL).kind == "equal"
-    monkeypatch.setattr(ScalarTerms, "acceleration", wrong)
+    monkeypatch.setattr(ScalarProgram, "acceleration", wrong)
     report = fuzz.run(True, seconds=1e-3, first=7)
     find = report.rows[-1]
     assert find["kind"].startswith("seed 7: ")

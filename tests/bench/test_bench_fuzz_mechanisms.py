@@ -19,7 +19,7 @@ from jaxlag._linalg import _independent_rows
 from jaxlag._lowering import ArrayTerms, _array_terms
 from jaxlag._lowering import QuasiState as Rates
 from jaxlag._lowering._jaxpr import _from_jaxpr
-from jaxlag._lowering._scalar_terms import ScalarTerms
+from jaxlag._lowering._scalar_program import ScalarProgram
 from jaxlag._tracing import _traced_function
 
 NUMBERS = {"a": [0.1, 0.2, 0.3], "b": 2.0, "k": 1.0}
@@ -228,9 +228,9 @@ def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
 
 
 def test_wrong_scalars_are_found(monkeypatch):
-    right = ScalarTerms.rates
+    right = ScalarProgram.quasi_rates
     monkeypatch.setattr(
-        ScalarTerms, "rates", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
+        ScalarProgram, "quasi_rates", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
     )
     for what in found_in(DOUBLED, IN_QUASI):
         assert "scalars" in what

@@ -183,13 +183,18 @@ def test_only_plain_operations_are_marked():
 
 def test_scalar_programs_are_plain():
     """Else every loop would run operation by operation where XLA's setting came too late."""
-    terms, params = double_pendulum.system._terms, dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0)
+    program, params = (
+        double_pendulum.system._program,
+        dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0),
+    )
     q = jnp.ones((3, 2))
-    one = jax.make_jaxpr(lambda q: terms.acceleration(jnp.zeros(()), q, q, params, {}))
-    lanes = jax.make_jaxpr(jax.vmap(lambda q: terms.acceleration(jnp.zeros(()), q, q, params, {})))
-    for program in (one(q[0]), lanes(q)):
-        assert "round" in str(program)  # sines by polynomial
-        assert _xla._plain(program.jaxpr)
+    one = jax.make_jaxpr(lambda q: program.acceleration(jnp.zeros(()), q, q, params, {}))
+    lanes = jax.make_jaxpr(
+        jax.vmap(lambda q: program.acceleration(jnp.zeros(()), q, q, params, {}))
+    )
+    for traced in (one(q[0]), lanes(q)):
+        assert "round" in str(traced)  # sines by polynomial
+        assert _xla._plain(traced.jaxpr)
 
 
 def test_merging():

@@ -100,6 +100,6 @@ def test_what_is_regular_needs_no_look():
         (lambda t, q, v, p: 0.5 * p["m"] * (v @ v), 0),
     ):
         system, q = jl.System(lagrangian, ("x", "y")), jnp.zeros(2)
-        equations = system._terms.lowered(q, {"m": jnp.ones(())}, {}).equations
+        equations = system._program.lowered(q, {"m": jnp.ones(())}, {}).equations
         assert equations.program.operations == lines
         np.testing.assert_array_equal(system.acceleration([0.0, 0.0], [1.0, 2.0], {"m": 2.0}), 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._lowering import ArrayTerms, ScalarTerms
+from jaxlag._lowering import ArrayTerms, ScalarProgram
 
 # ---- Rows ----------------------------------------------------------------------------------------
 
@@ -96,9 +96,9 @@ def test_kinematics_of_unlike_units():
     state = q, v
     for a in (system.acceleration(*state), system._quasi_reactions(*state)["a"]):
         np.testing.assert_allclose(a / units, right, rtol=1e-13)
-    scalars = ScalarTerms(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system._in_u), None)
+    scalars = ScalarProgram(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system._in_u), None)
     given = jnp.asarray(q), None, {}
-    rates = scalars.rates(
+    rates = scalars.quasi_rates(
         jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.precompute(*given)
     )
     np.testing.assert_allclose(rates[:2], v, rtol=1e-14)

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 
-from jaxlag._lowering import ScalarTerms
+from jaxlag._lowering import ScalarProgram
 
 
 def lowered(system, params=None):
     """For a state of its quasi-velocities, where it has any."""
-    terms = system._terms
-    assert isinstance(terms, ScalarTerms)
+    program = system._program
+    assert isinstance(program, ScalarProgram)
     if system.quasi is not None:
-        array = replace(terms.array, quasi=system.quasi, in_u=system._in_u)
-        terms = replace(terms, array=array)
-    return terms.lowered(jnp.zeros(system.size), params, {})
+        array = replace(program.array, quasi=system.quasi, in_u=system._in_u)
+        program = replace(program, array=array)
+    return program.lowered(jnp.zeros(system.size), params, {})

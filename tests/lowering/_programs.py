@@ -49,17 +49,17 @@ def floats(values):
 def prelude(case):
     """The operations done once per solve."""
     system, params, q, inputs = case
-    return operations(lambda params: system._terms.precompute(q, params, inputs), params)
+    return operations(lambda params: system._program.precompute(q, params, inputs), params)
 
 
 def evaluation(case, regular=False):
     """The operations of one acceleration inside a solve; whether M is known to be regular."""
     system, params, q, inputs = case
-    terms = system._terms.regular() if regular else system._terms
-    constants = terms.precompute(q, params, inputs)
+    program = system._program.regular() if regular else system._program
+    constants = program.precompute(q, params, inputs)
 
     def acceleration(constants, params, t, q, v, inputs):
-        return terms.acceleration(t, q, v, params, inputs, constants)
+        return program.acceleration(t, q, v, params, inputs, constants)
 
     return operations(acceleration, constants, params, jnp.zeros(()), q, q, inputs)
 

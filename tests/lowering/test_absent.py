@@ -129,10 +129,10 @@ def test_time_is_not_read_where_nothing_depends_on_it():
 
     def reads_time(lagrangian):
         system, params, q, _ = geared(lagrangian=lagrangian)
-        constants = system._terms.precompute(q, params, {})
+        constants = system._program.precompute(q, params, {})
 
         def acceleration(t):
-            return system._terms.acceleration(t, q, q, params, {}, constants)
+            return system._program.acceleration(t, q, q, params, {}, constants)
 
         jaxpr = jax.make_jaxpr(acceleration)(jnp.zeros(())).jaxpr
         return any(jaxpr.invars[0] is x for eqn in jaxpr.eqns for x in eqn.invars)

@@ -6,7 +6,7 @@ import pytest
 from _jaxprs import loop, names, operations
 
 import jaxlag as jl
-from jaxlag._lowering import ArrayTerms, ScalarTerms
+from jaxlag._lowering import ArrayProgram, ScalarProgram
 from systems._catalogue import ENTRIES
 
 DOUBLE = ENTRIES["double_pendulum"]
@@ -38,7 +38,7 @@ def test_solves_are_compiled_from_the_lowering_in_use(lowering):
 
 
 def test_only_systems_left_at_auto_follow(lowering):
-    kinds = {"auto": ArrayTerms if lowering == "array" else ScalarTerms}
-    for chosen, kind in (kinds | {"scalar": ScalarTerms, "array": ArrayTerms}).items():
+    kinds = {"auto": ArrayProgram if lowering == "array" else ScalarProgram}
+    for chosen, kind in (kinds | {"scalar": ScalarProgram, "array": ArrayProgram}).items():
         system = jl.System(DOUBLE.system.lagrangian, ("a", "b"), lowering=chosen)
-        assert type(system._terms) is kind
+        assert type(system._program) is kind

@@ -126,9 +126,9 @@ def test_single_precision_does_for_si_units(name):
         f = lambda q: system.acceleration(q, v_, p, t=jnp.zeros((), dtype))  # noqa: E731
         return jax.jit(lambda q: (f(q), jax.jacfwd(f)(q)))(q_)
 
-    terms = system._terms
+    program = system._program
     like = {key: jnp.asarray(x, jnp.float32) for key, x in params.items()}
-    found = terms.lowered(jnp.asarray(q, jnp.float32), like, {})
+    found = program.lowered(jnp.asarray(q, jnp.float32), like, {})
     assert found.equations is not None, found.reason
     eps = float(jnp.finfo(jnp.float32).eps)
     for single, double in zip(both(jnp.float32), both(jnp.float64), strict=True):

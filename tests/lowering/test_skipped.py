@@ -105,13 +105,13 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
 def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
     """The other one is not read: it is poisoned."""
     system, params, q, _ = case("double_pendulum_cartesian")
-    terms, given = system._terms, (jnp.zeros(()), q, 0.1 * q, params, {})
-    longer, shorter = (x.precompute(q, params, {}) for x in (terms, terms.regular()))
-    expected = terms.acceleration(*given, longer)
+    program, given = system._program, (jnp.zeros(()), q, 0.1 * q, params, {})
+    longer, shorter = (x.precompute(q, params, {}) for x in (program, program.regular()))
+    expected = program.acceleration(*given, longer)
     poison = lambda unread: jax.tree.map(lambda x: jnp.nan * x, unread)  # noqa: E731
     longer, shorter = (poison(longer), shorter) if definite else (longer, poison(shorter))
     either = longer._replace(definite=jnp.array(definite), alone=shorter)
-    np.testing.assert_allclose(terms.acceleration(*given, either), expected, rtol=1e-12)
+    np.testing.assert_allclose(program.acceleration(*given, either), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -120,13 +120,13 @@ def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(defin
 def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     """No multipliers, no matrix, and no division but by what may vanish: cos(theta), 1 + y^2."""
     system, params, q, _ = case(name)
-    array = replace(system._terms.array, quasi=system.quasi, in_u=system._in_u)
-    terms = replace(system._terms, array=array)
-    constants = terms.precompute(q, params, {})
+    array = replace(system._terms, quasi=system.quasi, in_u=system._in_u)
+    program = replace(system._program, array=array)
+    constants = program.precompute(q, params, {})
     u = jnp.zeros(len(system.quasi.free))
 
     def rates(constants, params, t, q, u):
-        return terms.rates(t, q, u, params, {}, constants)
+        return program.quasi_rates(t, q, u, params, {}, constants)
 
     program = operations(rates, constants, params, jnp.zeros(()), q, u)
     functions, divisions = QUASI[name]

@@ -156,7 +156,7 @@ def declared(name, lowering="auto"):
 
 def by_array_program(system, q, v):
     """M a + h = 0 with M and h by JAX, interpreted."""
-    array = system._terms.array
+    array = system._terms
     at = np.array(0.3), q, v
     M, h = (
         interpret(jax.make_jaxpr(lambda t, q, v, f=f: f(t, q, v, None))(*at), *at)[0]

@@ -1,9 +1,9 @@
-"""The scalar program behind the terms: every element of every array its own scalar."""
+"""The program on scalars: every element of every array is a scalar of its own."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,13 +12,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._linalg._projection import ConstraintProjector
+from jaxlag._lowering._acceleration_program import AccelerationProgram, ArrayProgram
 from jaxlag._lowering._array_terms import ArrayTerms, SolveConstants
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._lowering._symbolic._lower import Lowered, lower
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._symbolic_system import Equations
-from jaxlag._lowering._terms import Terms
+from jaxlag._model._constraints import ConstraintRows
 from jaxlag._tracing import _params
 
 
@@ -49,15 +50,15 @@ _WITH_INPUTS = ("acceleration", "lam")
 _BY_MASS = ("acceleration", "lam", "shift", "kick")  # where M is divided by
 
 
-class ScalarTerms(Terms):
-    """Terms whose accelerations are straight-line code on scalars, derived on a graph.
+@final
+class ScalarProgram(AccelerationProgram):
+    """Accelerations as straight-line code on scalars, derived on a graph.
 
     A system that has no scalar program, or one of more operations than `limit`, gets its
-    accelerations from the array program. So do the other terms, which no solver evaluates in its
-    loop.
+    accelerations from the array program.
 
     Attributes:
-        array: the array program of the same system.
+        array: the terms of the same system on arrays.
         limit: operations up to which the scalar program is used; None for no limit.
         lanes: whether terms are vmapped, so that every scalar is a row of numbers.
         in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
@@ -92,11 +93,33 @@ class ScalarTerms(Terms):
         kept: Bool[Array, " m"] | None = None,
         reacting: RowChoice | None = None,
         time_direction: Array | float = 1.0,
+        definite: Callable[[], Array] | None = None,
     ) -> ScalarSolveConstants | SolveConstants:
         """All that accelerations and projections need of what depends on params alone."""
+        given = q, params, inputs, sample, kept, reacting, time_direction
+        constants = self._precomputed(*given)
+        if constants is None:
+            return self.array.precompute(q, params, time_direction)
+        if definite is not None:
+            alone = self.regular()._precomputed(*given)
+            if alone is not None:
+                constants = constants._replace(definite=definite(), alone=alone)
+        return constants
+
+    def _precomputed(
+        self,
+        q: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        sample: _params.Sample,
+        kept: Array | None,
+        reacting: RowChoice | None,
+        time_direction: Array | float,
+    ) -> ScalarSolveConstants | None:
+        """The same of this program; None where there is none."""
         equations = self.lowered(q, params, inputs, sample).equations
         if equations is None:
-            return self.array.precompute(q, params, inputs, sample, kept, reacting, time_direction)
+            return None
 
         def before(
             code: Program | None, kept: Array | None, there: Array | None = None
@@ -130,50 +153,62 @@ class ScalarTerms(Terms):
     ) -> Float[Array, " n"]:
         """Acceleration a; NaN, whole, where M is not positive definite.
 
-        In a solve, where `prepared` is known, of blocks of M that nothing couples the others keep
+        In a solve, where `constants` are known, of blocks of M that nothing couples the others keep
         their values: the step fails by the one that is NaN.
         """
         if self.lowered(q, params, inputs).equations is None:
-            return self.array.acceleration(t, q, v, params, inputs, constants, reacting)
+            return self._on_arrays.acceleration(t, q, v, params, inputs, constants, reacting)
         if constants is not None:
-            return self.rates(t, q, v, params, inputs, constants)
+            return self._run("acceleration", t, q, v, params, inputs, constants)
         own: Any = self.precompute(q, params, inputs, reacting=reacting)
-        a = self.rates(t, q, v, params, inputs, own)
+        a = self._run("acceleration", t, q, v, params, inputs, own)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
-    def rates(
+    @property
+    def _on_arrays(self) -> ArrayProgram:
+        return ArrayProgram(self.array)
+
+    def quasi_rates(
         self,
-        t: Array,
-        q: Array,
-        v: Array,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        w: Float[Array, " k"],
         params: Any,
         inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
-    ) -> Array:
-        """The acceleration at (q, v); (v, u') at (q, u) of quasi-velocities."""
-        return self._run("acceleration", t, q, v, params, inputs, constants)
+        constants: Any,
+    ) -> Float[Array, " m"]:
+        """(v, w') at (q, w)."""
+        given = t, q, w, params, inputs, constants
+        if not isinstance(constants, ScalarSolveConstants):
+            return self._on_arrays.quasi_rates(*given)
+        return self._run("acceleration", *given)
 
     def velocities(
         self,
-        t: Array,
-        q: Array,
-        u: Array,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        w: Float[Array, " k"],
         params: Any,
         inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
-    ) -> Array:
-        """v at (q, u) of quasi-velocities."""
-        return self._run("rates", t, q, u, params, inputs, constants)
+        constants: Any,
+    ) -> Float[Array, " n"]:
+        """v at (q, w)."""
+        given = t, q, w, params, inputs, constants
+        if self.array.quasi is None or not isinstance(constants, ScalarSolveConstants):
+            return self._on_arrays.velocities(*given)
+        return self._run("rates", *given)
 
     def determinants(
         self,
-        t: Array,
-        q: Array,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
-    ) -> Array:
-        """What vanishes where quasi-velocities are singular, without what never changes."""
+        constants: Any,
+    ) -> Float[Array, " b"]:
+        """Determinants of the blocks of dU/dv, or of dv/du, without those that do not change."""
+        if not isinstance(constants, ScalarSolveConstants) or constants.determinants is None:
+            return self._on_arrays.determinants(t, q, params, inputs, constants)
         code = self._equations(q, params, inputs).determinants
         assert code is not None
         if not code.results:
@@ -192,7 +227,7 @@ class ScalarTerms(Terms):
     ) -> Array:
         """The results of one of the programs, whose prelude has this name."""
 
-        def by(terms: "ScalarTerms", constants: ScalarSolveConstants) -> Array:
+        def by(terms: "ScalarProgram", constants: ScalarSolveConstants) -> Array:
             program = terms._equations(q, params, inputs).code(name)
             carried = getattr(constants, name)
             assert program is not None
@@ -207,7 +242,7 @@ class ScalarTerms(Terms):
         alone = partial(by, self.regular(), constants.alone)
         return lax.cond(constants.definite, alone, partial(by, self, constants))
 
-    def regular(self) -> "ScalarTerms":
+    def regular(self) -> "ScalarProgram":
         """The same where M is positive definite without the constraints."""
         return replace(self, array=replace(self.array, regular=True))
 
@@ -216,16 +251,22 @@ class ScalarTerms(Terms):
         assert equations is not None
         return equations
 
-    def surface(
+    def projector(
         self,
-        t: Array,
-        q: Array,
-        v: Array,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        w: Float[Array, " k"],
         params: Any,
         inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
+        constants: Any,
+        rows: ConstraintRows,
+        kept: Bool[Array, " m"] | None,
     ) -> ConstraintProjector:
-        """The constraints near the state (q, v); positions alone near a (q, u)."""
+        """By the matrices of the program at the state."""
+        v = w
+        if not isinstance(constants, ScalarSolveConstants):
+            given = t, q, w, params, inputs, constants
+            return self._on_arrays.projector(*given, rows, kept)
         code = self._equations(q, params, inputs).surface
         assert code is not None
 
@@ -254,99 +295,21 @@ class ScalarTerms(Terms):
 
     def multipliers(
         self,
-        t: Array,
-        q: Array,
-        v: Array,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
-    ) -> Array:
+        constants: Any,
+        reacting: RowChoice | None = None,
+    ) -> Float[Array, " m"]:
         """The multipliers that forces depend on, at (q, v)."""
-        return self._run("lam", t, q, v, params, inputs, constants)
+        given = t, q, v, params, inputs, constants
+        if not isinstance(constants, ScalarSolveConstants):
+            return self._on_arrays.multipliers(*given, reacting)
+        return self._run("lam", *given)
 
-    def momentum(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> Float[Array, " n"]:
-        """Momentum p = dL/dv."""
-        return self.array.momentum(t, q, v, params)
-
-    def mass(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> Float[Array, "n n"]:
-        """Mass matrix M = d2L/dv2."""
-        return self.array.mass(t, q, v, params)
-
-    def bias(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> Float[Array, " n"]:
-        """Bias h."""
-        return self.array.bias(t, q, v, params)
-
-    def euler_lagrange(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        a: Float[Array, " n"],
-        params: Any,
-    ) -> Float[Array, " n"]:
-        """M a + h; M is not formed."""
-        return self.array.euler_lagrange(t, q, v, a, params)
-
-    def force(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-    ) -> Float[Array, " n"]:
-        """Q, summed over the declared forces."""
-        return self.array.force(t, q, v, params, inputs)
-
-    def position(
-        self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
-    ) -> Float[Array, " k"]:
-        """phi(t, q) of the holonomic rows."""
-        return self.array.position(t, q, params)
-
-    def velocity(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> Float[Array, " m"]:
-        """A v + b."""
-        return self.array.velocity(t, q, v, params)
-
-    def rows(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """(A, b)."""
-        return self.array.rows(t, q, v, params)
-
-    def gamma(
-        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
-    ) -> Float[Array, " m"]:
-        """A' v + b'."""
-        return self.array.gamma(t, q, v, params)
-
-    def reactions(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam)."""
-        return self.array.reactions(t, q, v, params, inputs)
-
-    def correction(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        constants: Any = None,
-        kept: Bool[Array, " m"] | None = None,
-    ) -> Float[Array, "n m"]:
-        """M^-1 A^T (A M^-1 A^T)^-1."""
-        return self.array.correction(t, q, v, params, None, kept)
+    def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
+        """Of the part that is evaluated at every state."""
+        equations = self.lowered(q, params, inputs).equations
+        return None if equations is None else len(equations.program.body)

@@ -44,7 +44,7 @@ def pair(system):
 def lowered(name):
     system, params, q0, _ = case(name)
     scalar, _ = pair(system)
-    return scalar._terms.lowered(jnp.asarray(q0, float), params, {})
+    return scalar._program.lowered(jnp.asarray(q0, float), params, {})
 
 
 def states(q0, v0):
@@ -319,7 +319,7 @@ def test_values_of_params_never_decide(name):
     for factor in (0.0, 1.0):
         scaled = jax.tree.map(lambda x, f=factor: f * jnp.asarray(x, float), params)
         scalar, _ = pair(system)
-        program = scalar._terms.lowered(jnp.asarray(q0, float), scaled, {}).equations.program
+        program = scalar._program.lowered(jnp.asarray(q0, float), scaled, {}).equations.program
         found.append((program.operations, len(program.prelude), program.count("div")))
     assert found[0] == found[1]
 
