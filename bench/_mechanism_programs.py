@@ -16,7 +16,8 @@ from bench._random_mechanisms import Mechanism, values
 from bench._reference import Equations, Solved, Terms, Unclear, terms_of
 from bench._rounding import evaluated
 from jaxlag._linalg._independent_rows import RowChoice
-from jaxlag._lowering import ArrayTerms, QuasiState, ScalarProgram
+from jaxlag._lowering import ArrayProgram, ArrayTerms, Choices, QuasiState, ScalarProgram
+from jaxlag._lowering import State as StateOfProgram
 
 NUDGES = 4
 NEARBY = 2  # to tell a contradiction from roundings
@@ -206,9 +207,9 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     kept = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
     choice = RowChoice(jnp.asarray(kept), jnp.asarray(~prepared.equations.void))
 
-    def by(terms: Any) -> Any:
+    def by(program: Any) -> Any:
         def a(t: Any, q: Any, v: Any, params: Any) -> Any:
-            return terms.acceleration(t, q, v, params, {}, None, choice)
+            return program.acceleration(StateOfProgram(t, q, v, params, {}), None, choice)
 
         return a
 
@@ -220,7 +221,7 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     found["scalars"] = by(ScalarProgram(array, OPERATIONS))
     if round(1e3 * mechanism.t) % 3 == 0:  # by chance
         given = system.lagrangian, system.forces, system.constraints
-        found["null space"] = by(ArrayTerms(*given, "null_space"))
+        found["null space"] = by(ArrayProgram(ArrayTerms(*given, "null_space")))
     return found
 
 
@@ -249,8 +250,10 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
     def straight(t: Any, q: Any, v: Any, params: Any) -> Any:
         """v' = B u' + s from the rates (v, u') of the scalar program."""
         w = speeds(t, q, v, params)
-        prepared: Any = scalars.precompute(q, params, {}, kept=choice.kept, reacting=choice)
-        rates = scalars.quasi_rates(t, q, w, params, {}, prepared)
+        prepared: Any = scalars.precompute(
+            q, params, {}, Choices(kept=choice.kept, reacting=choice)
+        )
+        rates = scalars.quasi_rates(StateOfProgram(t, q, w, params, {}), prepared)
         du = rates[q.shape[0] :]
 
         def velocity(t: Any, q: Any, w: Any) -> Any:

@@ -14,7 +14,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 import jaxlag as jl
 from bench._scenes import Scene
-from jaxlag._lowering import ScalarProgram
+from jaxlag._lowering import ScalarProgram, State
 
 STEP = 1e-4  # s
 STAGES = 4  # evaluations in a step
@@ -98,11 +98,11 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
         prepared = program.precompute(like, params, {})
 
         def on_scalars(q: Parts, v: Parts) -> Parts:
-            a = program.acceleration(t, jnp.stack(q), jnp.stack(v), params, {}, prepared)
+            a = program.acceleration(State(t, jnp.stack(q), jnp.stack(v), params, {}), prepared)
             return _elements(a)
 
         def on_arrays(q: Parts, v: Parts) -> Parts:
-            return [program.acceleration(t, *q, *v, params, {}, prepared)]
+            return [program.acceleration(State(t, *q, *v, params, {}), prepared)]
 
         return on_scalars if scalar else on_arrays
 

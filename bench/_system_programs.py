@@ -14,7 +14,7 @@ import numpy as np
 from bench._compared import DIFFERS, EQUAL, SLACK, Compared
 from bench._random_systems import Drawn
 from bench._rounding import evaluated
-from jaxlag._lowering import ArrayTerms, ScalarProgram
+from jaxlag._lowering import ArrayProgram, ArrayTerms, ScalarProgram, State
 from jaxlag._system._inspection import check_traceable
 
 NUDGES = 4  # runs with other roundings
@@ -31,8 +31,8 @@ def compared(drawn: Drawn) -> Compared:
         "b": jnp.asarray(drawn.params["b"], dtype),
     }
     params = leaves | {"k": _number(drawn)}
-    arrays = ArrayTerms(system.lagrangian, system.forces)
-    scalars = ScalarProgram(arrays, 1500)
+    terms = ArrayTerms(system.lagrangian, system.forces)
+    arrays, scalars = ArrayProgram(terms), ScalarProgram(terms, 1500)
     try:
         like = jax.ShapeDtypeStruct((drawn.n,), dtype)
         check_traceable(system, params, dtype, {})
@@ -69,12 +69,12 @@ def _judged(
     units = np.array(drawn.units).astype(dtype)
     parts = {"da/dq": slice(0, n), "da/dv": slice(n, 2 * n), "da/dparams": slice(2 * n, None)}
 
-    def everything(terms: Any) -> Any:
+    def everything(program: Any) -> Any:
         def a(x: Any) -> Any:
             """The acceleration in units, as a function of state in units and params in one row."""
             params = {"a": x[2 * n : -1], "b": x[-1], "k": _number(drawn)}
             q, v = units * x[:n], units * x[n : 2 * n]
-            return terms.acceleration(jnp.asarray(0.3), q, v, params, {}) / units
+            return program.acceleration(State(jnp.asarray(0.3), q, v, params, {})) / units
 
         def of(x: Any) -> dict[str, Any]:
             value, push = jax.linearize(a, x)

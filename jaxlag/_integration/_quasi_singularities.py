@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._integration._step_arguments import Arguments, midway
 from jaxlag._integration._vector_field import VectorField
+from jaxlag._lowering import State
 
 PART = 0.5  # of the least of three samples
 SPREAD = 8.0  # of samples within one step
@@ -90,7 +91,8 @@ def determinants(
     """
     t, (params, _) = dynamics.clock(tau, args), dynamics.given(args)
     values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
-    return dynamics.program.determinants(t, q, params, values, args.constants)
+    state = State(t, q, q, params, values)  # no speed is read
+    return dynamics.program.determinants(state, args.constants)
 
 
 def opening(dynamics: VectorField, found: Float[Array, " b"]) -> Float[Array, " b"]:

@@ -15,6 +15,7 @@ from jaxlag._integration._step_arguments import Arguments, StepChecks
 from jaxlag._integration._vector_field import VectorField
 from jaxlag._linalg._mass_solve import closed_to
 from jaxlag._linalg._projection import ConstraintProjector, project, tangential
+from jaxlag._lowering import State
 from jaxlag._model._forces import reads_lam, sliding
 
 
@@ -83,8 +84,8 @@ class StepEnd(eqx.Module):
         t, q, v, params, values = self.dynamics.at(tau, y, args)
         right = []
         if self._contacts:
-            given = t, q, v, params, values, args.constants, args.reacting
-            lam = self.dynamics.program.multipliers(*given)
+            state = State(t, q, v, params, values)
+            lam = self.dynamics.program.multipliers(state, args.constants, args.reacting)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
             assert args.senses is not None

@@ -17,7 +17,7 @@ from jaxlag._integration._step_arguments import Arguments, KnotIntervals, RowSel
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, row_sizes
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._lowering import AccelerationProgram, ArrayTerms, ScalarProgram
+from jaxlag._lowering import AccelerationProgram, ArrayTerms, Choices, ScalarProgram, State
 from jaxlag._model._constraints import NO_ROWS, Baumgarte, ConstraintRows
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import (
@@ -150,12 +150,11 @@ class VectorField(eqx.Module):
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
             args = args._replace(senses=jax.lax.stop_gradient(senses))
         time_direction = self.signed(jnp.ones_like(tau), args)
-        rows = args.kept, args.reacting
         definite = None
         if self.regular is None and self.formulation != "null_space":
             definite = partial(self._definite, t, q, v, params)
-        given = q, params, values, self.sample, *rows, time_direction, definite
-        return args._replace(constants=self.program.precompute(*given))
+        choices = Choices(self.sample, args.kept, args.reacting, time_direction, definite)
+        return args._replace(constants=self.program.precompute(q, params, values, choices))
 
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
@@ -257,14 +256,12 @@ class VectorField(eqx.Module):
         """Acceleration a, or w' of quasi-velocities, at (tau, y)."""
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
-        t, q, v, params, values = self.at(tau, y, args)
-        return self.program.acceleration(t, q, v, params, values, args.constants, args.reacting)
+        state = State(*self.at(tau, y, args))
+        return self.program.acceleration(state, args.constants, args.reacting)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
-        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
-        values = self._values(tau, q, w, args)
-        return self.program.quasi_rates(t, q, w, params, values, args.constants)
+        return self.program.quasi_rates(self.state_at(tau, y, args), args.constants)
 
     def effort(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -295,7 +292,8 @@ class VectorField(eqx.Module):
         if self.quasi is None:
             return w
         values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
-        return self.program.velocities(t, q, w, self.given(args)[0], values, args.constants)
+        state = State(t, q, w, self.given(args)[0], values)
+        return self.program.velocities(state, args.constants)
 
     def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
         """(t, q, v, params, values of the inputs) at (tau, y)."""
@@ -332,19 +330,16 @@ class VectorField(eqx.Module):
 
     def projector(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
         """The projection onto the constraints near a predicted state."""
-        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
-        given = t, q, w, params, self._values(tau, q, w, args), args.constants
-        return self.program.projector(*given, self.rows, args.kept)
+        state = self.state_at(tau, y, args)
+        return self.program.projector(state, args.constants, self.rows, args.kept)
 
-    def _values(self, tau: Array, q: Array, w: Array, args: Arguments) -> Any:
-        """Values of the inputs at a state."""
-        if self.quasi is None:
-            v = w
-        elif reads_state(self.given(args)[1]):
-            v = self.velocities_of(self.clock(tau, args), q, w, args)
-        else:
-            v = jnp.zeros_like(q)
-        return self.inputs_at(tau, q, v, args)
+    def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
+        """The state as programs take it, of quasi-velocities where it is made of these."""
+        t, (q, w), (params, inputs) = self.clock(tau, args), self.parts(y), self.given(args)
+        v = w
+        if self.quasi is not None:
+            v = self.velocities_of(t, q, w, args) if reads_state(inputs) else jnp.zeros_like(q)
+        return State(t, q, w, params, self.inputs_at(tau, q, v, args))
 
     def parts(self, y: Any) -> tuple[Any, Any]:
         """(q, v), or (q, w), of y, (..., m)."""

@@ -2,6 +2,8 @@
 
 from jaxlag._lowering._acceleration_program import AccelerationProgram as AccelerationProgram
 from jaxlag._lowering._acceleration_program import ArrayProgram as ArrayProgram
+from jaxlag._lowering._acceleration_program import Choices as Choices
+from jaxlag._lowering._acceleration_program import State as State
 from jaxlag._lowering._array_terms import ArrayTerms as ArrayTerms
 from jaxlag._lowering._array_terms import SolveConstants as SolveConstants
 from jaxlag._lowering._graph._straight_line import Program as Program

@@ -12,7 +12,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._lowering._acceleration_program import AccelerationProgram, ArrayProgram
+from jaxlag._lowering._acceleration_program import (
+    AS_USUAL,
+    AccelerationProgram,
+    ArrayProgram,
+    Choices,
+    State,
+)
 from jaxlag._lowering._array_terms import ArrayTerms, SolveConstants
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
@@ -85,39 +91,24 @@ class ScalarProgram(AccelerationProgram):
         return lower(key, _params.sample(_params.split(params)[0], sample))
 
     def precompute(
-        self,
-        q: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        sample: _params.Sample = _params.UNKNOWN,
-        kept: Bool[Array, " m"] | None = None,
-        reacting: RowChoice | None = None,
-        time_direction: Array | float = 1.0,
-        definite: Callable[[], Array] | None = None,
+        self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices = AS_USUAL
     ) -> ScalarSolveConstants | SolveConstants:
         """All that accelerations and projections need of what depends on params alone."""
-        given = q, params, inputs, sample, kept, reacting, time_direction
+        given = q, params, inputs, choices
         constants = self._precomputed(*given)
         if constants is None:
-            return self.array.precompute(q, params, time_direction)
-        if definite is not None:
+            return self._on_arrays.precompute(*given)
+        if choices.definite is not None:
             alone = self.regular()._precomputed(*given)
             if alone is not None:
-                constants = constants._replace(definite=definite(), alone=alone)
+                constants = constants._replace(definite=choices.definite(), alone=alone)
         return constants
 
     def _precomputed(
-        self,
-        q: Array,
-        params: Any,
-        inputs: Mapping[str, Any],
-        sample: _params.Sample,
-        kept: Array | None,
-        reacting: RowChoice | None,
-        time_direction: Array | float,
+        self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices
     ) -> ScalarSolveConstants | None:
         """The same of this program; None where there is none."""
-        equations = self.lowered(q, params, inputs, sample).equations
+        equations = self.lowered(q, params, inputs, choices.sample).equations
         if equations is None:
             return None
 
@@ -126,9 +117,9 @@ class ScalarProgram(AccelerationProgram):
         ) -> Array | None:
             if code is None:
                 return None
-            return _emit.prelude(code, params, q.dtype, kept, there, time_direction)
+            return _emit.prelude(code, params, q.dtype, kept, there, choices.time_direction)
 
-        solving = (None, None) if reacting is None else reacting
+        kept, solving = choices.kept, choices.reacting or (None, None)
         first = before(equations.program, *solving)
         assert first is not None
         rates, determinants = before(equations.velocity, kept), before(equations.determinants, None)
@@ -141,99 +132,58 @@ class ScalarProgram(AccelerationProgram):
             first, *others, lam=reacting_too, rates=rates, determinants=determinants
         )
 
+    @property
+    def _on_arrays(self) -> ArrayProgram:
+        return ArrayProgram(self.array)
+
     def acceleration(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any = None,
-        reacting: RowChoice | None = None,
+        self, state: State, constants: Any = None, reacting: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """Acceleration a; NaN, whole, where M is not positive definite.
 
         In a solve, where `constants` are known, of blocks of M that nothing couples the others keep
         their values: the step fails by the one that is NaN.
         """
-        if self.lowered(q, params, inputs).equations is None:
-            return self._on_arrays.acceleration(t, q, v, params, inputs, constants, reacting)
+        given = state.q, state.params, state.inputs
+        if self.lowered(*given).equations is None:
+            return self._on_arrays.acceleration(state, constants, reacting)
         if constants is not None:
-            return self._run("acceleration", t, q, v, params, inputs, constants)
-        own: Any = self.precompute(q, params, inputs, reacting=reacting)
-        a = self._run("acceleration", t, q, v, params, inputs, own)
+            return self._run("acceleration", state, constants)
+        own: Any = self.precompute(*given, Choices(reacting=reacting))
+        a = self._run("acceleration", state, own)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
-    @property
-    def _on_arrays(self) -> ArrayProgram:
-        return ArrayProgram(self.array)
-
-    def quasi_rates(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        w: Float[Array, " k"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any,
-    ) -> Float[Array, " m"]:
-        """(v, w') at (q, w)."""
-        given = t, q, w, params, inputs, constants
+    def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
+        """(v, w') by one program."""
         if not isinstance(constants, ScalarSolveConstants):
-            return self._on_arrays.quasi_rates(*given)
-        return self._run("acceleration", *given)
+            return self._on_arrays.quasi_rates(state, constants)
+        return self._run("acceleration", state, constants)
 
-    def velocities(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        w: Float[Array, " k"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any,
-    ) -> Float[Array, " n"]:
-        """v at (q, w)."""
-        given = t, q, w, params, inputs, constants
+    def velocities(self, state: State, constants: Any) -> Float[Array, " n"]:
+        """v by a program of its own."""
         if self.array.quasi is None or not isinstance(constants, ScalarSolveConstants):
-            return self._on_arrays.velocities(*given)
-        return self._run("rates", *given)
+            return self._on_arrays.velocities(state, constants)
+        return self._run("rates", state, constants)
 
-    def determinants(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any,
-    ) -> Float[Array, " b"]:
+    def determinants(self, state: State, constants: Any) -> Float[Array, " b"]:
         """Determinants of the blocks of dU/dv, or of dv/du, without those that do not change."""
         if not isinstance(constants, ScalarSolveConstants) or constants.determinants is None:
-            return self._on_arrays.determinants(t, q, params, inputs, constants)
-        code = self._equations(q, params, inputs).determinants
+            return self._on_arrays.determinants(state, constants)
+        code = self._equations(state).determinants
         assert code is not None
         if not code.results:
-            return jnp.zeros((0,), q.dtype)
-        return self._run("determinants", t, q, q, params, inputs, constants)  # no speed is read
+            return jnp.zeros((0,), state.q.dtype)
+        return self._run("determinants", state, constants)
 
-    def _run(
-        self,
-        name: str,
-        t: Array,
-        q: Array,
-        v: Array,
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: ScalarSolveConstants,
-    ) -> Array:
+    def _run(self, name: str, state: State, constants: ScalarSolveConstants) -> Array:
         """The results of one of the programs, whose prelude has this name."""
 
-        def by(terms: "ScalarProgram", constants: ScalarSolveConstants) -> Array:
-            program = terms._equations(q, params, inputs).code(name)
-            carried = getattr(constants, name)
-            assert program is not None
+        def by(program: "ScalarProgram", constants: ScalarSolveConstants) -> Array:
+            code, carried = program._equations(state).code(name), getattr(constants, name)
+            assert code is not None
             assert carried is not None
-            read = inputs if name in _WITH_INPUTS else {}
-            return _emit.body(program, carried, t, q, v, read, terms.lanes, terms.in_loop)
+            read = state.inputs if name in _WITH_INPUTS else {}
+            return _emit.body(code, carried, *state[:3], read, program.lanes, program.in_loop)
 
         # Equations in quasi-velocities are projected: of them the projection alone divides by M.
         projected = self.array.quasi is not None and name == "acceleration"
@@ -246,32 +196,22 @@ class ScalarProgram(AccelerationProgram):
         """The same where M is positive definite without the constraints."""
         return replace(self, array=replace(self.array, regular=True))
 
-    def _equations(self, q: Array, params: Any, inputs: Mapping[str, Any]) -> Equations:
-        equations = self.lowered(q, params, inputs).equations
+    def _equations(self, state: State) -> Equations:
+        equations = self.lowered(state.q, state.params, state.inputs).equations
         assert equations is not None
         return equations
 
     def projector(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        w: Float[Array, " k"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any,
-        rows: ConstraintRows,
-        kept: Bool[Array, " m"] | None,
+        self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
     ) -> ConstraintProjector:
         """By the matrices of the program at the state."""
-        v = w
         if not isinstance(constants, ScalarSolveConstants):
-            given = t, q, w, params, inputs, constants
-            return self._on_arrays.projector(*given, rows, kept)
-        code = self._equations(q, params, inputs).surface
+            return self._on_arrays.projector(state, constants, rows, kept)
+        code, q, v = self._equations(state).surface, state.q, state.w
         assert code is not None
 
         def run(name: str, q: Array, v: Array) -> Array:
-            return self._run(name, t, q, v, params, inputs, constants)
+            return self._run(name, state._replace(q=q, w=v), constants)
 
         n = q.shape[0]
 
@@ -294,20 +234,12 @@ class ScalarProgram(AccelerationProgram):
         )
 
     def multipliers(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        inputs: Mapping[str, Any],
-        constants: Any,
-        reacting: RowChoice | None = None,
+        self, state: State, constants: Any, reacting: RowChoice | None = None
     ) -> Float[Array, " m"]:
-        """The multipliers that forces depend on, at (q, v)."""
-        given = t, q, v, params, inputs, constants
+        """The multipliers that forces depend on."""
         if not isinstance(constants, ScalarSolveConstants):
-            return self._on_arrays.multipliers(*given, reacting)
-        return self._run("lam", *given)
+            return self._on_arrays.multipliers(state, constants, reacting)
+        return self._run("lam", state, constants)
 
     def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
         """Of the part that is evaluated at every state."""

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxlag._core._arguments import state_first
 from jaxlag._core._errors import invalid
-from jaxlag._lowering import ArrayTerms, QuasiState
+from jaxlag._lowering import ArrayTerms, QuasiState, State
 from jaxlag._model._forces import reads_lam
 from jaxlag._system._state_functions import AbstractQuantities
 from jaxlag._tracing._compiled import Compiled
@@ -85,7 +85,7 @@ class AbstractReactions(AbstractQuantities):
         values = self._inputs_at(inputs, t, q, v, params)
         if self.constraints:
             return self._reactions(t, q, v, params, values)[0]
-        return self._program.acceleration(t, q, v, params, values)
+        return self._program.acceleration(State(t, q, v, params, values))
 
     @state_first
     def multipliers(

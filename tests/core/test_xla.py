@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jaxlag._core import _xla
+from jaxlag._lowering import State
 from systems import double_pendulum
 
 SOLVE = """
@@ -188,9 +189,9 @@ def test_scalar_programs_are_plain():
         dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0),
     )
     q = jnp.ones((3, 2))
-    one = jax.make_jaxpr(lambda q: program.acceleration(jnp.zeros(()), q, q, params, {}))
+    one = jax.make_jaxpr(lambda q: program.acceleration(State(jnp.zeros(()), q, q, params, {})))
     lanes = jax.make_jaxpr(
-        jax.vmap(lambda q: program.acceleration(jnp.zeros(()), q, q, params, {}))
+        jax.vmap(lambda q: program.acceleration(State(jnp.zeros(()), q, q, params, {})))
     )
     for traced in (one(q[0]), lanes(q)):
         assert "round" in str(traced)  # sines by polynomial

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._lowering import ArrayTerms, ScalarProgram
+from jaxlag._lowering import ArrayTerms, ScalarProgram, State
 
 # ---- Rows ----------------------------------------------------------------------------------------
 
@@ -98,9 +98,8 @@ def test_kinematics_of_unlike_units():
         np.testing.assert_allclose(a / units, right, rtol=1e-13)
     scalars = ScalarProgram(ArrayTerms(system.lagrangian, (), quasi=quasi, in_u=system._in_u), None)
     given = jnp.asarray(q), None, {}
-    rates = scalars.quasi_rates(
-        jnp.zeros(()), given[0], jnp.asarray(u), None, {}, scalars.precompute(*given)
-    )
+    state = State(jnp.zeros(()), given[0], jnp.asarray(u), None, {})
+    rates = scalars.quasi_rates(state, scalars.precompute(*given))
     np.testing.assert_allclose(rates[:2], v, rtol=1e-14)
     turning = jax.jvp(
         lambda q, u: quasi.velocities(jnp.zeros(()), q, u, None),

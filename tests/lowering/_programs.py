@@ -9,6 +9,7 @@ from _systems.problems import MOTIONS
 
 import jaxlag as jl
 from bench._scenes import SCENES
+from jaxlag._lowering import State
 from systems._catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
@@ -59,7 +60,7 @@ def evaluation(case, regular=False):
     constants = program.precompute(q, params, inputs)
 
     def acceleration(constants, params, t, q, v, inputs):
-        return program.acceleration(t, q, v, params, inputs, constants)
+        return program.acceleration(State(t, q, v, params, inputs), constants)
 
     return operations(acceleration, constants, params, jnp.zeros(()), q, q, inputs)
 

@@ -20,7 +20,7 @@ from _systems.problems import MOTIONS
 
 import jaxlag as jl
 from jaxlag._integration._step_end import StepEnd
-from jaxlag._lowering import ArrayTerms
+from jaxlag._lowering import ArrayTerms, State
 
 # ---- A constant mass matrix ----------------------------------------------------------------------
 
@@ -132,7 +132,7 @@ def test_time_is_not_read_where_nothing_depends_on_it():
         constants = system._program.precompute(q, params, {})
 
         def acceleration(t):
-            return system._program.acceleration(t, q, q, params, {}, constants)
+            return system._program.acceleration(State(t, q, q, params, {}), constants)
 
         jaxpr = jax.make_jaxpr(acceleration)(jnp.zeros(())).jaxpr
         return any(jaxpr.invars[0] is x for eqn in jaxpr.eqns for x in eqn.invars)

@@ -17,6 +17,7 @@ from _jaxprs import count, loop, names, operations
 from _programs import PACKING, SCALAR, STEP, Case, case, evaluation, solve
 
 import jaxlag as jl
+from jaxlag._lowering import State
 from jaxlag._system._inspection import mass_definite
 from systems._catalogue import ENTRIES
 
@@ -105,13 +106,13 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
 def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
     """The other one is not read: it is poisoned."""
     system, params, q, _ = case("double_pendulum_cartesian")
-    program, given = system._program, (jnp.zeros(()), q, 0.1 * q, params, {})
+    program, state = system._program, State(jnp.zeros(()), q, 0.1 * q, params, {})
     longer, shorter = (x.precompute(q, params, {}) for x in (program, program.regular()))
-    expected = program.acceleration(*given, longer)
+    expected = program.acceleration(state, longer)
     poison = lambda unread: jax.tree.map(lambda x: jnp.nan * x, unread)  # noqa: E731
     longer, shorter = (poison(longer), shorter) if definite else (longer, poison(shorter))
     either = longer._replace(definite=jnp.array(definite), alone=shorter)
-    np.testing.assert_allclose(program.acceleration(*given, either), expected, rtol=1e-12)
+    np.testing.assert_allclose(program.acceleration(state, either), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     u = jnp.zeros(len(system.quasi.free))
 
     def rates(constants, params, t, q, u):
-        return program.quasi_rates(t, q, u, params, {}, constants)
+        return program.quasi_rates(State(t, q, u, params, {}), constants)
 
     program = operations(rates, constants, params, jnp.zeros(()), q, u)
     functions, divisions = QUASI[name]

@@ -16,6 +16,7 @@ from _systems.mechanics import chain as any_chain
 
 import jaxlag as jl
 from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
+from jaxlag._lowering import State
 from systems._catalogue import ENTRIES
 
 SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2
@@ -293,7 +294,7 @@ def test_the_factor_is_made_where_the_solve_is_prepared():
         return system._program.precompute(q, params, {})
 
     def each(constants, q, v):
-        return system._program.acceleration(jnp.zeros(()), q, v, INERTIA, {}, constants)
+        return system._program.acceleration(State(jnp.zeros(()), q, v, INERTIA, {}), constants)
 
     assert count(operations(once, INERTIA), "div") == n * (n - 1) // 2
     inside = operations(each, constants, q, v)
@@ -311,7 +312,7 @@ def test_no_bias_is_computed_where_it_is_zero():
         constants = program.precompute(q, INERTIA, {})
 
         def each(constants, q, v, program=program):
-            return program.acceleration(jnp.zeros(()), q, v, INERTIA, {}, constants)
+            return program.acceleration(State(jnp.zeros(()), q, v, INERTIA, {}), constants)
 
         inside = operations(each, constants, q, v)
         outside = [o for o in inside if "custom_linear_solve" not in o.inside]
@@ -348,7 +349,7 @@ def test_derivatives_of_one_acceleration_go_through_the_factor(n):
         params, system = INERTIA | {"a": a}, of(lagrangian, n, (HELD,))
         constants = system._program.precompute(q, params, {})
         return jnp.sum(
-            system._program.acceleration(jnp.zeros(()), q, q, params, {}, constants) ** 2
+            system._program.acceleration(State(jnp.zeros(()), q, q, params, {}), constants) ** 2
         )
 
     def orders(f):
@@ -415,7 +416,7 @@ def test_terms_are_those_of_the_public_methods(chosen):
             (terms.momentum(t, q, v, params), system.momentum(q, v, params, t=t)),
             (terms.force(t, q, v, params, {}), system.generalized_force(q, v, params, t=t)),
             (
-                system._program.acceleration(t, q, v, params, {}),
+                system._program.acceleration(State(t, q, v, params, {})),
                 system.acceleration(q, v, params, t=t),
             ),
         ]
