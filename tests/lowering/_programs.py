@@ -8,7 +8,7 @@ from _jaxprs import operations
 from _systems.problems import MOTIONS
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from systems._catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}

@@ -1,7 +1,7 @@
 """Systems with states, under both lowerings."""
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from systems._catalogue import ENTRIES
 from systems._entry import Entry
 

@@ -9,7 +9,7 @@ from _families import mostly_full
 from _running_error import U, carried, rounded
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from jaxlag._lowering import ArrayTerms
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._symbolic._bias_forms import mass_matrix, momentum_form
