@@ -117,7 +117,7 @@ def _digits(x: Any) -> str:
 
 
 def _entries() -> Mapping[str, Any]:
-    from systems._catalogue import ENTRIES
+    from systems.catalogue import ENTRIES
 
     return {name: entry for name, entry in ENTRIES.items() if entry.kind == "trajectory"}
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from systems.double_pendulum import kinetic, potential, system
+from systems.catalogue.chapter3.double_pendulum import kinetic, potential, system
 
 PARAMS = {"m1": 1.0, "m2": 1.0, "h1": 1.0, "h2": 1.0, "g": 9.81}
 Q0 = (1.0, 0.5)

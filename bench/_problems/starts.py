@@ -8,8 +8,8 @@ the state nearest to them is taken.
 
 from typing import NamedTuple
 
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from systems.catalogue import ENTRIES
+from systems.catalogue._entry import Entry
 
 
 class Start(NamedTuple):

@@ -23,7 +23,7 @@ import jaxlag as jl
 from bench._harness.timing import Report
 from bench._multiprecision.make_references import Reference, load
 from bench.accuracy._verdict import NOTHING, Errors, conclusions, judged, name_exact, scaled
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 MOVING = tuple(name for name, entry in ENTRIES.items() if entry.kind == "trajectory")
 TOLERANCES = tuple(10.0**-k for k in range(4, 12))

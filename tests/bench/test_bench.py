@@ -14,7 +14,7 @@ from bench import __main__ as command
 from bench._harness import results, timing, workers
 from bench._harness.timing import BENCHMARKS, RUNS_PER_TURN, Reference, Report, Target
 from bench._problems import double_pendulum as pendulum
-from systems.double_pendulum import system
+from systems.catalogue.chapter3.double_pendulum import system
 
 
 class Clock:

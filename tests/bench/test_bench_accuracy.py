@@ -13,7 +13,7 @@ from bench import accuracy
 from bench._multiprecision import make_references as references
 from bench._problems.starts import STARTS, Start
 from bench.accuracy._verdict import EPS, Errors, conclusions, judged, name_exact, scaled
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 FILES = accuracy.MOVING
 

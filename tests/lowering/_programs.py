@@ -9,7 +9,7 @@ from _systems.problems import MOTIONS
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
 PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}

@@ -2,8 +2,8 @@
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from systems.catalogue import ENTRIES
+from systems.catalogue._entry import Entry
 
 MOVING = {name: entry for name, entry in ENTRIES.items() if isinstance(entry, Entry)}
 

@@ -17,7 +17,7 @@ from _jaxprs import count, loop, names, operations
 from _programs import PACKING, SCALAR, STEP, Case, case, evaluation, solve
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
 

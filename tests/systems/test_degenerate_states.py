@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from systems.catalogue import ENTRIES
+from systems.catalogue._entry import Entry
 
 HALF = np.pi / 2
 

@@ -1,0 +1,1 @@
+"""Systems of chapter 3 of the book."""

@@ -1,0 +1,1 @@
+"""Systems of chapter 4 of the book."""

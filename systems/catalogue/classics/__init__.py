@@ -1,0 +1,1 @@
+"""Classics of nonholonomic, rigid and linked systems that the book does not have."""
