@@ -20,7 +20,7 @@ import jaxlag as jl
 from bench._harness.timing import Reference, Report, Target, build, interleaved, spread
 from bench._problems import double_pendulum as pendulum
 from bench._problems import mechanisms, scenes
-from systems.catalogue.chapter4 import rigid_aircraft
+from systems import rigid_aircraft
 
 LANES = 16
 INPUTS = ("m1", "m2", "h1", "h2")

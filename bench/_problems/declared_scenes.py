@@ -15,10 +15,9 @@ import jaxlag as jl
 from bench._problems import explicit_equations
 from bench._problems.explicit_equations import Functions, Numbers
 from bench._problems.scenes import links
-from systems.catalogue._entry import Entry
-from systems.catalogue.chapter2 import rotating_body_on_frame
-from systems.catalogue.chapter3 import cart_pendulum, double_pendulum, quadcopter
-from systems.catalogue.chapter3 import simple_pendulum as pendulum_on_string
+from systems import cart_pendulum, double_pendulum, quadcopter, rotating_body_on_frame
+from systems import simple_pendulum as pendulum_on_string
+from systems.catalogue import Entry
 
 Law = Callable[[Functions, Mapping[str, Any], Any, Numbers], list[Any]]  # (f, p, t, y) -> dy/dt
 

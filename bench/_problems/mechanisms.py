@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from systems.catalogue.classics import rolling_disk, snakeboard
+from systems import rolling_disk, snakeboard
 
 G = 9.81
 

@@ -21,10 +21,14 @@ from bench._problems.declared_scenes import chain_on_arrays
 from bench._problems.double_pendulum import PARAMS as PENDULUM
 from bench._problems.explicit_equations import PLAIN, Rates
 from bench._problems.scenes import G, elastic_pendulum, links
+from systems import (
+    double_pendulum,
+    double_pendulum_cartesian,
+    heavy_symmetric_top,
+    rigid_aircraft,
+    rolling_disk,
+)
 from systems.catalogue import _attitude
-from systems.catalogue.chapter3 import double_pendulum, double_pendulum_cartesian
-from systems.catalogue.chapter4 import rigid_aircraft
-from systems.catalogue.classics import heavy_symmetric_top, rolling_disk
 
 DISKS = {"m": 1.0, "R": 0.3, "I_d": 0.0225, "I_a": 0.045, "g": G}
 

@@ -8,8 +8,7 @@ the state nearest to them is taken.
 
 from typing import NamedTuple
 
-from systems.catalogue import ENTRIES
-from systems.catalogue._entry import Entry
+from systems.catalogue import ENTRIES, Entry
 
 
 class Start(NamedTuple):

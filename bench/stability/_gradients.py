@@ -18,7 +18,7 @@ from bench.stability._long_runs import ARMS, BOBS, ORBIT
 from bench.stability._reference_motions import double_pendulum
 from bench.stability._rows import TIGHT, Found, Rows, names, run
 from bench.stability._singular_states import ANGLES, QUATERNION, UNEQUAL, G, rod, springs
-from systems.catalogue.chapter3 import spherical_pendulum_cartesian
+from systems import spherical_pendulum_cartesian
 
 EPS = float(np.finfo(float).eps)
 Motion = Callable[[Any], tuple[Array, jl.Solution]]

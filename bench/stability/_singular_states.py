@@ -19,9 +19,7 @@ from bench.stability._rows import (
     names,
     run,
 )
-from systems.catalogue.chapter3 import spherical_pendulum_cartesian, spherical_pendulum_fixed
-from systems.catalogue.chapter4 import rigid_aircraft
-from systems.catalogue.classics import four_bar
+from systems import four_bar, rigid_aircraft, spherical_pendulum_cartesian, spherical_pendulum_fixed
 
 EPS = np.finfo(float).eps
 G = 9.81

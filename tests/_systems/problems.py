@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 import jaxlag as jl
-from systems.catalogue.chapter2 import rotating_slender_rod
-from systems.catalogue.chapter3 import (
+from systems import (
     cart_pendulum,
     central_motion,
     double_pendulum,
     double_pendulum_rayleigh,
+    rotating_slender_rod,
 )
 
 

@@ -9,7 +9,7 @@ from _jaxprs import operations
 import jaxlag as jl
 from jaxlag._core import _batching
 from jaxlag._core._buffer_entries import set_entry
-from systems.catalogue.chapter3 import double_pendulum
+from systems import double_pendulum
 
 EPS = np.finfo(float).eps
 PARAMS = {"m1": 1.0, "m2": 0.6, "h1": 0.9, "h2": 0.7, "g": 9.81}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jaxlag._core import _xla
-from systems.catalogue.chapter3 import double_pendulum
+from systems import double_pendulum
 
 SOLVE = """
 {before}

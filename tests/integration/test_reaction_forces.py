@@ -13,7 +13,7 @@ from jaxlag._linalg._kkt import solve_general as on_arrays
 from jaxlag._lowering._graph._eliminate import solve_general as on_graph
 from jaxlag._lowering._graph._expression import Graph
 from jaxlag._lowering._symbolic._evaluate import evaluate
-from systems.catalogue.chapter3 import falling_stick_friction
+from systems import falling_stick_friction
 
 G = 9.81
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}

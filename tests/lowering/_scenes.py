@@ -2,8 +2,7 @@
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES
-from systems.catalogue import ENTRIES
-from systems.catalogue._entry import Entry
+from systems.catalogue import ENTRIES, Entry
 
 MOVING = {name: entry for name, entry in ENTRIES.items() if isinstance(entry, Entry)}
 

@@ -10,8 +10,7 @@ from _scenes import case
 import jaxlag as jl
 from bench._problems.scenes import SCENES, links
 from jaxlag._lowering._symbolic import _lower
-from systems.catalogue.chapter2 import lamina_on_parabola
-from systems.catalogue.chapter4 import rigid_aircraft
+from systems import lamina_on_parabola, rigid_aircraft
 
 EPS = np.finfo(float).eps
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxlag as jl
-from systems.catalogue.chapter3 import double_pendulum, double_pendulum_cartesian
-from systems.catalogue.classics import rolling_disk
+from systems import double_pendulum, double_pendulum_cartesian, rolling_disk
 
 
 def example(module):

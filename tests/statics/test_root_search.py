@@ -7,7 +7,7 @@ import pytest
 from _pendulum import PARAMS, PENDULUM
 
 import jaxlag as jl
-from systems.catalogue.chapter3 import double_pendulum_static_load
+from systems import double_pendulum_static_load
 
 EPS = np.finfo(float).eps
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from systems.catalogue import find
-from systems.catalogue._entry import AbstractEntry
+from systems.catalogue import AbstractEntry, find
 from systems.reference._check import Motion
 
 

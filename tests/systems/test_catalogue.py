@@ -10,11 +10,11 @@ import pytest
 from _families import mostly_full
 
 import jaxlag as jl
+import systems
 from systems import catalogue
 from systems.__main__ import main
 from systems._run import TOLERANCE, drifts, simulate_example
-from systems.catalogue import ENTRIES, UnknownSystem, find
-from systems.catalogue._entry import Chart, Entry, Example
+from systems.catalogue import ENTRIES, Chart, Entry, Example, UnknownSystem, find
 
 MODULES = {
     path.stem: import_module(f"systems.catalogue.{path.parent.name}.{path.stem}")
@@ -26,7 +26,9 @@ MODULES = {
 def test_every_module_is_collected_under_its_own_name():
     assert set(ENTRIES) == set(MODULES)
     for name, entry in ENTRIES.items():
+        assert entry.name == name
         assert MODULES[name].entry is entry
+        assert getattr(systems, name) is MODULES[name]
 
 
 @pytest.mark.parametrize("name", ENTRIES)
@@ -94,6 +96,13 @@ def test_an_unknown_name_gets_its_neighbours(capsys):
         find("zzz")
     assert main(["run", "centralmotion"]) == 1
     assert "Did you mean central_motion" in capsys.readouterr().err
+
+
+def test_a_name_of_no_system_is_no_attribute():
+    with pytest.raises(AttributeError, match="'systems' has no attribute 'duble_pendulum'"):
+        systems.duble_pendulum  # noqa: B018
+    with pytest.raises(ImportError):
+        from systems import duble_pendulum  # noqa: F401
 
 
 def declare(**changes):

@@ -18,8 +18,8 @@ from _states import random_states
 from jax.numpy import cos, sin
 
 import jaxlag as jl
+from systems import two_link_robot_arm
 from systems.catalogue import ENTRIES
-from systems.catalogue.chapter2 import two_link_robot_arm
 from systems.catalogue.chapter2.disk_on_shaft import entry as DISK
 from systems.catalogue.chapter2.rotating_body_on_frame import entry as FRAME
 from systems.catalogue.chapter2.rotating_body_on_frame import pose as frame_pose

@@ -11,8 +11,8 @@ from _consistent import onto_constraints
 from numpy import cos, sin
 
 import jaxlag as jl
-from systems.catalogue._entry import Chart
-from systems.catalogue.classics import four_bar, n_link_loop, slider_crank
+from systems import four_bar, n_link_loop, slider_crank
+from systems.catalogue import Chart
 
 TIGHT = {"method": "tsit5", "rtol": 1e-12, "atol": 1e-12}
 """Of low order, for which less is compiled."""
