@@ -10,9 +10,9 @@ from typing import Any
 
 import jax
 
-from bench import _results
-from bench._fit_data import DataError
-from bench._harness import BENCHMARKS
+from bench._harness import results
+from bench._harness.timing import BENCHMARKS
+from bench.fits._data import DataError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,21 +46,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{arguments.name} has no option --{foreign[0]}.", file=sys.stderr)
         return 2
     jax.config.update("jax_enable_x64", True)
-    circumstances = _results.circumstances()
+    circumstances = results.circumstances()
     try:
         report = run(arguments.quick, **options)
     except DataError as error:
         print(error, file=sys.stderr)
         return 2
-    path = _results.save(
+    path = results.save(
         arguments.name,
         _headline(arguments.name),
         report,
         circumstances,
         arguments.quick or "system" in options,  # in part is not what is kept
-        _results.FOLDER,
+        results.FOLDER,
     )
-    print(_results.text(report))
+    print(results.text(report))
     print(f"\nwritten to {path}")
     return 0 if all(target.met for target in report.targets) else 1
 

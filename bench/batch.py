@@ -16,9 +16,9 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench import _double_pendulum as pendulum
-from bench._double_pendulum import Ended
-from bench._harness import Reference, Report, Target, build, interleaved, spread
+from bench._harness.timing import Reference, Report, Target, build, interleaved, spread
+from bench._problems import double_pendulum as pendulum
+from bench._problems.double_pendulum import Ended
 
 COMPARED = 256
 KNOTS = 21

@@ -17,9 +17,9 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 import jaxlag as jl
-from bench import _double_pendulum as pendulum
-from bench import _mechanisms, _scenes
-from bench._harness import Reference, Report, Target, build, interleaved, spread
+from bench._harness.timing import Reference, Report, Target, build, interleaved, spread
+from bench._problems import double_pendulum as pendulum
+from bench._problems import mechanisms, scenes
 from systems import rigid_aircraft
 
 LANES = 16
@@ -80,7 +80,7 @@ def _cases(quick: bool) -> list[Case]:
 
 def _others() -> list[Case]:
     """Solve and gradient: quasi-velocities of a rigid body, rods as constraints, a long chain."""
-    entry, bobs, chain = rigid_aircraft.entry, _mechanisms.double_pendulum(), _scenes.links(8)
+    entry, bobs, chain = rigid_aircraft.entry, mechanisms.double_pendulum(), scenes.links(8)
     links = jl.System(chain.lagrangian, tuple(f"theta{i}" for i in range(8)))
     masses = {name: bobs.params[name] for name in ("m1", "m2")}
     found = []

@@ -14,9 +14,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from bench import _double_pendulum as pendulum
-from bench._harness import Call, Reference, Report, Target, build, spread
-from bench._workers import Worker
+from bench._harness.timing import Call, Reference, Report, Target, build, spread
+from bench._harness.workers import Worker
+from bench._problems import double_pendulum as pendulum
 from jaxlag._core import _xla
 
 SAVES = 501

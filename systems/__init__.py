@@ -1,5 +1,24 @@
 """Systems of Pila, "Introduction to Lagrangian Dynamics", declared for jaxlag, and a few beyond.
 
-One module per system, each with its sketch, its energies and its forces as the book has them;
-`python -m systems` lists them, runs their examples and checks reference files against them.
+Read `catalogue/chapter3/simple_pendulum.py` first. Every system has a module like it, with its
+sketch, its energies and its forces as the book has them:
+
+    from systems import simple_pendulum
+
+    simple_pendulum.system  # the declaration
+    simple_pendulum.entry.example  # parameters and a start
+
+`python -m systems` lists the systems, runs their examples and checks reference files against them.
 """
+
+from types import ModuleType
+
+from systems import catalogue
+
+
+def __getattr__(name: str) -> ModuleType:
+    """The module of a system."""
+    try:
+        return catalogue.module(name)
+    except KeyError:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}") from None

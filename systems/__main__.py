@@ -7,8 +7,9 @@ from pathlib import Path
 
 import jax
 
-from systems import _check, _run
-from systems._catalogue import ENTRIES, UnknownSystem, find
+from systems import _run
+from systems.catalogue import ENTRIES, UnknownSystem, find
+from systems.reference import _check
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from systems._entry import AbstractEntry
+from systems.catalogue._entry import AbstractEntry
 
 
 class PlotError(RuntimeError):

@@ -12,9 +12,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 import jaxlag as jl
-from systems._entry import AbstractEntry, Entry, PrescribedEntry, StaticEntry
 from systems._plot import Panel, PlotError, by_unit, save
-from systems._quantities import prescribed_quantities, static_quantities
+from systems.catalogue._entry import AbstractEntry, Entry, PrescribedEntry, StaticEntry
+from systems.reference._quantities import prescribed_quantities, static_quantities
 
 TOLERANCE = 1e-10
 SAMPLES = 601

@@ -1,6 +1,6 @@
 """What a kept run of a benchmark holds."""
 
-from bench import _results
+from bench._harness import results
 
 RUN_FIELDS = {"date", "commit", "machine", "versions", "native_loops", "quick"} | {
     "rows",
@@ -12,7 +12,7 @@ RUN_FIELDS = {"date", "commit", "machine", "versions", "native_loops", "quick"} 
 def check_fields(run):
     assert set(run) == RUN_FIELDS
     assert set(run["machine"]) == {"cpu", "cores", "platform", "load"}
-    assert set(run["versions"]) == {"python", *_results.PACKAGES}
+    assert set(run["versions"]) == {"python", *results.PACKAGES}
     for target in run["targets"]:
         assert set(target) == {"claim", "figure", "relation", "bound", "met"}
     for reference in run["references"]:

@@ -11,14 +11,10 @@ import pytest
 from _kept_runs import check_fields
 
 from bench import __main__ as command
-from bench import _double_pendulum as pendulum
-from bench import (
-    _harness,
-    _results,
-    _workers,
-)
-from bench._harness import BENCHMARKS, RUNS_PER_TURN, Reference, Report, Target
-from systems.double_pendulum import system
+from bench._harness import results, timing, workers
+from bench._harness.timing import BENCHMARKS, RUNS_PER_TURN, Reference, Report, Target
+from bench._problems import double_pendulum as pendulum
+from systems.catalogue.chapter3.double_pendulum import system
 
 
 class Clock:
@@ -26,7 +22,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 0.0
-        monkeypatch.setattr(_harness, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(timing, "perf_counter", lambda: self.now)
 
     def pending(self, seconds):
         return Pending(self, seconds)
@@ -49,12 +45,12 @@ def clock(monkeypatch):
 
 
 def test_the_timer_waits_for_every_output(clock):
-    assert _harness.seconds(lambda: {"q": clock.pending(5.0), "v": [clock.pending(2.0)]}) == 7.0
+    assert timing.seconds(lambda: {"q": clock.pending(5.0), "v": [clock.pending(2.0)]}) == 7.0
 
 
 def test_the_timer_sees_nothing_of_outputs_not_waited_for(clock, monkeypatch):
     monkeypatch.setattr(jax, "block_until_ready", lambda x: x)
-    assert _harness.seconds(lambda: clock.pending(5.0)) == 0.0
+    assert timing.seconds(lambda: clock.pending(5.0)) == 0.0
 
 
 def test_a_program_known_to_be_slow_takes_long():
@@ -68,29 +64,29 @@ def test_a_program_known_to_be_slow_takes_long():
     def slow(x):
         return jax.pure_callback(sleep, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
-    program = _harness.build(slow, jnp.zeros(()))
+    program = timing.build(slow, jnp.zeros(()))
     assert not runs  # compilation is measured apart
-    assert _harness.seconds(lambda: program.call(jnp.zeros(()))) >= 0.2
+    assert timing.seconds(lambda: program.call(jnp.zeros(()))) >= 0.2
     assert len(runs) == 1
 
 
 def test_calls_take_turns_after_one_to_warm_up(clock):
     order = []
     calls = {name: lambda name=name: order.append(name) or clock.pending(1.0) for name in "ab"}
-    samples = _harness.interleaved(calls, rounds=2)
+    samples = timing.interleaved(calls, rounds=2)
     assert "".join(order) == "ab" + "aaabbb" * 2
     assert samples == {"a": [1.0] * 6, "b": [1.0] * 6}
 
 
 def test_a_call_over_its_budget_sits_out(clock):
     calls = {"slow": lambda: clock.pending(9.0), "fast": lambda: clock.pending(0.1)}
-    samples = _harness.interleaved(calls, rounds=6, budget_s=2.0)
+    samples = timing.interleaved(calls, rounds=6, budget_s=2.0)
     assert len(samples["slow"]) == RUNS_PER_TURN
     assert len(samples["fast"]) == 6 * RUNS_PER_TURN
 
 
 def test_times_are_per_lane_in_the_unit_named():
-    columns = _harness.spread([3e-3, 1e-3, 2e-3], "us", lanes=10)
+    columns = timing.spread([3e-3, 1e-3, 2e-3], "us", lanes=10)
     assert columns["repeats"] == 3
     assert math.isclose(columns["min_us"], 100.0)
     assert math.isclose(columns["median_us"], 200.0)
@@ -117,7 +113,7 @@ def report(figure=12.0):
 
 
 def test_results_hold_all_fields(tmp_path):
-    path = _results.save("solve", "Headline.", report(), _results.circumstances(), False, tmp_path)
+    path = results.save("solve", "Headline.", report(), results.circumstances(), False, tmp_path)
     assert path == tmp_path / "solve.json"
     content = json.loads(path.read_text())
     assert (content["benchmark"], content["measures"]) == ("solve", "Headline.")
@@ -130,8 +126,8 @@ def test_results_hold_all_fields(tmp_path):
 
 def test_a_run_replaces_the_last_on_its_jax_and_keeps_the_others(tmp_path):
     def save(jax_version, quick=False):
-        circumstances = {**_results.circumstances(), "versions": {"jax": jax_version}}
-        return _results.save("solve", "Headline.", report(), circumstances, quick, tmp_path)
+        circumstances = {**results.circumstances(), "versions": {"jax": jax_version}}
+        return results.save("solve", "Headline.", report(), circumstances, quick, tmp_path)
 
     for jax_version in ("0.12.0.1", "0.10.2", "0.9.1", "0.10.2"):
         path = save(jax_version)
@@ -144,7 +140,7 @@ def test_a_run_replaces_the_last_on_its_jax_and_keeps_the_others(tmp_path):
 def test_a_missed_target_makes_the_exit_status_1(
     figure, status, verdict, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(_results, "FOLDER", tmp_path)
+    monkeypatch.setattr(results, "FOLDER", tmp_path)
     monkeypatch.setattr("bench.solve.run", lambda quick: report(figure))
     assert command.main(["solve"]) == status
     assert f"target {verdict:<6}  {figure:g} >= 10" in capsys.readouterr().out
@@ -166,7 +162,7 @@ def test_the_list_names_every_benchmark_and_what_it_measures(capsys):
 
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_results_of_full_runs_are_kept(name):
-    content = json.loads((_results.FOLDER / f"{name}.json").read_text())
+    content = json.loads((results.FOLDER / f"{name}.json").read_text())
     assert content["benchmark"] == name
     for run in content["runs"]:
         check_fields(run)
@@ -185,8 +181,8 @@ def test_workers_start_under_their_own_settings_alone(monkeypatch):
             return 7
 
     monkeypatch.setenv("XLA_FLAGS", "--from_importing_jaxlag_here")
-    monkeypatch.setattr(_workers.subprocess, "Popen", Process)
-    worker = _workers.Worker("solve", True, {"JAXLAG_XLA_FLAGS": "0"})
+    monkeypatch.setattr(workers.subprocess, "Popen", Process)
+    worker = workers.Worker("solve", True, {"JAXLAG_XLA_FLAGS": "0"})
     assert worker.facts == {"a": 1}
     assert worker.seconds() == {"b": [2.0]}
     with pytest.raises(RuntimeError, match="ended early with status 7"):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from bench import _make_references as references
 from bench import accuracy
-from bench._accuracy import EPS, Errors, conclusions, judged, name_exact, scaled
-from bench._starts import STARTS, Start
-from systems._catalogue import ENTRIES
+from bench._multiprecision import make_references as references
+from bench._problems.starts import STARTS, Start
+from bench.accuracy._verdict import EPS, Errors, conclusions, judged, name_exact, scaled
+from systems.catalogue import ENTRIES
 
 FILES = accuracy.MOVING
 
@@ -152,8 +152,8 @@ class TestManyDigits:
         return pytest.importorskip("gmpy2")
 
     def follow(self, system, q, v, times, params=None):
-        from bench._equations import Motion
-        from bench._extrapolation import integrated
+        from bench._multiprecision.equations import Motion
+        from bench._multiprecision.extrapolation import integrated
 
         motion = Motion(system, params or {})
         start = motion.start(q, v)
@@ -161,8 +161,8 @@ class TestManyDigits:
         return rows
 
     def test_operations(self, gmpy2):
-        from bench._equations import precise
-        from bench._jaxpr_code import Floats, Tape, compiled, read
+        from bench._multiprecision.equations import precise
+        from bench._multiprecision.jaxpr_code import Floats, Tape, compiled, read
 
         precise()
 
@@ -184,7 +184,7 @@ class TestManyDigits:
             np.testing.assert_allclose(found, expected(jnp.array(x)), rtol=1e-14, atol=1e-15)
 
     def test_reading_beside_an_array_is_refused(self):
-        from bench._jaxpr_code import Floats, Tape, read
+        from bench._multiprecision.jaxpr_code import Floats, Tape, read
 
         tape = Tape()
         x = Floats(tape.inputs("x", (3,)))
@@ -208,7 +208,7 @@ class TestManyDigits:
         def lagrangian(t, q, v, params):
             return 0.5 * v @ v + 1 / jnp.linalg.norm(q)
 
-        from bench._equations import precise
+        from bench._multiprecision.equations import precise
 
         precise()
         system = jl.System(lagrangian, coordinates=("x", "y"))
@@ -216,8 +216,8 @@ class TestManyDigits:
         E = gmpy2.mpfr(4)
         for _ in range(20):  # Kepler's equation by Newton's method
             E -= (E - gmpy2.sin(E) / 2 - time) / (1 - gmpy2.cos(E) / 2)
-        from bench._equations import Motion
-        from bench._extrapolation import integrated
+        from bench._multiprecision.equations import Motion
+        from bench._multiprecision.extrapolation import integrated
 
         motion = Motion(system, {})
         half, zero = gmpy2.mpfr("0.5"), gmpy2.mpfr(0)
@@ -236,8 +236,8 @@ class TestManyDigits:
         circle = jl.Holonomic(lambda t, q, params: q @ q - 1.0, "circle")
         free = jl.System(polar, coordinates=("theta",))
         held = jl.System(cartesian, coordinates=("x", "y"), constraints=(circle,))
-        from bench._equations import Motion
-        from bench._extrapolation import integrated
+        from bench._multiprecision.equations import Motion
+        from bench._multiprecision.extrapolation import integrated
 
         motion = Motion(held, {"g": 9.81})
         start = motion.start([0.6, -0.8], [0.4, 0.3])
@@ -251,7 +251,7 @@ class TestManyDigits:
         assert abs(found[1] + gmpy2.cos(theta)) < 1e-21
 
     def test_rows_that_contradict_one_another_are_named(self):
-        from bench._equations import Singular
+        from bench._multiprecision.equations import Singular
 
         two = [jl.Holonomic(lambda t, q, params, r=r: q @ q - r, f"r{r}") for r in (1.0, 4.0)]
         system = jl.System(
@@ -262,7 +262,7 @@ class TestManyDigits:
 
     def test_what_a_heavy_top_keeps(self, gmpy2):
         """The momenta of psi and phi and the energy along the rows of its file."""
-        from bench._equations import precise
+        from bench._multiprecision.equations import precise
 
         precise()
         content = json.loads((references.FOLDER / "heavy_symmetric_top.json").read_text())

@@ -11,12 +11,10 @@ from _families import mostly_full
 from _kept_runs import check_fields
 
 from bench import __main__ as command
-from bench import (
-    _drift_plot,
-    _results,
-    constraints,
-)
-from bench._mechanisms import BOBS, LINKAGES, ROLLING, double_pendulum
+from bench import constraints
+from bench._harness import results
+from bench._problems.mechanisms import BOBS, LINKAGES, ROLLING, double_pendulum
+from bench.constraints import _drift_plot
 
 
 def recorded(position, energy=0.0, steps=1_000_000):
@@ -126,7 +124,7 @@ def test_without_matplotlib_there_are_no_curves(tmp_path, monkeypatch):
 
 @pytest.mark.full
 def test_drift_is_measured_and_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(_results, "FOLDER", tmp_path)
+    monkeypatch.setattr(results, "FOLDER", tmp_path)
     monkeypatch.setattr(constraints, "QUICK_STEPS", 2000)
     command.main(["constraints", "--quick"])
     assert "times the energy drift: projection as none" in capsys.readouterr().out

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from _families import mostly_full
 
-from bench import _explicit, first_result
-from bench._first import CASES
-from bench._first_scenes import BEGINNINGS
+from bench import first_result
+from bench._problems import explicit_equations
+from bench._problems.declared_scenes import BEGINNINGS
+from bench.first_result._one_process import CASES
 
 EPS = np.finfo(float).eps
 
@@ -34,7 +35,7 @@ def test_equations_by_hand_are_those_of_the_system(name):
     allowed = 1e5 * EPS * np.max(np.abs(right))
     np.testing.assert_allclose(motion.by_hand()(0.0, y, motion.params), right, rtol=0, atol=allowed)
     if motion.rates is not None:
-        found = motion.rates(_explicit.PLAIN, motion.params, 0.0, [float(x) for x in y])
+        found = motion.rates(explicit_equations.PLAIN, motion.params, 0.0, [float(x) for x in y])
         np.testing.assert_allclose(found, right, rtol=0, atol=allowed)
 
 

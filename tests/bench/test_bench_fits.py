@@ -11,14 +11,14 @@ import pytest
 
 import jaxlag as jl
 from bench import __main__ as command
-from bench import _fit_actuated as actuated
-from bench import _fit_cube as cube
-from bench import _fit_multiarm as multiarm
-from bench import _fit_synthetic as synthetic
-from bench import _fit_video as video
 from bench import fits
-from bench._fit_data import DataError, folder, pieces, table, windows
-from bench._fit_part import Part, errors, missed
+from bench.fits import _actuated_arm as actuated
+from bench.fits import _cube as cube
+from bench.fits import _multiarm as multiarm
+from bench.fits import _synthetic as synthetic
+from bench.fits import _video as video
+from bench.fits._data import DataError, folder, pieces, table, windows
+from bench.fits._report import Part, errors, missed
 from jaxlag import rotation
 
 EPS = np.finfo(float).eps

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from jax import lax
 
-from bench import _system_programs, fuzz
-from bench._compared import Compared
-from bench._random_systems import ONE, TWO, Drawn, draw, smaller, text
-from bench._rounding import CALLS, NUMPY, evaluated
+from bench import fuzz
+from bench.fuzz import _system_programs
+from bench.fuzz._comparison import Compared
+from bench.fuzz._random_systems import ONE, TWO, Drawn, draw, smaller, text
+from bench.fuzz._rounding import CALLS, NUMPY, evaluated
 from jaxlag._lowering import ScalarProgram
 from jaxlag._system._inspection import check_traceable
 

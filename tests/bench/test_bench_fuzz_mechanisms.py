@@ -5,16 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bench import (
-    _loops,
-    _mechanism_motions,
-    _random_mechanisms,
-    _random_quasi,
-)
-from bench._mechanism_programs import compared, prepare
-from bench._random_mechanisms import Mechanism, Quasi, Row, smaller
-from bench._random_systems import Drawn
-from bench._reference import Unclear
+from bench.fuzz import _loops, _mechanism_motions, _random_mechanisms, _random_quasi
+from bench.fuzz._mechanism_programs import compared, prepare
+from bench.fuzz._random_mechanisms import Mechanism, Quasi, Row, smaller
+from bench.fuzz._random_systems import Drawn
+from bench.fuzz._reference_solution import Unclear
 from jaxlag._linalg import _independent_rows
 from jaxlag._lowering import ArrayTerms, _array_terms
 from jaxlag._lowering import QuasiState as Rates

@@ -8,16 +8,12 @@ import numpy as np
 import pytest
 from _families import mostly_full
 
-from bench import (
-    _exact_ends,
-    _harness,
-    _jax_lines,
-    _peers,
-    _sweep,
-    work_precision,
-)
-from bench._motions import MOTIONS
-from bench._sweep import Line, Solved, swept, time_at
+from bench import work_precision
+from bench._harness import timing
+from bench._problems import exact_ends
+from bench._problems.motions import MOTIONS
+from bench.work_precision import _jax, _peers, _sweep
+from bench.work_precision._sweep import Line, Solved, swept, time_at
 
 motion_of = cache(lambda name: MOTIONS[name]())
 
@@ -69,7 +65,7 @@ def test_sweeps_wait_for_every_result():
 def test_a_deliberately_long_computation_shows_its_full_time(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(_sweep, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(_harness, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(timing, "perf_counter", lambda: now[0])
 
     class Long(Result):
         def block_until_ready(self):
@@ -143,12 +139,12 @@ def test_every_solver_of_ours_has_a_line():
     from jaxlag._simulation._methods import METHODS
     from jaxlag.solvers import AbstractFixedStep
 
-    single = _jax_lines.methods(MOTIONS["double pendulum, regular"]())
+    single = _jax.methods(MOTIONS["double pendulum, regular"]())
     ours = {name for name, make in METHODS.items() if type(make()).__module__.startswith("jaxlag")}
     assert ours <= set(single)
     assert {"tsit5", "dopri8"} <= set(single)
-    assert "kvaerno5" in _jax_lines.methods(MOTIONS["elastic pendulum, k = 1e6"]())
-    lanes = _jax_lines.methods(MOTIONS["16 double pendulums"]())
+    assert "kvaerno5" in _jax.methods(MOTIONS["elastic pendulum, k = 1e6"]())
+    lanes = _jax.methods(MOTIONS["16 double pendulums"]())
     assert "dopri8" in lanes
     assert not any(isinstance(METHODS[name](), AbstractFixedStep) for name in lanes)
 
@@ -157,7 +153,7 @@ def test_every_solver_of_ours_has_a_line():
 @pytest.mark.parametrize("method", ["gauss8", "variational4"])
 def test_canonical_methods_have_a_line_where_the_state_is_of_quasi_velocities(method):
     motion = motion_of("heavy top")._replace(t1=0.1)
-    line = _jax_lines.with_jaxlag(motion, method)
+    line = _jax.with_jaxlag(motion, method)
     assert line.read(line.make(0.1 / 64)()).steps == 64
 
 
@@ -169,10 +165,8 @@ def test_lines_in_jax_get_to_the_end(lanes):
     motion = motion._replace(t1=0.5)
     ends = []
     for line in (
-        _jax_lines.with_jaxlag(motion, "tsit5"),
-        _jax_lines.with_diffrax(
-            motion, _jax_lines.by_hand(motion), "Tsit5", jnp.asarray(motion.start())
-        ),
+        _jax.with_jaxlag(motion, "tsit5"),
+        _jax.with_diffrax(motion, _jax.by_hand(motion), "Tsit5", jnp.asarray(motion.start())),
     ):
         solved = line.read(line.make(1e-10)())
         assert solved.steps > 3
@@ -203,7 +197,7 @@ def test_scipy_reaches_the_end_kept_here():
     line = _peers.lines(motion)["scipy DOP853"][1](motion)
     solved = line.read(line.make(1e-10)())
     # The global error of a motion of 10 s at this tolerance, about 30 times as large.
-    assert motion.error(solved.q, _exact_ends.exact_end("Cartesian double pendulum")) < 1e-8
+    assert motion.error(solved.q, exact_ends.exact_end("Cartesian double pendulum")) < 1e-8
 
 
 @pytest.mark.full
@@ -224,14 +218,14 @@ def test_every_library_gets_to_the_end_kept_here(name):
 
 
 def exact(name):
-    return _exact_ends.exact_end(name)
+    return exact_ends.exact_end(name)
 
 
 @pytest.mark.full
 def test_dop853_in_numba_takes_the_steps_of_scipy():
     pytest.importorskip("numba")
     integrate = pytest.importorskip("scipy.integrate")
-    from bench import _numba_dop853
+    from bench.work_precision import _numba_dop853
 
     motion = MOTIONS["double pendulum, regular"]()
     y, accepted, attempts = _numba_dop853.build(motion).run(motion.start(), 10.0, 1e-8, 1e-8)

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from _families import mostly_full
 
-from bench import (
-    _chains,
-    _results,
-    _rk4,
-    lowering,
-)
-from bench._by_hand import BY_HAND
-from bench._harness import Report
-from bench._scenes import SCENES, links
-from bench._verdict import NEIGHBOURS, OPERATIONS, verdict
+from bench import lowering
+from bench._harness import results
+from bench._harness.timing import Report
+from bench._problems.scenes import SCENES, links
+from bench.lowering import _chains, _rk4
+from bench.lowering._by_hand import BY_HAND
+from bench.lowering._verdict import NEIGHBOURS, OPERATIONS, verdict
 
 
 def off(name, contenders):
@@ -42,7 +39,7 @@ def test_hand_written_equations_are_those_of_the_scene(name):
 @pytest.mark.parametrize("name", ["pendulum", "cart_pole", "kepler", "top", "chain_3"])
 def test_equations_by_sympy_are_those_of_the_scene(name, monkeypatch):
     pytest.importorskip("sympy")
-    from bench import _sympy
+    from bench.lowering import _sympy
 
     monkeypatch.setattr(_sympy, "PATIENCE_S", 3.0)
     forms = _sympy.forms(name, SCENES[name])
@@ -52,7 +49,7 @@ def test_equations_by_sympy_are_those_of_the_scene(name, monkeypatch):
 
 def test_sympy_stops_simplifying_when_its_time_is_up(monkeypatch):
     pytest.importorskip("sympy")
-    from bench import _sympy
+    from bench.lowering import _sympy
 
     monkeypatch.setattr(_sympy, "PATIENCE_S", 0.01)
     monkeypatch.setattr(_sympy, "_tidy", lambda x: time.sleep(5.0))
@@ -175,5 +172,5 @@ def test_a_system_without_a_scalar_program_misses_its_count():
 
 
 def test_columns_that_do_not_apply_are_blank():
-    text = _results.text(Report([{"a": "x", "b": None, "c": 1.0}], [], []))
+    text = results.text(Report([{"a": "x", "b": None, "c": 1.0}], [], []))
     assert text.splitlines()[1].split() == ["x", "1"]

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 from _families import mostly_full
 
-from bench import (
-    _exact_ends,
-    _jax_lines,
-    _peers,
-    _straight_line,
-)
-from bench._motions import MOTIONS
+from bench._problems import exact_ends
+from bench._problems.motions import MOTIONS
+from bench.work_precision import _jax, _peers, _straight_line
 
 EPS = np.finfo(float).eps
 motion_of = cache(lambda name: MOTIONS[name]())
@@ -66,9 +62,9 @@ def test_explicit_equations_are_those_of_the_system(name):
     out = [0.0] * len(y)
     assert np.max(np.abs(np.array(_peers.plain(motion)(0.0, y.tolist(), out)) - expected)) < bound
     params = {key: jnp.asarray(value) for key, value in motion.params.items()}
-    by_hand = jax.jit(_jax_lines.by_hand(motion))(0.0, jnp.asarray(y), params)
+    by_hand = jax.jit(_jax.by_hand(motion))(0.0, jnp.asarray(y), params)
     assert np.max(np.abs(by_hand - expected)) < bound
-    naive = jax.jit(_jax_lines.naive(motion))(0.0, jnp.concatenate([q, v]), params)
+    naive = jax.jit(_jax.naive(motion))(0.0, jnp.concatenate([q, v]), params)
     assert (
         np.max(np.abs(naive - jnp.concatenate([v, a]))) < 10 * bound
     )  # its solve knows no structure
@@ -84,11 +80,11 @@ def test_no_operation_is_written_twice():
 
 
 def test_ends_are_kept_for_every_motion_to_20_digits():
-    ends = json.loads(_exact_ends.PATH.read_text())["ends"]
+    ends = json.loads(exact_ends.PATH.read_text())["ends"]
     assert list(ends) == list(MOTIONS)
     for name, make in MOTIONS.items():
         motion = make()
-        assert _exact_ends.exact_end(name).shape == motion.q0.shape
+        assert exact_ends.exact_end(name).shape == motion.q0.shape
         words = np.ravel(ends[name])
         assert all(len(word.lstrip("-0.").split("E")[0].replace(".", "")) >= 17 for word in words)
 
@@ -97,7 +93,7 @@ def test_ends_are_kept_for_every_motion_to_20_digits():
 def test_orbits_close(name, e):
     """After 100 periods: where they began, but for the rounding of the span and of the start."""
     motion = motion_of(name)
-    off = np.abs(_exact_ends.exact_end(name) - motion.q0)
+    off = np.abs(exact_ends.exact_end(name) - motion.q0)
     # Starts to one rounding: the period is off by as much, times its growth with 1 / (1 - e).
     late = motion.t1 * EPS * 4.0 / (1.0 - e)
     assert off[0] < EPS
@@ -108,6 +104,6 @@ def test_orbits_close(name, e):
 @pytest.mark.parametrize("name", ["rigid aircraft", "rolling disk", "16 double pendulums"])
 def test_ends_are_those_of_a_tight_solve(name):
     motion = motion_of(name)
-    line = _jax_lines.with_jaxlag(motion, "dopri8")
+    line = _jax.with_jaxlag(motion, "dopri8")
     solved = line.read(line.make(1e-13)())
-    assert motion.error(solved.q, _exact_ends.exact_end(name)) < 1e-9
+    assert motion.error(solved.q, exact_ends.exact_end(name)) < 1e-9

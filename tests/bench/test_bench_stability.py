@@ -6,20 +6,15 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from bench import (
-    _drifts,
-    _long_runs,
-    _references,
-    _stress,
-    stability,
-)
+from bench import stability
+from bench.stability import _drifts, _long_runs, _reference_motions, _rows
 
 
 def stressed(bound=1.0, statuses=(), figure=0.5, found=("ok",)):
     def run(quick):
-        return _stress.Found(figure, found)
+        return _rows.Found(figure, found)
 
-    return _stress.Case("row", "figure", bound, statuses, run)
+    return _rows.Case("row", "figure", bound, statuses, run)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +46,7 @@ def test_a_stress_row_that_breaks_off_fails_alone():
     def run(quick):
         raise ValueError("`q0` must be finite")
 
-    row = stability.judged(_stress.Case("row", "figure", 1.0, (), run), quick=True)
+    row = stability.judged(_rows.Case("row", "figure", 1.0, (), run), quick=True)
     assert row["verdict"] == "failed"
     assert row["statuses"] == "raised ValueError: `q0` must be finite"
 
@@ -99,8 +94,11 @@ def test_a_drift_that_cannot_be_told_is_beyond_its_bound():
 def test_a_derivative_by_the_imaginary_part_is_that_of_the_motion():
     """Of motions written by hand, against a difference."""
     along = np.array([0.3, -1.0])
-    ends = [_references.double_pendulum([1.0, 0.5] + h * along, 1.0, 2.0)[0] for h in (1e-4, -1e-4)]
-    slope = _references.double_pendulum(np.array([1.0, 0.5]), 1.0, 2.0, along)[1]
+    ends = [
+        _reference_motions.double_pendulum([1.0, 0.5] + h * along, 1.0, 2.0)[0]
+        for h in (1e-4, -1e-4)
+    ]
+    slope = _reference_motions.double_pendulum(np.array([1.0, 0.5]), 1.0, 2.0, along)[1]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-4, rtol=0, atol=1e-6)
 
 

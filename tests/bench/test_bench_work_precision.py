@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 from bench import __main__ as command
-from bench import (
-    _contest,
-    _contest_plot,
-    _results,
-    work_precision,
-)
+from bench import work_precision
+from bench._harness import results
+from bench.work_precision import _plot, _ranking
 
 COLUMNS = {"system", "line", "knob", "value", "error", "steps"} | {
     "min_us",
@@ -33,7 +30,7 @@ def made_up_rows(ours=1.0):
     across = (1e-4, 1e-13)
     flat = lambda us: [(error, us) for error in across]  # noqa: E731
     rows = []
-    for system in (_contest.REGULAR, "Kepler, e = 0.6"):
+    for system in (_ranking.REGULAR, "Kepler, e = 0.6"):
         rows += rows_of(system, "jaxlag dopri8", *flat(100.0 * ours))
         rows += rows_of(system, "jaxlag dopri8, jax 0.12.0", *flat(1.0))
         rows += rows_of(system, "heyoka", *flat(80.0))
@@ -47,22 +44,22 @@ def made_up_rows(ours=1.0):
 
 
 def test_the_fastest_are_told_at_equal_error():
-    table = _contest.fastest(made_up_rows())
+    table = _ranking.fastest(made_up_rows())
     at = {(row["system"], row["error"]): row for row in table}
-    regular = at[_contest.REGULAR, "1e-06"]
+    regular = at[_ranking.REGULAR, "1e-06"]
     assert (regular["jaxlag_us"], regular["peer_us"]) == (100.0, 80.0)
     assert (regular["peer"], regular["naive_us"]) == ("heyoka", 3000.0)
-    told = {reference.what: reference.figure for reference in _contest.told(made_up_rows())}
-    words = f"{_contest.REGULAR}: fastest at 1e-09; jaxlag dopri8 100 us"
+    told = {reference.what: reference.figure for reference in _ranking.told(made_up_rows())}
+    words = f"{_ranking.REGULAR}: fastest at 1e-09; jaxlag dopri8 100 us"
     assert told[words] == "jaxlag dopri8, jax 0.12.0 1 us"
 
 
 TIMES = "times as long: jaxlag "
-SYSTEMS = (_contest.REGULAR, "Kepler, e = 0.6")
+SYSTEMS = (_ranking.REGULAR, "Kepler, e = 0.6")
 
 
 def test_targets_are_judged_and_what_misses_is_explained():
-    targets, profiles = _contest.judged(made_up_rows(), SYSTEMS)
+    targets, profiles = _ranking.judged(made_up_rows(), SYSTEMS)
     found = {target.claim: (round(target.figure, 6), target.met) for target in targets}
     best = "times as long: jaxlag as the best of heyoka and numba, double pendulum, regular"
     assert found[f"{best} at 1e-06"] == (1.25, False)
@@ -79,10 +76,10 @@ def test_targets_are_judged_and_what_misses_is_explained():
         "jaxlag dopri8 100 us in 100 steps of 1 us (about 0 us however few, and 1 us each)"
         " against heyoka 80 us in 100 steps of 0.8 us"
     )
-    slow = _contest.judged(made_up_rows(ours=3.0), SYSTEMS)[1]
+    slow = _ranking.judged(made_up_rows(ours=3.0), SYSTEMS)[1]
     assert any(reference.what.startswith("3.75 times the best peer") for reference in slow)
     assert not any("times diffrax by hand" in reference.what for reference in slow)
-    slower = {reference.what for reference in _contest.judged(made_up_rows(ours=5.0), SYSTEMS)[1]}
+    slower = {reference.what for reference in _ranking.judged(made_up_rows(ours=5.0), SYSTEMS)[1]}
     words = "1.25 times diffrax by hand with the setting: Kepler, e = 0.6 at 1e-09"
     assert words in slower
 
@@ -90,19 +87,19 @@ def test_targets_are_judged_and_what_misses_is_explained():
 @pytest.mark.parametrize(("fixed", "expected"), [(70.0, (70.0, 0.6)), (0.0, (0.0, 0.6))])
 def test_the_time_besides_the_steps_is_told(fixed, expected):
     points = [{"steps": n, "min_us": fixed + 0.6 * n} for n in (50, 90, 200, 400)]
-    assert np.allclose(_contest.fixed_and_each(points), expected, atol=1e-9)
+    assert np.allclose(_ranking.fixed_and_each(points), expected, atol=1e-9)
 
 
 def test_the_time_besides_the_steps_is_not_negative():
     points = [{"steps": n, "min_us": 0.01 * n**2} for n in (50, 100, 200)]
-    fixed, each = _contest.fixed_and_each(points)
+    fixed, each = _ranking.fixed_and_each(points)
     assert fixed == 0.0
     assert each > 0.0
 
 
 def test_a_system_that_failed_misses_its_targets():
-    targets, _ = _contest.judged(made_up_rows(), [*SYSTEMS, _contest.LANES])
-    lost = [target for target in targets if _contest.LANES in target.claim]
+    targets, _ = _ranking.judged(made_up_rows(), [*SYSTEMS, _ranking.LANES])
+    lost = [target for target in targets if _ranking.LANES in target.claim]
     assert len(lost) == 4  # two of its own, and it is the worst of all twice
     assert not any(target.met for target in lost)
 
@@ -111,28 +108,28 @@ def test_an_error_we_never_reach_is_missed_and_one_only_we_reach_is_met():
     rows = rows_of("a", "jaxlag x", (1e-3, 1.0), (1e-7, 2.0)) + rows_of(
         "a", "heyoka", (1e-3, 1.0), (1e-10, 2.0)
     )
-    assert math.isnan(_contest.ratio(rows, "a", 1e-9, _contest.is_peer))
-    claim = _contest.overall(rows, ["a"])[-1]
+    assert math.isnan(_ranking.ratio(rows, "a", 1e-9, _ranking.is_peer))
+    claim = _ranking.overall(rows, ["a"])[-1]
     assert math.isnan(claim.figure)
     assert not claim.met
     swapped = [
         {**row, "line": {"jaxlag x": "heyoka", "heyoka": "jaxlag x"}[row["line"]]} for row in rows
     ]
-    assert _contest.ratio(swapped, "a", 1e-9, _contest.is_peer) == 0.0
+    assert _ranking.ratio(swapped, "a", 1e-9, _ranking.is_peer) == 0.0
 
 
 def test_a_target_without_the_peer_is_not_met():
     rows = [row for row in made_up_rows() if not row["line"].startswith(("heyoka", "numba"))]
-    targets, _ = _contest.judged(rows, SYSTEMS)
+    targets, _ = _ranking.judged(rows, SYSTEMS)
     against = [target for target in targets if "heyoka" in target.claim]
     assert against
     assert not any(target.met for target in against)
 
 
 def test_the_worst_is_the_largest_or_what_is_unknown():
-    assert _contest.worst({"a": 1.0, "b": 3.0}, smallest=False) == ("b", 3.0)
-    assert _contest.worst({"a": 1.0, "b": 3.0}, smallest=True) == ("a", 1.0)
-    assert _contest.worst({"a": 1.0, "b": math.nan}, smallest=True)[0] == "b"
+    assert _ranking.worst({"a": 1.0, "b": 3.0}, smallest=False) == ("b", 3.0)
+    assert _ranking.worst({"a": 1.0, "b": 3.0}, smallest=True) == ("a", 1.0)
+    assert _ranking.worst({"a": 1.0, "b": math.nan}, smallest=True)[0] == "b"
 
 
 # ---- Diagrams and the command --------------------------------------------------------------------
@@ -141,17 +138,17 @@ def test_the_worst_is_the_largest_or_what_is_unknown():
 def test_diagrams_group_lines_and_lead_with_our_fastest(tmp_path):
     pytest.importorskip("matplotlib")
     rows = made_up_rows()
-    regular = [row for row in rows if row["system"] == _contest.REGULAR]
-    found = _contest_plot.curves(regular)
+    regular = [row for row in rows if row["system"] == _ranking.REGULAR]
+    found = _plot.curves(regular)
     assert set(found) == {
         *("jaxlag dopri8", "jaxlag dopri8, jax 0.12.0", "heyoka", "numba"),
         *("diffrax by hand", "diffrax naive, no setting"),
     }
-    assert _contest_plot.leaders(found) == {"jaxlag dopri8"}
+    assert _plot.leaders(found) == {"jaxlag dopri8"}
     errors, us = found["numba"]
     assert errors.min() >= 1e-8
     assert np.all(np.diff(us) > 0)
-    name = _contest_plot.save(_contest.REGULAR, regular, tmp_path / "new")
+    name = _plot.save(_ranking.REGULAR, regular, tmp_path / "new")
     assert name == "work-precision-double-pendulum-regular.png"
     path = tmp_path / "new" / name
     assert path.read_bytes().startswith(b"\x89PNG")
@@ -169,7 +166,7 @@ def test_a_system_whose_process_dies_is_named_and_the_others_go_on(tmp_path, mon
             raise RuntimeError("a worker ended early with status -11")
         return [row | {"system": name} for row in made_up_rows()[:2]], []
 
-    monkeypatch.setattr(_results, "FOLDER", tmp_path)
+    monkeypatch.setattr(results, "FOLDER", tmp_path)
     monkeypatch.setattr(work_precision, "contest", contest)
     report = work_precision.run(False, system=["heavy top", "rolling disk"])
     assert ("failed", "heavy top: a worker ended early with status -11") in report.references
@@ -180,7 +177,7 @@ def test_a_system_whose_process_dies_is_named_and_the_others_go_on(tmp_path, mon
 def test_results_have_a_line_for_every_row():
     rows = [{"a": 1.5, "b": "row 0"}, {"a": None, "b": "x"}]
     content = {"benchmark": "b", "runs": [{"rows": rows[:1]}, {"rows": rows}]}
-    text = _results._compact(content)
+    text = results._compact(content)
     assert json.loads(text) == content
     assert sum('"b": "' in line for line in text.splitlines()) == 3
 
@@ -257,7 +254,7 @@ def test_another_interpreter_that_cannot_do_it_is_named(monkeypatch):
 
 @pytest.mark.full
 def test_a_quick_run_is_measured_and_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(_results, "FOLDER", tmp_path)
+    monkeypatch.setattr(results, "FOLDER", tmp_path)
     command.main(["work-precision", "--quick"])
     assert "times as long: jaxlag as the best peer" in capsys.readouterr().out
     (run,) = json.loads((tmp_path / "quick" / "work-precision.json").read_text())["runs"]

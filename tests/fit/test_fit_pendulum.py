@@ -9,13 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from systems import _pendulum_fit as pendulum
-from systems import _pendulum_report as report
 from systems import fit_pendulum
-from systems._pendulum_data import DataError, Recording, cut, read, segment, split
-from systems._pendulum_fit import choose, correlation, estimated, fit_segments, guess, try_models
-from systems._pendulum_report import mean_mrad, mrad
+from systems.fit_pendulum import _models as pendulum
+from systems.fit_pendulum import _report as report
 from systems.fit_pendulum import synthetic
+from systems.fit_pendulum._data import DataError, Recording, cut, read, segment, split
+from systems.fit_pendulum._models import (
+    choose,
+    correlation,
+    estimated,
+    fit_segments,
+    guess,
+    try_models,
+)
+from systems.fit_pendulum._report import mean_mrad, mrad
 
 DATA = Path(os.environ.get("JAXLAG_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SINGLE = DATA / "multiarm_pendulum" / "single.csv.gz"

@@ -11,7 +11,7 @@ from _directions import direction, dot
 
 import jaxlag as jl
 from jaxlag._gradient._modes import capacity_for, needed
-from systems._catalogue import find
+from systems.catalogue import find
 
 # Seconds that each runs for. Starts are assembled where they have to stay on constraints.
 SPANS = {

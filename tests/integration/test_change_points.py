@@ -15,7 +15,7 @@ import jaxlag as jl
 from jaxlag._integration._tableaus import nodes_of
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._simulation._methods import METHODS
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 SIDE = (0.0, 1.0)  # where the fixed ends are
 SPEEDS = jnp.linspace(0.9, 1.5, 24)

@@ -8,9 +8,9 @@ from _jaxprs import operations
 from _systems.problems import MOTIONS
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from jaxlag._lowering import State
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
 PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}

@@ -1,9 +1,8 @@
 """Systems with states, under both lowerings."""
 
 import jaxlag as jl
-from bench._scenes import SCENES
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from bench._problems.scenes import SCENES
+from systems.catalogue import ENTRIES, Entry
 
 MOVING = {name: entry for name, entry in ENTRIES.items() if isinstance(entry, Entry)}
 

@@ -7,7 +7,7 @@ from _jaxprs import loop, names, operations
 
 import jaxlag as jl
 from jaxlag._lowering import ArrayProgram, ScalarProgram
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 DOUBLE = ENTRIES["double_pendulum"]
 PARAMS = dict(DOUBLE.example.params)

@@ -9,14 +9,14 @@ from _families import mostly_full
 from _running_error import U, carried, rounded
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from jaxlag._lowering import ArrayTerms
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._symbolic._bias_forms import mass_matrix, momentum_form
 from jaxlag._lowering._symbolic._derive import derive
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._read_system import read_scene
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 WORSE = 4.0  # the bound of the program may be so many times that of L as it is written
 

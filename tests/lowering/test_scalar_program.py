@@ -13,7 +13,7 @@ from _scenes import MOVING, case
 from numpy.linalg import cond, norm
 
 import jaxlag as jl
-from bench._scenes import SCENES
+from bench._problems.scenes import SCENES
 from jaxlag import math
 from jaxlag._lowering import find
 

@@ -19,7 +19,7 @@ from _programs import PACKING, SCALAR, STEP, Case, case, evaluation, solve
 import jaxlag as jl
 from jaxlag._lowering import State
 from jaxlag._system._inspection import mass_definite
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
 

@@ -10,7 +10,7 @@ from _systems.mechanics import GENERAL, chain
 import jaxlag as jl
 from jaxlag._lowering import find_structure
 from jaxlag._tracing._dependence import outputs_depend_on
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 PAIR = ("x", "y")
 

@@ -17,7 +17,7 @@ from _systems.mechanics import chain as any_chain
 import jaxlag as jl
 from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO, factor_mass, solve_mass
 from jaxlag._lowering import State
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2
 chain = partial(any_chain, lowering="array")

@@ -8,7 +8,7 @@ from _lowered import lowered
 from _scenes import case
 
 import jaxlag as jl
-from bench._scenes import SCENES, links
+from bench._problems.scenes import SCENES, links
 from jaxlag._lowering._symbolic import _lower
 from systems import lamina_on_parabola, rigid_aircraft
 

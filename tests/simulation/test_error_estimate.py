@@ -8,7 +8,7 @@ import optimistix
 import pytest
 
 import jaxlag as jl
-from systems.double_pendulum import entry
+from systems.catalogue.chapter3.double_pendulum import entry
 from tests._user import unchecked  # noqa: F401
 
 EPS = np.finfo(float).eps

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import jaxlag as jl
-from systems.quadcopter import entry as quadcopter
+from systems.catalogue.chapter3.quadcopter import entry as quadcopter
 
 # ---- Linear: x'' = -k x - c v, Phi by the matrix exponential ------------------------------------
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag._simulation._methods import METHODS, choose, name_of
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 TS = np.linspace(0.0, 1.0, 3)
 FIXED = [

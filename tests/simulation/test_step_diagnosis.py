@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 
 def pendulum(t, q, v, params):

@@ -10,7 +10,7 @@ import pytest
 from _families import mostly_full
 
 import jaxlag as jl
-from systems.double_pendulum_cartesian import entry
+from systems.catalogue.chapter3.double_pendulum_cartesian import entry
 from tests._user import unchecked  # noqa: F401
 from tests.solvers._flows import EPS, end, slopes, symplectic_defect
 

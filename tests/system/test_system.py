@@ -16,8 +16,7 @@ from _families import mostly_full
 from _systems.mechanics import BEAD, GENERAL, RELATIVISTIC, Case, chain
 from numpy.linalg import norm
 
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from systems.catalogue import ENTRIES, Entry
 
 K = 32
 EPS = np.finfo(float).eps

@@ -10,7 +10,7 @@ import pytest
 from _systems.mechanics import GENERAL
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 K = 32  # roundings of what is summed
 EPS = np.finfo(float).eps

@@ -9,7 +9,7 @@ import numpy as np
 from numpy import cos, sin
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 CLOSE = 1e-11

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from systems._catalogue import find
-from systems._check import Motion
-from systems._entry import AbstractEntry
+from systems.catalogue import AbstractEntry, find
+from systems.reference._check import Motion
 
 
 def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2.5)):

@@ -11,7 +11,7 @@ from _states import random_states
 from numpy import cos, sin
 from scipy.special import ellipj, ellipkinc
 
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 # ---- Tops ----------------------------------------------------------------------------------------
 

@@ -11,31 +11,30 @@ from _families import mostly_full
 
 import jaxlag as jl
 import systems
+from systems import catalogue
 from systems.__main__ import main
-from systems._catalogue import ENTRIES, UnknownSystem, find
-from systems._entry import Chart, Entry, Example
 from systems._run import TOLERANCE, drifts, simulate_example
+from systems.catalogue import ENTRIES, Chart, Entry, Example, UnknownSystem, find
 
-JOBS = {"errata", "fit_pendulum"}
-"""Public modules of the package that are commands, not systems."""
-
-PUBLIC = {
-    path.stem
-    for path in Path(systems.__path__[0]).glob("*.py")
-    if not path.stem.startswith("_") and path.stem not in JOBS
+MODULES = {
+    path.stem: import_module(f"systems.catalogue.{path.parent.name}.{path.stem}")
+    for path in Path(catalogue.__path__[0]).glob("*/*.py")
+    if not path.stem.startswith("_")
 }
 
 
 def test_every_module_is_collected_under_its_own_name():
-    assert set(ENTRIES) == PUBLIC
+    assert set(ENTRIES) == set(MODULES)
     for name, entry in ENTRIES.items():
-        assert import_module(f"systems.{name}").entry is entry
+        assert entry.name == name
+        assert MODULES[name].entry is entry
+        assert getattr(systems, name) is MODULES[name]
 
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_the_docstring_says_what_the_system_is(name):
     entry = ENTRIES[name]
-    doc = import_module(f"systems.{name}").__doc__
+    doc = MODULES[name].__doc__
     assert 'Pila, "Introduction to Lagrangian Dynamics", ch. ' in doc
     assert "\nParameters" in doc
     for word in (*entry.coordinates, *entry.quasi_velocities, *entry.parameter_units):
@@ -46,7 +45,7 @@ def test_the_docstring_says_what_the_system_is(name):
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_the_book_place_is_that_of_the_docstring(name):
-    doc = " ".join(import_module(f"systems.{name}").__doc__.split())
+    doc = " ".join(MODULES[name].__doc__.split())
     entry = ENTRIES[name]
     for figure in re.findall(r"\d\.\d+[a-c]?", entry.book):
         assert figure in doc
@@ -97,6 +96,13 @@ def test_an_unknown_name_gets_its_neighbours(capsys):
         find("zzz")
     assert main(["run", "centralmotion"]) == 1
     assert "Did you mean central_motion" in capsys.readouterr().err
+
+
+def test_a_name_of_no_system_is_no_attribute():
+    with pytest.raises(AttributeError, match="'systems' has no attribute 'duble_pendulum'"):
+        systems.duble_pendulum  # noqa: B018
+    with pytest.raises(ImportError):
+        from systems import duble_pendulum  # noqa: F401
 
 
 def declare(**changes):

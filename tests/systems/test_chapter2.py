@@ -19,10 +19,10 @@ from jax.numpy import cos, sin
 
 import jaxlag as jl
 from systems import two_link_robot_arm
-from systems._catalogue import ENTRIES
-from systems.disk_on_shaft import entry as DISK
-from systems.rotating_body_on_frame import entry as FRAME
-from systems.rotating_body_on_frame import pose as frame_pose
+from systems.catalogue import ENTRIES
+from systems.catalogue.chapter2.disk_on_shaft import entry as DISK
+from systems.catalogue.chapter2.rotating_body_on_frame import entry as FRAME
+from systems.catalogue.chapter2.rotating_body_on_frame import pose as frame_pose
 
 K = 32
 EPS = np.finfo(float).eps

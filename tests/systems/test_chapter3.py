@@ -15,11 +15,11 @@ from jax.numpy import cos, sin
 
 import jaxlag as jl
 from jaxlag import energy, rotation
-from systems._catalogue import ENTRIES
-from systems.falling_stick import centre as stick_centre
-from systems.falling_stick import normal_force
-from systems.spherical_pendulum_fixed import tension
-from systems.symmetric_plane_pendulum import pin_reaction
+from systems.catalogue import ENTRIES
+from systems.catalogue.chapter3.falling_stick import centre as stick_centre
+from systems.catalogue.chapter3.falling_stick import normal_force
+from systems.catalogue.chapter3.spherical_pendulum_fixed import tension
+from systems.catalogue.chapter3.symmetric_plane_pendulum import pin_reaction
 
 K = 32
 EPS = np.finfo(float).eps

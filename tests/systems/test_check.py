@@ -11,11 +11,11 @@ from _paths import REFERENCE
 
 import jaxlag as jl
 from jaxlag._simulation import _simulate
-from systems import _check
 from systems.__main__ import main
-from systems._catalogue import ENTRIES
-from systems._check import compare, replay, replay_case, replay_prescribed, replay_rest
-from systems._reference import load, read
+from systems.catalogue import ENTRIES
+from systems.reference import _check
+from systems.reference._check import compare, replay, replay_case, replay_prescribed, replay_rest
+from systems.reference._files import load, read
 
 
 def written(path, raw):

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
-from systems._entry import Entry
+from systems.catalogue import ENTRIES, Entry
 
 HALF = np.pi / 2
 

@@ -21,8 +21,8 @@ from _states import random_states
 from numpy import cos, sin
 from numpy.linalg import norm
 
-from systems._catalogue import ENTRIES
-from systems._quantities import quantities
+from systems.catalogue import ENTRIES
+from systems.reference._quantities import quantities
 
 K = 32
 EPS = np.finfo(float).eps

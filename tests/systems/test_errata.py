@@ -11,8 +11,8 @@ from _families import mostly_full
 
 from systems import errata
 from systems.__main__ import main
-from systems._erratum import DRAWS, around, examine
 from systems.errata import ERRATA, TEXT_ONLY, TOLERANCE, WRONG, confirmed
+from systems.errata._erratum import DRAWS, around, examine
 
 by_place = pytest.mark.parametrize(
     "erratum", mostly_full(ERRATA, *ERRATA[::10]), ids=lambda erratum: erratum.place

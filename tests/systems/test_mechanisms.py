@@ -12,7 +12,7 @@ from numpy import cos, sin
 
 import jaxlag as jl
 from systems import four_bar, n_link_loop, slider_crank
-from systems._entry import Chart
+from systems.catalogue import Chart
 
 TIGHT = {"method": "tsit5", "rtol": 1e-12, "atol": 1e-12}
 """Of low order, for which less is compiled."""

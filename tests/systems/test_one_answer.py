@@ -11,7 +11,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxlag as jl
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 
 TIGHT = {"method": "tsit5", "rtol": 1e-12, "atol": 1e-12}
 FEW_STAGES = TIGHT | {"method": "bosh3", "max_steps": 32768}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from _files import harmonic, recorded
 
-from systems._catalogue import ENTRIES
-from systems._check import replay, replay_rest
-from systems._fields import InvalidReference
-from systems._reference import load, read
+from systems.catalogue import ENTRIES
+from systems.reference._check import replay, replay_rest
+from systems.reference._files import load, read
+from systems.reference._json_fields import InvalidReference
 
 CASE = ("cases", 0)
 

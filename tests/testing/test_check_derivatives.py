@@ -28,7 +28,7 @@ from _families import mostly_full
 
 import jaxlag as jl
 from jaxlag import testing
-from systems._catalogue import ENTRIES
+from systems.catalogue import ENTRIES
 from tests._user import unchecked  # noqa: F401
 
 # ---- What is looked at ------------------------------------------------------------------------

@@ -1,0 +1,97 @@
+"""Child processes that time the same cases under different settings, taking turns.
+
+A setting that XLA reads once per process needs a process of its own. Each worker compiles its
+cases once, alone on the machine; then the workers are asked for a round of timings in turn.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from bench._harness.timing import interleaved
+
+ROOT = Path(__file__).parents[2]
+
+
+class Worker:
+    """A process that has compiled the cases of a benchmark under `settings`.
+
+    It starts without XLA_FLAGS: those of this process hold what importing jaxlag here has put in.
+    `interpreter` is the Python it runs in, `core` the one core it keeps to.
+
+    Attributes:
+        facts: what the benchmark's `prepare` knows of its cases before they are timed.
+    """
+
+    def __init__(
+        self,
+        benchmark: str,
+        quick: bool,
+        settings: Mapping[str, str],
+        interpreter: str = sys.executable,
+        core: int | None = None,
+    ) -> None:
+        environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
+        options = ["--quick"] if quick else []
+        options += [] if core is None else [f"--core={core}"]
+        self._process = subprocess.Popen(
+            [interpreter, "-m", "bench._harness.workers", benchmark, *options],
+            env={**environment, **settings},
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.facts: dict[str, Any] = self._answer()
+
+    def seconds(self, cases: Sequence[str] | None = None) -> dict[str, list[float]]:
+        """Seconds of every run in one turn of every case, or of those named."""
+        assert self._process.stdin is not None
+        print(json.dumps(cases), file=self._process.stdin, flush=True)
+        return self._answer()
+
+    def __enter__(self) -> "Worker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate()  # its input ends, and so does it
+
+    def _answer(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"a worker ended early with status {self._process.wait()}")
+        return json.loads(line)
+
+
+def serve(benchmark: str, quick: bool) -> None:
+    """The other end: facts first, then the timings of one turn for every line read."""
+    # What libraries write to the output must not get between the answers.
+    with os.fdopen(os.dup(sys.stdout.fileno()), "w") as answers:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+        calls, facts = import_module(f"bench.{benchmark}").prepare(quick)
+        print(json.dumps(facts), file=answers, flush=True)
+        for line in sys.stdin:
+            names = json.loads(line)
+            chosen = calls if names is None else {name: calls[name] for name in names}
+            print(json.dumps(interleaved(chosen, rounds=1)), file=answers, flush=True)
+
+
+def main(options: Sequence[str]) -> None:
+    """A worker's command line: the benchmark, --quick, --core=NUMBER."""
+    for option in options[1:]:
+        if option.startswith("--core="):  # before XLA counts the cores it may use
+            os.sched_setaffinity(0, {int(option.removeprefix("--core="))})
+    jax.config.update("jax_enable_x64", True)
+    serve(options[0], "--quick" in options)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,175 @@
+"""References of 20 digits and more for motions of the systems.
+
+Two motions of every system that moves, from the starts in `bench._problems.starts`, go into one
+file of `bench/references/`. The equations are plain derivatives of the declaration (`equations`),
+in 50 digits, integrated by extrapolation of order 26 to 1e-26 per step; the engine takes no part. A
+second integration of another order and tolerance says how far to trust the first: the file holds
+the largest difference of the two.
+
+    python -m bench._multiprecision.make_references                     all, in half an hour
+    python -m bench._multiprecision.make_references double_pendulum     some
+    python -m bench._multiprecision.make_references --check [NAME ...]  make them again and compare
+
+Needs gmpy2 (`pip install "jaxlag[bench]"`).
+"""
+
+import json
+import sys
+from argparse import ArgumentParser
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from bench._multiprecision.equations import DIGITS, Motion
+from bench._multiprecision.extrapolation import integrated
+from bench._problems.starts import STARTS, Start
+
+MODULE = "bench._multiprecision.make_references"
+FOLDER = Path(__file__).parents[1] / "references"
+SAVES = 33
+KEPT = 25  # digits in the files
+COLUMNS, TOLERANCE = 13, 1e-26
+OTHER_COLUMNS, OTHER_TOLERANCE = 11, 1e-24
+AGREEMENT = 1e-18  # of the two integrations, relative to 1 + |y|
+
+
+class Reference(NamedTuple):
+    """One motion, as a benchmark wants it.
+
+    Attributes:
+        start: what the start is called.
+        times: (s,), s.
+        y: (s, 2n), the doubles nearest to (q, v).
+        agreement: of two integrations, relative to 1 + |y|.
+    """
+
+    start: str
+    times: np.ndarray
+    y: np.ndarray
+    agreement: float
+
+
+def load(name: str, folder: Path = FOLDER) -> tuple[Mapping[str, Any], list[Reference]]:
+    """(parameters, motions) of a file."""
+    content = json.loads((folder / f"{name}.json").read_text())
+    motions = [
+        Reference(
+            motion["start"],
+            np.array(motion["times"]),
+            np.array([[float(x) for x in (*q, *v)] for q, v in _rows(motion)]),
+            motion["agreement"],
+        )
+        for motion in content["motions"]
+    ]
+    return content["params"], motions
+
+
+def made(system: Any, params: Mapping[str, Any], starts: Sequence[Start]) -> list[dict[str, Any]]:
+    """The motions of a system, as they are written into its file."""
+    motion = Motion(system, params)
+    return [_followed(motion, start) for start in starts]
+
+
+def _followed(motion: Motion, start: Start) -> dict[str, Any]:
+    times = [start.duration * i / (SAVES - 1) for i in range(SAVES)]
+    y = motion.start(start.q0, start.v0)
+    rows, steps = integrated(motion.rates, y, times, TOLERANCE, COLUMNS)
+    others, _ = integrated(motion.rates, y, times, OTHER_TOLERANCE, OTHER_COLUMNS)
+    n = motion.size
+    return {
+        "start": start.name,
+        "times": times,
+        "q": [[_digits(x) for x in row[:n]] for row in rows],
+        "v": [[_digits(x) for x in row[n:]] for row in rows],
+        "steps": steps,
+        "agreement": float(f"{apart(rows, others):.1e}"),
+    }
+
+
+def apart(rows: Sequence[Sequence], others: Sequence[Sequence]) -> float:
+    """Largest difference relative to 1 + |y|."""
+    pairs = [(a, b) for x, y in zip(rows, others, strict=True) for a, b in zip(x, y, strict=True)]
+    return max(float(abs(a - b) / (1 + abs(a))) for a, b in pairs)
+
+
+def differences(motion: Mapping[str, Any], again: Mapping[str, Any]) -> float:
+    """How far a motion of a file is from the same made again, relative to 1 + |y|."""
+    if motion["times"] != again["times"] or motion["start"] != again["start"]:
+        return float("inf")
+    import gmpy2
+
+    def numbers(motion: Mapping[str, Any]) -> list[list]:
+        return [[gmpy2.mpfr(x) for x in (*q, *v)] for q, v in _rows(motion)]
+
+    return apart(numbers(motion), numbers(again))
+
+
+def _rows(motion: Mapping[str, Any]) -> Any:
+    return zip(motion["q"], motion["v"], strict=True)
+
+
+def _digits(x: Any) -> str:
+    return f"{x:.{KEPT - 1}e}"
+
+
+def _entries() -> Mapping[str, Any]:
+    from systems.catalogue import ENTRIES
+
+    return {name: entry for name, entry in ENTRIES.items() if entry.kind == "trajectory"}
+
+
+def plain(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters as files have them: numbers and lists."""
+    return {name: np.asarray(value).tolist() for name, value in params.items()}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make references, or check them; 0 if all agree with themselves and with the files."""
+    parser = ArgumentParser(prog=f"python -m {MODULE}", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="systems; by default all")
+    parser.add_argument("--check", action="store_true", help="compare with the files, write none")
+    arguments = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    entries, good = _entries(), True
+    for name in arguments.names or entries:
+        begin, entry = perf_counter(), entries[name]
+        try:
+            motions = made(entry.system, entry.example.params, STARTS[name])
+        except ArithmeticError as error:  # the others go on
+            print(f"{name:<36} {error}", flush=True)
+            good = False
+            continue
+        apart = [motion["agreement"] for motion in motions]
+        if arguments.check:
+            kept = json.loads((FOLDER / f"{name}.json").read_text())["motions"]
+            pairs = zip(kept, motions, strict=True)
+            apart += [differences(*pair) for pair in pairs]
+        else:
+            _write(name, entry, motions)
+        fine = max(apart) <= AGREEMENT
+        good = good and fine
+        seconds = perf_counter() - begin
+        verdict = "ok" if fine else "NOT TRUSTED"
+        print(f"{name:<36} {max(apart):.1e} {verdict:<11} {seconds:6.1f} s", flush=True)
+    return 0 if good else 1
+
+
+def _write(name: str, entry: Any, motions: list[dict[str, Any]]) -> None:
+    content = {
+        "system": name,
+        "made_by": f"python -m {MODULE} {name}",
+        "arithmetic": f"gmpy2.mpfr, {DIGITS} digits; {KEPT} digits kept",
+        "integration": f"extrapolated midpoint rule, order {2 * COLUMNS}, {TOLERANCE:g} per step",
+        "params": plain(entry.example.params),
+        "motions": motions,
+    }
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / f"{name}.json").write_text(json.dumps(content, indent=0) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Constraint drift over a million steps: residuals, energy, and time per step of stabilisation.
+
+Two linkages (bench/_problems/mechanisms.py), by both formulations with multipliers, with nothing
+against drift ("none"), with Baumgarte's damping and with projection; and two systems that roll, by
+multipliers without and with projection, and in quasi-velocities, in which nothing can drift. Steps
+are fixed: 0.01 s of order 8. Baumgarte's alpha = beta = 0.1 / step damp residuals critically, over
+ten steps.
+
+A quick run takes 20 000 steps, of the linkages the first by multipliers without Baumgarte's
+damping, of what rolls the first: most of its time goes into compilation.
+
+Motions that tumble are chaotic and soon differ between the cases. Compared is what should stay as
+it was at the start, in 1001 rows (quick: 201) evenly over the run; nan where a run failed.
+`position`: the largest |phi_k| / |A_k| of any row k, about the distance from the constraint, in m
+(double pendulum) or rad (four-bar), 0 for what has none; `growth`: that over the largest of the
+first tenth of the run;
+`velocity`: the largest |A v + b|_k / |A_k|, in m/s or rad/s; `energy`: the largest |H - H0| / T0,
+T0 the kinetic energy at the start; `slope`: that of a line through the second half of
+(H - H0) / T0, per million steps. `min_us` and `median_us` are per step; `ratio` is min_us over that
+of "none" with the same mechanism and formulation, of quasi-velocities over that of multipliers with
+projection.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import jaxlag as jl
+from bench._harness import results
+from bench._harness.timing import Program, Reference, Report, Target, build, interleaved, spread
+from bench._problems.mechanisms import LINKAGES, ROLLING, Mechanism
+from bench.constraints import _drift_plot
+
+STEP = 0.01  # s
+METHOD = "dopri8"
+GAIN = 0.1 / STEP  # 1/s
+NONE, BAUMGARTE, PROJECTION = "none", "Baumgarte", "projection"
+STABILISATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
+FORMULATIONS = ("multipliers", "null_space")
+QUASI = "quasi"
+STEPS, ROWS = 1_000_000, 1001
+QUICK_STEPS, QUICK_ROWS = 20_000, 201
+
+Row = dict[str, Any]
+
+
+class Case(NamedTuple):
+    """What is compared."""
+
+    mechanism: str
+    formulation: str
+    stabilisation: str
+
+
+def cases(quick: bool) -> list[Case]:
+    """All that is compared."""
+    linkages, rolling = list(LINKAGES), list(ROLLING)
+    forms, ways = list(FORMULATIONS), list(STABILISATIONS)
+    if quick:
+        linkages, rolling, forms, ways = linkages[:1], rolling[:1], forms[:1], [NONE, PROJECTION]
+    found = [Case(*each) for each in product(linkages, forms, ways)]
+    for name in rolling:
+        found += [Case(name, forms[0], way) for way in (NONE, PROJECTION)]
+        found.append(Case(name, QUASI, NONE))
+    return found
+
+
+class Record(NamedTuple):
+    """One run at its rows: the columns of the same names before the largest is taken.
+
+    Attributes:
+        steps: steps up to the row.
+        position: largest |phi_k| / |A_k|.
+        velocity: largest |A v + b|_k / |A_k|.
+        energy: (H - H0) / T0.
+    """
+
+    steps: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    energy: np.ndarray
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run came to its end."""
+        return all(np.isfinite(each).all() for each in self)
+
+
+def run(quick: bool) -> Report:
+    """All cases: recorded one after the other, timed in turn."""
+    steps, rows = (QUICK_STEPS, QUICK_ROWS) if quick else (STEPS, ROWS)
+    compared = cases(quick)
+    starts = LINKAGES | ROLLING
+    mechanisms = {name: starts[name]() for name in dict.fromkeys(c.mechanism for c in compared)}
+    calls, programs, records = {}, {}, {}
+    for case in compared:
+        mechanism = mechanisms[case.mechanism]
+        programs[case] = program = compiled(mechanism, case, steps, rows)
+        calls[", ".join(case)] = call = partial(program.call, mechanism.q0, mechanism.v0)
+        q, v = call()
+        records[case] = record(mechanism, q, v, steps)
+    samples = interleaved(calls, 8, budget_s=1.0 if quick else 8.0)
+    found = {
+        case: {
+            **case._asdict(),
+            **figures(records[case]),
+            **programs[case].cost(),
+            **times(samples[", ".join(case)], records[case]),
+        }
+        for case in compared
+    }
+    for case, row in found.items():
+        row["ratio"] = row["min_us"] / found[against(case)]["min_us"]
+    targets, references = judged(list(found.values()))
+    folder = results.FOLDER / "quick" if quick else results.FOLDER
+    references.append(Reference(_drift_plot.save(records, folder / "constraints.png"), "curves"))
+    return Report(list(found.values()), targets, references)
+
+
+def against(case: Case) -> Case:
+    """What a step of this case is timed against."""
+    if case.formulation == QUASI:
+        return Case(case.mechanism, FORMULATIONS[0], PROJECTION)
+    return case._replace(stabilisation=NONE)
+
+
+def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program:
+    """(q0, v0) -> (q, v), evenly over `steps` steps; nan from where the run failed."""
+    ts = np.linspace(0.0, steps * STEP, rows)
+
+    def solve(q0: Array, v0: Array) -> tuple[Array, Array]:
+        motion = jl.simulate(
+            mechanism.system,
+            q0,
+            v0,
+            ts,
+            mechanism.params,
+            method=METHOD,
+            dt=STEP,
+            max_steps=steps + 1,  # the times of steps are rounded, and may leave a short last one
+            formulation=case.formulation,
+            stabilization=STABILISATIONS[case.stabilisation],
+            throw=False,
+        )
+        return motion.q, motion.v
+
+    return build(solve, mechanism.q0, mechanism.v0)
+
+
+def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
+    """Of states (q, v), the first at the start and the last after `steps` steps."""
+
+    def rows(q: Array, v: Array) -> tuple[Array, Array]:
+        position, velocity = mechanism.system.residuals(q, v, mechanism.params)
+        rates = jnp.concatenate([jnp.ravel(x) for x in velocity.values()])
+        if not position:  # rows without phi
+            return jnp.zeros_like(rates), rates
+        return jnp.concatenate([jnp.ravel(x) for x in position.values()]), rates
+
+    @jax.jit
+    @jax.vmap
+    def each(q: Array, v: Array) -> tuple[Array, Array, Array]:
+        A = jax.jacfwd(lambda v: rows(q, v)[1])(v)
+        position, velocity = (jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in rows(q, v))
+        return position, velocity, mechanism.system.energy(q, v, mechanism.params)
+
+    position, velocity, H = (np.asarray(x) for x in each(q, v))
+    return Record(
+        np.linspace(0.0, steps, len(H)), position, velocity, (H - H[0]) / mechanism.energy
+    )
+
+
+def figures(record: Record) -> dict[str, float]:
+    """The columns on one record."""
+    count = len(record.steps)
+    early, late = slice(1, count // 10 + 1), slice(count // 2, None)
+    position = float(np.max(record.position))
+    millions = (record.steps[late] - np.mean(record.steps[late])) / 1e6
+    return {
+        "position": position,
+        "growth": position / (float(np.max(record.position[early])) or 1.0),
+        "velocity": float(np.max(record.velocity)),
+        "energy": float(np.max(np.abs(record.energy))),
+        "slope": float(millions @ record.energy[late] / (millions @ millions)),
+    }
+
+
+def times(samples: Sequence[float], record: Record) -> Row:
+    """The columns on time: per step, and nan for a run that failed, since it ended early."""
+    columns = spread(samples, "us", round(record.steps[-1]))
+    if record.complete:
+        return columns
+    return columns | {"min_us": np.nan, "median_us": np.nan}
+
+
+def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
+    """Targets for each formulation, its worst mechanism named; references for the rest."""
+    found = {Case(*(row[name] for name in Case._fields)): row for row in rows}
+    targets = []
+    for formulation in FORMULATIONS:
+        projected = {
+            case: row for case, row in found.items() if case[1:] == (formulation, PROJECTION)
+        }
+        if not projected:
+            continue
+        drifts = {
+            case: row["energy"] / found[against(case)]["energy"] for case, row in projected.items()
+        }
+        for words, figure, bound in (
+            ("position residual with projection", _of(projected, "position"), 1e-12),
+            ("velocity residual with projection", _of(projected, "velocity"), 1e-12),
+            ("times the energy drift: projection as none", drifts, 1.0),
+            ("times as long: a step with projection as none", _of(projected, "ratio"), 1.5),
+        ):
+            targets.append(_worst(f"{words}, {formulation}", figure, bound))
+    rolling = {case: row for case, row in found.items() if case.formulation == QUASI}
+    if rolling:
+        drifts = {
+            case: row["energy"] / found[against(case)]["energy"] for case, row in rolling.items()
+        }
+        targets += [
+            _worst("velocity residual, quasi", _of(rolling, "velocity"), 1e-12),
+            _worst("times the energy drift: quasi as multipliers with projection", drifts, 1.0),
+            _worst(
+                "times as long: a step, quasi as multipliers with projection",
+                _of(rolling, "ratio"),
+                1.0,
+            ),
+        ]
+    return targets, _references(found)
+
+
+def _worst(words: str, figure: Mapping[Case, float], bound: float) -> Target:
+    """The target that no mechanism exceeds the bound, the worst named."""
+    # nan is worse than any number.
+    worst = max(figure, key=lambda case: np.nan_to_num(figure[case], nan=np.inf))
+    return Target(f"{words} ({worst.mechanism})", figure[worst], "<=", bound)
+
+
+def _of(rows: Mapping[Case, Row], column: str) -> dict[Case, float]:
+    return {case: row[column] for case, row in rows.items()}
+
+
+def _references(rows: Mapping[Case, Row]) -> list[Reference]:
+    references = []
+    for stabilisation, column, words in (
+        (NONE, "position", "position residual without stabilisation"),
+        (NONE, "growth", "times that of the first tenth of the run: the same"),
+        (BAUMGARTE, "position", "position residual with Baumgarte's damping"),
+        (BAUMGARTE, "velocity", "velocity residual with Baumgarte's damping"),
+        (BAUMGARTE, "ratio", "times as long: a step with Baumgarte's damping as none"),
+    ):
+        values = [
+            row[column]
+            for case, row in rows.items()
+            if case[2] == stabilisation and case.mechanism not in ROLLING
+        ]
+        if not values:
+            continue
+        ends = [f"{x:.2g}" for x in (np.min(values), np.max(values))]
+        references.append(Reference(" to ".join(dict.fromkeys(ends)), words))
+    return references

@@ -1,0 +1,144 @@
+"""Seconds from a declared motion to its first result, in fresh processes.
+
+Nine systems, each with 2 rows, 101 rows, a gradient, 256 lanes and their gradients, at tolerance
+1e-9. "cold" is a process with an empty compile cache, "warm" the next one with the same cache;
+importing jaxlag is apart. Beside it diffrax' Dopri8 on equations written by hand, cold, and heyoka
+(building its Taylor integrator and running it once). Of all rounds the shortest is kept; ends are
+compared with diffrax'.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from bench._harness.timing import Reference, Report, Target
+from bench._harness.workers import ROOT
+from bench.first_result._one_process import CASES
+
+SMALL = ("simple pendulum", "double pendulum", "cart pendulum", "rotating body")
+LARGE = ("chain of 8", "chain of 12", "5 bodies", "network potential")
+SCENES = (*SMALL[:3], "quadcopter", SMALL[3], *LARGE)
+ROUNDS = 2
+ROWS = CASES[:2]
+# By its path: as a module of this package it would import jax before anything is timed.
+ONE_PROCESS = str(Path(__file__).with_name("_one_process.py"))
+APART = 1e-5  # of ends, over 1 + their size: tolerance 1e-9 a step, magnified on the way
+CACHE = {
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
+
+
+def run(quick: bool) -> Report:
+    """Every process by itself, one after the other."""
+    scenes, cases = (SCENES[:2], CASES[:1]) if quick else (SCENES, CASES)
+    rows = []
+    for scene in scenes:
+        heyoka = first("heyoka", scene, CASES[0], None) if find_spec("heyoka") else {}
+        for case in cases:
+            found = [_round(scene, case) for _ in range(1 if quick else ROUNDS)]
+            rows.append(_row(scene, case, found, heyoka if case == CASES[0] else {}))
+    return Report(rows, *judged(rows))
+
+
+def first(side: str, scene: str, case: str, cache: str | None) -> dict[str, Any]:
+    """What one process says of its program."""
+    environment = {
+        key: value
+        for key, value in os.environ.items()
+        if key != "XLA_FLAGS" and not key.startswith("JAX_")
+    }
+    environment["PYTHONPATH"] = str(ROOT)
+    if cache is not None:
+        environment |= {"JAX_COMPILATION_CACHE_DIR": cache, **CACHE}
+    done = subprocess.run(
+        [sys.executable, ONE_PROCESS, side, scene, case],
+        env=environment,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _round(scene: str, case: str) -> dict[str, dict[str, Any]]:
+    with TemporaryDirectory() as cache:
+        cold, warm = (first("jaxlag", scene, case, cache) for _ in range(2))
+    return {"cold": cold, "warm": warm, "diffrax": first("diffrax", scene, case, None)}
+
+
+def _row(
+    scene: str, case: str, rounds: Sequence[Mapping[str, Any]], heyoka: Mapping[str, Any]
+) -> dict[str, Any]:
+    cold, warm, diffrax = (
+        min((found[side] for found in rounds), key=lambda x: x["first_s"])
+        for side in ("cold", "warm", "diffrax")
+    )
+    run_ms = {side: min(r[side]["run_ms"] for r in rounds) for side in ("cold", "diffrax")}
+    apart = _apart(cold["end"], diffrax["end"])
+    if case in ROWS and not apart <= APART:
+        raise RuntimeError(f"{scene}: jaxlag and the equations by hand end {apart:.1e} apart")
+    return {
+        "scene": scene,
+        "case": case,
+        "import_s": cold["import_s"],
+        "cold_s": cold["first_s"],
+        "derive_s": cold["derive_s"],
+        "lower_s": cold["lower_s"],
+        "compile_s": cold["compile_s"],
+        "warm_s": warm["first_s"],
+        "diffrax_s": diffrax["first_s"],
+        "heyoka_s": heyoka.get("first_s"),
+        "run_ms": run_ms["cold"],
+        "diffrax_run_ms": run_ms["diffrax"],
+        "heyoka_run_ms": heyoka.get("run_ms"),
+        "apart": apart if case in ROWS else None,
+        "rounds": len(rounds),
+    }
+
+
+def _apart(a: Sequence[float], b: Sequence[float]) -> float:
+    if len(a) != len(b):  # y behind the coordinates may be something else by hand
+        return float("nan")
+    x, y = np.asarray(a), np.asarray(b)
+    return float(np.max(np.abs(x - y) / (1.0 + np.abs(y))))
+
+
+def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[Reference]]:
+    """The worst row of every kind."""
+    targets = []
+    names = {row["scene"] for row in rows}
+    for kind, wanted, bounds in (
+        ("n <= 4", SMALL, (1.5, 3.0)),
+        ("the quadcopter", ("quadcopter",), (2.5, 4.0)),
+        ("chains, bodies, a network", LARGE, (4.0, 8.0)),
+    ):
+        for what, cases, bound in (("rows", ROWS, bounds[0]), ("a gradient", ("grad",), bounds[1])):
+            if names & set(wanted):
+                found = _worst(rows, wanted, cases, lambda row: row["cold_s"])
+                targets.append(Target(f"s to the first result: {what}, {kind}", found, "<=", bound))
+    for what, cases, bound in (("rows", ROWS, 1.2), ("a gradient", ("grad",), 1.0)):
+        found = _worst(rows, SCENES, cases, lambda row: row["cold_s"] / row["diffrax_s"])
+        claim = f"times as long to the first result as diffrax by hand: {what}"
+        targets.append(Target(claim, found, "<=", bound))
+    found = _worst(rows, SCENES, CASES, lambda row: row["warm_s"])
+    targets.append(Target("s to the first result with the persistent cache", found, "<=", 1.5))
+    slower = [row for row in rows if row["run_ms"] > row["diffrax_run_ms"]]
+    references = [
+        Reference(f"{len(slower)} of {len(rows)}", "rows that run longer than diffrax by hand")
+    ]
+    return targets, references
+
+
+def _worst(rows: Sequence[Mapping[str, Any]], scenes: Any, cases: Any, figure: Any) -> float:
+    found = [figure(row) for row in rows if row["scene"] in scenes and row["case"] in cases]
+    return max(found, default=float("nan"))

@@ -1,0 +1,61 @@
+"""Recordings of real machines, from a folder outside this project."""
+
+import gzip
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+import jaxlag as jl
+
+VARIABLE = "JAXLAG_DATA"
+
+
+class DataError(ValueError):
+    """The recordings are not where they were said to be."""
+
+
+def folder(given: str | None) -> Path:
+    """Where the recordings lie.
+
+    Args:
+        given: the folder; None for the one that JAXLAG_DATA names.
+
+    Raises:
+        DataError: there is none.
+    """
+    path = given or os.environ.get(VARIABLE)
+    if not path:
+        must = f"--data must name the folder of recordings, or {VARIABLE} must, but neither did"
+        raise DataError(f"{must}. See the docstring of bench.fits for what it holds.")
+    if not Path(path).is_dir():
+        raise DataError(f"--data must name a folder, but {path} is none.")
+    return Path(path)
+
+
+def table(path: Path) -> dict[str, np.ndarray]:
+    """Columns by name: of a CSV file, gzipped, with comments (#) and a line of names at its top."""
+    with gzip.open(path, "rt") as file:
+        head = next(line for line in file if not line.startswith("#"))
+        rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    return dict(zip(head.strip().split(","), rows.T, strict=True))
+
+
+def pieces(columns: dict[str, np.ndarray], by: str) -> dict[int, dict[str, np.ndarray]]:
+    """The rows of each number in the column `by`."""
+    numbers = columns[by].astype(int)
+    return {
+        int(number): {name: x[numbers == number] for name, x in columns.items()}
+        for number in np.unique(numbers)
+    }
+
+
+def windows(recordings: Iterable[jl.Experiment], seconds: float) -> list[jl.Experiment]:
+    """All windows of all recordings that are as long as one."""
+    return [
+        window
+        for each in recordings
+        if each.ts[-1] - each.ts[0] + np.median(np.diff(each.ts)) >= (1 - 1e-9) * seconds
+        for window in each.windows(seconds)
+    ]

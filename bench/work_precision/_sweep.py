@@ -1,0 +1,132 @@
+"""Lines of a diagram of work over error: one way to solve at many tolerances or steps."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import jax
+
+from bench._harness.timing import Call, seconds
+
+CLOSE = 3e-14  # an error no tighter tolerance needs to go below
+WRONG = 0.1  # errors that no line needs
+ROUNDED = 1e-8  # from here on
+PATIENCE = 3  # values in a row without progress mean that rounding has the last word
+FACTOR = 4  # by which a first run may exceed the patience, for what it compiles
+
+
+class Solved(NamedTuple):
+    """What one run ended with.
+
+    Attributes:
+        q: coordinates at the end; nan where it was not reached.
+        steps: accepted steps; None where the program does not tell.
+    """
+
+    q: Any
+    steps: int | None = None
+
+
+class Line(NamedTuple):
+    """One way to solve a motion.
+
+    Attributes:
+        knob: "tolerance" or "step" (in s).
+        knobs: its values, from loose to tight.
+        make: a call that returns finished work for one value.
+        read: what it returned.
+        build_s: what it took to get here, compilation in it; `make` may add to that.
+        said: what runs that failed said, added to as they do.
+    """
+
+    knob: str
+    knobs: Sequence[float]
+    make: Callable[[float], Call]
+    read: Callable[[Any], Solved]
+    build_s: float
+    said: Sequence[str] = ()
+
+    def why_none(self, patience_s: float) -> str:
+        """Of a line without a point."""
+        if self.said:
+            return self.said[-1]
+        return f"no run of at most {FACTOR * patience_s:g} s ended with an error below {WRONG:g}"
+
+
+def tolerances(loosest: float = 2.5, tightest: float = 14.0, each: float = 0.5) -> list[float]:
+    """Powers of ten from 10^-loosest on."""
+    count = round((tightest - loosest) / each) + 1
+    return [10.0 ** -(loosest + each * i) for i in range(count)]
+
+
+def steps(t1: float, fewest: int, most: int) -> list[float]:
+    """Steps that go into the span a whole number of times, from `fewest` on."""
+    counts = [fewest * 2**i for i in range(32)]
+    return [t1 / count for count in counts if count <= most]
+
+
+def built(make: Callable[[], Line]) -> Line:
+    """The line, with what making it took."""
+    start = perf_counter()
+    line = make()
+    return line._replace(build_s=line.build_s + perf_counter() - start)
+
+
+def swept(
+    line: Line, error: Callable[[Any], float], patience_s: float
+) -> tuple[dict[str, Call], list[dict[str, Any]]]:
+    """Calls by the values of the knob, and what is known of them before they are timed.
+
+    It ends where rounding takes over and with the first run longer than `patience_s`. Points have
+    the two runs made here: `swept_s`.
+    """
+    calls: dict[str, Call] = {}
+    points: list[dict[str, Any]] = []
+    best, idle = math.inf, 0
+    for value in line.knobs:
+        start = perf_counter()
+        call = line.make(value)
+        made = perf_counter() - start
+        start = perf_counter()
+        solved = line.read(jax.block_until_ready(call()))
+        first = perf_counter() - start
+        if first > FACTOR * patience_s:
+            break
+        again = seconds(call)
+        found = error(solved.q)
+        if found < WRONG:  # nan is not
+            calls[f"{value:.3g}"] = call
+            points.append(
+                {
+                    "knob": line.knob,
+                    "value": value,
+                    "error": found,
+                    "steps": solved.steps,
+                    "compile_s": line.build_s + made,
+                    "swept_s": [first, again],
+                }
+            )
+        if found < 0.7 * best:
+            best, idle = found, 0
+        elif best < ROUNDED:
+            idle += 1
+        if best < CLOSE or idle == PATIENCE or again > patience_s:
+            break
+    return calls, points
+
+
+def time_at(points: Iterable[Mapping[str, Any]], error: float, column: str) -> float | None:
+    """Least time in which the line reaches an error, None where it never does.
+
+    Between two neighbours on the line that enclose it, times are interpolated in logarithms. Where
+    the loosest point is better already, its own time is one that suffices.
+    """
+    line = [(point["error"], point[column]) for point in points]
+    found = [line[0][1]] if line and line[0][0] <= error else []
+    for (loose, fast), (tight, slow) in pairwise(line):
+        if loose > error >= tight:
+            part = math.log(loose / error) / math.log(loose / max(tight, 1e-300))
+            found.append(fast * (slow / fast) ** part)
+    return min(found, default=None)

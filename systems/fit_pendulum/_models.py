@@ -1,0 +1,194 @@
+r"""The pendulum, models of its friction, and which of them a measured motion shows.
+
+A rigid body on a fixed horizontal axis, swinging freely or driven by a motor:
+
+      --o--
+         \        L = 1/2 J q'^2 + m g l cos(q - zero)
+        l \
+           \      J q'' = -m g l sin(q - zero) - c q' - f tanh(q'/V_S) - k q'|q'| + u + u0
+            O m
+
+Coordinate
+    q      angle of the sensor [rad], 0 where it says hanging, positive counterclockwise
+
+Parameters (of a free swing, which cannot tell a scale of torque: J = 1, the others are over J)
+    J      moment of inertia about the axis [kg m^2]
+    mgl    mass times gravity times distance of the centre of mass from the axis [N m]
+    c      viscous friction [N m s]
+    f      Coulomb friction [N m], made smooth below |q'| = V_S
+    k      quadratic drag [N m s^2]
+    u0     torque missing from the measured one, u [N m]
+    zero   what the sensor shows where the pendulum really hangs [rad]
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import jaxlag as jl
+from systems.fit_pendulum._data import Recording, split
+
+NAMES: tuple[str, ...] = ("J", "mgl", "c", "f", "k", "u0", "zero")
+V_S = 0.1  # rad/s; any from 0.01 to 0.5 moves the friction of a free swing by 2 % at most
+EARLY = 0.1  # s: the first motion in a window
+OPTIONS = {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}
+
+
+def kinetic(t, q, v, params):
+    """T = 1/2 J q'^2 [J]."""
+    return 0.5 * params["J"] * v[0] ** 2
+
+
+def potential(t, q, params):
+    """V = -m g l cos(q - zero) [J]."""
+    return -params["mgl"] * jnp.cos(q[0] - params["zero"])
+
+
+def viscous(t, q, v, params):
+    """R = 1/2 c q'^2 [W]."""
+    return 0.5 * params["c"] * v[0] ** 2
+
+
+def coulomb(t, q, v, params):
+    """R = f V_S log cosh(q'/V_S) [W]."""
+    x = v[0] / V_S
+    return params["f"] * V_S * (jnp.logaddexp(x, -x) - jnp.log(2.0))
+
+
+def quadratic(t, q, v, params):
+    """R = 1/3 k |q'|^3 [W]."""
+    return params["k"] * jnp.abs(v[0]) ** 3 / 3
+
+
+def motor(t, q, v, params, inputs):
+    """Q = u + u0 [N m]."""
+    return (inputs["torque"] + params["u0"])[None]
+
+
+free = jl.System(
+    coordinates=("q",),
+    kinetic=kinetic,
+    potential=potential,
+    forces=(
+        jl.Rayleigh(viscous, "viscous"),
+        jl.Rayleigh(coulomb, "Coulomb"),
+        jl.Rayleigh(quadratic, "quadratic"),
+    ),
+)
+driven = free.with_forces(jl.GeneralizedForce(motor, "motor"))
+MODELS = {"none": "", "viscous": "c", "+ Coulomb": "cf", "+ quadratic": "cfk"}
+FRICTION = "cfk"
+# A friction that a model lacks is one that is known to be 0. So all models are one program, which
+# is compiled once; compiling takes longer than all their fits.
+ABSENT, PRESENT = jl.Prior(0.0, 1e-6), jl.Prior(0.0, 1e6)
+
+
+class Trial(NamedTuple):
+    """One model of friction, fitted to the training windows and tried on the test windows.
+
+    Attributes:
+        fit: to the training windows.
+        test: of the test windows, their starts fitted to all of them.
+        ahead: of the test windows, their starts fitted to the first 0.1 s.
+    """
+
+    fit: jl.FitResult
+    test: jl.Prediction
+    ahead: jl.Prediction
+
+
+def try_models(
+    recording: Recording, other: Recording | None = None, seconds: float = 1.0
+) -> dict[str, Trial]:
+    """Every model, fitted to `recording` and tried on `other`, or on a third of `recording`.
+
+    Raises:
+        DataError: the recordings are too short, or only one of them has a torque.
+    """
+    train, test = split(recording.thinned(), other and other.thinned(), seconds)
+    params0 = guess(train)
+    trials = {}
+    for model in MODELS:
+        found = fit(train, params0, model)
+        trials[model] = Trial(found, found.predict(test), found.predict(test, EARLY))
+    return trials
+
+
+def fit_segments(recording: Recording, trials: Mapping[str, Trial]) -> dict[str, jl.FitResult]:
+    """Every model, fitted to all segments whole; the search begins where that of windows ended."""
+    whole = list(recording.thinned().segments.values())
+    return {model: fit(whole, trial.fit.params, model) for model, trial in trials.items()}
+
+
+def fit(
+    experiments: Sequence[jl.Experiment], params0: Mapping[str, Any], model: str
+) -> jl.FitResult:
+    """One model of friction, fitted to windows or whole segments."""
+    system = driven if experiments[0].inputs else free
+    told = [name for name in params0 if system is driven or name != "J"]
+    priors = {name: PRESENT if name in MODELS[model] else ABSENT for name in FRICTION}
+    return jl.fit(system, experiments, params0, free=told, priors=priors, simulate_options=OPTIONS)
+
+
+def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:
+    """Names of the params that a model estimates."""
+    return tuple(n for n in fitted.names if n not in FRICTION or n in MODELS[model])
+
+
+def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
+    """Params, without friction, by linear regression of q'' on sin q, and on u and 1 where driven.
+
+    Rates are differences of neighbouring samples: rough, but their errors are in q'' alone.
+    """
+    rows, q2 = [], []
+    for each in windows:
+        q = each.channels["q"][:, 0]
+        torque = each.inputs.get("torque")
+        u = () if torque is None else (np.interp(each.ts, torque.times, torque.values),)
+        rows.append(np.stack([-np.sin(q), *u, *(np.ones_like(x) for x in u)], axis=1)[2:-2])
+        q2.append(np.gradient(np.gradient(q, each.ts), each.ts)[2:-2])
+    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(q2))[0].tolist()
+    if len(found) == 1:
+        return {"J": 1.0, "mgl": found[0], "zero": 0.0} | dict.fromkeys(FRICTION, 0.0)
+    mgl, per_J, u0 = found
+    params = {"J": 1 / per_J, "mgl": mgl / per_J, "u0": u0 / per_J, "zero": 0.0}
+    return params | dict.fromkeys(FRICTION, 0.0)
+
+
+# What residuals tell.
+
+
+def correlation(found: jl.FitResult) -> float:
+    """Of residuals one sample apart."""
+    rows = [each["q"][:, 0] for each in found.residuals]
+    products = sum(float(np.nansum(r[1:] * r[:-1])) for r in rows)
+    return products / sum(float(np.nansum(r**2)) for r in rows)
+
+
+def samples_each(found: jl.FitResult) -> float:
+    """Number of samples that tell as much as one independent one."""
+    r = correlation(found)
+    return max(1.0, (1 + r) / (1 - r))
+
+
+def count(found: jl.FitResult) -> int:
+    """Number of residuals."""
+    return sum(int(np.isfinite(each["q"]).sum()) for each in found.residuals)
+
+
+def choose(fits: Mapping[str, jl.FitResult]) -> str:
+    """The model of least Bayesian information criterion, n log(r.r) + p log n.
+
+    A real recording's residuals are correlated: n counts independent ones, by the correlation
+    under the last and richest model.
+    """
+    richest = list(fits.values())[-1]
+    n = count(richest) / samples_each(richest)
+
+    def criterion(model: str) -> float:
+        fitted = fits[model]
+        return 2 * n * np.log(fitted.rms("q")[0]) + len(estimated(fitted, model)) * np.log(n)
+
+    return min(fits, key=criterion)
