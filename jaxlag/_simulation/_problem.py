@@ -77,7 +77,61 @@ class Values(NamedTuple):
 
 
 def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
-    """The problem that a plan and its values describe."""
+    """The initial-value problem that a plan and its values describe."""
+    # --- the equations, and what is known of them before any state
+    dynamics, args, method = _equations(plan, values)
+    params, inputs = dynamics.given(args)
+
+    # --- the initial state: given, from quasi-velocities, or assembled
+    initial = _initial_state(plan, values, dynamics, params, inputs)
+    y0, args = _started(dynamics, initial, params, args)
+    consistent = start_consistent(dynamics, *initial.at, params, args)
+    if dynamics.rows.size:
+        y0, args = stop_gradient_unless(consistent.ok, (y0, args))
+
+    # --- on the constraints
+    start = jnp.zeros_like(args.origin)
+    args = _with_scales(dynamics, start, y0, args)
+    if dynamics.projects:
+        moved, _ = StepEnd(dynamics).project(start, y0, args, differentiable=True)
+        y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
+
+    # --- the steps
+    if isinstance(method[0], AbstractPartitioned):  # from here on the steps hold the constraints
+        dynamics = replace(dynamics, stabilization=None, crossing=False)
+        args = args._replace(lengths=None, units=None, slopes=None)
+    stepper = _stepper(dynamics, method, y0, args, values.longest)
+    stepper_traced, stepper_static = eqx.partition(stepper, eqx.is_array)
+
+    # --- the times, and whether all of it may start
+    times, in_range = _times(dynamics, args, inputs, values.ts)
+    valid = _valid(dynamics, values, inputs, args)
+    finite = start_finite(dynamics, start, y0, args)
+    if args.lengths is not None:  # what depends at the start is not known to be independent nearby
+        finite = finite & jnp.all(args.lengths > 0)
+    contacts = StepEnd(dynamics).contacts_valid(start, y0, args)
+    begun = Start(valid, in_range, finite, consistent, contacts)
+    setup = Setup(values.step, begun.allowed, stepper_traced)
+    problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.capacity)
+    return dynamics, begun, problem
+
+
+class _Initial(NamedTuple):
+    """The initial state, w0 of the velocities that it is made of."""
+
+    t0: Array
+    q0: Array
+    v0: Array
+    w0: Array
+
+    @property
+    def at(self) -> tuple[Array, Array, Array]:
+        """(t0, q0, v0)."""
+        return self[:3]
+
+
+def _equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments, tuple[Any, Any]]:
+    """The vector field, its arguments, and (solver, controller)."""
     power = None
     if "work" in plan.save:
         params = _params.join(values.params, plan.params.tree)
@@ -97,15 +151,20 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
     dynamics = replace(dynamics, rows=plan.system._rows(params, values.q0.dtype))
-    crossing = plan.change_points == "pass" and may_cross(dynamics)
-    dynamics = replace(dynamics, crossing=crossing)
     solver, controller = eqx.combine(values.stepper, plan.stepper.tree)
     if plan.auto and controller is None:
         splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
         solver = Splitting(8) if splitting else solver
-    dynamics = replace(dynamics, extrapolates=looks_ahead(solver))
+    crossing = plan.change_points == "pass" and may_cross(dynamics)
+    dynamics = replace(dynamics, crossing=crossing, extrapolates=looks_ahead(solver))
     check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
+    return dynamics, args, (solver, controller)
 
+
+def _initial_state(
+    plan: ProgramKey, values: Values, dynamics: VectorField, params: Any, inputs: Any
+) -> _Initial:
+    """As given, with the velocities that follow from quasi-velocities, or assembled."""
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
     if v0 is None:
         v0 = plan.system.velocities(q0, u0, params, t=t0)
@@ -117,61 +176,66 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     if dynamics.quasi is not None:
         u0 = dynamics.quasi.of(t0, q0, v0, params) if u0 is None else u0
         w0 = u0[dynamics.quasi.free]
+    return _Initial(t0, q0, v0, w0)
+
+
+def _started(
+    dynamics: VectorField, initial: _Initial, params: Any, args: Arguments
+) -> tuple[Array, Arguments]:
+    """y at the start, and the arguments with what is computed once per solve.
+
+    A lane that has no start, or none that is consistent, or whose kinematics are singular there,
+    has no derivatives, so that those of the others stay finite.
+    """
+    t0, q0, v0, w0 = initial
     if dynamics.quasi is not None or dynamics.rows.size:
-        # A lane that has no start, or none that is consistent, or whose kinematics are singular
-        # there, lends no derivatives to the others.
         known = (q0, dynamics.velocities(t0, q0, w0, params))
         known = (*known, *residuals(dynamics, t0, q0, v0, params))
         sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
-        q0, w0, known = stop_gradient_unless(sound, (q0, w0, args.params))
-        args = args._replace(params=known)
+        q0, w0, traced = stop_gradient_unless(sound, (q0, w0, args.params))
+        args = args._replace(params=traced)
     y0 = dynamics.start(q0, w0)
     start = jnp.zeros_like(args.origin)
     args = dynamics.precompute(start, y0, args)
     if dynamics.quasi is not None:
         args = args._replace(usual=usual(dynamics, *stop_gradient((start, q0, args))))
-    consistent = start_consistent(dynamics, t0, q0, v0, params, args)
-    if dynamics.rows.size:
-        y0, args = stop_gradient_unless(consistent.ok, (y0, args))
-    if dynamics.crossing:
-        masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
-        assert masses is not None
-        units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
-        lengths = lengths_of(masses, args.kept)
-        args = args._replace(lengths=lengths, units=units, slopes=slopes)
-    if dynamics.projects:
-        moved, _ = StepEnd(dynamics).project(start, y0, args, differentiable=True)
-        y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
-    if isinstance(solver, AbstractPartitioned):  # from here on the steps hold the constraints
-        dynamics = replace(dynamics, stabilization=None, crossing=False)
-        args = args._replace(lengths=None, units=None, slopes=None)
-    solver, controller = for_state(solver, controller, q0.shape[0], y0.shape[0])
+    return y0, args
+
+
+def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments) -> Arguments:
+    """The arguments with the scales by which change points are recognised."""
+    if not dynamics.crossing:
+        return args
+    masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
+    assert masses is not None
+    units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
+    return args._replace(lengths=lengths_of(masses, args.kept), units=units, slopes=slopes)
+
+
+def _stepper(
+    dynamics: VectorField, method: tuple[Any, Any], y0: Array, args: Arguments, longest: Any
+) -> Stepper:
+    """Solver, controller, vector field and what follows a step, as one."""
+    solver, controller = for_state(*method, dynamics.system.size, y0.shape[0])
     step_end = StepEnd(dynamics)
-    term = term_of(dynamics, start, y0, args)
+    term = term_of(dynamics, jnp.zeros_like(args.origin), y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
     after = step_end if step_end.settles else None
-    how = (dynamics.windows, after, dynamics.projects, values.longest)
+    how = (dynamics.windows, after, dynamics.projects, longest)
     passes = args.usual is not None
     stops = not dynamics.crossing and may_stop(dynamics)
-    stepper = Stepper(solver, controller, term, *how, passes=passes, stops=stops)
-    stepper_traced, stepper_static = eqx.partition(stepper, eqx.is_array)
-    times, in_range = _times(dynamics, args, inputs, values.ts)
+    return Stepper(solver, controller, term, *how, passes=passes, stops=stops)
+
+
+def _valid(dynamics: VectorField, values: Values, inputs: Any, args: Arguments) -> Array:
+    """Whether start, times, tolerances and steps are numbers within their bounds."""
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
-    given = jnp.concatenate([values.q0, speeds])
-    saves = dynamics.signed(values.ts, args)
-    steps = (values.step, values.longest)
+    given, saves = jnp.concatenate([values.q0, speeds]), dynamics.signed(values.ts, args)
+    steps = values.step, values.longest
     valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
-    valid = valid & knots_increase(inputs)
-    finite = start_finite(dynamics, start, y0, args)
-    if args.lengths is not None:  # what depends at the start is not known to be independent nearby
-        finite = finite & jnp.all(args.lengths > 0)
-    pressed = step_end.contacts_valid(start, y0, args)
-    begun = Start(valid, in_range, finite, consistent, pressed)
-    setup = Setup(values.step, begun.allowed, stepper_traced)
-    problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.capacity)
-    return dynamics, begun, problem
+    return valid & knots_increase(inputs)
 
 
 def stop_gradient_unless(moves: Array, tree: Any) -> Any:
