@@ -234,8 +234,8 @@ class Torque(AbstractForce):
     def __init__(self, angular_velocity: Callable, torque: Callable, name: str) -> None:
         _require_name("Torque", name)
         arguments = ("t", "q", "v", "params")
-        require_arity(f"couple {name!r}: angular_velocity", angular_velocity, arguments)
-        self.takes_inputs = _takes_inputs(f"couple {name!r}: torque", torque)
+        require_arity(f"torque {name!r}: angular_velocity", angular_velocity, arguments)
+        self.takes_inputs = _takes_inputs(f"torque {name!r}: torque", torque)
         self.angular_velocity, self.torque = (
             traced_function(angular_velocity),
             traced_function(torque),
@@ -251,7 +251,7 @@ class Torque(AbstractForce):
         inputs: Mapping[str, Any],
     ) -> Float[Array, " n"]:
         """(dw/dv)^T tau, shape (n,)."""
-        argument = f"couple {self.name!r}: angular_velocity"
+        argument = f"torque {self.name!r}: angular_velocity"
 
         def rate(v: Array) -> Array:
             return _real(argument, self.angular_velocity(t, q, v, params))
@@ -270,7 +270,7 @@ class Torque(AbstractForce):
                 "and choices and loops that read v, even where they cancel.",
             )
         state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
-        torque = _like(f"couple {self.name!r}: torque", self.torque(*state), w)
+        torque = _like(f"torque {self.name!r}: torque", self.torque(*state), w)
         return vjp_fn(torque)[0]
 
 

@@ -196,9 +196,8 @@ def simulate(
             `motion.error` what follows for the errors of q and v at every save time (of the same
             method, up to every save time; not below 32 eps sqrt(steps) |y|, what rounding leaves):
             global ones, where rtol and atol bound those of a step.
-        throw: raise `SimulationError` where a motion ends in a status other than ok; under `jit`,
-            `vmap` and `grad` of them nothing can be raised: ask the result, `motion.ok`,
-            or call `motion.check()` outside.
+        throw: outside `jit` and `vmap`, raise `SimulationError` for a status other than ok. Inside
+            them nothing is raised: read `motion.ok`, or call `motion.check()` outside.
 
     Raises:
         ValueError: an argument of wrong form or value, named.

@@ -127,7 +127,8 @@ def assemble(
         weights: (n,) positive numbers or a dict by name, the diagonal of W; by default W = M, in
             which a coordinate moves the less the more inertia it has, and M + A^T D A with a
             diagonal D where M is singular.
-        throw: raise where a concrete result has a status other than ok.
+        throw: outside `jit` and `vmap`, raise for a status other than ok. Inside them nothing is
+            raised: read `status`.
 
     Raises:
         ValueError: q, v, weights of wrong length or not finite; weights that are not positive; t
@@ -176,9 +177,8 @@ def assemble(
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
     found = _run((system, held, rates_held), params, None, q, v, t, diagonal)
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
-        found = stop_gradient(
-            found
-        )  # under grad its numbers are traced, and have values all the same
+        # Under grad the numbers are traced, and have values all the same.
+        found = stop_gradient(found)
         fix = (
             _what_to_release(system, (held, rates_held), params, q, v, t, diagonal) if hold else ""
         )

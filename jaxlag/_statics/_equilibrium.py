@@ -207,7 +207,8 @@ def equilibrium(
             float32.
         max_steps: bound on the steps of the first search. What follows it is begun only while it
             has taken fewer together.
-        throw: raise where a concrete result has a status other than ok.
+        throw: outside `jit` and `vmap`, raise for a status other than ok. Inside them nothing is
+            raised: read `status`.
 
     Raises:
         ValueError: q0 of wrong length or not finite; t not a finite number; rtol not a number
@@ -263,9 +264,8 @@ def equilibrium(
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)
     found = _search(key, (q0, t, rtol, traced, inputs_traced))
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
-        found = stop_gradient(
-            found
-        )  # under grad its numbers are traced, and have values all the same
+        # Under grad the numbers are traced, and have values all the same.
+        found = stop_gradient(found)
         more = ""
         if np.ndim(found.status) == 0 and concrete(traced, t, found.q):
             more = f" {advice_on_rows(system, params, t, found.q)}".rstrip()

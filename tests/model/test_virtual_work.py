@@ -222,7 +222,7 @@ def test_an_angular_velocity_that_is_not_affine_is_refused(rates):
         forces=(jl.Torque(rates, torque, "motor"),),
     )
     message = (
-        r"couple 'motor': `angular_velocity` must be affine in v, but its derivative dw/dv depe"
+        r"torque 'motor': `angular_velocity` must be affine in v, but its derivative dw/dv depe"
     )
     with pytest.raises(ValueError, match=message):
         system.acceleration(Q, V, PARAMS)
@@ -268,7 +268,7 @@ def test_a_position_of_wrong_shape_is_refused(was, position):
 
 def test_an_angular_velocity_of_wrong_shape_is_refused():
     couple = jl.Torque(lambda t, q, v, params: v[:2], lambda t, q, v, params: v[:2], "motor")
-    message = "couple 'motor': `angular_velocity` must return 3 components or a scalar, but it ret"
+    message = "torque 'motor': `angular_velocity` must return 3 components or a scalar, but it ret"
     with pytest.raises(ValueError, match=message):
         force_of(couple)
 
@@ -280,7 +280,7 @@ def test_force_and_torque_must_match_what_they_act_on():
     message = r"force 'pull': `force` must return shape \(3,\), but it returned \(2,\)\."
     with pytest.raises(ValueError, match=message):
         force_of(jl.PointForce(corner, two, "pull"))
-    message = r"couple 'motor': `torque` must return shape \(3,\), but it returned \(2,\)\."
+    message = r"torque 'motor': `torque` must return shape \(3,\), but it returned \(2,\)\."
     with pytest.raises(ValueError, match=message):
         force_of(jl.Torque(body_rates, two, "motor"))
     message = "force 'pull': `force` must return an array, but it returned None"
@@ -297,8 +297,8 @@ def declarations():
 
     yield "force 'f': position", lambda: jl.PointForce(short, constant, "f")
     yield "force 'f': force", lambda: jl.PointForce(corner, short, "f")
-    yield "couple 'c': angular_velocity", lambda: jl.Torque(short, constant, "c")
-    yield "couple 'c': torque", lambda: jl.Torque(body_rates, short, "c")
+    yield "torque 'c': angular_velocity", lambda: jl.Torque(short, constant, "c")
+    yield "torque 'c': torque", lambda: jl.Torque(body_rates, short, "c")
 
 
 @pytest.mark.parametrize(("argument", "declare"), list(declarations()), ids=lambda x: str(x)[:24])
