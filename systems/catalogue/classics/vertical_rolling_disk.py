@@ -41,7 +41,7 @@ Without torques the contact goes round a circle of radius R theta'/phi'.
 import jax.numpy as jnp
 
 import jaxlag as jl
-from systems.catalogue import _exact
+from systems.catalogue import _exact, _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -63,8 +63,8 @@ def torques(t, q, v, params):
 
 def velocities(t, q, v, params):
     """(thetadot, phidot, s_x, s_y) (rad/s, rad/s, m/s, m/s)."""
-    heading = jnp.stack([jnp.cos(q[3]), jnp.sin(q[3])])
-    return jnp.concatenate([v[2:], v[:2] - params["R"] * v[2] * heading])
+    slip = _rolling.of_upright_wheel(v[:2], q[3], v[2], params["R"])
+    return jnp.concatenate([v[2:], slip])
 
 
 system = jl.System(
