@@ -7,20 +7,17 @@ jax 0.12); "native" is whether XLA does so. Errors are the largest over all save
 the hand-written equations at tolerance 1e-13 with a step ending on every save time.
 """
 
-from collections import defaultdict
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import Any
 
 import jax.numpy as jnp
 
 from bench._harness.timing import Call, Reference, Report, Target, build, spread
-from bench._harness.workers import Worker
+from bench._harness.workers import under_both_settings
 from bench._problems import double_pendulum as pendulum
 from jaxlag._core import _xla
 
 SAVES = 501
-SETTINGS = {"on": {_xla.SWITCH: "1"}, "off": {_xla.SWITCH: "0"}}
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
@@ -63,21 +60,12 @@ def _cases(quick: bool) -> list[tuple[str, int, Callable]]:
 
 def run(quick: bool) -> Report:
     """Both settings in turn."""
-    samples: dict[tuple[str, str], list[float]] = defaultdict(list)
-    with ExitStack() as stack:
-        workers = {
-            setting: stack.enter_context(Worker("solve", quick, environment))
-            for setting, environment in SETTINGS.items()
-        }
-        for _ in range(5 if quick else 20):
-            for setting, worker in workers.items():
-                for case, seconds in worker.seconds().items():
-                    samples[setting, case] += seconds
-        rows = {
-            (setting, case): {"setting": setting, **facts, **spread(samples[setting, case], "ms")}
-            for setting, worker in workers.items()
-            for case, facts in worker.facts.items()
-        }
+    known, samples = under_both_settings("solve", quick)
+    rows = {
+        (setting, case): {"setting": setting, **facts, **spread(samples[setting, case], "ms")}
+        for setting, cases in known.items()
+        for case, facts in cases.items()
+    }
     return Report(list(rows.values()), *_judged(rows))
 
 

@@ -8,7 +8,9 @@ import json
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from typing import Any
 import jax
 
 from bench._harness.timing import interleaved
+from jaxlag._core import _xla
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,6 +72,23 @@ class Worker:
         if not line:
             raise RuntimeError(f"a worker ended early with status {self._process.wait()}")
         return json.loads(line)
+
+
+def under_both_settings(
+    benchmark: str, quick: bool
+) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], list[float]]]:
+    """(facts by setting, seconds by setting and case), with XLA's setting on and off in turn."""
+    samples: dict[tuple[str, str], list[float]] = defaultdict(list)
+    with ExitStack() as stack:
+        workers = {
+            setting: stack.enter_context(Worker(benchmark, quick, {_xla.SWITCH: switch}))
+            for setting, switch in (("on", "1"), ("off", "0"))
+        }
+        for _ in range(5 if quick else 20):
+            for setting, worker in workers.items():
+                for case, seconds in worker.seconds().items():
+                    samples[setting, case] += seconds
+    return {setting: worker.facts for setting, worker in workers.items()}, samples
 
 
 def serve(benchmark: str, quick: bool) -> None:

@@ -16,7 +16,6 @@ XLA's setting and without.
 """
 
 from collections.abc import Mapping
-from contextlib import ExitStack
 from importlib.util import find_spec
 from math import inf
 from typing import Any
@@ -27,14 +26,13 @@ import numpy as np
 
 import jaxlag as jl
 from bench._harness.timing import Call, Report, build, interleaved, spread
-from bench._harness.workers import Worker
+from bench._harness.workers import under_both_settings
 from bench._problems import double_pendulum as pendulum
 from bench._problems.scenes import SCENES, Scene, links
 from bench.lowering import _chains, _rk4
 from bench.lowering._by_hand import BY_HAND
 from bench.lowering._rk4 import Equations
 from bench.lowering._verdict import OPERATIONS, verdict
-from jaxlag._core import _xla
 
 STEPS = 10_000
 AGREEMENT = 1e-10  # relative
@@ -43,7 +41,6 @@ COLUMNS = ("part", "system", "n", "contender", "ratio", "operations", "error", "
 COLUMNS += ("compile_s", "min_us", "median_us", "repeats")
 QUICK = ("pendulum", "cart_pole", "kepler_polar", "symmetric_top")
 CHAINS = (2, 3, 4, 6, 8, 12, 16, 32, 64)
-SETTINGS = {"on": {_xla.SWITCH: "1"}, "off": {_xla.SWITCH: "0"}}
 TOLERANCES = (1e-7, 3e-8, 1e-8, 3e-9, 1e-9, 3e-10, 1e-10, 3e-11, 1e-11)
 ERROR = 1e-9
 
@@ -211,20 +208,12 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
 
 def solves(quick: bool) -> list[Row]:
     """The double pendulum with XLA's setting and without, in turn."""
-    samples: dict[str, list[float]] = {setting: [] for setting in SETTINGS}
-    with ExitStack() as stack:
-        workers = {
-            setting: stack.enter_context(Worker("lowering", quick, environment))
-            for setting, environment in SETTINGS.items()
-        }
-        for _ in range(5 if quick else 20):
-            for setting, worker in workers.items():
-                samples[setting] += worker.seconds()["solve"]
+    known, samples = under_both_settings("lowering", quick)
     rows = []
-    for setting, worker in workers.items():
-        facts = {key: value for key, value in worker.facts.items() if key in COLUMNS}
-        words = f"setting {setting}, tolerance {worker.facts['tolerance']:g}"
-        times = spread(samples[setting], "us")
+    for setting, all_facts in known.items():
+        facts = {key: value for key, value in all_facts.items() if key in COLUMNS}
+        words = f"setting {setting}, tolerance {all_facts['tolerance']:g}"
+        times = spread(samples[setting, "solve"], "us")
         rows.append(_row(part="solve", system="double_pendulum", n=2, contender=words,
                          **facts, **times))  # fmt: skip
     return rows

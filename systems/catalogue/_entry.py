@@ -185,6 +185,8 @@ class Entry(AbstractEntry):
         extras: name -> function of the state, beyond the H, p and dp/dt of every system.
         invariants: name -> function of the state that the motion keeps constant, as long as no
             force is applied.
+        exact: `exact(t, q0, v0, params)`, (q, v) at t of the motion from (q0, v0) at t = 0, each
+            (n,), in closed form; None where none is known. Its derivatives by JAX are exact, too.
     """
 
     kind: ClassVar[str] = "trajectory"
@@ -192,6 +194,7 @@ class Entry(AbstractEntry):
     example: Example
     extras: Mapping[str, StateFunction] = field(default_factory=dict)
     invariants: Mapping[str, StateFunction] = field(default_factory=dict)
+    exact: Callable[..., tuple[Array, Array]] | None = None
 
     def __post_init__(self) -> None:
         """Check the start, too."""

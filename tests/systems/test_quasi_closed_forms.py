@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from _closed_forms import TIGHT, close, integral, move, space_axes
+from _closed_forms import TIGHT, close, close_to_exact, move, space_axes
 from numpy import cos, sin
 from scipy.integrate import solve_ivp
 
@@ -17,34 +17,14 @@ import jaxlag as jl
 SLEIGH = {"m": 2.0, "I": 0.9, "a": 0.5}
 
 
-def sleigh(times, m, I, a, start, v0, omega0):  # noqa: E741
-    """(x, y, theta, v, omega, lambda) by hyperbolic functions."""
-    J = I + m * a**2
-    C, sense = np.sqrt(v0**2 + J * omega0**2 / m), np.sign(omega0)
-    s0, rate = np.arctanh(v0 / C), m * a * C / J
-
-    def state(t):
-        s = rate * t + s0
-        turned = sense * np.sqrt(J / m) / a * 2 * (np.arctan(np.tanh(s / 2)))
-        return turned, C * np.tanh(s), sense * C * np.sqrt(m / J) / np.cosh(s)
-
-    def theta(t):
-        return start[2] + state(t)[0] - state(0.0)[0]
-
-    x = start[0] + integral(lambda t: state(t)[1] * cos(theta(t)), times)
-    y = start[1] + integral(lambda t: state(t)[1] * sin(theta(t)), times)
-    _, v, omega = state(times)
-    lam = m * (v * omega - a * (m * a * v * omega / J))
-    return np.column_stack([x, y, theta(times), v, omega, lam])
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(("v0", "omega0"), [(-1.2, 0.3), (0.5, -1.5)])
 def test_the_sleigh_moves_by_hyperbolic_functions(v0, omega0):
     times, start = np.linspace(0.0, 6.0, 7), (1.0, -0.5, -0.2)
     motion = move("chaplygin_sleigh", SLEIGH, start, {"v": v0, "omega": omega0}, times)
-    found = np.column_stack([motion.q, motion["v"], motion["omega"], motion.lam["v_n"]])
-    close(found, sleigh(times, **SLEIGH, start=start, v0=v0, omega0=omega0))
+    close_to_exact("chaplygin_sleigh", motion, SLEIGH)
+    m, I, a = (SLEIGH[name] for name in ("m", "I", "a"))  # noqa: E741
+    close(motion.lam["v_n"], m * I / (I + m * a**2) * motion["v"] * motion["omega"])
     close(motion.energy, np.full(7, motion.energy[0]))
 
 
@@ -174,6 +154,7 @@ def test_the_upright_disk_goes_round_a_circle():
     times = np.linspace(0.0, 2 * np.pi / abs(turn), 7)
     u0 = {"thetadot": roll, "phidot": turn}
     motion = move("vertical_rolling_disk", params, (0.1, -0.2, 0.5, phi0), u0, times)
+    close_to_exact("vertical_rolling_disk", motion, params)
     phi, radius = phi0 + turn * times, params["R"] * roll / turn
     x, y = 0.1 + radius * (sin(phi) - sin(phi0)), -0.2 - radius * (cos(phi) - cos(phi0))
     close(motion.q, np.column_stack([x, y, 0.5 + roll * times, phi]))
@@ -188,21 +169,9 @@ def test_the_upright_disk_is_driven_along_a_spiral():
     times, start = np.linspace(0.0, 4.0, 7), (1.0, 0.5, 0.2, -0.4)
     u0 = {"thetadot": -1.0, "phidot": 0.5}
     motion = move("vertical_rolling_disk", params, start, u0, times)
-    spin = params["tau_theta"] / (params["I"] + params["m"] * params["R"] ** 2)
-    steer = params["tau_phi"] / params["J"]
-
-    def rates(t):
-        return -1.0 + spin * t, -0.4 + 0.5 * t + 0.5 * steer * t**2
-
-    def along(direction):
-        return integral(lambda t: params["R"] * rates(t)[0] * direction(rates(t)[1]), times)
-
-    roll, phi = rates(times)
-    theta = 0.2 - times + 0.5 * spin * times**2
-    close(motion.q, np.column_stack([1.0 + along(cos), 0.5 + along(sin), theta, phi]))
-    turn = 0.5 + steer * times
-    close(motion.u[:, :2], np.column_stack([roll, turn]))
-    m, R = params["m"], params["R"]
+    q, v = close_to_exact("vertical_rolling_disk", motion, params)
+    m, R, phi, roll, turn = params["m"], params["R"], q[:, 3], v[:, 2], v[:, 3]
+    spin = params["tau_theta"] / (params["I"] + m * R**2)
     close(motion.lam["s_x"], m * R * (spin * cos(phi) - roll * turn * sin(phi)))
     close(motion.lam["s_y"], m * R * (spin * sin(phi) + roll * turn * cos(phi)))
 
@@ -215,18 +184,13 @@ def test_the_knife_edge_does_not_slide_down_the_slope(v0, turn, phi0):
     times, pull = np.linspace(0.0, 6.0, 7), params["g"] * sin(params["alpha"])
     u0 = {"v": v0, "phidot": turn}
     motion = move("knife_edge_incline", params, (0.0, 0.0, phi0), u0, times)
+    q, _ = close_to_exact("knife_edge_incline", motion, params)
     phi = phi0 + turn * times
     v = v0 + pull / turn * (sin(phi) - sin(phi0))
-    rest = v0 - pull / turn * sin(phi0)
-    x = rest / turn * (sin(phi) - sin(phi0))
-    x += pull / (2 * turn**2) * (sin(phi) ** 2 - sin(phi0) ** 2)
-    y = -rest / turn * (cos(phi) - cos(phi0))
-    y += pull / (2 * turn**2) * (phi - phi0 - (sin(2 * phi) - sin(2 * phi0)) / 2)
-    close(motion.q, np.column_stack([x, y, phi]))
     close(motion["v"], v)
     close(motion.lam["v_n"], -params["m"] * (v * turn + pull * sin(phi)))
     if v0 == 0:
-        close(x, pull / (2 * turn**2) * sin(turn * times) ** 2, 1e-15)
+        close(q[:, 0], pull / (2 * turn**2) * sin(turn * times) ** 2, 1e-15)
 
 
 @pytest.mark.full
@@ -236,13 +200,9 @@ def test_the_nonholonomic_particle_slows_by_its_constraint():
     times = np.linspace(0.0, 3.0, 6)
     u0 = {"xdot": x_rate, "ydot": y_rate}
     motion = move("nonholonomic_particle", {"m": m}, start, u0, times)
-    y = start[1] + y_rate * times
-    c, root = x_rate * np.sqrt(1 + start[1] ** 2), np.sqrt(1 + y**2)
-    x = start[0] + c / y_rate * (np.arcsinh(y) - np.arcsinh(start[1]))
-    z = start[2] + c / y_rate * (root - np.sqrt(1 + start[1] ** 2))
-    close(motion.q, np.column_stack([x, y, z]))
-    close(motion["xdot"], c / root)
-    close(motion.lam["s"], m * c * y_rate / root**3)  # m z'' of z' = c y/root
+    q, _ = close_to_exact("nonholonomic_particle", motion, {"m": m})
+    y, c = q[:, 1], x_rate * np.sqrt(1 + start[1] ** 2)
+    close(motion.lam["s"], m * c * y_rate / (1 + y**2) ** 1.5)  # m z'' of z' = c y/root
 
     def too_early(t, q, v, params):
         return 0.5 * m * (v[0] ** 2 * (1 + q[1] ** 2) + v[1] ** 2)

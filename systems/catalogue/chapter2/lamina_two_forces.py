@@ -100,25 +100,15 @@ system = jl.System(
     forces=(jl.PointForce(points, following_forces, "f1 and f2"),),
 )
 
+geometry = {"M": "kg", "Iz": "kg m^2", **dict.fromkeys(("xb", "yb", "x1", "y1", "x2", "y2"), "m")}
+"""Units of the parameters of the lamina and of the points where forces act."""
+
 entry = Entry(
     name="lamina_two_forces",
     book="ch. 2, sec. 2.5, Example 4, Fig. 2.6, eqs. 2.20-2.22",
     system=system,
     coordinate_units=("m", "m", "rad"),
-    parameter_units={
-        "M": "kg",
-        "Iz": "kg m^2",
-        "xb": "m",
-        "yb": "m",
-        "x1": "m",
-        "y1": "m",
-        "x2": "m",
-        "y2": "m",
-        "f1x": "N",
-        "f1y": "N",
-        "f2x": "N",
-        "f2y": "N",
-    },
+    parameter_units={**geometry, **dict.fromkeys(("f1x", "f1y", "f2x", "f2y"), "N")},
     example=Example(
         params={
             "M": 1.5,

@@ -42,7 +42,7 @@ import jax.numpy as jnp
 
 import jaxlag as jl
 from systems.catalogue._entry import Entry, Example
-from systems.catalogue.chapter2.lamina_two_forces import kinetic, points, potential
+from systems.catalogue.chapter2.lamina_two_forces import geometry, kinetic, points, potential
 
 
 def fixed_forces(t, q, v, params):
@@ -81,20 +81,7 @@ entry = Entry(
     book="ch. 2, sec. 2.5, Example 4, Fig. 2.6, eqs. 2.20-2.22",
     system=system,
     coordinate_units=("m", "m", "rad"),
-    parameter_units={
-        "M": "kg",
-        "Iz": "kg m^2",
-        "xb": "m",
-        "yb": "m",
-        "x1": "m",
-        "y1": "m",
-        "x2": "m",
-        "y2": "m",
-        "F1X": "N",
-        "F1Y": "N",
-        "F2X": "N",
-        "F2Y": "N",
-    },
+    parameter_units={**geometry, **dict.fromkeys(("F1X", "F1Y", "F2X", "F2Y"), "N")},
     example=Example(
         params={
             "M": 1.5,

@@ -29,6 +29,7 @@ From rest at theta = pi/2 on, T + V = W l, and the bob passes the bottom at sqrt
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -54,6 +55,12 @@ def bottom_speed(t, q, v, a, params):
 
 system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The swing by Jacobi's functions, while the bob does not turn over."""
+    return _exact.swinging(t, q0, v0, jnp.sqrt(params["g"] / params["l"]))
+
+
 entry = Entry(
     name="pendulum_bob_energy",
     book="ch. 2, sec. 2.10, Fig. 2.15, eqs. 2.69-2.71",
@@ -67,4 +74,5 @@ entry = Entry(
         duration=5.0,
     ),
     extras={"speed": speed, "v2_at_bottom": bottom_speed},
+    exact=exact,
 )

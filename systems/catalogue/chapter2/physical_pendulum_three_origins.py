@@ -40,6 +40,7 @@ inertias, about (1), (2) and (3). Misprint: 2.18 ends in "= 0", but L is not zer
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -79,6 +80,13 @@ def kinetic_from_centre(t, q, v, a, params):
 
 system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The swing by Jacobi's functions, while the body does not turn over."""
+    moment = params["M"] * params["g"] * centre_distance(params)
+    return _exact.swinging(t, q0, v0, jnp.sqrt(moment / pivot_inertia(params)))
+
+
 entry = Entry(
     name="physical_pendulum_three_origins",
     book="ch. 2, sec. 2.5, Example 3, Fig. 2.5, eqs. 2.17-2.19",
@@ -104,4 +112,5 @@ entry = Entry(
         "I_pivot": lambda t, q, v, a, params: pivot_inertia(params),
         "T_origin_cm": kinetic_from_centre,
     },
+    exact=exact,
 )

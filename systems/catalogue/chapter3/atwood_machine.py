@@ -34,6 +34,7 @@ With a massive pulley T1 and T2 differ; that their moments cancel holds for the 
 """
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -66,6 +67,14 @@ def massless_pulley(t, q, v, a, params):
 
 system = jl.System(coordinates=("y",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The fall under a constant acceleration."""
+    m1, m2 = params["m1"], params["m2"]
+    inertia = m1 + m2 + params["m3"] * (params["kappa"] / params["R"]) ** 2
+    return _exact.accelerated(t, q0, v0, (m1 - m2) * params["g"] / inertia)
+
+
 entry = Entry(
     name="atwood_machine",
     book="ch. 3, Example 16, Fig. 3.30, eq. 3.172",
@@ -83,4 +92,5 @@ entry = Entry(
         "tension2": tension2,
         "y_ddot_massless_pulley": massless_pulley,
     },
+    exact=exact,
 )

@@ -34,6 +34,7 @@ Parameters
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -62,6 +63,15 @@ system = jl.System(
     constraints=(jl.Holonomic(slip, ("cord1", "cord2")),),
 )
 
+
+def exact(t, q0, v0, params):
+    """The fall under a constant acceleration."""
+    m1, m2, R = params["m1"], params["m2"], params["R"]
+    inertia = m1 + m2 + params["m3"] * (params["kappa"] / R) ** 2
+    a = (m1 - m2) * params["g"] / inertia
+    return _exact.accelerated(t, q0, v0, jnp.stack([a, -a, a / R]))
+
+
 entry = Entry(
     name="atwood_multipliers",
     book="ch. 3, Example 16, Fig. 3.30",
@@ -75,4 +85,5 @@ entry = Entry(
         v0=(-0.8, 0.8, -8.0),
         duration=4.0,
     ),
+    exact=exact,
 )

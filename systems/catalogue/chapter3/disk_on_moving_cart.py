@@ -43,6 +43,7 @@ import jax.numpy as jnp
 
 import jaxlag as jl
 from jaxlag import energy
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -93,6 +94,17 @@ system = jl.System(
     forces=(jl.PointForce(disk_centre, drive, "drive"), jl.Rayleigh(dissipation, "damper")),
 )
 
+
+def exact(t, q0, v0, params):
+    """The damped and driven linear motion."""
+    m, along = params["m"], jnp.cos(params["theta"])
+    M = jnp.array([[params["m0"] + m, m * along], [m * along, 1.5 * m]])
+    C = jnp.diag(jnp.array([params["b"], 0.0]))
+    K = jnp.diag(jnp.stack([params["K2"], params["K1"]]))
+    push = params["F1"] * jnp.array([1.0, along])
+    return _exact.oscillating(t, q0, v0, M, C, K, jnp.zeros(2), push, params["Omega"])
+
+
 entry = Entry(
     name="disk_on_moving_cart",
     book="ch. 3, Example 12, Fig. 3.22, eqs. 3.144-3.154",
@@ -128,4 +140,5 @@ entry = Entry(
         duration=12.0,
     ),
     extras={"friction_x1": friction, "Q": applied_force},
+    exact=exact,
 )

@@ -37,6 +37,7 @@ import jax.numpy as jnp
 
 import jaxlag as jl
 from systems.catalogue._entry import StaticEntry, StaticExample
+from systems.catalogue.chapter3 import double_pendulum_forces
 from systems.catalogue.chapter3.double_pendulum_forces import end, joint, joint_force, potential
 
 
@@ -76,15 +77,9 @@ entry = StaticEntry(
     system=system,
     coordinate_units=("rad", "rad"),
     parameter_units={
-        "m1": "kg",
-        "m2": "kg",
-        "l1": "m",
-        "l2": "m",
-        "g": "m/s^2",
-        "Fx": "N",
-        "Fy": "N",
-        "Bx": "N",
-        "By": "N",
+        name: unit
+        for name, unit in double_pendulum_forces.entry.parameter_units.items()
+        if name != "Omega"
     },
     example=StaticExample(
         params={

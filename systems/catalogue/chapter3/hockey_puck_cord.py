@@ -34,6 +34,7 @@ where the cord leaves the puck stands still relative to G and would give no mome
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 from systems.catalogue.chapter3 import hockey_puck
 
@@ -58,6 +59,14 @@ system = jl.System(
     forces=(jl.PointForce(cord_end, pull, "cord"),),
 )
 
+
+def exact(t, q0, v0, params):
+    """The slide and the spin under constant accelerations."""
+    spin = params["F1"] * params["R"] / (params["M"] * params["kappa"] ** 2)
+    push = pull(t, q0, v0, params) / params["M"]
+    return _exact.accelerated(t, q0, v0, jnp.append(spin, push))
+
+
 entry = Entry(
     name="hockey_puck_cord",
     book="ch. 3, secs. 3.11-3.12, Figs. 3.25-3.28, eqs. 3.161-3.162, 3.167-3.168",
@@ -71,4 +80,5 @@ entry = Entry(
         duration=3.0,
     ),
     invariants={"initial_spin": hockey_puck.initial_spin},
+    exact=exact,
 )

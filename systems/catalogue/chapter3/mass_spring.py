@@ -20,6 +20,8 @@ Parameters
 The motion is x = x0 cos(w t) + (v0/w) sin(w t) with w^2 = k/m.
 """
 
+import jax.numpy as jnp
+
 import jaxlag as jl
 from systems.catalogue._entry import Entry, Example
 
@@ -36,6 +38,14 @@ def potential(t, q, params):
 
 system = jl.System(coordinates=("x",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """x = x0 cos(w t) + (v0/w) sin(w t), and x'."""
+    w = jnp.sqrt(params["k"] / params["m"])
+    c, s = jnp.cos(w * t), jnp.sin(w * t)
+    return q0 * c + v0 / w * s, v0 * c - q0 * w * s
+
+
 entry = Entry(
     name="mass_spring",
     book="ch. 3, Example 1, Fig. 3.7, eq. 3.57",
@@ -43,4 +53,5 @@ entry = Entry(
     coordinate_units=("m",),
     parameter_units={"m": "kg", "k": "N/m"},
     example=Example(params={"m": 1.5, "k": 24.0}, q0=(0.3,), v0=(0.5,), duration=5.0),
+    exact=exact,
 )

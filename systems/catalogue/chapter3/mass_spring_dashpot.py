@@ -36,6 +36,7 @@ there is no m in it.
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -66,6 +67,14 @@ system = jl.System(
     forces=(jl.GeneralizedForce(drive, "drive"), jl.Rayleigh(dissipation, "dashpot")),
 )
 
+
+def exact(t, q0, v0, params):
+    """The damped and driven linear motion (3.92)."""
+    m, b, k = (jnp.reshape(params[name], (1, 1)) for name in ("m", "b", "k"))
+    weight, drive = m[0] * params["g"], jnp.reshape(params["F0"], 1)
+    return _exact.oscillating(t, q0, v0, m, b, k, weight, drive, params["Omega"])
+
+
 entry = Entry(
     name="mass_spring_dashpot",
     book="ch. 3, Example 6, Fig. 3.11, eqs. 3.91-3.92",
@@ -85,4 +94,5 @@ entry = Entry(
         v0=(0.0,),
         duration=12.0,
     ),
+    exact=exact,
 )

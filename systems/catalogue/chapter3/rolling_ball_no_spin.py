@@ -41,6 +41,7 @@ import jax.numpy as jnp
 
 import jaxlag as jl
 from jaxlag.rotation import yaw_pitch_roll
+from systems.catalogue import _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -73,8 +74,8 @@ def drive(t, q, v, params):
 
 def slip_and_spin(t, q, v, params):
     """Velocity of the point of contact along X, Y [m/s], and omega_Z [rad/s]."""
-    omega_X, omega_Y, omega_Z = angular_velocity(q, v)
-    return jnp.stack([v[0] - params["R"] * omega_Y, v[1] + params["R"] * omega_X, omega_Z])
+    omega = angular_velocity(q, v)
+    return jnp.append(_rolling.of_ball(v[:2], omega, params["R"]), omega[2])
 
 
 def omega_inertial(t, q, v, a, params):

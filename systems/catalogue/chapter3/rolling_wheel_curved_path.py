@@ -40,6 +40,7 @@ Parameters
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -63,8 +64,7 @@ def torques(t, q, v, params):
 
 def slip(t, q, v, params):
     """Velocity of the wheel at the point of contact along X, Y [m/s] (3.17)."""
-    heading = jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
-    return v[:2] - params["r"] * v[3] * heading
+    return _rolling.of_upright_wheel(v[:2], q[2], v[3], params["r"])
 
 
 system = jl.System(

@@ -32,6 +32,7 @@ Example 18 writes H in theta1' instead of p: right in value, but the canonical e
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -52,6 +53,12 @@ def tension(t, q, v, a, params):
 
 system = jl.System(coordinates=("theta1",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The swing by Jacobi's functions, while the bob does not turn over."""
+    return _exact.swinging(t, q0, v0, jnp.sqrt(params["g"] / params["h1"]))
+
+
 entry = Entry(
     name="simple_pendulum",
     book="ch. 3, Examples 3 and 18, Fig. 3.9a, eqs. 3.60-3.64, 3.209-3.211",
@@ -60,4 +67,5 @@ entry = Entry(
     parameter_units={"m1": "kg", "h1": "m", "g": "m/s^2"},
     example=Example(params={"m1": 1.0, "h1": 0.8, "g": 9.81}, q0=(2.5,), v0=(0.0,), duration=8.0),
     extras={"tension": tension},
+    exact=exact,
 )

@@ -34,6 +34,7 @@ The pin does no work, so its reaction is found afterwards, from M a_G = R + weig
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -58,6 +59,14 @@ def pin_reaction(t, q, v, a, params):
 
 system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The swing by Jacobi's functions, while the body does not turn over."""
+    moment = params["M"] * params["L"]
+    inertia = params["IG"] + moment * params["L"]
+    return _exact.swinging(t, q0, v0, jnp.sqrt(moment * params["g"] / inertia))
+
+
 entry = Entry(
     name="symmetric_plane_pendulum",
     book="ch. 3, Example 15, Fig. 3.29, eqs. 3.169-3.171",
@@ -68,4 +77,5 @@ entry = Entry(
         params={"M": 1.5, "IG": 0.08, "L": 0.4, "g": 9.81}, q0=(2.0,), v0=(0.0,), duration=6.0
     ),
     extras={"R_pin": pin_reaction},
+    exact=exact,
 )

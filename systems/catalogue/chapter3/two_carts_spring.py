@@ -29,6 +29,7 @@ the parentheses of V are not balanced.
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -60,6 +61,22 @@ system = jl.System(
     forces=(jl.GeneralizedForce(push, "push"),),
 )
 
+
+def exact(t, q0, v0, params):
+    """The mass centre under a constant push, and the carts swinging about it."""
+    m1, m2, k, F1 = params["m1"], params["m2"], params["k"], params["F1"]
+    total = m1 + m2
+    weights = jnp.stack([m1, m2]) / total
+    centre, speed = _exact.accelerated(t, weights @ q0, weights @ v0, F1 / total)
+    w = jnp.sqrt(k * total / (m1 * m2))
+    rest = params["l0"] - F1 / (m1 * w**2)
+    stretch, rate = q0[1] - q0[0] - rest, v0[1] - v0[0]
+    c, s = jnp.cos(w * t), jnp.sin(w * t)
+    apart, opening = rest + stretch * c + rate / w * s, rate * c - stretch * w * s
+    shares = jnp.stack([-m2, m1]) / total
+    return centre + shares * apart, speed + shares * opening
+
+
 entry = Entry(
     name="two_carts_spring",
     book="ch. 3, Example 13, Fig. 3.23, eqs. 3.155-3.157",
@@ -73,4 +90,5 @@ entry = Entry(
         duration=8.0,
     ),
     invariants={"initial_momentum": initial_momentum},
+    exact=exact,
 )

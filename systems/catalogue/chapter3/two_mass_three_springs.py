@@ -23,7 +23,10 @@ Parameters
     m2 x2'' = -k2 (x2 - x1) - k3 x2                                       (3.59)
 """
 
+import jax.numpy as jnp
+
 import jaxlag as jl
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -40,6 +43,16 @@ def potential(t, q, params):
 
 system = jl.System(coordinates=("x1", "x2"), kinetic=kinetic, potential=potential)
 
+
+def exact(t, q0, v0, params):
+    """The linear motion."""
+    k1, k2, k3 = params["k1"], params["k2"], params["k3"]
+    M = jnp.diag(jnp.stack([params["m1"], params["m2"]]))
+    K = jnp.array([[k1 + k2, -k2], [-k2, k2 + k3]])
+    still = jnp.zeros(2)
+    return _exact.oscillating(t, q0, v0, M, jnp.zeros((2, 2)), K, still, still, 0.0)
+
+
 entry = Entry(
     name="two_mass_three_springs",
     book="ch. 3, Example 2, Fig. 3.8, eqs. 3.58-3.59",
@@ -52,4 +65,5 @@ entry = Entry(
         v0=(0.0, 0.0),
         duration=12.0,
     ),
+    exact=exact,
 )

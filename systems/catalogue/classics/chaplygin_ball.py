@@ -37,7 +37,7 @@ theta = +-pi/2.
 import jax.numpy as jnp
 
 import jaxlag as jl
-from systems.catalogue import _attitude
+from systems.catalogue import _attitude, _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -65,7 +65,7 @@ def potential(t, q, params):
 def velocities(t, q, v, params):
     """(wx, wy, wz, s_x, s_y) (rad/s, m/s)."""
     omega = _attitude.space_rates(q[2:], v[2:])
-    rolling = v[:2] + params["a"] * jnp.stack([-omega[1], omega[0]])
+    rolling = _rolling.of_ball(v[:2], omega, params["a"])
     return jnp.concatenate([angular_velocity(t, q, v, params), rolling])
 
 

@@ -38,6 +38,7 @@ import jax.numpy as jnp
 
 import jaxlag as jl
 from jaxlag import energy
+from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
@@ -75,6 +76,37 @@ system = jl.System(
     quasi=jl.QuasiVelocities(velocities, ("v", "v_n", "omega"), constrained=("v_n",)),
 )
 
+
+def exact(t, q0, v0, params):
+    """A sleigh that turns, by hyperbolic functions, and the path along them."""
+    m, a = params["m"], params["a"]
+    J = params["I"] + m * a**2
+    forward, _, turning = velocities(0.0, q0, v0, params)
+    sense, size = jnp.sign(turning), jnp.sqrt(J / m)
+    C = jnp.sqrt(forward**2 + (size * turning) ** 2)
+    s0, rate = jnp.arctanh(forward / C), m * a * C / J
+
+    def turned(s):
+        return sense * size / a * 2 * jnp.arctan(jnp.tanh(s / 2))
+
+    def moved(t):
+        """(theta, v) at t."""
+        s = s0 + rate * t
+        return q0[2] + turned(s) - turned(s0), C * jnp.tanh(s)
+
+    def path(direction):
+        def rate(t):
+            theta, v = moved(t)
+            return v * direction(theta)
+
+        return _exact.integral(rate, t), rate(t)
+
+    (x, x_rate), (y, y_rate) = path(jnp.cos), path(jnp.sin)
+    omega = sense * C / size / jnp.cosh(s0 + rate * t)
+    q = jnp.stack([q0[0] + x, q0[1] + y, moved(t)[0]])
+    return q, jnp.stack([x_rate, y_rate, omega])
+
+
 entry = Entry(
     name="chaplygin_sleigh",
     book="not in the book; Chaplygin (1911); ch. 4, sec. 4.3, Example 2",
@@ -89,4 +121,5 @@ entry = Entry(
         v0=(-1.0, 0.0, 0.4),
         duration=8.0,
     ),
+    exact=exact,
 )

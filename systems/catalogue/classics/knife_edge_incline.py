@@ -65,6 +65,19 @@ system = jl.System(
     quasi=jl.QuasiVelocities(velocities, ("v", "v_n", "phidot"), constrained=("v_n",)),
 )
 
+
+def exact(t, q0, v0, params):
+    """An edge that turns, at the constant rate w, from the velocity v along itself."""
+    (_, _, start), (v, _, w) = q0, velocities(0.0, q0, v0, params)
+    pull, phi = params["g"] * jnp.sin(params["alpha"]), start + w * t
+    s, s0, c, c0 = jnp.sin(phi), jnp.sin(start), jnp.cos(phi), jnp.cos(start)
+    rest = v - pull / w * s0
+    x = rest / w * (s - s0) + pull / (2 * w**2) * (s**2 - s0**2)
+    y = -rest / w * (c - c0) + pull / (2 * w**2) * (phi - start - s * c + s0 * c0)
+    along = rest + pull / w * s
+    return q0 + jnp.stack([x, y, w * t]), jnp.stack([along * c, along * s, w])
+
+
 entry = Entry(
     name="knife_edge_incline",
     book="not in the book; Bloch (2003); ch. 4, sec. 4.3, Example 2",
@@ -79,4 +92,5 @@ entry = Entry(
         v0=(0.0, 0.0, 1.5),
         duration=8.0,
     ),
+    exact=exact,
 )

@@ -59,6 +59,18 @@ system = jl.System(
     quasi=jl.QuasiVelocities(velocities, ("xdot", "ydot", "s"), constrained=("s",)),
 )
 
+
+def exact(t, q0, v0, params):
+    """Where y' is not 0, by the inverse of the hyperbolic sine."""
+    y0, y_rate = q0[1], v0[1]
+    y, root0 = y0 + y_rate * t, jnp.sqrt(1 + y0**2)
+    root, c = jnp.sqrt(1 + y**2), v0[0] * root0
+    x = c / y_rate * (jnp.arcsinh(y) - jnp.arcsinh(y0))
+    z = c / y_rate * (root - root0)
+    x_rate = c / root
+    return q0 + jnp.stack([x, y_rate * t, z]), jnp.stack([x_rate, y_rate, y * x_rate])
+
+
 entry = Entry(
     name="nonholonomic_particle",
     book="not in the book; Rosenberg (1977); ch. 4, sec. 4.3, Example 2",
@@ -73,4 +85,5 @@ entry = Entry(
         v0=(1.0, 0.6, -1.0),
         duration=5.0,
     ),
+    exact=exact,
 )

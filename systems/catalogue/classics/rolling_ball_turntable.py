@@ -44,7 +44,7 @@ The rates do not determine phi' and psi' at theta = +-pi/2.
 import jax.numpy as jnp
 
 import jaxlag as jl
-from systems.catalogue import _attitude
+from systems.catalogue import _attitude, _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -67,7 +67,7 @@ def potential(t, q, params):
 def velocities(t, q, v, params):
     """(wX, wY, wZ, s_x, s_y) (rad/s, m/s)."""
     omega = angular_velocity(t, q, v, params)
-    rolling = v[:2] + params["a"] * jnp.stack([-omega[1], omega[0]])
+    rolling = _rolling.of_ball(v[:2], omega, params["a"])
     table = params["Omega"] * jnp.stack([-q[1], q[0]])
     return jnp.concatenate([omega, rolling - table])
 

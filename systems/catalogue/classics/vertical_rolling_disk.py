@@ -41,6 +41,7 @@ Without torques the contact goes round a circle of radius R theta'/phi'.
 import jax.numpy as jnp
 
 import jaxlag as jl
+from systems.catalogue import _exact, _rolling
 from systems.catalogue._entry import Entry, Example
 
 
@@ -62,8 +63,8 @@ def torques(t, q, v, params):
 
 def velocities(t, q, v, params):
     """(thetadot, phidot, s_x, s_y) (rad/s, rad/s, m/s, m/s)."""
-    heading = jnp.stack([jnp.cos(q[3]), jnp.sin(q[3])])
-    return jnp.concatenate([v[2:], v[:2] - params["R"] * v[2] * heading])
+    slip = _rolling.of_upright_wheel(v[:2], q[3], v[2], params["R"])
+    return jnp.concatenate([v[2:], slip])
 
 
 system = jl.System(
@@ -75,6 +76,26 @@ system = jl.System(
         velocities, ("thetadot", "phidot", "s_x", "s_y"), constrained=("s_x", "s_y")
     ),
 )
+
+
+def exact(t, q0, v0, params):
+    """Roll and heading under constant torques, and the path along them."""
+    inertia = jnp.stack([params["I"] + params["m"] * params["R"] ** 2, params["J"]])
+    a = jnp.stack([params["tau_theta"], params["tau_phi"]]) / inertia
+
+    def speed(t):
+        return params["R"] * (v0[2] + a[0] * t)
+
+    def heading(t):
+        return q0[3] + v0[3] * t + 0.5 * a[1] * t**2
+
+    x = _exact.integral(lambda t: speed(t) * jnp.cos(heading(t)), t)
+    y = _exact.integral(lambda t: speed(t) * jnp.sin(heading(t)), t)
+    turns, rates = _exact.accelerated(t, q0[2:], v0[2:], a)
+    forward = jnp.stack([jnp.cos(turns[1]), jnp.sin(turns[1])])
+    q = jnp.concatenate([q0[:2] + jnp.stack([x, y]), turns])
+    return q, jnp.concatenate([speed(t) * forward, rates])
+
 
 entry = Entry(
     name="vertical_rolling_disk",
@@ -104,4 +125,5 @@ entry = Entry(
         v0=(0.9, 0.0, 3.0, 0.5),
         duration=5.0,
     ),
+    exact=exact,
 )

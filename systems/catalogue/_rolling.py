@@ -1,0 +1,14 @@
+"""Velocities at the point of contact of what rolls on a plane, along its X, Y [m/s]."""
+
+import jax.numpy as jnp
+from jax import Array
+
+
+def of_ball(v: Array, omega: Array, radius: Array) -> Array:
+    """From the velocity (x', y') of the centre and the angular velocity along X, Y, Z."""
+    return v + radius * jnp.stack([-omega[1], omega[0]])
+
+
+def of_upright_wheel(v: Array, heading: Array, roll: Array, radius: Array) -> Array:
+    """From the velocity (x', y') of the centre, the heading from X and the rate of the roll."""
+    return v - radius * roll * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
