@@ -223,9 +223,9 @@ def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
 
 
 def test_wrong_scalars_are_found(monkeypatch):
-    right = ScalarProgram.quasi_rates
+    right = ScalarProgram._run
     monkeypatch.setattr(
-        ScalarProgram, "quasi_rates", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
+        ScalarProgram, "_run", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
     )
     for what in found_in(DOUBLED, IN_QUASI):
         assert "scalars" in what
