@@ -4,10 +4,10 @@
 
 from importlib.metadata import version as _version
 
-from jaxlag._core import _old_layout, _xla
+from jaxlag._core import _old_pickles, _xla
 
 _xla.configure()
-_old_layout.install()
+_old_pickles.install()
 
 from jaxlag import energy as energy
 from jaxlag import math as math

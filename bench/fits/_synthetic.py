@@ -18,9 +18,9 @@ from jax import Array
 import jaxlag as jl
 from bench._harness.timing import Reference, Target
 from bench.fits._report import Figure, Part
+from jaxlag._fit._covariance import linearised
 from jaxlag._fit._fit import last_gap
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
-from jaxlag._fit._identifiability import linearised
 from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, search
 from jaxlag._fit._residuals import squares
 from jaxlag._fit._segments import layout

@@ -13,10 +13,10 @@ from scipy.special import stdtrit
 
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
+from jaxlag._fit._covariance import Spectrum, distance, linearised, saturated
 from jaxlag._fit._dissipation import feeding
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns, paths
-from jaxlag._fit._identifiability import Spectrum, distance, linearised, saturated
 from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._plot import plotted
 from jaxlag._fit._predict import Prediction, predict, residuals_of

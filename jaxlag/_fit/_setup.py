@@ -14,9 +14,9 @@ from jaxtyping import Array
 from jaxlag._core._arguments import positive_integer
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
+from jaxlag._fit._covariance import effective_parameters
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns
-from jaxlag._fit._identifiability import effective_parameters
 from jaxlag._fit._initial_guess import initial_states, typical
 from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._residuals import Reader, readers, squares

@@ -20,7 +20,7 @@ from jaxlag._gradient._recorded_motion import (
 )
 from jaxlag._gradient._rescan import again
 from jaxlag._gradient._split_problem import SplitProblem, Static
-from jaxlag._gradient._sweeps import adjoint_sweep, tangent_sweep
+from jaxlag._gradient._tangent_and_adjoint import adjoint_sweep, tangent_sweep
 from jaxlag._integration._record import Outcome, Record, Times
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers, with_stages

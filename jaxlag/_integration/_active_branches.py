@@ -9,7 +9,7 @@ from jaxlag._integration._step_arguments import Arguments
 from jaxlag._integration._vector_field import VectorField
 from jaxlag._model._input_signals import AbstractInput, AbstractTable
 from jaxlag._model._inputs import evaluate
-from jaxlag._system._closure import declared
+from jaxlag._system._closure_tracers import declared
 from jaxlag._tracing import _params
 from jaxlag._tracing._input_values import InputValues
 from jaxlag._tracing._nonsmooth_points import outcomes

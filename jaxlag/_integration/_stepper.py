@@ -23,7 +23,7 @@ from jaxlag._integration._step_end import StepEnd
 from jaxlag._integration._tableaus import explicit_tableau, nodes_of, remembers
 from jaxlag._integration._term import Term
 from jaxlag.solvers import AbstractExplicit, Splitting
-from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
+from jaxlag.solvers._unweighted_stages import at_least, unseen, unstacked, unweighted_stages
 
 SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
 

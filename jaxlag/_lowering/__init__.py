@@ -13,7 +13,7 @@ from jaxlag._lowering._row_layout import layout as layout
 from jaxlag._lowering._scalar_program import ScalarProgram as ScalarProgram
 from jaxlag._lowering._structure import Structure as Structure
 from jaxlag._lowering._structure import find_structure as find_structure
-from jaxlag._lowering._symbolic._findings import find as find
 from jaxlag._lowering._symbolic._lower import OPERATIONS as OPERATIONS
 from jaxlag._lowering._symbolic._lower import Lowered as Lowered
 from jaxlag._lowering._symbolic._symbolic_system import Equations as Equations
+from jaxlag._lowering._symbolic._system_properties import find as find

@@ -23,7 +23,7 @@ from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._jaxprs import called, equations, within
 from jaxlag._model._input_signals import AbstractInput, AbstractTable
 from jaxlag._model._inputs import evaluate
-from jaxlag._system._closure import declared
+from jaxlag._system._closure_tracers import declared
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._closure_params import ParamsWithClosure, plain

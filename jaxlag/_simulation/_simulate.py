@@ -44,7 +44,7 @@ from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
 from jaxlag._simulation._step_diagnosis import is_stiff
-from jaxlag._system._closure import check_params, lift_closure_tracers
+from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._inspection import contact_rows_independent, mass_definite
 from jaxlag._system._system import System
 from jaxlag._tracing import _params

@@ -2,7 +2,7 @@
 
 from typing import NoReturn
 
-from jaxlag._core._old_layout import missing
+from jaxlag._core._old_pickles import missing
 
 
 def __getattr__(name: str) -> NoReturn:

@@ -21,7 +21,7 @@ from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import state_vectors
-from jaxlag._system._closure import check_params, lift_closure_tracers
+from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
 from jaxlag._tracing._compiled import Compiled

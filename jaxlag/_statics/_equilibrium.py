@@ -23,7 +23,7 @@ from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._statics._rest_search import Rest, find_rest
 from jaxlag._statics._root_search import differentiable_if, solve_tangent
-from jaxlag._system._closure import lift_closure_tracers
+from jaxlag._system._closure_tracers import lift_closure_tracers
 from jaxlag._system._inspection import check_declaration
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System

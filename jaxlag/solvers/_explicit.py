@@ -15,7 +15,7 @@ from jax import Array, lax
 
 from jaxlag._core._arrays import elements
 from jaxlag._core._xla import opaque_one
-from jaxlag.solvers._unweighted import at_least, unseen, unstacked, unweighted_stages
+from jaxlag.solvers._unweighted_stages import at_least, unseen, unstacked, unweighted_stages
 
 # Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
 # tracing and compiling and microseconds per step, written out | in a loop: elastic pendulum (21

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._system import _closure
+from jaxlag._system import _closure_tracers
 
 TS = jnp.array([0.0, 0.5, 1.0])
 
@@ -90,7 +90,7 @@ def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
 
     def check(times, values):
         inputs = {"u": jl.LinearInterpolation(times, values)}
-        assert _closure.lift_closure_tracers(system, {}, jnp.zeros(1), inputs) == {}
+        assert _closure_tracers.lift_closure_tracers(system, {}, jnp.zeros(1), inputs) == {}
         return jl.simulate(system, [0.0], [1.0], TS, {}, inputs=inputs).q[-1, 0]
 
     jax.make_jaxpr(jax.grad(check, (0, 1)))(jnp.array([0.0, 2.0]), jnp.array([1.0, 3.0]))
@@ -103,7 +103,7 @@ def test_nothing_is_traced_twice_for_the_sake_of_closures(monkeypatch, formulati
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), quasi=quasi)
     run = partial(jl.simulate, system, [0.0], [1.0], TS, {}, formulation=formulation)
     run()
-    monkeypatch.setattr(_closure, "_consts", None)
+    monkeypatch.setattr(_closure_tracers, "_consts", None)
     run()
 
 

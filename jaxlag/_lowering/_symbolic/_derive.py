@@ -26,7 +26,7 @@ from jaxlag._lowering._symbolic._constraint_solve import (
     solve_with_rows,
 )
 from jaxlag._lowering._symbolic._derive_quasi import derive_rates
-from jaxlag._lowering._symbolic._surface import surface
+from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 
 

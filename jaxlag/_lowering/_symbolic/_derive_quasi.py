@@ -16,7 +16,7 @@ from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._bias_forms import attempt, cost, mass_matrix
 from jaxlag._lowering._symbolic._cofactor_inverse import Inverse
 from jaxlag._lowering._symbolic._constraint_solve import rows
-from jaxlag._lowering._symbolic._surface import surface
+from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, SymbolicSystem
 
 WRITTEN_OUT = 3  # forms of the right side, shortest first

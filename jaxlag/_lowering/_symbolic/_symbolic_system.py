@@ -6,7 +6,7 @@ from typing import NamedTuple
 from jaxlag._lowering._graph._expression import Graph, Node
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._lowering._symbolic._constraint_solve import Constrained, SymbolicRows
-from jaxlag._lowering._symbolic._surface import ProjectionCode
+from jaxlag._lowering._symbolic._projection_program import ProjectionCode
 
 
 class Kinematics(NamedTuple):

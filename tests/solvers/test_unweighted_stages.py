@@ -8,7 +8,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag.solvers._explicit import tableau_of
-from jaxlag.solvers._unweighted import unseen
+from jaxlag.solvers._unweighted_stages import unseen
 
 G = 9.81
 METHODS = [jl.solvers.Dopri8, jl.solvers.Prince9, jl.solvers.Dopri5, jl.solvers.Tsit5]

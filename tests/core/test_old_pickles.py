@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import jaxlag
-from jaxlag._core import _old_layout
+from jaxlag._core import _old_pickles
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,6 @@ def test_names_that_are_there_and_names_of_others_are_as_ever():
 
 
 def test_python_asks_once():
-    _old_layout.install()
-    finders = [x for x in sys.meta_path if type(x).__module__ == _old_layout.__name__]
+    _old_pickles.install()
+    finders = [x for x in sys.meta_path if type(x).__module__ == _old_pickles.__name__]
     assert len(finders) == 1

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlag._fit._identifiability import Spectrum, combination, saturated
+from jaxlag._fit._covariance import Spectrum, combination, saturated
 
 
 def spectrum(names, values, *known):
