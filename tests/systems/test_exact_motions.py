@@ -35,7 +35,7 @@ def test_the_equations_hold_along_the_exact_motion(name):
     def sides(t):
         rates = jax.jvp(lambda t: entry.exact(t, q0, v0, params), (t,), (jnp.ones_like(t),))
         (q, v), (q_rate, v_rate) = rates
-        return q, v, q_rate, v_rate, entry.system.acceleration(params, q, v, t)
+        return q, v, q_rate, v_rate, entry.system.acceleration(q, v, params, t=t)
 
     q, v, q_rate, v_rate, a = sides(jnp.linspace(0.0, entry.example.duration, 7))
     close(q[0], q0, 1e-14)
