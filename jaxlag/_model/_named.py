@@ -35,7 +35,7 @@ def named(
         ... def lagrangian(t, q, v, params):
         ...     return 0.5 * (v["r"] ** 2 + q["r"] ** 2 * v["spin"] @ v["spin"]) + v["spin"][0]
         >>> bead = jl.System(lagrangian, names)
-        >>> print(bead.mass_matrix({}, [2.0, 0.0, 0.0, 0.0]).diagonal())
+        >>> print(bead.mass_matrix([2.0, 0.0, 0.0, 0.0]).diagonal())
         [1. 4. 4. 4.]
     """
     table = Coordinates(coordinates)
