@@ -1,8 +1,8 @@
 """One iteration of the loop: one attempted step, or one to a save time.
 
-The phases are `aim`, where the step is to end; `attempt`, the step itself and what is to be said of
-it; `accept`, whether it is kept and how long the next one is; `saved_on`, the state at a save time;
-and `advance`, the state of the loop afterwards.
+The phases, in the order of `iterate`: `aimed`, where the step is to end; `attempt`, the step itself
+and its checks; `accept`, whether it is kept and how long the next one is; `beside_change_points`,
+states near a change point; `advance`, the new state of the loop, with the states saved.
 """
 
 from typing import Any, NamedTuple, cast
