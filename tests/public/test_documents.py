@@ -1,41 +1,20 @@
 """Every documented line runs: the README's code and its printed numbers, doctests, set-up lines."""
 
-import contextlib
 import doctest
 import importlib
-import io
 import pkgutil
 import re
 import tomllib
 from pathlib import Path
 
-import jax
 import pytest
+from _code_blocks import blocks, run
 from _families import mostly_full
-from sybil import Document
-from sybil.parsers.markdown import CodeBlockParser
 
 import jaxlag
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
-
-
-class Blocks(CodeBlockParser):
-    """Code blocks of one language, handed to the test as they are."""
-
-    def evaluate(self, example):
-        raise NotImplementedError
-
-
-def blocks():
-    """(line, language, text) of the README's Python and text blocks, in order."""
-    document = Document.parse(str(README), Blocks("python"), Blocks("text"))
-    found = {}
-    for example in document:
-        language = re.match(r"```(\w+)", document.text[example.start :]).group(1)
-        found[example.line] = (language, example.parsed)
-    return [(line, *found[line]) for line in sorted(found)]
 
 
 def numbers(text):
@@ -50,30 +29,18 @@ FIRST = 4
     ("count", "outputs"), mostly_full([(FIRST, 2), (None, 10)], (FIRST, 2)), ids=["first", "all"]
 )
 def test_readme_runs_and_prints_what_it_says(count, outputs):
-    namespace, printed, compared = {}, "", 0
-    for line, language, text in blocks()[:count]:
-        if language == "python":
-            out = io.StringIO()
-            # What optax computes needs JAX's own promotion of dtypes.
-            kind = "standard" if "import optax" in text else "strict"
-            with contextlib.redirect_stdout(out), jax.numpy_dtype_promotion(kind):
-                exec(compile(text, f"README.md:{line}", "exec"), namespace)
-            printed = out.getvalue()
-        else:
-            assert printed.strip() == str(text).strip(), f"README.md:{line}"
-            compared += 1
-    assert compared == outputs
+    assert run("README.md", blocks(README)[:count], {}) == outputs
 
 
 def test_readme_shows_the_same_numbers_twice():
     """The simulated and the closed form, to the digits shown."""
-    shown = [numbers(text) for _, language, text in blocks() if language == "text"]
+    shown = [numbers(text) for _, language, text in blocks(README) if language == "text"]
     assert len(shown[0]) == 2
     assert shown[0] == pytest.approx(shown[1], abs=2e-6)
 
 
 def test_first_program_is_short():
-    first = next(text for _, language, text in blocks() if language == "python")
+    first = next(text for _, language, text in blocks(README) if language == "python")
     assert sum(bool(line.strip()) for line in first.splitlines()) <= 15
 
 
