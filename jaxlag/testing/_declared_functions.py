@@ -109,6 +109,8 @@ def declared(
             add(f"{name}: torque", force.torque, "t q v params", _FORCE, force.takes_inputs)
         elif isinstance(force, Rayleigh):
             add(f"{name}: R", force.R, "t q v params", _CONJUGATE)
+        else:  # of a class that is not known here: as a whole
+            add(name, force, "t q v params", _FORCE, True)
     for row in system.constraints:
         name = f"constraint {row.names!r}"
         if isinstance(row, Holonomic):

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +29,7 @@ from _families import mostly_full
 
 import jaxlag as jl
 from jaxlag import testing
+from jaxlag._model._forces import AbstractForce
 from systems.catalogue import ENTRIES
 from tests._user import unchecked  # noqa: F401
 
@@ -128,6 +130,22 @@ def test_inputs_that_depend_on_the_state():
     assert {f.state for f in report.findings} == {"rest", "zero"}
     with pytest.raises(ValueError, match="`inputs` must have an entry 'u'"):
         testing.check_derivatives(system, Q, V, {})
+
+
+class Springs(AbstractForce):
+    """A force of a class of its own, whose derivative is not finite at q = 0."""
+
+    name: str = eqx.field(static=True, default="springs")
+
+    def __call__(self, t, q, v, params, inputs):
+        return -jnp.sqrt(q * q)  # wrong
+
+
+def test_a_force_of_another_class_is_looked_at_as_a_whole():
+    system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(Springs(),))
+    report = testing.check_derivatives(system, Q, V, {}, states=("given", "zero"))
+    assert dict(report.functions) == {"lagrangian": 3, "force 'springs'": 1}
+    assert places(report) == here("sqrt", Springs, "# wrong")
 
 
 def test_constraints_reactions_and_quasi_velocities():
