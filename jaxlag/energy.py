@@ -8,7 +8,7 @@ inertial ones, as in `jaxlag.rotation`. Functions of the configuration are writt
 
 so moving frames and prescribed motions (explicit t) are included. The results are terms of T and
 V to be added up in `System(kinetic=..., potential=...)`, in the precision of the positions and
-velocities: masses, inertias, stiffnesses and g are brought to it.
+velocities: masses, inertias, stiffnesses and g are converted to it.
 
 Source: Pila, Introduction to Lagrangian Dynamics, secs. 2.2 to 2.5 (eq. 2.16 for rigid bodies).
 """
@@ -32,21 +32,21 @@ Pose = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 def velocity(position: Callable, t: Any, q: Any, v: Any, params: Any) -> Float[Array, "..."]:
-    """dr/dt of points r(t, q) as the coordinates move at rates v, by one forward derivative.
+    """dr/dt of points r(t, q) for coordinate rates v, by one forward derivative.
 
     Args:
         position: function `position(t, q, params)` returning r, in m, of any shape.
         t: s.
         q: coordinates, shape (n,).
         v: generalized velocities, shape (n,).
-        params: handed to `position`.
+        params: passed to `position`.
 
     Returns:
         dr/dt, m/s, in the shape of r and in the same axes.
 
     Raises:
-        ValueError: `position` is no function of (t, q, params) or returns something else than an
-            array of real numbers; q and v of different shapes; t no number.
+        ValueError: `position` is no function of (t, q, params) or does not return an array of
+            real numbers; q and v of different shapes; t no number.
     """
     return _along(_located(position), t, q, v, params)[1]
 
@@ -61,15 +61,15 @@ def body_velocity(
 
     Args:
         pose: function `pose(t, q, params)` returning (R, r_O): R of shape (3, 3), proper
-            orthogonal, body to inertial components, in any parametrisation; r_O of shape (3,), m.
+            orthogonal, body to inertial components, in any parametrization; r_O of shape (3,), m.
         t: s.
         q: coordinates, shape (n,).
         v: generalized velocities, shape (n,).
-        params: handed to `pose`.
+        params: passed to `pose`.
 
     Raises:
-        ValueError: `pose` is no function of (t, q, params) or returns something else than a
-            (3, 3) and a (3,) array of real numbers; q and v of different shapes; t no number.
+        ValueError: `pose` is no function of (t, q, params) or does not return a (3, 3) and a
+            (3,) array of real numbers; q and v of different shapes; t no number.
     """
     (R, _), (R_rate, r_rate) = _along(_placed(pose), t, q, v, params)
     return R.T @ r_rate, rotation.body_rates(R, R_rate)
@@ -87,7 +87,7 @@ def particles(
         t: s.
         q: coordinates, shape (n,).
         v: generalized velocities, shape (n,).
-        params: handed to `position`.
+        params: passed to `position`.
 
     Raises:
         ValueError: positions are not vectors, masses not one for each of them; as `velocity`.
@@ -128,7 +128,7 @@ def gravity(mass: Any, r: Any, g: Any) -> Float[Array, ""]:
 def spring(stiffness: Any, r: Any, length: Any = 0.0) -> Float[Array, ""]:
     """V = k/2 (r.r - 2 l0 |r| + l0^2) = k/2 (|r| - l0)^2 of a spring between two points, J.
 
-    In this form its derivatives to any order are right at zero length with l0 = 0, where the
+    In this form its derivatives of any order are correct at zero length with l0 = 0: the
     Hessian is k times the identity. With l0 > 0 the force at zero length has no direction: the
     term in |r| then counts as constant (see `jaxlag.math.norm`).
 
@@ -138,8 +138,8 @@ def spring(stiffness: Any, r: Any, length: Any = 0.0) -> Float[Array, ""]:
         length: unstretched length l0 >= 0, m.
 
     Raises:
-        ValueError: r is not one vector, stiffness or length not one number; a length with a value
-            that is negative.
+        ValueError: r is not one vector, stiffness or length not one number; a negative length
+            (if its value is known).
     """
     r = real("spring: r", r)
     if r.ndim != 1:
@@ -173,15 +173,15 @@ def inertia_matrix(
 
 
 def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
-    """I_O = I_G + m (|c|^2 E - c c^T): central inertia carried to a point O, kg m^2.
+    """I_O = I_G + m (|c|^2 E - c c^T): central inertia transferred to a point O, kg m^2.
 
     Args:
-        inertia: I_G about the mass centre, shape (3, 3), or (3,) principal moments.
+        inertia: I_G about the center of mass, shape (3, 3), or (3,) principal moments.
         mass: m, kg.
-        centre: c from O to the mass centre in the same axes, m, shape (3,).
+        centre: c from O to the center of mass in the same axes, m, shape (3,).
 
     Raises:
-        ValueError: wrong shapes; a mass with a value that is negative or not finite.
+        ValueError: wrong shapes; a negative or nonfinite mass (if its value is known).
     """
     inertia = _inertia.matrix("parallel_axis: inertia", inertia)
     mass = _inertia.number("parallel_axis: mass", mass)
@@ -190,25 +190,25 @@ def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
 
 
 class RigidBody(eqx.Module):
-    """Mass, inertia about the body's origin O, and mass centre: the inertia of a rigid body.
+    """Mass, inertia about the body's origin O, and center of mass of a rigid body.
 
     T = 1/2 m V.V + m V.(w x c) + 1/2 w.I_O w, with V the velocity of O and w the body rates, in
-    body components. O is any point fixed in the body; with c = 0 (or left out) it is the mass
-    centre and the middle term is not computed.
+    body components. O is any point fixed in the body. With c = 0 (or left out) it is the center of
+    mass and the middle term is not computed.
 
     Args:
         mass: m, kg, not negative.
         inertia: I_O about O along the body axes, kg m^2, shape (3, 3) symmetric, or (3,) for
             principal axes. Moments may be zero: a slender rod's own axis, or the axes in the
-            plane of a planar motion, which never enter.
-        centre: c from O to the mass centre, body components, m, shape (3,); by default O itself.
+            plane of a planar motion, which are not used.
+        centre: c from O to the center of mass, body components, m, shape (3,); by default O itself.
 
     Raises:
-        ValueError: wrong shapes, or not real numbers. Where they have values: a mass that is
-            negative, numbers that are not finite, an inertia that is not symmetric, has a
-            negative principal moment, or leaves one about the mass centre, so that it is not
-            about O (named with its axis). Values traced by jit are not looked at, numbers written
-            in a traced Lagrangian are: build the body, or call `System.check`, once outside.
+        ValueError: wrong shapes, or not real numbers. For known values: a negative mass, nonfinite
+            numbers, an inertia that is not symmetric, has a negative principal moment, or gives a
+            negative one about the center of mass (it is then not about O; the axis is named).
+            Values traced by jit are not checked, but numbers inside a traced Lagrangian are: build
+            the body, or call `System.check`, once outside.
 
     Source: Pila, eq. 2.16; the 6 x 6 mass matrix is [[m E, -m [c]x], [m [c]x, I_O]].
     """
@@ -229,14 +229,14 @@ class RigidBody(eqx.Module):
             _inertia.check_about_origin("RigidBody: inertia", *body)
 
     def kinetic(self, pose: Pose, t: Any, q: Any, v: Any, params: Any) -> Float[Array, ""]:
-        """T, J, of the body in the pose `pose(t, q, params)` moving at rates v.
+        """T, J, of the body in the pose `pose(t, q, params)` with the rates v.
 
         Args:
             pose: function returning (R, r_O), see `body_velocity`.
             t: s.
             q: coordinates, shape (n,).
             v: generalized velocities, shape (n,).
-            params: handed to `pose`.
+            params: passed to `pose`.
         """
         return self.kinetic_from_rates(*body_velocity(pose, t, q, v, params))
 
@@ -258,13 +258,13 @@ class RigidBody(eqx.Module):
         return T + mass * (V @ jnp.cross(w, self.centre.astype(V.dtype)))
 
     def gravity(self, pose: Pose, t: Any, q: Any, params: Any, g: Any) -> Float[Array, ""]:
-        """V = -m g . (r_O + R c), J, zero where the mass centre is at the inertial origin.
+        """V = -m g . (r_O + R c), J, zero if the center of mass is at the inertial origin.
 
         Args:
             pose: function returning (R, r_O), see `body_velocity`.
             t: s.
             q: coordinates, shape (n,).
-            params: handed to `pose`.
+            params: passed to `pose`.
             g: acceleration of free fall, inertial components, m/s^2, shape (3,).
         """
         R, r = _placed(pose)(t, q, params)
@@ -284,7 +284,7 @@ def _along(function: Callable, t: Any, q: Any, v: Any, params: Any) -> tuple[Any
 
 
 def _located(position: Callable) -> Callable:
-    """`position`, raising in our form while it is traced unless it returns a real array."""
+    """`position`, with an error in our form while tracing unless it returns a real array."""
     require_arity("position", position, ("t", "q", "params"))
 
     def located(t: Any, q: Any, params: Any) -> Array:
@@ -298,7 +298,7 @@ def _located(position: Callable) -> Callable:
 
 
 def _placed(pose: Pose) -> Pose:
-    """`pose`, raising in our form unless it returns (R, r_O); both of one dtype."""
+    """`pose`, with an error in our form unless it returns (R, r_O); both of one dtype."""
     require_arity("pose", pose, ("t", "q", "params"))
 
     def placed(t: Any, q: Any, params: Any) -> tuple[Array, Array]:

@@ -1,9 +1,9 @@
-"""Elementary functions whose derivatives are right at their singular points.
+"""Elementary functions with correct derivatives at their singular points.
 
-JAX differentiates |x|, sqrt, atan2 and their like to NaN or infinity where a mechanism stretches
-out or a spring has no length, and one NaN spoils the whole acceleration, even times zero. Here
-value and derivatives, in every mode and of every order, are the limits where limits exist, and
-follow a convention elsewhere:
+JAX differentiates |x|, sqrt, atan2 and the like to NaN or infinity where a mechanism is stretched
+out or a spring has no length, and one NaN makes the whole acceleration NaN, even times zero. Here
+values and derivatives, in every mode and of every order, are the limits if limits exist, and
+otherwise follow a convention:
 
 | function             | singular point  | value       | 1st, 2nd, 3rd derivative | these are   |
 |----------------------|-----------------|-------------|--------------------------|-------------|
@@ -20,9 +20,9 @@ follow a convention elsewhere:
 | `sinc_sqrt(z)`       | z = 0           | 1           | -1/6, 1/60, -1/840       | the limits  |
 | `cosc_sqrt(z)`       | z = 0           | 1/2         | -1/24, 1/360, -1/6720    | the limits  |
 
-A convention holds for the function by itself, not for what is composed of it: `norm(x)**2` and
-`sinc(norm(x))` are smooth, but their second derivatives at x = 0 come out as 0. Write functions of
-the square as such: `x @ x`, `sinc_sqrt(x @ x)`.
+A convention holds for the function itself, not for compositions: `norm(x)**2` and
+`sinc(norm(x))` are smooth, but their second derivatives at x = 0 are computed as 0. Write functions
+of the square directly: `x @ x`, `sinc_sqrt(x @ x)`.
 
 Scalars act element by element, vectors along the last axis. The dtype is that of the arguments;
 integers become the default float, complex numbers raise a ValueError.
@@ -41,18 +41,18 @@ from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._errors import invalid
 from jaxlag._tracing._nonsmooth_points import smooth
 
-# Of the Taylor series of sin(x)/x in z = x^2. Up to |z| = 4 the first term left out is below EPSEPS
-# of the sum, in each of its first three derivatives too; beyond, the quotient loses few digits.
+# Of the Taylor series of sin(x)/x in z = x^2. Up to |z| = 4 the first omitted term is below eps
+# of the sum, also in each of its first three derivatives; beyond, the quotient loses few digits.
 _SINC_TERMS = 13
 _SINC_SERIES_BELOW = 4.0
 
 
 @smooth
 def norm(x: Any) -> Float[Array, "..."]:
-    """Euclidean length |x| = sqrt(sum x_i^2), free of overflow and underflow on the way.
+    """Euclidean length |x| = sqrt(sum x_i^2), without intermediate overflow and underflow.
 
-    The derivative is x/|x|; the k-th is of order |x|^(1 - k), right where it can be represented.
-    At x = 0 none exists: all are 0 there, the first being the smallest subgradient. A spring of
+    The derivative is x/|x|; the k-th is of order |x|^(1 - k), correct if it can be represented.
+    At x = 0 none exists: all are 0 there, and the first is the smallest subgradient. A spring of
     unstretched length l0 is `k/2 * (r @ r - 2 * l0 * norm(r) + l0**2)`, not `(norm(r) - l0)**2`.
 
     Args:
@@ -89,7 +89,7 @@ def angle_between(a: Any, b: Any) -> Float[Array, "..."]:
     """Angle in [0, pi] between two vectors, rad: atan2(|a ^ b|, a . b), to some eps everywhere.
 
     |a ^ b|^2 = sum_(i<j) (a_i b_j - a_j b_i)^2, the cross product in three dimensions. For parallel
-    vectors no derivative exists, as for |x| at 0: all are 0 there. Vectors count as parallel where
+    vectors no derivative exists, as for |x| at 0: all are 0 there. Vectors count as parallel if
     every difference above is within 4 eps of its two products, so b = c a does for every c. For a
     zero vector the angle and its derivatives are 0.
 
@@ -138,11 +138,11 @@ def atan2(y: Any, x: Any) -> Float[Array, "..."]:
     """Angle of the point (x, y) from the x axis, rad, in [-pi, pi]: y = r sin, x = r cos.
 
     Axes, the branch at y = +-0 with x < 0, and the origin are as in numpy, by the signs of zero.
-    The k-th derivative is of order r^-k, right where it can be represented; all are 0 at r = 0.
+    The k-th derivative is of order r^-k, correct if it can be represented; all are 0 at r = 0.
 
     Args:
         y: any shape and unit.
-        x: the same unit, a shape that goes with that of y.
+        x: the same unit, a shape compatible with that of y.
 
     Source: d atan2 = (x dy - y dx)/(x^2 + y^2), taken of (x, y)/max(|x|, |y|).
     """
@@ -198,7 +198,7 @@ def sinc_sqrt(z: Any) -> Float[Array, "..."]:
     """sin(x)/x as a function of z = x^2; smooth at z = 0, NaN for z <= -4.
 
     With z = w @ w it is the even, smooth factor in the rotation by the vector w,
-    R = 1 + sinc_sqrt(z) [w]x + cosc_sqrt(z) [w]x^2, with every derivative right at w = 0. Between
+    R = 1 + sinc_sqrt(z) [w]x + cosc_sqrt(z) [w]x^2, with correct derivatives at w = 0. Between
     -4 and 0 it is sinh(y)/y with y^2 = -z.
 
     Args:
@@ -248,7 +248,7 @@ def cosc_sqrt(z: Any) -> Float[Array, "..."]:
 
 
 def _real(argument: str, x: Any) -> Array:
-    # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
+    # float() keeps a Python number weakly typed: it takes the dtype of the arrays in an operation.
     x = jnp.asarray(float(x) if isinstance(x, int) else x)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise invalid(argument, "be real", f"its dtype was {x.dtype}")
@@ -263,18 +263,18 @@ def _vector(argument: str, x: Any) -> Array:
 
 
 def _scale(largest: Array) -> Array:
-    """`largest` where one can divide by it, else 1."""
+    """`largest` if it can be a divisor, else 1."""
     return jnp.where((largest > 0) & (largest < jnp.inf), largest, 1.0)
 
 
 def _scaled(x: Array) -> tuple[Array, Array]:
-    """x/s and s = max|x|, of which no derivative is taken."""
+    """x/s and s = max|x|, which is not differentiated."""
     scale = _scale(jnp.max(jnp.abs(stop_gradient(x)), axis=-1, keepdims=True, initial=0.0))
     return x / scale, scale
 
 
-# With rules of their own, since the chain rule through the scaling passes through |x|^-2 on its way
-# to the second derivative of |x|, of order 1/|x|, and overflows. Those of |x| for n = 1 are exact.
+# With custom rules, since the chain rule through the scaling contains |x|^-2 in the second
+# derivative of |x|, of order 1/|x|, and overflows. Those of |x| for n = 1 are exact.
 @CustomJVP
 def _norm(x: Array) -> Array:
     scaled, scale = _scaled(x)
@@ -303,7 +303,7 @@ def _unit_rule(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Ar
     return u, across / jnp.where(zero, 1.0, length)
 
 
-# With a rule of its own, as differentiating the sum costs many times the sum of the derivatives.
+# With a custom rule, as differentiating the sum costs many times the sum of the derivatives.
 @cache
 def _sinc_series(order: int) -> CustomJVP:
     """d^order/dz^order of sum_k (-z)^k/(2k + 1)!, by nested multiplication."""

@@ -1,12 +1,12 @@
-"""Rotation of a rigid body: matrices, angular velocities and three parametrisations.
+"""Rotation of a rigid body: matrices, angular velocities and three parametrizations.
 
-Convention: R = T_I/B takes body components to inertial ones, `r_inertial = R @ r_body`; its
-columns are the body axes written in the inertial frame. R^T = T_B/I is the direction cosines
+Convention: R = T_I/B transforms body components to inertial ones, `r_inertial = R @ r_body`; its
+columns are the body axes in inertial components. R^T = T_B/I is the direction cosines
 matrix. With w the angular velocity of the body relative to the inertial frame, in rad/s,
 `dR/dt = R [w_body]x = [w_space]x R` and `w_space = R @ w_body`; [a]x is `skew(a)`. Both frames
 are right-handed, angles are in rad and count positive by the right-hand rule.
 
-Everything is a plain function of arrays of one rotation; batches go by `jax.vmap`.
+All functions take arrays of one rotation; use `jax.vmap` for batches.
 
 Source: Pila, Introduction to Lagrangian Dynamics, ch. 1.
 """
@@ -24,7 +24,7 @@ from jaxlag._core._errors import invalid
 
 
 def _times(A: Array, B: Array) -> Array:
-    return jnp.matmul(A, B, precision="highest")  # float32 in full, on every device
+    return jnp.matmul(A, B, precision="highest")  # full float32 precision on every device
 
 
 def _rows(*rows: tuple[Array, ...]) -> Array:
@@ -52,7 +52,7 @@ def skew(a: Any) -> Float[Array, "3 3"]:
 
 
 def unskew(S: Any) -> Float[Array, "3"]:
-    """The a with `skew(a) = (S - S^T)/2`: inverse of `skew`, any symmetric part left out.
+    """The a with `skew(a) = (S - S^T)/2`: inverse of `skew`; a symmetric part is ignored.
 
     Args:
         S: shape (3, 3), any unit.
@@ -75,7 +75,7 @@ def _about(axis: int, angle: Any) -> Array:
 
 
 def about_x(angle: Any) -> Float[Array, "3 3"]:
-    """R of a body turned by `angle` about x: positive turns y towards z.
+    """R of a body rotated by `angle` about x: a positive angle rotates y towards z.
 
     Args:
         angle: scalar, rad.
@@ -83,18 +83,18 @@ def about_x(angle: Any) -> Float[Array, "3 3"]:
     Raises:
         ValueError: not a scalar.
 
-    Source: Pila, ch. 1, transposed (printed are the matrices T_B/I).
+    Source: Pila, ch. 1, transposed (the book has the matrices T_B/I).
     """
     return _about(0, angle)
 
 
 def about_y(angle: Any) -> Float[Array, "3 3"]:
-    """R of a body turned by `angle` about y: positive turns z towards x; else as `about_x`."""
+    """R of a body rotated by `angle` about y: positive rotates z towards x; else as `about_x`."""
     return _about(1, angle)
 
 
 def about_z(angle: Any) -> Float[Array, "3 3"]:
-    """R of a body turned by `angle` about z: positive turns x towards y; else as `about_x`."""
+    """R of a body rotated by `angle` about z: positive rotates x towards y; else as `about_x`."""
     return _about(2, angle)
 
 
@@ -102,7 +102,7 @@ def compose(*rotations: Any) -> Float[Array, "3 3"]:
     """The product R1 R2 ... of rotation matrices, left to right.
 
     R1 R2 acts as R2 first and R1 second about fixed axes, or R1 first and R2 second about the
-    axes that turn with the body; with R1 = T_A/B and R2 = T_B/C it is T_A/C.
+    axes that rotate with the body; with R1 = T_A/B and R2 = T_B/C it is T_A/C.
 
     Args:
         rotations: each of shape (3, 3).
@@ -166,7 +166,7 @@ class AbstractParametrisation(eqx.Module):
     shape. Units are those of w = W x_dot: rad, and rad/s (quaternion: 1 and 1/s).
 
     Attributes:
-        names: of the coordinates, in their order.
+        names: names of the coordinates, in their order.
     """
 
     names: eqx.AbstractClassVar[tuple[str, ...]]
@@ -180,9 +180,9 @@ class AbstractParametrisation(eqx.Module):
         return self._matrix(*self._read(x))
 
     def from_matrix(self, R: Any) -> Float[Array, " n"]:
-        """x with R(x) = R, in the principal ranges that the class states, shape (n,).
+        """x with R(x) = R, in the principal ranges of the class, shape (n,).
 
-        R is reproduced to rounding everywhere, at gimbal lock too. Derivatives hold along
+        R is reproduced to rounding everywhere, also at gimbal lock. Derivatives are correct along
         rotations (R_dot = R [w]x).
 
         Args:
@@ -194,8 +194,8 @@ class AbstractParametrisation(eqx.Module):
     def body_rate_matrix(self, x: Any) -> Float[Array, "3 n"]:
         """W(x) with w_body = W x_dot.
 
-        By virtual work a torque with body components tau, in N m, gives the generalized force
-        W^T tau on x.
+        By virtual work the generalized force on x of a torque with body components tau, in N m, is
+        W^T tau.
 
         Args:
             x: coordinates, shape (n,).
@@ -217,7 +217,7 @@ class AbstractParametrisation(eqx.Module):
         return _times(self.matrix(x), self.body_rates(x, x_dot))
 
     def from_body_rates(self, x: Any, w: Any) -> Float[Array, " n"]:
-        """x_dot of a body turning with w, shape (n,), rad/s.
+        """x_dot of a body rotating with w, shape (n,), rad/s.
 
         Not finite at gimbal lock, see the class.
 
@@ -249,13 +249,13 @@ class AbstractParametrisation(eqx.Module):
 
 
 def _divisor(s: Array, theta: Array) -> Array:
-    """The sine or cosine `s` of theta, 0 where it is within the rounding of theta itself."""
+    """The sine or cosine `s` of theta, 0 if it is within the rounding of theta itself."""
     rounding = float(jnp.finfo(s.dtype).eps) * jnp.abs(theta)
     return jnp.where(jnp.abs(s) <= rounding, jnp.zeros_like(s), s)
 
 
 def _direction(y: Array, x: Array) -> Array:
-    """Angle of (x, y) in [-pi, pi]; 0 for a zero vector of any signs, its derivative NaN."""
+    """Angle of (x, y) in [-pi, pi]; 0 for a zero vector with any signs, its derivative NaN."""
     return jnp.arctan2(y, jnp.where((x == 0) & (y == 0), jnp.zeros_like(x), x))
 
 
@@ -361,7 +361,7 @@ class ZXZ(AbstractParametrisation):
 class Quaternion(AbstractParametrisation):
     """x = (e0, e1, e2, e3), scalar first, of any norm but 0: r_inertial = e r_body e^-1.
 
-    A turn by alpha about the unit axis n is e = (cos(alpha/2), n sin(alpha/2)); e and every
+    A rotation by alpha about the unit axis n is e = (cos(alpha/2), n sin(alpha/2)); e and every
     multiple of it give the same R. With * the conjugate, the rates are
 
         w_body = 2 vec(e* e_dot)/(e.e),    e_dot = e (0, w_body)/2,
@@ -370,8 +370,8 @@ class Quaternion(AbstractParametrisation):
     e_dot from w keeps e.e. There is no gimbal lock; W W^T = 4 E/(e.e). R does not depend on the
     norm, so the mass matrix of a Lagrangian in e alone is singular along e. e = 0 gives NaN.
 
-    Principal range: unit norm and e0 >= 0; where e0 = 0 (half turns) the largest component is
-    positive. Near half turns the sign is a matter of rounding, and from_matrix jumps there.
+    Principal range: unit norm and e0 >= 0; if e0 = 0 (half turns) the largest component is
+    positive. Near half turns rounding determines the sign, and from_matrix jumps there.
 
     Source: Shepperd, J. Guidance and Control 1 (1978) 223 (from_matrix); Goldstein, Classical
     Mechanics, sec. 4.5 (Euler parameters).
@@ -433,9 +433,9 @@ class Quaternion(AbstractParametrisation):
 
 
 def _largest(x: Array) -> Array:
-    """max|x_i|, by which squares neither overflow nor underflow.
+    """max|x_i|, a scale against overflow and underflow of squares.
 
-    R(x/s) = R(x) and W(x/s)/s = W(x) for every number s, so no derivative of s is taken.
+    R(x/s) = R(x) and W(x/s)/s = W(x) for every number s, so s is not differentiated.
     """
     return jnp.max(jnp.abs(stop_gradient(x)))
 

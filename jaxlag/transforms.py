@@ -1,7 +1,7 @@
-"""Transforms: maps from all real numbers onto the values that a parameter of `fit` may take.
+"""Transforms: maps from all real numbers onto the allowed values of a parameter of `fit`.
 
-`fit(..., transforms={"m": jl.transforms.Positive()})`: an optimizer moves freely in unconstrained
-numbers, and the parameter is valid whatever they are.
+`fit(..., transforms={"m": jl.transforms.Positive()})`: the optimizer works on unconstrained
+numbers, and the parameter is always valid.
 """
 
 from jaxlag._fit._transforms import SPD as SPD

@@ -1,1 +1,1 @@
-"""What every other package stands on: errors, arrays, batching, maps with derivatives."""
+"""Helpers of all packages: errors, arrays, batching, maps with derivatives."""

@@ -1,4 +1,4 @@
-"""Arguments of public functions: their order, their names, and checks that many share."""
+"""Decorators and checks for the arguments of public functions: order, names, types."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -14,9 +14,9 @@ R = TypeVar("R")
 
 
 def state_first(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator of functions of a state: more arguments by position than it has are refused.
+    """Decorator of functions of a state: raises if more arguments are given by position.
 
-    The sentence says the order, (q, v, params) and the rest by name, which Python's does not.
+    The message shows the order, (q, v, params) and the rest by name; Python's message does not.
     """
     parameters = list(signature(function).parameters.values())
     positional = [p.name for p in parameters if p.kind is Parameter.POSITIONAL_OR_KEYWORD]
@@ -44,10 +44,10 @@ def _listed(names: list[str]) -> str:
 
 
 def renamed(**words: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of functions whose keywords had other names: these are refused, with what to write.
+    """Decorator that refuses former keywords with a message that shows the new ones.
 
     Args:
-        **words: by the old name, what is written in its place.
+        **words: by the former name, its replacement.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -64,7 +64,7 @@ def renamed(**words: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def required(**fixes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of functions whose required arguments, left out, are asked for by a sentence.
+    """Decorator that raises with a message if required arguments are left out.
 
     Args:
         **fixes: by the argument's name, what to write.
@@ -86,14 +86,14 @@ def required(**fixes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def positive_integer(argument: str, x: Any) -> int:
-    """`x`, a whole number above 0; raises naming the argument where it is none."""
+    """`x`, a whole number above 0; raises with the argument's name otherwise."""
     if isinstance(x, bool) or not isinstance(x, int | np.integer) or x < 1:
         raise invalid(argument, "be a positive integer", f"it was {x!r}")
     return int(x)
 
 
 def name_sequence(argument: str, x: Any, fix: str | None = None) -> tuple[str, ...]:
-    """`x`, a sequence of names; raises naming the argument where it is none, or one name alone."""
+    """`x`, a sequence of names; raises with the argument's name otherwise, also for one name."""
     if isinstance(x, str):
         raise invalid(
             argument,

@@ -1,4 +1,4 @@
-"""Arrays: of numbers given by the user, in one precision; whether they are traced."""
+"""Arrays: conversion of user values to one precision; whether values are traced."""
 
 from typing import Any
 
@@ -13,19 +13,19 @@ from jaxlag._core._errors import invalid
 
 
 def concrete(*arrays: Any) -> bool:
-    """Whether all of these have values, rather than being traced by a transform."""
+    """Whether all of these have values and none is traced by a transform."""
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
 def stop_gradient(tree: Any) -> Any:
-    """Without derivatives: a status has none, and differentiating its making would cost."""
+    """The same without derivatives, for example for a status, which has none."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def real(argument: str, x: Any) -> Array:
-    """`x` as a real inexact array of any shape; raises naming `argument` if it cannot be one."""
+    """`x` as a real inexact array of any shape; raises with the argument's name otherwise."""
     try:
-        # float() keeps a Python number weakly typed: it takes the dtype of the arrays it meets.
+        # float() keeps a Python number weakly typed: it takes the dtype of arrays in an operation.
         x = jnp.asarray(float(x) if isinstance(x, int) else x)
     except (TypeError, ValueError, OverflowError) as error:
         raise invalid(argument, "be real numbers", f"it was {x!r}") from error
@@ -35,11 +35,11 @@ def real(argument: str, x: Any) -> Array:
 
 
 def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
-    """`x` as a scalar of this dtype, finite where its value is known; raises if it cannot be one.
+    """`x` as a scalar of this dtype, finite if its value is known; raises otherwise.
 
     Args:
-        argument: as errors name it.
-        must: what it is to be, in words.
+        argument: its name in errors.
+        must: the requirement, in words.
         x: anything.
         dtype: of the result.
     """
@@ -55,16 +55,16 @@ def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
 
 
 def common(*arrays: Array) -> list[Array]:
-    """Arrays of one dtype, the result type of all, whatever the promotion JAX is set to."""
+    """Arrays of one dtype, the result type of all, for every promotion setting of JAX."""
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*arrays)
     return [x.astype(dtype) for x in arrays]
 
 
 def of_state(argument: str, *arrays: Array) -> list[Array]:
-    """Arrays of one dtype, that of a state; raises where it has less than 32 bits.
+    """Arrays of one dtype, that of a state; raises if it has less than 32 bits.
 
-    Of a motion in half precision whole percents are rounding, whatever the steps are.
+    In half precision the rounding of a motion is several percent, for all steps.
     """
     state = common(*arrays)
     dtype = state[0].dtype
@@ -76,7 +76,7 @@ def of_state(argument: str, *arrays: Array) -> list[Array]:
 
 
 def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
-    """Real arrays of one dtype from (argument, value, shape); raises naming the argument."""
+    """Real arrays of one dtype from (argument, value, shape); raises with the argument's name."""
     arrays = []
     for argument, x, shape in given:
         x = real(argument, x)

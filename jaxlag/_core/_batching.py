@@ -1,12 +1,12 @@
-"""Many trajectories at once: what `jax.vmap` of a solve becomes.
+"""Batching rule of a solve: how `jax.vmap` runs many trajectories.
 
-On CPU a loop over a few numbers at once is compiled to vector instructions, one over thousands
-to a traversal of memory for every operation. A vmapped solve is therefore run in chunks of
-trajectories, one chunk after another, each by one loop that ends with its last trajectory.
+On CPU, XLA compiles a loop over a few numbers to vector instructions. A loop over thousands of
+numbers traverses memory for every operation. A vmapped solve therefore runs in chunks of
+trajectories, one chunk after another. Each chunk is one loop that ends with its last trajectory.
 
-XLA splits large operations among threads, and a loop in which equations are solved for thousands
-of trajectories can wait for its own threads for ever (jaxlib 0.10.2; never seen on one thread,
-nor with matrices of 1e5 numbers in all). Chunks of implicit methods stay far below that.
+XLA splits large operations among threads. A loop that solves equations for thousands of
+trajectories can deadlock on its own threads (jaxlib 0.10.2; never seen on one thread, nor with
+matrices of 1e5 numbers in all). Chunks of implicit methods stay far below that.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ NUMBERS = 2**14  # of all their Jacobians of the vector field
 
 
 def at_once_implicit(size: int) -> int:
-    """How many trajectories of `size` numbers an implicit method takes in one loop."""
+    """Number of trajectories of `size` numbers that an implicit method takes in one loop."""
     return max(1, min(MOST, NUMBERS // size**2))
 
 
@@ -36,7 +36,7 @@ def in_lanes(
 ) -> PyTree:
     """single(*args), and under `jax.vmap` chunks of `vmapped`.
 
-    No derivative is taken: that of the results is zero.
+    Results have zero derivatives.
 
     Args:
         single: of arrays, returns arrays.
@@ -70,7 +70,7 @@ def in_lanes(
 def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
     """(own, shared) -> results of `size` trajectories; own leaves have one lane for each.
 
-    A further vmap makes more lanes.
+    A further vmap multiplies the number of lanes.
     """
 
     @custom_vmap
@@ -108,8 +108,8 @@ def in_batches(
         lanes: leaves (count, ...).
         count: number of lanes.
         at_once: the largest batch.
-        even: whether batches may be smaller to be equal; else, and where their number is a symbol
-            of `jax.export`, all have `at_once` lanes. The last lane fills the last batch up.
+        even: whether batches may be smaller to be equal; otherwise, and if their number is a symbol
+            of `jax.export`, all have `at_once` lanes. The last lane fills up the last batch.
     """
     if at_most(count, at_once):
         return jax.vmap(function)(lanes)
@@ -122,7 +122,7 @@ def in_batches(
 
 
 def at_most(count: Any, most: Any) -> bool:
-    """Whether a number of lanes is known to be no more; either may be a symbol of `jax.export`."""
+    """Whether count <= most is known to hold; either may be a symbol of `jax.export`."""
     try:
         return bool(count <= most)
     except jax.errors.InconclusiveDimensionOperation:

@@ -1,7 +1,7 @@
-"""Entries of a buffer written where each of several trajectories says.
+"""Buffer writes at an index of each trajectory's own, without a scatter.
 
-What `jax.vmap` makes of an entry written at an index of its own is a scatter, and a loop with one
-is no native function on CPU. A few trajectories write one after the other instead. (256 double
+`jax.vmap` turns such a write into a scatter, and on CPU a loop with a scatter is no native
+function. A few trajectories write one after the other instead. (256 double
 pendulums, microseconds each: with 11 entries 214 | 50, 101 entries 307 | 72, 1001 entries 1262 |
 296.)
 """
@@ -20,7 +20,7 @@ from jaxlag._core._custom_jvp import CustomJVP
 
 
 def set_entry(buffer: PyTree, index: Array, entry: PyTree) -> PyTree:
-    """buffer[index] = entry in every leaf. Not to be transposed."""
+    """buffer[index] = entry in every leaf. It has no transpose."""
     return jax.tree.map(lambda b, r: _put(b, r.astype(b.dtype), index), buffer, entry)
 
 
@@ -39,7 +39,7 @@ def _(primals: tuple, tangents: tuple) -> tuple:
 
 
 def _write(buffer: Array, entry: Array, *index: Array | None) -> Array:
-    """buffer[index] = entry; None for all of an axis."""
+    """buffer[index] = entry; None for a whole axis."""
     axes = [axis for axis, k in enumerate(index) if k is not None]
     start = [0 if k is None else k for k in (*index, *[None] * (buffer.ndim - len(index)))]
     start = [jnp.asarray(k, jnp.int32) for k in start]
@@ -60,13 +60,13 @@ def _(size: Any, mapped: list, buffer: Array, entry: Array, index: Array) -> tup
 
 
 def _each(size: Any, mapped: list, *arrays: Array) -> list[Array]:
-    """The arrays with an entry for each of `size`."""
+    """The arrays, broadcast to one entry for each of `size`."""
     pairs = zip(arrays, mapped, strict=False)
     return [x if has else jnp.broadcast_to(x, (size, *x.shape)) for x, has in pairs]
 
 
 def _places(shared: int) -> Callable:
-    """(buffers, entries, indices) -> buffers with an entry each.
+    """(buffers, entries, indices) -> buffers with one entry written in each.
 
     Args:
         shared: number of axes after the first one over which buffers and entries share an index.

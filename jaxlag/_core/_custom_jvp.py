@@ -1,8 +1,8 @@
-"""Functions with a derivative rule of their own, which no transform drops.
+"""Functions with custom derivative rules that every transform keeps.
 
-`jax.custom_jvp` means the same. But a reverse derivative of a scan splits its body into what is
-known and what is linear, and there JAX goes on with the function and forgets its rule (0.10): the
-second derivative of a loop is that of the body then. The rule of a primitive stays with it.
+`jax.custom_jvp` has the same purpose. But the reverse derivative of a scan splits its body into a
+known and a linear part, and JAX then drops the rule (0.10): the second derivative of a loop is
+that of the body. The rule of a primitive is kept.
 """
 
 from abc import ABC, abstractmethod
@@ -25,24 +25,24 @@ NAME = "custom_jvp_call"
 
 
 class AbstractRule(ABC):
-    """The derivative of a function from a list of arrays to another."""
+    """The derivative of a function between lists of arrays."""
 
     @abstractmethod
     def __call__(self, primals: Leaves, dots: Leaves, /) -> tuple[Leaves, Leaves]:
-        """(results, their tangents), at the arguments and tangents; None for one that is zero."""
+        """(results, their tangents) at the arguments and tangents; None for a zero tangent."""
 
     @property
     @abstractmethod
     def key(self) -> Any:
-        """The same for rules that are the same."""
+        """Equal for equal rules."""
 
 
 class CustomJVP:
     """A function of pytrees of arrays, with a rule for its derivatives.
 
-    Used as `jax.custom_jvp` is, but for this: neither the function nor its rule may close over a
-    traced value, and tangents that are zero are None to a rule with `symbolic_zeros`, and may be
-    None in what any rule returns, all of them at once too.
+    It is used as `jax.custom_jvp`, with these differences: neither the function nor its rule may
+    have a traced value in its closure; zero tangents are None for a rule with `symbolic_zeros`;
+    any rule may return None for zero tangents, or for all of them.
 
     Attributes:
         function: of arrays.
@@ -65,7 +65,7 @@ class CustomJVP:
     def __call__(self, *args: Any) -> Any:
         """The results of the function."""
         leaves, tree = jax.tree.flatten(args)
-        if not any(isinstance(x, Tracer) for x in leaves):  # there is nothing to differentiate
+        if not any(isinstance(x, Tracer) for x in leaves):  # no derivative is possible
             return self.function(*args)
         with jax.disable_jit(False):
             traced = self._traced.trace(*args)
@@ -73,7 +73,7 @@ class CustomJVP:
         return jax.tree.unflatten(jax.tree.structure(traced.out_info), results)
 
     def derivative(self, args: tuple, dots: tuple) -> tuple[Any, Any]:
-        """(results, their tangents); None for a tangent that is zero."""
+        """(results, their tangents); None for a zero tangent."""
         assert self._rule is not None
         if not self._symbolic_zeros:
             leaves, tree = jax.tree.flatten(args)
@@ -84,7 +84,7 @@ class CustomJVP:
 
 @dataclass(frozen=True)
 class _Flat(AbstractRule):
-    """The rule of a function between lists of leaves; `tree` is that of its arguments."""
+    """The rule of a function between lists of leaves; `tree` is the structure of its arguments."""
 
     custom: CustomJVP
     tree: Any
@@ -99,15 +99,15 @@ class _Flat(AbstractRule):
 
     @property
     def key(self) -> Any:
-        """The function, and how its arguments are given."""
+        """The function, and the structure of its arguments."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
 class _Users(AbstractRule):
-    """The rule of an equation that `jax.custom_jvp` made.
+    """The rule of an equation made by `jax.custom_jvp`.
 
-    Its program is traced, so that rules within it are kept, too.
+    Its program is traced, so that rules in it are kept, too.
     """
 
     eqn: Any
@@ -138,7 +138,7 @@ class _Users(AbstractRule):
 
 @dataclass(frozen=True)
 class _Rows(AbstractRule):
-    """The rule of the function over rows of those arguments whose axis is 0, not None."""
+    """The rule of a function vmapped over the arguments whose axis is 0, not None."""
 
     rule: AbstractRule
     axes: tuple[int | None, ...]
@@ -152,17 +152,17 @@ class _Rows(AbstractRule):
 
     @property
     def key(self) -> Any:
-        """The rule, and which arguments have rows."""
+        """The rule, and the mapped arguments."""
         return self.rule.key, self.axes, self.size
 
 
 def with_rules_kept(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program; rules by `jax.custom_jvp` stay with their functions from here on."""
+    """The same program; rules by `jax.custom_jvp` are kept with their functions."""
     return rewritten(program, with_rule_kept)
 
 
 def keeping_rules(function: Callable) -> Callable:
-    """The same function of pytrees of arrays, as `with_rules_kept` has it; traced by every call."""
+    """The function with `with_rules_kept` applied to its program; traced by every call."""
 
     def kept(*args: Any) -> Any:
         program, like = jax.make_jaxpr(function, return_shape=True)(*args)
@@ -173,20 +173,20 @@ def keeping_rules(function: Callable) -> Callable:
 
 
 def with_rule_kept(eqn: Any) -> Any:
-    """The same equation; the rule of one by `jax.custom_jvp` stays with it."""
+    """The same equation; a rule by `jax.custom_jvp` is kept with it."""
     if eqn.primitive.name != NAME or eqn.primitive is _custom_jvp:
         return eqn
     return with_rule(eqn, eqn.params["call_jaxpr"], _Users(eqn))
 
 
 def with_rule(eqn: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> Any:
-    """An equation of this program and this rule in the place of another."""
+    """An equation of this program and rule in place of another."""
     params = {"call_jaxpr": call_jaxpr, "rule": rule}
     return eqn.replace(primitive=_custom_jvp, params=params)
 
 
 def _zero(x: Any) -> Any:
-    """The tangent of what does not move."""
+    """The tangent of a constant."""
     if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
         return jnp.zeros_like(x)
     return np.zeros(jnp.shape(x), jax.dtypes.float0)
@@ -201,7 +201,7 @@ _custom_jvp.multiple_results = True
 
 
 def bind_rule(args: Leaves, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
-    """The results of a program that has this rule."""
+    """The results of a program with this rule."""
     return _custom_jvp.bind(*args, call_jaxpr=call_jaxpr, rule=rule)
 
 
@@ -240,7 +240,7 @@ ad.primitive_jvps[_custom_jvp] = _derivative
 def _transposed(
     cotangents: Leaves, *args: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule
 ) -> list:
-    """Of the function itself, as JAX has it: a rule may call it on what it is linear in."""
+    """The transpose of the function itself, as in JAX: a rule may call it on linear arguments."""
     del rule
     linear = [i for i, x in enumerate(args) if ad.is_undefined_primal(x)]
 
@@ -261,7 +261,7 @@ ad.primitive_transposes[_custom_jvp] = _transposed
 
 
 def _batched(args: Leaves, axes: Leaves, *, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> tuple:
-    """Rows in front of all results: one program for them whatever their rule returns."""
+    """Batch axes in front of all results: one program for every result of the rule."""
     pairs = list(zip(args, axes, strict=True))
     (size, *_) = (x.shape[i] for x, i in pairs if i is not None)
     args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]

@@ -1,20 +1,20 @@
-"""One sentence form for every error: argument, requirement, what it was, likely fix."""
+"""Error messages in one form: argument, requirement, given value, likely fix."""
 
 import re
 from typing import Any
 
 _MANY = 8
-"""Numbers of an array that are shown; of more than these the first and the last three are."""
+"""Numbers of an array that are shown; of longer arrays the first and the last three are shown."""
 _EXPRESSION = re.compile(r"[A-Za-z_]\w*(\.\w+|\[[^\]]+\])*(=\S+)?")
 _NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf|True|False)"
 _ARRAY = re.compile(rf"\[[\[\]\s,]*{_NUMBER}(?:[\[\]\s,]+{_NUMBER}){{{_MANY},}}[\[\]\s,]*\]")
 
 
 class SimulationError(RuntimeError):
-    """A simulation ended in a status other than `Status.ok`.
+    """A simulation ended with a status other than `Status.ok`.
 
     Attributes:
-        motion: the `Solution` up to the failure; rows not reached are NaN.
+        motion: the `Solution` up to the failure; rows that were not reached are NaN.
     """
 
     def __init__(self, message: str, motion: object = None) -> None:
@@ -26,7 +26,7 @@ class EquilibriumError(RuntimeError):
     """A search for a state of rest found none.
 
     Attributes:
-        equilibrium: the `Equilibrium` with the nearest point and the forces left there.
+        equilibrium: the `Equilibrium` with the nearest point and its unbalanced forces.
     """
 
     def __init__(self, message: str, equilibrium: object = None) -> None:
@@ -35,10 +35,10 @@ class EquilibriumError(RuntimeError):
 
 
 class AssemblyError(RuntimeError):
-    """No state near satisfies the constraints.
+    """No nearby state satisfies the constraints.
 
     Attributes:
-        assembly: the `Assembly` with the nearest state and the residuals left there.
+        assembly: the `Assembly` with the nearest state and its residuals.
     """
 
     def __init__(self, message: str, assembly: object = None) -> None:
@@ -49,8 +49,8 @@ class AssemblyError(RuntimeError):
 def requirement(argument: str, must: str, was: str, fix: str = "") -> str:
     """`<argument> must <must>, but <was>. <fix>`; arrays in it are shortened.
 
-    An argument that is a name, or an expression of one, stands in back-ticks; words in front of a
-    colon say whose argument it is.
+    A name, or an expression of one, is written in back-ticks; words before a colon are the owner
+    of the argument.
     """
     return shortened(f"{_ticked(argument)} must {must}, but {was}.") + (f" {fix}" if fix else "")
 
@@ -66,7 +66,7 @@ def unsupported(what: str, why: str, fix: str = "") -> ValueError:
 
 
 def shortened(text: Any) -> str:
-    """The text, of arrays of more than 8 numbers the first and the last three alone."""
+    """The text, with only the first and the last three numbers of arrays of more than 8."""
 
     def few(array: re.Match) -> str:
         numbers = re.findall(_NUMBER, array[0])

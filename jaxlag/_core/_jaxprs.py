@@ -1,6 +1,6 @@
-"""Walks over traced programs: their equations, programs within them, equations changed.
+"""Traversal and rewriting of jaxprs: their equations and the jaxprs nested in them.
 
-The names and parameters of JAX's primitives for calls and loops are read here, and here alone.
+Only this module reads the names and parameters of JAX's primitives for calls and loops.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,14 +16,14 @@ _PROGRAM = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 def equations(program: Any) -> Iterator[Any]:
-    """All equations of a program, each before those of the programs within it."""
+    """All equations of a program, each before those of its nested programs."""
     for eqn in getattr(program, "jaxpr", program).eqns:
         yield eqn
         yield from within(eqn)
 
 
 def within(eqn: Any) -> Iterator[Any]:
-    """All equations of the programs within an operation."""
+    """All equations of the programs nested in an operation."""
     for inner in _among(eqn.params.values()):
         yield from equations(inner)
 
@@ -37,12 +37,12 @@ def _among(values: Any) -> Iterator[Any]:
 
 
 def closed(program: ClosedJaxpr | Jaxpr) -> ClosedJaxpr:
-    """A program with its constants; one without has none."""
+    """A program as a ClosedJaxpr, with its constants if it has any."""
     return program if isinstance(program, ClosedJaxpr) else ClosedJaxpr(program, ())
 
 
 def called(eqn: Any) -> ClosedJaxpr | None:
-    """The program of a call, whose operands and results are those of the call; else None."""
+    """The program of a call with the same operands and results; None for other equations."""
     if eqn.primitive.name not in _CALLS:
         return None
     for key in _PROGRAM:
@@ -55,7 +55,7 @@ def called(eqn: Any) -> ClosedJaxpr | None:
 
 
 def scan_sizes(params: Any) -> tuple[int, int]:
-    """How many operands of a scan are constants, how many are carried; the rest are scanned over.
+    """(number of constants, number of carried operands) of a scan; the rest are scanned over.
 
     Args:
         params: of the equation.
@@ -71,14 +71,14 @@ def rewritten(
     equation: Callable[[Any], Any],
     constant: Callable[[Any], Any] = lambda x: x,
 ) -> ClosedJaxpr:
-    """The program with every equation and every constant changed.
+    """The program with every equation and every constant replaced.
 
-    What changes in nothing is left as it is, the same object: JAX knows equal functions by the
+    Unchanged parts are the same objects: JAX recognizes equal functions by the
     identity of their programs.
 
     Args:
         code: the program.
-        equation: from one to the one in its place. Programs within it are changed before.
+        equation: old equation -> new equation. Nested programs are replaced first.
         constant: the same for constants.
     """
     jaxpr = _inside(code.jaxpr, equation, constant)

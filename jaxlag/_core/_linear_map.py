@@ -1,8 +1,8 @@
-"""Linear maps with a fast form of their own for every direction.
+"""Linear maps y = A(r) x with separate programs for A(r) x and A(r)^T y.
 
-y = A(r) x. JAX derives the transpose of a program by turning it round operation by operation,
-which it cannot do with a loop that ends by itself, and does at the price of a record of everything
-in one of known length. Where both A(r) x and A(r)^T y are known as programs, neither is needed.
+JAX transposes a program operation by operation. It cannot transpose a loop with a termination
+condition. For a loop of fixed length it stores all intermediate values. If both A(r) x and
+A(r)^T y are given as programs, neither problem occurs.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,15 +32,15 @@ _TWICE = (
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """x -> A(r) x in four programs of (r, x) or (r, y), which close over no traced value.
+    """x -> A(r) x as four programs of (r, x) or (r, y), without traced values in closures.
 
     Attributes:
-        forward: A(r) x. May hold loops of any kind.
+        forward: A(r) x. May contain loops of any kind.
         backward: A(r)^T y. The same.
         plain: A(r) x by a program that JAX differentiates in any mode and to any order.
         plain_backward: A(r)^T y in the same way; None for the transpose of `plain`.
         in_lanes: the same map in the form to be vmapped over r; None for this one.
-        at_once: lanes of a vmap that are taken together; None for all.
+        at_once: lanes of a vmap in one batch; None for all.
     """
 
     forward: Callable[[PyTree, PyTree], PyTree]
@@ -54,7 +54,7 @@ class LinearMap:
 def linear(form: LinearMap, r: PyTree, x: PyTree) -> PyTree:
     """A(r) x, differentiable in both to any order.
 
-    Forward derivatives in r are those of `forward` and `backward`, reverse ones those of `plain`.
+    Forward derivatives in r use `forward` and `backward`, reverse ones use `plain`.
     """
     r_leaves, r_tree = jax.tree.flatten(r)
     x_leaves, x_tree = jax.tree.flatten(x)
@@ -104,9 +104,9 @@ def _turned(form: LinearMap, like: Leaves) -> LinearMap:
 
 
 def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -> LinearMap:
-    """The derivative of A(r) x as a map with (r, x) for its r.
+    """The derivative of A(r) x as a linear map with (r, x) in place of r.
 
-    It maps the directions of the leaves `moving` of r, and with `both` those of x.
+    It maps the tangents of the leaves `moving` of r, and with `both` those of x.
     """
 
     def at(function: Callable, residual: Leaves) -> tuple[Callable, list]:
@@ -149,7 +149,7 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
 
 
 def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
-    """The map for `size` lanes of x, y and the leaves of r that are mapped."""
+    """The map for `size` lanes of x, y and the mapped leaves of r."""
     in_lanes = form.in_lanes
     if any(mapped) and in_lanes is not None:
         form, in_lanes = in_lanes, None
@@ -239,7 +239,7 @@ def _lanes(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     pairs = zip(args, axes, strict=True)
     args = [x if i is None else jnp.moveaxis(x, i, 0) for x, i in pairs]
     mapped = [i is not None for i in axes]
-    # Lanes of x for all: the sum over them that a shared x has as its cotangent is JAX's then.
+    # x gets lanes in all cases: JAX then sums the cotangents of a shared x over them.
     x = [
         leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *leaf.shape))
         for leaf, is_mapped in zip(args[count:], mapped[count:], strict=True)

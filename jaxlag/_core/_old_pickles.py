@@ -1,8 +1,8 @@
-"""Pickles name the modules that hold their classes: those of an older layout are refused by name.
+"""Import errors for modules of an older layout, such as those named in old pickles.
 
-All modules once lay in one folder. The finder, an entry of `sys.meta_path`, is the last that Python
-asks, so that it is met by names alone that nobody else finds; a package that has the name of an old
-module says the same of what that module held.
+All modules once lay in one folder. The finder is the last entry of `sys.meta_path`: it receives
+only names that no other finder knows. If a package has the name of an old module, its
+`__getattr__` raises the same error for the contents of that module.
 """
 
 import sys
@@ -15,7 +15,7 @@ _OLD = "jaxlag._"
 
 
 def refuse(name: str) -> NoReturn:
-    """Raise on a name that is of no module of this version.
+    """Raise on a name that is no module of this version.
 
     Raises:
         ImportError: always.
@@ -29,25 +29,25 @@ def refuse(name: str) -> NoReturn:
 
 
 def missing(module: str, name: str) -> NoReturn:
-    """`__getattr__` of a package: as any module, but of what was in the module of that name."""
+    """`__getattr__` of a package: refuses the contents of an old module of the same name."""
     if name.startswith("_"):
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
     refuse(f"{module}.{name}")
 
 
 class _Finder(MetaPathFinder):
-    """Finds nothing."""
+    """Finds no module."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> Any:
-        """None of modules of others."""
+        """None for modules of other packages."""
         if fullname.startswith(_OLD):
             refuse(fullname)
         return None
 
 
 def install() -> None:
-    """Have Python ask, once."""
+    """Register the finder, once."""
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.append(_Finder())

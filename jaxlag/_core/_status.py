@@ -1,4 +1,4 @@
-"""How a trajectory ended."""
+"""Status: the outcome of a trajectory, and the advice for each outcome."""
 
 from enum import IntEnum
 
@@ -6,9 +6,9 @@ from enum import IntEnum
 class Status(IntEnum):
     """Outcome of one trajectory, stored as int32 in `Solution.status`.
 
-    `ok` is the only success. Every other value comes with `last_time`, `last_state`
-    and `where` (index of the coordinate, constraint row or, where kinematics are singular, the
-    quasi-velocity concerned, -1 if none).
+    `ok` is the only success. All other values come with `last_time`, `last_state`
+    and `where`, the index of the coordinate or constraint row concerned, for singular kinematics
+    of the quasi-velocity; -1 if none.
     """
 
     ok = 0
@@ -99,11 +99,11 @@ ADVICE_FIXED = {
     ),
     Status.implicit_solve_failed: ("The implicit solver's equations did not converge: reduce dt."),
 }
-"""What is to be done otherwise with fixed steps, where tolerances have no part."""
+"""Different advice for fixed steps, which have no tolerances."""
 
 ADVICE_SHARP = {
     Status.max_steps: (
         "Raise max_steps, or shorten ts. What held the steps short is in motion.explain()."
     ),
 }
-"""Where forces change within a short way, and a looser tolerance would pass over it."""
+"""Advice if forces change over a short distance, which a looser tolerance would miss."""

@@ -1,13 +1,13 @@
-"""How XLA's CPU backend is told to compile a loop to one native function.
+"""XLA settings by which the CPU backend compiles a loop to one native function.
 
-Before jax 0.12 it runs the body of a while loop operation by operation unless the loop handles
-less than about a kilobyte; the dispatch then costs ten times the arithmetic of a small mechanical
-system. There are two ways past that bound:
+Before jax 0.12 XLA runs the body of a while loop operation by operation unless the loop handles
+less than about a kilobyte. The dispatch then costs ten times the arithmetic of a small mechanical
+system. There are two ways to raise that bound:
 
-* the one global setting, which XLA reads once, before the first compilation;
-* where that came too late or is switched off, attributes on the call of a function that holds the
-  loop. They are internal to XLA, so they are used on the versions that the tests run on and
-  around loops of operations that XLA emits code for itself.
+* the global setting, which XLA reads once, before the first compilation;
+* if that came too late or is switched off, attributes on the call of a function that holds the
+  loop. They are internal to XLA. They are used only on the versions that the tests run on, and
+  only around loops of operations that XLA emits code for itself.
 """
 
 import os
@@ -40,9 +40,9 @@ def needed() -> bool:
 
 
 def merged(flags: str) -> str:
-    """XLA_FLAGS with the bound merged into the extra backend options, whatever else they hold.
+    """XLA_FLAGS with the bound added to the extra backend options.
 
-    A bound that the user has set stays.
+    A bound set by the user is kept.
     """
     if OPTION in flags:
         return flags
@@ -64,7 +64,7 @@ def configure() -> None:
 
 @lru_cache(maxsize=1)
 def in_force() -> bool:
-    """Whether loops past the old bound do compile to one function: asked of XLA itself."""
+    """Whether loops beyond the old bound compile to one function, tested by a compilation."""
 
     def loop(x: jax.Array) -> jax.Array:
         turn = lambda c: (c[0] + 1, c[1] * c[1][::-1])  # noqa: E731
@@ -75,7 +75,7 @@ def in_force() -> bool:
 
 
 def by_attribute() -> bool:
-    """Whether loops past the bound compile to one function by attributes of their calls."""
+    """Whether loops beyond the bound compile to one function by attributes of their calls."""
     return (
         jax.default_backend() == "cpu"
         and os.environ.get(ATTRIBUTE_SWITCH) != "0"
@@ -85,11 +85,11 @@ def by_attribute() -> bool:
 
 
 def native(function: Callable, *args: Any, stages: int = 0) -> Any:
-    """function(*args), a loop, compiled to one native function where XLA can be told to.
+    """function(*args), a loop, compiled to one native function if XLA allows it.
 
     Args:
         function: of arrays and pytrees of them, without side effects.
-        args: what it is called with.
+        args: its arguments.
         stages: of a method whose weighted sums of stages are products with a vector.
     """
     if not by_attribute():
@@ -100,9 +100,9 @@ def native(function: Callable, *args: Any, stages: int = 0) -> Any:
     )(*flat)
     if not _plain(program.jaxpr, stages):
         return function(*args)
-    # A parameter that has lost its uses inside, being known at the call or of no consequence, ends
-    # the process: the emitter of marked calls looks for a buffer that is not there. So what the
-    # function closes over becomes a parameter, none is known, and of each a number is returned.
+    # A parameter without uses inside, because it is constant or has no effect, crashes the process:
+    # the emitter of marked calls searches for a missing buffer. So closure values become
+    # parameters, none is constant, and a number of each is returned.
     given = jax.lax.optimization_barrier((list(program.consts), flat))
 
     def run(consts: list, flat: list) -> Any:
@@ -114,11 +114,11 @@ def native(function: Callable, *args: Any, stages: int = 0) -> Any:
 
 
 def not_inlined(function: Callable, attributes: Any = None) -> Callable:
-    """The function, compiled apart from its callers."""
+    """The function, compiled separately from its callers."""
     attributes = attributes or {"inlineable": "false"}
 
     def body(*args: Any) -> Any:
-        # The attributes are for the call, not for what is called.
+        # The attributes belong to the call, not to the function body.
         with set_xla_metadata(**dict.fromkeys(attributes)):
             return function(*args)
 
@@ -132,16 +132,16 @@ def not_inlined(function: Callable, attributes: Any = None) -> Callable:
 
 
 def opaque_one(dtype: Any) -> jax.Array:
-    """1, in a way that XLA does not see through: it computes what is divided by it once.
+    """1, as a value that XLA cannot fold: a division by it is computed once.
 
-    What it takes for cheap, all but divisions, roots and the like, it computes anew wherever that
-    is read.
+    XLA recomputes cheap operations, all but divisions, roots and the like, for every
+    use.
     """
     return jax.lax.optimization_barrier(jnp.ones((), dtype))
 
 
 def _plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
-    """Whether a program holds nothing but operations on numbers that XLA itself emits code for."""
+    """Whether a program contains only operations on numbers that XLA itself emits code for."""
     return all(
         _is_sum(eqn, stages)
         if eqn.primitive.name == "dot_general"
@@ -151,9 +151,9 @@ def _plain(jaxpr: Jaxpr, stages: int = 0) -> bool:
 
 
 def _is_sum(dot: Any, stages: int) -> bool:
-    """Whether a product is one of numbers, or of the row of a method with its stages.
+    """Whether a product is one of numbers, or of a row of a method's weights with its stages.
 
-    Products of matrices call a library, and a vmap makes one of any other product.
+    Products of matrices call a library, and a vmap turns any other product into one.
     """
     contracted, batched = dot.params["dimension_numbers"]
     operand = dot.invars[0].aval
@@ -200,7 +200,7 @@ _LATE = (
 
 @lru_cache(maxsize=1)
 def warn_if_late() -> None:
-    """Say once per process that the setting came too late."""
+    """Warn once per process if the setting came too late."""
     if jax.default_backend() != "cpu" or not needed() or os.environ.get(SWITCH) == "0":
         return
     if not in_force() and not by_attribute():

@@ -1,4 +1,4 @@
-"""Params from measurements: multiple shooting, its statistics, predictions."""
+"""Parameter estimation from measurements: multiple shooting, statistics, predictions."""
 
 from typing import NoReturn
 

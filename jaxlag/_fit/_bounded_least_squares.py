@@ -1,11 +1,12 @@
-"""Linear least squares of few unknowns in a box.
+"""Linear least squares with bounds, for few unknowns.
 
     min |R z - c|^2,  low <= z <= high
 
-By block principal pivoting: unknowns beyond a limit are put there, those that a limit holds against
-the slope are let go, until neither is left; where that does not make progress, one at a time, which
-always ends (Portugal, Judice, Vicente, A comparison of block pivoting and interior-point algorithms
-for linear least squares problems with nonnegative variables, Math. Comp. 63, 1994).
+Block principal pivoting: unknowns beyond a bound are set to it, and unknowns at a bound with a
+gradient that points inside are released, until neither remains. If this makes no progress, one
+unknown at a time is exchanged, which always terminates (Portugal, Judice, Vicente, A comparison of
+block pivoting and interior-point algorithms for linear least squares problems with nonnegative
+variables, Math. Comp. 63, 1994).
 """
 
 from typing import Any
@@ -16,9 +17,9 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 PATIENCE = 3
-"""Exchanges of whole blocks that may fail to make fewer unknowns wrong."""
+"""Consecutive block exchanges that may fail to reduce the number of infeasible unknowns."""
 ROUNDS = 10
-"""Exchanges per unknown, a bound that rounding alone could reach."""
+"""Exchanges per unknown, a bound that only rounding could reach."""
 
 
 def box_least_squares(
@@ -32,21 +33,21 @@ def box_least_squares(
     Args:
         R: upper triangular, regular.
         c: the right-hand side.
-        low: limits, -inf for none; where both are equal, that is the unknown's value.
+        low: lower bounds, -inf for none; if both are equal, that is the unknown's value.
         high: likewise.
     """
     p, eps = R.shape[0], jnp.finfo(R.dtype).eps
     if not p:
         return c
     given = low == high
-    # Slopes smaller than these are rounding.
+    # Smaller gradients are rounding.
     size = 10 * p * eps * jnp.linalg.norm(R, axis=0) * jnp.linalg.norm(c)
 
     def at_limits(side: Array) -> Array:
         return jnp.where(side < 0, low, jnp.where(side > 0, high, 0.0))
 
     def solved(side: Array) -> Array:
-        """Those at a limit (-1, 1) there, the others (0) by least squares."""
+        """Unknowns at a bound (-1, 1) are set to it, the others (0) follow by least squares."""
         held = side != 0
         known = at_limits(side)
         rows = jnp.concatenate([jnp.where(held, 0.0, R), jnp.diag(jnp.where(held, 1.0, 0.0))])
@@ -55,7 +56,7 @@ def box_least_squares(
         return jnp.where(held, known, solve_triangular(turned[:p, :p], turned[:p, -1]))
 
     def wrong(side: Array, z: Array) -> Array:
-        """Where to those are to go that are on the wrong side: -1, 0, 1; 2 for those that stay."""
+        """The new side (-1, 0, 1) of infeasible unknowns; 2 for those that stay."""
         slope = R.T @ (R @ z - c)
         free = jnp.where(z < low, -1, jnp.where(z > high, 1, 2))
         held = jnp.where(-side * slope < -size, 0, 2)

@@ -1,9 +1,9 @@
-"""What measurements tell of params: precise, imprecise, or not at all, in the params' names.
+"""Identifiability of params: precise, imprecise or unidentifiable directions, by name.
 
-From the triangular factor R of the weighted derivatives J, states eliminated: R^T R is the Fisher
-information of the params. Directions are those of relative changes d(log theta), so that they do
-not depend on units: a null direction (1, 1) of g and l says that both may grow by one factor and
-nothing measured would change, and that g/l is all that is known.
+R is the triangular factor of the weighted derivatives J with the states eliminated: R^T R is the
+Fisher information of the params. Directions are relative changes d(log theta), which do not
+depend on units. Example: for a null direction (1, 1) of g and l both may grow by one factor
+without any change of the measurements. Only g/l is identifiable.
 """
 
 from fractions import Fraction
@@ -20,16 +20,16 @@ from jaxlag._fit._linear_least_squares import LinearRows, eliminate
 from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 
 NEGLIGIBLE = 1e-6
-"""Singular values of normed columns below it are those of derivatives that vanish: solves at a
-tolerance of 1e-9 give derivatives to about 1e-8."""
+"""Smaller singular values of normalized columns count as zero: solves at a tolerance of 1e-9 give
+derivatives to about 1e-8."""
 LARGEST = 4
 """Exponents of products are ratios of integers up to this one."""
 
 
 def reduced(rows: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Reduced row echelon form of independent rows, pivots in the first columns of `order` that do.
+    """Reduced row echelon form of independent rows, pivots in the first possible of `order`.
 
-    Pivoting by size within what is left keeps it stable; `order` decides among equals.
+    Pivoting by size within the remaining rows keeps it stable; `order` decides between columns.
     """
     rows = rows[:, order].copy()
     pivot = 0
@@ -78,19 +78,19 @@ def _power(name: str, exponent: Fraction) -> str:
 
 
 def relative(values: np.ndarray) -> np.ndarray:
-    """By which changes are divided: the values themselves, 1 where they are 0."""
+    """Divisors of relative changes: the values themselves, 1 if they are 0."""
     return np.where(values == 0, 1.0, values)
 
 
 def saturated(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.ndarray:
-    """(e,) which numbers are on a bound of their transform, where no derivative moves them.
+    """(e,) which numbers are saturated at a bound of their transform.
 
-    Of a matrix, all that its transform ties to such a number.
+    For a matrix, also all numbers that its transform connects with such a number.
 
     Args:
         factor: (e, e), a factor of the weighted derivatives by the unknowns.
         by_z: (e, e), derivatives of the numbers by the unknowns.
-        at_first: (e, e), likewise where the search began.
+        at_first: (e, e), likewise at the start of the search.
     """
     sizes, before, moved = (np.linalg.norm(x, axis=0) for x in (by_z, at_first, factor))
     idle = (sizes <= SATURATED * before) & (moved <= SATURATED)
@@ -102,27 +102,27 @@ def saturated(factor: np.ndarray, by_z: np.ndarray, at_first: np.ndarray) -> np.
 
 
 class Spectrum:
-    """Singular values of the derivatives by relative changes, and what their null directions say.
+    """Singular values of the derivatives by relative changes, and their null directions.
 
     Args:
-        names: of the numbers.
-        values: of them.
-        factor: (e, e) or of more rows, a factor of the weighted derivatives by them; columns of
-            zeros of those that nothing measured depends on.
+        names: names of the numbers.
+        values: the numbers.
+        factor: (e, e) or with more rows, a factor of the weighted derivatives by them; zero
+            columns for numbers without effect on any measurement.
 
     Attributes:
-        singular_values: (e,), falling; a relative change of 1 along a direction moves the weighted
-            residuals by so much.
-        null: orthonormal rows, relative changes that nothing measured depends on.
-        unidentifiable: in words: which numbers may change together.
-        determined: in words: which combinations of those are known.
+        singular_values: (e,), descending; a relative change of 1 along a direction changes the
+            weighted residuals by its singular value.
+        null: orthonormal rows, relative changes without effect on any measurement.
+        unidentifiable: as text: numbers that may change together.
+        determined: as text: identifiable combinations of those.
     """
 
     def __init__(self, names: tuple[str, ...], values: np.ndarray, factor: np.ndarray) -> None:
         self.values = values
         self.singular_values = np.linalg.svd(factor * relative(values), compute_uv=False)
-        # What vanishes is seen in columns of one size: a number near zero, whose relative changes
-        # are small, may be known as well as any.
+        # Zero singular values are found with normalized columns: a number near zero, with small
+        # relative changes, may be as precise as any.
         norms = np.linalg.norm(factor, axis=0)
         self._norms = np.where(norms > 0, norms, 1.0)
         _, self._sizes, self._directions = np.linalg.svd(factor / self._norms, full_matrices=False)
@@ -132,7 +132,7 @@ class Spectrum:
         self.unidentifiable, self.determined = _in_words(names, self.null)
 
     def covariance(self) -> np.ndarray:
-        """(R^T R)^-1; inf for numbers that take part in a null direction."""
+        """(R^T R)^-1; inf for numbers in a null direction."""
         kept = self._directions[~self._vanish] / self._sizes[~self._vanish, None] / self._norms
         found = kept.T @ kept
         open_ended = np.any(np.abs(self.null) > 1e-3, axis=0)
@@ -142,21 +142,21 @@ class Spectrum:
 
 
 def _in_words(names: tuple[str, ...], null: np.ndarray) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """(which numbers change together, which combinations of them are known)."""
+    """(numbers that change together, identifiable combinations of them)."""
     columns = np.flatnonzero(np.any(np.abs(null) > 1e-3, axis=0))
     if not len(columns):
         return (), ()
     own, basis = tuple(names[i] for i in columns), null[:, columns]
     order = np.arange(len(columns))
     together = tuple(_together(own, row) for row in reduced(basis, order))
-    # What is orthogonal to the null directions is known.
+    # Directions orthogonal to the null directions are identifiable.
     _, sizes, rows = np.linalg.svd(basis)
     rest = rows[np.count_nonzero(sizes > 1e-9) :]
     return together, tuple(combination(own, row) for row in reduced(rest, order[::-1]))
 
 
 def _together(names: tuple[str, ...], row: np.ndarray) -> str:
-    """A null direction in words."""
+    """A null direction as text."""
     moved = [(n, x) for n, x in zip(names, row, strict=True) if abs(x) > 1e-3]
     if len(moved) == 1:
         return f"{moved[0][0]} is not determined at all"
@@ -167,9 +167,9 @@ def _together(names: tuple[str, ...], row: np.ndarray) -> str:
 
 
 REGULARIZATION = 1e-20
-"""Damping, in squares of unknowns of order one, that keeps starts regular that are not observed."""
+"""Damping, in squares of unknowns of order one, that keeps unobserved starts regular."""
 NOTHING = 1e-7
-"""Singular values below this part of the largest: of directions in which no motion goes."""
+"""Singular values below this part of the largest belong to directions without any motion."""
 
 
 @eqx.filter_jit
@@ -183,10 +183,10 @@ def linearised(free: Unknowns, found: SearchResult) -> tuple[Array, Array, Array
 
 @eqx.filter_jit
 def distance(found: SearchResult, moves: Bool[Array, " p"]) -> Float[Array, ""]:
-    """How far params are from where their derivatives lead, in standard deviations.
+    """Length of the Gauss-Newton step of the params, in standard deviations.
 
-    sqrt(dz . C^-1 dz), dz the step of Gauss and Newton, C the covariance, of unknowns that move.
-    Where a search has converged it is small.
+    sqrt(dz . C^-1 dz), dz the Gauss-Newton step, C the covariance, for unknowns that move.
+    It is small for a converged search.
     """
     assert found.rows is not None
     p, rows = moves.shape[0], _without_failed(found.rows, found)
@@ -202,7 +202,7 @@ def distance(found: SearchResult, moves: Bool[Array, " p"]) -> Float[Array, ""]:
 
 
 def _without_failed(rows: LinearRows, found: SearchResult) -> LinearRows:
-    """The linear problem without rows of segments that failed."""
+    """The linear problem without rows of failed segments."""
     ok = (found.seen.status == Status.ok)[:, None, None]
     joined = None if rows.joined is None else jnp.where(ok, rows.joined, 0.0)
     following = None if rows.next is None else jnp.where(ok[:, :, 0], rows.next, 0.0)
@@ -210,10 +210,10 @@ def _without_failed(rows: LinearRows, found: SearchResult) -> LinearRows:
 
 
 def effective_parameters(problem: MultipleShooting, found: SearchResult) -> float:
-    """How many of the numbers measured went into unknowns: the trace of the hat matrix.
+    """Effective number of unknowns: the trace of the hat matrix.
 
-    As many as there are unknowns that measurements tell: not those that are held, those along which
-    constraints let nothing move, and what priors tell of the others.
+    Unknowns determined by measurements: without held ones, without directions in which
+    constraints allow no motion, and without the part that priors determine.
 
     Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.6.
     """
@@ -242,7 +242,7 @@ def effective_parameters(problem: MultipleShooting, found: SearchResult) -> floa
 
 
 def _told(rows: np.ndarray, prior: np.ndarray) -> float:
-    """How many unknowns rows tell, less what their own part `prior` tells of these."""
+    """Number of unknowns determined by rows, minus the part that the rows `prior` determine."""
     _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
     kept = sizes > NOTHING * max(np.max(sizes, initial=0.0), np.finfo(float).tiny)
     share = prior @ (directions[kept] / sizes[kept, None]).T

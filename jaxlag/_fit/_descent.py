@@ -1,4 +1,4 @@
-"""Fits of many numbers by gradients of few segments at a time, with any optimizer of optax."""
+"""Stochastic gradient descent on batches of segments, with any optimizer of optax."""
 
 from typing import Any, final
 
@@ -14,20 +14,20 @@ from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, Segme
 
 @final
 class Descent(eqx.Module):
-    """How `jl.fit` goes downhill where there are too many numbers for least squares.
+    """Stochastic gradient descent in `jl.fit`, for more params than least squares can handle.
 
-    In every step the gradient is taken of a part of the segments, drawn anew in every epoch; starts
-    of segments move with the params. It costs a few solves whatever the number of params is, where
-    least squares takes a derivative in the direction of each.
+    Every step takes the gradient of a batch of segments, in a new random order in every epoch. The
+    starts of segments are optimized with the params. A step costs a few solves for any number of
+    params. Least squares needs a derivative in the direction of each.
 
     Args:
-        optimizer: of optax, such as `optax.adam(1e-3)`. It moves a leaf of params in units of the
-            root mean square that it starts with (of 1 where that is 0, and for logarithms), starts
-            of segments in units of how far states range.
-        epochs: how often all segments are used.
-        batch: segments per step; all of them where there are fewer.
-        seed: of the order of segments.
-        gap: standard deviation of the gaps between joined segments, over how far states range.
+        optimizer: of optax, such as `optax.adam(1e-3)`. The unit of a leaf of params is its initial
+            root mean square (1 if that is 0, and for logarithms). The unit of starts of segments is
+            the range of the states.
+        epochs: number of passes over all segments.
+        batch: segments per step; all of them if there are fewer.
+        seed: seed of the order of segments.
+        gap: standard deviation of the gaps between joined segments, over the range of the states.
 
     Raises:
         ValueError: an optimizer without `init` and `update`, numbers that are not positive.
@@ -68,7 +68,7 @@ class Descent(eqx.Module):
         return segments // batch, batch
 
     def solves(self, segments: int) -> int:
-        """Motions of segments whose gradient is taken in all."""
+        """Total number of segment motions whose gradient is taken."""
         steps, batch = self.steps(segments)
         return self.epochs * steps * batch
 
@@ -77,11 +77,11 @@ class Descent(eqx.Module):
 def descend(
     shooting: MultipleShooting, guess: FitVariables, descent: Descent
 ) -> tuple[FitVariables, Float[Array, " epochs"], Int[Array, ""]]:
-    """(where the descent ends, mean cost of the steps of each epoch, unsound steps).
+    """(end of the descent, mean cost of the steps of each epoch, number of unsound steps).
 
-    Unsound are steps some of whose derivatives were not finite; they move nothing by those.
+    In an unsound step some derivatives are nonfinite; these are replaced by 0.
     """
-    # An extra: whoever has one of its optimizers has it.
+    # Optional dependency: a user of its optimizers has it.
     from optax import with_extra_args_support
 
     update = with_extra_args_support(descent.optimizer).update
@@ -100,9 +100,9 @@ def descend(
         cost, slope = jax.value_and_grad(value)(guess)
         sound = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in slope]))
         slope = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), slope)
-        # Optimisers count their steps in integers and mix them with floats.
+        # Optimizers count their steps in integers and mix them with floats.
         with jax.numpy_dtype_promotion("standard"):
-            # Line searches ask for the last three.
+            # Line searches need the last three.
             updates, state = update(slope, state, guess, value=cost, grad=slope, value_fn=value)
         z, x = eqx.apply_updates(guess, updates)
         held = jnp.clip(z, shooting.free.low, shooting.free.high)
@@ -122,7 +122,7 @@ def descend(
 def cost_of(
     guess: FitVariables, shooting: MultipleShooting, which: Int[Array, " b"], join: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Half the sum of squares over all segments, guessed from some of them; and of the priors."""
+    """Half the sum of squares over all segments, estimated from some of them; plus the priors."""
     segments = jax.tree.map(lambda x: x[which], shooting.segments)
     seen = SegmentOutputs(*jax.vmap(shooting.one, (None, 0, 0))(guess.z, guess.x[which], segments))
     weighed = shooting.weighed(guess.x[which], segments, seen.residuals)

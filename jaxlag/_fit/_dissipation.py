@@ -1,4 +1,4 @@
-"""Forces that take energy as they are declared, and give some at other params."""
+"""Check of dissipative forces: whether they supply energy at the estimated params."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -18,11 +18,11 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._dependence import outputs_depend_on
 
 STATES = 32
-"""Of each experiment, at which powers are looked at."""
+"""States of each experiment at which powers are computed."""
 NEGLIGIBLE = 1e-9
-"""Of what a force would give if it pushed along the velocity, or took."""
+"""Smallest significant power, over |v| |Q|."""
 DEVIATIONS = 2.0
-"""Standard deviations of a power, within which it may as well be none."""
+"""Standard deviations of a power within which it is not significant."""
 
 
 def feeding(
@@ -33,20 +33,20 @@ def feeding(
     moved: Sequence[Any],
     options: Mapping[str, Any],
 ) -> dict[str, frozenset[str]]:
-    """Forces that give energy somewhere along what was measured, and should take it.
+    """Dissipative forces that supply energy somewhere along the measurements.
 
     By name, with the paths of the params that each reads.
 
-    These are `Rayleigh` forces, and others that take energy, or none, everywhere there with the
-    params before, and are zero where nothing moves.
+    Dissipative are `Rayleigh` forces, and others that supply no energy at these states with the
+    initial params and are zero at zero velocity.
 
     Args:
-        system: what moves.
-        experiments: what was measured.
-        before: params, of which the system is as it was meant to be.
-        params: those that were found.
-        moved: the same, each of the numbers found in turn by its standard deviation.
-        options: of `simulate`.
+        system: the mechanical system.
+        experiments: the measurements.
+        before: initial params, for which the forces are as intended.
+        params: estimated params.
+        moved: the same, with one of the estimates each changed by its standard deviation.
+        options: options of `simulate`.
     """
     found: dict[str, frozenset[str]] = {}
     for each in experiments:
@@ -71,7 +71,7 @@ def feeding(
 
 
 class _Powers(NamedTuple):
-    """v . Q, |v| . |Q|, and Q with velocities zero, at some states."""
+    """v . Q, |v| . |Q|, and Q at zero velocities, at some states."""
 
     power: np.ndarray
     size: np.ndarray
@@ -91,7 +91,7 @@ class _States(NamedTuple):
 def _states(
     system: System, experiment: Experiment, params: Any, options: Mapping[str, Any]
 ) -> _States:
-    """About where the system was."""
+    """Approximate states of the system along an experiment."""
     rows = np.unique(np.linspace(0, len(experiment.ts) - 1, STATES).astype(int)).tolist()
     state = jnp.asarray(initial_states(system, experiment, rows, params, dict(options)))
     t, n = jnp.asarray(experiment.ts[rows]), system.size
@@ -119,7 +119,7 @@ def _powers(
 def _read(
     force: AbstractForce, inputs: Mapping[str, Any], states: _States, params: Any
 ) -> frozenset[str]:
-    """Leaves of the params that the force depends on."""
+    """Leaves of the params on which the force depends."""
     traced, static = _params.halves(params)
 
     def of(traced: Any) -> Array:

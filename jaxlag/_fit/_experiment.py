@@ -1,4 +1,4 @@
-"""Experiments: what was measured, when, how well, and what drove it."""
+"""Experiment: measured channels, their times and noise, and the inputs."""
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
@@ -15,36 +15,36 @@ from jaxlag._tracing._traced_function import TracedFunction, traced_function
 
 @final
 class Experiment(eqx.Module):
-    """One recording: channels measured at times, from an unknown, known or roughly known start.
+    """One recording: channels measured at times, from an unknown, known or approximate start.
 
     Args:
         ts: (s,) times, s, strictly increasing, s >= 2. Spacing may vary.
-        channels: name -> measured values, (s,) or (s, k), in the unit of what they measure; NaN
-            where nothing was measured. A name is that of a coordinate ("theta"), of a velocity
+        channels: name -> measured values, (s,) or (s, k), in the unit of the quantity; NaN
+            for missing values. A name is that of a coordinate ("theta"), of a velocity
             ("theta'"), an acceleration ("theta''"), a quasi-velocity, a constraint row (its
             multiplier), or one of the `channels` given to `jl.fit`.
         inputs: as for `jl.simulate`; tables must reach from ts[0] to ts[-1]. Experiments that are
-            fitted together have the same names; under each, tables of one kind in all, of any
-            length, or any functions and constants. Those that another one has are computed beside.
-            Or a function of the params to such a dict, where times or values of tables, or knots,
-            depend on them: a delay, the time of a switch.
+            fitted together have the same input names. Under each name there are tables of one kind
+            in all experiments, of any length, or any functions and constants; different ones are
+            all computed. `inputs` may also be a function of the params to such a dict, if times or
+            values of tables, or knots, depend on them: a delay, the time of a switch.
         sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
-            (s, k). Of channels that are left out it is estimated from the residuals.
-        q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: where the search starts.
-            Where it is left out, the coordinates must be among the channels.
-        v0: velocities, (n,) or (s, n), of systems that have quasi-velocities those, one for each
-            name, m/s or rad/s; left out, they are slopes of the measured coordinates.
-        start_sigma: how well q0 and v0 are known: None, not at all, the state at ts[0] is free;
-            0, exactly; standard deviations, m, rad, m/s, rad/s: a number, or one for each of the
-            coordinates and of the velocities that no constraint takes.
-        name: what messages call it.
+            (s, k). For other channels it is estimated from the residuals.
+        q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: the initial guess.
+            Without it the coordinates must be among the channels.
+        v0: velocities, (n,) or (s, n); for systems with quasi-velocities these, one for each
+            name, m/s or rad/s. By default they are slopes of the measured coordinates.
+        start_sigma: uncertainty of q0 and v0: None, the state at ts[0] is free; 0, it is exact;
+            standard deviations, m, rad, m/s, rad/s: a number, or one for each of the
+            coordinates and of the free velocities.
+        name: its name in messages.
 
     Raises:
-        ValueError: times that do not increase, shapes that do not fit, a channel without a single
-            number, a sigma that is not positive, a start that is said to be known and not given.
+        ValueError: times that do not increase, shapes that do not fit, a channel without any
+            number, a sigma that is not positive, a `start_sigma` without q0 and v0.
 
     Example:
-        A push that ends at a time which is to be found:
+        A push that ends at an unknown time:
 
         >>> import jaxlag as jl, numpy as np
         >>> def inputs(params):
@@ -118,10 +118,10 @@ class Experiment(eqx.Module):
                 raise invalid(f"{name}: start_sigma", "be zero or positive, or None", was)
 
     def inputs_at(self, params: Any) -> dict[str, Any]:
-        """The inputs by name, of these params.
+        """The inputs by name, for these params.
 
         Raises:
-            ValueError: they are no inputs, or tables do not reach from ts[0] to ts[-1].
+            ValueError: invalid inputs, or tables that do not reach from ts[0] to ts[-1].
         """
         if not isinstance(self.inputs, TracedFunction):
             return self.inputs
@@ -130,7 +130,7 @@ class Experiment(eqx.Module):
         return found
 
     def part(self, samples: slice | np.ndarray, name: str | None = None) -> "Experiment":
-        """Some of its samples, as an experiment whose start is free unless it is the same start."""
+        """Some of its samples as an experiment; its start is free unless it is the same start."""
         indices = np.arange(len(self.ts))[samples]
 
         def of(x: np.ndarray | None) -> np.ndarray | None:
@@ -150,10 +150,9 @@ class Experiment(eqx.Module):
         )
 
     def windows(self, seconds: float | int) -> tuple["Experiment", ...]:
-        """Pieces of equal length side by side, each with a start of its own.
+        """Consecutive pieces of equal length, each with its own start.
 
-        A remainder that is shorter is left out, and so are pieces in gaps, of less than two
-        samples.
+        A shorter remainder is left out, and so are pieces with less than two samples, as in gaps.
 
         Raises:
             ValueError: the recording is shorter than that, or a piece would have one sample.
@@ -173,7 +172,7 @@ class Experiment(eqx.Module):
         return tuple(
             self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
             for a, b in pairwise(samples)
-            if b - a >= 2  # none where the recording has a gap
+            if b - a >= 2  # fewer where the recording has a gap
         )
 
 

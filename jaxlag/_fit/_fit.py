@@ -1,4 +1,4 @@
-"""Parameters from measurements: least squares over motions, by multiple shooting."""
+"""`fit`: parameter estimation by least squares and multiple shooting."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -43,23 +43,23 @@ from jaxlag._tracing._params import check_keys
 from jaxlag._tracing._traced_function import warn_of_changes
 
 GAPS = (1e-1, 1e-2, 1e-3, 1e-5, 1e-7, 1e-9)
-"""Standard deviations of the gaps between segments, stage by stage, over the states' ranges."""
+"""Standard deviations of the gaps between segments in each stage, over the states' ranges."""
 TIGHT = 1e-2
-"""The last of them, over what all measurements together tell of a state."""
+"""The last of them, over the precision of a state from all measurements together."""
 TIGHTEST = 1e-11
-"""Below it, gaps are rounding."""
+"""Smallest gap: below it gaps are rounding."""
 UNITS = 3
-"""Searches of one stage, with units that fit better each time."""
+"""Searches of one stage, each with improved units."""
 FAR_OFF = 1e3
-"""By which an unknown's unit may be wrong."""
+"""Largest error factor of an unknown's unit."""
 MAX_NEWTON_DISTANCE = 0.3
-"""Standard deviations, within which estimates are to be where their derivatives lead."""
+"""Largest Newton step at converged estimates, in standard deviations."""
 LARGEST_COVARIANCE = 200
-"""Numbers, beyond which a covariance costs more than the descent that found them."""
+"""Number of unknowns beyond which a covariance costs more than the descent."""
 LOOSE = 1e-4
-"""Tolerance of searches that only lead to the next one."""
+"""Tolerance of intermediate searches."""
 NOISE_ROUNDS = 3
-"""How often noise that was not given is estimated, and the fit repeated with it."""
+"""Largest number of noise estimates, each followed by a new fit."""
 
 
 @renamed(optimiser="optimizer=", **FORMER)
@@ -80,56 +80,57 @@ def fit(
     max_steps: int = 100,
     simulate_options: Mapping[str, Any] = NO_OPTIONS,
 ) -> FitResult:
-    r"""Params, and starts of experiments, for which motions come closest to what was measured.
+    r"""Params and starts of experiments for which motions are closest to the measurements.
 
         min  sum (g(y_i) - m_i)^2 / sigma_i^2 + sum (theta - mean)^2 / sigma^2
 
-    over params theta and starts; y_i is the motion at the times of the measurements, g what a
-    channel shows of it. With `segments` above 1, each experiment is cut into so many, whose starts
-    are unknown, too, and which are joined in the same least squares, ever more tightly: from a poor
-    guess, and over many Lyapunov times, that converges where the one long motion does not. Segments
+    over params theta and starts; y_i is the motion at the times of the measurements, g the channel
+    as a function of it. With `segments` above 1, each experiment is cut into as many segments with
+    unknown starts. The same least squares joins them more tightly in each stage. From a poor
+    guess, or over many Lyapunov times, this converges where one long motion does not. Segments
     are lanes of one batch, and the linear algebra is linear in their number.
 
-    A segment whose solve fails counts as far off, does not move the params, and is named at the
-    end. Noise that no experiment states is estimated from the residuals, and the fit repeated.
+    A segment whose solve fails has a constant large residual, does not affect the params, and is
+    named in the result. Noise without a given sigma is estimated from the residuals, and the fit
+    is repeated.
 
     Args:
-        system: what moves.
-        experiments: one `Experiment` or more, of any lengths and rates; those of pieces that are
-            not joined, too (`Experiment.windows`).
-        params0: all params; where the search starts.
-        free: names of leaves to be found: "m", "link.mass", "links[0].mass"; a branch stands for
+        system: the mechanical system.
+        experiments: one `Experiment` or more, of any lengths and rates; also separate pieces
+            (`Experiment.windows`).
+        params0: all params; the initial guess.
+        free: names of leaves to estimate: "m", "link.mass", "links[0].mass"; a branch includes
             all leaves below it.
-        channels: name -> function of a `Solution` to what was measured at its save times, (s,) or
-            (s, k); beside those that names mean by themselves.
+        channels: name -> function of a `Solution` to the measured quantity at its save times, (s,)
+            or (s, k); in addition to the standard names.
         segments: per experiment; 1 is single shooting.
         transforms: name -> transform of a free leaf.
         priors: name -> `Prior` of a free leaf, in its own unit.
-        loss: "squares"; "soft_l1", "huber", "cauchy" count outliers for less: residuals beyond
-            about one sigma. The covariance is that of least squares with weights that fall with the
-            residuals; of Gaussian noise it is too large by up to a third (cauchy, soft_l1).
-        optimizer: None, Levenberg and Marquardt's; a `Descent` for more numbers than a few hundred.
-            There may then be more of them than measurements; no covariance is computed of more than
-            200.
+        loss: "squares"; "soft_l1", "huber", "cauchy" give outliers less weight: residuals beyond
+            about one sigma. The covariance is that of least squares with weights that decrease with
+            the residuals; for Gaussian noise it is too large by up to a third (cauchy, soft_l1).
+        optimizer: None, Levenberg-Marquardt; a `Descent` for more than a few hundred numbers.
+            There may then be more of them than measurements; no covariance is computed for more
+            than 200.
         rtol: relative tolerance of unknowns and residuals, both of order one.
         atol: absolute tolerance of the same.
         max_steps: bound on the steps of Levenberg and Marquardt's method, in each stage.
-        simulate_options: of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
+        simulate_options: options of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
 
     Raises:
-        ValueError: an argument of wrong form or value, named; fewer measurements than unknowns.
+        ValueError: an invalid argument, named; fewer measurements than unknowns.
 
     Warns:
-        of a parameter that starts or ends on a bound, one that nothing measured depends on, a
-        channel that is constant, segments whose solve fails, a search that did not converge, or
-        that stopped where errors of the solver hide what params do, friction that gives energy,
+        of a parameter that starts or ends on a bound, one without effect on any measurement, a
+        constant channel, segments whose solve fails, a search that did not converge, or
+        stopped because solver errors exceed the effect of params, friction that supplies energy,
         each by name.
 
     Source: Bock (1983), see `_shooting`; Schittkowski, Numerical Data Fitting in Dynamical Systems
     (2002).
 
     Example:
-        A mass on a spring: how it swings tells k/m alone.
+        A mass on a spring: its motion determines k/m alone.
 
         >>> import jax, jax.numpy as jnp, jaxlag as jl, numpy as np
         >>> jax.config.update("jax_enable_x64", True)
@@ -195,7 +196,7 @@ def _check(system: Any, segments: Any, loss: Any, optimizer: Any) -> None:
 
 
 def _count(experiments: Sequence[Experiment], params: int, priors: int, start: int) -> None:
-    """Raise where there is less to be known from than is to be known."""
+    """Raise if there are fewer measurements and priors than unknowns."""
     numbers = sum(int(np.isfinite(x).sum()) for each in experiments for x in each.channels.values())
     unknown = params + start * sum(each.start_sigma is None for each in experiments)
     if numbers + priors < unknown:
@@ -217,7 +218,7 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
 
 
 def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns) -> dict[str, str]:
-    """Names of leaves that a jump depends on, and lines; warns where it is a jump in time."""
+    """Names of leaves that jumps depend on, and their lines; warns of jumps in time."""
     names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
     moving = {name for name, own in names.items() if own in {leaf.name for leaf in free.leaves}}
     found: dict[str, str] = {}
@@ -234,10 +235,10 @@ def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns)
 def _stages(
     problem: MultipleShooting, tolerances: tuple[float, float], max_steps: int
 ) -> tuple[MultipleShooting, SearchResult, int]:
-    """(the problem in units that fit, what is found from loosely joined segments on, all steps).
+    """(the problem in adjusted units, the result of all stages of gaps, total steps).
 
-    By squares first, whatever the loss: losses that count outliers for less have minima wherever
-    everything is an outlier.
+    Always by squares first: losses with less weight for outliers have minima where all residuals
+    are outliers.
     """
     turns = 0
     guess = FitVariables(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
@@ -263,11 +264,11 @@ def _stages(
 
 
 def _units(problem: MultipleShooting, found: SearchResult) -> Float[np.ndarray, " p"]:
-    """Scales of the unknowns: as they are, but for those that are far from what they measure.
+    """Scales of the unknowns: unchanged, unless they are far from the size of the unknowns.
 
-    An unknown is of order one where its unit is as large as it is; or, where it is about 0, as what
-    moves the residuals by their own size. The size that a search begins at says little: it may be
-    0, or a billionth of the truth.
+    The scale of an unknown should be its own size. For an unknown of about 0 it should be the
+    change that moves the residuals by their own size. The initial value is a poor scale: it may be
+    0, or a billionth of the true value.
     """
     free, rows = problem.free, found.rows
     assert rows is not None
@@ -287,7 +288,7 @@ def _units(problem: MultipleShooting, found: SearchResult) -> Float[np.ndarray, 
 
 
 def last_gap(problem: MultipleShooting) -> float:
-    """Of segments that are one motion, as far as measurements can see."""
+    """The gap of segments that are one motion within the accuracy of the measurements."""
     if not problem.chained:
         return 1.0
     weights = np.asarray(problem.segments.weights)
@@ -304,7 +305,7 @@ def _with_its_noise(
     tolerances: tuple[float, float],
     max_steps: int,
 ) -> tuple[MultipleShooting, dict[str, float], SearchResult, int]:
-    """The problem, weighed by the noise that its residuals show, what is found then, and steps."""
+    """The problem weighted by the noise estimated from its residuals, the noise, result, steps."""
     turns = 0
     for _ in range(NOISE_ROUNDS if noise else 0):
         changed = estimated_noise(found, problem, where, noise)
@@ -321,7 +322,7 @@ def _with_its_noise(
 def _downhill(
     problem: MultipleShooting, descent: Descent, max_steps: int
 ) -> tuple[FitVariables, Float[np.ndarray, " epochs"], int]:
-    """(where a descent ends, its costs, solves); starts by least squares before and after it."""
+    """(end of a descent, its costs, solves); starts by least squares before and after it."""
     z, join = jnp.zeros(len(problem.free.u0)), _join(problem, descent)
     before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
     guess, costs, unsound = descend(problem, FitVariables(z, before.guess.x), descent)
@@ -341,7 +342,7 @@ def _join(problem: MultipleShooting, descent: Descent) -> Float[Array, ""]:
 def _starts(
     problem: MultipleShooting, z: Array, x: Array, join: Array, max_steps: int
 ) -> SearchResult:
-    """Starts by least squares, params as they are at z."""
+    """Starts by least squares, with params held at z."""
     held = replace(problem, free=problem.free.held(z), prior=NO_PRIOR)
     return search(held, FitVariables(jnp.zeros(0), x), join, jnp.full(2, LOOSE), max_steps)
 
@@ -353,7 +354,7 @@ def _judged(
     costs: Float[np.ndarray, " epochs"],
     linear: bool,
 ) -> SearchResult:
-    """All that is known where a descent ended, with derivatives or without."""
+    """The result at the end of a descent, with or without derivatives."""
     cost, rows, seen, starts = judged(problem, guess, _join(problem, descent), linear)
     fell = bool(np.all(np.isfinite(costs)) and costs[-1] <= costs[0])
     return SearchResult(guess, jnp.asarray(fell), jnp.asarray(len(costs)), cost, rows, seen, starts)

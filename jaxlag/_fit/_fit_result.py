@@ -1,4 +1,4 @@
-"""What a fit found: estimates, how well they are known, and how well they predict."""
+"""FitResult: estimates, their uncertainties, and their predictions."""
 
 from collections.abc import Mapping
 from statistics import NormalDist
@@ -27,14 +27,13 @@ from jaxlag._simulation._jump_times import names_of
 from jaxlag._system._system import System
 
 SHOWN = 40
-"""Estimates in a result's text."""
+"""Number of estimates in a result's text."""
 INSENSITIVE = 1e-12
-"""A column of round-off, over the largest, of unknowns of order one: nothing measured depends on
-its number."""
+"""Relative column norm below which a parameter does not affect any measurement."""
 
 
 class Model(NamedTuple):
-    """What moves, what is measured of it, and by which options it is simulated."""
+    """The system, its measured channels, and the options of its simulation."""
 
     system: System
     channels: tuple[tuple[str, Reader], ...]
@@ -46,45 +45,45 @@ class FitResult(eqx.Module):
     """Estimates with their uncertainty.
 
     Attributes:
-        params: all params, those that were free at their estimates.
-        names: of the numbers found, "m", "I[1,0]".
+        params: all params, with estimates of the free ones.
+        names: names of the estimated numbers, "m", "I[1,0]".
         values: their estimates, in their own units.
-        freedom: how many more numbers were measured than went into unknowns, 0 if no segment has a
+        freedom: degrees of freedom: measurements minus effective unknowns; 0 if no segment has a
             solution.
         covariance: of `values`, (e, e), from the derivatives at the estimates (Cramer-Rao); inf
-            for numbers that take part in what is not determined. It holds for noise that is
-            independent from sample to sample. NaN after a `Descent` of more than 200 numbers, where
-            derivatives at the estimates are not finite, and of numbers on a bound.
-        singular_values: of the weighted derivatives by relative changes of `values` that are on no
-            bound, states eliminated, falling: a relative change of eps along the i-th direction
-            moves the weighted residuals by eps times the i-th. NaN where there is no covariance.
-        unidentifiable: null directions, in words: which numbers change together without a trace.
-        determined: what is known of those: "g/l".
-        unused: numbers that nothing measured depends on.
-        jumps: numbers that nothing shows but where a force or a row jumps, which derivatives do not
-            see, and the line where each is compared: no fit moves them.
-        feeding: forces that at the estimates give energy somewhere along what was measured, and
-            should take it, as friction does, each with the numbers that it depends on: `Rayleigh`
-            forces, and others that vanish at rest and give none with the first params.
+            for numbers in unidentifiable directions. It holds for noise that is
+            independent from sample to sample. NaN after a `Descent` of more than 200 numbers, if
+            derivatives at the estimates are nonfinite, and for numbers on a bound.
+        singular_values: of the weighted derivatives by relative changes of `values` that are not on
+            a bound, states eliminated, descending: a relative change of eps along the i-th
+            direction changes the weighted residuals by eps times the i-th. NaN without covariance.
+        unidentifiable: null directions, as text: numbers that change together without effect.
+        determined: the identifiable combinations of these: "g/l".
+        unused: numbers without effect on any measurement.
+        jumps: numbers with an effect only at jumps of a force or a row, which derivatives do not
+            contain, and the line of each comparison: a fit does not change them.
+        feeding: dissipative forces that supply energy at the estimates somewhere along the
+            measurements, each with the numbers on which it depends. These are `Rayleigh`
+            forces, and others that vanish at rest and supply no energy with the initial params.
         on_bound: numbers that ended on a bound of their transform; the covariance of the others is
             that with these held there.
-        noise: channel -> standard deviation of its noise, where it was estimated.
-        residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
-            NaN where nothing was measured or the segment failed.
-        starts: of each experiment, (q, v) or (q, u) at its first time.
-        gap: largest gap between segments, over the range of the states; of those with a solution.
-        distance: from the estimates to where derivatives lead, in standard deviations, all numbers
-            together; NaN where there is no covariance. Far below 1 where a search has converged;
-            more, where errors of the solver hide what params do.
-        converged: whether the optimizer met its tolerance; of a `Descent`, whether costs are finite
-            and lower than at first.
-        iterations: how many it took in the last stage; of a `Descent`, epochs.
-        solves: motions of segments, each with its derivatives, that the search took in all; line
+        noise: channel -> standard deviation of its noise, if it was estimated.
+        residuals: for each experiment, channel -> motion minus measurement, (s, k), in its own
+            unit; NaN for missing values and failed segments.
+        starts: for each experiment, (q, v) or (q, u) at its first time.
+        gap: largest gap between segments, over the range of the states, without failed ones.
+        distance: length of the Newton step at the estimates, in standard deviations, all numbers
+            together; NaN without covariance. Far below 1 for a converged search;
+            larger if solver errors exceed the effect of params.
+        converged: whether the optimizer met its tolerance; for a `Descent`, whether costs are
+            finite and lower than at first.
+        iterations: number in the last stage; epochs for a `Descent`.
+        solves: total number of segment motions, each with its derivatives; line
             searches of a descent are not counted.
         cost: half the weighted sum of squares.
         failed: segments without a solution, each with its status.
-        costs: of a `Descent`, mean cost of the steps of each epoch; else empty.
-        experiments: what was measured.
+        costs: for a `Descent`, mean cost of the steps of each epoch; else empty.
+        experiments: the measurements.
     """
 
     params: Any
@@ -119,7 +118,7 @@ class FitResult(eqx.Module):
         return channels_of(self.residuals)
 
     def predict(self, experiments: Any, settle: float | int | None = None) -> Prediction:
-        """How well the estimates predict other experiments: `jl.predict` with them."""
+        """Predictions of other experiments with the estimates, by `jl.predict`."""
         model = self._model
         return predict(
             model.system,
@@ -134,8 +133,8 @@ class FitResult(eqx.Module):
     def plot(self) -> Any:
         """A figure of measurements and motions, residuals beneath.
 
-        One column for every experiment, of more than four those from the best to the worst; needs
-        matplotlib, from the extra "plot".
+        One column for every experiment; of more than four a selection from the best to the worst.
+        Needs matplotlib, from the extra "plot".
 
         Returns:
             A `matplotlib.figure.Figure`.
@@ -148,9 +147,9 @@ class FitResult(eqx.Module):
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def interval(self, level: float | int = 0.95) -> dict[str, tuple[float, float]]:
-        """Of each estimate, the interval that holds the truth with this probability.
+        """For each estimate, the interval that contains the true value with this probability.
 
-        By Student's t where noise was estimated, with `freedom`; else by the normal distribution.
+        By Student's t with `freedom` if noise was estimated, else by the normal distribution.
 
         Args:
             level: between 0 and 1.
@@ -206,14 +205,14 @@ def summarised(
 
     Args:
         problem: the least squares.
-        found: where the search ended.
-        experiments: what was measured.
+        found: the result of the search.
+        experiments: the measurements.
         where: their segments.
-        noise: that was estimated.
+        noise: estimated noise.
         own: channels of the caller.
         costs: of the epochs of a descent.
-        solves: what it took.
-        compared: names of leaves that a jump depends on, and the line where each is compared.
+        solves: number of solves.
+        compared: names of leaves that a jump depends on, and the line of each comparison.
     """
     z = found.guess.z
     params, values = _at(problem.free, z)
@@ -262,7 +261,7 @@ def _feeding(
     covariance: np.ndarray,
     experiments: tuple[Experiment, ...],
 ) -> dict[str, tuple[str, ...]]:
-    """Forces that give energy and should not, with the numbers found that they depend on."""
+    """Dissipative forces that supply energy, with the estimated numbers on which they depend."""
     free = problem.free
     spread = np.sqrt(np.diag(covariance))
     moved = []
@@ -283,7 +282,7 @@ def _feeding(
 
 
 class _Uncertainty(NamedTuple):
-    """How well estimates are known: attributes of a `FitResult`."""
+    """Uncertainty of estimates: attributes of a `FitResult`."""
 
     covariance: np.ndarray
     singular_values: np.ndarray
@@ -323,14 +322,14 @@ def _uncertainty(
     )
 
 
-@eqx.filter_jit  # one program: operation by operation they took seconds to compile
+@eqx.filter_jit  # one program: separate operations took seconds to compile
 def _at(free: Unknowns, z: Float[Array, " p"]) -> tuple[Any, Array]:
-    """(all params, the numbers found)."""
+    """(all params, the estimated numbers)."""
     return free.params(z), free.numbers(z)
 
 
 def _how_it_ended(problem: MultipleShooting, z: Any, found: SearchResult, k: int) -> str:
-    """The status of a segment that failed, or the channel that is not finite."""
+    """The status of a failed segment, or its nonfinite channel."""
     segment = jax.tree.map(lambda x: x[k], problem.segments)
     start = jnp.asarray(found.starts)[k]
     params = problem.free.params(z)
@@ -343,7 +342,7 @@ def _how_it_ended(problem: MultipleShooting, z: Any, found: SearchResult, k: int
 
 
 def _gaps(found: SearchResult, problem: MultipleShooting) -> np.ndarray:
-    """Ends less the starts that follow, over the range of the states."""
+    """Ends minus the following starts, over the range of the states."""
     apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states[None]
     ok = np.asarray(found.seen.status == Status.ok)[:, None]
     return np.where(problem.segments.follows[:, None], np.where(ok, apart, np.nan), 0.0)

@@ -1,4 +1,4 @@
-"""Which numbers of params are to be found, and how the unknowns of an optimizer make them."""
+"""Free parameters: the selection of params to estimate, and their map from optimizer unknowns."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,12 +14,13 @@ from jaxlag._core._errors import invalid
 from jaxlag._fit._transforms import AbstractTransform, Free
 
 NO_PRIOR = np.zeros(0, int), np.zeros(0), np.zeros(0)
-"""Of which numbers, means, standard deviations: nothing is known beforehand."""
+"""(indices of numbers, means, standard deviations): no priors."""
 
 
 SATURATED = 1e-3
-"""An unknown that moves its numbers by this part of what it did at first, and weighted residuals by
-this much, has run off: the numbers are on a bound, within this part of a standard deviation."""
+"""An unknown is saturated if its effect on its numbers is below this part of the initial effect,
+and its effect on the weighted residuals is below this. The numbers are then on a bound, within this
+part of a standard deviation."""
 
 
 class Prior(eqx.Module):
@@ -63,15 +64,15 @@ def _name(path: Any) -> str:
 
 
 class Leaf(NamedTuple):
-    """One leaf that is to be found.
+    """One leaf to estimate.
 
     Attributes:
         name: its path in params.
         index: among the leaves of params.
         shape: its shape.
-        transform: from its unknowns.
-        first: of its unknowns, among all.
-        indices: of the numbers in it, as many as it has unknowns.
+        transform: map from its unknowns.
+        first: index of its first unknown among all.
+        indices: indices of the numbers in it, one for each unknown.
     """
 
     name: str
@@ -88,17 +89,17 @@ class Leaf(NamedTuple):
 
 
 class Unknowns(eqx.Module):
-    """The map z -> params: u = u0 + scale z, each leaf `transform.value(u)`, the others as given.
+    """The map z -> params: u = u0 + scale z, each free leaf `transform.value(u)`, others as given.
 
     Attributes:
-        leaves: those that are to be found.
+        leaves: the leaves to estimate.
         params0: all params.
-        u0: unconstrained numbers that make params0, (p,).
-        scale: (p,), by which z is multiplied.
-        reach: (p,), how far z may go in one step.
-        low: (p,), between which z may go.
-        high: (p,), likewise.
-        limits: (2, p), those of u.
+        u0: unconstrained numbers of params0, (p,).
+        scale: (p,), factor of z.
+        reach: (p,), largest change of z in one step.
+        low: (p,), lower bounds of z.
+        high: (p,), upper bounds of z.
+        limits: (2, p), bounds of u.
         on_bound: names of leaves that started on a bound.
     """
 
@@ -113,7 +114,7 @@ class Unknowns(eqx.Module):
     on_bound: tuple[str, ...] = eqx.field(static=True)
 
     def params(self, z: Float[Array, " p"]) -> Any:
-        """All params at z; of an unknown at its limit, those of the limit to the last digit."""
+        """All params at z; an unknown at its bound has exactly the bound's value."""
         u = jnp.asarray(self.u0) + jnp.asarray(self.scale) * z
         if not self.plain:
             under, over = self._beyond(z)
@@ -127,7 +128,7 @@ class Unknowns(eqx.Module):
 
     @property
     def plain(self) -> bool:
-        """Whether all unknowns are the numbers themselves, and may go anywhere."""
+        """Whether all unknowns are the numbers themselves, without bounds."""
         return all(isinstance(leaf.transform, Free) for leaf in self.leaves)
 
     def held(self, z: Float[Array, " p"]) -> "Unknowns":
@@ -161,35 +162,35 @@ class Unknowns(eqx.Module):
         )
 
     def numbers(self, z: Float[Array, " p"]) -> Float[Array, " e"]:
-        """The numbers that are to be found, in their own units: as many as there are unknowns."""
+        """The numbers to estimate, in their own units: as many as there are unknowns."""
         leaves = jax.tree.leaves(self.params(z))
         own = [leaves[leaf.index][leaf.columns].ravel() for leaf in self.leaves]
         return jnp.concatenate(own) if own else jnp.zeros(0)
 
     def speeds(self, z: Float[Array, " p"]) -> Float[Array, " p"]:
-        """How much each unknown moves the numbers, over what it did at z = 0."""
+        """Effect of each unknown on the numbers, over that at z = 0."""
         by = jax.jacfwd(self.numbers)
         now, first = (jnp.linalg.norm(by(at), axis=0) for at in (z, jnp.zeros_like(z)))
         return now / first
 
     def at_limit(self, z: Float[Array, " p"]) -> Bool[np.ndarray, " p"]:
-        """Which unknowns are as far as they may go, to rounding."""
+        """Which unknowns are at a bound, to rounding."""
         under, over = self._beyond(z)
         return np.asarray(under | over)
 
     def _beyond(self, z: Float[Array, " p"]) -> tuple[Array, Array]:
-        """Which unknowns are at their lower limit, and which at their upper one."""
+        """Which unknowns are at their lower bound, and which at their upper one."""
         near = 8 * jnp.finfo(float).eps * jnp.maximum(1.0, jnp.abs(z))
         return z - near <= self.low, z + near >= self.high
 
     @property
     def places(self) -> tuple[tuple[Leaf, tuple[int, ...]], ...]:
-        """The leaf of every number, and where it stands in it."""
+        """The leaf of every number, and its index in it."""
         return tuple((leaf, index) for leaf in self.leaves for index in leaf.indices)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the numbers: "m", "I[0,0]"."""
+        """Names of the numbers: "m", "I[0,0]"."""
         return tuple(
             leaf.name + (f"[{','.join(map(str, index))}]" if leaf.shape else "")
             for leaf, index in self.places
@@ -197,12 +198,12 @@ class Unknowns(eqx.Module):
 
 
 def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -> Unknowns:
-    """The unknowns of the leaves that `free` names, by their own name or by that of a branch.
+    """The unknowns of the leaves in `free`, by their own name or by that of a branch.
 
-    Of a branch, such as a network, only leaves that hold real numbers are meant.
+    For a branch, such as a network, only leaves of real numbers are used.
 
     Raises:
-        ValueError: a name of nothing, a leaf that holds no real numbers, or a transform of a leaf
+        ValueError: an unknown name, a leaf without real numbers, or a transform of a leaf
             that is not free.
     """
     free = name_sequence("free", free)
@@ -237,8 +238,7 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
         on_bound += [names[i]] * bound
         indices = transform.entries(value.shape)
         leaves.append(Leaf(names[i], i, value.shape, transform, k, indices))
-        # Unknowns of order one: as multiples of the size that a leaf starts at, logarithms as they
-        # are.
+        # Unknowns of order one: multiples of the initial size of a leaf; logarithms are not scaled.
         plain = np.isinf(transform.reach)
         size = (float(np.sqrt(np.mean(u**2))) if plain and u.size else 1.0) or 1.0
         one = np.ones(len(u))
@@ -259,7 +259,7 @@ def _is_real(leaf: Any) -> bool:
 def prior_rows(
     free: Unknowns, priors: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(which of the numbers, means, sigmas) that are known beforehand.
+    """(indices, means, sigmas) of the numbers with a prior.
 
     Raises:
         ValueError: a prior of a parameter that is not free, or of another shape.

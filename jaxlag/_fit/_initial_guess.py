@@ -1,4 +1,4 @@
-"""States that were measured, roughly: where a search for them starts."""
+"""Initial guesses of the states, from the measurements."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +13,9 @@ from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
 
 FEWEST = 5
-"""Samples through which a parabola is laid to find a value and a slope, at the least."""
+"""Least number of samples for a parabola that gives a value and a slope."""
 SHARE = 50
-"""A parabola spans this part of the samples of a recording."""
+"""Number of parts of a recording, one of which a parabola spans."""
 
 
 def initial_states(
@@ -25,14 +25,15 @@ def initial_states(
     params: Any,
     options: dict[str, Any],
 ) -> np.ndarray:
-    """(q, v), or (q, u) of those that are not constrained, at some samples, (r, d).
+    """(q, v), or (q, u) of the free quasi-velocities, at some samples, (r, d).
 
-    Coordinates and rates as q0 and v0 along the recording say, or else as measured, rates from
-    slopes; what was not measured, by a simulation from q0 and v0 with the params of the guess.
+    Coordinates and rates are taken from q0 and v0 along the recording, or else from measurements,
+    rates from slopes. Unmeasured ones follow from a simulation from q0 and v0 with the initial
+    params.
 
     Raises:
-        ValueError: q0 or v0 of another length than the system's; a coordinate was not measured, and
-            there is no q0 or v0 to simulate from.
+        ValueError: q0 or v0 of another length than the system's; an unmeasured coordinate
+            without q0 or v0 for a simulation.
     """
     _check(system, experiment)
     q, v = (_along(system, experiment, samples, kind) for kind in ("q0", "v0"))
@@ -55,18 +56,18 @@ def initial_states(
 
 
 def start_size(system: System) -> int:
-    """Numbers in a state (q, v), or (q, u) of those that are not constrained."""
+    """Numbers in a state (q, v), or (q, u) of the free quasi-velocities."""
     return system.size + (system.size if system.quasi is None else len(system.quasi.free))
 
 
 def start_freedom(system: System, params: Any) -> int:
-    """Numbers of a state that constraints leave, if all their rows are independent."""
+    """Free numbers of a state with constraints, if all their rows are independent."""
     rows = system._rows(params, jnp.dtype(float)).holonomic if system.constraints else ()
     return max(0, start_size(system) - sum(2 if holonomic else 1 for holonomic in rows))
 
 
 def _check(system: System, experiment: Experiment) -> None:
-    """Raise where q0, v0 or start_sigma are not as long as the system wants them."""
+    """Raise if q0, v0 or start_sigma do not have the length that the system requires."""
     name, n = experiment.name, system.size
     rates = n if system.quasi is None else len(system.quasi.names)
     what = "velocities" if system.quasi is None else "quasi-velocities"
@@ -84,7 +85,7 @@ def _check(system: System, experiment: Experiment) -> None:
 
 
 def _along(system: System, experiment: Experiment, samples: Sequence[int], kind: str) -> np.ndarray:
-    """Coordinates ("q0") or velocities ("v0") at the samples; NaN where they are not known."""
+    """Coordinates ("q0") or velocities ("v0") at the samples; NaN if they are unknown."""
     given = experiment.q0 if kind == "q0" else experiment.v0
     if kind == "v0" and system.quasi is not None:
         given = None  # those are quasi-velocities
@@ -110,7 +111,7 @@ def _along(system: System, experiment: Experiment, samples: Sequence[int], kind:
 
 
 def _parabola(ts: np.ndarray, x: np.ndarray, sample: int) -> tuple[np.ndarray, np.ndarray]:
-    """Value and slope at a sample, of parabolas through the nearest samples that were measured.
+    """Value and slope at a sample, from parabolas through the nearest measured samples.
 
     NaN in columns without any.
     """
@@ -157,6 +158,6 @@ def _simulated(
 
 
 def typical(states: np.ndarray) -> np.ndarray:
-    """How far states range, (d,): their standard deviations, 1 where they do not."""
+    """Range of the states, (d,): their standard deviations, or 1 if these are zero."""
     found = np.where(np.isfinite(states), states, 0.0).std(axis=0)
     return np.where(found > 1e-6 * np.max(np.abs(states), axis=0, initial=0.0), found, 1.0)

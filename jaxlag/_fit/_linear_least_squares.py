@@ -1,12 +1,12 @@
-"""Linear least squares of many segments: states eliminated one after another, params at the end.
+"""Linear least squares of many segments: states are eliminated in turn, params last.
 
     min  sum_k |E_k x_k + F_k p - r_k|^2 + sum_k |A_k x_k + B_k p - W x_{k+1} - g_k|^2
          + |P p - c|^2 + damping (|p|^2 + sum_k |x_k|^2)
 
-The first sum is what was measured in segment k, whose state at its start is x_k; the second joins
-its end to the start of the next one, the third holds what is known of the params beforehand. The
-rows that hold x_k are turned by an orthogonal matrix so that d of them alone hold it; what is left
-says the same of x_{k+1} and p. The work is linear in the number of segments, and no condition
+The first sum holds the measurements of segment k, with x_k the state at its start. The second sum
+joins its end to the start of the next segment. The third term is the prior of the params. An
+orthogonal matrix transforms the rows with x_k so that only d of them contain it. The remaining
+rows contain x_{k+1} and p. The work is linear in the number of segments, and no condition
 number is squared (square-root information filter: Bierman, Factorization Methods for Discrete
 Sequential Estimation, 1977, ch. V and VI).
 """
@@ -24,8 +24,8 @@ class LinearRows(NamedTuple):
 
     Attributes:
         measured: (k, m, d + p + 1), of x_k, p and the right-hand side.
-        joined: (k, d, d + p + 1), likewise; None where no segment goes on in another.
-        next: (k, d), the diagonal of W; zero for segments that end.
+        joined: (k, d, d + p + 1), likewise; None if no segment is joined to another.
+        next: (k, d), the diagonal of W; zero for segments that are not joined to the next.
         prior: (c, p + 1), of p and the right-hand side.
     """
 
@@ -36,7 +36,7 @@ class LinearRows(NamedTuple):
 
 
 class ReducedRows(NamedTuple):
-    """What is left of the rows.
+    """The rows after the elimination.
 
     Attributes:
         states: (k, d, d + d + p + 1), upper triangular rows of x_k, x_{k+1}, p, right-hand side.
@@ -48,7 +48,7 @@ class ReducedRows(NamedTuple):
 
 
 def _triangle(rows: Float[Array, "*k m c"]) -> Float[Array, "*k c c"]:
-    """R of the rows' QR factors, square: with rows of zeros where there were fewer."""
+    """R of the rows' QR factors, square: with rows of zeros if there are fewer rows."""
     *_, m, c = rows.shape
     if m < c:
         rows = jnp.concatenate([rows, jnp.zeros((*rows.shape[:-2], c - m, c), rows.dtype)], -2)
@@ -56,7 +56,7 @@ def _triangle(rows: Float[Array, "*k m c"]) -> Float[Array, "*k c c"]:
 
 
 def condense(rows: LinearRows) -> LinearRows:
-    """The same problem with as many measured rows as columns: once for every damping."""
+    """The same problem with as many measured rows as columns, for repeated damping."""
     return rows._replace(measured=_triangle(rows.measured), prior=_triangle(rows.prior))
 
 
@@ -72,12 +72,12 @@ def sizes_of(rows: LinearRows) -> Float[Array, " c"]:
 def eliminate(
     rows: LinearRows, damping: Float[Array, ""], weights: Float[Array, " p"] | None = None
 ) -> ReducedRows:
-    """Rows of condensed problems from which params and states follow by substitution.
+    """The triangular rows of condensed problems: params and states follow by substitution.
 
     Args:
         rows: of the problem.
-        damping: of all unknowns.
-        weights: by which its root is multiplied for params.
+        damping: damping of all unknowns.
+        weights: factors of its root for params.
     """
     count, _, columns = rows.measured.shape
     size = rows.prior.shape[1]
@@ -109,12 +109,12 @@ def eliminate(
 
     start = jnp.zeros((d, columns), dtype), _triangle(about)
     (left, params), states = jax.lax.scan(one, start, (rows.measured, rows.joined, rows.next))
-    # The last segment ends: what is left over holds p alone.
+    # The last segment is not joined: the remaining rows contain p alone.
     return ReducedRows(states, _triangle(jnp.concatenate([params, left[:, d:]])))
 
 
 def states_of(left: ReducedRows, p: Float[Array, " p"]) -> Float[Array, "k d"]:
-    """The states x of least squares where the params are p."""
+    """The least-squares states x for the params p."""
     d = left.states.shape[1]
 
     def back(later: Array, row: Array) -> tuple[Array, Array]:

@@ -1,10 +1,10 @@
-"""Multiple shooting: motions of all segments as lanes of one batch, and the least squares of them.
+"""Multiple shooting: all segments are integrated as one batch; their residuals and derivatives.
 
-Unknown are params, by z, and the state where each segment starts, by x. Residuals are what a
-segment shows less what was measured, over sigma; and the end of each segment less the start of the
-next, over a sigma of their own, which goes to zero from stage to stage: early on, segments follow
-what was measured however wrong the params are; in the end they are one motion (Bock, Recent
-advances in parameter identification techniques for ODE, 1983).
+Unknowns are the params, by z, and the state at the start of each segment, by x. Residuals are the
+predicted minus the measured values, over sigma, and the end of each segment minus the start of the
+next, over a sigma of its own. The latter sigma goes to zero from stage to stage. In early stages
+segments follow the measurements even with wrong params. In the last stage they form one motion
+(Bock, Recent advances in parameter identification techniques for ODE, 1983).
 """
 
 from collections.abc import Callable
@@ -30,30 +30,30 @@ from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
 
 MOVED_AT_ONCE = 64
-"""Segments times directions of derivatives: vectors, and no more than a core's cache holds."""
+"""Segments times directions of derivatives in one batch: vectorized, and within a core's cache."""
 AT_ONCE = 16
-"""Motions without derivatives that run side by side."""
+"""Motions without derivatives in one batch."""
 FAR = 10.0
-"""What a segment without a solution is off by, in multiples of how far its channels range."""
+"""Residual of a segment without a solution, in multiples of the range of its channels."""
 LARGEST_GAP = 1e4
-"""Of such a segment to the next, over `join` times the range of the states: its square must leave
-digits for what else is summed up."""
+"""Gap of such a segment to the next, over `join` times the range of the states: its square must
+leave digits for the other terms of the sum."""
 
 
 class FitVariables(NamedTuple):
-    """What the optimizer moves: z (p,) of the params, x (k, d) of the states, all of order one."""
+    """The unknowns: z (p,) for the params, x (k, d) for the states, all of order one."""
 
     z: Float[Array, " p"]
     x: Float[Array, "k d"]
 
 
 class Residuals(NamedTuple):
-    """What is to be small.
+    """The residuals of the least squares.
 
     Attributes:
-        measured: (k, s m + d): of the channels, and of starts that are known roughly.
-        joined: (k, d), of ends and the starts that follow; None where none follow.
-        prior: (c,), of params that are known roughly.
+        measured: (k, s m + d): of the channels, and of approximately known starts.
+        joined: (k, d), of ends and the following starts; None if none follow.
+        prior: (c,), of params with a prior.
     """
 
     measured: Float[Array, "k m"]
@@ -62,11 +62,11 @@ class Residuals(NamedTuple):
 
 
 class SegmentOutputs(NamedTuple):
-    """What segments did.
+    """Results of the segments.
 
     Attributes:
         residuals: (k, s, m), over sigma, before the loss.
-        ends: (k, d), states where they end, m, rad, m/s, rad/s.
+        ends: (k, d), states at their ends, m, rad, m/s, rad/s.
         status: (k,).
     """
 
@@ -76,19 +76,19 @@ class SegmentOutputs(NamedTuple):
 
 
 class MultipleShooting(eqx.Module):
-    """The problem.
+    """The multiple-shooting problem.
 
     Attributes:
-        system: what moves.
-        options: of `simulate`.
-        channels: what is measured.
-        widths: columns of each.
-        loss: by which residuals are made smaller; one of `LOSSES`.
+        system: the mechanical system.
+        options: options of `simulate`.
+        channels: measured channels.
+        widths: number of columns of each.
+        loss: one of `LOSSES`, applied to the residuals.
         chained: whether any segment follows another.
-        free: from z to params.
-        segments: what was measured.
-        states: (d,), by which x is multiplied.
-        ranges: (m,), how far channels range.
+        free: map from z to params.
+        segments: the measurements.
+        states: (d,), factor of x.
+        ranges: (m,), ranges of the channels.
         prior: (which numbers, means, sigmas).
     """
 
@@ -131,7 +131,7 @@ class MultipleShooting(eqx.Module):
     def one(
         self, z: Float[Array, " p"], x: Float[Array, " d"], segment: Segments
     ) -> tuple[Array, Array, Array]:
-        """(residuals (s, m) before the loss, end less start, status) of one segment."""
+        """(residuals (s, m) before the loss, end state, status) of one segment."""
         start = self.start(x, segment)
         params = self.free.params(z)
         inputs = segment.inputs.at(params, segment.ts)
@@ -149,7 +149,7 @@ class MultipleShooting(eqx.Module):
         end = jnp.concatenate([motion.q[-1], rates])
         residuals = jnp.where(ok, residuals, far)
         end = jnp.where(ok, end, start)
-        # Samples beyond those that were measured hold nothing, not even NaN.
+        # Residuals of samples without measurements are set to 0, even if they are NaN.
         return jnp.where(measured, residuals, 0.0), end, status
 
     def linearized(self, guess: FitVariables) -> tuple[Any, Any]:
@@ -170,9 +170,9 @@ class MultipleShooting(eqx.Module):
         return values, by
 
     def __call__(self, guess: FitVariables, join: Float[Array, ""]) -> tuple[Residuals, Any]:
-        """(residuals, what is seen of them), written as their own expansion about `guess`.
+        """(residuals, segment outputs), written as their own linear expansion about `guess`.
 
-        So a segment is differentiated by its own start only: in p + d directions, not p + k d.
+        A segment is then differentiated by its own start only: in p + d directions, not p + k d.
         """
         here = jax.lax.stop_gradient(guess)
         (residuals, ends, status), by = self.linearized(here)
@@ -186,7 +186,7 @@ class MultipleShooting(eqx.Module):
     def compared(
         self, guess: FitVariables, seen: SegmentOutputs, join: Float[Array, ""]
     ) -> Residuals:
-        """All that is to be small, of what segments do."""
+        """All residuals, from the segment outputs."""
         joined = None
         if self.chained:
             begins = jax.vmap(self.start)(guess.x, self.segments)
@@ -197,7 +197,7 @@ class MultipleShooting(eqx.Module):
     def weighed(
         self, x: Float[Array, "k d"], segments: Segments, residuals: Float[Array, "k s m"]
     ) -> Float[Array, "k r"]:
-        """Rows of what was measured by the loss, and of starts that are known roughly."""
+        """Rows of the measurements after the loss, and of approximately known starts."""
         known = jnp.isfinite(segments.held) & (segments.held > 0)
         sigma = jnp.where(known, segments.held, 1.0)
         starts = jnp.where(known, x * self.states[None] / sigma, 0.0)
@@ -210,9 +210,9 @@ class MultipleShooting(eqx.Module):
         begins: Float[Array, "k d"],
         join: Float[Array, ""],
     ) -> Float[Array, "k d"]:
-        """Ends less the starts that follow, over `join` times the range of the states.
+        """Ends minus the following starts, over `join` times the range of the states.
 
-        A segment without a solution has no end: its gap is large, and nothing moves it.
+        A segment without a solution has no end: its gap is a large constant.
         """
         ok = (seen.status == Status.ok)[:, None]
         missing = jnp.minimum(FAR / join, LARGEST_GAP)
@@ -220,7 +220,7 @@ class MultipleShooting(eqx.Module):
         return jnp.where(segments.follows[:, None], gaps, 0.0)
 
     def known(self, z: Float[Array, " p"]) -> Float[Array, " c"]:
-        """Params less what is known of them beforehand, over its standard deviation."""
+        """Params minus their prior means, over the standard deviations."""
         which, mean, deviation = self.prior
         return (self.free.numbers(z)[jnp.asarray(which)] - mean) / deviation
 
@@ -231,9 +231,9 @@ class MultipleShooting(eqx.Module):
 def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> LinearRows:
     """The linear problem: the operator's columns by z, and by the states of all segments at once.
 
-    A segment's measured rows hold its own state only. The rows that join it to the next hold
-    that one, too, through a diagonal matrix. Segments are moved by turns, first those of even
-    number, so that the two can be told apart.
+    A segment's measured rows contain its own state only. The rows that join it to the next also
+    contain the next state, with a diagonal matrix. Segments of even and odd number are perturbed
+    separately to distinguish the two.
     """
     guess = operator.in_structure()
     p, (k, d) = guess.z.shape[0], guess.x.shape
@@ -268,12 +268,12 @@ def rows_of(operator: lx.AbstractLinearOperator, residuals: Residuals) -> Linear
 
 
 class _Condensed(eqx.Module):
-    """A linear problem, and how its params are to be moved.
+    """A linear problem, with weights and bounds of its params.
 
     Attributes:
         rows: condensed.
-        weights: (p,), of the damping; None where all are 1.
-        box: how far each may go down and up, (p,) each; None where all may go anywhere.
+        weights: (p,), of the damping; None if all are 1.
+        box: largest decrease and increase of each, (p,) each; None without bounds.
     """
 
     rows: LinearRows
@@ -284,14 +284,14 @@ class _Condensed(eqx.Module):
 class Eliminating(optx.AbstractDescent):
     """Steps -(J^T J + D / step_size)^-1 J^T r by elimination of states, linear in segments.
 
-    D is 1, and less for unknowns whose numbers have become slower: damped are changes of numbers,
-    or else a number on its way to a bound would take ever smaller steps.
+    D is 1, and less for unknowns whose effect on their numbers has decreased. It damps changes of
+    numbers: otherwise a number on its way to a bound would take ever smaller steps.
     """
 
     shooting: MultipleShooting
 
     def init(self, y: FitVariables, f_info_struct: Any) -> _Condensed:
-        """Of the right shapes."""
+        """A state of the right shapes."""
         shapes = eqx.filter_eval_shape(self._condense, f_info_struct)
         rows = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         if self.shooting.free.plain:
@@ -302,7 +302,7 @@ class Eliminating(optx.AbstractDescent):
         return condense(rows_of(f_info.jac, f_info.residual))
 
     def query(self, y: FitVariables, f_info: Any, state: _Condensed) -> _Condensed:
-        """Of new derivatives."""
+        """The condensed problem of new derivatives."""
         free, rows = self.shooting.free, self._condense(f_info)
         if free.plain:
             return _Condensed(rows, None, None)
@@ -313,7 +313,7 @@ class Eliminating(optx.AbstractDescent):
         return _Condensed(rows, jnp.minimum(speeds, 1.0), (down, up))
 
     def step(self, step_size: Array, state: _Condensed) -> tuple[FitVariables, optx.RESULTS]:
-        """Of a step size: the best within what each of the params may move."""
+        """The step for a step size: the optimum within the bounds of the params."""
         left = eliminate(state.rows, 1.0 / step_size, state.weights)
         factor, right = left.params[:-1, :-1], left.params[:-1, -1]
         if state.box is None:
@@ -341,20 +341,20 @@ class Shooter(optx.AbstractGaussNewton):
 
 
 def _quiet(**_: Any) -> None:
-    """Print nothing."""
+    """Do not print."""
 
 
 class SearchResult(NamedTuple):
-    """Where the optimizer ended.
+    """The end of a search.
 
     Attributes:
         guess: the unknowns.
         converged: whether it met its tolerance.
-        steps: how many it took; of least squares each is a solve of all segments with derivatives.
+        steps: number of steps; in least squares each is a solve of all segments with derivatives.
         cost: half the sum of squares.
-        rows: condensed, of the linear problem there; None where nobody asked.
-        seen: what segments do there.
-        starts: (k, d), states where they start, m, rad, m/s, rad/s.
+        rows: condensed, of the linear problem there; None if not requested.
+        seen: segment outputs there.
+        starts: (k, d), states at the starts, m, rad, m/s, rad/s.
     """
 
     guess: FitVariables
@@ -390,7 +390,7 @@ def search(
         max_steps=max_steps,
         throw=False,
     )
-    # What the optimizer knows of the last point that it accepted; nothing is solved once more.
+    # The optimizer's values at the last accepted point; no further solve.
     state = solution.state
     return SearchResult(
         solution.value,
@@ -405,7 +405,7 @@ def search(
 
 @eqx.filter_jit
 def moved(shooting: MultipleShooting, guess: FitVariables) -> SegmentOutputs:
-    """What segments do, without derivatives."""
+    """Segment outputs without derivatives."""
 
     def one(segment: tuple[Array, Segments]) -> tuple[Array, Array, Array]:
         return shooting.one(guess.z, *segment)
@@ -418,11 +418,11 @@ def moved(shooting: MultipleShooting, guess: FitVariables) -> SegmentOutputs:
 def judged(
     shooting: MultipleShooting, guess: FitVariables, join: Array, linear: bool
 ) -> tuple[Float[Array, ""], LinearRows | None, SegmentOutputs, Float[Array, "k d"]]:
-    """(cost, the linear problem condensed, what segments do, where they start) at a guess.
+    """(cost, the condensed linear problem, segment outputs, starts) at a guess.
 
     Args:
         shooting: the problem.
-        guess: where.
+        guess: the unknowns.
         join: of the gaps.
         linear: whether to take derivatives; without them there is no linear problem.
     """

@@ -1,4 +1,4 @@
-"""A figure of what was measured beside the motions that were fitted or predicted."""
+"""Figures of measured against fitted or predicted motions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,9 +10,9 @@ from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._residuals import channels_of, rms_of
 
 MOST = 4
-"""Experiments in a figure."""
+"""Largest number of experiments in a figure."""
 DOTS = 60
-"""Measurements shown of each."""
+"""Number of measurements shown for each."""
 
 
 def plotted(
@@ -23,9 +23,9 @@ def plotted(
     """Measurements as dots, motions as lines, residuals beneath; one column per experiment.
 
     Args:
-        experiments: what was measured.
-        residuals: of each, channel -> motion less measurement, (s, k).
-        predicted: of each, (s,), samples beyond those that its start was fitted to; a line is drawn
+        experiments: the measurements.
+        residuals: for each, channel -> motion minus measurement, (s, k).
+        predicted: for each, (s,), samples beyond those of the fit of its start; a line marks
             where they begin.
 
     Raises:
@@ -88,5 +88,5 @@ def _channel(
 
 
 def _size(residuals: Mapping[str, np.ndarray]) -> float:
-    """By which experiments are ordered: the worst channel's root mean square; NaN comes last."""
+    """Sort key of experiments: the worst channel's root mean square; NaN comes last."""
     return float(np.max([np.max(rms_of([residuals], name)) for name in residuals]))

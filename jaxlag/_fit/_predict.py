@@ -1,4 +1,4 @@
-"""Predictions: motions from starts that the first measurements tell, against the later ones."""
+"""Predictions: initial states from the first measurements, motions compared with the later ones."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -35,17 +35,17 @@ from jaxlag._tracing._traced_function import warn_of_changes
 
 @final
 class Prediction(eqx.Module):
-    """What was predicted of experiments, beside what was measured.
+    """Predictions of experiments, compared with the measurements.
 
     Attributes:
-        residuals: of each experiment, channel -> motion less measurement, (s, k), in its own unit;
-            NaN where nothing was measured or the motion failed.
-        predicted: of each experiment, (s,): samples that the start was not fitted to; all of them
-            where it was fitted to all.
-        starts: of each experiment, (q, v) or (q, u) at its first time.
+        residuals: for each experiment, channel -> motion minus measurement, (s, k), in its own
+            unit; NaN for missing values and failed motions.
+        predicted: for each experiment, (s,): samples not used in the fit of the start; all of them
+            if all were used.
+        starts: for each experiment, (q, v) or (q, u) at its first time.
         failed: experiments whose motion failed, each with its status.
         converged: whether the search for starts met its tolerance.
-        experiments: what was measured.
+        experiments: the measurements.
     """
 
     residuals: tuple[dict[str, np.ndarray], ...]
@@ -61,13 +61,13 @@ class Prediction(eqx.Module):
         return channels_of(self.residuals)
 
     def rms(self, channel: str) -> Float[np.ndarray, " k"]:
-        """Root mean square of a channel over all samples that were predicted, in its own unit."""
+        """Root mean square of a channel over all predicted samples, in its own unit."""
         own = zip(self.residuals, self.predicted, strict=True)
         parts = [{name: x[samples] for name, x in each.items()} for each, samples in own]
         return rms_of(parts, channel)
 
     def plot(self) -> Any:
-        """A figure as `FitResult.plot`, a dotted line where predictions begin."""
+        """A figure as `FitResult.plot`, with a dotted line where predictions begin."""
         return plotted(self.experiments, self.residuals, self.predicted)
 
     def __str__(self) -> str:
@@ -92,30 +92,30 @@ def predict(
     max_steps: int = 100,
     simulate_options: Mapping[str, Any] = NO_OPTIONS,
 ) -> Prediction:
-    """How well params predict experiments, of which none need have been used to find them.
+    """Predictions of experiments with given params; the experiments may be new.
 
-    The start of each experiment is fitted to its first `settle` seconds, params as they are; the
-    motion from there is compared with all that was measured.
+    The start of each experiment is fitted to its first `settle` seconds, with fixed params. The
+    motion from there is compared with all measurements.
 
     Args:
-        system: what moves.
+        system: the mechanical system.
         experiments: one `Experiment` or more.
         params: all params.
         settle: s, from the first time of each experiment; None fits its start to all of it.
         channels: as for `jl.fit`.
-        noise: channel -> standard deviation, where the experiments state none: by which channels
-            are weighed when starts are fitted.
+        noise: channel -> standard deviation, for experiments without sigma: weights of the
+            channels in the fit of starts.
         rtol: relative tolerance of the starts and residuals, both of order one.
         atol: absolute tolerance of the same.
-        max_steps: bound on the steps of Levenberg and Marquardt's method.
-        simulate_options: of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
+        max_steps: bound on the steps of the Levenberg-Marquardt method.
+        simulate_options: options of `jl.simulate`, such as `{"method": "tsit5", "rtol": 1e-7}`.
 
     Raises:
-        ValueError: an argument of wrong form or value, named; `settle` that leaves fewer
-            measurements than a start has numbers.
+        ValueError: an invalid argument, named; a `settle` with fewer
+            measurements than numbers in a start.
 
     Warns:
-        where the search for the starts did not converge, and of each motion that failed: its
+        if the search for the starts did not converge, and of each failed motion: its
         samples do not count.
 
     Example:
@@ -182,7 +182,7 @@ def predict(
 
 
 def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> Experiment:
-    """The samples that a start is fitted to."""
+    """The samples to which a start is fitted."""
     if settle is None:
         return experiment
     if not settle > 0:
@@ -206,7 +206,7 @@ def residuals_of(
     experiments: Sequence[Experiment],
     where: SegmentLayout,
 ) -> tuple[dict[str, np.ndarray], ...]:
-    """Of each experiment by channel, in the channels' units; NaN where a segment failed."""
+    """For each experiment by channel, in the channels' units; NaN for failed segments."""
     weights = np.asarray(problem.segments.weights)
     with np.errstate(divide="ignore", invalid="ignore"):
         raw = np.where(weights > 0, weighted / weights, np.nan)

@@ -1,4 +1,4 @@
-"""Residuals of experiments: what was measured against what a motion shows, by channels; losses."""
+"""Residuals by channel: measured against simulated values; loss functions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
@@ -18,10 +18,10 @@ def channels_of(residuals: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, ...
 
 
 def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float[np.ndarray, " k"]:
-    """Root mean square of a channel over all samples that have a number; NaN where none has.
+    """Root mean square of a channel over all samples with a number; NaN if there are none.
 
     Raises:
-        ValueError: a channel that nobody measured.
+        ValueError: a channel without measurements.
     """
     known = channels_of(residuals)
     if channel not in known:
@@ -41,16 +41,16 @@ Reader = Callable[[Solution], Array]
 def readers(
     system: System, names: tuple[str, ...], own: Mapping[str, Reader], rows: tuple[str, ...]
 ) -> dict[str, Reader]:
-    """name -> function of a motion that gives the channel at its save times, (s,) or (s, k).
+    """name -> function of a motion that returns the channel at its save times, (s,) or (s, k).
 
     Args:
-        system: what moves.
-        names: of all channels that were measured.
-        own: functions of the caller, which go before what names mean otherwise.
+        system: the mechanical system.
+        names: names of all measured channels.
+        own: functions of the caller; they override the standard names.
         rows: names of constraint rows, whose multipliers may be measured.
 
     Raises:
-        ValueError: a name that means nothing.
+        ValueError: an unknown name.
     """
     known = standard(system, rows) | dict(own)
     for name in names:
@@ -61,9 +61,9 @@ def readers(
     return {name: known[name] for name in names}
 
 
-@lru_cache(maxsize=256)  # so that one channel is one function, and what is compiled stays so
+@lru_cache(maxsize=256)  # so that one channel is one function, compiled once
 def standard(system: System, rows: tuple[str, ...]) -> dict[str, Reader]:
-    """What names mean by themselves."""
+    """The standard channels by name."""
     found: dict[str, Reader] = {"energy": lambda motion: motion.energy}
     for name in rows:
         found[name] = lambda motion, name=name: motion.multipliers[name]
@@ -85,11 +85,11 @@ def read(
 
     Args:
         channels: name -> function of a motion.
-        widths: columns that were measured of each.
-        motion: what is seen.
+        widths: number of measured columns of each.
+        motion: the motion.
 
     Raises:
-        ValueError: a channel shows another number of times or columns.
+        ValueError: a channel returns another number of times or columns.
     """
     count, shown = motion.ts.shape[0], []
     for (name, function), width in zip(channels.items(), widths, strict=True):

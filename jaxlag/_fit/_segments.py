@@ -1,4 +1,4 @@
-"""Experiments cut into segments of equal shape, the lanes of one batch."""
+"""Segments of equal shape, cut from experiments, as lanes of one batch."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -18,17 +18,17 @@ from jaxlag._system._system import System
 class Segments(NamedTuple):
     """k segments of s samples each.
 
-    The last sample is where a segment ends: its last measurement, or where the next one starts.
-    Those that have fewer samples are filled up with times before it, of weight 0.
+    The last sample is the end of a segment: its last measurement, or the start of the next one.
+    Segments with fewer samples are filled up with times before it, of weight 0.
 
     Attributes:
         ts: (k, s), s.
-        values: (k, s, m), what was measured; 0 where nothing was.
-        weights: (k, s, m), 1/sigma; 0 where nothing was measured.
-        follows: (k,), whether the next segment goes on where this one ends.
+        values: (k, s, m), the measurements; 0 for missing ones.
+        weights: (k, s, m), 1/sigma; 0 for missing measurements.
+        follows: (k,), whether the next segment continues this one.
         inputs: of each segment, stacked.
-        guess: (k, d), the state (q, v) or (q, u) where each starts, as far as it is known.
-        held: (k, d), standard deviations of that guess; 0 where it is exact, inf where unknown.
+        guess: (k, d), the state (q, v) or (q, u) at each start, approximately.
+        held: (k, d), standard deviations of that guess; 0 if it is exact, inf if unknown.
     """
 
     ts: Float[Array, "k s"]
@@ -41,14 +41,14 @@ class Segments(NamedTuple):
 
 
 class SegmentLayout(NamedTuple):
-    """Where samples of experiments stand.
+    """The positions of the samples of experiments in the segments.
 
     Attributes:
         owner: (k,), the experiment of each segment.
-        first: (k,), the first sample of it.
-        count: (k,), how many samples.
-        follows: (k,), whether the next segment goes on where this one ends.
-        places: where the samples of each segment stand among its s.
+        first: (k,), its first sample.
+        count: (k,), its number of samples.
+        follows: (k,), whether the next segment continues this one.
+        places: positions of the samples of each segment among its s.
         columns: name -> the channel's columns among m.
     """
 
@@ -61,7 +61,7 @@ class SegmentLayout(NamedTuple):
 
 
 def layout(experiments: Sequence[Experiment], segments: int) -> SegmentLayout:
-    """At most `segments` per experiment, of equally many samples as far as that goes."""
+    """`segments` per experiment, of equally many samples if possible."""
     owner, first, count = [], [], []
     for i, experiment in enumerate(experiments):
         samples = len(experiment.ts)
@@ -102,11 +102,11 @@ def pack(
     """The segments of `where`.
 
     Args:
-        system: what moves.
-        experiments: what was measured.
+        system: the mechanical system.
+        experiments: the measurements.
         where: samples of each segment.
-        sigma: of channels whose experiment gives none.
-        guess: states where the segments start, (k, d).
+        sigma: of channels without sigma in their experiment.
+        guess: states at the starts of the segments, (k, d).
     """
     length = int(np.max(where.count + where.follows))
     width = max(part.stop for part in where.columns.values())
@@ -144,7 +144,7 @@ def pack(
 def _inputs_between(inputs: Any, start: float, end: float) -> Any:
     """The inputs with only those samples of their tables that are read from start to end.
 
-    All of those that depend on params.
+    Inputs that are a function of params are unchanged.
     """
     if callable(inputs):
         return inputs

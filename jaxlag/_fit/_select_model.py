@@ -1,4 +1,4 @@
-"""Models compared: which forces does a system need to predict what it was not fitted to?"""
+"""Model selection: candidate forces compared by predictions on data not used in the fit."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -24,16 +24,16 @@ from jaxlag._system._system import System
 
 @final
 class Candidate(eqx.Module):
-    """A term that a system may need: one force or more, and the params that come with it.
+    """A term that a system may need: one force or more, with its params.
 
     Args:
         forces: `Rayleigh`, `GeneralizedForce`, `PointForce`, `Torque`.
-        params0: entries for the dict of params; all are found.
+        params0: entries for the dict of params; all are estimated.
         transforms: as for `jl.fit`, of these entries.
         priors: likewise.
 
     Raises:
-        ValueError: no force, or something that is none.
+        ValueError: no force, or an object that is no force.
     """
 
     forces: tuple[AbstractForce, ...]
@@ -60,12 +60,12 @@ class Ranked(NamedTuple):
     """One model of a comparison.
 
     Attributes:
-        name: of its terms, "none" or "viscous + Coulomb".
-        error: root mean square over all channels of what it mispredicts, each over how far that
-            channel ranges in the data held out; inf where a motion failed, or the search for a
-            start.
-        fit: to the experiments.
-        prediction: of those held out.
+        name: names of its terms, "none" or "viscous + Coulomb".
+        error: root mean square of the prediction errors over all channels, each over the range of
+            that channel in the held-out data; inf if a motion or the search for a
+            start failed.
+        fit: result of the fit to the experiments.
+        prediction: predictions of the held-out experiments.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Ranked(NamedTuple):
 
 @final
 class ModelSelection(eqx.Module):
-    """Models, the best first: by what they predict of experiments that were held out.
+    """Models, the best first, ranked by predictions of held-out experiments.
 
     Attributes:
         models: ranked.
@@ -86,7 +86,7 @@ class ModelSelection(eqx.Module):
 
     @property
     def best(self) -> Ranked:
-        """The model of the smallest error."""
+        """The model with the smallest error."""
         return self.models[0]
 
     def __getitem__(self, name: str) -> Ranked:
@@ -133,34 +133,34 @@ def select_model(
     priors: Mapping[str, Any] | None = None,
     fit_options: Mapping[str, Any] = NO_OPTIONS,
 ) -> ModelSelection:
-    """Fit a system with and without candidate terms, and rank them by what they predict.
+    """Fit a system with and without candidate terms, and rank the models by their predictions.
 
     Every combination of up to `most` candidates is added to the system and fitted to the
-    experiments; the error is that of its predictions of experiments held out, whose starts alone
-    are fitted (`jl.predict`). More terms always fit better; they need not predict better.
+    experiments. The error is that of its predictions of held-out experiments, for which only the
+    starts are fitted (`jl.predict`). More terms always fit better, but may predict worse.
 
-    Where candidates share params, or are combined, the search for those of one begins at the
+    If candidates share params, or are combined, the search starts from the
     estimates of an earlier model that has most of them: name the simple candidates first.
 
     Args:
         system: without the candidates.
-        experiments: to fit to.
+        experiments: experiments for the fit.
         params0: of the system, a dict.
         candidates: name -> `Candidate`.
         held_out: experiments to predict.
-        free: as for `jl.fit`; the candidates' params are free beside these.
-        most: of the candidates in one model.
+        free: as for `jl.fit`; the candidates' params are also free.
+        most: largest number of candidates in one model.
         settle: s, as for `jl.predict`.
         transforms: as for `jl.fit`.
         priors: as for `jl.fit`.
         fit_options: further arguments of `jl.fit`, such as segments and simulate_options.
 
     Raises:
-        ValueError: an argument of wrong form or value, named; params of a candidate that the system
-            has, or another candidate that it may stand beside.
+        ValueError: an invalid argument, named; params of a candidate that the system
+            has, or another candidate in the same model.
 
     Warns:
-        as `jl.fit` and `jl.predict` do, and where no model predicts all that was held out.
+        as `jl.fit` and `jl.predict`, and if no model predicts all held-out experiments.
 
     Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.2.
     """
@@ -200,10 +200,10 @@ def _estimates(
     models: Sequence[Ranked],
     transforms: Mapping[str, AbstractTransform],
 ) -> dict[str, Any]:
-    """Those of the model that has most of these params, of several of that which fits best.
+    """Estimates of the model with most of these params, and of several the one that fits best.
 
-    Nothing where none has more than the params that are common to all: they may be far off there;
-    and nothing of another form, or that a transform does not allow.
+    Empty if none has more than the params common to all, whose estimates may be far off then. An
+    estimate of another structure, or not allowed by a transform, is left out.
     """
     able = [model for model in models if model.error < float("inf") and model.fit.converged]
     shared = [len(params.keys() & model.fit.params.keys()) for model in able]
@@ -213,7 +213,7 @@ def _estimates(
         zip(able, shared, strict=True),
         key=lambda x: (-x[1], _error(x[0].fit, x[0].fit.experiments)),
     )[0].fit
-    # A logarithm that has run off finds no way back.
+    # A logarithm that has diverged does not return.
     held = {name.partition("[")[0].partition(".")[0] for name in near.on_bound}
     return {
         name: near.params[name]
@@ -230,7 +230,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool:
-    """Whether a search may begin there."""
+    """Whether a search may start there."""
     if transform is None:
         return True
     try:
@@ -265,14 +265,14 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> 
 
 
 def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:
-    """Of all channels, each over how far it ranges; inf where a motion or a start failed."""
+    """Error over all channels, each over its range; inf if a motion or a start failed."""
     if predicted.failed or not predicted.converged:
         return float("inf")
     shares = []
     for name in predicted.channels:
         values = np.concatenate([x.channels[name] for x in experiments if name in x.channels])
         shares.append(predicted.rms(name) / spreads(values))
-    # A channel may have no number in the samples that were predicted.
+    # A channel may have no number in the predicted samples.
     known = np.concatenate(shares)
     known = known[np.isfinite(known)]
     return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")

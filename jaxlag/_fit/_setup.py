@@ -1,4 +1,4 @@
-"""The least squares of a fit: experiments cut into segments, their noise, where a search starts."""
+"""Set-up of the least squares of a fit: segments, noise, initial guesses."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from inspect import signature
@@ -25,17 +25,17 @@ from jaxlag._simulation._simulate import simulate
 from jaxlag._system._system import System
 
 OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
-"""Arguments of `simulate` that a fit gives itself."""
+"""Arguments of `simulate` that a fit sets itself."""
 STATES_FOR_RANGE = 32
-"""States of each experiment, by whose spread those of the problem are measured."""
+"""Number of states of each experiment for the ranges of the states."""
 MEDIAN = NormalDist().inv_cdf(0.75)
-"""Of the sizes of Gaussian numbers, over their standard deviation."""
+"""Median of |x| over the standard deviation, for Gaussian x."""
 ASSUMED_NOISE = 1e-2
-"""Of what a channel ranges over, where neither a sigma nor an estimate is at hand."""
+"""Noise over the range of a channel, if neither a sigma nor an estimate is available."""
 
 
 def experiments_of(given: Any) -> tuple[Experiment, ...]:
-    """What was given as one experiment or several, as a tuple."""
+    """One experiment or several, as a tuple."""
     if not isinstance(given, Experiment | Iterable):
         raise invalid(
             "experiments", "be a jl.Experiment or a sequence of them", f"it was {given!r}"
@@ -49,7 +49,7 @@ def experiments_of(given: Any) -> tuple[Experiment, ...]:
 
 
 NO_OPTIONS: Mapping[str, Any] = MappingProxyType({})
-"""Of `simulate`, none."""
+"""No options of `simulate`."""
 
 
 FORMER = {
@@ -61,11 +61,11 @@ FORMER = {
     for name in signature(simulate).parameters
     if name not in (*OURS, "system", "rtol", "atol", "max_steps")
 }
-"""Keywords of `fit` and `predict` that were others once, or went straight to `simulate`."""
+"""Former keywords of `fit` and `predict`, and those once passed to `simulate`."""
 
 
 def check_search(rtol: Any, atol: Any, max_steps: Any) -> None:
-    """Raise where an optimizer could not work with these."""
+    """Raise if these are invalid for an optimizer."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         if not isinstance(value, int | float | np.number) or not 0 < value < 1:
             raise invalid(name, "be a number between 0 and 1", f"it was {value!r}")
@@ -73,10 +73,10 @@ def check_search(rtol: Any, atol: Any, max_steps: Any) -> None:
 
 
 def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
-    """Options of `jl.simulate` by which compiled programs are keyed, numbers as Python's.
+    """Options of `jl.simulate` for the key of compiled programs, numbers as Python's.
 
     Raises:
-        ValueError: one that `simulate` does not know, that the caller decides, or that holds an
+        ValueError: an option unknown to `simulate`, one that the caller sets, or one with an
             array.
     """
     if not isinstance(options, Mapping):
@@ -102,7 +102,7 @@ def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
 def readers_of(
     system: System, experiments: Sequence[Experiment], own: Mapping[str, Reader], params: Any
 ) -> dict[str, Reader]:
-    """name -> function of a motion, of every channel that was measured."""
+    """name -> function of a motion, for every measured channel."""
     names = tuple(dict.fromkeys(name for each in experiments for name in each.channels))
     for name, shape in system.coordinates.shapes.items():
         size = int(np.prod(shape))
@@ -118,7 +118,7 @@ def readers_of(
 
 
 def _unstated(experiments: Sequence[Experiment]) -> set[str]:
-    """Channels whose noise one experiment or more does not state."""
+    """Channels without sigma in one experiment or more."""
     without = {name for each in experiments for name in each.channels if name not in each.sigma}
     for name in without & {name for each in experiments for name in each.sigma}:
         was = f"that of {name!r} was given in some"
@@ -139,17 +139,17 @@ def build_shooting(
     options: Mapping[str, Any],
     known_noise: Mapping[str, float] | None = None,
 ) -> tuple[MultipleShooting, dict[str, float]]:
-    """The problem, and the noise assumed of channels whose noise is not stated.
+    """The problem, and the noise assumed for channels without sigma.
 
     Args:
-        system: what moves.
-        experiments: what was measured.
+        system: the mechanical system.
+        experiments: the measurements.
         where: their segments.
-        free: what is to be found beside the starts of segments.
-        shown: name -> what a motion shows of a channel.
-        prior: (which numbers, means, sigmas).
+        free: unknowns besides the starts of segments.
+        shown: name -> channel as a function of a motion.
+        prior: (indices of numbers, means, sigmas).
         loss: one of `LOSSES`.
-        options: of `simulate`.
+        options: options of `simulate`.
         known_noise: of channels, from an earlier fit.
     """
     if system.constraints:
@@ -187,7 +187,7 @@ def build_shooting(
 
 
 def freedom(found: SearchResult, problem: MultipleShooting) -> float:
-    """How many more numbers were measured than went into unknowns; segments that failed aside."""
+    """Degrees of freedom: measurements minus effective unknowns, without failed segments."""
     ok = (np.asarray(found.seen.status) == Status.ok)[:, None, None]
     measured = np.count_nonzero((np.asarray(problem.segments.weights) > 0) & ok)
     return measured - effective_parameters(problem, found)
@@ -196,15 +196,15 @@ def freedom(found: SearchResult, problem: MultipleShooting) -> float:
 def estimated_noise(
     found: SearchResult, problem: MultipleShooting, where: SegmentLayout, noise: Mapping[str, float]
 ) -> dict[str, float]:
-    """Standard deviations of the channels' residuals, m, rad or what they are measured in.
+    """Standard deviations of the channels' residuals, in the channels' units.
 
-    Where a loss counts outliers for less, from the median of what residuals are in size: outliers
+    With a loss that gives outliers less weight, from the median of |residual|: outliers
     are not noise.
     """
     ok = (np.asarray(found.seen.status) == Status.ok)[:, None, None]
     measured = (np.asarray(problem.segments.weights) > 0) & ok
     share = freedom(found, problem) / max(1, np.count_nonzero(measured))
-    if share <= 0:  # nothing is left to judge by, as with a network: as if none had been fitted
+    if share <= 0:  # no degrees of freedom, as with a network: as if nothing had been fitted
         share = 1.0
     residuals, changed = np.asarray(found.seen.residuals), dict(noise)
     for name, sigma in noise.items():
@@ -213,13 +213,13 @@ def estimated_noise(
         if own.size:
             plain = problem.loss is squares
             size = np.sqrt(np.mean(own**2)) if plain else np.median(np.abs(own)) / MEDIAN
-            # Measurements without noise: what is left then is the solver's.
+            # Measurements without noise: the residuals are then solver errors.
             changed[name] = sigma * max(float(size / np.sqrt(share)), 1e-9)
     return changed
 
 
 def spreads(x: np.ndarray) -> np.ndarray:
-    """How far each column ranges: its standard deviation, 1 where it has none."""
+    """Range of each column: its standard deviation, or 1 if that is zero."""
     some = np.isfinite(x).any(axis=0)
     found = np.ones(x.shape[1])
     found[some] = np.nanstd(x[:, some], axis=0)
@@ -229,7 +229,7 @@ def spreads(x: np.ndarray) -> np.ndarray:
 def with_noise(
     problem: MultipleShooting, where: SegmentLayout, noise: Mapping[str, float]
 ) -> MultipleShooting:
-    """The problem with other weights of these channels."""
+    """The problem with new weights of these channels."""
     weights = problem.segments.weights
     for name, sigma in noise.items():
         part = where.columns[name]

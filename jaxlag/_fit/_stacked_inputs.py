@@ -1,4 +1,4 @@
-"""The inputs of many experiments as those of one batch: what differs is told by an index."""
+"""Inputs of many experiments stacked into one batch, selected by an index."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -25,39 +25,39 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import TracedFunction, functions_of, traced_function
 
 JUST_AFTER = 1e-9
-"""Of the length of a segment."""
+"""Delay of a knot, over the length of a segment."""
 
 
 class AbstractStackedInputs(eqx.Module):
-    """Inputs by name of many experiments; every array has an axis of them in front."""
+    """Inputs by name of many experiments; every array has their axis in front."""
 
     @abstractmethod
     def at(self, params: Any, ts: Array) -> dict[str, Any]:
-        """Of one experiment, at these params, as for `jl.simulate` at times ts."""
+        """Inputs of one experiment at these params, as for `jl.simulate` at times ts."""
 
 
 class StackedInputs(AbstractStackedInputs):
-    """Those that are given.
+    """Inputs that do not depend on params.
 
-    A leaf of a batch may be no function: what is no array stands apart.
+    Functions cannot be leaves of a batch: all that is no array is stored separately.
     """
 
     arrays: Any
     rest: _params.Static = eqx.field(static=True)
 
     def at(self, params: Any, ts: Array) -> dict[str, Any]:
-        """As they are given."""
+        """The given inputs."""
         del params, ts
         return eqx.combine(self.arrays, self.rest.tree)
 
 
 class ComputedInputs(AbstractStackedInputs):
-    """Those that depend on params: all are computed, and each experiment takes its own.
+    """Inputs that depend on params: all are computed, and each experiment selects its own.
 
     Attributes:
-        which: of the functions, by experiment.
-        functions: of the params.
-        ends: last times, s, of the experiments that have the functions.
+        which: index of the function, by experiment.
+        functions: functions of the params.
+        ends: last times, s, of the experiments with these functions.
     """
 
     which: Int[Array, " k"]
@@ -65,7 +65,7 @@ class ComputedInputs(AbstractStackedInputs):
     ends: tuple[float, ...] = eqx.field(static=True)
 
     def at(self, params: Any, ts: Array) -> dict[str, Any]:
-        """Of one function."""
+        """Inputs of one function."""
         each = [check_inputs(f.function(params)) for f in self.functions]
         if len(each) > 1:
             for inputs in each:
@@ -77,9 +77,9 @@ class ComputedInputs(AbstractStackedInputs):
 
 
 def _after(signal: Any, ts: Array) -> Any:
-    """The same signal; a knot at the first time lies just after it.
+    """The same signal; a knot at the first time is moved to just after it.
 
-    Else nothing would show that it moves where one segment ends and the next begins.
+    Otherwise derivatives would not contain its motion where one segment ends and the next begins.
     """
     if not isinstance(signal, AbstractInput) or not signal.tabulated:
         return signal
@@ -100,20 +100,20 @@ class _OfTime(eqx.Module):
     among: tuple[Any, ...]
 
     def __call__(self, t: Array, params: Any) -> Array:
-        """That which is meant; the others are computed beside it."""
+        """The selected value; the others are computed, too."""
         nothing = jnp.zeros(0)
         return _chosen(self, t, nothing, nothing, params)
 
 
 class _OfState(eqx.Module):
-    """The same of functions among which some read the state, u(t, q, v, params)."""
+    """The same for functions some of which read the state, u(t, q, v, params)."""
 
     name: str = eqx.field(static=True)
     which: Int[Array, ""]
     among: tuple[Any, ...]
 
     def __call__(self, t: Array, q: Array, v: Array, params: Any) -> Array:
-        """That which is meant; the others are computed beside it."""
+        """The selected value; the others are computed, too."""
         return _chosen(self, t, q, v, params)
 
 
@@ -133,7 +133,7 @@ def _chosen(
 
 
 def _check_closures(inputs: dict[str, Any]) -> None:
-    """Raise where a signal closes over params: of several one is chosen, which is an argument."""
+    """Raise if a signal has params in its closure: a selection needs them as arguments."""
     for name, signal in inputs.items():
         for function in functions_of(signal):
             cells = getattr(function.function, "__closure__", None) or ()
@@ -146,11 +146,11 @@ def _check_closures(inputs: dict[str, Any]) -> None:
 
 
 def computed(inputs: Sequence[Any], ends: Sequence[float]) -> ComputedInputs:
-    """The inputs of segments, where those of some are a function of the params.
+    """The inputs of segments if some of them are a function of the params.
 
     Args:
-        inputs: of each segment, by name, or a function.
-        ends: its last time, s.
+        inputs: for each segment, by name, or a function.
+        ends: last time of each segment, s.
     """
     functions: dict[Any, TracedFunction] = {}
     last: dict[Any, float] = {}
@@ -172,15 +172,15 @@ def _constant(inputs: dict[str, Any]) -> Callable[[Any], dict[str, Any]]:
 def stacked(inputs: Sequence[dict[str, Any]], ends: Sequence[float]) -> StackedInputs:
     """The inputs of segments, with a leading axis.
 
-    Tables go on with their last value as far as the longest. Functions and constants may differ:
-    all of them are part of the program then.
+    Tables are extended with their last value to the longest. Functions and constants may differ:
+    the program then contains all of them.
 
     Args:
-        inputs: of each segment.
-        ends: its last time, s.
+        inputs: for each segment.
+        ends: last time of each segment, s.
 
     Raises:
-        ValueError: other names in one than in another, tables beside what is none.
+        ValueError: different names, or tables combined with other inputs.
     """
     if any(each.keys() != inputs[0].keys() for each in inputs):
         was = " or ".join(sorted({str(sorted(each)) for each in inputs}))
@@ -219,7 +219,7 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
 
 
 def _choice(name: str, signal: Any, among: list[Any], of_state: bool) -> TimeFunction | Feedback:
-    """The same signal, where its structure stands among those of all experiments."""
+    """The same signal, with its structure among those of all experiments."""
     i = next(i for i, other in enumerate(among) if _equal([signal, other]))
     which = jnp.asarray(i, jnp.int32), (*among[:i], signal, *among[i + 1 :])
     return Feedback(_OfState(name, *which)) if of_state else TimeFunction(_OfTime(name, *which))
@@ -230,7 +230,7 @@ def _kind(signal: Any) -> str:
 
 
 def _equal(signals: list[Any]) -> bool:
-    """Whether they are of one structure, so that only their arrays need an axis in front."""
+    """Whether they have one structure, so that only their arrays need an axis in front."""
     first, *others = ((jax.tree.structure(a), _params.Static(b)) for a, b in map(_halves, signals))
     shapes = [[np.shape(x) for x in jax.tree.leaves(_halves(signal)[0])] for signal in signals]
     return all(other == first for other in others) and all(x == shapes[0] for x in shapes)
@@ -252,7 +252,7 @@ def _different(signals: list[Any]) -> list[Any]:
 def _later(
     times: Array | None, count: int, end: float
 ) -> Float[np.ndarray, " k"] | Float[Array, " k"]:
-    """As many knots: those that are missing lie where nobody looks."""
+    """Knots filled up to `count`: the missing ones lie beyond the end."""
     xp = np if concrete(times) else jnp
     own = np.zeros(0) if times is None else xp.asarray(times, float)
     last = xp.max(xp.append(own, end))
@@ -260,7 +260,7 @@ def _later(
 
 
 def _filled(table: Any, length: int) -> AbstractInput:
-    """A table that goes on with its last value."""
+    """A table extended with its last value."""
     xp = np if concrete(table) else jnp
     times, values = xp.asarray(table.times), xp.asarray(table.values)
     missing = length - len(times)

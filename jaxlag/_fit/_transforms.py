@@ -1,7 +1,6 @@
-"""Transforms: maps from all real numbers onto the values that a parameter may take.
+"""Transforms: maps from all real numbers onto the allowed values of a parameter.
 
-An optimizer moves freely in the unconstrained numbers u; the parameter is `value(u)`, valid
-whatever u is.
+The optimizer works on unconstrained numbers u. The parameter `value(u)` is valid for every u.
 """
 
 import math
@@ -29,21 +28,21 @@ class AbstractTransform(eqx.Module):
         """(u that gives this value, whether the value is on a bound).
 
         Raises:
-            ValueError: the value is not valid; `name` says whose it is.
+            ValueError: an invalid value; `name` is its name.
         """
 
     def entries(self, shape: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-        """Indices of the numbers that say all of the leaf, as many as there are u."""
+        """Indices of the numbers that determine the leaf, as many as there are u."""
         return tuple(np.ndindex(*shape))
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Between which each u may go."""
+        """The bounds of each u."""
         return -np.inf, np.inf
 
     @property
     def reach(self) -> float:
-        """How far u may go in one step: logarithms are no longer linear beyond 1."""
+        """Largest change of u in one step: logarithms are no longer linear beyond 1."""
         return 1.0
 
 
@@ -66,7 +65,7 @@ class Free(AbstractTransform):
 
     @property
     def reach(self) -> float:
-        """Any."""
+        """Infinite."""
         return np.inf
 
 
@@ -74,8 +73,8 @@ class Free(AbstractTransform):
 class Positive(AbstractTransform):
     """Positive numbers: value = exp(u).
 
-    For what cannot be zero, such as masses and lengths; for what may, such as friction, take
-    `Bounded(0.0, np.inf)`: a logarithm that has gone far below finds no way back.
+    For numbers that cannot be zero, such as masses and lengths. Otherwise, as for friction, use
+    `Bounded(0.0, np.inf)`: a logarithm that has become very negative does not return.
     """
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
@@ -95,9 +94,9 @@ class Positive(AbstractTransform):
 
 @final
 class Bounded(AbstractTransform):
-    """Numbers between two bounds or on them: value = u, held there.
+    """Numbers between two bounds or on them: value = u, clipped to the bounds.
 
-    A search that would leave the bounds goes on along them, and comes back where that is better.
+    A search that would leave the bounds continues along them, and returns if that is better.
 
     Args:
         lower: in the unit of the parameter; may be -inf.
@@ -119,7 +118,7 @@ class Bounded(AbstractTransform):
             raise invalid("Bounded: lower and upper", "be finite, one at least", "neither was")
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
-        """U, or the bound that it is beyond, with the derivative of u: also from there back."""
+        """U clipped to the bounds, with the derivative of u: a search can return from there."""
         held = jnp.clip(u, self.lower, self.upper)
         return (u + jax.lax.stop_gradient(held - u)).reshape(shape)
 
@@ -138,7 +137,7 @@ class Bounded(AbstractTransform):
 
     @property
     def reach(self) -> float:
-        """As far as the bounds."""
+        """Infinite: only the bounds limit a step."""
         return np.inf
 
 
@@ -160,7 +159,7 @@ class SPD(AbstractTransform):
         return factor @ factor.T
 
     def start(self, name: str, value: Any) -> tuple[np.ndarray, bool]:
-        """Logarithms of the diagonal of C, then what is below it."""
+        """Logarithms of the diagonal of C, then the elements below it."""
         x = np.asarray(value, float)
         if x.ndim != 2 or x.shape[0] != x.shape[1] or not np.allclose(x, x.T):
             must, was = "be a symmetric matrix", f"its shape was {x.shape}"
@@ -182,11 +181,11 @@ class SPD(AbstractTransform):
 
 @final
 class Inertia(AbstractTransform):
-    """Inertias that a body of positive density can have, about its centre of mass.
+    """Inertias of bodies of positive density, about the center of mass.
 
     The leaf is a matrix (3, 3) or principal moments (3,), kg m^2. With the second moment of mass
-    S = 1/2 tr(I) 1 - I, any S that is symmetric positive definite is that of some body, which is
-    more than I > 0: the triangle inequalities I1 <= I2 + I3 hold, too. S is the parameter, by its
+    S = 1/2 tr(I) 1 - I, any symmetric positive definite S belongs to some body. This is stricter
+    than I > 0: it includes the triangle inequalities I1 <= I2 + I3. S is the parameter, by its
     log-Cholesky factor or the logarithms of its three numbers.
 
     Source: Traversaro et al., Identification of fully physical consistent inertial parameters
@@ -203,7 +202,7 @@ class Inertia(AbstractTransform):
         return jnp.trace(second) * jnp.eye(3, dtype=u.dtype) - second
 
     def start(self, name: str, value: Any) -> tuple[np.ndarray, bool]:
-        """Of S; an inertia that no body has raises."""
+        """u of S; raises for an inertia that no body has."""
         x = np.asarray(value, float)
         if x.shape not in ((3,), (3, 3)):
             must = "be a matrix (3, 3) or three principal moments (jl.transforms.Inertia)"
@@ -224,12 +223,12 @@ class Inertia(AbstractTransform):
 
 @final
 class PseudoInertia(AbstractTransform):
-    """All ten inertial numbers of a body: m, m c (3), and I about the origin of the frame.
+    """The ten inertial parameters of a body: m, m c (3), and I about the origin of the frame.
 
     The leaf is (10,): m [kg], m c_x, m c_y, m c_z [kg m], I_xx, I_yy, I_zz, I_xy, I_xz, I_yz
-    [kg m^2], the products as they stand in the matrix. They are those of a body of positive
-    density exactly if the pseudo-inertia [[S, m c], [m c^T, m]], S = 1/2 tr(I) 1 - I, is positive
-    definite; it is the parameter, by its log-Cholesky factor.
+    [kg m^2], the products with the signs of the matrix. A body of positive
+    density exists exactly if the pseudo-inertia [[S, m c], [m c^T, m]], S = 1/2 tr(I) 1 - I, is
+    positive definite. This matrix is the parameter, by its log-Cholesky factor.
 
     Source: Wensing, Kim, Slotine, Linear matrix inequalities for physically consistent inertial
     parameter identification, RA-L 3 (2018); Rucker, Wensing (2022).
@@ -244,7 +243,7 @@ class PseudoInertia(AbstractTransform):
         return jnp.concatenate([J[3, 3][None], J[3, :3], jnp.diag(I), products])
 
     def start(self, name: str, value: Any) -> tuple[np.ndarray, bool]:
-        """Of the pseudo-inertia; numbers that no body has raise."""
+        """u of the pseudo-inertia; raises for numbers that no body has."""
         x = np.asarray(value, float)
         if x.shape != (10,):
             must = "be ten numbers (jl.transforms.PseudoInertia)"

@@ -1,4 +1,4 @@
-"""Derivatives of a motion: its steps are recorded, and swept forwards or backwards."""
+"""Derivatives of a motion: forward and reverse sweeps over the recorded steps."""
 
 from typing import NoReturn
 

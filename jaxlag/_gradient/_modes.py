@@ -1,4 +1,4 @@
-"""What a derivative keeps of the steps: the choice, its memory, its name."""
+"""GradientMode: the storage scheme of a derivative, its choice and its memory."""
 
 import math
 from enum import IntEnum
@@ -7,15 +7,15 @@ from typing import Any
 from jaxlag._core._errors import invalid
 
 MODES = ("auto", "forward", "recorded", "checkpoints")
-# States that "auto" keeps: as many steps go backwards without any taken again, and what they
-# take fits into the caches of a processor for 16 lanes at once.
+# States that "auto" keeps: with this many steps none is repeated backwards, and the states fit into
+# the caches of a processor for 16 lanes at once.
 ROOM = 512
 
 
 class GradientMode(IntEnum):
-    """How reverse derivatives go through the steps, stored as int32 in `Solution.gradient_mode`.
+    """How reverse derivatives are computed, stored as int32 in `Solution.gradient_mode`.
 
-    `none` is that of a motion of which no derivative is taken.
+    `none` is for a motion without derivatives.
     """
 
     none = 0
@@ -33,16 +33,16 @@ def capacity_for(
     itemsize: int,
     knots: bool = False,
 ) -> int:
-    """How many states to keep of `max_steps` steps; 0 where derivatives go forwards.
+    """Number of states to keep for `max_steps` steps; 0 if derivatives are computed forwards.
 
     Args:
-        mode: as asked for.
+        mode: the requested mode.
         memory: bytes that one trajectory may keep; None for no bound.
         max_steps: bound on the steps.
         saves: number of save times, or a symbol of `jax.export`.
         state: numbers in a state.
         itemsize: bytes of a number.
-        knots: whether inputs have some.
+        knots: whether inputs have knots.
     """
     least = max(2, 2 ** math.ceil(math.log2(max(max_steps, 1)) / 2))
     rooms = {"recorded": 2 * math.ceil(max_steps / 2), "checkpoints": least, "forward": 0}
@@ -51,7 +51,7 @@ def capacity_for(
     if not isinstance(saves, int):
         was = f"it was {memory} for {saves} times"
         raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
-    turns = max_steps + saves - 2  # at most, of lanes together
+    turns = max_steps + saves - 2  # upper bound, for all lanes
     needs = {
         name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])
@@ -74,9 +74,9 @@ def capacity_for(
 
 
 def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:
-    """Bytes kept of one trajectory: times of all turns, states at points and between two.
+    """Bytes kept for one trajectory: times of all turns, states at points and between two points.
 
-    With knots, of every turn the knot that it is counted from, and whether it begins with a jump.
+    With knots also, for every turn, its anchor and whether it begins with a jump.
     """
     states = room + 1 + math.ceil(turns / room) if room else 0
     return turns * (8 + 5 * knots) + states * state * itemsize

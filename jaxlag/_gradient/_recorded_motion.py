@@ -1,4 +1,4 @@
-"""A recorded motion, as its derivatives are taken along it."""
+"""RecordedMotion: the recorded steps as the derivatives use them."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -13,13 +13,13 @@ from jaxlag._integration._record import Record, Times, reached_time
 
 
 class SolveTangents(NamedTuple):
-    """What is wanted of a motion or of its derivative.
+    """States of a motion, or their tangents or cotangents.
 
     Attributes:
         last: state after the last step.
-        time: of it.
+        time: its time.
         saved: states at the save times, (s, ...).
-        points: states at the points of the record; None where nobody asks.
+        points: states at the points of the record; None if they are not needed.
     """
 
     last: PyTree
@@ -29,13 +29,13 @@ class SolveTangents(NamedTuple):
 
 
 class InputTangents(NamedTuple):
-    """A direction of what a motion depends on; None for what does not move.
+    """Tangents of the inputs of a motion; None for inputs that do not vary.
 
     Attributes:
         y0: of the start, an array.
         args: of some leaves of the arguments.
         anchors: of `Times.anchors`.
-        saves: of `Times.saves`; moves where the anchors do.
+        saves: of `Times.saves`; given if those of the anchors are.
     """
 
     y0: Array | None
@@ -45,7 +45,7 @@ class InputTangents(NamedTuple):
 
 
 class StepTimes(NamedTuple):
-    """When the turns of a recorded motion ended; time -1 is that of the start."""
+    """End times of the turns of a recorded motion; turn -1 ends at the start."""
 
     times: Times
     record: Record
@@ -58,19 +58,19 @@ class StepTimes(NamedTuple):
         return jnp.where(k < 0, anchors[0], anchors[anchor] + offset)
 
     def anchor(self, k: Array) -> Array:
-        """The anchor that it moves with."""
+        """The anchor of this time."""
         if self.record.anchors is not None:
             return jnp.where(k < 0, 0, at(self.record.anchors, k))
         return ((k >= 0) & (at(self.record.offsets, k) < 0)).astype(jnp.int32)
 
     def jump(self, k: Array) -> Array | None:
-        """Whether the vector field jumps where turn k starts."""
+        """Whether the vector field jumps at the start of turn k."""
         return None if self.record.jumps is None else at(self.record.jumps, k)
 
     def reach(
         self, end: Array, anchors: Array, save: Array | None = None, r: Array | None = None
     ) -> Array | None:
-        """How the end of a turn is reached, or save time r between the first and the last.
+        """How the end of a turn, or save time r between the first and the last, is reached.
 
         Args:
             end: time after the turn.
@@ -93,20 +93,20 @@ class StepTimes(NamedTuple):
 
 
 class RecordedMotion(NamedTuple):
-    """A recorded motion: what was given to the loop and what it kept.
+    """A recorded motion: the inputs of the loop and its record.
 
     Attributes:
-        step: (args, t0, t1, state, jump, time) -> the state at a time, of a step from t0 to t1.
+        step: (args, t0, t1, state, jump, time) -> the state at a time, by a step from t0 to t1.
         start: the state before the first step, as the step takes it.
         args: leaves of the arguments.
         tree: of the arguments.
-        moving: indices of the leaves that may move.
+        moving: indices of the leaves that may vary.
         windows: (args, t0) -> (args as a step from t0 reads them: of each table two entries; where
-            these start in the leaves that may move, None for those that are no tables).
+            these start in the leaves that may vary, None for leaves that are no tables).
         clock: times of the steps.
-        stages: number of them in a step, 0 where it has none.
-        plain: whether XLA may compile a sweep to one native function. Not where lanes gather at
-            different indices: it overestimates the cost of such a gather, and splits it over
+        stages: number of stages in a step, 0 if it has none.
+        plain: whether XLA may compile a sweep to one native function. False if lanes gather at
+            different indices: XLA overestimates the cost of such a gather, and splits it over
             threads.
     """
 
@@ -121,11 +121,11 @@ class RecordedMotion(NamedTuple):
     plain: bool
 
     def native(self, loop: Callable, *args: Any) -> Any:
-        """loop(*args), compiled to one native function where that can be done."""
+        """loop(*args), compiled to one native function if possible."""
         return _xla.native(loop, *args, stages=self.stages) if self.plain else loop(*args)
 
     def with_args(self, moved: Sequence[Array], leaves: Sequence[Any] | None = None) -> Any:
-        """The arguments with other values of the leaves that may move."""
+        """The arguments with new values of the leaves that may vary."""
         leaves = list(self.args if leaves is None else leaves)
         for i, leaf in zip(self.moving, moved, strict=True):
             leaves[i] = leaf
@@ -141,7 +141,7 @@ class RecordedMotion(NamedTuple):
         reach: Array | None = None,
         turn_end: Array | None = None,
     ) -> PyTree:
-        """The state at `end`, one step on from t, or within the step that ends at `turn_end`."""
+        """The state at `end`, by a step from t, or within the step that ends at `turn_end`."""
         jump = jnp.array(False) if jump is None else jump
         if reach is None:
             return self.step(args, t, end, state, jump, end)
@@ -149,21 +149,22 @@ class RecordedMotion(NamedTuple):
         return self.step(args, t, reached_time(reach, t, end, turn_end), state, jump, end)
 
     def recompute(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
-        """The state after turn k, with the arguments as they are."""
+        """The state after turn k, with unchanged arguments."""
         t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
         reach = self.clock.reach(end, anchors)
         args = self.with_args(self.moved())
         return self.ahead(args, t, end, self.clock.jump(k), state, reach, end)
 
     def moved(self) -> list[Array]:
-        """The leaves of the arguments that may move."""
+        """The leaves of the arguments that may vary."""
         return [self.args[i] for i in self.moving]
 
     def local(self, t: Array) -> tuple[Callable, list[Array], list[Array | None]]:
-        """What a step from t reads of the arguments.
+        """The parts of the arguments that a step from t reads.
 
         Returns:
-            moved -> arguments, what moves of them (of tables two entries), where these start.
+            function from varying leaves to arguments, these leaves (of tables two entries), where
+            these start.
         """
         args, starts = self.windows(self.with_args(self.moved()), t)
         leaves = jax.tree.leaves(args, is_leaf=lambda x: x is None)
@@ -172,7 +173,7 @@ class RecordedMotion(NamedTuple):
 
 
 def at(buffer: PyTree, k: Array) -> PyTree:
-    """Entry k of a buffer, the first one below 0."""
+    """Entry k of a buffer; the first one for negative k."""
     index = partial(jax.lax.dynamic_index_in_dim, index=jnp.maximum(k, 0), keepdims=False)
     return jax.tree.map(index, buffer)
 
@@ -183,7 +184,7 @@ def pick(use: Array, new: PyTree, old: PyTree) -> PyTree:
 
 
 def all_saved(first: PyTree, saved: PyTree | None, last: PyTree, reached: Array) -> PyTree:
-    """All saved states, from those between the first and the last; zero where there was none."""
+    """All saved states, from those between the first and the last; zero for unreached ones."""
 
     def of(a: Array, between: Array | None, b: Array) -> Array:
         parts = [a[None], jnp.where(reached, b, 0.0)[None]]

@@ -1,4 +1,4 @@
-"""A recorded motion taken again by a scan, which JAX differentiates in any mode, to any order."""
+"""A recorded motion repeated by a scan, which JAX differentiates in any mode, to any order."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ from jaxlag._integration._loop import CHUNK
 
 
 class _Slots(NamedTuple):
-    """Steps and save times in one sequence, a save time before the step that it lies in."""
+    """Steps and save times in one sequence; a save time precedes the step that contains it."""
 
     begins: Array
     ends: Array
@@ -81,10 +81,10 @@ def again(
     saves: Array,
     points: bool,
 ) -> SolveTangents:
-    """The motion itself by a scan, which JAX differentiates in any mode and to any order.
+    """The motion repeated by a scan, which JAX differentiates in any mode and to any order.
 
-    The scan skips whole chunks that no lane of a vmapped solve needs. Turns that are not wanted
-    repeat the first step and drop its result, so that no derivative meets a state out of reach.
+    The scan skips whole chunks that no lane of a vmapped solve needs. Unused turns
+    repeat the first step and discard its result, so that derivatives avoid unreachable states.
     """
     clock, record = path.clock, path.clock.record
     slots, of_turn, of_save = _slots(path, anchors, saves)

@@ -1,9 +1,9 @@
 """The differentiable solve: states at the save times, with one derivative for every transform.
 
-The derivative is that of the map from (state, args, times) to the saved states at the FROZEN
-sequence of accepted steps: step ends keep their distance from the start, knot or stop they are
-anchored to, and move with it. The loop of steps is never differentiated; under any derivative it
-records where it went, and the derivative goes the same way again.
+It is the derivative of the map from (state, args, times) to the saved states at the FROZEN
+sequence of accepted steps. The end of a step keeps its distance from its anchor (the start, a knot
+or the stop) and moves with it. The loop of steps itself is never differentiated. Under a
+derivative it records its steps, and the derivative follows this record.
 """
 
 from functools import partial
@@ -28,7 +28,7 @@ from jaxlag._integration._tableaus import remembers
 
 
 class SavedStates(NamedTuple):
-    """The solution at the save times, and where the solve ended."""
+    """The solution at the save times, and the end of the solve."""
 
     saved: PyTree  # leaves (s, ...), NaN where not reached
     state: PyTree  # last good state
@@ -69,7 +69,7 @@ def solve(problem: Problem) -> tuple[SavedStates, Outcome]:
 
 
 def _ended(outcome: Outcome) -> tuple[SavedStates, Outcome]:
-    """The saved states, and what is said of a solve without what was kept on the way."""
+    """The saved states, and the outcome of a solve without its record."""
     lost = (outcome.missed != int(Status.ok)) & (outcome.status == int(Status.ok))
     status = jnp.where(lost, outcome.missed, outcome.status).astype(jnp.int32)
     states = SavedStates(outcome.saved, outcome.state, outcome.time)
@@ -77,7 +77,7 @@ def _ended(outcome: Outcome) -> tuple[SavedStates, Outcome]:
 
 
 def _mode(outcome: Outcome, problem: SplitProblem) -> Array:
-    """How reverse derivatives go through the steps."""
+    """The mode of the reverse derivatives."""
     assert outcome.record is not None
     if problem.static.capacity == 0 and not remembers(problem.stepper.solver):
         return jnp.full_like(outcome.gradient, int(GradientMode.forward))
@@ -87,7 +87,7 @@ def _mode(outcome: Outcome, problem: SplitProblem) -> Array:
 
 
 def _recorded(problem: SplitProblem) -> Outcome:
-    """The loop with its record; states on the way and saved ones are differentiable."""
+    """The loop with its record; states at points and saved ones are differentiable."""
     static = problem.static
 
     @CustomJVP
@@ -103,7 +103,7 @@ def _recorded(problem: SplitProblem) -> Outcome:
             change = changes(tangents[0], outcome)
             record = outcome.record
             assert record is not None
-            kept = record.points is not None  # none where derivatives go forwards
+            kept = record.points is not None  # none for forward derivatives
             walk = changed(problem, record, change, points=kept)
             record = dots.record._replace(points=walk.points)
             dots = dots._replace(
@@ -113,13 +113,13 @@ def _recorded(problem: SplitProblem) -> Outcome:
 
     outcome = run(*problem.traced)
     assert outcome.record is not None
-    # Times stay where they are, or move with their anchors.
+    # Times are constant, or move with their anchors.
     still = outcome.record._replace(offsets=jax.lax.stop_gradient(outcome.record.offsets))
     return outcome._replace(record=still)
 
 
 def _integrated(problem: SplitProblem, record: bool) -> Outcome:
-    """The loop of steps; of scalar programs and implicit methods, vmapped, in chunks."""
+    """The loop of steps; scalar programs and implicit methods are vmapped in chunks."""
     static = problem.static
 
     def single(*traced: Any, lanes: bool = False) -> Outcome:
@@ -128,7 +128,7 @@ def _integrated(problem: SplitProblem, record: bool) -> Outcome:
         if record:
             stepper = stepper.for_derivatives(y0, args)
         fast = stepper.on_scalars(lanes)
-        if record and lanes:  # written out, this half would take most of the time to compile
+        if record and lanes:  # unrolled, this part would take most of the compile time
             fast = None if fast is None else in_loops(fast)
         bounds = setup.first_step, setup.allowed, static.max_steps, record, static.capacity
         native = None if fast is None else _xla.native
@@ -144,12 +144,12 @@ def _integrated(problem: SplitProblem, record: bool) -> Outcome:
 
 
 def _replay(problem: SplitProblem, outcome: Outcome, differentiable: Any) -> SavedStates:
-    """The saved states as a function of the differentiable leaves, all steps taken again."""
+    """The saved states as a function of the differentiable leaves, with all steps repeated."""
     problem = problem._replace(differentiable=differentiable)
     y0, args, times = problem.motion
     assert outcome.record is not None
     path = path_of(problem.stepper, y0, args, times, outcome.record, ())
     walk = again(path, path.start, [], times.anchors(), times.saves, False)
-    # What was not reached, or failed, is so again.
+    # States that were not reached, or failed, are NaN again.
     found = jnp.isfinite(outcome.saved)
     return SavedStates(jnp.where(found, walk.saved[0], jnp.nan), walk.last[0], walk.time)

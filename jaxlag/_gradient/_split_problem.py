@@ -1,4 +1,4 @@
-"""The problem of a solve, split by what derivatives and compiled programs make of its parts."""
+"""The problem of a solve, split into differentiated, traced and static parts."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from jaxlag._integration._stepper import Stepper
 
 
 class Setup(NamedTuple):
-    """What a solve needs and no derivative is taken of."""
+    """Inputs of a solve that are not differentiated."""
 
     first_step: Array | None
     allowed: Bool[Array, ""]
@@ -26,17 +26,17 @@ class Problem(NamedTuple):
     setup: Setup
     stepper: Any  # static half of the Stepper
     max_steps: int
-    capacity: int  # states that reverse derivatives keep; 0 where they go forwards
+    capacity: int  # states that reverse derivatives keep; 0 for forward ones
 
 
 class Static(NamedTuple):
-    """What compiled programs are keyed by.
+    """The static key of compiled programs.
 
     Attributes:
         motion: static half of (y0, args, times).
         stepper: static half of the Stepper.
         max_steps: bound on the steps.
-        capacity: states that reverse derivatives keep; 0 where they go forwards.
+        capacity: states that reverse derivatives keep; 0 for forward ones.
     """
 
     motion: Any
@@ -51,7 +51,7 @@ class SplitProblem(NamedTuple):
     Attributes:
         differentiable: inexact leaves of (y0, args, times).
         arrays: their other arrays.
-        setup: arrays of no derivative.
+        setup: arrays that are not differentiated.
         static: the rest.
     """
 
@@ -67,7 +67,7 @@ class SplitProblem(NamedTuple):
 
     @property
     def stepper(self) -> Stepper:
-        """Its two halves together."""
+        """The stepper, from its two halves."""
         return eqx.combine(self.setup.stepper, self.static.stepper)
 
     @property
@@ -77,7 +77,7 @@ class SplitProblem(NamedTuple):
 
 
 def split(problem: Problem) -> SplitProblem:
-    """A problem in its parts."""
+    """Split a problem into its parts."""
     differentiable, rest = eqx.partition(problem[:3], eqx.is_inexact_array)
     arrays, motion = eqx.partition(rest, eqx.is_array)
     static = Static(motion, problem.stepper, problem.max_steps, problem.capacity)

@@ -4,12 +4,12 @@ With y_{k+1} = step(y_k, args, t_k, t_{k+1}) at recorded times the derivative is
 
     dy_{k+1} = J_k dy_k + B_k dargs + c_k dt_k + e_k dt_{k+1},
 
-and the same for a saved state, which a step from y_k reaches at its own time: a linear map from
-(dy_0, dargs, danchors, dsaves) to what is wanted of dy_0, dy_1, ..., and of the saved states.
-Forwards dy is carried beside y. Backwards the transposed steps are taken from the last to the
-first, at the recorded points, or at states found anew from them where points are further apart than
-a step. Neither depends on the step-size control, whose error estimates round differently in another
-program.
+and the same for a saved state, which a step from y_k reaches at its own time. It is a linear map
+from (dy_0, dargs, danchors, dsaves) to the required states dy_0, dy_1, ... and the saved states.
+The forward sweep carries dy beside y. The reverse sweep takes the transposed steps from the last to
+the first, at the recorded points. If points are further apart than one step, the states between are
+recomputed from them. Neither sweep depends on the step-size control, whose error estimates round
+differently in another program.
 
 Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.6 (variational
 equations); Griewank, Walther, Evaluating Derivatives, ch. 12 (checkpoints).
@@ -47,13 +47,13 @@ def _zeros(state: PyTree, size: Any) -> PyTree:
 
 
 def _turn_of_save_time(record: Record, r: Array) -> Array:
-    """The turn of save time r between the first and the last; none beyond these."""
+    """The turn of save time r between the first and the last; beyond all turns for later ones."""
     assert record.save_turn is not None
     return jnp.where(r < 0, -1, at(record.save_turn, r))
 
 
 def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> SolveTangents:
-    """The derivative in one direction."""
+    """The derivative in one direction: forward variational equations."""
     clock, record = path.clock, path.clock.record
     anchors, dues = clock.times.anchors(), clock.times.dues()
     dues_dot = None
@@ -64,12 +64,12 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
     count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
     zero = jnp.zeros((), jnp.int32)
     saved = None if record.save_turn is None else _zeros(start, record.save_turn.shape[0])
-    # Save times are reached from the state before the last step, with dy there.
+    # Save times are reached from the state before the last step, with its dy.
     base = None if saved is None else (start, dy0)
     begin = (zero, zero, start, dy0, base, saved, _zeros(start, count) if points else None)
 
     def turn(carry: tuple) -> tuple:
-        """One step, or one to a save time where a lane takes none or must not go on without."""
+        """One step, or one to a save time if a lane takes none or must first reach it."""
         k, r, y, dy, base, saved, kept = carry
         t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
         use, end = (k < record.turns) & (turn_end > t), turn_end
@@ -133,11 +133,11 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
 def adjoint_sweep(
     path: RecordedMotion, change: InputTangents, wanted: SolveTangents
 ) -> InputTangents:
-    """The transposed map.
+    """The transposed map: the adjoint equations, from the last step to the first.
 
     Args:
         path: the motion.
-        change: which parts of `InputTangents` there are.
+        change: marks the parts of `InputTangents` that exist.
         wanted: cotangents.
     """
     clock, record = path.clock, path.clock.record
@@ -157,14 +157,15 @@ def adjoint_sweep(
     )
 
     def save_left(r: Array) -> Array:
-        """The turn of the last save time that is left."""
+        """The turn of the last remaining save time."""
         return jnp.array(-1) if between is None else _turn_of_save_time(record, r - 1)
 
     def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
         """One turn back: turn k - 1, or save times reached from the state before turn k.
 
-        The cotangent is that of the state before turn k. A lane for which turn k - 1 was none takes
-        a save time reached from the state before its last step; `pending` is what that adds there.
+        The cotangent belongs to the state before turn k. A lane without a step in turn k - 1 takes
+        a save time reached from the state before its last step; `pending` is its contribution
+        there.
         """
         k, r, bar, pending, (args_bar, anchors_bar, dues_bar) = carry
         j, now = save_left(r), clock.time(k - 1, anchors)
@@ -216,7 +217,7 @@ def adjoint_sweep(
         return k, r, bar, pending, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
-        """All turns after the first, that one and its save times."""
+        """All turns after the first, and the save times of the first."""
 
         def left(carry: tuple) -> Array:
             k, r, *_ = carry
@@ -224,16 +225,16 @@ def adjoint_sweep(
 
         return jax.lax.while_loop(left, partial(turn, first, state_before), carry)
 
-    # Lanes that were recorded together have one stride; all have points at those of the longest.
+    # Lanes that were recorded together have one stride; all have points at the longest stride.
     stride = eqxi.unvmap_max(record.stride)
     room = jax.tree.leaves(record.points)[0].shape[0] - 1
     turns = record.offsets.shape[0]
-    longest = 2 * -(-turns // room)  # or more; of a symbol of jax.export that will do
+    longest = 2 * -(-turns // room)  # an upper bound, for a symbol of jax.export
     if isinstance(turns, int):
         longest = 2 ** ceil(log2(turns / room))
 
     def segment(carry: tuple) -> tuple:
-        """All turns since the last point before turn k; all there are, where each has a point."""
+        """All turns since the last point before turn k; all turns if each has a point."""
         k = carry[0]
         first = jnp.where(stride == 1, 0, (k - 1) // stride * stride)
         y = at(record.points, first // record.stride)
@@ -260,7 +261,7 @@ def adjoint_sweep(
             return back(zero, partial(at, record.points), carry)
         return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
 
-    most = eqxi.unvmap_max(record.turns)  # shared by lanes
+    most = eqxi.unvmap_max(record.turns)  # common to all lanes
     saves_left = zero
     if record.save_turn is not None:
         saves_left = jnp.sum(record.save_turn < record.turns, dtype=jnp.int32)
@@ -277,7 +278,7 @@ def adjoint_sweep(
 
 
 def _added(bar: Array, more: Array, start: Array | None) -> Array:
-    """The cotangent of a leaf with more of it, of two entries of a table at their place."""
+    """The cotangent of a leaf plus a contribution; two entries of a table go to their place."""
     if start is None:
         return bar + more
     for k in range(more.shape[0]):
@@ -286,5 +287,5 @@ def _added(bar: Array, more: Array, start: Array | None) -> Array:
 
 
 def _added_at(bar: Array, index: Array, more: Array) -> Array:
-    """One entry with more of it."""
+    """A contribution added to one entry."""
     return set_entry(bar, index, at(bar, index) + more)

@@ -1,4 +1,4 @@
-"""The derivative of the states on the way of a solve, as one linear map."""
+"""The derivative of the intermediate states of a solve, as one linear map."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,17 +27,17 @@ from jaxlag._integration._tableaus import remembers, with_stages
 
 
 def changes(tangents: Any, outcome: Outcome) -> Any:
-    """The directions of what moves, None still for what does not.
+    """The tangents of the varying inputs; None for the others.
 
-    A trajectory that took no step depends on nothing but its start: its derivatives, which may
-    not be finite, are kept out.
+    A trajectory without steps depends on its start alone: its other derivatives, which may
+    be nonfinite, are set to 0.
     """
     moved = outcome.accepted > 0
     return jax.tree.map(lambda dot: jnp.where(moved, dot, 0.0), tangents)
 
 
 def filled(change: Any, like: Any) -> Any:
-    """The directions with zeros for what does not move."""
+    """The tangents with zeros for inputs that do not vary."""
 
     def fill(x: Any, dot: Any) -> Any:
         return jnp.zeros_like(x) if dot is None and x is not None else dot
@@ -48,7 +48,7 @@ def filled(change: Any, like: Any) -> Any:
 def changed(
     problem: SplitProblem, record: Record, change: Any, points: bool = False
 ) -> SolveTangents:
-    """The derivative of the states on the way, at the points of the record too if asked for."""
+    """The tangents of the states, also at the points of the record if requested."""
     y0_dot, args_dot, times_dot = change
     dots = jax.tree.leaves(args_dot, is_leaf=lambda x: x is None)
     moving = tuple(i for i, dot in enumerate(dots) if dot is not None)
@@ -62,7 +62,7 @@ def changed(
 
 
 class _Kind(NamedTuple):
-    """What moves, and what is wanted to move with it."""
+    """The varying inputs, and the results that are needed."""
 
     static: Static
     moving: tuple[int, ...]
@@ -95,7 +95,7 @@ def _map(kind: _Kind, lanes: bool = False) -> LinearMap:
         return adjoint_sweep(way, change, y)
 
     def by_directions(r: Any, y: SolveTangents) -> InputTangents:
-        """The same from `forward`, one direction of x after another."""
+        """The same from `forward`, for one direction of x after another."""
         return _transposed(partial(forward, r), like(r)[1], y)
 
     def plain(r: Any, x: InputTangents) -> SolveTangents:
@@ -151,9 +151,9 @@ def path_of(
     fast: Stepper | None = None,
     lanes: bool = False,
 ) -> RecordedMotion:
-    """The recorded motion, by steps with loops over stages.
+    """The recorded motion, with steps that loop over their stages.
 
-    Written out, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
+    Unrolled, derivatives of steps of order 8 take 3 to 5 times as long to compile (double
     pendulum: a gradient 5.3 | 2.3 s, a Hessian 22 | 4.5 s, a gradient of lanes 15 | 4.5 s) and
     run 0.9 to 1.4 times as fast.
     """
@@ -172,7 +172,7 @@ def path_of(
 
 
 def in_loops(stepper: Stepper) -> Stepper:
-    """The form with loops over stages that JAX differentiates in any mode."""
+    """The stepper with loops over stages that JAX differentiates in any mode."""
     return eqx.tree_at(lambda s: s.solver, stepper, with_stages(stepper.solver, "bounded"))
 
 
@@ -186,9 +186,9 @@ def one_step(
     differentiable: bool,
     wanted: Array | None = None,
 ) -> tuple[PyTree, Bool[Array, ""]]:
-    """One step from (y, memory), and whether it was solved; without memory it starts afresh.
+    """One step from (y, memory), and whether it was solved; without memory nothing is carried over.
 
-    Near change points the state may be `wanted` at another time than that of its end.
+    Near change points the state may be `wanted` at another time than the end of the step.
     """
     y0, memory = y, _ = state
     args = stepper.within(args, t0)

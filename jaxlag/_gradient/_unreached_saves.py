@@ -1,4 +1,4 @@
-"""Derivatives at save times that a motion did not reach: not known, as the states are not."""
+"""Derivatives at save times that the motion did not reach: NaN, as the states."""
 
 import jax
 import jax.numpy as jnp
@@ -8,17 +8,15 @@ from jaxlag._core._linear_map import LinearMap, linear
 
 
 def unreached(reached: Bool[Array, " s"], given: PyTree, change: PyTree, saved: PyTree) -> PyTree:
-    """The derivative of saved states along `change`, NaN where they were not reached.
+    """The derivative of saved states along `change`; NaN for unreached states.
 
-    Backwards NaN comes to everything that moves as soon as one of these states is asked for, by a
-    cotangent that is not zero: a loss that leaves them out, by `jnp.where(reached, ..., 0.0)`,
-    keeps the derivative of what it counts.
+    In reverse mode all inputs become NaN if the cotangent of one of these states is nonzero. A loss
+    that excludes them, by `jnp.where(reached, ..., 0.0)`, keeps its derivative.
 
     Args:
         reached: whether a save time was reached.
-        given: what the saved states are functions of: derivatives of these derivatives are not
-            known, either.
-        change: directions in it, None for what does not move.
+        given: inputs of the saved states: second derivatives by them are NaN, too.
+        change: tangents of these, None for inputs that do not vary.
         saved: their derivative, leaves (s, ...).
     """
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), change)
@@ -43,11 +41,11 @@ def unreached(reached: Bool[Array, " s"], given: PyTree, change: PyTree, saved: 
 
 
 def _unknown(reached: Array, given: PyTree) -> Array:
-    """NaN, with NaN for its derivatives by anything of this; 0 where all was reached."""
+    """NaN, also in its derivatives by these inputs; 0 if all states were reached."""
     total = jnp.sum(jnp.stack([jnp.sum(x).astype(float) for x in jax.tree.leaves(given)]))
     return jnp.where(jnp.all(reached), 0.0, jnp.nan) * total
 
 
 def _of(reached: Array, x: Array) -> Array:
-    """As wide as the states."""
+    """`reached`, broadcast to the states."""
     return reached.reshape(reached.shape + (1,) * (x.ndim - 1))

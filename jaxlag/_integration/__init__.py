@@ -1,1 +1,1 @@
-"""From a system to a motion: the vector field, one step, the loop over steps."""
+"""Time integration: the vector field, one step, the loop over steps."""

@@ -1,4 +1,4 @@
-"""Which branches of its comparisons a declaration is on: the forces are smooth while they stay."""
+"""Branch outcomes of the comparisons in a declaration; forces are smooth while they stay equal."""
 
 from typing import Any
 
@@ -16,10 +16,10 @@ from jaxlag._tracing._nonsmooth_points import outcomes
 
 
 def branches(dynamics: VectorField, tau: Array, y: Array, args: Arguments) -> Array | None:
-    """Outcomes of the comparisons in what is declared, at (tau, y); None where there are none.
+    """Outcomes of the comparisons in the declaration at (tau, y); None if there are none.
 
-    As long as they stay the same, forces are smooth. Tables and functions with knots bend and
-    jump at ends of steps; multipliers that forces read are taken for 0.
+    Forces are smooth as long as the outcomes stay the same. Tables and functions with knots have
+    their kinks and jumps at ends of steps. Multipliers that forces read are set to 0.
     """
     t, q, v, params, values = dynamics.at(tau, y, args)
     _, inputs = dynamics.given(args)

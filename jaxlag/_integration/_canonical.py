@@ -1,4 +1,4 @@
-"""Momenta and forces, as methods in canonical variables see a system."""
+"""Canonical variables: momenta and forces for structure-preserving methods."""
 
 from typing import Any
 
@@ -18,18 +18,18 @@ from jaxlag._tracing._signature import gradient
 class Canonical(eqx.Module):
     """p = dL/dv,   p' = dL/dq + Q + A^T lam,   phi(t, q) = 0, at times tau of the loop.
 
-    Rows that follow from others are left out: their multiplier is 0.
+    The multiplier of a row that is left out as dependent is 0.
 
     Attributes:
-        dynamics: of the system.
-        args: within a step.
+        dynamics: the vector field.
+        args: arguments within a step.
     """
 
     dynamics: VectorField
     args: Arguments
 
     def span(self, tau0: Float[Array, ""], tau1: Float[Array, ""]) -> Float[Array, ""]:
-        """The user's time between two times, negative where it runs backwards."""
+        """t1 - t0 in the user's time; negative if time runs backwards."""
         return self.dynamics.signed(tau1 - tau0, self.args)
 
     @property
@@ -51,7 +51,7 @@ class Canonical(eqx.Module):
     def regular(
         self, tau: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"]
     ) -> Bool[Array, ""]:
-        """Whether d2L/dv2 is positive definite, under constraints where these leave motion."""
+        """Whether d2L/dv2 is positive definite, with constraints on their tangent space."""
         tau, q, v, form = stop_gradient((tau, q, v, self))
         t, params = form._at(tau)
         M = form.dynamics.terms.mass(t, q, v, params)
@@ -63,7 +63,7 @@ class Canonical(eqx.Module):
     def position(
         self, tau: Float[Array, ""], q: Float[Array, " n"], lam: Float[Array, " m"]
     ) -> Float[Array, " m"]:
-        """phi, or lam of a row that is left out."""
+        """phi; lam for a row that is left out."""
         t, params = self._at(tau)
         return self._of_rows(self.dynamics.terms.position(t, q, params), lam)
 
@@ -74,7 +74,7 @@ class Canonical(eqx.Module):
         v: Float[Array, " n"],
         lam: Float[Array, " m"],
     ) -> Float[Array, " m"]:
-        """A v + b, or lam of a row that is left out."""
+        """A v + b; lam for a row that is left out."""
         t, params = self._at(tau)
         return self._of_rows(self.dynamics.terms.velocity(t, q, v, params), lam)
 

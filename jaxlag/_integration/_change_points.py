@@ -1,42 +1,40 @@
-"""Places on the way where constraint rows that are independent elsewhere depend on one another.
+"""Change points: states where constraint rows that are independent elsewhere become dependent.
 
-As where a parallelogram linkage lies flat: ways of moving meet there, and rows do not tell one from
-another. The motion that comes along one of them goes on along its tangent, and is as smooth as
-elsewhere. Beside the ways it is not: with x across them and T the time to the place
+An example is a parallelogram linkage that lies flat. Branches of motion meet there, and the rows do
+not distinguish them. The motion continues along the tangent of its branch and is smooth. Across the
+branch it is not smooth: with x the deviation across and T the time to the change point
 
-    x'' = -2 x' / T,
+    x'' = -2 x' / T.
 
-so that stages of a Runge-Kutta method, which are across the ways by errors of lower order, disturb
-those that follow (what is across at the start of a step leaves it 2 times as large in "tsit5", 400
-times in "dopri8"). So near the place
+Stages of a Runge-Kutta method deviate across the branch by errors of lower order and disturb the
+later stages (a deviation at the start of a step is 2 times as large at its end in "tsit5", 400
+times in "dopri8"). So near a change point
 
-- every stage is moved onto the constraints, so that methods keep their order;
-- the error of a step is that of the state after the projection, by what is left of it along the
-  constraints;
-- steps pass it with the stages on either side, as far from it as they can be, and do not end
-  beside it: rounding is eps / T^2 in accelerations, and more in their derivatives (Hessians along
+- every stage is projected onto the constraints, so that methods keep their order;
+- the error of a step is that of the projected state: its component along the constraints;
+- steps cross the change point with their stages as far from it as possible, and do not end
+  close to it: rounding is eps / T^2 in accelerations, and more in their derivatives (Hessians along
   1,000 motions of a parallelogram at a tolerance of 1e-12: off by 5e-11 at most, and by up to 2e-2
-  with stages as they come);
-- what rounding makes of a projected state is accepted: shorter steps do not improve it;
-- an equal step of which a stage meets the place is not taken, as no estimate tells what it is off;
-- what is saved in a step across is interpolated where a step to it would have a stage at the place:
-  by the polynomial of degree 5 through the ends of that step, which is a short one. A motion that
-  ends at the place does so by that through the ends of a step half the way there.
+  with unadjusted stages);
+- rounding of a projected state is accepted: shorter steps do not reduce it;
+- a step of fixed length with a stage at the change point fails, as no estimate gives its error;
+- a state saved within a crossing step is interpolated if a step to it would have a stage at the
+  change point: by the polynomial of degree 5 through the ends of that step, which is a short one.
+  If the motion ends at the change point, the polynomial is that of a step half the way there.
 
-Where the place lies is told by s = 1 / sqrt(effective mass), the length of what a row has apart
-from all others in the metric of M^-1: it goes through 0 there, as a straight line. Where ways
-touch, or one ends in a cusp, it does so as a higher power of the way to the place, so that rows
-depend for LONGER than that line says: there the motion stops.
+The change point is located by s = 1 / sqrt(effective mass), the length of the part of a row that
+is orthogonal to all others in the metric of M^-1: s goes through 0 linearly. If branches touch, or
+one ends in a cusp, s goes to 0 as a higher power of the distance. Rows are then dependent LONGER
+than the linear law predicts, and the motion stops.
 
-A state that lies at the place but for LOST is not moved along the row, as rounding of positions
-would become 1 / s times as much of velocities, and once more as positions turn these. Its error
-across is moved back with the next state. Where even accelerations are nothing but rounding, where
-the sine of the angle between rows is less than eps^(1/3), the row that depends on those before it
-is left out. That leaves out the force that holds the motion on its way, for a time tau, and is off
-by tau^2 / 2 times what the force would have accelerated.
+If s is below LOST, the state is not moved along the row: rounding of positions would be multiplied
+by 1 / s in velocities, and once more as the rows turn with positions. Its error across is removed
+with the next state. If the sine of the angle between rows is less than eps^(1/3), accelerations are
+only rounding: the row that depends on those before it is left out. The force of that row is then
+missing for a time tau; the error is tau^2 / 2 times the acceleration by that force.
 
 Sources: Khatib, IEEE J. Robotics Autom. 3 (1987) 43 (effective mass); Wampler, Sommese, Acta
-Numerica 20 (2011) 469 (where ways of moving meet); Eich, SIAM J. Numer. Anal. 30 (1993) 1467
+Numerica 20 (2011) 469 (where branches of motion meet); Eich, SIAM J. Numer. Anal. 30 (1993) 1467
 (errors of projected states).
 """
 
@@ -56,49 +54,50 @@ from jaxlag._model._forces import reads_lam
 CHANGE_POINTS = ("pass", "stop")
 
 GAP = 0.35
-"""Of a step: stages before it are of low order, and are the more disturbed the nearer they are."""
+"""Least position of the gap between stages in a step: earlier stages are of low order and are
+disturbed more the nearer they are."""
 
 AT_HAND = 0.02
-"""Of a step: a place that is nearer to its start has no stages on either side."""
+"""Fraction of a step: a change point nearer to its start has no stages on both sides."""
 
 ROOM = 0.9
-"""Of the length of steps: what that of the step across is to be."""
+"""Length of the crossing step over the proposed length."""
 
 BESIDE = 0.05
-"""Of the length of a row at the start of a step: not to end with less, if it can be helped."""
+"""Row length at the end of a step over that at its start, below which steps should not end."""
 
 AHEAD = 0.5
-"""Of the same: below it a place is looked out for."""
+"""Row length over that at the start of the motion, below which a change point is predicted."""
 
 UNLIKE = 10.0
-"""Tolerances that a step to what is saved is off by where one of its stages meets a place."""
+"""Error of a step to a save time, in tolerances, above which a stage has met a change point."""
 
 AGAIN = 4.0
-"""Times what is allowed, that a step is taken to be off by which is taken again, shorter."""
+"""Error in tolerances that is assigned to a step so that it is repeated with a shorter length."""
 
 SHORT = 0.1
-"""Of the length of a row at the start of a motion: below it a place is near."""
+"""Row length over that at the start of the motion, below which a change point is near."""
 
 LOST = 1e-3
-"""Of the same: below it states are not moved along the row."""
+"""The same ratio, below which states are not moved along the row."""
 
 ROUNDINGS = 8
-"""Of a position that a length of 1 leaves."""
+"""Rounding of a projected position, in eps, for a row of length 1."""
 
 LONGER = 2.5
-"""Times the way that rows depend for where ways cross. It is 7 at cusps x^2 = y^3, 20 where ways
-touch."""
+"""Bound on the distance over which rows are dependent, over that at a crossing of branches. The
+ratio is 7 at cusps x^2 = y^3, 20 where branches touch."""
 
 
 class Crossing(NamedTuple):
-    """What is known of change points where a step starts.
+    """Detection of change points: its state at the start of a step.
 
     Attributes:
-        apart: the least length of a row over its length at the start of the motion.
-        within: the way that was covered where rows depend; as `span`, in kg^1/2 m.
-        span: the change of coordinates in which the row would lose all of its length, as the step
-            tells it that came nearer; infinite where none did.
-        time: when the next place is to be expected; infinite where none is.
+        apart: least row length over its length at the start of the motion.
+        within: distance covered while rows are dependent; as `span`, in kg^1/2 m.
+        span: change of coordinates over which the row length goes to 0, extrapolated from a step;
+            infinite if it does not decrease.
+        time: predicted time of the next change point; infinite if there is none.
     """
 
     apart: Float[Array, ""]
@@ -113,12 +112,12 @@ class Crossing(NamedTuple):
         apart: Float[Array, ""],
         moved: Float[Array, " n"],
     ) -> "Crossing":
-        """What is known at the end of a step, in which coordinates moved so far.
+        """The state of the detection at the end of a step.
 
         Args:
             t0: start of the step.
             t1: its end.
-            apart: see `Crossing`, at its end.
+            apart: as in `Crossing`, at the end of the step.
             moved: change of coordinates, in units in which their inertias are 1.
         """
         lost = self.apart - apart
@@ -126,7 +125,7 @@ class Crossing(NamedTuple):
         nearer = (apart > 0) & (apart < AHEAD) & falls
         left = jnp.where(nearer, apart / jnp.where(nearer, lost, 1.0), jnp.inf).astype(t1.dtype)
         fresh = jnp.where(falls, jnp.abs(moved) / jnp.where(falls, lost, 1.0), jnp.inf)
-        # Rows that vanish as a power of the way do so the slower the nearer they are.
+        # Row lengths that vanish as a higher power of the distance decrease ever more slowly.
         stays = self.depends | (self.is_near & (jnp.sum(self.span) < jnp.sum(fresh)))
         span = jnp.where(stays, self.span, fresh)
         part = jnp.where(apart > 2 * LOST, 2 * LOST / jnp.where(apart > 0, apart, 1.0), 1.0)
@@ -135,26 +134,26 @@ class Crossing(NamedTuple):
 
     @property
     def depends(self) -> Bool[Array, ""]:
-        """Whether rows depend on one another but for LOST."""
+        """Whether rows are dependent: the row length is below LOST."""
         return self.apart <= LOST
 
     @property
     def stands(self) -> Bool[Array, ""]:
-        """Whether it is at the place, as accelerations and velocities tell it."""
+        """Whether the state is at the change point, to the accuracy of accelerations."""
         return self.apart <= unknown_below(self.apart.dtype)
 
     @property
     def passes(self) -> Bool[Array, ""]:
-        """Whether they did so for as short a way as where ways cross."""
+        """Whether rows were dependent for a distance as short as at a crossing of branches."""
         return self.within <= LONGER * 2 * LOST * jnp.linalg.norm(self.span)
 
     @property
     def is_near(self) -> Bool[Array, ""]:
-        """Whether a row has little apart from all others."""
+        """Whether a row is almost dependent on the others."""
         return self.apart < SHORT
 
     def is_beside(self, before: "Crossing") -> Bool[Array, ""]:
-        """Whether it is all but at the place, and the step before started away from it."""
+        """Whether a step from outside the change point ends very close to it."""
         return (self.apart < BESIDE * before.apart) & ~before.depends
 
     def rounding(
@@ -164,15 +163,15 @@ class Crossing(NamedTuple):
         columns: Float[Array, "m n"],
         args: Arguments,
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """What rounding makes of coordinates and velocities that are projected here; else 0.
+        """Rounding of projected coordinates and velocities near a change point; 0 elsewhere.
 
-        A row is wrong by roundings of what it reads, and the projection moves coordinates by as
-        much over what it has apart from others; velocities by that over the time to the place.
+        A row has the rounding errors of its inputs. The projection moves coordinates by these over
+        the row length, and velocities by the same over the time to the change point.
 
         Args:
             q: coordinates.
             v: velocities.
-            columns: of the matrix of the projection.
+            columns: columns of the matrix of the projection.
             args: arguments of the step.
         """
         assert args.units is not None
@@ -196,9 +195,9 @@ class Crossing(NamedTuple):
     def noise(
         self, v: Float[Array, " n"], args: Arguments
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """What single stages may differ by in changes of coordinates and of velocities; else 0.
+        """Allowed differences of stages in coordinates and velocities near a change point; else 0.
 
-        Those across the ways are not of the motion, and the projection removes what they do.
+        They are deviations across the branch, and the projection removes their effect.
 
         Args:
             v: velocities.
@@ -218,17 +217,17 @@ class Crossing(NamedTuple):
         stop: Float[Array, ""] | float = np.inf,
         due: Float[Array, ""] | float = np.inf,
     ) -> Float[Array, ""]:
-        """A step no longer than h that has the place ahead between its stages, or leads up to it.
+        """A step of at most h with the change point between its stages, or one that ends before it.
 
-        What is saved within a step across is interpolated: that step is a short one. So is the
-        last one of a motion that ends at the place. One that ends beyond it has its start where
-        the place is between its stages.
+        A state saved within a crossing step is interpolated: that step is made short. So is the
+        last step of a motion that ends at the change point. If the motion ends beyond it, the last
+        step starts so that the change point is between its stages.
 
         Args:
-            t: where it starts.
-            h: its length as proposed.
+            t: start of the step.
+            h: its proposed length.
             gap: see `widest_gap`.
-            stop: where the motion ends.
+            stop: end of the motion.
             due: the next save time.
         """
         left = jnp.asarray(self.time - t, h.dtype)
@@ -237,12 +236,12 @@ class Crossing(NamedTuple):
         across, approach = left / gap, left - ROOM * gap * h
         near = ahead & self.is_near & (left > AT_HAND * h)
         found = jnp.where(near & (across > h), approach, jnp.where(near, across, h))
-        # To a last step that has the place at `gap`, and to a short one.
+        # Step up to a last one that has the change point at `gap`; below, up to a short one.
         lead = left - gap / (1 - gap) * jnp.asarray(stop - self.time, h.dtype)
         cut = near & (stop > self.time) & (stop < t + across) & (lead > AT_HAND * left)
         found = jnp.where(cut, lead, found)
         least, ends = narrow(self.apart.dtype), self.is_at(t, stop)
-        # In float32 steps are as short as need be: shorter ones add rounding.
+        # Not in float32, where shorter steps would add rounding.
         saved = ahead & (due < t + jnp.maximum(across, h)) & (least < SHORT)
         found = jnp.where(ends, h, jnp.where(saved & ~cut, across, found))
         part = 1.0 - jnp.maximum(least / jnp.where(ahead, self.apart.astype(h.dtype), 1.0), 0.1)
@@ -250,11 +249,11 @@ class Crossing(NamedTuple):
         return jnp.minimum(found, h)
 
     def is_at(self, t: Float[Array, ""], time: Float[Array, ""] | float) -> Bool[Array, ""]:
-        """Whether a time is that of the place ahead, but for a third of a narrow step.
+        """Whether a time is that of the change point ahead, within a third of a narrow step.
 
         Args:
-            t: now.
-            time: the other one.
+            t: the current time.
+            time: the time to compare.
         """
         pace = (self.time - t) / self.apart.astype(self.time.dtype)
         close = narrow(self.apart.dtype) / 3
@@ -262,21 +261,21 @@ class Crossing(NamedTuple):
 
 
 def unknown_below(dtype: Any) -> float:
-    """Where so little of a row is left, over what there is at the start, rounding is the rest."""
+    """Row length over that at the start of the motion, below which it is only rounding."""
     return min(2 * float(jnp.finfo(dtype).eps) ** (1 / 3), LOST)
 
 
 def narrow(dtype: Any) -> float:
-    """Of the same: where a step across begins in which states are saved, or the motion ends.
+    """The same ratio at the start of a crossing step with saved states, or of the last step.
 
-    A polynomial through its ends is off by its length to the power of 6, and rounding by eps over
-    its square: 0.015 in float64, where both are 1e-12, and 0.1 in float32.
+    The error of the polynomial is the step length to the power of 6, and that of rounding is eps
+    over its square: 0.015 in float64, where both are 1e-12, and 0.1 in float32.
     """
     return min(1.35 * float(jnp.finfo(dtype).eps) ** (1 / 8), SHORT)
 
 
 def no_crossing(time: Float[Array, ""], n: int, dtype: Any) -> Crossing:
-    """What is known where a motion of n coordinates starts; times are of the dtype of `time`."""
+    """The detection at the start of a motion of n coordinates; times have the dtype of `time`."""
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     return Crossing(one, zero, jnp.full((n,), jnp.inf, dtype), jnp.full_like(time, jnp.inf))
 
@@ -284,15 +283,15 @@ def no_crossing(time: Float[Array, ""], n: int, dtype: Any) -> Crossing:
 def is_across(
     begin: Crossing, end: Crossing, saved: Crossing, sound: Bool[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether what is saved within a step is to be interpolated.
+    """Whether a state saved within a step is to be interpolated.
 
-    Where the step to it met a place, or where it lies at one, in a short step also near one.
+    It is if the step to it met a change point, or if it lies at one; in a short step also near one.
 
     Args:
-        begin: what is known at the start of the step.
+        begin: detection at the start of the step.
         end: at its end.
-        saved: at the end of a step to what is saved.
-        sound: whether that went well.
+        saved: at the saved state.
+        sound: whether the step to the saved state succeeded.
     """
     at_it = saved.stands | (saved.depends & (begin.apart < 2 * narrow(begin.apart.dtype)))
     apart = jnp.minimum(jnp.minimum(begin.apart, end.apart), saved.apart)
@@ -300,16 +299,16 @@ def is_across(
 
 
 def widest_gap(nodes: Sequence[float]) -> float:
-    """The middle of the longest part of a step in which no stage lies."""
+    """The middle of the longest interval without stages, as a fraction of the step."""
     places = np.unique(np.clip([0.0, *nodes, 1.0], 0.0, 1.0))
     middles, widths = 0.5 * (places[1:] + places[:-1]), np.diff(places)
     return float(middles[np.argmax(np.where(middles >= GAP, widths, 0.0))])
 
 
 def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Float[Array, " m"]:
-    """1 / sqrt of effective masses: what rows have apart from all others, in the metric of M^-1.
+    """1 / sqrt of effective masses: row lengths orthogonal to all others, in the metric of M^-1.
 
-    0 of rows that were left out as they depend on others, 1 of those that are not kept.
+    0 for rows that are dependent here, 1 for rows that are not in `kept`.
     """
     masses = jax.lax.stop_gradient(masses)
     lengths = jnp.where(masses > 0, jax.lax.rsqrt(jnp.where(masses > 0, masses, 1.0)), 0.0)
@@ -320,24 +319,24 @@ def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Fl
 def scales_at(
     dynamics: VectorField, tau: Array, y: Array, args: Arguments
 ) -> tuple[Float[Array, " n"], Float[Array, "m n"]]:
-    """Units of the coordinates in which their inertias at a state are 1, and |A| there."""
+    """Units of the coordinates in which their inertias are 1 at this state, and |A| there."""
     t, q, v, params = dynamics.state(tau, y, args)
     A = dynamics.terms.rows(t, q, v, params)[0]
     return units_of(dynamics.mass(tau, y, args), A), jnp.abs(A)
 
 
 def may_cross(dynamics: VectorField) -> bool:
-    """Whether there are rows of which one may be left out for a moment.
+    """Whether a constraint row may be left out near a change point.
 
-    Beyond the place the state is moved back onto all of them. A force that reads multipliers is not
-    known where these are not.
+    Beyond the change point the state is projected onto all rows again. A force that reads
+    multipliers is undefined where these are unknown.
     """
     reads = any(map(reads_lam, dynamics.system.forces))
     return dynamics.projects and may_stop(dynamics) and not reads
 
 
 def may_stop(dynamics: VectorField) -> bool:
-    """Whether there are rows that accelerations are solved with."""
+    """Whether accelerations are solved for with constraint rows."""
     return dynamics.quasi is None and dynamics.rows.size > 0
 
 
@@ -352,11 +351,11 @@ def same_sense(
 ) -> Bool[Array, ""]:
     """Whether a step passes no change point: pivots of A(t) M^-1 A(t0)^T keep their signs.
 
-    Looked at in the middle and at the end of the step, over what they are at its start, where that
-    makes 1 of all of them. Ways that meet at one place change one sign each.
+    They are tested in the middle and at the end of the step, relative to their values at its start.
+    Every branch that meets at a change point changes one sign.
 
     Args:
-        dynamics: what moves.
+        dynamics: the vector field.
         t0: start of the step.
         t1: its end.
         y0: state at its start.

@@ -1,4 +1,4 @@
-"""The first adaptive step."""
+"""The length of the first adaptive step."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 def slope_and_step(
     field: Callable, t0: Array, y0: Array, controller: Any, order: float
 ) -> tuple[Array, Array]:
-    """(dy/dt at the start, length of the first step), in a loop that holds the field once.
+    """(dy/dt at the start, length of the first step), in a loop that contains the field once.
 
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.4.
     """
@@ -55,13 +55,13 @@ def first_step(
 
     Args:
         solver: the method.
-        controller: what chooses its steps.
+        controller: step-size controller.
         term: vector field.
         t0: start.
         t1: end of the motion.
         y: state at the start.
         args: arguments of a step from there.
-        guess: the step; None where it is to be estimated.
+        guess: the step; None if it is to be estimated.
     """
     order = solver.error_order(term)
     dtype = jnp.result_type(*jax.tree.leaves(y))

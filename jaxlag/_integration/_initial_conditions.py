@@ -1,4 +1,4 @@
-"""Whether a trajectory may start, inside the compiled program."""
+"""Checks of the initial conditions, inside the compiled program."""
 
 from typing import Any, NamedTuple
 
@@ -21,17 +21,17 @@ from jaxlag._linalg._rounding_bounds import with_rounding
 
 
 class Start(NamedTuple):
-    """Whether a trajectory may start, and if not, why."""
+    """Whether a trajectory may start, and the reasons if it may not."""
 
     valid: Array  # all values are allowed
     in_range: Array  # the inputs are defined there
     finite: Array  # L and the residuals are finite there
     consistent: "Consistency"
-    contacts_valid: Array  # contacts press and slide as their friction takes them to
+    contacts_valid: Array  # contacts press, and slide in the direction that their friction assumes
 
     @property
     def allowed(self) -> Bool[Array, ""]:
-        """Whether all is well."""
+        """Whether all conditions hold."""
         return self.valid & self.in_range & self.finite & self.consistent.ok & self.contacts_valid
 
 
@@ -39,10 +39,10 @@ class Consistency(NamedTuple):
     """Whether a start satisfies its constraints.
 
     Attributes:
-        ok: all residuals are small, and the rows do not contradict one another.
-        contradictory: no motion near satisfies all rows.
-        row: the row concerned.
-        complete: the state's quasi-velocities stand for all motions that the rows leave.
+        ok: all residuals are small, and no row contradicts the others.
+        contradictory: no motion nearby satisfies all rows.
+        row: index of the row concerned.
+        complete: the quasi-velocities of the state represent all motions that the rows allow.
     """
 
     ok: Bool[Array, ""]
@@ -54,7 +54,7 @@ class Consistency(NamedTuple):
 def values_allowed(
     y0: Array, saves: Array, rtol: Any, atol: Any, step: Any, longest: Any
 ) -> Bool[Array, ""]:
-    """What concrete values have raised about already, for values that are traced."""
+    """The checks of concrete values, repeated for traced values."""
     floor = 10 * jnp.finfo(y0.dtype).eps
     checks = [
         jnp.all(jnp.isfinite(y0)),
@@ -67,7 +67,7 @@ def values_allowed(
 
 
 def start_finite(dynamics: VectorField, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
-    """Whether L and the residuals are finite there; of accelerations the first step tells."""
+    """Whether L and the residuals are finite; the first step checks the accelerations."""
     at = dynamics.state(*stop_gradient((tau, y0, args)))
     finite = jnp.isfinite(dynamics.system.lagrangian(*at))
     for residual in residuals(dynamics, *at):
@@ -78,7 +78,7 @@ def start_finite(dynamics: VectorField, tau: Array, y0: Array, args: Arguments) 
 def residuals(
     dynamics: VectorField, t: Array, q: Array, v: Array, params: Any
 ) -> tuple[Array, ...]:
-    """(phi for every row, A v + b), none without constraints."""
+    """(phi for every row, A v + b); empty without constraints."""
     if not dynamics.rows.size:
         return ()
     phi = dynamics.rows.of_all(dynamics.terms.position(t, q, params))
@@ -88,7 +88,7 @@ def residuals(
 def start_consistent(
     dynamics: VectorField, t: Array, q: Array, v: Array, params: Any, args: Arguments
 ) -> Consistency:
-    """Whether a state satisfies the constraints, and its quasi-velocities stand for velocities."""
+    """Whether a state satisfies the constraints and its quasi-velocities are regular."""
     found = _rows_consistent(dynamics, t, q, v, params, args)
     if dynamics.quasi is None:
         return found
@@ -101,8 +101,8 @@ def _rows_consistent(
 ) -> Consistency:
     """Whether residuals are below sqrt(eps) of the state, and no row contradicts the others.
 
-    A row contradicts where it is left open by solving for the independent ones: phi, A v + b, or
-    A a + gamma; with quasi-velocities where these do not satisfy it by themselves.
+    A row is contradictory if the solution of the independent rows does not satisfy it: phi, A v + b
+    or A a + gamma. With quasi-velocities it is so if their kinematics do not satisfy it.
     """
     if not dynamics.rows.size:
         true = jnp.array(True)
@@ -145,7 +145,7 @@ def _rows_consistent(
     for c, x in ((phi, q), (rate, v)):
         size = jnp.abs(c) / unit / (1.0 + jnp.max(jnp.abs(x)))
         off = jnp.maximum(off, size / floor)
-        # A contradiction is not just what the linearised rows leave open.
+        # A residual of the linearized rows alone is no contradiction.
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
@@ -161,7 +161,7 @@ def _rows_consistent(
 
 
 def _sizes(dynamics: VectorField, t: Array, q: Array, v: Array, params: Any) -> Sizes:
-    """Of every row, see `row_sizes`."""
+    """Sizes of all rows, see `row_sizes`."""
 
     def rows(q: Array) -> Array:
         return dynamics.terms.rows(t, q, v, params)[0]
@@ -179,7 +179,7 @@ def _fitting(
     void: Bool[Array, " m"],
     unit: Array,
 ) -> tuple[Array, Bool[Array, ""]]:
-    """How far off A B = 0 every row is, as a sine; whether B and A leave no velocity out."""
+    """(error of A B = 0 in every row, as a sine; whether A and B together have full rank)."""
     quasi = dynamics.quasi
     assert quasi is not None
     u = quasi.of(t, q, v, params)
@@ -188,7 +188,7 @@ def _fitting(
     B = B / jnp.where(size > 0, size, 1.0)[None]
     sines = jnp.abs(A @ B) / unit[:, None]
     rows = jnp.concatenate([jnp.where(void[:, None], 0.0, A) / unit[:, None], B.T])
-    # Singular kinematics, as at gimbal lock, are a fault of their own.
+    # Singular kinematics, as at gimbal lock, are a separate failure.
     sound = jnp.all(jnp.isfinite(rows))
     rows = jnp.where(sound, rows, jnp.eye(*rows.shape, dtype=q.dtype))
     rank = jnp.sum(independent_rows(jnp.eye(q.shape[0], dtype=q.dtype), rows))
@@ -198,10 +198,10 @@ def _fitting(
 def rows_hold_after(
     dynamics: VectorField, ts: Array, q: Array, v: Array, params: Any
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether velocities that kinematics give satisfy the rows at all saved times; else which not.
+    """(whether the kinematics satisfy the rows at all saved times, index of a row that fails).
 
-    With U the rows are satisfied by themselves, and projection sees to them without
-    quasi-velocities.
+    With U the rows are satisfied by definition. Without quasi-velocities the projection satisfies
+    them.
     """
     quasi = dynamics.quasi
     if quasi is None or quasi.U is not None or not dynamics.rows.size:
@@ -220,7 +220,7 @@ def rows_hold_after(
 def _consistency(off: Array, bad: Array, near: Array, phi: Array, rate: Array) -> Consistency:
     contradictory = jnp.any(bad > 1.0)
     row = jnp.where(contradictory, jnp.argmax(bad), jnp.argmax(off))
-    # Residuals that are not finite are another fault.
+    # Nonfinite residuals are a separate failure.
     ok = (near & ~contradictory) | ~jnp.all(jnp.isfinite(phi) & jnp.isfinite(rate))
     row = jnp.where(ok, -1, row).astype(jnp.int32)
     return Consistency(ok, contradictory, row, jnp.array(True))

@@ -1,4 +1,4 @@
-"""One iteration of the loop: one attempted step, or one to a save time.
+"""One iteration of the loop: one attempted step, or one step to a save time.
 
 The phases, in the order of `iterate`: `aimed`, where the step is to end; `attempt`, the step itself
 and its checks; `accept`, whether it is kept and how long the next one is; `beside_change_points`,
@@ -30,19 +30,19 @@ from jaxlag._integration._stepper import SINGULAR, Estimate, all_finite, resolut
 
 
 class Aim(NamedTuple):
-    """Where a step starts and is to end.
+    """Where a step starts and ends.
 
     Attributes:
-        start: from where it goes.
-        tnext: time at which a state is wanted.
-        end: time at which the step ends; another than tnext near change points alone.
-        reach: how the state at tnext follows from the step; None where no change points are passed.
+        start: start of the step.
+        tnext: time at which a state is required.
+        end: time at which the step ends; it differs from tnext only near change points.
+        reach: how the step gives the state at tnext; None if no change points are passed.
         to_save: whether it goes to a save time inside the last accepted step.
         due: the next save time; None without any.
         lands: whether it ends on a knot or on the stop.
-        cut: whether it is shorter than was proposed.
+        cut: whether it is shorter than proposed.
         on_grid: whether it reaches the next time of the fixed grid.
-        anchor: index of the knot, or of the stop, that lies ahead.
+        anchor: index of the next knot, or of the stop.
     """
 
     start: StepStart
@@ -58,24 +58,24 @@ class Aim(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step, and what is to be said of it.
+    """An attempted step and its checks.
 
     Attributes:
         y1: state by the method alone.
-        settled: the same on the constraints.
+        settled: the same after the projection.
         memory: the solver's own state.
-        estimate: of its error.
-        checks: of constraints and contacts.
-        crossing: what is known of change points at its end.
-        determinants: of quasi-velocities there.
-        share: of the allowed error that is left near a singular place; None elsewhere.
-        finite: whether y1 is.
-        solved: whether implicit equations were.
-        regular: whether quasi-velocities stay so.
+        estimate: error estimate.
+        checks: checks of constraints and contacts.
+        crossing: detection of change points at its end.
+        determinants: determinants of quasi-velocities at its end.
+        share: fraction of the allowed error near a singularity of these; None elsewhere.
+        finite: whether y1 is finite.
+        solved: whether implicit equations were solved.
+        regular: whether quasi-velocities stay regular.
         crossable: whether no change point forbids the step.
-        independent: whether rows stay so.
+        independent: whether rows stay independent.
         met: whether a stage met a change point.
-        good: whether nothing speaks against the step but its error.
+        good: whether the step is acceptable apart from its error.
     """
 
     y1: PyTree
@@ -115,7 +115,7 @@ def iterate(loop: Loop, c: LoopState) -> LoopState:
 
 
 def aimed(loop: Loop, c: LoopState) -> Aim:
-    """The step of the proposed length, cut short at a knot or the stop; or to a save time."""
+    """Choose the end of the step: the proposed length, a knot, the stop, or a save time."""
     stepper, times, t = loop.stepper, loop.times, c.at.t
     fixed = stepper.controller is None
     h = c.h
@@ -136,7 +136,7 @@ def aimed(loop: Loop, c: LoopState) -> Aim:
         tnext = jnp.where(to_save, due, tnext)
     end, reach = tnext, None
     if c.reach is not None:
-        # A motion may end at such a place: saves of its last step are then reached alike.
+        # The motion may end at a change point: saves of its last step are treated in the same way.
         assert start.crossing is not None
         there = (tnext >= times.stop) & start.crossing.is_at(start.t, tnext)
         beyond = jnp.where(to_save, c.reach == Reach.beyond, there)
@@ -162,7 +162,7 @@ def _next_boundary(times: Times, t: Array) -> tuple[Array, Array]:
 
 
 def attempt(loop: Loop, c: LoopState, aim: Aim) -> Attempt:
-    """The step by the method, moved onto the constraints, and whether anything forbids it."""
+    """Take the step, project it onto the constraints, and check it."""
     stepper, (start, tnext, end, *_) = loop.stepper, aim
     made_jump = False if start.jump is None else start.jump
     args = stepper.within(loop.args, start.t)
@@ -177,7 +177,7 @@ def attempt(loop: Loop, c: LoopState, aim: Aim) -> Attempt:
     crossable = independent = stepper.same_sense(*step)
     met = jnp.array(False)
     if crossing is not None:
-        # A step from such a place, or one of equal steps to it, has a stage there.
+        # A step from a change point, or a step of fixed length to it, has a stage there.
         assert start.crossing is not None
         fixed = stepper.controller is None
         stands = start.crossing.stands | (crossing.stands if fixed else False)
@@ -206,9 +206,9 @@ def attempt(loop: Loop, c: LoopState, aim: Aim) -> Attempt:
 def beside_change_points(
     loop: Loop, c: LoopState, aim: Aim, step: Attempt
 ) -> tuple[Aim, PyTree, Array]:
-    """(the aim, the state at tnext, whether it is one between both ends of the last step).
+    """(the aim, the state at tnext, whether it is interpolated within the last accepted step).
 
-    Near a change point states follow from a polynomial through both ends of a short step.
+    Near a change point states are computed from a polynomial through both ends of a short step.
     """
     if aim.reach is None:
         return aim, step.settled, jnp.array(False)
@@ -231,7 +231,7 @@ def beside_change_points(
 def accept(
     loop: Loop, c: LoopState, aim: Aim, step: Attempt
 ) -> tuple[Array, Array, Any, Array, Array]:
-    """Whether to keep this step, and the next one.
+    """Decide whether to keep this step, and choose the next one.
 
     Returns:
         whether to keep it, length of the next, the controller's state, whether the field jumps,
@@ -242,41 +242,41 @@ def accept(
     if stepper.controller is None:
         return good, c.h, None, jnp.zeros_like(good), ~good
     order: Any = stepper.solver.error_order(stepper.term)
-    # What derivatives need must not use up the steps of the motion: as many as get through it.
+    # Derivatives must not use up the steps that the motion itself needs.
     stop = loop.times.stop
     spare = c.attempted.astype(t.dtype) * stop < loop.max_steps * jnp.maximum(0.25 * stop, 0.9 * t)
     error = stepper.held_to(t, t1, y, y1, loop.args, step.estimate, spare)
     if share is not None:
         error = jax.tree.map(lambda e: e / share, error)
     error = jax.tree.map(lambda e: jnp.where(good & ~jnp.isnan(e), e, jnp.inf), error)
-    y1 = select(good, y1, y)  # an infinite one would make the scale of the error infinite, too
+    y1 = select(good, y1, y)  # an infinite y1 would make the scale of the error infinite
     proposal: Any = stepper.controller.adapt_step_size(
         t, t1, y, y1, loop.args, error, order, c.control
     )
     keep, next0, next1, jump, control, result = proposal
     keep = keep & good
     h = jnp.asarray(next1 - next0, t.dtype)
-    # A step cut short says nothing against the length proposed before it.
+    # A step that was cut short does not reduce the length proposed before it.
     cut = keep & cut
     h = jnp.where(cut, jnp.maximum(h, c.h), h)
     if stepper.standard:
         control = _uncut(stepper.controller, cut, h, c.control, control)
     h = h if stepper.longest is None else jnp.minimum(h, stepper.longest)
     least = jnp.maximum(resolution(t), jnp.finfo(h.dtype).eps ** 2 * loop.times.stop)
-    if share is not None:  # before a singular place a state in fewer digits would stand still
+    if share is not None:  # tiny steps would not change a state of fewer digits
         coarse = 64 * float(jnp.finfo(share.dtype).eps) * loop.times.stop
         least = jnp.where(step.regular | aim.to_save, least, jnp.maximum(least, coarse))
     refused = (result != diffrax.RESULTS.successful) & ~cut
-    # A controller with a least step proposes it again where no shorter one is left to try.
+    # A controller with a minimum step proposes it again if no shorter one is possible.
     again = ~good & ~(h < t1 - t)
     stuck = (~keep & ~(h > least)) | refused | again
     return keep & ~refused, h, control, jnp.asarray(jump), stuck
 
 
 def _uncut(controller: Any, cut: Array, h: Array, before: Any, after: Any) -> Any:
-    """The state of a PID control, which takes no notice of a step that was cut short.
+    """The state of a PID controller without the effect of a step that was cut short.
 
-    Its last part says that the step proposed is the least there is, and to be kept as it comes.
+    Its last entry is whether the proposed step is the minimum one, which is always accepted.
     """
     control = select(cut, before, after)
     if controller.dtmin is None:
@@ -286,7 +286,7 @@ def _uncut(controller: Any, cut: Array, h: Array, before: Any, after: Any) -> An
 
 
 def failure_of(loop: Loop, aim: Aim, step: Attempt, smooth: Array) -> Array:
-    """The status of a motion that ends with this step, the cause that goes before all others."""
+    """The status of a motion that ends with this step; later causes below override earlier ones."""
     checks, met = step.checks, step.met
     status = jnp.full((), int(Status.step_below_resolution))
     for right, kind in (
@@ -316,7 +316,7 @@ def saved_on(
     across: Array,
     failure: Array,
 ) -> SaveProgress | None:
-    """The states at save times with this one, where it is one; NaN where the step failed."""
+    """Store the state if it is one at a save time; NaN if the step failed."""
     saved, to_save, tnext = c.saved, aim.to_save, aim.tnext
     if saved is None:
         return None
@@ -331,7 +331,7 @@ def saved_on(
         assert aim.reach is not None
         reaches = set_entry(reaches, slot, jnp.where(to_save, aim.reach, 0))
     if turns is not None:
-        # The slot after the last save is that of nothing: it stays beyond all turns.
+        # The slot after the last save is unused: it stays beyond all turns.
         beyond = turns[-1]
         turns = set_entry(turns, slot, jnp.where(to_save, saved.turn, beyond))
     return SaveProgress(
@@ -357,7 +357,7 @@ def advance(
     jump: Array,
     stuck: Array,
 ) -> LoopState:
-    """The state of the loop after the step: where it is now, how it ended, what is kept."""
+    """The state of the loop after the step: its start, its status, its records."""
     stepper, start, tnext = loop.stepper, aim.start, aim.tnext
     active = ~c.done & ~aim.to_save
     take = active & keep_step

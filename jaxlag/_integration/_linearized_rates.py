@@ -1,4 +1,4 @@
-"""How fast perturbations of a state turn and grow: its linearised equations and their rates."""
+"""Rates of perturbations, from the Jacobian of the vector field at a state."""
 
 import math
 from collections.abc import Callable
@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_UNSEEN = 1e3  # tolerances: an error estimate that sees no more says nothing of perturbations
+_UNSEEN = 1e3  # tolerances: below this change, error estimates do not bound perturbations
 
 
 def linearized(field: Callable, y: Array) -> tuple[Array, Array]:
-    """(f, df/dy) at y by differences: half the digits, and compiled in a fraction of the time."""
+    """(f, df/dy) at y by differences: half the digits, compiled in a fraction of the time."""
     beside = jnp.sqrt(jnp.finfo(y.dtype).eps) * (1.0 + jnp.abs(y))
     states = jnp.concatenate([y[None], y[None] + jnp.diag(beside)])
     f, *others = jax.lax.map(field, states)
@@ -20,10 +20,9 @@ def linearized(field: Callable, y: Array) -> tuple[Array, Array]:
 
 
 def spectral_size(J: Array) -> tuple[Array, Array]:
-    """(rate, J^16 / rate^16): about the spectral radius, the 16th root of the size of that power.
+    """(rate, J^16 / rate^16): rate is the 16th root of the norm of J^16, about the spectral radius.
 
-    Units hardly matter to it. Scaled on the way, as the power of a rate may leave the range of
-    numbers.
+    It hardly depends on units. The powers are scaled, as they may overflow.
     """
     power, rate = J, jnp.ones((), J.dtype)
     for k in range(5):
@@ -35,7 +34,7 @@ def spectral_size(J: Array) -> tuple[Array, Array]:
 
 
 def turning_rate(J: Array) -> Array:
-    """The largest eigenvalue in size among those that do not merely decay."""
+    """The largest |eigenvalue| among those that oscillate or grow."""
     finite = jnp.all(jnp.isfinite(J))
     values = jnp.linalg.eigvals(jnp.where(finite, J, 0.0))
     turning = (jnp.abs(values.imag) >= jnp.abs(values.real)) | (values.real > 0)
@@ -45,24 +44,24 @@ def turning_rate(J: Array) -> Array:
 def longest_step(
     field: Callable, y: Array, controller: Any, order: float, explicit: bool
 ) -> Float[Array, ""]:
-    """In which the fastest perturbations turn or grow by what an estimate of the error would see.
+    """Step in which the fastest perturbations turn or grow by an amount that an estimate detects.
 
-    Infinite where the motion itself moves them, for `_UNSEEN` tolerances and more, so that error
-    estimates of its steps tell; and where differences lead across a jump or a bend.
+    It is infinite if the motion itself changes along them by `_UNSEEN` tolerances or more: the
+    error estimates then detect them. It is also infinite if the differences cross a jump or a kink.
 
     Args:
-        field: y -> dy/dt, and after these outcomes of comparisons.
+        field: y -> dy/dt, followed by the outcomes of comparisons.
         y: state.
-        controller: its tolerances.
-        order: of the error estimate.
-        explicit: whether the method follows what decays, too.
+        controller: step-size controller with the tolerances.
+        order: order of the error estimate.
+        explicit: whether the method must also resolve decay.
     """
     f, J = linearized(field, y)
     smooth = ~jnp.any(J[y.size :] != 0)
     f, J = f[: y.size], J[: y.size]
     if explicit:
         rate, power = spectral_size(J)
-        # In J^16 f only the fastest motions are left: those of half their rate to 1e-5.
+        # J^16 f contains only the fastest modes: those of half their rate to 1e-5.
         seen = jnp.abs(power @ f)
     else:
         rate = turning_rate(J)

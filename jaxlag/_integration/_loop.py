@@ -1,10 +1,10 @@
 """The integration loop: steps, step-size control, knots, save times, the record, the status.
 
-Integration runs forwards in a time tau = sigma (t - ts[0]), sigma = +1 or -1, so that nothing here
-knows about direction, and times are as fine as the span allows.
+Integration runs forwards in a time tau = sigma (t - ts[0]), sigma = +1 or -1. The loop does not
+depend on the direction of time, and the resolution of times is relative to the span.
 
-Each iteration (`_iteration`) takes one step, or one step to a save time. A save time that lies
-inside the last accepted step is reached by a separate step from its start, not by interpolation:
+Each iteration (`_iteration`) takes one step, or one step to a save time. A save time inside the
+last accepted step is reached by a separate step from its start, not by interpolation:
 this is as accurate as the method is, and the loop body contains one step only.
 """
 
@@ -61,20 +61,20 @@ def integrate(
         first_step: the fixed step without a controller; else the first step, None for automatic.
         allowed: False where the trajectory must not start (status set by the caller).
         max_steps: bound on attempted steps.
-        record: whether to keep what is needed to go the same way again.
-        room: for so many states on the way, an even number. When it is full every other one is
+        record: whether to record the steps so that they can be repeated.
+        room: capacity for states on the way, an even number. When it is full, every second state is
             dropped, and from then on half as many are kept.
-        native: what calls the loop, with its start.
+        native: function that calls the loop with its initial state.
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    # Turns in which any lane takes a step: at most those in which one attempts it or goes to a save
-    # time.
+    # Turns in which any lane takes a step: at most the attempts and the steps to save times of one
+    # lane.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
     room = (room if room < max_steps else size) if record and not remembers(stepper.solver) else 0
     if stepper.controller is not None:
         memory, sound, h, control = stepper.start(t0, times.stop, y0, args, first_step)
-        # The estimate is 0/0 where atol = 0 meets a component that is 0.
+        # The estimate is 0/0 if atol = 0 and a component is 0.
         h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * times.stop)
         h = h if stepper.longest is None else jnp.minimum(h, stepper.longest)
     else:

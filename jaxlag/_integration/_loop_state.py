@@ -1,4 +1,4 @@
-"""What a loop of steps carries from turn to turn, and its record on the way."""
+"""The state of the integration loop, with the buffers of its record."""
 
 from typing import Any, NamedTuple
 
@@ -19,25 +19,25 @@ class StepStart(NamedTuple):
     t: Array
     y: PyTree
     memory: Any  # the solver's own state
-    jump: Array | None  # whether the field jumps there; None where nothing ever does
+    jump: Array | None  # whether the field jumps there; None if it never does
     determinants: Array | None  # see `Stepper.determinants`
-    crossing: Crossing | None  # what is known of change points; None where none are passed
+    crossing: Crossing | None  # detection of change points; None if none are passed
 
 
 class SaveProgress(NamedTuple):
     """States at the save times between the first and the last."""
 
     base: StepStart  # where the last accepted step started
-    turn: Array  # that took it
+    turn: Array  # in which that step was taken
     next: Array  # index of the next save time
-    values: PyTree  # one more for what is not kept
+    values: PyTree  # with one more entry for values that are discarded
     turns: Array | None  # `Record.save_turn`
     reaches: Array | None  # `Record.save_reach`
     missed: Array
 
 
 class RecordBuffers(NamedTuple):
-    """The record on the way."""
+    """Buffers of the record."""
 
     offsets: Array
     anchors: Array | None
@@ -57,14 +57,14 @@ class LoopState(NamedTuple):
     tried: Array
     accepted: Array
     attempted: Array
-    turn: Array  # number of those in which any lane took a step
+    turn: Array  # number of turns in which any lane took a step
     saved: SaveProgress | None
     kept: RecordBuffers | None
-    reach: Array | None  # of the last step, see `Reach`; None where no change points are passed
+    reach: Array | None  # of the last step, see `Reach`; None if no change points are passed
 
 
 class Loop(NamedTuple):
-    """What stays the same from turn to turn."""
+    """Constants of the loop."""
 
     stepper: Stepper
     args: Any
@@ -84,12 +84,12 @@ def buffer(size: Any, like: PyTree, fill: float | int) -> PyTree:
 
 
 def is_full(c: Any, room: int) -> Array:
-    """Whether there is no room for the point that the next step starts from."""
+    """Whether the buffer of points is full before the next step."""
     return (c.turn >= room * c.kept.stride) & ~c.done
 
 
 def thin(c: Any, room: int) -> Any:
-    """Every other point dropped, if they are full."""
+    """Drop every second point if the buffer is full."""
 
     def halved(leaf: Array) -> Array:
         return leaf.at[: room // 2].set(leaf[:room:2])
@@ -103,7 +103,7 @@ def thin(c: Any, room: int) -> Any:
 def write_turn(
     loop: Loop, c: LoopState, kept: RecordBuffers, t: Array, anchor: Array
 ) -> RecordBuffers:
-    """The record with this turn."""
+    """Write this turn to the record."""
     anchors, jumps, points = kept.anchors, kept.jumps, kept.points
     if anchors is None:
         offset = jnp.where(anchor == 1, -1.0, t)

@@ -1,4 +1,4 @@
-"""Whether a step passes a place where v does not follow from u, or u not from v."""
+"""Detection of singular quasi-velocities within a step: dU/dv or dv/du loses rank."""
 
 from functools import reduce
 from typing import NamedTuple
@@ -11,21 +11,20 @@ from jaxlag._integration._step_arguments import Arguments, midway
 from jaxlag._integration._vector_field import VectorField
 from jaxlag._lowering import State
 
-PART = 0.5  # of the least of three samples
-SPREAD = 8.0  # of samples within one step
-BESIDE = 0.125  # of an adaptive step, before its start and beyond its end
-BESIDE_FIXED = 0.5  # where no error control shortens steps near such a place
-LOST = 200.0  # tolerances: what rounding of u may make of v, but for a small factor
-NEAR = 0.01  # of a radian, or another unit of the coordinates
+PART = 0.5  # lower bound of the parabola, over the least of three samples
+SPREAD = 8.0  # largest ratio of samples within one step
+BESIDE = 0.125  # margin before and after an adaptive step, over its length
+BESIDE_FIXED = 0.5  # the same for fixed steps, which no error control shortens
+LOST = 200.0  # error of v by rounding of u, in tolerances, at which a motion ends; up to a factor
+NEAR = 0.01  # rad, or another unit of the coordinates
 
 
 class Passage(NamedTuple):
-    """What is to be said about a step of quasi-velocities.
+    """Result of the check of quasi-velocities along a step.
 
     Attributes:
-        regular: v and u follow from one another all along it, to the digits that are asked for.
-        share: of errors of u what those of v are at least, beside the start of the motion; at
-            most 1.
+        regular: v and u determine each other along the whole step, to the digits required.
+        share: fraction of the tolerance that bounds errors of u; at most 1.
         last: determinants at its end.
     """
 
@@ -45,12 +44,12 @@ def passage(
     turn: Float[Array, " m"] | None,
     first: Float[Array, " b"],
 ) -> Passage:
-    """What becomes of v and u along a step.
+    """Check whether quasi-velocities become singular along a step.
 
-    Near a place where dU/dv loses rank an error of u is one of v by as much larger as the
-    determinant is smaller than elsewhere: the error of a step is bounded by that `share` of the
-    tolerance, as far as rounding lets it: what rates are rough by, eps over that share, is left to
-    it. Where that makes more of v than `LOST` tolerances, the motion ends:
+    Near a place where dU/dv loses rank, errors of u are larger in v, by the usual determinant over
+    the present one. The error of a step is therefore bounded by a `share` of the tolerance. The
+    bound includes the rounding of rates, eps over that share. If rounding makes an error of v of
+    more than `LOST` tolerances, the motion ends:
 
         det / (det at the start) < sqrt(eps / (200 tol)) = 1e-3, 3e-5, 1e-6, 3e-8
 
@@ -58,14 +57,14 @@ def passage(
     to there within 800 tolerances, and 12 at a tenth of a radian.
 
     Args:
-        dynamics: what moves.
+        dynamics: the vector field.
         tolerance: bound on local errors; None with fixed steps.
         t0: start of the step.
         t1: its end.
         y0: state at its start.
         y1: state at its end.
         args: arguments of the step.
-        turn: h dy/dt at the start less that at the end; None where it is not known.
+        turn: h dy/dt at the start minus that at the end; None if it is unknown.
         first: determinants at its start.
     """
     assert args.usual is not None
@@ -84,10 +83,10 @@ def passage(
 def determinants(
     dynamics: VectorField, tau: Array, q: Float[Array, " n"], args: Arguments
 ) -> Float[Array, " b"]:
-    """What is 0 or infinite where quasi-velocities are singular.
+    """Determinants that are 0 or infinite where quasi-velocities are singular.
 
-    Determinants of the blocks of dU/dv, or of dv/du where that is given, without those that do not
-    change, where there is a scalar program of them.
+    They are those of the blocks of dU/dv, or of dv/du if that is given. A scalar program leaves out
+    constant ones.
     """
     t, (params, _) = dynamics.clock(tau, args), dynamics.given(args)
     values = dynamics.inputs_at(tau, q, jnp.zeros_like(q), args)
@@ -96,7 +95,7 @@ def determinants(
 
 
 def opening(dynamics: VectorField, found: Float[Array, " b"]) -> Float[Array, " b"]:
-    """How large dU/dv is, by its determinants, or by those of its inverse where that is given."""
+    """The magnitude of dU/dv, from its determinants or from those of its inverse if given."""
     quasi = dynamics.quasi
     assert quasi is not None
     size = jnp.abs(found)
@@ -108,9 +107,9 @@ def opening(dynamics: VectorField, found: Float[Array, " b"]) -> Float[Array, " 
 def usual(
     dynamics: VectorField, tau: Array, q: Float[Array, " n"], args: Arguments
 ) -> Array | None:
-    """How large dU/dv is at the start of a motion, or near it where that lies close to a zero.
+    """The magnitude of dU/dv at the start of a motion, or near it if it is almost zero there.
 
-    None where its determinants never change.
+    None if its determinants are constant.
     """
     assert dynamics.quasi is not None
     here = determinants(dynamics, tau, q, args)
@@ -132,19 +131,19 @@ def resolved(
     last: Float[Array, " b"],
     beside: float = BESIDE,
 ) -> Bool[Array, ""]:
-    """Whether determinants stay away from 0, and from infinity, within a step and close beside it.
+    """Whether determinants stay away from 0 and from infinity within a step and close beside it.
 
-    The parabola through three samples of one sign, and that through their reciprocals, may not
-    fall below half the least of them, from a part `beside` of the step before its start to one
-    beyond its end. So none has a zero there, be it crossed once or twice or touched: a parabola
-    through samples of (tau - s)^2 is that. A zero of first order is two such parts of the step
-    away; what grows exponentially may do so by a factor of 8 in a step.
+    The parabola through three samples of one sign, and that through their reciprocals, must not
+    fall below half the least of them. The interval is the step with a margin at both ends, a part
+    `beside` of the step. So no determinant has a zero there, whether it is crossed once, crossed
+    twice or touched: (tau - s)^2 is such a parabola. A zero of first order is two such parts of the
+    step away. Exponential growth may reach a factor of 8 in a step.
 
     Args:
         first: determinants at the start of a step; the blocks of dU/dv, or of dv/du.
         middle: in its middle.
         last: at its end.
-        beside: parts of the step.
+        beside: margin at both ends, over the step.
     """
     scale = 1.0 / middle
     a, c = first * scale, last * scale
@@ -157,7 +156,7 @@ def resolved(
 
 
 def _above(a: Array, b: Array | float, c: Array, beside: float) -> Array:
-    """Whether the parabola through (0, a), (1/2, b), (1, c) stays above a part of the least."""
+    """Whether the parabola through (0, a), (1/2, b), (1, c) stays above PART of the least."""
     bend = 2.0 * (a - 2.0 * b + c)
     slope = c - a - bend
     low = PART * jnp.minimum(jnp.minimum(a, b), c)

@@ -1,4 +1,4 @@
-"""States within a step, or a little beyond it, by a polynomial through its ends."""
+"""Quintic Hermite interpolation of a state within a step, or slightly beyond it."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,8 +17,8 @@ def hermite(
     """Hermite interpolation: coordinates by a polynomial of degree 5, velocities by its derivative.
 
     The polynomial has the coordinates, velocities and accelerations of both ends. With h = t1 - t0
-    and x = (t - t0) / h coordinates are off by h^6 x^3 (x - 1)^3 / 720 of their sixth derivative;
-    what is integrated beside them, by a cubic, by h^4 x^2 (x - 1)^2 / 24 of the fourth.
+    and x = (t - t0) / h the error of coordinates is h^6 x^3 (x - 1)^3 / 720 times their sixth
+    derivative. Integrals use a cubic: their error is h^4 x^2 (x - 1)^2 / 24 times the fourth.
 
     Args:
         t0: one end.
@@ -27,7 +27,7 @@ def hermite(
         t1: the other end.
         y1: as y0.
         f1: as f0.
-        t: where the state is wanted.
+        t: time of the state.
         n: number of coordinates.
     """
     h = (t1 - t0).astype(y0.dtype)

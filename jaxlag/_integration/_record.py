@@ -1,4 +1,4 @@
-"""Where the steps of a motion go, and what a loop of steps tells of where it went."""
+"""Times of a motion, the record of its steps, and the outcome of the loop."""
 
 import enum
 from typing import NamedTuple
@@ -8,11 +8,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 class Times(NamedTuple):
-    """What the grid of steps is anchored to, in tau, which is 0 at the start.
+    """Times that anchor the grid of steps, in tau, which is 0 at the start.
 
     Attributes:
-        stop: where integration ends: the last save time, or the end of an input's table before it.
-        knots: where inputs jump, sorted.
+        stop: end of the integration: the last save time, or an earlier end of an input's table.
+        knots: times where inputs jump, sorted.
         saves: the save times, the first one at the start.
     """
 
@@ -26,53 +26,53 @@ class Times(NamedTuple):
         return ends if self.knots is None else jnp.concatenate([ends, self.knots])
 
     def dues(self) -> Float[Array, " r"]:
-        """Save times between the first and the last, and then never."""
+        """Save times between the first and the last, followed by the largest number."""
         never = jnp.full((1,), jnp.finfo(self.saves.dtype).max, self.saves.dtype)
         return jnp.concatenate([self.saves[1:-1], never])
 
 
 class Reach(enum.IntEnum):
-    """How a state is reached from the start of a step: see `_change_points`."""
+    """How a state is computed from the start of a step: see `_change_points`."""
 
     step = 0
     """By a step to it."""
     within = 1
-    """By the polynomial through the ends of the step that it lies in."""
+    """By the polynomial through the ends of the step that contains it."""
     beyond = 2
-    """By that through the ends of a step half the way to it."""
+    """By the polynomial through the ends of a step of half the length."""
 
 
 def reached_time(reach: Array, t0: Array, t1: Array, end: Array) -> Array:
-    """Where the step ends by which t1 is reached from t0.
+    """The end of the step that gives the state at t1.
 
     Args:
         reach: a `Reach`.
-        t0: where the step starts.
-        t1: time of the state that is wanted.
-        end: of the accepted step that t1 lies in.
+        t0: start of the step.
+        t1: time of the required state.
+        end: end of the accepted step that contains t1.
     """
     half = jnp.where(reach == Reach.beyond, t0 + 0.5 * (t1 - t0), t1)
     return jnp.where(reach == Reach.within, end, half)
 
 
 class Record(NamedTuple):
-    """What a loop did, turn by turn: enough to go the same way again without step-size control.
+    """The record of a loop, turn by turn, from which its steps are repeated without control.
 
-    Lanes share turns; a turn that takes a lane nowhere is one whose end is that of the last.
+    Lanes share turns. If a turn takes no step in a lane, its end equals that of the turn before.
 
     Attributes:
-        offsets: time after every turn, from its anchor, with which it moves.
-        anchors: which of `Times.anchors` that is. None without knots: the start, or where the
-            offset is negative the stop, at which the turn ends.
-        jumps: whether the vector field jumps where the turn starts; None where it never does.
-        points: states before turn 0, `stride`, 2 `stride`, ...; None where nobody needs them.
+        offsets: time after every turn, from its anchor; the time moves with the anchor.
+        anchors: index of the anchor in `Times.anchors`. None without knots: the anchor is the start
+            or, for a negative offset, the stop, and the turn ends there.
+        jumps: whether the vector field jumps at the start of the turn; None if it never does.
+        points: states before turn 0, `stride`, 2 `stride`, ...; None if they are not needed.
         stride: a power of 2.
-        turns: how many there were.
+        turns: number of turns.
         save_turn: save time i + 1 is reached from the state before this turn; beyond all turns
-            where it was not reached, and after the last. None where there are no save times between
+            if it was not reached, and after the last. None if there are no save times between
             the first and the last.
-        save_reach: how, see `Reach`; None where no change points are passed.
-        last_reach: the same of the last turn.
+        save_reach: how it is reached, see `Reach`; None if no change points are passed.
+        last_reach: the same for the last turn.
     """
 
     offsets: Float[Array, " N"]
@@ -87,7 +87,7 @@ class Record(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Where integration ended, and the states at the save times."""
+    """The end of the integration, and the states at the save times."""
 
     status: Int[Array, ""]
     time: Float[Array, ""]
@@ -96,6 +96,6 @@ class Outcome(NamedTuple):
     accepted: Int[Array, ""]
     attempted: Int[Array, ""]
     saved: PyTree  # leaves (s, ...), NaN where not reached
-    missed: Int[Array, ""]  # how the step to one of them failed: a Status
+    missed: Int[Array, ""]  # the Status of a failed step to a save time
     record: Record | None
     gradient: Int[Array, ""]  # a GradientMode

@@ -1,4 +1,4 @@
-"""What a step is given besides time and state, and what is said about its end."""
+"""Arguments of a step besides time and state, and checks at its end."""
 
 from typing import Any, NamedTuple
 
@@ -8,14 +8,15 @@ from jaxlag._linalg._independent_rows import RowChoice
 
 
 class RowSelection(NamedTuple):
-    """Which constraint rows are solved with: a largest independent set at the start.
+    """The constraint rows used in solves: a largest independent set at the start.
 
     Attributes:
         kept: these rows, holonomic ones first; the others follow from them as long as the rank does
             not change.
-        size: of every row at the start and beside.
-        void: those that are 0 = 0 but for rounding.
-        reacting: such a set with as many as possible of the rows whose multipliers forces read.
+        size: size of every row at the start and nearby.
+        void: rows that are 0 = 0 up to rounding.
+        reacting: an independent set with as many as possible of the rows whose multipliers are read
+            by forces.
     """
 
     kept: Bool[Array, " m"]
@@ -29,8 +30,8 @@ class KnotIntervals(NamedTuple):
 
     Attributes:
         knots: sorted, in tau; empty within a step.
-        lower: in the user's time, the lower end of the gap before each knot and of that after the
-            last; -inf where there is none.
+        lower: in the user's time, the lower end of the interval before each knot and of that after
+            the last; -inf if there is none.
     """
 
     knots: Float[Array, " k"]
@@ -44,8 +45,8 @@ class StepChecks(NamedTuple):
         projected: Newton's method of the projection converged.
         redundant_rows_hold: rows that were left out as dependent are satisfied.
         contacts_valid: multipliers of contacts are not negative, and sliding has not reversed.
-        apart: see `_change_points.Crossing`; None where nobody asks.
-        columns: of the matrix of the projection; None likewise.
+        apart: see `_change_points.Crossing`; None if it is not needed.
+        columns: columns of the matrix of the projection; None likewise.
     """
 
     projected: Bool[Array, ""]
@@ -56,21 +57,21 @@ class StepChecks(NamedTuple):
 
     @property
     def good(self) -> Bool[Array, ""]:
-        """Whether all is well; where rows depend on one another a motion may still go on."""
+        """Whether all checks passed; a motion may continue where rows are dependent."""
         return self.projected & self.redundant_rows_hold & self.contacts_valid
 
 
 class Arguments(NamedTuple):
-    """What the vector field depends on besides time and state; all leaves are arrays."""
+    """Arguments of the vector field besides time and state; all leaves are arrays."""
 
     params: Any
     inputs: Any  # within a step two rows of each table, in time from the start
-    time_direction: Float[Array, ""] | None  # direction of time where it is traced
+    time_direction: Float[Array, ""] | None  # direction of time if it is traced
     origin: Float[Array, ""]  # the start, in the user's time
-    end: Float[Array, ""]  # beyond which no time is read
+    end: Float[Array, ""]  # no time beyond it is read
     gaps: KnotIntervals | None  # None without tables
-    constants: Any  # what accelerations need of what depends on params alone
-    rows: RowSelection | None = None  # None where there is no choice
+    constants: Any  # values for accelerations that depend on params alone
+    rows: RowSelection | None = None  # None if all rows are used
     senses: Float[Array, " k"] | None = None  # signs of sliding velocities at the start
     usual: Float[Array, " b"] | None = None  # see `_quasi_singularities.usual`
     lengths: Float[Array, " m"] | None = None  # of rows at the start, see `_change_points`
@@ -79,24 +80,24 @@ class Arguments(NamedTuple):
 
     @property
     def kept(self) -> Bool[Array, " m"] | None:
-        """Rows to project by; None for all."""
+        """Rows for the projection; None for all."""
         return None if self.rows is None else self.rows.kept
 
     @property
     def reacting(self) -> RowChoice | None:
-        """Rows to solve accelerations with; None for all."""
+        """Rows for the accelerations; None for all."""
         return None if self.rows is None else self.rows.reacting
 
 
 def midway(t0: Array, t1: Array, y0: Array, y1: Array, turn: Array | None) -> tuple[Array, Array]:
-    """(time, state) in the middle of a step, by the parabola through it where that is known.
+    """(time, state) in the middle of a step, by its parabola if that is known.
 
     Args:
         t0: start of the step.
         t1: its end.
         y0: state at its start.
         y1: state at its end.
-        turn: h dy/dt at the start less that at the end; None where it is not known.
+        turn: h dy/dt at the start minus that at the end; None if it is unknown.
     """
     middle = 0.5 * (y0 + y1)
     return t0 + 0.5 * (t1 - t0), middle if turn is None else middle + 0.125 * turn

@@ -1,4 +1,4 @@
-"""What becomes of a state at the end of a step: constraints, contacts and what slides."""
+"""Post-step processing: project onto the constraints; check contacts and the sliding direction."""
 
 from functools import reduce
 from typing import Any, NamedTuple
@@ -20,17 +20,17 @@ from jaxlag._model._forces import reads_lam, sliding
 
 
 class StepEnd(eqx.Module):
-    """Moves the end of a step onto the constraints, and looks whether what was assumed holds.
+    """Projects the end of a step onto the constraints, and checks the assumptions of the step.
 
     Attributes:
-        dynamics: what moves.
+        dynamics: the vector field.
     """
 
     dynamics: VectorField
 
     @property
     def _slides(self) -> tuple[Any, ...]:
-        """Velocities of contact points that must not change their sign."""
+        """Velocities of contact points whose sign must not change."""
         return sliding(self.dynamics.system.forces)
 
     @property
@@ -46,12 +46,12 @@ class StepEnd(eqx.Module):
 
     @property
     def contact_row(self) -> int:
-        """The first row that friction depends on, as far as it is declared; else row 0."""
+        """The first row whose multiplier friction reads; else row 0."""
         return self._contacts[0] if self._contacts else 0
 
     @property
     def settles(self) -> bool:
-        """Whether a step's end is moved, or looked at beyond its being finite."""
+        """Whether the end of a step is projected, or checked for more than finite values."""
         if self.dynamics.quasi is not None:
             return self.dynamics.projects
         chosen = self.dynamics.rows.chooses  # then some may have been left out
@@ -60,7 +60,7 @@ class StepEnd(eqx.Module):
     def __call__(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
     ) -> tuple[Array, StepChecks]:
-        """The state at the end of a step as it is kept, and what is to be said about it."""
+        """The accepted state at the end of a step, and its checks."""
         true = jnp.array(True)
         checks = StepChecks(true, true, true)
         if self.dynamics.projects:
@@ -77,7 +77,7 @@ class StepEnd(eqx.Module):
         return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args))
 
     def contacts_valid(self, tau: Array, y: Array, args: Arguments) -> Bool[Array, ""]:
-        """Whether contacts press and slide as their friction takes them to."""
+        """Whether contacts press, and slide in the direction that their friction assumes."""
         if not self._contacts and not self._slides:
             return jnp.array(True)
         tau, y, args = stop_gradient((tau, y, args))
@@ -95,15 +95,15 @@ class StepEnd(eqx.Module):
     def project(
         self, tau: Array, y: Array, args: Arguments, differentiable: bool = False
     ) -> tuple[Array, StepChecks]:
-        """The state on the constraints nearest to y, and what is to be said about it."""
+        """The nearest state on the constraints, and its checks."""
         return self._projected(self._near(tau, y, args, differentiable), y, args)
 
     def with_error(
         self, tau: Array, y: Array, args: Arguments, error: Array, near: Bool[Array, ""]
     ) -> tuple[Array, StepChecks, Array]:
-        """The same as a call, and the error of the state that is kept.
+        """The same as a call, with the error of the accepted state.
 
-        It is another near change points alone: elsewhere errors across the rows, which the
+        It differs from `error` only near change points. Elsewhere errors across the rows, which the
         projection removes, are as small as those along them.
 
         Args:
@@ -111,7 +111,7 @@ class StepEnd(eqx.Module):
             y: state at the end of a step.
             args: arguments of the step.
             error: estimate for y.
-            near: whether the step starts near such a place.
+            near: whether the step starts near a change point.
         """
         around = self._near(tau, y, args)
         y, checks = self._projected(around, y, args)
@@ -125,17 +125,17 @@ class StepEnd(eqx.Module):
         return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args)), error
 
     def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
-        """A state within a step moved towards the constraints, by one turn of Newton's method.
+        """A state within a step after one Newton iteration towards the constraints.
 
-        Its matrix has no derivative: whatever it is, a motion on the constraints stays where it is,
-        with all of its derivatives.
+        Its matrix is not differentiated: a motion on the constraints does not depend on it, nor do
+        derivatives of that motion.
 
         Args:
             tau: time of the stage.
             y: its state.
             args: arguments of the step.
-            refuses: whether it is NaN at a change point, so that the step is not taken. It is to be
-                where no estimate tells that the step is off.
+            refuses: whether the result is NaN at a change point, so that the step is rejected; for
+                steps without an error estimate.
         """
         around = self._near(*stop_gradient((tau, y, args)))
         near, apart = around.surface, around.apart
@@ -150,7 +150,7 @@ class StepEnd(eqx.Module):
         return jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan) if refuses else moved
 
     def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
-        """The least length of a row over its length at the start of the motion."""
+        """The least row length over its length at the start of the motion."""
         found = self._near(*stop_gradient((tau, y, args))).apart
         assert found is not None
         return found
@@ -163,7 +163,7 @@ class StepEnd(eqx.Module):
         )
 
     def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
-        """The constraints near a state, without rows that all but depend on one another."""
+        """The constraints near a state, without almost dependent rows."""
         surface, frozen = self.dynamics.projector(tau, y, args), None
         if differentiable:
             frozen = self.dynamics.projector(*stop_gradient((tau, y, args)))
@@ -186,15 +186,15 @@ class StepEnd(eqx.Module):
         return _Near(without(surface), frozen, jnp.min(lengths / args.lengths))
 
     def _joined(self, q: Array, v: Array, y: Array) -> Array:
-        """The state y with other coordinates and velocities."""
+        """The state y with new coordinates and velocities."""
         return jnp.concatenate([q, v, y[self.dynamics.system.size + self.dynamics.speeds :]])
 
     def _closed(
         self, surface: ConstraintProjector, q: Array, v: Array, args: Arguments
     ) -> Bool[Array, ""]:
-        """Whether rows that were left out hold as well.
+        """Whether rows that were left out as dependent are satisfied.
 
-        Where nothing holds the others, these may drift as they do.
+        Without stabilization the kept rows drift, and these may drift in proportion.
         """
         if args.rows is None:
             return jnp.array(True)
@@ -219,12 +219,12 @@ class StepEnd(eqx.Module):
 
 
 class _Near(NamedTuple):
-    """The constraints near a state, and how far apart they are there.
+    """The constraints near a state, and their distance from dependence.
 
     Attributes:
         surface: the constraints.
-        frozen: the same without derivatives; None where none are taken.
-        apart: see `_change_points.Crossing`; None where nobody asks.
+        frozen: the same without derivatives; None if it is not needed.
+        apart: see `_change_points.Crossing`; None if it is not needed.
     """
 
     surface: ConstraintProjector

@@ -1,4 +1,4 @@
-"""How one step is taken, settled and followed by the next."""
+"""Stepper: one step, its post-processing, and the choice of the next one."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,16 +25,16 @@ from jaxlag._integration._term import Term
 from jaxlag.solvers import AbstractExplicit, Splitting
 from jaxlag.solvers._unweighted_stages import at_least, unseen, unstacked, unweighted_stages
 
-SINGULAR = 1e3  # tolerances that no part of an accepted step is off by in a smooth field
+SINGULAR = 1e3  # tolerances: bound on the error of a part of an accepted step in a smooth field
 
 
 class Estimate(NamedTuple):
-    """What a step says of its error.
+    """The error estimate of a step.
 
     Attributes:
-        error: its estimate; None of methods that have none.
-        unseen: what that takes no notice of; None where there is nothing.
-        turn: h dy/dt at the start less that at the end; None where nobody asks, or it is not known.
+        error: the estimate; None for methods without one.
+        unseen: error of stages without weight in it; None if there are none.
+        turn: h dy/dt at the start minus that at the end; None if it is not needed or unknown.
     """
 
     error: PyTree
@@ -44,44 +44,44 @@ class Estimate(NamedTuple):
 
 
 class Stepper(eqx.Module):
-    """How one step is taken and the next one chosen; with no controller steps are fixed."""
+    """Takes one step and chooses the next one; without a controller steps are fixed."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController | None
     term: diffrax.AbstractTerm
-    # (args, tau) -> (args of a step from tau, where entries of tables begin in them)
+    # (args, tau) -> (args of a step from tau, start of the table entries in them)
     windows: Callable = eqx.field(static=True)
-    # (tau, y, args, differentiable) -> (the end of a step as it is kept, StepChecks)
+    # (tau, y, args, differentiable) -> (accepted state at the end of a step, StepChecks)
     step_end: Callable | None = eqx.field(static=True, default=None)
     moves: bool = eqx.field(static=True, default=False)  # whether `step_end` moves the state
     longest: Array | None = None  # bound on adaptive steps
-    # whether steps in which a comparison comes out otherwise are held to what derivatives need
+    # whether steps across a change of a comparison are held to the accuracy of derivatives
     across: bool = eqx.field(static=True, default=False)
-    # whether quasi-velocities may become singular on the way
+    # whether quasi-velocities may become singular during the motion
     passes: bool = eqx.field(static=True, default=False)
-    # whether steps end before places where rows depend on one another
+    # whether steps end before change points
     stops: bool = eqx.field(static=True, default=False)
 
     @property
     def implicit(self) -> bool:
-        """Whether equations may be solved in a step."""
+        """Whether a step may solve implicit equations."""
         return not isinstance(self.solver, AbstractExplicit | Splitting | diffrax.AbstractERK)
 
     @property
     def gap(self) -> float:
-        """Where in a step a change point is far from all stages."""
+        """The position in a step that is farthest from all stages, see `widest_gap`."""
         return widest_gap(nodes_of(self.solver))
 
     @property
     def standard(self) -> bool:
-        """Whether steps are fixed or chosen by diffrax's own control, not a variant of it."""
+        """Whether steps are fixed or chosen by diffrax's PID controller itself."""
         return self.controller is None or type(self.controller) is diffrax.PIDController
 
     def on_scalars(self, lanes: bool = False, in_loop: bool = True) -> "Stepper | None":
-        """The form for loops that are one native function, where there is one.
+        """The form for loops that are one native function; None if there is none.
 
         Args:
-            lanes: whether it is going to be vmapped.
+            lanes: whether it will be vmapped.
             in_loop: whether it is for a loop over one trajectory or a few lanes.
         """
         if not isinstance(self.term, Term) or self.term.lines is None:
@@ -97,21 +97,21 @@ class Stepper(eqx.Module):
         return self.windows(args, tau)[0]
 
     def is_sound(self, memory: Any) -> Bool[Array, ""]:
-        """Whether the first stage is finite, where that is what is carried from step to step."""
+        """Whether the first stage is finite, if it is the state carried from step to step."""
         explicit = isinstance(self.solver, AbstractExplicit)
         return all_finite(memory) if explicit and memory is not None else jnp.array(True)
 
     def for_derivatives(self, y: Array, args: Any) -> "Stepper":
         """The stepper for a motion of which derivatives are taken.
 
-        A motion that starts at rest or moves steadily, up to what error estimates do not see, takes
-        steps of any length, though perturbations of it turn or grow; and so does one whose fastest
-        motions are at rest, beside slower ones. Its steps are bounded by the time in which the
-        fastest perturbations turn or grow, as their own error estimate would have it. Other motions
-        keep their steps. Implicit methods need not follow what decays: theirs are bounded, on CPU,
-        at rest alone and by what turns or grows.
+        At rest or in steady motion, to the accuracy of the error estimates, steps have any length,
+        although perturbations turn or grow. The same holds if the fastest modes are at rest beside
+        slower ones. Steps are then bounded by the time in which the fastest perturbations turn or
+        grow by an amount that their own error estimate would detect. Other motions keep their
+        steps. Implicit methods need not resolve decay: their steps are bounded only on CPU, at
+        rest, and for perturbations that turn or grow.
 
-        Where forces may bend, perturbations jump: steps are held to more (`held_to`).
+        At kinks of forces perturbations jump: steps have a tighter bound (`held_to`).
         """
         controller: Any = self.controller
         if type(controller) is not diffrax.PIDController:
@@ -122,7 +122,7 @@ class Stepper(eqx.Module):
         return stepper._bounded_at_rest(y, args)
 
     def _bounded_at_rest(self, y: Array, args: Any) -> "Stepper":
-        """With steps bounded where error estimates do not see what perturbations do."""
+        """Bound the steps if error estimates do not detect the growth of perturbations."""
         controller: Any = self.controller
         explicit = not self.implicit
         if controller.dtmax is not None or not (explicit or jax.default_backend() == "cpu"):
@@ -142,11 +142,11 @@ class Stepper(eqx.Module):
         return replace(self, longest=longest)
 
     def begin(self, t0: Array, t1: Array, y: PyTree, args: Any) -> Any:
-        """Solver state with nothing carried over from a step before."""
+        """Solver state with nothing carried over from the step before."""
         return self.solver.init(self.term, t0, t1, y, self.within(args, t0))
 
     def afresh(self, t0: Array, t1: Array, y: PyTree, args: Any) -> tuple[Any, Any]:
-        """(solver state, whether there was a jump) for a step that takes nothing over."""
+        """(solver state, whether there was a jump) for a step without carried-over state."""
         if isinstance(self.solver, AbstractExplicit):
             return None, True
         return self.begin(t0, t1, y, args), jnp.array(True)
@@ -163,7 +163,7 @@ class Stepper(eqx.Module):
     ) -> tuple[PyTree, Estimate, Any, Bool[Array, "..."]]:
         """(y1, its error, solver state, whether implicit equations were solved).
 
-        Near a change point stages are moved onto the constraints, too.
+        Near a change point the stages are moved onto the constraints, too.
         """
         step = t0, t1, y, args, memory, jump
         if args.lengths is None:
@@ -174,7 +174,7 @@ class Stepper(eqx.Module):
         held = self._held(near)
         if not isinstance(self.solver, AbstractExplicit) or self.solver.looped:
             return held._step(*step)
-        # Another copy of every stage would take long to compile.
+        # A second unrolled copy of every stage would take long to compile.
         held = replace(held, solver=replace(self.solver, looped=True))
         plain = self._step(*step)
 
@@ -184,11 +184,11 @@ class Stepper(eqx.Module):
         return jax.lax.cond(eqxi.unvmap_any(near), chosen, lambda: plain)
 
     def _held(self, near: Array) -> "Stepper":
-        """The stepper with stages on the constraints in a step that is near a change point."""
+        """The stepper with stages moved onto the constraints in a step near a change point."""
         step_end, term = cast(StepEnd, self.step_end), cast(Term, self.term)
         refuses = self.controller is None and not self.implicit
 
-        @jax.checkpoint  # what transposes keep of a branch is copied in all steps
+        @jax.checkpoint  # residuals of a branch would be stored for all steps
         def closer(t: Array, y: Array, args: Any) -> Array:
             return jnp.where(near, step_end.stage(t, y, args, refuses), y)
 
@@ -203,10 +203,10 @@ class Stepper(eqx.Module):
     ) -> tuple[PyTree, Estimate, Any, Bool[Array, "..."]]:
         """(y1, its error, solver state, whether implicit equations were solved)."""
         if self.moves:
-            # The state is not the one that the last step ended in: its last stage is of no use.
+            # The projection has changed the state: the last stage cannot be reused.
             jump = True if isinstance(self.solver, AbstractExplicit) else jnp.array(True)
         if remembers(self.solver) and jump is not False:
-            # What was remembered is of the other side.
+            # The remembered values are from before the jump.
             fresh = self.solver.init(self.term, t0, t1, y, args)
             memory = jax.tree.map(partial(jnp.where, jump), fresh, memory)
         if isinstance(self.solver, AbstractExplicit) and self.solver.steps_as_declared:
@@ -226,16 +226,16 @@ class Stepper(eqx.Module):
         return y1, Estimate(error, beside, self._turn(dense["k"])), memory, solved
 
     def _turn(self, k: PyTree) -> PyTree:
-        """h dy/dt at the start less that at the end, where it is asked for."""
+        """h dy/dt at the start minus that at the end; None if it is not needed."""
         return k[0] - k[-1] if self.across or self.passes else None
 
     def _compares(self, tau: Array, y: Array, args: Any) -> bool:
-        """Whether there are comparisons in what is declared; nothing is computed for that."""
+        """Whether the declaration contains comparisons; found without computing them."""
         found: Any = jax.eval_shape(lambda: self._branches(tau, y, args))
         return found is not None
 
     def _branches(self, tau: Array, y: Array, args: Any) -> Array | None:
-        """Outcomes of the comparisons in what is declared."""
+        """Outcomes of the comparisons in the declaration."""
         term: Any = self.term
         return branches(term.dynamics, tau, y, self.within(args, tau))
 
@@ -249,18 +249,18 @@ class Stepper(eqx.Module):
         estimate: Estimate,
         spare: Array,
     ) -> PyTree:
-        """The error that the controller bounds; `across` a bend, that of the derivative, too.
+        """The error that the controller bounds; `across` a kink, also that of the derivative.
 
-        Where a force bends, its derivative jumps by J. A step of h across leaves an error of order
-        h^2 J in the state, and one of order h J in perturbations of it: the former over the length
-        of the step. So in a step in which a comparison comes out otherwise at its end than at its
-        start, or in its middle, the error is bounded by a part of the change over the step,
+        At a kink of a force its derivative jumps by J. A step of h across it has an error of order
+        h^2 J in the state and of order h J in perturbations: the former over the length of the
+        step. If the outcome of a comparison in the middle or at the end of a step differs from that
+        at its start, the error is therefore bounded by a part of the change over the step,
 
-            |error| <= rtol |y1 - y0| / 100     in the controller's norm;
+            |error| <= rtol |y1 - y0| / 100     in the controller's norm.
 
-        a hundredth, as the estimate is a small part of the error there: it is that of rules for
-        functions without a bend. Steps near what times can resolve, and all of them where there are
-        none to `spare`, are bounded by their own error.
+        The factor is a hundredth because the estimate, made for smooth functions, is a small part
+        of the error there. Steps near the resolution of time are bounded by their own error; so are
+        all steps if there are none to `spare`.
         """
         error = at_least(estimate.error, estimate.unseen)
         if not self.across:
@@ -280,10 +280,10 @@ class Stepper(eqx.Module):
     def is_small(
         self, y0: PyTree, y1: PyTree, error: PyTree | None, tolerances: float
     ) -> Bool[Array, ""]:
-        """Whether the error of a step to a save time, which no control rejects, is below so many.
+        """Whether the error of a step to a save time, which no control rejects, is small.
 
-        It is part of one that was accepted: an error estimate of `SINGULAR` times what is allowed
-        is that of a field which is singular, or jumps, at the save time.
+        The step is part of an accepted one. If its error estimate is `SINGULAR` tolerances, the
+        field is singular or jumps at the save time.
         """
         controller = self.controller
         if error is None or not isinstance(controller, diffrax.PIDController):
@@ -296,9 +296,9 @@ class Stepper(eqx.Module):
         return jax.tree.reduce(jnp.logical_and, jax.tree.map(small, y0, y1, error))
 
     def through(self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, args: Any) -> Array:
-        """The state at t by a polynomial through two others."""
+        """The state at t by the Hermite polynomial through two others."""
         ends = jnp.stack([t0, t1]), jnp.stack([y0, y1])
-        # A loop, as another copy of the vector field would take long to compile.
+        # A loop: a second copy of the vector field would take long to compile.
         f0, f1 = jax.lax.map(lambda end: cast(Array, self.term.vf(end[0], end[1], args)), ends)
         n = cast(Term, self.term).dynamics.system.size
         return hermite(t0, y0, f0, t1, y1, f1, t, n)
@@ -306,19 +306,19 @@ class Stepper(eqx.Module):
     def reached(
         self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, far: Array, args: Any
     ) -> Array:
-        """The state at t, by a step from t0 to t1, where that is `far`: else the one at t1."""
+        """The state at t by the polynomial from t0 to t1 if `far`; else the state at t1."""
         through = lambda: jnp.where(far, self.through(t0, y0, t1, y1, t, args), y1)  # noqa: E731
         return jax.lax.cond(eqxi.unvmap_any(far), through, lambda: y1)
 
     def determinants(self, tau: Array, y: Array, args: Any) -> Array | None:
-        """What tells singular quasi-velocities; None where they never are."""
+        """Determinants that detect singular quasi-velocities; None if these are always regular."""
         if not self.passes:
             return None
         dynamics = cast(Term, self.term).dynamics
         return determinants(dynamics, tau, dynamics.parts(y)[0], self.within(args, tau))
 
     def passage(self, *step: Any) -> Passage | None:
-        """What becomes of v and u along a step: `_quasi_singularities.passage`; None where nothing.
+        """Check of quasi-velocities along a step; None if they are always regular.
 
         Args:
             step: (t0, t1, y0, y1, args, turn, determinants at its start).
@@ -334,7 +334,7 @@ class Stepper(eqx.Module):
         return passage(cast(Term, self.term).dynamics, tolerance, *step)
 
     def same_sense(self, *step: Any) -> Bool[Array, ""]:
-        """Whether a step passes no change point, where it is not to.
+        """Whether a step passes no change point; True if it may pass one.
 
         Args:
             step: (t0, t1, y0, y1, args, turn).
@@ -344,7 +344,7 @@ class Stepper(eqx.Module):
     def settled(
         self, t: Array, y: PyTree, args: Any, differentiable: bool = False
     ) -> tuple[PyTree, StepChecks]:
-        """The end of a step as it is kept, and what is to be said about it."""
+        """The accepted state at the end of a step, and its checks."""
         if self.step_end is None:
             true = jnp.array(True)
             return y, StepChecks(true, true, true)
@@ -361,10 +361,10 @@ class Stepper(eqx.Module):
         crossing: Crossing | None,
         bound: Array,
     ) -> tuple[PyTree, StepChecks, Estimate, Crossing | None]:
-        """The same, the error of the state that is kept, and what is known of change points there.
+        """The same, with the error of the accepted state and the detection of change points.
 
-        Rounding of what is projected near such a place is not made less by shorter steps. A step
-        that need not end beside it is taken again, shorter.
+        Near a change point shorter steps do not reduce the rounding of projected states. A step
+        that need not end close to it is repeated with a shorter length.
 
         Args:
             t0: start of the step.
@@ -373,8 +373,8 @@ class Stepper(eqx.Module):
             y: state at its end.
             args: arguments of the step.
             estimate: the error of y.
-            crossing: what is known at the start of the step.
-            bound: whether it has to end there.
+            crossing: detection at the start of the step.
+            bound: whether the step has to end at t.
         """
         if crossing is None:
             return *self.settled(t, y, args), estimate, None
@@ -432,7 +432,7 @@ class Stepper(eqx.Module):
 
 
 _FINE = 64.0  # resolutions of time
-_ACROSS = 0.01  # of the change that an error across a bend may be, in tolerances
+_ACROSS = 0.01  # bound on the error across a kink over the change in the step, in tolerances
 
 
 def all_finite(y: PyTree) -> Bool[Array, ""]:
@@ -441,5 +441,5 @@ def all_finite(y: PyTree) -> Bool[Array, ""]:
 
 
 def resolution(t: Array) -> Array:
-    """Below this a difference of times near t means nothing: 8 eps |t|."""
+    """8 eps |t|: differences of times near t below this are only rounding."""
     return 8 * jnp.finfo(t.dtype).eps * jnp.abs(t)

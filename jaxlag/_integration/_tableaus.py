@@ -1,4 +1,4 @@
-"""What is known of a method by its coefficients, and how it loops over its stages."""
+"""Properties of a method from its coefficients, and the kind of its loop over stages."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,7 +18,7 @@ def remembers(solver: diffrax.AbstractSolver) -> bool:
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> Any:
-    """The coefficients of an explicit Runge-Kutta method; None of others, wrapped ones included."""
+    """The coefficients of an explicit Runge-Kutta method; None for others and for wrapped ones."""
     explicit = isinstance(solver, diffrax.AbstractERK)
     return getattr(solver, "tableau", None) if explicit else None
 
@@ -29,7 +29,7 @@ def looks_ahead(solver: diffrax.AbstractSolver) -> bool:
 
 
 def nodes_of(solver: diffrax.AbstractSolver) -> list[float]:
-    """Where in a step the stages of a Runge-Kutta method lie; none of other methods."""
+    """Positions of the stages of a Runge-Kutta method in a step; empty for other methods."""
     if isinstance(solver, diffrax.HalfSolver):
         return [0.5 * (half + c) for half in (0.0, 1.0) for c in (*nodes_of(solver.solver), 1.0)]
     if isinstance(solver, AbstractExplicit):
@@ -42,7 +42,7 @@ def nodes_of(solver: diffrax.AbstractSolver) -> list[float]:
 def with_stages(solver: Any, kind: str) -> Any:
     """A Runge-Kutta solver, wrapped or not, with its loop over stages of the given kind.
 
-    "lax" for solving, "bounded" (a scan, which every derivative passes) for replaying.
+    "lax" for solving, "bounded" (a scan, differentiable in every mode) for replaying.
     """
     if isinstance(solver, diffrax.HalfSolver):
         return eqx.tree_at(lambda s: s.solver, solver, with_stages(solver.solver, kind))

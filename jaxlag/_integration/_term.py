@@ -1,4 +1,4 @@
-"""The vector field as diffrax takes it."""
+"""The vector field as a diffrax term."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,12 +15,12 @@ from jaxlag._integration._vector_field import VectorField
 
 
 class Term(diffrax.ODETerm):
-    """A vector field whose increments keep the state's dtype where time has another.
+    """A vector field whose increments keep the dtype of the state if that of time differs.
 
     Attributes:
-        dynamics: what it is the vector field of.
-        lines: of the scalar program for the accelerations; None where there is none.
-        dtype: of the state.
+        dynamics: the system's vector field.
+        lines: number of lines of the scalar program for the accelerations; None if there is none.
+        dtype: dtype of the state.
     """
 
     dynamics: VectorField
@@ -28,7 +28,7 @@ class Term(diffrax.ODETerm):
     dtype: Any = eqx.field(static=True)
 
     def compiled_for(self, lanes: bool, in_loop: bool) -> "Term":
-        """The same, written for where it is going to be evaluated, as told to `VectorField`."""
+        """The same, compiled for the place where it is evaluated, see `VectorField`."""
         dynamics = replace(self.dynamics, lanes=lanes, in_loop=in_loop)
         field: Any = dynamics.__call__
         return Term(field, dynamics, self.lines, self.dtype)

@@ -1,4 +1,4 @@
-"""The equations of motion in first-order form, as solvers see them."""
+"""The vector field: the equations of motion in first-order form."""
 
 from dataclasses import replace
 from functools import partial
@@ -40,26 +40,26 @@ class VectorField(eqx.Module):
     tau = sigma (t - t0) with t0 the start and sigma the direction of time.
 
     In the quasi-velocity formulation y = (q, w) and dy/dtau = sigma (v, w') with w the free
-    quasi-velocities. Where work is asked for, y has one more component for each term of dH/dt.
+    quasi-velocities. With work, y has one more component for each term of dH/dt.
 
     Attributes:
-        system: what moves.
+        system: the mechanical system.
         params: static half of the params.
         inputs: static half of the inputs.
-        time_direction: sigma, +1 or -1, where known while tracing; else None.
-        power: terms of dH/dt to integrate along; None for none.
-        sample: values of the params, where known.
-        lanes: whether all this is vmapped, so that elements are arrays of numbers.
+        time_direction: sigma, +1 or -1, if known while tracing; else None.
+        power: terms of dH/dt to integrate; None for none.
+        sample: values of the params, if known.
+        lanes: whether it is vmapped, so that elements are arrays of numbers.
         in_loop: whether it is evaluated in a loop over one trajectory or a few lanes.
         rows: the constraint rows.
-        formulation: how accelerations are solved for under constraints; "quasi" for a state of
+        formulation: how accelerations are solved for with constraints; "quasi" for a state of
             quasi-velocities.
         stabilization: "projection", a `Baumgarte`, or None.
-        regular: whether M is positive definite without the constraints; None where that shows at
-            the start of a solve alone.
+        regular: whether M is positive definite without the constraints; None if that is found only
+            at the start of a solve.
         apart: whether rows whose multipliers forces read are known to be independent.
         extrapolates: whether the method has stages beyond the end of a step.
-        crossing: whether rows that come to depend on others on the way are left out there.
+        crossing: whether rows that become dependent during the motion are left out there.
     """
 
     system: System
@@ -93,7 +93,7 @@ class VectorField(eqx.Module):
 
     @property
     def quasi(self) -> QuasiVelocities | None:
-        """The quasi-velocities that the state is made of, if any."""
+        """The quasi-velocities of the state, if any."""
         return self.system.quasi if self.formulation == "quasi" else None
 
     @property
@@ -102,7 +102,7 @@ class VectorField(eqx.Module):
         return self.system.size if self.quasi is None else len(self.quasi.free)
 
     def _solved(self, terms: ArrayTerms) -> ArrayTerms:
-        """The terms with constraints solved for as asked."""
+        """The terms with the selected solve for constraints."""
         if self.quasi is not None:
             in_u = self.system._in_u
             return replace(terms, quasi=self.quasi, in_u=in_u, regular=bool(self.regular))
@@ -127,7 +127,7 @@ class VectorField(eqx.Module):
         knots = all_knots(eqx.combine(inputs, self.inputs.tree))
         if knots is None:
             return args
-        # They say which rows are read, and no derivative passes through that.
+        # Knots only select table rows: no derivative passes through them.
         knots = jnp.sort(jax.lax.stop_gradient(knots.astype(ts.dtype)))
         never = jnp.full((1,), jnp.finfo(ts.dtype).min, ts.dtype)
         ahead = KnotIntervals(self.tau(knots, args), jnp.concatenate([never, knots]))
@@ -142,7 +142,7 @@ class VectorField(eqx.Module):
     def precompute(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Arguments:
-        """The arguments with all that accelerations need of what depends on params alone."""
+        """Add to the arguments the values for accelerations that depend on params alone."""
         t, q, v, params, values = self.at(tau, y, args)
         args = args._replace(rows=self._choice(t, q, v, params, values))
         if slides := sliding(self.system.forces):
@@ -159,7 +159,7 @@ class VectorField(eqx.Module):
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether M is positive definite without the constraints, in all lanes.
 
-        Looked at as by `mass_definite`; a lane without values is none to be careful for.
+        Tested as in `mass_definite`. A lane with nonfinite values does not count.
         """
         t, q, v, params = stop_gradient((t, q, v, params))
         elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
@@ -172,21 +172,21 @@ class VectorField(eqx.Module):
     def _choice(
         self, t: Array, q: Array, v: Array, params: Any, values: Any
     ) -> RowSelection | None:
-        """The rows to solve with; None where that is no question."""
+        """The rows to solve with; None if all are used."""
         if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = stop_gradient((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         sure = all(self.rows.sure)
         there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
-        if self.rows.size == 1:  # one that vanishes here alone is not to be done without
+        if self.rows.size == 1:  # left out only if it is void
             return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.terms.rows_read(t, q, v, params, values))
-        # Where multipliers are read, what is left out is told by those that are kept.
+        # If multipliers are read, the kept rows determine which others are left out.
         reads = not np.all(unread)
         kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
-        if not np.any(velocity & ~unread):  # then those that are read come first already
+        if not np.any(velocity & ~unread):  # then the rows that are read already come first
             return RowSelection(kept, size, void, RowChoice(kept, there))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
@@ -200,7 +200,7 @@ class VectorField(eqx.Module):
         return RowSelection(kept, size, void, RowChoice(reacting, there))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
-        """The user's time t = t0 + sigma tau, which rounding must not take beyond the end."""
+        """The user's time t = t0 + sigma tau, bounded by the end in spite of rounding."""
         t, end = args.origin + self.signed(tau, args), args.end
         if self.time_direction is not None:
             bounded = (jnp.minimum if self.time_direction == 1 else jnp.maximum)(t, end)
@@ -222,7 +222,7 @@ class VectorField(eqx.Module):
         return -x if args.time_direction is None else x * args.time_direction.astype(x.dtype)
 
     def given(self, args: Arguments) -> tuple[Any, dict[str, Any]]:
-        """(params, inputs) as the user passed them; within a step of each table two entries."""
+        """(params, inputs) as the user passed them; within a step two entries of each table."""
         return (
             _params.join(args.params, self.params.tree),
             eqx.combine(args.inputs, self.inputs.tree),
@@ -235,7 +235,7 @@ class VectorField(eqx.Module):
     def windows(
         self, args: Arguments, tau: Float[Array, ""]
     ) -> tuple[Arguments, list[Array | None]]:
-        """The same, and for each leaf of the arguments where its entries start, None for all."""
+        """The same, and for each leaf of the arguments the start of its entries; None for all."""
         _, inputs = self.given(args)
         starts: dict[str, Array] = {}
         located = args
@@ -266,13 +266,13 @@ class VectorField(eqx.Module):
     def effort(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
-        """Q - h at (tau, y): what M a is equal to."""
+        """Q - h at (tau, y)."""
         t, q, v, params, values = self.at(tau, y, args)
         terms = self.terms
         return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
 
     def state_of(self, t: Array, q: Array, v: Array, params: Any) -> Array:
-        """The state of a motion in terms of (q, v), no work done yet."""
+        """The state of a motion from (q, v), with zero work."""
         w = v if self.quasi is None else self.quasi.of(t, q, v, params)[self.quasi.free]
         return self.start(q, w)
 
@@ -288,7 +288,7 @@ class VectorField(eqx.Module):
         return self.quasi.velocities(t, q, self.quasi.full(w), params)
 
     def velocities_of(self, t: Array, q: Array, w: Array, args: Arguments) -> Array:
-        """The same by the program; no input changes them."""
+        """The same by the program; it does not depend on inputs."""
         if self.quasi is None:
             return w
         values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
@@ -301,7 +301,7 @@ class VectorField(eqx.Module):
         return t, q, v, params, self.inputs_at(tau, q, v, args)
 
     def inputs_at(self, tau: Array, q: Array, v: Array, args: Arguments) -> Any:
-        """Values of the inputs within a step; else in the interval that starts at tau."""
+        """Values of the inputs within a step, or in the interval that starts at tau."""
         args = self.within(args, tau)
         (params, inputs), since = self.given(args), self.signed(tau, args)
         first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
@@ -334,7 +334,7 @@ class VectorField(eqx.Module):
         return self.program.projector(state, args.constants, self.rows, args.kept)
 
     def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
-        """The state as programs take it, of quasi-velocities where it is made of these."""
+        """The state as programs take it, with quasi-velocities if it has them."""
         t, (q, w), (params, inputs) = self.clock(tau, args), self.parts(y), self.given(args)
         v = w
         if self.quasi is not None:
@@ -347,7 +347,7 @@ class VectorField(eqx.Module):
         return y[..., :n], y[..., n:rest]
 
     def start(self, q0: Float[Array, " n"], w0: Float[Array, " k"]) -> Float[Array, " m"]:
-        """y at the start, no work done yet."""
+        """y at the start, with zero work."""
         terms = 0 if self.power is None else len(self.power.names)
         return jnp.concatenate([q0, w0, jnp.zeros((terms,), q0.dtype)])
 
@@ -362,7 +362,7 @@ class VectorField(eqx.Module):
         return dict(zip(self.power.names, columns, strict=True))
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
-        """Lines of the scalar program for states and arguments like these, where there is one."""
+        """Number of lines of the scalar program for such states; None if there is none."""
         if self.power is not None:
             return None
         _, q, _, params, values = self.at(tau, y, args)

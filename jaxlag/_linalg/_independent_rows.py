@@ -1,4 +1,4 @@
-"""Which constraint rows are independent, and how rows that are not share what they exert."""
+"""A largest independent set of constraint rows, and the multipliers of dependent rows."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,18 +15,18 @@ from jaxlag._linalg._mass_solve import eliminate, factor_mass, rank_floor
 from jaxlag._linalg._rounding_bounds import with_rounding, with_scatter
 
 ROUNDINGS = 16
-"""Of what a row is made of: if that is all of it, it is none."""
+"""Multiple of the rounding of a row up to which the row counts as zero."""
 
 ALIKE = 0.01
-"""Pivots above this part of the largest one are as good as it."""
+"""Part of the largest pivot from which on pivots count as equally good."""
 
 
 class RowChoice(NamedTuple):
-    """Rows to solve with.
+    """Rows used in solves.
 
     Attributes:
-        kept: a largest set of independent ones; the others follow from them.
-        there: those that are more than rounding.
+        kept: a largest independent set; the others follow from it.
+        there: rows that are more than rounding.
     """
 
     kept: Bool[Array, " m"]
@@ -34,13 +34,13 @@ class RowChoice(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """How large rows are.
+    """Sizes of the constraint rows.
 
     Attributes:
-        there: those that are more than rounding.
-        void: those that are rounding here and nearby: 0 = 0, whatever the motion.
-        size: their lengths; of those that are rounding how fast they grow, or what they are made
-            of if that is more.
+        there: rows that are more than rounding.
+        void: rows that are rounding here and nearby: 0 = 0 for every motion.
+        size: their lengths. For rows that are rounding, their rate of change, or the size of their
+            terms if that is larger.
     """
 
     there: Bool[Array, " m"]
@@ -54,16 +54,16 @@ def row_sizes(
     A: Float[Array, "m n"],
     sure: bool = False,
 ) -> Sizes:
-    """Which rows are more than rounding, and how large.
+    """The rows that are more than rounding, and the sizes of all rows.
 
-    At a dead point, where rows vanish, sin(pi) leaves 1e-16 of them, of no meaning whatever: what
-    a few roundings of the coordinates, and of all that is computed from them, change.
+    At a dead point, where rows vanish, sin(pi) leaves a meaningless 1e-16. Such a value changes
+    with a few roundings of the coordinates, and of all intermediate results.
 
     Args:
         rows: A as a function of q.
         q: coordinates.
         A: rows(q).
-        sure: whether none is known to be void, so that roundings of the coordinates tell enough.
+        sure: whether no row is void, so that roundings of the coordinates are sufficient.
     """
     eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
     small = eps**0.25
@@ -80,7 +80,7 @@ def row_sizes(
     found, rounding = jax.vmap(partial(with_rounding, rows))(places)
     rounding, norms = _lengths(rounding), _lengths(A)
     growth = _lengths(found[1:] - jax.lax.stop_gradient(A)[None])
-    # What is not known, as derivatives beside the end of a domain, speaks for the row.
+    # Unknown rounding, as of derivatives beside the end of a domain, does not exclude the row.
     there = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
     void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
     made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
@@ -94,12 +94,12 @@ def without_rounding(
     size: Float[Array, " m"],
     *args: Array,
 ) -> tuple[Array, ...]:
-    """Residuals of rows; of those that are void 0 if they are no more than rounding.
+    """Residuals of rows; 0 for void rows if they are no more than rounding.
 
-    Of such a row a residual does not depend on the state: what changes beside it is rounding.
+    The residual of such a row does not depend on the state: its changes nearby are rounding.
 
     Args:
-        residuals: of all rows, of coordinates and what else they are taken to be functions of.
+        residuals: of all rows, as functions of `args`.
         void: rows, see `row_sizes`.
         size: of the rows.
         args: coordinates, velocities.
@@ -113,7 +113,7 @@ def without_rounding(
 
 
 def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
-    """Lengths of rows; derivatives of those that vanish are 0. What is not known stays NaN."""
+    """Lengths of rows; derivatives of rows that vanish are 0. NaN stays NaN."""
     square = jnp.sum(A**2, axis=-1)
     return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
 
@@ -127,15 +127,15 @@ def redundant_rows_hold(
     force: Float[Array, " n"],
     units: Float[Array, " n"],
 ) -> Bool[Array, ""]:
-    """Whether A x + gamma = 0 for all rows, those that were left out included.
+    """Whether A x + gamma = 0 for all rows, including those left out as dependent.
 
-    Up to what the angle may be below which a row counts as dependent, in units of the coordinates,
-    and up to the rounding of gamma, of any row, and of the accelerations by forces, from which
-    reactions take x.
+    The tolerance is the angle below which a row counts as dependent, in units of the coordinates,
+    plus the rounding of gamma, of any row, and of the accelerations by forces that
+    reactions cancel.
 
     Args:
         A: rows.
-        x: an acceleration that some of them have been solved for.
+        x: an acceleration that satisfies some of them.
         gamma: of (t, q, v).
         state: (t, q, v).
         sizes: of the rows, see `row_sizes`.
@@ -148,7 +148,7 @@ def redundant_rows_hold(
     size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
     scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
     allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
-    # Whatever rounding x has from the rows that it solves for, the others meet in it.
+    # The rounding of x from the solved rows appears in the others.
     rounding = jnp.nan_to_num(rounding)
     allowed += ROUNDINGS * jnp.max(jnp.where(sizes.there, rounding / size, 0.0))
     allowed = allowed * size + ROUNDINGS * rounding
@@ -163,21 +163,21 @@ def independent_rows(
     there: Bool[Array, " m"] | None = None,
     mobile_first: bool = False,
 ) -> Bool[Array, " m"]:
-    """A largest set of rows that are independent of one another, found greedily.
+    """A largest independent set of rows, found greedily.
 
-    Cholesky with the largest pivot first of A (M + A^T W A)^-1 A^T, rows scaled to 1: a pivot is
-    the squared sine of the angle between a row and those chosen before it. Of equal ones the
-    first is taken.
+    Cholesky factorization with diagonal pivoting of A (M + A^T W A)^-1 A^T, rows scaled to 1. A
+    pivot is the squared sine of the angle between a row and those chosen before it. Of equal
+    pivots the first is taken.
 
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
-        turn: for every row, when it is to be taken: before all rows of a higher number; None for
-            all at once.
+        turn: for every row its priority: rows of a lower number are taken first; None for
+            one priority.
         floor: least pivot; by default `rank_floor`.
-        there: rows that are not taken for zero; by default those that are not.
-        mobile_first: of rows whose pivots are much alike take that along which a force of the same
-            size moves most. By it `least_norm` tells well what the others take.
+        there: rows that do not count as zero; by default the nonzero ones.
+        mobile_first: of rows with similar pivots take the one along which a force of the same
+            size moves most. `least_norm` is then accurate for the others.
 
     Source: Golub, Van Loan, Matrix Computations, sec. 4.2.8.
     """
@@ -186,7 +186,7 @@ def independent_rows(
     floor = rank_floor(A.dtype) if floor is None else floor
     nonzero = norms > 0
     usable = nonzero if there is None else nonzero & there
-    if m == 1:  # nothing to depend on
+    if m == 1:  # no other rows
         return usable
     A = jnp.where(usable[:, None], A, 0.0) / jnp.where(usable, norms, 1.0)[:, None]
     mass = factor_mass(augmented(M, A)[0])
@@ -221,19 +221,19 @@ def least_norm(
 ) -> Float[Array, " m"]:
     """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
 
-    |A_k lam_k| is the generalized force of row k alone, so that the choice does not depend on
-    how a residual is scaled. Rows are compared in units of the coordinates, for short levers make
-    rows alike that are not: with unit rows a_k there, those that are left out are a_j = C_j a_kept,
-    and what they take, z_j, the kept ones give, mu_kept - C^T z. Of all z the least norm is a
-    problem of least squares; A^T lam stays what it is, however well that is solved. Rows that do
-    not follow from those that are kept have none. Derivatives are those at constant rank of A.
+    |A_k lam_k| is the generalized force of row k alone, so that the result does not depend on
+    the scale of a residual. Rows are compared in units of the coordinates, because with short
+    levers different rows look alike. With unit rows a_k, dependent rows are a_j = C_j a_kept. A
+    multiplier z_j of such a row reduces the kept ones to mu_kept - C^T z. The z of least norm is a
+    least-squares problem; A^T lam does not depend on its accuracy. Rows that do
+    not follow from the kept ones have none. Derivatives are those at constant rank of A.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam.
-        kept: a largest set of independent rows; by default it is looked for.
-        there: rows that are more than rounding, see `row_sizes`; by default those that are not 0.
-        units: of the coordinates, in which rows are compared; by default 1.
+        kept: a largest set of independent rows; by default it is computed.
+        there: rows that are more than rounding, see `row_sizes`; by default the nonzero ones.
+        units: of the coordinates, for the comparison of rows; by default 1.
 
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
@@ -252,14 +252,14 @@ def least_norm(
     C = _least_squares(unit.T, unit.T, kept).T
     apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
     follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))
-    # What a row has of another by rounding alone may be much to one of smaller weight.
+    # Coefficients that are rounding could be large for a row of smaller weight.
     rounding = jnp.abs(C) <= ROUNDINGS * float(jnp.finfo(A.dtype).eps)
     C = C - jax.lax.stop_gradient(jnp.where(rounding, C, 0.0))
     C = jnp.where(follows[:, None], C, 0.0)
     mu, weights = sizes * lam, norms / sizes
     of_kept = jnp.where(kept, mu + mu @ C, 0.0)
-    # Normal equations, in units in which their diagonal is 1: weights may be as unlike as forces
-    # and moments of short levers, and rows of small ones are kept, so that they are no worse.
+    # Normal equations, in units in which their diagonal is 1: weights may differ as much as forces
+    # and moments of short levers. Rows of small weights are kept, so that accuracy is not lost.
     moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
     lengths = _lengths(moved.T)
     lengths = jnp.where(lengths > 0, lengths, 1.0)
@@ -274,7 +274,7 @@ def least_norm(
 def _least_squares(
     X: Float[Array, "r m"], Y: Float[Array, "r k"], columns: Bool[Array, " m"]
 ) -> Float[Array, "m k"]:
-    """The x that minimise |X x - Y| over these columns of X, 0 in the others; by Q R."""
+    """The x that minimizes |X x - Y| over these columns of X, 0 in the others; by QR."""
     m = X.shape[1]
     spare = jnp.diag((~columns).astype(X.dtype))
     Q, R = jnp.linalg.qr(jnp.concatenate([jnp.where(columns, X, 0.0), spare]))
@@ -290,15 +290,15 @@ def shared(
     group: Sequence[bool] | np.ndarray,
     units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
-    """The multipliers with those of a group of rows of least norm among themselves.
+    """The multipliers, with those of a group of rows of least norm within the group.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam, 0 where rows are not kept.
-        kept: a largest set of independent rows, first of those of the group.
+        kept: a largest set of independent rows, those of the group first.
         there: rows that are more than rounding.
         group: for every row, whether it belongs to the group.
-        units: of the coordinates, in which rows are compared.
+        units: of the coordinates, for the comparison of rows.
     """
     chosen = np.flatnonzero(group)
     if len(chosen) < 2:

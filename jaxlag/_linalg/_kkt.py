@@ -1,7 +1,7 @@
-"""Solves with M bordered by constraint rows: M x - A^T lam = r, A x + c = 0.
+"""KKT systems: solves with M bordered by constraint rows, M x - A^T lam = r, A x + c = 0.
 
-M may be singular, but is positive definite on the tangent space A x = 0. Rows that depend on
-others are left out by a mask `kept`; their lam is 0.
+M may be singular, but is positive definite on the tangent space A x = 0. A mask `kept` leaves out
+rows that depend on others; their lam is 0.
 """
 
 from collections.abc import Callable
@@ -105,15 +105,15 @@ def factor_kkt(
     formulation: str,
     crossing: bool = False,
 ) -> Factor:
-    """Factor once, for any number of right-hand sides.
+    """Factor the KKT matrix once, for any number of right-hand sides.
 
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
         kept: rows to solve with; None for all.
         formulation: "multipliers" or "null_space".
-        crossing: whether rows that depend on those before them are left out; else they are not
-            healthy.
+        crossing: whether rows that depend on those before them are left out; otherwise they are
+            unhealthy.
     """
     A = masked(A, kept)
     if formulation == "null_space":
@@ -132,8 +132,8 @@ def augmented(
 ) -> tuple[Float[Array, "n n"], Float[Array, " m"]]:
     """(M + A^T W A, W): positive definite if M is semidefinite, and definite on A x = 0.
 
-    W is diagonal, 1 / sum_i A_ki^2 / M_ii over the coordinates with inertia: what a row adds is
-    as large as the inertia that it meets, however different inertias are.
+    W is diagonal, 1 / sum_i A_ki^2 / M_ii over the coordinates with inertia: the term of a row is
+    as large as the inertia of its coordinates, also if inertias differ widely.
     """
     inertias = jnp.diagonal(M)
     there = inertias > 0
@@ -147,13 +147,13 @@ def augmented(
 
 
 def _size(M: Array) -> Array:
-    """The trace of M; 1 where there is no inertia at all, as in a motion led throughout."""
+    """The trace of M; 1 if M = 0 (motion fully prescribed by constraints)."""
     trace = jnp.trace(M)
     return jnp.where(trace > 0, trace, jnp.ones_like(trace))
 
 
 def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
+    """1 / sqrt of the inertia of every coordinate; of A^T W A if M has none."""
     inertias = jnp.diagonal(M)
     inertias = jnp.where(inertias > 0, inertias, jnp.diagonal(augmented(M, A)[0]))
     return jax.lax.rsqrt(jnp.where(inertias > 0, inertias, 1.0))
@@ -162,7 +162,7 @@ def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n
 def _null_space(
     M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, crossing: bool
 ) -> NullSpace:
-    """Rows made orthonormal one after the other, each twice (Gram-Schmidt, "twice is enough")."""
+    """Gram-Schmidt orthonormalization of the rows, each row twice ("twice is enough")."""
     units = units_of(M, A)
     M, A = units[:, None] * M * units[None], A * units[None]
     m, n = A.shape
@@ -191,7 +191,7 @@ def _null_space(
 
 
 def masked(A: Array, kept: Bool[Array, " m"] | None) -> Array:
-    """A, or entries of c, with rows that are not kept set to zero."""
+    """A, or entries of c, with zeros for rows that are not kept."""
     if kept is None:
         return A
     return jnp.where(kept if A.ndim == 1 else kept[:, None], A, jnp.zeros_like(A))
@@ -207,9 +207,9 @@ def solve_kkt(
     factor: Factor | None = None,
     crossing: bool = False,
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-    """(x, lam) with M x = r + A^T lam, A x + c = 0; NaN where there is none.
+    """(x, lam) with M x = r + A^T lam, A x + c = 0; NaN if there is no solution.
 
-    Derivatives reuse the factor; the set of rows kept is constant under them.
+    Derivatives reuse the factor; they hold for a constant set of kept rows.
 
     Args:
         M: symmetric, positive definite where A x = 0.
@@ -217,9 +217,9 @@ def solve_kkt(
         r: right-hand side.
         c: right-hand side of the rows.
         kept: rows to solve with; None for all.
-        formulation: how, "multipliers" or "null_space".
-        factor: `factor_kkt` of the same if it exists already.
-        crossing: as `factor_kkt` takes it.
+        formulation: "multipliers" or "null_space".
+        factor: `factor_kkt` of the same, if it exists already.
+        crossing: as for `factor_kkt`.
     """
     frozen = jax.lax.stop_gradient((M, A))
     factor = factor_kkt(*frozen, kept, formulation, crossing) if factor is None else factor
@@ -254,11 +254,11 @@ def solve_reactions(
     kept: Bool[Array, " m"] | None,
     affine: bool,
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-    """(x, lam) with M x = r + push(lam) + A^T lam, A x + c = 0; NaN where there is none.
+    """(x, lam) with M x = r + push(lam) + A^T lam, A x + c = 0; NaN if there is no solution.
 
-    Newton's method on lam, one step of it where push is affine. Each takes the unsymmetric
-    A (M + A^T W A)^-1 (A^T + d push/d lam), by L U without exchanges: a pivot that is not positive
-    means that reaction forces have turned the sense of rows (Painleve), and that there is no
+    Newton's method on lam, with one step if push is affine. Each step solves with the unsymmetric
+    A (M + A^T W A)^-1 (A^T + d push/d lam), by LU factorization without pivoting. A pivot that is
+    not positive means that reaction forces have reversed the sense of rows (Painleve): there is no
     solution, or more than one.
 
     Args:
@@ -322,7 +322,7 @@ MAX_NEWTON = 50
 
 
 def _iterated(newton: Callable, lam: Array) -> Array:
-    """The lam that Newton's method settles at, or after MAX_NEWTON steps."""
+    """The lam at which Newton's method converges, or after MAX_NEWTON steps."""
     eps = float(jnp.finfo(lam.dtype).eps)
 
     def turn(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

@@ -22,12 +22,12 @@ def dependence_floor(dtype: jnp.dtype) -> float:
 
 
 def rank_floor(dtype: jnp.dtype) -> float:
-    """The same in flight, where rows that were independent at the start no longer are: eps^2/3."""
+    """The same during a motion, for rows that were independent at its start: eps^2/3."""
     return float(jnp.finfo(dtype).eps) ** (2 / 3)
 
 
 def closed_to(dtype: jnp.dtype) -> float:
-    """Residual over row and state up to which rows that were left out hold: eps^3/4."""
+    """Residual over row and state up to which dependent rows count as satisfied: eps^3/4."""
     return float(jnp.finfo(dtype).eps) ** 0.75
 
 
@@ -58,14 +58,14 @@ def factor_mass(
 ) -> MassFactor:
     """Factor M once; `healthy[i]` is whether pivot i is positive to working precision.
 
-    A pivot below 4 n eps M_ii is what cancellation leaves of a singular matrix, whatever the
-    units of coordinate i. A singular matrix whose other pivots are ill-conditioned themselves can
-    pass: its round-off is larger than that.
+    A pivot below 4 n eps M_ii is the rounding of a singular matrix, for all units of
+    coordinate i. A singular matrix whose other pivots are ill-conditioned can
+    pass: its rounding is larger than that.
 
     Args:
         M: symmetric.
-        relative: what to multiply M_ii with instead of 4 n eps.
-        crossing: whether a pivot that is too small is taken for infinite, so that its unknown is 0.
+        relative: factor of M_ii instead of 4 n eps.
+        crossing: whether a pivot that is too small is set to infinity, so that its unknown is 0.
     """
     n = M.shape[0]
     floor = _floor(M) if relative is None else relative * jnp.abs(jnp.diagonal(M))
@@ -92,7 +92,7 @@ def factor_mass(
 def first_unhealthy(M: Float[Array, "n n"], factor: MassFactor | None = None) -> Int[Array, ""]:
     """Index of the coordinate whose pivot fails first, -1 if M is positive definite.
 
-    A library factorisation that fails does not say where, so a plain elimination looks again.
+    A failed library factorization does not report the index, so a plain elimination finds it.
 
     Args:
         M: symmetric.
@@ -109,9 +109,9 @@ def first_unhealthy(M: Float[Array, "n n"], factor: MassFactor | None = None) ->
 def _eliminated(
     M: Float[Array, "n n"], floor: Float[Array, " n"] | None = None
 ) -> Float[Array, "n n"]:
-    """U = D L^T on and above the diagonal, by rows; what is below it means nothing.
+    """U = D L^T on and above the diagonal, by rows; elements below it are meaningless.
 
-    Pivots that are no more than `floor` are taken for infinite.
+    Pivots up to `floor` are set to infinity.
     """
     n = M.shape[0]
     at = jnp.arange(n)
@@ -119,7 +119,7 @@ def _eliminated(
     def one(k: Int[Array, ""], M: Float[Array, "n n"]) -> Float[Array, "n n"]:
         if floor is not None:
             M = M.at[k, k].set(jnp.where(M[k, k] <= floor[k], jnp.inf, M[k, k]))
-        # XLA would divide again for every entry.
+        # XLA would repeat the division for every entry.
         ratio = jax.lax.optimization_barrier(M[k] / M[k, k])
         return jnp.where((at > k)[:, None], M - ratio[:, None] * M[k][None], M)
 
@@ -140,7 +140,7 @@ def _floor(M: Float[Array, "n n"]) -> Float[Array, " n"]:
 
 
 def eliminate(factor: MassFactor, r: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The x with M x = r, whatever the health of the factor."""
+    """The x with M x = r, also for an unhealthy factor."""
     if factor.upper is None:
         assert factor.cholesky is not None
         return cho_solve((factor.cholesky, True), r)
@@ -180,7 +180,7 @@ def _substituted(U: Float[Array, "n n"], r: Float[Array, " n"]) -> Float[Array, 
 def solve_mass(
     M: Float[Array, "n n"], r: Float[Array, " n"], factor: MassFactor | None = None
 ) -> Float[Array, " n"]:
-    """The x with M x = r; NaN where M is not positive definite.
+    """The x with M x = r; NaN if M is not positive definite.
 
     Derivatives reuse the factor: dx = M^-1 (dr - dM x).
 

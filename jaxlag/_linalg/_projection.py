@@ -1,4 +1,4 @@
-"""Projection of a state onto its constraints, by the metric of M and one factorisation."""
+"""Projection of a state onto its constraints, in the metric of M with one factorization."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,20 +9,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 MAX_TURNS = 12
 SWEEPS = 3
-TARGET = 8.0  # roundings of the state below which a correction is not worth a turn
-ACCEPTED = 0.6  # a state counts as consistent where its correction is below eps^this
+TARGET = 8.0  # roundings of the state: smaller corrections are not iterated
+ACCEPTED = 0.6  # a state counts as consistent if its correction is below eps^this
 
 
 class ConstraintProjector(NamedTuple):
     """The constraints near a predicted state, as functions of vectors.
 
     Attributes:
-        position: q -> phi(t, q), None where no row has one.
-        velocity: (q, v) -> A v + b; None where velocities satisfy all rows by themselves.
+        position: q -> phi(t, q), None if no row has one.
+        velocity: (q, v) -> A v + b; None if velocities satisfy all rows by definition.
         shift: c -> M^-1 A^T (A M^-1 A^T)^-1 c over the rows of `position`, at the predicted state.
         kick: the same over all rows; None as `velocity`.
-        columns: of its matrix, 0 for rows that are left out; None as `velocity`.
-        masses: diagonal of (A M^-1 A^T)^-1, 0 for those that are left out; None where nobody asks.
+        columns: columns of its matrix, 0 for rows that are left out; None as `velocity`.
+        masses: diagonal of (A M^-1 A^T)^-1, 0 for rows that are left out; None if not needed.
     """
 
     position: Callable | None
@@ -36,18 +36,18 @@ class ConstraintProjector(NamedTuple):
 def project(
     surface: ConstraintProjector, q: Array, v: Array, frozen: ConstraintProjector | None = None
 ) -> tuple[Array, Array, Bool[Array, ""]]:
-    """The consistent (q, v) nearest to a predicted one, and whether it was found.
+    """The consistent (q, v) nearest to a predicted one, and whether the iteration converged.
 
     First q* = q - M^-1 A^T mu with phi(t, q*) = 0, then v* = v - M^-1 A^T nu with
-    A(t, q*) v* + b(t, q*) = 0; M and A at the predicted state, factored once. The order of a
-    solver is kept, since both moves are as large as its local error.
+    A(t, q*) v* + b(t, q*) = 0; M and A at the predicted state, factored once. The order of the
+    solver is kept, since both corrections are as large as its local error.
 
     Args:
         surface: the constraints.
         q: predicted coordinates.
         v: predicted velocities.
-        frozen: the same surface without derivatives, where derivatives are going to be taken.
-            They are those of the equations, whatever number of turns it took to solve them.
+        frozen: the same surface without derivatives, if derivatives will be taken.
+            They are those of the equations and do not depend on the number of iterations.
 
     Source: Hairer, Wanner, Solving Ordinary Differential Equations II, sec. VII.2 (projection).
     """
@@ -67,10 +67,10 @@ def project(
 def tangential(
     surface: ConstraintProjector, q: Array, v: Array, dq: Array, dv: Array
 ) -> tuple[Array, Array]:
-    """What is left of an error (dq, dv) when both states, with it and without, are projected.
+    """The error (dq, dv) after the projection: the difference of the projected states.
 
-    What is left is along the constraints, and of second order in the rest, by one turn of Newton's
-    method from (q + dq, v + dv).
+    It is along the constraints, up to second order, by one Newton iteration
+    from (q + dq, v + dv).
 
     Args:
         surface: the constraints.
@@ -89,7 +89,7 @@ def tangential(
 
 
 def turns_needed(surface: ConstraintProjector, q: Array, v: Array) -> Int[Array, ""]:
-    """The larger of the numbers of turns that `project` takes for q and for v."""
+    """The larger of the numbers of iterations of `project` for q and for v."""
     count = jnp.zeros((), jnp.int32)
     if surface.position is not None:
         equation = _Equation(surface.position, surface.shift)
@@ -123,11 +123,11 @@ class _Equation(NamedTuple):
 def _solved(
     equation: _Equation, start: Array, frozen: _Equation | None
 ) -> tuple[Array, Bool[Array, ""]]:
-    """(x, whether it is one): mu grows by what is left of the residual.
+    """(x, whether it converged), by the simplified Newton method: mu grows by the residual.
 
-    That shrinks per turn by a factor as small as the way from the predicted state. Where mu is
-    solved for, further turns are the identity with the derivative of the implicit function, to
-    that factor to the power of their number.
+    The residual shrinks per iteration by a factor proportional to the distance from the predicted
+    state. At the solution further iterations are the identity with the derivative of the implicit
+    function, up to that factor to the power of their number.
     """
     if frozen is None:
         mu, size, _ = _iterate(equation, start)
@@ -139,9 +139,9 @@ def _solved(
 
 
 def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
-    """(mu at which nothing is left, up to rounding or after MAX_TURNS; what is left; turns).
+    """(mu for which the residual is rounding, or after MAX_TURNS; the residual; iterations).
 
-    The first turn, which is enough after most steps, is outside the loop.
+    The first iteration, which is sufficient after most steps, is outside the loop.
     """
     target = TARGET * _eps(start)
 

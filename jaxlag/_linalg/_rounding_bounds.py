@@ -1,10 +1,10 @@
-"""How far rounding may move what a function gives: every operation of it is rounded in other ways.
+"""Rounding bounds of a function by stochastic arithmetic.
 
-A number that is 0 but for rounding has no size of its own to compare it with. What it is made of
-tells: each result of an operation is changed by some roundings of its size, at random, in several
-runs side by side; so far the results differ. Operations that are exact, as moves of numbers are,
-change nothing, and choices are made as without changes. Loops and library calls are taken as one
-operation each.
+If the exact value of a result is 0, the computed number has no scale to be compared with. The scale
+follows from the operations: several runs change each result of an operation by random multiples of
+its rounding, and the difference of their results is the bound. Exact operations, such as moves of
+numbers, change nothing. Choices are those of the unchanged run. Loops and library calls count as
+one operation each.
 
 Source: Vignes, A stochastic arithmetic for reliable scientific computation, Mathematics and
 Computers in Simulation 35 (1993) 233.
@@ -23,10 +23,10 @@ from jaxlag._core._jaxprs import called
 
 RUNS = 4
 STRENGTH = 256.0
-"""Roundings by which results are changed: so many that the rounding of the runs is none to them."""
+"""Roundings by which results are changed: so many that the runs' own rounding is negligible."""
 
 NEARBY = 8
-"""Places; that all of so many results agree by luck is not to be feared."""
+"""Number of states; so many results are very unlikely to agree by chance."""
 
 _TABLE = 1021
 _EXACT = frozenset(
@@ -77,14 +77,14 @@ _EXACT = frozenset(
 
 
 def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
-    """(Results, what one rounding of every operation, and of the arguments, may change in them).
+    """(results, their changes by one rounding of every operation and of the arguments).
 
     Args:
         function: of arrays, with arrays as results.
         args: its arguments.
 
     Returns:
-        Changes are absolute; NaN where they are not known, as beside the end of a domain.
+        Changes are absolute; NaN if unknown, as beside the end of a domain.
     """
     args = jax.lax.stop_gradient(args)
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
@@ -106,9 +106,9 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
 
 
 def with_scatter(function: Callable, *args: Array) -> tuple[Any, Any]:
-    """(Results, how far they differ at places nearby), from one program.
+    """(results, their spread over states nearby), from one program.
 
-    Of what does not change with its arguments that is its rounding, whatever it is made of.
+    For a result that does not depend on the arguments the spread is its rounding.
 
     Args:
         function: of arrays, with arrays as results.
@@ -129,7 +129,7 @@ def with_scatter(function: Callable, *args: Array) -> tuple[Any, Any]:
 
 
 class _Changed:
-    """One run; every change takes the next numbers of a row of random ones."""
+    """One run; every change takes the next entries of a row of random numbers."""
 
     def __init__(self, signs: Array) -> None:
         self.signs, self.place = signs, 0
@@ -155,7 +155,7 @@ class _Changed:
     def run(
         self, closed: ClosedJaxpr, exact: Sequence[Any], given: Sequence[Any]
     ) -> tuple[list[Any], list[Any]]:
-        """(the results, the results changed)."""
+        """(the results, the changed results)."""
         jaxpr = closed.jaxpr
         values = dict(zip(jaxpr.constvars, [(c, c) for c in closed.consts], strict=True))
         values |= dict(zip(jaxpr.invars, zip(exact, given, strict=True), strict=True))
@@ -187,7 +187,7 @@ class _Changed:
             given = [exact[0], *given[1:]]
         if name in _EXACT:
             return plain, bind(given)
-        # A sum is rounded by its terms, which may be far larger.
+        # A sum is rounded in proportion to its terms, which may be far larger.
         if any(np.shape(x) not in ((), plain[0].shape) for x in given) or len(plain) > 1:
             given = [self(x) for x in given]
         return plain, [self(x) for x in bind(given)]

@@ -1,4 +1,4 @@
-"""From a declared system to the terms of its equations of motion."""
+"""The terms of the equations of motion, derived from a declared system."""
 
 from jaxlag._lowering._acceleration_program import AccelerationProgram as AccelerationProgram
 from jaxlag._lowering._acceleration_program import ArrayProgram as ArrayProgram

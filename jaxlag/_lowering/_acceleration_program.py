@@ -1,4 +1,4 @@
-"""Programs of the equations of motion that a solver evaluates, and the one on arrays."""
+"""Acceleration programs: the interface that solvers evaluate, and its form on arrays."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping

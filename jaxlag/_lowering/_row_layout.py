@@ -1,4 +1,4 @@
-"""Which rows A v + b there are, and what they contain: read from their program, not from values."""
+"""Row layout: constraint rows A v + b and their contents, from the jaxpr and not from values."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache

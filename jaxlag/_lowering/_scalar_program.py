@@ -1,4 +1,4 @@
-"""The program on scalars: every element of every array is a scalar of its own."""
+"""The scalar program: every element of every array is a separate scalar."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

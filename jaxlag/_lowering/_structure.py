@@ -1,4 +1,4 @@
-"""What the traced equations do and do not depend on, read from their jaxprs."""
+"""Structure of the traced equations: their dependences, from the jaxprs."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

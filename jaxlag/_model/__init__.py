@@ -1,1 +1,1 @@
-"""What a user declares: coordinates, forces, constraints, quasi-velocities, inputs."""
+"""Declarations of the user: coordinates, forces, constraints, quasi-velocities, inputs."""

@@ -1,4 +1,4 @@
-"""Constraints A(t,q) v + b(t,q) = 0, declared by one residual each; rows bear names."""
+"""Constraints A(t,q) v + b(t,q) = 0, each declared by a residual; rows have names."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from jaxlag._tracing._traced_function import traced_function, traced_unless_modu
 
 
 class AbstractConstraint(eqx.Module):
-    """Rows of A(t,q) v + b(t,q) = 0, on which the constraint exerts A^T lam on the system.
+    """Rows of A(t,q) v + b(t,q) = 0, with the generalized force A^T lam on the system.
 
     Attributes:
         names: one name for all rows, or one for each.
@@ -36,7 +36,7 @@ class AbstractConstraint(eqx.Module):
     def position(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
     ) -> Float[Array, " k"]:
-        """phi(t, q), where there is one."""
+        """phi(t, q), for holonomic constraints."""
         raise NotImplementedError
 
     def velocity(
@@ -47,21 +47,21 @@ class AbstractConstraint(eqx.Module):
 
 
 class Holonomic(AbstractConstraint):
-    """Position constraint phi(t, q) = 0, rheonomic where phi depends on t.
+    """Position constraint phi(t, q) = 0, rheonomic if phi depends on t.
 
-    A = d phi/dq, b = d phi/dt and gamma come from phi by automatic differentiation. The
-    constraint exerts the generalized force A^T lam on the system: with phi = r(q) - r0 for a
-    point held at r0, lam is the force on that point (N, along the axes of r); with
+    A = d phi/dq, b = d phi/dt and gamma follow from phi by automatic differentiation. The
+    generalized force of the constraint on the system is A^T lam. With phi = r(q) - r0 for a
+    point held at r0, lam is the force on that point (N, along the axes of r). With
     phi = |r|^2 - l^2, -2 l lam is the tension of the rod.
 
     Args:
         phi: function `phi(t, q, params)` returning a scalar or shape (k,).
-        names: one name, under which `motion.multipliers[name]` has the shape of phi, or a
+        names: one name, and `motion.multipliers[name]` has the shape of phi, or a
             name for each of the k rows.
 
     Raises:
-        ValueError: `phi` is not callable in this form; names that are empty or not distinct.
-            While tracing: a row that contains no coordinate.
+        ValueError: `phi` cannot be called in this form; names that are empty or not distinct.
+            While tracing: a row without coordinates.
 
     Source: Pila, eqs. 3.10, 3.11, 3.118.
     """
@@ -96,12 +96,12 @@ class Pfaffian(AbstractConstraint):
     Args:
         residual: function `residual(t, q, v, params)`, affine in v, returning a scalar or shape
             (k,). With a velocity of the contact point as residual, lam is the force on that point.
-        names: one name, under which `motion.multipliers[name]` has the shape of the residual,
+        names: one name, and `motion.multipliers[name]` has the shape of the residual,
             or a name for each of the k rows.
 
     Raises:
-        ValueError: `residual` is not callable in this form; names that are empty or not distinct.
-            While tracing: a row that is not affine in v, as far as its program tells, or that
+        ValueError: `residual` cannot be called in this form; names that are empty or not distinct.
+            While tracing: a row that is not affine in v according to its program, or that
             contains no velocity.
 
     Source: Pila, eqs. 3.12, 3.14, 3.118.
@@ -126,10 +126,10 @@ class Pfaffian(AbstractConstraint):
 
 @dataclass(frozen=True)
 class Baumgarte:
-    """Stabilisation A a + gamma + 2 alpha (A v + b) + beta^2 phi = 0 in place of projection.
+    """Stabilization A a + gamma + 2 alpha (A v + b) + beta^2 phi = 0 instead of projection.
 
-    Residuals decay at the rates alpha +- sqrt(alpha^2 - beta^2), but are never zero; rates that
-    are not small against 1/h make the equations stiff. Rows without phi take alpha alone.
+    Residuals decay at the rates alpha +- sqrt(alpha^2 - beta^2), but are never zero. Rates that
+    are not small against 1/h make the equations stiff. Rows without phi use alpha alone.
 
     Attributes:
         alpha: 1/s.
@@ -168,7 +168,7 @@ def _names(kind: str, names: Any) -> str | tuple[str, ...]:
 
 
 def _rows(constraint: AbstractConstraint, function: str, value: Any, dtype: Any) -> Array:
-    """What a residual returned, as a flat array; raises in our form while tracing."""
+    """The value of a residual as a flat array; raises with the constraint's name while tracing."""
     argument = f"constraint {constraint.names!r}: {function}"
     if not eqx.is_array_like(value):
         raise invalid(argument, "return an array", f"it returned {value!r}", "Use jnp.stack.")
@@ -217,7 +217,7 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
 def check_reactions(
     constraints: tuple[AbstractConstraint, ...], forces: tuple[AbstractForce, ...]
 ) -> None:
-    """Raise unless rows and forces bear names of their own, and forces read rows that exist."""
+    """Raise unless rows and forces have distinct names, and forces read existing rows."""
     names = [name for constraint in constraints for name in constraint.all_names]
     taken = {force.name for force in forces}
     for name in names:
@@ -234,14 +234,14 @@ def check_reactions(
 
 
 class ConstraintRows(NamedTuple):
-    """Which rows are whose, found by tracing.
+    """Names, shapes and kinds of the constraint rows, found by tracing.
 
     Attributes:
-        shapes: name -> shape of what belongs to it, in the order of the rows.
+        shapes: name -> shape of its rows, in the order of the rows.
         labels: one label for every row: the name, or name[i].
         holonomic: for every row, whether it has a position residual.
         driven: for every row, whether b may differ from 0, so that the row may do work.
-        sure: for every row, whether its program shows that A is no mere rounding.
+        sure: for every row, whether its program shows that A is more than rounding.
     """
 
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
@@ -252,7 +252,7 @@ class ConstraintRows(NamedTuple):
 
     @property
     def chooses(self) -> bool:
-        """Whether rows to solve with are chosen: of several, or whether a single one is any."""
+        """Whether rows for the solves are selected: of several, or one that may be void."""
         return self.size > 1 or not all(self.sure)
 
     @property
@@ -267,11 +267,11 @@ class ConstraintRows(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """For every row the name that it bears or belongs to."""
+        """For every row its name."""
         return tuple(name for name, shape in self.shapes for _ in range(int(np.prod(shape))))
 
     def contradiction(self, coordinates: int) -> str:
-        """What may be said about rows that contradict one another."""
+        """Advice on contradictory rows."""
         if self.size <= coordinates:
             return ""
         return (
@@ -300,7 +300,7 @@ class ConstraintRows(NamedTuple):
         return parts
 
     def of_all(self, phi: Array) -> Array:
-        """Position residuals, shape (k,), for every row: 0 where there is none."""
+        """Position residuals, shape (k,), for every row: 0 for Pfaffian rows."""
         rows = np.flatnonzero(self.holonomic)
         return jnp.zeros((self.size,), phi.dtype).at[rows].set(phi)
 
@@ -338,7 +338,7 @@ def velocity_rows(
 def position_or_zero(
     constraints: tuple[AbstractConstraint, ...], t: Array, q: Array, params: Any
 ) -> Float[Array, " m"]:
-    """phi(t, q) for every row, 0 where there is none."""
+    """phi(t, q) for every row, 0 for Pfaffian rows."""
 
     def of(c: AbstractConstraint) -> Array:
         if c.holonomic:

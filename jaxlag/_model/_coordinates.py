@@ -1,4 +1,4 @@
-"""Names and shapes of the coordinates, and the flat vector they are stored in."""
+"""Names and shapes of the coordinates, and the flat vector that stores them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from jaxlag._core._arrays import of_state
 from jaxlag._core._errors import invalid
 
 ORDER = "The order of the arguments is (q, v, params)."
-"""Said where something else stands in the place of q or v."""
+"""Error text if another value is passed for q or v."""
 
 
 class Coordinates:
@@ -130,7 +130,7 @@ def _is_count(x: Any) -> bool:
 def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     """`x` as an inexact array of shape (n,); raises naming `argument` if it cannot be one.
 
-    A number will do for a single coordinate.
+    A scalar is accepted for a single coordinate.
     """
     n = coordinates.size
     fix = f"Give one entry per coordinate, in the order {list(coordinates.labels)}."

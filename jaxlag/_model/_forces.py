@@ -15,7 +15,7 @@ from jaxlag._tracing._signature import accepts, gradient, require_arity, wants
 from jaxlag._tracing._traced_function import traced_function
 
 EXPLICIT_TIME = "explicit time"
-"""Name of the power -dL/dt at fixed (q, v), which no force may bear."""
+"""Name of the power -dL/dt at fixed (q, v); no force may have it."""
 
 _ARGUMENTS = ("t", "q", "v", "params", "inputs")
 
@@ -30,14 +30,14 @@ def _require_name(kind: str, name: object) -> None:
 
 
 def _takes_inputs(argument: str, function: Callable) -> bool:
-    """Whether a function of (t, q, v, params) asks for `inputs` too; raises if it is neither."""
+    """Whether a function of (t, q, v, params) also takes `inputs`; raises if neither form fits."""
     takes = not (callable(function) and accepts(function, 4)) or wants(function, 4, "inputs")
     require_arity(argument, function, _ARGUMENTS if takes else _ARGUMENTS[:4])
     return takes
 
 
 def _real(argument: str, value: Any) -> Array:
-    """A real array, or an error in our form while tracing."""
+    """A real array, or an error with the argument's name while tracing."""
     if not eqx.is_array_like(value):
         raise invalid(argument, "return an array", f"it returned {value!r}")
     value = jnp.asarray(value)
@@ -59,34 +59,34 @@ class AbstractForce(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
     ) -> Float[Array, " n"]:
-        """Q_i such that the virtual work is sum_i Q_i dq_i (N for metres, N m for radians)."""
+        """Q_i such that the virtual work is sum_i Q_i dq_i (N for meters, N m for radians)."""
         raise NotImplementedError
 
 
 class GeneralizedForce(AbstractForce):
     """A force given directly by its components along the coordinates.
 
-    The virtual work is `sum_i Q_i dq_i`, so Q_i is in N where q_i is in m and in N m where q_i
-    is in rad; positive Q_i pushes towards larger q_i (Pila, eq. 3.25 ff.).
+    The virtual work is `sum_i Q_i dq_i`, so Q_i is in N if q_i is in m and in N m if q_i
+    is in rad; positive Q_i acts towards larger q_i (Pila, eq. 3.25 ff.).
 
-    With `reaction=True` the force depends on the multipliers of constraints, as friction does on
-    a normal reaction; it is solved for together with them. Where rows depend on one another, those
-    that are read share the reaction as equals (of least norm), and others take none of it. Where no
-    solution exists (Painleve's paradox), a contact lifts off or its sliding stops or reverses, a
+    With `reaction=True` the force depends on the multipliers of constraints, as friction depends on
+    a normal reaction; both are solved for together. If rows are dependent, those that
+    the force reads share the reaction with least norm, and the others have none of it. If no
+    solution exists (Painleve's paradox), a contact lifts off, or its sliding stops or reverses, the
     motion ends with the status no_reaction_solution.
 
     Args:
-        Q: function `Q(t, q, v, params, inputs)` or `Q(t, q, v, params)` returning shape (n,); with
-            `reaction=True` of one last argument more, `lam`: a dict from row names to multipliers.
+        Q: function `Q(t, q, v, params, inputs)` or `Q(t, q, v, params)` returning shape (n,). With
+            `reaction=True` its last argument is `lam`, a dict from row names to multipliers.
         name: shown in `explain()` and used to select this force.
         reaction: whether Q takes `lam`.
         contact: name of a constraint whose multipliers must not become negative.
         sliding: function `sliding(t, q, v, params)`, the velocity of the contact point (m/s) along
-            the direction in which Q takes it to slide: a scalar whose sign must not change.
+            the sliding direction that Q assumes: a scalar whose sign must not change.
 
     Raises:
-        ValueError: `Q` or `sliding` is not callable in these forms, the name is empty, or `contact`
-            or `sliding` is given without `reaction=True`.
+        ValueError: `Q` or `sliding` cannot be called in these forms, the name is empty, or
+            `contact` or `sliding` is given without `reaction=True`.
 
     Source: Pila, eqs. 3.173 to 3.177 (a stick sliding with friction); Lotstedt, SIAM J. Appl. Math.
     42 (1982) 281 (existence of solutions).
@@ -147,8 +147,8 @@ class PointForce(AbstractForce):
     """A force F acting at a point r(t, q): `Q = (dr/dq)^T F`, by its virtual work F . dr.
 
     One reverse derivative of `position`; the Jacobian dr/dq is never formed. Position and force
-    are components in the same axes, which must not turn (inertial, not body axes); a force known
-    in body components is turned into them by the rotation matrix of `jaxlag.rotation`.
+    are components in the same axes, which must not rotate (inertial, not body axes). Transform a
+    force in body components by the rotation matrix of `jaxlag.rotation`.
 
     Args:
         position: function `position(t, q, params)` returning the point r, in m: 1, 2 or 3
@@ -158,8 +158,8 @@ class PointForce(AbstractForce):
         name: shown in `explain()` and used to select this force.
 
     Raises:
-        ValueError: a function is not callable in these forms, or the name is empty. While
-            tracing: a position that is not made of 1, 2 or 3 real components, a force of another
+        ValueError: a function cannot be called in these forms, or the name is empty. While
+            tracing: a position that does not have 1, 2 or 3 real components, a force of another
             shape than the position.
 
     Source: Pila, eq. 3.10 and sec. 3.10.
@@ -216,12 +216,12 @@ class Torque(AbstractForce):
             affine in v: shape (3,), () for a rotation about one fixed axis, or (k, 3).
         torque: function `torque(t, q, v, params, inputs)` or `torque(t, q, v, params)` returning
             tau, in N m, in the shape of the angular velocity; positive by the right hand.
-        name: shown in `explain()` and used to select this force.
+            tau, in N m, in the shape of the angular velocity; positive by the right-hand rule.
 
     Raises:
-        ValueError: a function is not callable in these forms, or the name is empty. While
-            tracing: an angular velocity that is neither a scalar nor made of 3 real components,
-            or not affine in v; a torque of another shape.
+        ValueError: a function cannot be called in these forms, or the name is empty. While
+            tracing: an angular velocity that is neither a scalar nor has 3 real components,
+            or is not affine in v; a torque of another shape.
 
     Source: Pila, sec. 3.12 (force and couple); eqs. 4.70 and 4.103 (body torques on Euler angles).
     """
@@ -275,31 +275,31 @@ class Torque(AbstractForce):
 
 
 def _affine(function: Callable, v: Array, like: Array) -> bool:
-    """Whether the derivative of `function` is free of v, read from its traced program."""
+    """Whether the derivative of `function` does not depend on v, from its traced program."""
     derivative = jax.make_jaxpr(lambda v: jax.vjp(function, v)[1](jnp.ones_like(like)))(v)
     return not frozenset().union(*outputs_depend_on(derivative.jaxpr, [frozenset({"v"})]))
 
 
 def _like(argument: str, value: Any, conjugate: Array) -> Array:
-    """A real array in the shape and precision of what it does work on."""
+    """A real array in the shape and precision of its conjugate variable."""
     value = _real(argument, value)
     if value.shape != conjugate.shape:
         raise invalid(argument, f"return shape {conjugate.shape}", f"it returned {value.shape}")
-    return value.astype(conjugate.dtype)  # time is float64 where x64 is on, whatever q is
+    return value.astype(conjugate.dtype)  # time is float64 with x64, for every q
 
 
 class Rayleigh(AbstractForce):
     """Dissipation by a Rayleigh function: `Q = -dR/dv` (Pila, sec. 3.7).
 
-    For linear damping R = 1/2 sum c_i v_i^2 in W, half the power lost; R may depend on t and q
-    and need not be quadratic.
+    For linear damping R = 1/2 sum c_i v_i^2 in W, half the dissipated power; R may depend on t
+    and q and need not be quadratic.
 
     Args:
         R: function `R(t, q, v, params)` returning a scalar, in W.
         name: shown in `explain()` and used to select this force.
 
     Raises:
-        ValueError: `R` is not callable in this form, or the name is empty.
+        ValueError: `R` cannot be called in this form, or the name is empty.
     """
 
     R: Callable = eqx.field(static=True)
@@ -324,7 +324,7 @@ class Rayleigh(AbstractForce):
 
 
 def check_forces(forces: Any) -> tuple[AbstractForce, ...]:
-    """Forces as a tuple; raises unless each is one of the classes here, under a name of its own."""
+    """Forces as a tuple; raises unless each is one of the classes here, names distinct."""
     if isinstance(forces, AbstractForce):
         raise invalid("forces", "be a sequence", "it was a single force", "Write forces=(force,).")
     if not isinstance(forces, Iterable):
@@ -379,4 +379,4 @@ def components(
     Q = jnp.asarray(Q)
     if Q.shape != q.shape or not jnp.issubdtype(Q.dtype, jnp.floating):
         raise invalid(f"force {force.name!r}", must, f"it returned {Q.dtype} of shape {Q.shape}")
-    return Q.astype(q.dtype)  # time is float64 where x64 is on, whatever the state is
+    return Q.astype(q.dtype)  # time is float64 with x64, for every state

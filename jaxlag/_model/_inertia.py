@@ -1,4 +1,4 @@
-"""Mass, inertia matrix and mass centre of a rigid body: read, carried along, and refused."""
+"""Mass, inertia matrix and center of mass of a rigid body: input, transformation, validity."""
 
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -13,10 +13,10 @@ from jaxlag._core._errors import invalid
 
 
 def stated(*values: Any) -> AbstractContextManager:
-    """A context in which arrays made of values stay values, under a trace of JAX too.
+    """A context in which arrays of values stay values, also under a trace of JAX.
 
-    Without it `jnp.asarray` makes a tracer of a constant written inside a traced Lagrangian, and
-    what is wrong with the constant cannot be seen. Does nothing where one of them is traced.
+    Without it `jnp.asarray` makes a tracer of a constant inside a traced Lagrangian, and errors in
+    the constant cannot be detected. No effect if one of the values is traced.
     """
     return jax.ensure_compile_time_eval() if concrete(values) else nullcontext()
 
@@ -41,7 +41,7 @@ def place(argument: str, x: Any) -> Array:
 
 
 def matrix(argument: str, inertia: Any) -> Array:
-    """An inertia matrix, shape (3, 3), from itself or from (3,) principal moments."""
+    """An inertia matrix, shape (3, 3), from a matrix or from (3,) principal moments."""
     with stated(inertia):
         x = real(argument, inertia)
         if x.shape == (3,):
@@ -110,8 +110,8 @@ def check_inertia(argument: str, inertia: Float[Array, "3 3"]) -> None:
 def check_about_origin(argument: str, inertia: Array, mass: Array, centre: Array) -> None:
     """Raise unless I_O - m (|c|^2 E - c c^T), the central inertia, has no negative eigenvalue.
 
-    On the axes alone whose row of I_O is not zero: those of a planar body or of a slender rod
-    left out do not turn. The slack is some roundings of the terms of the difference.
+    Only on the axes whose row of I_O is not zero: the other axes of a planar body or of a slender
+    rod do not rotate. The slack is some roundings of the terms of the difference.
     """
     if not concrete(inertia, mass, centre):
         return
@@ -140,7 +140,7 @@ def _axis(axis: np.ndarray) -> str:
 
 
 def _numbers(*arrays: Array) -> tuple[Any, list[Any]]:
-    """numpy and arrays of it where all have values, which costs no dispatch; else jax.numpy."""
+    """numpy and its arrays if all have values, without dispatch; else jax.numpy."""
     return (np, [np.asarray(x) for x in arrays]) if concrete(arrays) else (jnp, list(arrays))
 
 

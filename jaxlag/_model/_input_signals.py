@@ -1,4 +1,4 @@
-"""Signals that forces read by name: from tables, functions of time or the state."""
+"""Input signals that forces read by name: tables, functions of time or of the state."""
 
 import math
 from collections.abc import Callable
@@ -22,8 +22,7 @@ class AbstractInput(eqx.Module):
     """A signal u(t, q, v, params) of any fixed shape.
 
     Attributes:
-        tabulated: the fields of which a step reads two entries, first the times that it lies
-            between.
+        tabulated: fields of which a step reads two entries; the first field contains the times.
     """
 
     tabulated: ClassVar[tuple[str, ...]] = ()
@@ -49,7 +48,7 @@ class AbstractInput(eqx.Module):
 
 
 class AbstractTable(AbstractInput):
-    """A signal between times at which it is given.
+    """A signal given at some times.
 
     Attributes:
         times: shape (k,), s, strictly increasing.
@@ -66,7 +65,7 @@ class AbstractTable(AbstractInput):
 
 
 def _inexact(x: Any) -> Array:
-    """`x` as an inexact array; values that are known remain so while JAX traces what is around."""
+    """`x` as an inexact array; known values stay concrete under a trace of JAX."""
     if concrete(x):
         with jax.ensure_compile_time_eval():
             x = jnp.asarray(x)
@@ -90,7 +89,7 @@ def _table(kind: str, times: Any, values: Any) -> tuple[Array, Array]:
 
 
 def _increasing(argument: str, times: Array, least: int) -> Array:
-    """Times as they are; raises unless there are so many and they increase, as far as is known."""
+    """Times unchanged; raises unless there are enough and known ones increase."""
     if times.ndim != 1 or times.shape[0] < least:
         must = f"be an array of at least {least} times"
         raise invalid(argument, must, f"its shape was {times.shape}")
@@ -121,7 +120,7 @@ class ZeroOrderHold(AbstractTable):
     Args:
         times: shape (k,), s, strictly increasing, k >= 2.
         values: shape (k, ...), in the unit the force expects; or (k - 1, ...), one for each
-            interval between the times, the last of which then holds at the last time, too.
+            interval between the times. The last of these then also holds at the last time.
 
     Raises:
         ValueError: shapes differ, times do not increase, values are not finite.
@@ -207,25 +206,25 @@ def _called(f: Callable, params: Any, *arguments: Any) -> Any:
 class TimeFunction(AbstractInput):
     """A signal u(t) given by a function of time, or of time and params, smooth between its knots.
 
-    Where it jumps, or bends, name the times: steps end there, and each step sees the side that it
-    lies on. What is shorter than a step and not named may be stepped over; `simulate(dt_max=)`
-    bounds the steps.
+    Name the times of jumps and kinks as knots: steps end there, and each step uses the values of
+    its own side. A feature shorter than a step that is no knot may be missed;
+    `simulate(dt_max=)` bounds the steps.
 
     Args:
         f: function `f(t)` or `f(t, params)`; t in s. An equinox module keeps its arrays traced.
-        knots: shape (k,), s, increasing: where steps are to end. At a jump f(t) is the value from
-            there on. "kvaerno4" and "kvaerno5", which look beyond the end of a step, take three
+        knots: shape (k,), s, increasing: times at which steps end. At a jump f(t) is the value from
+            then on. "kvaerno4" and "kvaerno5" have stages beyond the end of a step; they take three
             derivatives of f there.
 
     Raises:
-        ValueError: `f` is not callable in either form; knots that are no increasing numbers.
+        ValueError: `f` cannot be called in either form; knots that are not increasing numbers.
     """
 
     tabulated = ("ends",)
 
     f: Callable
     takes_params: bool = eqx.field(static=True)
-    ends: Float[Array, " k+2"] | None  # the knots between -inf and inf; two of them within a step
+    ends: Float[Array, " k+2"] | None  # -inf, the knots, inf; within a step two of these
 
     def __init__(self, f: Callable, knots: Any = None) -> None:
         self.takes_params = callable(f) and accepts(f, 2) and wants(f, 1, "params")
@@ -239,7 +238,7 @@ class TimeFunction(AbstractInput):
             self.ends = _inexact(joined((-never, times, never)))
 
     def knots(self) -> Float[Array, " k"] | None:
-        """The times that were named."""
+        """The declared knots."""
         return None if self.ends is None else self.ends[1:-1]
 
     def value(
@@ -250,16 +249,16 @@ class TimeFunction(AbstractInput):
         params: Any,
         interval: Int[Array, ""] | int | None,
     ) -> Array:
-        """f(t) or f(t, params); within a step on this side of its knots."""
+        """f(t) or f(t, params); within a step on its side of the knots."""
         if self.ends is None or self.ends.size > 2:
             return self._called(t, params)
         return self._called(self._inside(t), params)
 
     def onwards(self, t: Float[Array, ""], params: Any) -> Array:
-        """The same, beyond a knot by the Taylor polynomial of degree 3 from it.
+        """The same, extended beyond a knot by its Taylor polynomial of degree 3.
 
-        Methods with stages beyond the end of a step would lose their order where f stood still, and
-        derivatives in the time of the knot half their digits.
+        With a constant f beyond the knot, methods with stages beyond the end of a step would lose
+        their order, and derivatives in the time of the knot half their digits.
         """
         if self.ends is None or self.ends.size > 2:
             return self._called(t, params)
@@ -281,7 +280,7 @@ class TimeFunction(AbstractInput):
         return jnp.asarray(_called(self.f, params, t, *more))
 
     def _inside(self, t: Array) -> Array:
-        """The nearest time on this side of the knots; it moves with them where t lies beyond."""
+        """The nearest time on this side of the knots; it moves with a knot if t lies beyond."""
         assert self.ends is not None
         first, last = self.ends.astype(t.dtype)
         slack = 4 * jnp.finfo(t.dtype).eps * jnp.abs(t)
@@ -297,7 +296,7 @@ class Feedback(AbstractInput):
         f: function `f(t, q, v, params)`; an equinox module keeps its arrays traced.
 
     Raises:
-        ValueError: `f` is not callable in this form.
+        ValueError: `f` cannot be called in this form.
     """
 
     f: Callable

@@ -1,8 +1,8 @@
-"""The inputs of a simulation by name: their values, and what a step reads of them.
+"""The inputs of a simulation by name: their values, and their table entries within a step.
 
-Inputs have knots where the signal or its slope jumps. The driver ends a step on every knot, and
-evaluates a table throughout one step in the one interval that the step lies in, so that no stage
-ever reads the wrong side of a jump. All that a step reads of a table is two entries.
+Inputs have knots where the signal or its slope jumps. The loop ends a step on every knot. Within
+one step a table is evaluated only in the interval that contains the step, so that no stage
+reads the wrong side of a jump. A step reads two entries of each table.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ from jaxlag._tracing._input_values import InputValues
 
 
 def check_inputs(inputs: Any) -> dict[str, Any]:
-    """`inputs` as a dict of input objects and arrays, or a ValueError saying what is wrong."""
+    """`inputs` as a dict of input objects and arrays; raises a ValueError if they are invalid."""
     if inputs is None:
         return {}
     if not isinstance(inputs, Mapping) or not all(isinstance(k, str) for k in inputs):
@@ -73,7 +73,7 @@ def evaluate(
     since: Float[Array, ""] | None = None,
     onwards: bool = False,
 ) -> InputValues:
-    """Values of all inputs at (t, q, v); integers are numbers like any other.
+    """Values of all inputs at (t, q, v); integers are converted to the dtype of q.
 
     Args:
         inputs: by name.
@@ -81,9 +81,9 @@ def evaluate(
         q: coordinates.
         v: velocities.
         params: as the Lagrangian takes them.
-        intervals: in which tables are read; those at t by default.
-        since: the time of tables, where that is counted from another origin.
-        onwards: whether functions of time go on beyond the knots that a step ends on.
+        intervals: table intervals to read; those at t by default.
+        since: the time of tables, if it has another origin.
+        onwards: whether functions of time extend beyond the knot at the end of a step.
     """
     since = t if since is None else since
     intervals = locate(inputs, since) if intervals is None else intervals
@@ -102,16 +102,16 @@ def evaluate(
 
 
 def tables(inputs: Mapping[str, Any]) -> dict[str, AbstractTable]:
-    """Those of the inputs that are tables."""
+    """The inputs that are tables."""
     return {name: x for name, x in inputs.items() if isinstance(x, AbstractTable)}
 
 
 def at_interval(
     inputs: Mapping[str, Any], t: Float[Array, ""]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The inputs with the two entries of each around a time, and where these begin.
+    """The inputs with the two table entries around a time, and the indices of the first ones.
 
-    In the tables the interval is the first one; functions are those of the interval between knots.
+    The interval is then the first one of each table; functions are cut to two knots.
     """
     starts = {}
     cuts = dict(inputs)
@@ -125,24 +125,24 @@ def at_interval(
 
 
 def marked(signal: Any, start: Array) -> Any:
-    """The index where its entries begin in place of each leaf of an input that is a table."""
+    """An input with the index of its first entry in place of each table leaf, else None."""
     cut = {id(x) for x in _entries(signal)}
     return jax.tree.map(lambda x: start if id(x) in cut else None, signal)
 
 
 def _entries(signal: Any) -> list[Array]:
-    """What a step reads two entries of."""
+    """The tabulated arrays of a signal."""
     fields = signal.tabulated if isinstance(signal, AbstractInput) else ()
     return [x for x in (getattr(signal, name) for name in fields) if x is not None]
 
 
 def _with_entries(signal: Any, *entries: Array) -> Any:
-    """The same signal from other entries."""
+    """The same signal with other entries."""
     return eqx.tree_at(lambda s: [getattr(s, name) for name in s.tabulated], signal, entries)
 
 
 def counted_from(origin: Float[Array, ""], inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """The inputs, the times of tables counted from another one: small differences of late times."""
+    """The inputs with the times of tables from another origin: late times differ little."""
     given = tables(inputs).items()
     moved = {name: _with_entries(x, x.times - origin, x.values) for name, x in given}
     return dict(inputs) | moved
@@ -182,7 +182,7 @@ def common_range(inputs: Mapping[str, Any]) -> tuple[Array, Array] | None:
 
 
 def check_range(inputs: Mapping[str, Any], times: Any, argument: str = "ts") -> None:
-    """Raise where concrete tables do not cover concrete times, called `argument`."""
+    """Raise if concrete tables do not cover concrete times, called `argument`."""
     span = common_range(inputs)
     if span is None or not concrete(times, *span):
         return

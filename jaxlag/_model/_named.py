@@ -1,4 +1,4 @@
-"""Functions that take coordinates by name in place of one flat vector."""
+"""Functions that take coordinates by name instead of one flat vector."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import update_wrapper
@@ -13,20 +13,20 @@ from jaxlag._model._coordinates import Coordinates
 def named(
     coordinates: Sequence[str] | Mapping[str, tuple[int, ...] | int],
 ) -> Callable[[Callable], Callable]:
-    """Decorator for functions of (t, q, v, params, ...): they get q and v as dicts by name.
+    """Decorator for functions of (t, q, v, params, ...): they receive q and v as dicts by name.
 
-    Lagrangians, energies, forces, constraints, quasi-velocities: whatever is declared as a function
-    of flat q and v may be written so. Quasi-velocities, called u, stay as they are. A force or
-    velocities may be returned as a dict by name, too; coordinates that it leaves out have 0.
+    It applies to all declared functions of flat q and v: Lagrangians, energies, forces,
+    constraints, quasi-velocities. Quasi-velocities, called u, are passed unchanged. A force or
+    velocities may also be returned as a dict by name; coordinates not in it are 0.
 
     Args:
-        coordinates: names, or names with shapes, as of the `System`.
+        coordinates: names, or names with shapes, as for the `System`.
 
     Raises:
-        ValueError: names or shapes that are none. While tracing: a dict of other names or shapes.
+        ValueError: invalid names or shapes. While tracing: a dict of other names or shapes.
 
     Example:
-        A bead on a rod that turns, its place by name:
+        A bead on a rotating rod, with its coordinates by name:
 
         >>> import jax, jax.numpy as jnp, jaxlag as jl
         >>> jax.config.update("jax_enable_x64", True)
@@ -43,7 +43,7 @@ def named(
 
 
 class _Named:
-    """A function of dicts as one of flat vectors; it hashes by both."""
+    """A function of dicts as a function of flat vectors; it hashes by both."""
 
     def __init__(self, coordinates: Coordinates, function: Callable) -> None:
         self.coordinates, self.function = coordinates, function

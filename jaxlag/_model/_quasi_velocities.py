@@ -1,4 +1,4 @@
-"""Quasi-velocities u = U(t, q, v), and the kinematics v = V(t, q, u) that go with them."""
+"""Quasi-velocities u = U(t, q, v), and their kinematics v = V(t, q, u)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -30,32 +30,32 @@ from jaxlag._tracing._traced_function import traced_function
 
 
 class QuasiVelocities(eqx.Module):
-    """Speeds u = U(t, q, v) = Theta^T v + theta_0 in place of v: body rates, slip, and the like.
+    """Velocities u = U(t, q, v) = Theta^T v + theta_0 in place of v, such as body rates or slip.
 
     Either U is given: then v = (Theta^T)^-1 (u - theta_0) with Theta^T = dU/dv, square. Or
-    `kinematics`, which says how v follows from u, v = B u + c: B may be taller than wide, as for
-    the rates of a quaternion of unit norm, which is a `Holonomic` constraint then, or for speeds
-    with which Pfaffian rows are satisfied by themselves.
+    `kinematics` gives v from u, v = B u + c. B may have more rows than columns. Examples are the
+    rates of a quaternion, whose unit norm is a `Holonomic` constraint, and speeds
+    that satisfy Pfaffian rows by definition.
 
-    A name in `constrained` is a constraint: the row U_name = 0, whose multiplier bears the name.
-    In the quasi-velocity formulation it is left out of the state.
+    A name in `constrained` is a constraint: the row U_name = 0, whose multiplier has this name.
+    In the quasi-velocity formulation it is not part of the state.
 
-    There may be places where dU/dv is singular, as at a pitch of 90 degrees or where a wheel is
-    steered across the way: v does not follow from u there, though the motion may well go on. A
-    motion whose state holds u ends just before such a place in the status kinematics_singular, one
-    with fixed steps a step before it. With formulation "auto", outside of transforms and with L a
-    function of v, `simulate` goes on from the start by multipliers, and says so.
+    dU/dv may be singular at some places, as at a pitch of 90 degrees or with a wheel
+    steered by 90 degrees: there u does not determine v, although the motion may continue. A
+    motion with u in its state ends just before such a place with the status kinematics_singular;
+    with fixed steps one step before it. With formulation "auto", outside of transforms and with L
+    a function of v, `simulate` then repeats the motion with multipliers, and reports this.
 
     Args:
         U: function `U(t, q, v, params)`, affine in v, returning shape (k,), in m/s or rad/s.
-        names: k names; as many as there are coordinates where U is given, no more than that and
-            no fewer than constraints leave where `kinematics` is given.
-        constrained: those among the names that vanish.
+        names: k names; with U as many as there are coordinates; with `kinematics` no more than
+            that, and no fewer than the constraints leave free.
+        constrained: the names of quasi-velocities that are zero.
         kinematics: function `f(t, q, u, params)`, affine in u (k,), returning v, shape (n,).
 
     Raises:
         ValueError: neither or both of U and `kinematics`, functions that cannot be called in
-            these forms, names that are empty, not distinct or unknown; nothing left that moves.
+            these forms, names that are empty, not distinct or unknown; no free quasi-velocity.
             While tracing: shapes that do not fit the names, functions that are not affine.
 
     Source: Pila, Introduction to Lagrangian Dynamics, sec. 4.3, eqs. 4.28 to 4.58; Greenwood,
@@ -104,7 +104,7 @@ class QuasiVelocities(eqx.Module):
 
     @property
     def free(self) -> np.ndarray:
-        """Indices of those that are not constrained."""
+        """Indices of the free ones."""
         return np.array([i for i, name in enumerate(self.names) if name not in self.constrained])
 
     @property
@@ -114,7 +114,7 @@ class QuasiVelocities(eqx.Module):
 
     @property
     def rows(self) -> tuple[Pfaffian, ...]:
-        """The constraint that they declare: U_name = 0 for every constrained name."""
+        """The constraint of the constrained names: U_name = 0 for each."""
         if not self.constrained:
             return ()
         return (Pfaffian(Vanishing(self), self.constrained),)
@@ -124,7 +124,7 @@ class QuasiVelocities(eqx.Module):
     ) -> Float[Array, " k"]:
         """u = U(t, q, v), shape (k,), in m/s or rad/s; without U the u with B u + c nearest to v.
 
-        Velocities that B u + c does not reach are compared over the lengths of the rows of B.
+        The distance to v is measured over the lengths of the rows of B.
 
         Args:
             t: time, s.
@@ -133,12 +133,12 @@ class QuasiVelocities(eqx.Module):
             params: as U takes them.
 
         Raises:
-            ValueError: the function returns anything but one real number for each name.
+            ValueError: the function does not return one real number for each name.
         """
         if self.U is not None:
             return self._checked("U", self.U(t, q, v, params), self.size, v.dtype)
         B, c = self._affine(t, q, v.dtype, params)
-        # Rows of long units would leave nothing but rounding of those of short ones.
+        # Otherwise rows of large units would reduce those of small units to rounding.
         size = lengths(B)
         return nearest(B / size[:, None], (v - c) / size)
 
@@ -154,7 +154,7 @@ class QuasiVelocities(eqx.Module):
             params: as U takes them.
 
         Raises:
-            ValueError: the function returns anything but one real number for each coordinate.
+            ValueError: the function does not return one real number for each coordinate.
         """
         n = q.shape[0]
         if self.kinematics is not None:
@@ -170,7 +170,7 @@ class QuasiVelocities(eqx.Module):
         fine = jnp.all(jnp.abs(jnp.diagonal(R)) > least_sine(theta.dtype))
 
         def regular(x: Array) -> Array:
-            """So that derivatives of what is masked are finite."""
+            """Replace singular values so that the derivatives of masked results are finite."""
             return jnp.where(fine, x, jnp.eye(n, dtype=x.dtype))
 
         theta = regular(theta)
@@ -186,15 +186,15 @@ class QuasiVelocities(eqx.Module):
     def sines(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any, dtype: Any
     ) -> Float[Array, " k"]:
-        """Sine of the angle between every quasi-velocity and those before it; 0 if it follows.
+        """Sine of the angle between every quasi-velocity and those before it; 0 if dependent.
 
-        Or if it vanishes up to rounding, as cos(pitch) yaw' does at a pitch of 90 degrees.
+        Also 0 if it vanishes up to rounding, as cos(pitch) yaw' does at a pitch of 90 degrees.
 
         Args:
             t: time, s.
             q: coordinates, shape (n,).
             params: as U takes them.
-            dtype: of velocities.
+            dtype: dtype of velocities.
         """
 
         def rows(q: Array) -> Array:
@@ -205,10 +205,10 @@ class QuasiVelocities(eqx.Module):
         return jnp.where(there, jnp.nan_to_num(sines(here.T), nan=0.0), 0.0)
 
     def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
-        """Distance of every quasi-velocity's coefficients from the span of those before it.
+        """Distance of the coefficients of every quasi-velocity from the span of those before it.
 
-        That of every row of dU/dv, shape (k,), or of every column of B where `kinematics` are
-        given: |R_jj| of Q R = (dU/dv)^T or B.
+        The rows of dU/dv, shape (k,), or, with `kinematics`, the columns of B: |R_jj| of
+        Q R = (dU/dv)^T or B.
 
         Args:
             t: time, s.
@@ -221,7 +221,7 @@ class QuasiVelocities(eqx.Module):
     def determinant(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
     ) -> Float[Array, ""]:
-        """det dU/dv, or det B, or det B^T B where B is tall: 0 or infinite where it is singular.
+        """det dU/dv, or det B, or det B^T B for a tall B: 0 or infinite where it is singular.
 
         Args:
             t: time, s.
@@ -233,10 +233,10 @@ class QuasiVelocities(eqx.Module):
         return jnp.linalg.det(columns if square else columns.T @ columns)
 
     def moves(self, q: Any, params: Any) -> bool:
-        """Whether dU/dv, or B, depends on time or coordinates, as far as its program shows.
+        """Whether dU/dv, or B, depends on time or coordinates, according to its program.
 
         Args:
-            q: coordinates, or one like them.
+            q: coordinates, or an array of their shape and dtype.
             params: as U takes them.
         """
         like = jax.ShapeDtypeStruct(q.shape, q.dtype)
@@ -250,7 +250,7 @@ class QuasiVelocities(eqx.Module):
         return bool(found)
 
     def regular(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Bool[Array, ""]:
-        """Whether v follows from u there, and u from v.
+        """Whether u and v determine each other.
 
         Args:
             t: time, s.
@@ -263,7 +263,7 @@ class QuasiVelocities(eqx.Module):
         """All quasi-velocities from k numbers, or a dict by name; constrained ones may be left out.
 
         Args:
-            argument: what errors call it.
+            argument: its name in errors.
             u: m/s or rad/s.
 
         Raises:
@@ -318,7 +318,7 @@ class QuasiVelocities(eqx.Module):
 
 
 class Vanishing(eqx.Module):
-    """The residual of the constrained quasi-velocities; hashes by what they are."""
+    """The residual of the constrained quasi-velocities; hashes by its quasi-velocities."""
 
     quasi: QuasiVelocities
 
@@ -327,7 +327,7 @@ class Vanishing(eqx.Module):
 
 
 class InQuasiVelocities(eqx.Module):
-    """A function of (t, q, u, params) as one of (t, q, v, params)."""
+    """A function of (t, q, u, params) as a function of (t, q, v, params)."""
 
     function: Callable = eqx.field(static=True)
     quasi: QuasiVelocities
@@ -340,9 +340,9 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
     """Raise unless these can be the quasi-velocities of n coordinates.
 
     Args:
-        quasi: of the declaration.
+        quasi: the declared object.
         n: number of coordinates.
-        taken: name -> what bears it already.
+        taken: used name -> its owner.
     """
     if not isinstance(quasi, QuasiVelocities):
         must, fix = "be a jl.QuasiVelocities", "Write jl.QuasiVelocities(U, names)."

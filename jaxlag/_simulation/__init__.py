@@ -1,1 +1,1 @@
-"""`simulate`: its arguments, the problem that they pose, the solution."""
+"""`simulate`: its arguments, its initial-value problem, its solution."""

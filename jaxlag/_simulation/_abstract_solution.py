@@ -1,4 +1,4 @@
-"""What views, advice and further solves read of a `Solution`."""
+"""AbstractSolution: the attributes of a `Solution` that views, advice and further solves use."""
 
 from abc import abstractmethod
 from typing import Any
@@ -11,7 +11,7 @@ from jaxlag._system._system import System
 
 
 class AbstractSolution(eqx.Module):
-    """The attributes of a `Solution` that do not depend on how it was made; see there."""
+    """The attributes of a `Solution` that do not depend on how it was computed; see there."""
 
     system: eqx.AbstractVar[System]
     ts: eqx.AbstractVar[Array]
@@ -38,12 +38,12 @@ class AbstractSolution(eqx.Module):
     @property
     @abstractmethod
     def raw_status(self) -> Array:
-        """The same before the states around its end are looked at."""
+        """The same, before the states around its end are examined."""
 
     @property
     @abstractmethod
     def scene(self) -> MotionKey:
-        """What moved."""
+        """The key of the compiled program."""
 
     @property
     @abstractmethod
@@ -63,12 +63,12 @@ class AbstractSolution(eqx.Module):
     @property
     @abstractmethod
     def _given(self) -> Any:
-        """Params, and what declared functions close over."""
+        """Params, and the values in closures of declared functions."""
 
     @property
     @abstractmethod
     def fallback(self) -> str:
-        """Why the equations in quasi-velocities were left."""
+        """Why the solve changed from quasi-velocities to multipliers."""
 
     @property
     @abstractmethod
@@ -89,4 +89,4 @@ class AbstractSolution(eqx.Module):
 
     @abstractmethod
     def _at_saves(self, indices: list[int]) -> "AbstractSolution":
-        """The same at these save times only."""
+        """The same, at these save times only."""

@@ -1,4 +1,4 @@
-"""Checks of what `simulate` is given, before anything is compiled."""
+"""Checks of the arguments of `simulate`, before compilation."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -31,7 +31,7 @@ def check_options(
     save: Any,
     max_steps: Any,
 ) -> None:
-    """Raise on options that no value of the traced arguments could make right."""
+    """Raise on options that are invalid for all values of the traced arguments."""
     if not isinstance(system, System):
         raise invalid("system", "be a jl.System", f"it was {system!r}")
     if gradient not in MODES:
@@ -70,7 +70,7 @@ def check_options(
 
 
 def check_change_points(change_points: Any) -> None:
-    """Raise unless it is one of the words."""
+    """Raise unless it is a known option."""
     if change_points not in CHANGE_POINTS:
         must = f"be one of {', '.join(map(repr, CHANGE_POINTS))}"
         raise invalid("change_points", must, f"it was {change_points!r}")
@@ -79,7 +79,7 @@ def check_change_points(change_points: Any) -> None:
 def check_formulation(
     system: System, formulation: Any, stabilization: Any, params: Any, dtype: Any
 ) -> str:
-    """The formulation that is meant; raises where the system does not have it."""
+    """The formulation to be used; raises if the system does not have it."""
     known = ["auto", *FORMULATIONS] if system.constraints or system.quasi is not None else ["auto"]
     quasi = system.quasi
     why = "" if len(known) > 1 else "This system has no constraints: its state is (q, v)."
@@ -106,7 +106,7 @@ def check_formulation(
         return formulation
     if quasi is None or "quasi" not in known:
         return FORMULATIONS[0]
-    # Kinematics that leave more freedoms than the rows do not satisfy these by themselves.
+    # Kinematics with more freedoms than the rows leave do not satisfy these by themselves.
     fitting = len(quasi.free) + system._rows(params, dtype).size <= system.size
     return "quasi" if fitting or quasi.kinematics is None else FORMULATIONS[0]
 
@@ -180,7 +180,7 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
 
 
 def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
-    """Raise where two arguments would set the same thing."""
+    """Raise if two arguments set the same quantity."""
     tolerances = rtol is not None or atol is not None
     if dt is not None and tolerances:
         raise invalid("rtol and atol", "be left out with fixed steps", "dt was given too")
@@ -241,14 +241,14 @@ def check_tolerances(
 
 
 def check_longest(dt: Any, dt_max: Any) -> Any:
-    """The bound on adaptive steps, None for none."""
+    """The bound on adaptive steps; None for none."""
     if dt is not None and dt_max is not None:
         raise invalid("dt_max", "be left out with fixed steps", "dt was given too")
     return None if dt_max is None else _positive("dt_max", dt_max)
 
 
 def check_step(dt: Any, dt0: Any) -> Any:
-    """The fixed step, or the first one; None where neither is given."""
+    """The fixed step, or the first one; None if neither is given."""
     if dt is not None and dt0 is not None:
         raise invalid("dt and dt0", "be given one at a time", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)

@@ -1,4 +1,4 @@
-"""What is said where compiling takes long."""
+"""Log messages about long compilation."""
 
 import logging
 import time
@@ -20,15 +20,15 @@ def timed(
     values: Any,
     clock: Callable[[], float] = time.monotonic,
 ) -> Any:
-    """program(key, values), a jitted function, with a word on the log where compiling it took long.
+    """program(key, values), a jitted function, with a log message if its compilation took long.
 
-    Inside a transform, whose program compiles as a whole, nothing is said.
+    Inside a transform nothing is logged, as the program of the transform compiles as a whole.
 
     Args:
         program: jitted.
-        system: what moves.
-        key: what the program is compiled for.
-        values: what it is called with.
+        system: the mechanical system.
+        key: static part of the program's arguments.
+        values: traced part.
         clock: seconds.
     """
     compiled = getattr(program, "_cache_size", None)  # JAX's own count

@@ -1,4 +1,4 @@
-"""The error of a motion, by a finer one beside it."""
+"""Global error estimate of a motion, by comparison with a finer solve."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,16 +10,16 @@ from jaxtyping import Array
 from jaxlag._core._errors import invalid
 from jaxlag._simulation._solution import Solution
 
-# Room for what is left of the error in the finer motion.
+# Factor for the error of the finer motion.
 SHARE = 1.5
 # A method of higher order at a tenth of the tolerance leaves a hundredth of the error, or less.
 LEFT = 0.02
-# What rounding leaves, over eps sqrt(steps) |y|: both motions round, and their difference may be 0.
+# Rounding, over eps sqrt(steps) |y|: both motions round, and their difference may be 0.
 ROUNDED = 32.0
 
 
 def check_estimate(estimate_error: Any, method: Any) -> None:
-    """Raise where there is no finer motion to be had."""
+    """Raise if no finer motion can be computed."""
     if not isinstance(estimate_error, bool):
         raise invalid("estimate_error", "be True or False", f"it was {estimate_error!r}")
     if estimate_error and isinstance(method, tuple):
@@ -36,18 +36,18 @@ def finer(rtol: Any, atol: Any, step: Any, fixed: bool) -> tuple[Any, Any, Any]:
 
 
 def with_error(motion: Solution, beside: Solution, left: float) -> Solution:
-    """The motion with the estimate of its error, the difference of the two and half as much.
+    """The motion with its error estimate: SHARE times the difference from the finer motion.
 
-    Where the difference passes through 0 the error need not: it is at least what is left of the
-    largest so far in the finer motion, and what rounding leaves of steps that magnify nothing. It
-    is nan where the finer motion did not get.
+    The difference may pass through 0 although the error does not. The estimate is therefore at
+    least a part of the largest difference so far, and at least the rounding of the steps. It is nan
+    at times that the finer motion did not reach.
 
     Args:
-        motion: what was asked for.
+        motion: the motion requested.
         beside: the finer motion.
-        left: the part of the error in it: LEFT of another order; 1, to be safe, of the same, where
-            a tenth of the tolerance leaves about an eighth (its power p / (p + 1)) and half a step
-            2^-p.
+        left: the error of the finer motion over the difference: LEFT if its order is another. 1, a
+            safe value, for the same order, where a tenth of the tolerance leaves about an eighth
+            (its power p / (p + 1)) and half a step 2^-p.
     """
     steps = jnp.asarray(motion.stats["accepted"])[..., None, None]
 

@@ -1,4 +1,4 @@
-"""How a trajectory ended, and what that concerns."""
+"""Failures of a trajectory: the message and the force, row or coordinate concerned."""
 
 from dataclasses import replace
 from functools import partial
@@ -25,11 +25,11 @@ from jaxlag._tracing import _params
 
 
 class Ending(NamedTuple):
-    """How a trajectory ended, as far as the solve knows.
+    """The end of a trajectory, as the solve reports it.
 
     Attributes:
-        status: int32, see `Status`; `diagnose_failure` may tell more.
-        where: index of the coordinate or constraint row that it concerns; -1 if none is known.
+        status: int32, see `Status`; `diagnose_failure` may refine it.
+        where: index of the coordinate or constraint row concerned; -1 if none is known.
         tried: end of the last attempted step, s.
         state: (q, v), or (q, u), of the last good state.
     """
@@ -41,20 +41,20 @@ class Ending(NamedTuple):
 
 
 _PARTS = np.array([0.0, *[1.0] * 32, *2.0 ** np.arange(1, 7)]) / 32
-"""Of a failed step, from its start to its end and beyond: where these meet it is looked at."""
+"""Fractions of the failed step at which the equations are evaluated; some lie beyond its end."""
 
 _OPEN = (
     *(Status.step_below_resolution, Status.nonfinite, Status.rank_change),
     *(Status.no_reaction_solution, Status.kinematics_singular, Status.projection_failed),
     Status.implicit_solve_failed,
 )
-"""Outcomes of which `diagnose_failure` may say more."""
+"""Outcomes that `diagnose_failure` may refine."""
 
 
 def final_status(
     dynamics: VectorField, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
 ) -> Ending:
-    """What a solve knows of its end, at the price of nothing."""
+    """The end of a solve without further evaluations."""
     status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
     status = jnp.where(begun.contacts_valid, status, int(Status.no_reaction_solution))
     kind = jnp.where(
@@ -70,7 +70,7 @@ def final_status(
 
     faults, n = ~jnp.isfinite(stop_gradient(y0)), dynamics.system.size
     start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
-    # Of quasi-velocities it would be no coordinate.
+    # For quasi-velocities the index is no coordinate.
     start = jnp.where(start < n, start, start % n if dynamics.quasi is None else -1)
     start = start.astype(jnp.int32)
     where = jnp.where(status == int(Status.bad_value), start, -1)
@@ -85,22 +85,22 @@ def final_status(
 
 
 def is_open(ending: Ending) -> bool:
-    """Whether `diagnose_failure` may say more of an ending; True where they are traced."""
+    """Whether `diagnose_failure` may refine an ending; True if it is traced."""
     if not concrete(ending.status):
         return True
     return bool(np.isin(np.asarray(ending.status), [int(kind) for kind in _OPEN]).any())
 
 
 class MotionKey(NamedTuple):
-    """What a motion was of, to explain it by: the key of a compiled program."""
+    """The key of the compiled program that diagnoses a motion."""
 
     system: Any
     params: _params.Static
     inputs: _params.Static
     formulation: str
     stabilization: Any
-    kinematic: bool  # quasi-velocities enter, whose kinematics may be singular
-    implicit: bool  # steps may be far longer than what decays takes
+    kinematic: bool  # quasi-velocities are used; their kinematics may be singular
+    implicit: bool  # steps may be far longer than decay times
 
 
 def dynamics_of(
@@ -126,17 +126,17 @@ def dynamics_of(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def diagnose_failure(scene: MotionKey, batch: int, given: Any) -> Ending:
-    """The endings with what is found when one looks at the states around them.
+    """The endings, refined by an examination of the states around them.
 
     Args:
-        scene: what moved.
+        scene: key of the motion.
         batch: number of batch axes.
         given: (ending, last time, ts, q0, v0, traced halves of params and inputs).
     """
 
     def one(given: Any) -> Ending:
         ending, time, ts, q0, v0, params, inputs = stop_gradient(given)
-        # Kinematics that are singular at the start have no v0.
+        # v0 does not exist if kinematics are singular at the start.
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
         dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)
         time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
@@ -157,10 +157,10 @@ def _explained(
     q0: Array,
     args: Arguments,
 ) -> Ending:
-    """What can be said by the state a failed step started from and one that it was heading for.
+    """The failure found in the state before a failed step and in one state ahead.
 
-    The latter is asked where the former is sound: the first one on the way with something that is
-    not finite, or q + (t1 - t0) v.
+    The state ahead is used if the state before it is sound. It is the first one in the step with a
+    nonfinite value, or else q + (t1 - t0) v.
     """
     status = ending.status
     unexplained = status == int(Status.nonfinite)
@@ -226,14 +226,14 @@ def _explained(
 def _turned(
     dynamics: VectorField, taus: Array, q: Array, tau0: Array, q0: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """The quasi-velocity that follows from those before it, or came close to it; -1 for none.
+    """(quasi-velocity that is dependent or almost so, quasi-velocity that rejected the step).
 
-    And the one that a step was turned back for: its part that does not follow from those before it
-    has changed most since the start.
+    -1 for none. For the second, the part independent of the quasi-velocities before it has changed
+    most since the start.
 
     Args:
-        dynamics: what moves.
-        taus: of a last good state and of one ahead of it.
+        dynamics: the vector field.
+        taus: of the last good state and of one ahead of it.
         q: the coordinates of both.
         tau0: start of the motion.
         q0: coordinates there.
@@ -247,7 +247,7 @@ def _turned(
         return quasi.sines(dynamics.clock(tau, args), q, params, q.dtype)
 
     now = sines(taus[0], q[0])
-    # A small angle of its own, as of v0 + 1e-5 v1 and v0, is no fault.
+    # An angle that is always small, as of v0 + 1e-5 v1 and v0, is no failure.
     found = (now < jnp.minimum(eps**0.25, 0.01 * sines(tau0, q0))) | ~(now > SINE * eps)
     found = found & jnp.all(jnp.isfinite(q[0]))
     if dynamics.quasi is None:
@@ -277,10 +277,9 @@ def _lost(
 ) -> tuple[Bool[Array, ""], Array, Array]:
     """(whether dy/dt is not finite somewhere on a step from y, the first such time, state there).
 
-    By Euler's steps from y on, or on the tangent of the motion: where steps are `implicit`, what
-    decays within one of them is over at y, and the tangent follows what is left. Stages may lie
-    beyond the end of the step, and one at the resolution of time does not move the state: parts of
-    doubling length follow.
+    Euler's method from y, or along the tangent of the motion: with `implicit` steps fast modes have
+    decayed at y, and the tangent follows the others. Stages may lie beyond the end of the step, and
+    a step at the resolution of time does not change the state: fractions of doubling length follow.
     """
     lengths = (tried - time) * jnp.asarray(_PARTS, time.dtype)
 
@@ -299,7 +298,7 @@ def _lost(
 
     begin = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
     _, tau, y, rates = jax.lax.while_loop(cond_fun, ahead, begin)
-    # Where the state has grown beyond all numbers, so has all that depends on it.
+    # If the state itself overflows, all that depends on it does.
     found = wanted & ~jnp.all(jnp.isfinite(rates)) & jnp.all(jnp.isfinite(y))
     return found, tau, y
 
@@ -307,18 +306,18 @@ def _lost(
 def _culprits(
     dynamics: VectorField, tau: Array, y: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """Coordinates (without inertia, of non-finite Q - h, of the largest |a|).
+    """Coordinates (without inertia, with nonfinite Q - h, with the largest |a|).
 
-    -1 where there is none.
+    -1 if there is none.
     """
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
-        A = jnp.where(jnp.isfinite(A), A, 0.0)  # what is not finite there is no fault of inertia
+        A = jnp.where(jnp.isfinite(A), A, 0.0)  # a nonfinite A is no failure of M
         M, _ = augmented(M, masked(A, args.kept))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
-    # A component that is not finite spreads through the solve: it is looked for before.
+    # A nonfinite component spreads through the solve: it is searched before.
     finite = jnp.isfinite(effort)
     lost = jnp.where(jnp.all(finite), -1, jnp.argmin(finite))
     worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
@@ -328,18 +327,18 @@ def _culprits(
 def _dependent(
     dynamics: VectorField, kept: Array | None, taus: Array, states: Array, args: Arguments
 ) -> Int[Array, ""]:
-    """The row that vanishes, or follows from those before it, or came close to that; -1 for none.
+    """The row that vanishes, or depends on those before it, or almost does; -1 for none.
 
     Args:
-        dynamics: what moves.
-        kept: rows that are solved with; None for all.
-        taus: of a last good state, of one ahead of it, and of the start.
+        dynamics: the vector field.
+        kept: rows used in solves; None for all.
+        taus: of the last good state, of one ahead of it, and of the start.
         states: these three.
         args: arguments.
     """
 
     def squares(tau: Array, y: Array) -> tuple[Array, Array]:
-        """(squared distances of rows from those before them, whether they count as such)."""
+        """(squared distances of rows from those before them, whether they are independent)."""
         t, q, v, params = dynamics.state(tau, y, args)
 
         def rows(q: Array) -> Array:
@@ -354,7 +353,7 @@ def _dependent(
 
     pivots, fine = jax.vmap(squares)(taus, states)
     eps = float(jnp.finfo(states.dtype).eps)
-    # A small angle of its own, between rods that almost lie in line, is no fault.
+    # An angle that is always small, as between almost collinear rods, is no failure.
     near = pivots[:2] < eps**0.5 * pivots[2:]
     found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
     if kept is not None:

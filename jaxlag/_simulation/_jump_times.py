@@ -1,10 +1,10 @@
-"""Jumps of what is declared, at times that params tell: derivatives along a motion miss them.
+"""Jumps at times that depend on params: derivatives along a motion do not contain them.
 
-A force that is switched on at the time b jumps there. Derivatives are taken at frozen steps, and
-see no jump move with b. So operations whose outcome jumps, and which read both the time and a
-number that moves, are looked for in the program. Along the time the equations are then compared on
-both sides of every change of outcome: where they only bend, as between the entries of a table that
-is interpolated, derivatives are right.
+Example: a force is switched on at the time b and jumps there. Derivatives are taken at frozen
+steps, so that the jump does not move with b. The check searches the program for operations whose
+outcome jumps and which read both the time and a differentiated number. It then compares the
+equations on both sides of every change of outcome. If they only have a kink there, as between the
+entries of an interpolated table, derivatives are right.
 """
 
 import warnings
@@ -32,24 +32,24 @@ from jaxlag._tracing._input_values import InputValues
 from jaxlag._tracing._nonsmooth_points import outcomes
 
 _TIME, _STATE = "t", "q, v"
-_GUARDS = ("eq", "ne", "is_finite")  # of a single place
+_GUARDS = ("eq", "ne", "is_finite")  # true or false at single points only
 _STEPS = ("sign", "floor", "ceil", "round", "rem")
 _LOOPS = ("scan", "while", "cond")
 _NOT_RUN = ("pure_callback", "io_callback", "debug_callback", "debug_print", "while")
-_SIZES = (1.0, 0.1, 1e-3)  # of states that are made up: terms may not be finite at the larger ones
+_SIZES = (1.0, 0.1, 1e-3)  # of random states: terms may be nonfinite at the larger ones
 _CLOSED_OVER = "a number that a declared function closes over"
-_TOGETHER = 64  # times at which outcomes are computed side by side
-_SPANS = 32  # of them in a row
-_PLACES = 16  # at which an operation is looked at from both sides
+_TOGETHER = 64  # times at which outcomes are computed in one batch
+_SPANS = 32  # number of batches
+_PLACES = 16  # changes of an operation that are examined from both sides
 _HALVINGS = 60
 
 
 class Jump(NamedTuple):
-    """An operation whose outcome jumps as a number moves.
+    """An operation whose outcome jumps when a number changes.
 
     Attributes:
-        leaf: of params or inputs, by its path.
-        line: where the user asks for it.
+        leaf: path of the number in params or inputs.
+        line: source line of the operation.
     """
 
     leaf: str
@@ -57,7 +57,7 @@ class Jump(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """An operation, what it reads, and where the user asks for it."""
+    """An operation, the names of its inputs, and its source line."""
 
     eqn: Any
     names: Names
@@ -65,13 +65,13 @@ class _Found(NamedTuple):
 
 
 class Jumps:
-    """Those operations in what is declared.
+    """The operations of a declaration whose outcomes jump.
 
     Args:
-        system: what moves.
-        params: as simulate takes them, with what functions close over.
-        q: coordinates; their number and dtype matter.
-        inputs: by name. Tables, and functions with knots, jump where steps end.
+        system: the mechanical system.
+        params: as simulate takes them, with the values in closures.
+        q: coordinates; only their number and dtype are used.
+        inputs: by name. Tables, and functions with knots, jump at ends of steps.
     """
 
     def __init__(self, system: System, params: Any, q: Array, inputs: Mapping[str, Any]) -> None:
@@ -100,21 +100,20 @@ class Jumps:
         return declared(self._system, t, q, v, params, found, None)
 
     def _look(self, eqn: Any, operands: list[Names]) -> None:
-        # Operations of JAX's own functions have no line: that of the call counts.
+        # Operations inside JAX's own functions have no line: the line of the call is used.
         self._line = source_info_util.summarize(eqn.source_info) or self._line
         names = frozenset().union(*operands)
         if names - {_TIME, _STATE} and _jumps(eqn):
             self._found.append(_Found(eqn, names, self._line))
 
     def of_leaves(self) -> tuple[Jump, ...]:
-        """All, whatever they compare a number with."""
+        """All operations, with the numbers that they compare."""
         return _told(self._found)
 
     def in_time(self, leaves: set[str], ts: Any) -> tuple[Jump, ...]:
-        """Those that compare one of the leaves with the time, where the equations jump.
+        """The operations that compare one of the leaves with the time and make the equations jump.
 
-        With the numbers that are known, and others in place of those that are not. What cannot be
-        told counts as a jump.
+        Unknown numbers are replaced by random ones. An undecided case counts as a jump.
         """
         among = [x._replace(names=x.names & {_TIME, *leaves}) for x in self._found if _timed(x)]
         among = [x for x in among if x.names - {_TIME}]
@@ -125,9 +124,9 @@ class Jumps:
         return _told(among)
 
     def _may_be_run(self) -> bool:
-        """Whether the program may be run with numbers that are made up.
+        """Whether the program may be run with random numbers.
 
-        It may not where that could be seen, nor where a loop might not end.
+        It may not if this has visible effects, or if a loop might not end.
         """
         leaves = jax.tree.leaves(self._traced)
         numbers = [x for x in leaves if not concrete(x)]
@@ -136,7 +135,7 @@ class Jumps:
         return known and not calls and concrete(self._program.consts)
 
     def _jump(self, eqns: Sequence[Any], ts: Any) -> list[bool]:
-        """Whether the equations jump where the operations come out otherwise, or may."""
+        """Whether the equations jump, or may jump, where the operations change their outcome."""
         leaves, own = self._numbers()
         times = _params.known(ts)
         own = own and times is not None
@@ -151,7 +150,7 @@ class Jumps:
         terms = [self._sides(leaves, size) for size in _SIZES]
 
         def jumps(i: int, eqn: Any) -> bool:
-            if spans[0][i] is None or eqn.primitive.name in _LOOPS:  # what it compares is not seen
+            if spans[0][i] is None or eqn.primitive.name in _LOOPS:  # comparisons in it are hidden
                 return _jumps_anywhere(terms, grid)
             seen = np.concatenate([np.asarray(span[i]) for span in spans])
             if np.all(seen[1:] == seen[:-1]):
@@ -161,16 +160,16 @@ class Jumps:
         try:
             spans = [along(jnp.asarray(span)) for span in grid]
             return [jumps(i, eqn) for i, eqn in enumerate(eqns)]
-        except Exception:  # the user's functions may refuse numbers that are made up
+        except Exception:  # the user's functions may reject random numbers
             return [True] * len(eqns)
 
     def _sides(self, leaves: Sequence[Array], size: float) -> Callable:
-        """Terms at many times, states being so large."""
+        """Terms at many times, with states of this size."""
         t, q, v, *rest = leaves
         return jax.jit(jax.vmap(partial(self._terms, [t, size * q, size * v, *rest])))
 
     def _numbers(self) -> tuple[list[Array], bool]:
-        """(arguments of the program, whether all are given ones): made up where not known."""
+        """(arguments of the program, whether all are known); unknown ones are random."""
         draw = np.random.default_rng(0).uniform
         own, found = not jax.tree.leaves(self._moving[3]), []
         for x in jax.tree.leaves(self._moving):
@@ -178,14 +177,14 @@ class Jumps:
         for x in jax.tree.leaves(self._traced):
             value = x if concrete(x) else _params.known(x)
             own = own and value is not None
-            if value is None:  # in order, as tables are
+            if value is None:  # sorted, as tables are
                 value = np.sort(draw(0.5, 1.5, (1, *x.shape)), axis=-1)[0]
                 value = value > 1.0 if x.dtype == bool else value
             found.append(jnp.asarray(value, x.dtype))
         return found, own
 
     def _terms(self, leaves: Sequence[Array], t: Array) -> Array:
-        """What the equations of motion are made of, as one array of numbers."""
+        """The terms of the equations of motion, as one array of numbers."""
         tree = jax.tree.structure((*self._moving, self._traced))
         _, q, v, *rest = jax.tree.unflatten(tree, leaves)
 
@@ -200,10 +199,10 @@ class Jumps:
 
 
 def warned(jumps: Jumps, given: tuple[Any, Any], ts: Any) -> tuple[Any, Any]:
-    """Params and inputs as they are; who takes derivatives by what moves a jump is told so.
+    """Params and inputs unchanged; a warning is issued if derivatives move the time of a jump.
 
     Args:
-        jumps: in what is declared.
+        jumps: of the declaration.
         given: traced halves of the params, with what functions close over, and of the inputs.
         ts: times of the motion.
     """
@@ -224,7 +223,7 @@ def warned(jumps: Jumps, given: tuple[Any, Any], ts: Any) -> tuple[Any, Any]:
 
 
 def warn(jumps: Iterable[Jump]) -> None:
-    """Say by which numbers derivatives are not right, and how they would be."""
+    """Warn of numbers whose derivatives are wrong, with the remedy."""
     for leaf, line in jumps:
         warnings.warn(
             f"Derivatives by {leaf} leave out how the time moves at which the equations jump, as "
@@ -237,7 +236,7 @@ def warn(jumps: Iterable[Jump]) -> None:
 
 
 def names_of(params: Any, inputs: Any = None) -> list[str]:
-    """Of the leaves of params, with what functions close over, and inputs, by their paths."""
+    """Names of the leaves of params, with values in closures, and of inputs, by their paths."""
     own = jax.tree_util.tree_flatten_with_path(plain(params))[0]
     names = [f"params{jax.tree_util.keystr(path)}" for path, _ in own]
     if isinstance(params, ParamsWithClosure):
@@ -253,7 +252,7 @@ def _has_knots(signal: Any) -> bool:
 
 
 def _jumps(eqn: Any) -> bool:
-    """Whether its outcome jumps as a number moves."""
+    """Whether its outcome jumps when a number changes."""
     if eqn.primitive.name in _LOOPS:
         return any(map(_jumps, within(eqn)))
     if called(eqn) is not None:
@@ -272,17 +271,17 @@ def _timed(found: _Found) -> bool:
 
 
 def _told(found: Iterable[_Found]) -> tuple[Jump, ...]:
-    """Operations by the numbers that they read, each once."""
+    """Each operation once per number that it reads."""
     jumps = [Jump(name, x.line) for x in found for name in sorted(x.names - {_TIME, _STATE})]
     return tuple(dict.fromkeys(jumps))
 
 
 def _grid(times: np.ndarray | None, dtype: Any) -> np.ndarray:
-    """Times at which outcomes are looked at, in spans: of the motion, or of any size."""
+    """Times for the outcomes, in batches: of the motion, or of various sizes."""
     count = _TOGETHER * _SPANS
     if times is not None:
         return np.linspace(np.min(times), np.max(times), count, dtype=dtype).reshape(_SPANS, -1)
-    largest = min(1e4, 1e-2 / np.sqrt(jnp.finfo(dtype).eps))  # where times are still near enough
+    largest = min(1e4, 1e-2 / np.sqrt(jnp.finfo(dtype).eps))  # up to here times are resolved
     sizes = np.geomspace(1e-3, largest, count // 4, dtype=dtype)
     near = np.linspace(-10.0, 10.0, count // 2, dtype=dtype)
     return np.sort(np.concatenate([-sizes, near, sizes])).reshape(_SPANS, -1)
@@ -291,7 +290,7 @@ def _grid(times: np.ndarray | None, dtype: Any) -> np.ndarray:
 def _jumps_at_changes(
     outcome: Callable, seen: np.ndarray, terms: Sequence[Callable], grid: np.ndarray
 ) -> bool:
-    """Whether terms jump where an outcome, seen along the grid, changes."""
+    """Whether terms jump where an outcome changes along the grid."""
     changed = np.flatnonzero(np.any(seen[1:] != seen[:-1], axis=1))
     some = changed[np.linspace(0, len(changed) - 1, _PLACES).astype(int)]
     places = np.resize(some, _TOGETHER)
@@ -305,7 +304,7 @@ def _jumps_at_changes(
 
 
 def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
-    """Whether terms jump along the grid: looked for where their slope changes most."""
+    """Whether terms jump along the grid; tested where their slope changes most."""
     sides, found = _finite(terms, list(grid))
     if found is None:
         return True
@@ -327,7 +326,7 @@ def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
 def _finite(
     terms: Sequence[Callable], times: Sequence[np.ndarray]
 ) -> tuple[Callable, list[np.ndarray] | None]:
-    """(terms at the first size of states where they are finite at all times, these terms)."""
+    """(terms with the first size of states that makes them finite at all times, their values)."""
     for sides in terms:
         found = [np.asarray(sides(jnp.asarray(x))) for x in times]
         if np.all(np.isfinite(found)):
@@ -336,7 +335,7 @@ def _finite(
 
 
 def _apart(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:
-    """Whether terms jump from one time to the next, by what they are near; or may."""
+    """Whether terms jump between two times, relative to their size nearby; True if undecided."""
     size = np.max(np.abs([before, after, *near]), axis=(0, 1))
     jump = np.abs(after - before) > np.sqrt(np.finfo(before.dtype).eps) * size
     return bool(np.any(jump) or not np.all(np.isfinite(before + after)))

@@ -1,4 +1,4 @@
-"""Growth of perturbations along a motion, and how far a gradient along it says anything."""
+"""Lyapunov exponents: growth of perturbations along a motion, and the validity of its gradients."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -26,30 +26,31 @@ from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
 
-SEGMENTS_AT_ONCE = 64  # beside one another in one loop, at most
-# Bytes of their stages from which XLA (0.10) splits operations between threads, for which it has
-# no function inside a small loop: compilation would end in "Failed to materialize symbols".
+SEGMENTS_AT_ONCE = 64  # in one loop, at most
+# Bytes of their stages from which XLA (0.10) splits operations between threads. It has no code for
+# that inside a small loop: compilation would end in "Failed to materialize symbols".
 STAGES_IN_BYTES = 2**18
 TRANSIENT = 0.25  # part of the motion left out of the exponent
-BLOCKS = 8  # that the rest is divided into, at most
-SURE = 3.0  # errors by which an exponent must exceed zero
+BLOCKS = 8  # of the rest, at most
+SURE = 3.0  # standard errors by which an exponent must exceed zero
 
 
 class PerturbationGrowth(eqx.Module):
-    """How much perturbations of a motion y = (q, v) grow, Phi' = df/dy Phi along y' = f(t, y).
+    """Growth of perturbations of a motion y = (q, v), Phi' = df/dy Phi along y' = f(t, y).
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
-    the batch axes in front. All is NaN where the status is not ok.
+    the batch axes in front. All values are NaN if the status is not ok.
 
     Attributes:
         ts: (s,), s.
         transition: (s - 1, 2n, 2n), Phi(ts[i + 1], ts[i]) P(ts[i]) in (q, v), with P the orthogonal
-            projector onto perturbations that the constraints allow; 1 without constraints.
+            projector onto perturbations that the constraints allow; the identity without
+            constraints.
         log_kappa: (s,), logarithm of `kappa`.
         log_norm: (s,), logarithm of |W(t)^-1 Phi(t, ts[0]) W(ts[0])|.
         exponent: largest Lyapunov exponent, 1/s.
         exponent_error: its standard error, 1/s.
-        horizon: time after ts[0], s, from which on a single gradient says nothing; inf for never.
+        horizon: time after ts[0], s, beyond which a single gradient is meaningless; inf for never.
         rtol: of the weights W.
         atol: of the weights W.
         status: int32, see `Status`: ok, or that of the motion or of the segment that failed.
@@ -68,19 +69,19 @@ class PerturbationGrowth(eqx.Module):
 
     @property
     def kappa(self) -> Float[Array, "*batch s"]:
-        """Conditioning (s,): the largest |W(t)^-1 Phi(t, s) W(s)| over save times s up to t.
+        """Condition number (s,): the largest |W(t)^-1 Phi(t, s) W(s)| over save times s up to t.
 
-        Infinite where it overflows; see `log_kappa`.
+        Infinite on overflow; see `log_kappa`.
         """
         return jnp.exp(self.log_kappa)
 
     @property
     def exponential(self) -> Bool[Array, "*batch"]:
-        """Whether the exponent is positive beyond three of its errors."""
+        """Whether the exponent is positive by more than three standard errors."""
         return self.exponent > SURE * self.exponent_error
 
     def message(self) -> str:
-        """What the growth along a single motion is, and what to do about it, in words."""
+        """The kind of growth along a single motion, and a remedy, as text."""
         if self.ts.ndim != 1:
             raise unsupported(
                 "`message` of a batch",
@@ -134,41 +135,42 @@ def lyapunov(
     step_atol: Any = None,
     max_steps: int = 1024,
 ) -> PerturbationGrowth:
-    """Growth of perturbations along a motion: conditioning, Lyapunov exponent, horizon.
+    """Growth of perturbations along a motion: condition number, Lyapunov exponent, horizon.
 
     With y = (q, v), y' = f(t, y) and Phi(t, s) = dy(t)/dy(s), that is Phi' = df/dy Phi,
-    Phi(s, s) = 1, and weights w(t) = atol + rtol |y(t)|, W = diag(w), the conditioning is
+    Phi(s, s) = 1, and weights w(t) = atol + rtol |y(t)|, W = diag(w), the condition number is
 
         kappa(t) = max over save times s up to t of |W(t)^-1 Phi(t, s) W(s)|  (2-norm):
 
-    errors of rtol and atol that a solver makes on the way are up to kappa(t) times as large at t.
-    Phi is the product of its parts between neighbouring save times. Each is integrated together
-    with y from the saved state, its error controlled as that of y; products are rescaled and kept
-    with their logarithms, so that nothing overflows.
+    Errors of size rtol and atol made by a solver during the motion are up to kappa(t) times as
+    large at t. Phi is the product of its parts between neighboring save times. Each part is
+    integrated together with y from the saved state, with the same error control as y. Products are
+    rescaled and stored with their logarithms, so that they do not overflow.
 
-    Under constraints only perturbations dy that keep them count: the null space of the Jacobian of
-    (phi, A v + b) in (q, v), phi of the holonomic rows alone. There
-    kappa(t) = max over s and dy of |W(t)^-1 Phi(t, s) dy| / |W(s)^-1 dy|. The state is (q, v) for
-    motions in quasi-velocities, too.
+    With constraints only perturbations dy that satisfy them count: the null space of the Jacobian
+    of (phi, A v + b) in (q, v), with phi of the holonomic rows alone. Then
+    kappa(t) = max over s and dy of |W(t)^-1 Phi(t, s) dy| / |W(s)^-1 dy|. The state is (q, v) also
+    for motions in quasi-velocities.
 
-    The largest Lyapunov exponent is the growth rate of log |Phi(t, ts[0])|, in a norm with weights
-    of their own that do not change, after the first quarter of the motion. Its error is
-    that of the mean over eight blocks of what is left, together with what growth proportional to
-    time, as of regular motions, would add: log 4 / (3/4 span).
+    The largest Lyapunov exponent is the growth rate of log |Phi(t, ts[0])| after the first quarter
+    of the motion, in a norm with constant weights. Its error combines the standard error of the
+    mean over eight blocks of the rest with the effect of growth proportional to time, as of regular
+    motions: log 4 / (3/4 span).
 
-    The horizon is where max(rtol, eps) kappa(t) reaches 1, eps the rounding of the dtype: an error
-    of the tolerance is as large as the state, and the gradient is that of some other motion. It is
-    extrapolated by the exponent where that is positive beyond three errors, else it is inf.
+    The horizon is where max(rtol, eps) kappa(t) reaches 1, with eps the rounding of the dtype: an
+    error of the tolerance is then as large as the state, and the gradient is that of another
+    motion. It is extrapolated by the exponent if that is positive by more than three standard
+    errors; otherwise it is inf.
 
     Args:
-        motion: from `simulate`, at s >= 3 times. Its system, params and inputs are used. With batch
-            axes all results have them.
+        motion: from `simulate`, at s >= 3 times. Its system, params and inputs are used. If it has
+            batch axes, all results have them.
         rtol: of the weights, not negative; by default that of `simulate`, 1e-9 in float64, 1e-5 in
             float32. kappa depends on atol / rtol alone, the horizon on rtol.
         atol: of the weights, positive, m or rad and m/s or rad/s; by default 1e-9 and 1e-6.
         step_rtol: relative tolerance of the steps between save times; by default 1e-10, 1e-5 in
-            float32. Each part of Phi is wrong by about that of its own size, or of 1 where that is
-            larger, and products by the sum over their parts. To this comes that Phi follows the
+            float32. The error of each part of Phi is about this times its size, or times 1 if that
+            is larger; errors of products are the sum over their parts. In addition Phi follows the
             saved states, which have errors of their own.
         step_atol: absolute tolerance of the same steps, m or rad and m/s or rad/s; by default
             1e-10, 1e-5 in float32.
@@ -179,13 +181,13 @@ def lyapunov(
             or has a segment that cannot be solved again; tolerances out of range; a derivative of
             the results.
 
-    Warns where a motion goes on beyond its horizon, if its values are known.
+    Warns if a motion continues beyond its horizon and its values are known.
 
     Cost: s integrations of 2n + 4n^2 numbers, and s^2 norms of (2n, 2n) matrices, 2 us each.
 
-    Limits: the numbers have no derivatives of their own. Where f jumps with the state, as with dry
-    friction, what the jump itself contributes to Phi is left out. A finite motion shows a
-    finite-time exponent.
+    Limits: the numbers cannot be differentiated. If f jumps with the state, as with dry friction,
+    Phi does not contain the effect of the jump itself. A finite motion gives a finite-time
+    exponent.
 
     Source: Benettin, Galgani, Giorgilli, Strelcyn, Meccanica 15 (1980) 9 and 21; Hairer, Norsett,
     Wanner, Solving Ordinary Differential Equations I, sec. I.14 (variational equation).
@@ -245,7 +247,7 @@ def lyapunov(
 
 @CustomJVP
 def _not_differentiated(x: Any) -> Any:
-    """The same; an error says where a derivative is asked for."""
+    """The same; an error is raised if a derivative is requested."""
     return x
 
 
@@ -258,7 +260,7 @@ def _refused(primals: tuple, tangents: tuple) -> Any:
 
 
 def _warn_beyond(growth: PerturbationGrowth) -> None:
-    """Say where motions go on beyond their horizon; Python shows it once for each caller."""
+    """Warn if motions continue beyond their horizon; Python shows it once for each caller."""
     span, horizon = np.abs(growth.ts[..., -1] - growth.ts[..., 0]), np.asarray(growth.horizon)
     beyond = np.asarray(span) > horizon
     if beyond.ndim == 0 and beyond:
@@ -292,7 +294,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         params = _params.join(params, params_static.tree)
         inputs = eqx.combine(inputs, inputs_static.tree)
         y = jnp.concatenate([q, v], -1)
-        y = jnp.where(status == int(Status.ok), y, y[:1])  # NaN where the motion did not get
+        y = jnp.where(status == int(Status.ok), y, y[:1])  # NaN at times that were not reached
 
         rate = partial(_rate, system, formulation, params, inputs)
         tangent = jax.vmap(partial(_tangent, system, params))
@@ -302,7 +304,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         w = atol + rtol * jnp.abs(y)
         kept = tangent(ts, y, w)
         steps = kept[1:] @ (Phi * w[:-1, None, :] / w[1:, :, None]) @ kept[:-1]
-        # Weights that stay the same: the exponent is that of the motion alone.
+        # Constant weights: the exponent is that of the motion alone.
         scale = w / (atol + rtol * jnp.max(jnp.abs(y), axis=0))[None]
         log_kappa, log_norm, log_size = _products(steps, kept, scale)
 
@@ -335,7 +337,7 @@ def _tolerance(rtol: Array) -> Array:
 
 
 def _tangent(system: System, params: Any, t: Array, y: Array, w: Array) -> Array:
-    """Orthogonal projector onto the perturbations dy / w that keep phi = 0 and A v + b = 0."""
+    """Orthogonal projector onto the perturbations dy / w with phi = 0 and A v + b = 0."""
     n, one = system.size, jnp.eye(y.shape[0], dtype=y.dtype)
     if not system.constraints:
         return one
@@ -363,9 +365,9 @@ def _transitions(
 ) -> tuple[Array, Array]:
     """(Phi(ts[i + 1], ts[i]) directions[i], status) of every segment: y' = f, Y' = df/dy Y.
 
-    Steps are those that Y needs: at an equilibrium y needs none.
+    Y determines the steps: at an equilibrium y alone would not bound them.
     """
-    # The solver keeps all it integrates in the dtype of time; the system wants its own.
+    # The solver uses the dtype of time for its state; the system uses its own.
     inside, outside = y.dtype, ts.dtype
 
     def rates(t: Any, state: tuple[Array, Array], _: None) -> tuple[Array, Array]:
@@ -407,9 +409,9 @@ def _transitions(
 
 
 def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, Array]:
-    """Logarithms at every save time of the largest product, the one from ts[0], and its size.
+    """Logarithms at every save time: the largest product, the product from ts[0], and its size.
 
-    All products steps[j - 1] ... steps[i] starts[i] are carried along, each rescaled to norm 1.
+    All products steps[j - 1] ... steps[i] starts[i] are updated and rescaled to norm 1.
     """
 
     def turn(carry: tuple[Array, Array], part: tuple) -> tuple[tuple[Array, Array], Any]:
@@ -424,7 +426,7 @@ def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, 
 
     count = starts.shape[0]
     begin = jnp.zeros_like(starts), jnp.zeros((count,), starts.dtype)
-    into = jnp.concatenate([starts[:1], steps])  # nothing has begun before the first save time
+    into = jnp.concatenate([starts[:1], steps])  # no product starts before the first save time
     parts = (jnp.arange(count), into, starts, scale)
     return jax.lax.scan(turn, begin, parts)[1]
 
@@ -436,7 +438,7 @@ def _exponent(tau: Array, log_size: Array) -> tuple[Array, Array]:
     logs = jnp.interp(jnp.linspace(begin, end, count + 1), tau, log_size)
     rates = jnp.diff(logs) * count / (end - begin)
     by_chance = jnp.std(rates, ddof=1) / count**0.5
-    by_power = -float(np.log(TRANSIENT)) / (end - begin)  # of growth as t
+    by_power = -float(np.log(TRANSIENT)) / (end - begin)  # of growth proportional to t
     return jnp.mean(rates), jnp.hypot(by_chance, by_power)
 
 

@@ -1,4 +1,4 @@
-"""What structure-preserving methods ask of a system."""
+"""Requirements of structure-preserving methods on a system."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -24,18 +24,19 @@ def check_requirements(
     inputs: Mapping[str, Any],
     dtype: Any,
 ) -> None:
-    """Raise where a structure-preserving method is not one for this system.
+    """Raise if a structure-preserving method does not apply to this system.
 
     Args:
-        system: what moves.
-        solver: any solver; those that ask for nothing pass.
-        formulation: what the state is.
+        system: the mechanical system.
+        solver: any solver; those without requirements pass.
+        formulation: kind of the state.
         params: as the Lagrangian takes them.
+        inputs: the inputs.
         inputs: the inputs.
         dtype: of the state.
 
     Raises:
-        ValueError: with what the method needs, and what the system has.
+        ValueError: with the requirement of the method, and the property of the system.
     """
     if not isinstance(solver, Splitting | AbstractPartitioned):
         return
@@ -61,7 +62,7 @@ def check_requirements(
 
 
 def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
-    """Whether it is T(v) - V(t, q) with nothing else that accelerates."""
+    """Whether L is T(v) - V(t, q), without forces and constraints."""
     if formulation != "multipliers" or system.constraints or system.forces:
         return False
     structure = system._structure(params, dtype)
@@ -71,7 +72,7 @@ def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
 def _separable(
     system: System, name: str, params: Any, inputs: Mapping[str, Any], dtype: Any
 ) -> None:
-    """Raise unless M is constant and nothing that accelerates depends on v."""
+    """Raise unless M is constant and accelerations do not depend on v."""
     fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
     if system.constraints:
         was = f"it has constraints ({', '.join(map(repr, system._rows(params, dtype).labels))})"

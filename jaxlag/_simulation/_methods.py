@@ -1,4 +1,4 @@
-"""From `method`, tolerances and dt to a diffrax solver and step-size controller."""
+"""The diffrax solver and step-size controller from `method`, tolerances and dt."""
 
 from collections.abc import Callable
 from difflib import get_close_matches
@@ -70,11 +70,11 @@ HABITS = {
     **dict.fromkeys(("yoshida", "forest-ruth"), "'splitting4' with dt="),
     **dict.fromkeys(("midpoint_implicit", "implicit_midpoint"), "'gauss2' with dt="),
 }
-"""Names that other libraries have for methods, and what comes nearest to them here."""
-LOOSE, TIGHT = 1e-3, 1e-12  # rtol from which order 5, and up to which order 9 is taken
-IMPLICIT = "kvaerno5"  # where explicit steps run out
+"""Names of methods in other libraries, and the nearest method here."""
+LOOSE, TIGHT = 1e-3, 1e-12  # rtol: order 5 from the first upwards, order 9 up to the second
+IMPLICIT = "kvaerno5"  # if explicit steps run out
 FINER = {"bosh3": "tsit5", "tsit5": "dopri8", "dopri5": "dopri8", "dopri8": "prince9"}
-# Of steps of order 8 and 9, whose errors grow by 1.1^9 where a step is 10 % too long.
+# For steps of order 8 and 9, whose errors grow by 1.1^9 if a step is 10 % too long.
 SAFETY = {Dopri8: 0.8, Prince9: 0.8}
 
 
@@ -87,7 +87,7 @@ def choose(
         method: "auto", a name of METHODS, a diffrax solver, or (solver, controller).
         adaptive: whether dt was left out.
         rtol: relative tolerance of the default controller, and of implicit equations.
-        atol: absolute tolerance, the same; of every component of the state where it is an array.
+        atol: absolute tolerance, the same; for every component of the state if it is an array.
 
     Raises:
         ValueError: unknown name, a solver for other kinds of equations, a controller together
@@ -138,19 +138,19 @@ def choose(
 
 
 def _rms(x: Array) -> Array:
-    """Root mean square; by a product of x with itself a loop is no function of plain operations."""
+    """Root mean square. A product of x with itself would prevent a loop of plain operations."""
     return jnp.sqrt(jnp.mean(x**2))
 
 
 def automatic(tolerance: Any) -> str:
-    """The explicit method that is cheapest at the error of a tolerance; order 8 if it is not known.
+    """The explicit method that is cheapest for a tolerance; order 8 if the tolerance is unknown.
 
     At equal errors of the motion, on a double pendulum, a Kepler orbit of e = 0.6 and the system of
-    Henon and Heiles: order 5 takes as long as order 8 at 1e-4 and compiles in half the time, but
-    there it left errors of more than ten times the tolerance times the conditioning in 4 of 126
-    motions of the catalogue, order 8 in none of those. Order 9 takes 1.1 of order 8 at 1e-6, 0.95
-    at 1e-9 and 0.8 at 1e-12. At equal tolerance order 9 takes 1.3 to 1.8 times the evaluations of
-    order 8, and is a hundred times as accurate.
+    Henon and Heiles: order 5 takes as long as order 8 at 1e-4 and compiles in half the time. But at
+    1e-4 its errors were more than ten times the tolerance times the condition number in 4 of 126
+    motions of the catalog, those of order 8 in none of them. Order 9 takes 1.1 of order 8 at 1e-6,
+    0.95 at 1e-9 and 0.8 at 1e-12. At equal tolerance order 9 takes 1.3 to 1.8 times the evaluations
+    of order 8, and is a hundred times as accurate.
     """
     if tolerance is None:
         return "dopri8"
@@ -160,7 +160,7 @@ def automatic(tolerance: Any) -> str:
 
 
 def name_of(solver: diffrax.AbstractSolver) -> str:
-    """Its name in METHODS, or else that of its class."""
+    """The name of a solver in METHODS, or else that of its class."""
     default = type(solver).__name__
     for name, make in METHODS.items():
         known = make()
@@ -175,7 +175,7 @@ def name_of(solver: diffrax.AbstractSolver) -> str:
 
 
 def _nearest(name: str) -> str:
-    """What comes nearest to a name that other libraries have, or that is written otherwise."""
+    """The nearest method for a name of another library, or for a misspelled name."""
     plain = name.lower().replace("-", "_")
     found = HABITS.get(plain) or HABITS.get(plain.replace("_", "-"))
     if found is None:
@@ -210,11 +210,11 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
 
 
 def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
-    """Its equations are solved to a tenth of the tolerance, by one Jacobian per step.
+    """Solve the equations of an implicit step to a tenth of the tolerance, with one Jacobian each.
 
-    The solver's own way gives up where the first turns do not converge fast, and steps are as short
-    as it takes not to: 5 times as many on a double pendulum, 20 times on an elastic pendulum of
-    stiffness 1e6, half of them rejected, with errors far below the tolerance. At equal errors it
+    The solver's own root finder gives up if its first iterations converge slowly, and steps shrink
+    until they converge: 5 times as many steps on a double pendulum, 20 times on an elastic pendulum
+    of stiffness 1e6, half of them rejected, with errors far below the tolerance. At equal errors it
     takes 2 to 3 times as long.
     """
     dtype = jnp.result_type(rtol)
@@ -232,7 +232,7 @@ def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
 def _with_tolerances(
     solver: diffrax.AbstractSolver, controller: Any, rtol: Any, atol: Any
 ) -> diffrax.AbstractSolver:
-    """Implicit solvers take the tolerances of their equations from the step-size control."""
+    """Implicit solvers use the tolerances of the step-size control for their equations."""
     finder = getattr(solver, "root_finder", None)
     if finder is None:
         return solver
@@ -241,7 +241,7 @@ def _with_tolerances(
         "atol": getattr(controller, "atol", atol),
         "norm": getattr(controller, "norm", optimistix.max_norm),
     }
-    # diffrax marks "take it from the controller" by an object that is neither number nor function.
+    # diffrax marks "use the controller's value" by an object that is neither number nor function.
     unset = [
         name
         for name in source
@@ -260,13 +260,13 @@ def _with_tolerances(
 def for_state(solver: Any, controller: Any, n: int, size: int) -> tuple[Any, Any]:
     """Solver and controller with one atol for every component of the state.
 
-    Where there was one for every coordinate; velocities have that of their coordinates.
+    An atol for every coordinate is also used for its velocity.
 
     Args:
         solver: of `choose`.
         controller: the same.
         n: number of coordinates.
-        size: of the state (q, v), with whatever is integrated along behind it.
+        size: of the state (q, v), with the integrals that follow it.
     """
 
     def of(owner: Any) -> Any:

@@ -1,4 +1,4 @@
-"""From the arguments of a solve to its problem: equations, start, times, and the stepper."""
+"""Build the initial-value problem from simulate's arguments."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -40,7 +40,7 @@ from jaxlag.solvers._explicit import in_loop_over_stages
 
 
 class ProgramKey(NamedTuple):
-    """What the compiled program is keyed by."""
+    """The key of the compiled program."""
 
     system: System
     params: _params.Static
@@ -57,11 +57,11 @@ class ProgramKey(NamedTuple):
     apart: bool
     capacity: int
     change_points: str
-    auto: bool  # whether the method may be chosen by the structure of the system
+    auto: bool  # whether the structure of the system may select the method
 
 
 class Values(NamedTuple):
-    """What the compiled program takes."""
+    """The traced arguments of the compiled program."""
 
     q0: Array
     v0: Array | None  # one of v0 and u0
@@ -78,7 +78,7 @@ class Values(NamedTuple):
 
 def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
     """The initial-value problem that a plan and its values describe."""
-    # --- the equations, and what is known of them before any state
+    # --- the equations, and their properties that hold for all states
     dynamics, args, method = _equations(plan, values)
     params, inputs = dynamics.given(args)
 
@@ -103,11 +103,11 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     stepper = _stepper(dynamics, method, y0, args, values.longest)
     stepper_traced, stepper_static = eqx.partition(stepper, eqx.is_array)
 
-    # --- the times, and whether all of it may start
+    # --- the times, and whether the motion may start
     times, in_range = _times(dynamics, args, inputs, values.ts)
     valid = _valid(dynamics, values, inputs, args)
     finite = start_finite(dynamics, start, y0, args)
-    if args.lengths is not None:  # what depends at the start is not known to be independent nearby
+    if args.lengths is not None:  # rows dependent at the start may be so nearby
         finite = finite & jnp.all(args.lengths > 0)
     contacts = StepEnd(dynamics).contacts_valid(start, y0, args)
     begun = Start(valid, in_range, finite, consistent, contacts)
@@ -117,7 +117,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
 
 
 class _Initial(NamedTuple):
-    """The initial state, w0 of the velocities that it is made of."""
+    """The initial state; w0 are its velocities or free quasi-velocities."""
 
     t0: Array
     q0: Array
@@ -164,7 +164,7 @@ def _equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments
 def _initial_state(
     plan: ProgramKey, values: Values, dynamics: VectorField, params: Any, inputs: Any
 ) -> _Initial:
-    """As given, with the velocities that follow from quasi-velocities, or assembled."""
+    """The initial state as given, with velocities from quasi-velocities, or assembled."""
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
     if v0 is None:
         v0 = plan.system.velocities(q0, u0, params, t=t0)
@@ -182,10 +182,10 @@ def _initial_state(
 def _started(
     dynamics: VectorField, initial: _Initial, params: Any, args: Arguments
 ) -> tuple[Array, Arguments]:
-    """y at the start, and the arguments with what is computed once per solve.
+    """y at the start, and the arguments with the values computed once per solve.
 
-    A lane that has no start, or none that is consistent, or whose kinematics are singular there,
-    has no derivatives, so that those of the others stay finite.
+    A lane without a consistent start, or with singular kinematics there, has no derivatives, so
+    that those of the others stay finite.
     """
     t0, q0, v0, w0 = initial
     if dynamics.quasi is not None or dynamics.rows.size:
@@ -203,7 +203,7 @@ def _started(
 
 
 def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments) -> Arguments:
-    """The arguments with the scales by which change points are recognised."""
+    """The arguments with the scales for the detection of change points."""
     if not dynamics.crossing:
         return args
     masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
@@ -215,7 +215,7 @@ def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments
 def _stepper(
     dynamics: VectorField, method: tuple[Any, Any], y0: Array, args: Arguments, longest: Any
 ) -> Stepper:
-    """Solver, controller, vector field and what follows a step, as one."""
+    """The stepper: solver, controller, vector field and post-processing."""
     solver, controller = for_state(*method, dynamics.system.size, y0.shape[0])
     step_end = StepEnd(dynamics)
     term = term_of(dynamics, jnp.zeros_like(args.origin), y0, args)
@@ -229,7 +229,7 @@ def _stepper(
 
 
 def _valid(dynamics: VectorField, values: Values, inputs: Any, args: Arguments) -> Array:
-    """Whether start, times, tolerances and steps are numbers within their bounds."""
+    """Whether start, times, tolerances and steps are within their bounds."""
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
     given, saves = jnp.concatenate([values.q0, speeds]), dynamics.signed(values.ts, args)
@@ -239,7 +239,7 @@ def _valid(dynamics: VectorField, values: Values, inputs: Any, args: Arguments) 
 
 
 def stop_gradient_unless(moves: Array, tree: Any) -> Any:
-    """The same values, without derivatives where `moves` is False."""
+    """The same values, without derivatives if `moves` is False."""
 
     def unless(x: Any) -> Any:
         inexact = eqx.is_inexact_array(x)
@@ -251,20 +251,19 @@ def stop_gradient_unless(moves: Array, tree: Any) -> Any:
 def velocities_at(
     dynamics: VectorField, ts: Array, y: Array, args: Arguments, moved: Array
 ) -> tuple[Array, Array]:
-    """(q, v) at every save time of one motion; NaN where the motion did not get.
+    """(q, v) at every save time of one motion; NaN at times that were not reached.
 
-    A motion that took no step, as its kinematics may be singular at the start, lends no
-    derivatives.
+    A motion without steps has no derivatives, as its kinematics may be singular at the start.
     """
     q, w = dynamics.parts(y)
     if dynamics.quasi is None:
         return q, w
     reached = jnp.isfinite(q[:, :1])
-    # States not reached are NaN: look at the start instead, so that derivatives stay finite.
+    # States not reached are NaN: use the start instead, so that derivatives stay finite.
     safe = [jnp.where(reached, x, x[:1]) for x in (q, w)]
     ts, safe, args = stop_gradient_unless(moved, (ts, safe, args))
     v = jax.vmap(lambda t, q, w: dynamics.velocities_of(t, q, w, args))(ts, *safe)
-    return q, jnp.where(reached, v, q[:, :1])  # which is NaN there, with NaN for its derivatives
+    return q, jnp.where(reached, v, q[:, :1])  # NaN there, also in its derivatives
 
 
 def _times(

@@ -1,4 +1,4 @@
-"""Quantities that follow from the states of a motion, one by one."""
+"""Quantities computed from the states of a motion."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import Array
 from jaxlag._system._system import System
 
 Quantity = Callable[..., Any]
-"""(system, q, v, params, t=, inputs=) -> the quantity, as the method of `System` gives it."""
+"""(system, q, v, params, t=, inputs=) -> the quantity, as the method of `System` returns it."""
 
 
 def _without_inputs(method: Quantity) -> Quantity:
@@ -32,7 +32,7 @@ QUANTITIES: dict[str, Quantity] = {
     "constraint_force": System.constraint_force,
     "Q": System.generalized_force,
 }
-"""Quantities of one state, by the name `save=` and the Solution know them under."""
+"""Quantities of one state, by their names in `save=` and the Solution."""
 
 
 def _from_quasi(name: str) -> Quantity:
@@ -42,7 +42,7 @@ def _from_quasi(name: str) -> Quantity:
     return quantity
 
 
-# The same without multipliers solved for, from the equations in quasi-velocities.
+# The same from the equations in quasi-velocities.
 _BY_QUASI = {name: _from_quasi(name) for name in ("a", "multipliers", "constraint_force")}
 
 
@@ -56,7 +56,7 @@ def at_saves(
     q: Array,
     v: Array,
 ) -> Any:
-    """A quantity at every save time of one motion; NaN where the motion did not get."""
+    """A quantity at every save time of one motion; NaN at times that were not reached."""
     reached = jnp.isfinite(q[:, 0])
     quantity = QUANTITIES[name]
     if formulation == "quasi":
@@ -65,7 +65,7 @@ def at_saves(
     def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
         # States not reached are NaN: evaluate at the start instead, so that derivatives stay
         # finite.
-        unknown = q[0]  # NaN there, with NaN for its derivatives
+        unknown = q[0]  # NaN there, also in its derivatives
         q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
         value = quantity(system, q, v, params, t=t, inputs=inputs)
         return jax.tree.map(lambda x: jnp.where(reached, x, unknown.astype(x.dtype)), value)

@@ -1,4 +1,4 @@
-"""States of a motion between its save times: solved anew from the last one before."""
+"""States between save times: a new solve from the last save time before."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Arrays that are spread over devices in ways that motions do not go along with."""
+"""Sharding: checks of arrays that are distributed over devices in an unsupported way."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from jaxlag._core._errors import unsupported
 
 
 def check_placement(function: str, values: Any) -> None:
-    """Raise on arrays with axes of an explicit mesh, or of `shard_map` where these are checked.
+    """Raise on arrays with axes of an explicit mesh, or of `shard_map` with checked axes.
 
     Args:
-        function: as errors name it.
-        values: a pytree of what it is called with.
+        function: its name in errors.
+        values: a pytree of its arguments.
 
     Raises:
-        ValueError: with the axes, and what to write instead.
+        ValueError: with the axes, and the code to write instead.
     """
     for leaf in jax.tree.leaves(values):
         if not isinstance(leaf, Tracer) and not _spread(leaf):
@@ -42,10 +42,10 @@ def _spread(x: Any) -> bool:
 
 
 def _axes(x: Any) -> tuple[set[str], set[str]]:
-    """(axes that it varies over in a shard_map, explicit axes that it lies along)."""
+    """(axes of a shard_map that it varies over, explicit axes that it is sharded over)."""
     varying: set[str] = set()
     explicit: set[str] = set()
-    while isinstance(x, jax.Array):  # a program's own variable, further down, is none
+    while isinstance(x, jax.Array):  # a variable of a jaxpr is no jax.Array
         aval = jax.typeof(x)
         manual = getattr(aval, "manual_axis_type", None)
         varying |= set(getattr(manual, "varying", getattr(aval, "vma", ())))
@@ -54,6 +54,6 @@ def _axes(x: Any) -> tuple[set[str], set[str]]:
             explicit |= set() if axes is None else {axes} if isinstance(axes, str) else set(axes)
         if not isinstance(x, Tracer):
             break
-        # What vmap maps over, and what a derivative is taken of.
+        # The array inside a tracer of vmap or of a derivative.
         x = getattr(x, "val", getattr(x, "primal", None))
     return varying, explicit

@@ -1,4 +1,4 @@
-"""simulate: from a declared system and a start to a Solution."""
+"""`simulate`: the motion of a declared system from an initial state."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -89,120 +89,120 @@ def simulate(
 ) -> Solution:
     """Integrate M a + h = Q + A^T lam, A v + b = 0 from (q0, v0) at ts[0]; return it at ts.
 
-    Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. Other values of q0, v0, ts,
-    inputs, rtol, atol, dt, dt0, dt_max and of the traced params never recompile, unless a tolerance
-    makes "auto" another method; another number of times, method, static or structure of params
-    does, and so does turning the direction of time round, and each transform. What takes more than
-    5 s is said on the log "jaxlag".
+    Composes with jit, vmap, grad, jvp, jacfwd, jacrev and hessian. New values of q0, v0, ts,
+    inputs, rtol, atol, dt, dt0, dt_max and of the traced params do not recompile, unless a
+    tolerance changes the choice of "auto". A new number of times, method, static part or structure
+    of params recompiles, and so does a new direction of time, and each transform. The logger
+    "jaxlag" reports compilations of more than 5 s.
 
     The derivative under every transform is that of the solution at the frozen sequence of
-    accepted steps, the dependence on ts and on the inputs' knots kept (where knots of two tables
-    coincide, only for moving them together). It is zero in dt, dt0, dt_max, rtol and atol.
+    accepted steps. It includes the dependence on ts and on the inputs' knots (if knots of two
+    tables coincide, only for moving them together). It is zero in dt, dt0, dt_max, rtol and atol.
 
-    Where L or a force compares what moves (max(x, 0), where, abs), perturbations jump as the force
-    bends: steps along which derivatives are taken are shortened where a comparison comes out
-    otherwise, as far as `max_steps` lets them. A first derivative is then about as good as the
-    motion. It leaves out how the time moves at which a force itself jumps (sign(v), where between
-    two values), and a second one what every bend adds, as JAX's own derivatives of such functions
-    do: smooth the force (tanh, softplus) where that matters. Where the time of a jump is told by
-    params, a warning names these; knots of inputs that depend on them give the whole derivative.
+    If L or a force compares variables (max(x, 0), where, abs), perturbations jump at the kink of
+    the force. Steps along which derivatives are taken are shortened across such a kink, as far as
+    `max_steps` allows. A first derivative is then about as accurate as the motion. It does not
+    include the motion of the time at which a force itself jumps (sign(v), where between two
+    values). A second derivative does not include the contribution of kinks. JAX's own derivatives
+    of such functions have the same limits: smooth the force (tanh, softplus) if they matter. If
+    params determine the time of a jump, a warning names them. Make that time a knot of an input to
+    get the whole derivative.
 
     Args:
-        system: what moves.
+        system: the mechanical system.
         q0: coordinates at ts[0]: (n,) numbers or a dict by name; m or rad.
         v0: velocities at ts[0], in the same form; m/s or rad/s. Exactly one of v0, u0.
         ts: (s,) times in s, strictly monotone either way, s >= 2. ts[0] is the start; the rest
             are save times and cost no steps.
-        params: pytree handed to the Lagrangian and the forces. Floats and inexact arrays are
-            traced and differentiable, the rest is static, and must be of types that cannot change.
+        params: pytree passed to the Lagrangian and the forces. Floats and inexact arrays are
+            traced and differentiable. The rest is static, and must be of immutable types.
         u0: quasi-velocities at ts[0], for systems that declare them: (k,) numbers in the order of
             their names, or a dict by name; constrained ones are zero, and may be left out of a
             dict; m/s or rad/s.
         inputs: dict from names to `ZeroOrderHold`, `LinearInterpolation`, `TimeFunction`,
             `Feedback` or arrays (constant), read by the forces. Steps end on the knots of tables.
         method: "auto", a name such as "tsit5", any diffrax solver, or a pair (solver, step-size
-            controller). "auto" is "dopri8"; "tsit5" where rtol is known and at least 1e-3;
-            "prince9" where it is at most 1e-12; with fixed steps "splitting8" for T(v) - V(t, q)
+            controller). "auto" is "dopri8"; "tsit5" if rtol is known and at least 1e-3;
+            "prince9" if it is at most 1e-12; with fixed steps "splitting8" for T(v) - V(t, q)
             without forces and constraints (a fifth of the time of "dopri8", and as accurate or
             better in orbits and pendulums, but not at steps beyond 1 / omega); and "kvaerno5",
-            outside of transforms, where a stiff motion took max_steps explicit steps.
-            `Solution.method` names it. Implicit methods by name solve their equations to a tenth of
-            the tolerance; instances of diffrax's classes do as they were made to. "kvaerno4" and
+            outside of transforms, if a stiff motion took max_steps explicit steps.
+            `Solution.method` is the method used. Implicit methods by name solve their equations to
+            a tenth of the tolerance; diffrax instances keep their own settings. "kvaerno4" and
             "kvaerno5" read forces up to a quarter of a step beyond the last time.
-            Methods that keep the structure of the equations, for
-            long runs with fixed steps dt: "splitting2", "splitting4", "splitting6", "splitting8"
-            (`solvers.Splitting`) where M is constant and nothing that accelerates depends on v;
-            "gauss2" to "gauss8" (`solvers.GaussLegendre`) for any L without constraints;
-            "variational2" and "variational4" (`solvers.LobattoIIIAB`) for any L, with holonomic
-            constraints held inside the step, so that `stabilization` has nothing to do.
-        formulation: what the state is and how accelerations are found.
-            "quasi" ("auto" where quasi-velocities are declared and take care of all rows): (q, u)
-            with the quasi-velocities that are not constrained, no multipliers. Kinematics do so
-            where they leave no more freedoms than there are coordinates less rows.
-            "multipliers" ("auto" else; and where quasi-velocities become singular on the way,
-            outside of transforms and with L in v, which `motion.message()` says then): (q, v),
-            M + A^T W A and its Schur complement, factored once each. "null_space": (q, v), M on the
-            tangent space of the constraints. Both take an M that is singular, but not on that space
-            (links without mass).
-            A motion in quasi-velocities that comes to a place where these are singular, as a
-            steered wheel at 90 degrees, ends just before it in the status kinematics_singular;
-            with fixed steps one step before it.
+            Structure-preserving methods, for long runs with fixed steps dt: "splitting2",
+            "splitting4", "splitting6", "splitting8" (`solvers.Splitting`) if M is constant and
+            accelerations do not depend on v; "gauss2" to "gauss8" (`solvers.GaussLegendre`) for any
+            L without constraints; "variational2" and "variational4" (`solvers.LobattoIIIAB`) for
+            any L, with holonomic constraints satisfied inside the step, so that `stabilization` is
+            not used.
+        formulation: the state and the solve for accelerations.
+            "quasi" ("auto" if quasi-velocities are declared and satisfy all rows): (q, u)
+            with the quasi-velocities that are not constrained, no multipliers. Kinematics satisfy
+            the rows if they have no more freedoms than there are coordinates minus rows.
+            "multipliers" ("auto" otherwise; and if quasi-velocities become singular during the
+            motion, outside of transforms and with L in v, which `motion.message()` reports): (q,
+            v), M + A^T W A and its Schur complement, factored once each. "null_space": (q, v), M on
+            the tangent space of the constraints. Both accept an M that is singular, but not on that
+            space (links without mass).
+            If quasi-velocities become singular, as for a steered wheel at 90 degrees, a motion in
+            them ends just before that place with the status kinematics_singular; with fixed steps
+            one step before it.
         rtol: relative bound on the local error; by default 1e-9 in float64, 1e-5 in float32.
         atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32. A
             number, or one for every coordinate and its velocity: (n,) of them, or a dict by name.
-        dt: fixed step in s (positive, whichever way time runs); the last one is shortened to
-            land on ts[-1].
-        dt0: first step in s of an adaptive solve, positive; by default chosen from the start.
-        dt_max: bound on the steps of an adaptive solve in s, positive; None for none. A pulse, of a
-            `TimeFunction` or of explicit time, that is shorter than a step and between two of its
-            stages is not seen: bound the steps by its length, or say where it begins and ends
+        dt: fixed step in s (positive for both directions of time); the last one is shortened to
+            end at ts[-1].
+        dt0: first step in s of an adaptive solve, positive; by default estimated at the start.
+        dt_max: bound on the steps of an adaptive solve in s, positive; None for none. A pulse (of a
+            `TimeFunction` or of explicit time) that is shorter than a step may lie between two of
+            its stages and be missed: set dt_max to its length, or make its begin and end knots
             (`TimeFunction(f, knots=)`).
         max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
-            "potential", "Q", "power", "multipliers", "constraint_force", which the Solution
-            computes on demand without it; and "work", the integral of each term of dH/dt since
-            ts[0], which exists only here. It is integrated along with the motion, its local error
-            bounded like that of q and v.
+            "potential", "Q", "power", "multipliers", "constraint_force". The Solution also computes
+            these on demand. "work", the integral of each term of dH/dt since ts[0], exists only
+            here. It is integrated with the motion, and its local error is bounded like that of q
+            and v.
         gradient: a hint on the cost of reverse derivatives, never on their value.
             "recorded" keeps the state at the start of every step. "checkpoints" keeps about the
-            square root as many and takes the steps between two again, one more solve. "forward"
-            keeps none: reverse derivatives are put together from forward ones, the dearer the
-            more numbers move. "auto" keeps up to 512 states, which is "recorded" up to 512 steps,
-            and where `gradient_memory` is less than that the fastest mode that fits. All keep the
-            times of max_steps steps. What was done is in `motion.gradient_mode`. Forward
+            square root as many and repeats the steps between two of them: one more solve. "forward"
+            keeps none: reverse derivatives are computed from forward ones, and their cost grows
+            with the number of variables. "auto" keeps up to 512 states, which is "recorded" up to
+            512 steps; if `gradient_memory` is less than that, it takes the fastest mode that fits.
+            All keep the times of max_steps steps. `motion.gradient_mode` is the mode used. Forward
             derivatives need the times alone.
-        gradient_memory: bound on what reverse derivatives of one motion keep, bytes; None for
+        gradient_memory: bound on the memory of reverse derivatives of one motion, bytes; None for
             none.
         stabilization: "projection": accepted steps and saved states are moved onto the
-            constraints, q along M^-1 A^T, then v (with quasi-velocities there is nothing to move
-            but q). None: they are left to drift. `Baumgarte(alpha, beta)`: residuals are damped
-            instead.
-        change_points: what becomes of a motion where constraint rows that are independent elsewhere
-            depend on one another, as in a linkage that lies flat: there it may go on in more than
-            one way, and reactions may be infinite. "pass": it goes on along the tangent that it
-            came on, as accurate as elsewhere, with its derivatives. Where ways touch that do not
-            cross, one ends in a cusp, nothing is projected, or forces read multipliers, it ends
-            there, in the status rank_change. "stop": it ends just before every such place, at every
-            tolerance; with fixed steps one step before it. Variational methods stop, and so do
-            equal steps of which one meets the place with an end or a stage, to 1e-5 of a step.
-            States are saved there, too, and a motion may end there: by a polynomial through both
-            ends of a short step, with velocities to 1e-9 at best, at loose tolerances to some
-            hundred of them. In float32 rounding shows there: 1e-2 at worst of 384 linkages that
-            pass two such places, 3e-5 in the median.
+            constraints, q along M^-1 A^T, then v (with quasi-velocities only q). None: constraints
+            may drift. `Baumgarte(alpha, beta)`: residuals are damped instead.
+        change_points: the treatment of change points, where constraint rows that are independent
+            elsewhere become dependent, as in a linkage that lies flat. There the motion may have
+            more than one continuation, and reactions may be infinite. "pass": it continues along
+            its tangent, as accurate as elsewhere, with its derivatives. It ends with the status
+            rank_change if branches touch without crossing, if one ends in a cusp, if nothing is
+            projected, or if forces read multipliers. "stop": it ends just before every change
+            point, at every tolerance; with fixed steps one step before it. Variational methods
+            stop; so do fixed steps of which an end or a stage is at the change point, to 1e-5 of a
+            step. States may be saved there, too, and a motion may end there: by a polynomial
+            through both ends of a short step, with velocities to 1e-9 at best, and to some hundred
+            tolerances if these are loose. In float32 rounding is visible there: 1e-2 at worst of
+            384 linkages that pass two such places, 3e-5 in the median.
         assemble: whether an inconsistent start is moved to the nearest consistent one, as by
-            `jl.assemble`; else it ends in the status inconsistent_start.
-        estimate_error: whether to solve once more with a tenth of the tolerance and, where there
-            is one, a method of higher order, or else with half the step dt, and give in
-            `motion.error` what follows for the errors of q and v at every save time (of the same
-            method, up to every save time; not below 32 eps sqrt(steps) |y|, what rounding leaves):
-            global ones, where rtol and atol bound those of a step.
+            `jl.assemble`; otherwise it ends with the status inconsistent_start.
+        estimate_error: whether to estimate the global errors of q and v at every save time, in
+            `motion.error`; rtol and atol bound local errors. The solve is repeated with a tenth of
+            the tolerance and, if there is one, a method of higher order, or with half the step dt.
+            For the same method the estimate holds up to each save time. It is not below
+            32 eps sqrt(steps) |y|, the rounding.
         throw: outside `jit` and `vmap`, raise `SimulationError` for a status other than ok. Inside
             them nothing is raised: read `motion.ok`, or call `motion.check()` outside.
 
     Raises:
         ValueError: an argument of wrong form or value, named.
         SimulationError: the motion did not reach ts[-1], with `throw=True` and concrete values;
-            its `motion` attribute holds the part that was reached.
+            its `motion` attribute is the part that was reached.
 
     Source: Pila, Introduction to Lagrangian Dynamics, ch. 3; Hairer, Norsett, Wanner, Solving
     Ordinary Differential Equations I, ch. II.
@@ -302,8 +302,8 @@ def simulate(
             motion, method = other, IMPLICIT
             stepper = choose(IMPLICIT, True, rtol, atol)
     if estimate_error:
-        # Half the step takes twice as many; of a tenth of the tolerance, at order 5, 1.6 times.
-        # Steps of a higher order share no errors with those of the motion.
+        # Half the step takes twice as many; a tenth of the tolerance, at order 5, 1.6 times.
+        # Steps of a higher order do not have the same errors as those of the motion.
         room = plan._replace(max_steps=2 * max_steps)
         steps = finer(rtol, atol, step, dt is not None)
         better = method if dt is not None else FINER.get(name_of(stepper[0]), method)
@@ -333,16 +333,16 @@ def _with_method(
 def _past_singular(
     plan: ProgramKey, values: Values, motion: Solution
 ) -> tuple[ProgramKey, Solution]:
-    """The motion by multipliers where one in quasi-velocities ends as these are singular.
+    """The motion by multipliers if one in quasi-velocities ends at their singularity.
 
-    One motion, with values, and where it gets further so.
+    For a single motion with values, if it then gets further.
     """
     status = motion.raw_status
     single = np.ndim(status) == 0 and concrete(status, motion.q)
     if plan.formulation != "quasi" or not single or int(status) not in _MAY_BE_SINGULAR:
         return plan, motion
     if int(motion.status) != int(Status.kinematics_singular) or int(motion.where) < 0:
-        return plan, motion  # quasi-velocities that are too few are another fault
+        return plan, motion  # too few quasi-velocities are another failure
     multipliers = plan._replace(formulation=FORMULATIONS[0])
     other = _simulate(multipliers, values)
     start = values.ts[0]
@@ -352,7 +352,7 @@ def _past_singular(
 
 
 def _ran_out(motion: Solution) -> bool:
-    """Whether one motion, with values, took more steps than it may."""
+    """Whether a single motion with values took max_steps steps."""
     status = motion.raw_status
     single = np.ndim(status) == 0 and concrete(status, motion.q)
     return single and int(status) == int(Status.max_steps)
@@ -360,8 +360,8 @@ def _ran_out(motion: Solution) -> bool:
 
 @partial(jax.jit, static_argnums=0)
 def _simulate(plan: ProgramKey, values: Values) -> Solution:
-    """The compiled program: pose, solve, derive what `save` names."""
-    values = values._replace(ts=jnp.asarray(values.ts))  # under jax.disable_jit it is numpy's
+    """The compiled program: build the problem, solve it, compute the quantities of `save`."""
+    values = values._replace(ts=jnp.asarray(values.ts))  # under jax.disable_jit it is a numpy array
     dynamics, start, problem = build_problem(plan, values)
     stepper: Stepper = eqx.combine(problem.setup.stepper, problem.stepper)
     name = name_of(stepper.solver)

@@ -27,31 +27,30 @@ from jaxlag._tracing._compiled import Compiled
 
 
 class Solution(AbstractSolution):
-    """A motion at the requested times, and how it ended.
+    """A motion at the requested times, and its status.
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
-    the batch axes in front. States not reached are NaN, and so are their derivatives: a loss over a
-    batch leaves failed motions out by `jnp.where(motion.ok, loss, 0.0)`.
+    the batch axes in front. States not reached are NaN, and so are their derivatives: exclude
+    failed motions from a loss over a batch by `jnp.where(motion.ok, loss, 0.0)`.
 
     Attributes:
-        system: what was simulated.
+        system: the simulated system.
         ts: (s,), s.
         q: coordinates (s, n), m or rad.
         v: velocities (s, n), m/s or rad/s.
         last_time: last time reached, s.
         last_state: (q, v) there, each (n,).
         stats: counts of "accepted" and "rejected" steps.
-        gradient_mode: a `GradientMode`: how reverse derivatives of this motion go through the
-            steps.
+        gradient_mode: a `GradientMode`: how reverse derivatives of this motion are computed.
         saved: quantities named in `save=`, by name.
-        formulation: "quasi" where the state was (q, u), else how accelerations were found.
-        stabilization: "projection", a `Baumgarte`, or None: what kept states on the constraints
+        formulation: "quasi" if the state was (q, u), else how accelerations were solved for.
+        stabilization: "projection", a `Baumgarte`, or None: how states were kept on the constraints
             between steps.
         tolerances: (rtol, atol) of the step-size control; None with fixed steps.
-        dt_max: bound on adaptive steps, s; None where none was given.
-        change_points: whether places where constraint rows depend on one another are passed.
-        error: with `estimate_error=True` the errors of (q, v) about to be expected at each save
-            time, each (s, n), in their units; else None.
+        dt_max: bound on adaptive steps, s; None if none was given.
+        change_points: "pass" or "stop", see `simulate`.
+        error: with `estimate_error=True` the estimated errors of (q, v) at each save time, each
+            (s, n), in their units; else None.
     """
 
     system: System
@@ -79,26 +78,26 @@ class Solution(AbstractSolution):
     dt_max: Float[Array, "*batch"] | None = None
     change_points: str = eqx.field(static=True, default="pass")
     error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
-    # (last good time, index of the quasi-velocity) where those end that "auto" went on without
+    # (last good time, index of the quasi-velocity) if "auto" continued with multipliers
     _singular: tuple[Float[Array, ""], Int[Array, ""]] | None = None
 
     @property
     def status(self) -> Int[Array, "*batch"]:
         """How the motion ended: int32, see `Status`.
 
-        Where one failed, the states around its end are looked at when this is asked for; inside
-        jit and vmap always.
+        For a failed motion this examines the states around its end; inside jit and vmap it always
+        does.
         """
         return self._explained().status
 
     @property
     def ok(self) -> Bool[Array, "*batch"]:
-        """Whether the motion reached ts[-1]. Unlike the status it costs nothing inside jit."""
+        """Whether the motion reached ts[-1]. Unlike `status` it costs nothing inside jit."""
         return self.raw_status == int(Status.ok)
 
     @property
     def raw_status(self) -> Int[Array, "*batch"]:
-        """How the loop ended: the status before the states around the end are looked at."""
+        """The status of the loop, before the states around the end are examined."""
         return self._ending.status
 
     @property
@@ -108,7 +107,7 @@ class Solution(AbstractSolution):
 
     @property
     def scene(self) -> MotionKey:
-        """What moved, as compiled programs are keyed by it."""
+        """The key of compiled programs for this motion."""
         keys = self._params_static, self._inputs_static, self.formulation, self.stabilization
         return MotionKey(self.system, *keys, self._kinematic, self._implicit)
 
@@ -122,7 +121,7 @@ class Solution(AbstractSolution):
 
     @property
     def method(self) -> str:
-        """Name of the method that was used; of its class, where it is none of the named ones."""
+        """Name of the method used; the name of its class if it is not a named method."""
         if self._solver:
             return self._solver
         if not concrete(self._method):
@@ -146,7 +145,7 @@ class Solution(AbstractSolution):
     def __getitem__(self, name: Any) -> Any:
         """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
 
-        Of a batch by an index, a slice, or an array of indices the motions that it says.
+        For a batch, an index, a slice or an array of indices selects motions.
 
         Raises:
             ValueError: no such name; an index into a single motion.
@@ -196,12 +195,12 @@ class Solution(AbstractSolution):
 
     @property
     def kinetic(self) -> Float[Array, "*batch s"]:
-        """T, (s,), J, where the system declares it."""
+        """T, (s,), J, if the system declares it."""
         return self._quantity("kinetic")
 
     @property
     def potential(self) -> Float[Array, "*batch s"]:
-        """V, (s,), J, where the system declares it."""
+        """V, (s,), J, if the system declares it."""
         return self._quantity("potential")
 
     @property
@@ -213,7 +212,7 @@ class Solution(AbstractSolution):
     def multipliers(self) -> dict[str, Float[Array, "..."]]:
         """Multipliers by the name of the row, each (s,) or (s, its shape).
 
-        See `System.multipliers` for sign, unit and what holds where rows depend on one another.
+        See `System.multipliers` for sign, unit and dependent rows.
         """
         found = self._quantity("multipliers")
         names = [name for c in self.system.constraints for name in c.all_names]
@@ -226,7 +225,7 @@ class Solution(AbstractSolution):
 
     @property
     def constraint_force(self) -> Float[Array, "*batch s n"]:
-        """A^T lam, (s, n), N or N m: what the constraints exert on the system."""
+        """A^T lam, (s, n), N or N m: the generalized force of the constraints."""
         return self._quantity("constraint_force")
 
     @property
@@ -238,10 +237,10 @@ class Solution(AbstractSolution):
     def work(self) -> dict[str, Float[Array, "*batch s"]]:
         """Work since ts[0] of every term of dH/dt by name, each (s,), J, ordered as `power`.
 
-        The books close: H - H(ts[0]) is the sum over all names, to the accuracy of the solve.
+        Energy balance: H - H(ts[0]) is the sum over all names, to the accuracy of the solve.
 
         Raises:
-            ValueError: it was not asked for with `simulate(..., save=("work",))`.
+            ValueError: `simulate` was called without `save=("work",)`.
         """
         if "work" not in self.saved:
             raise unsupported(
@@ -252,26 +251,25 @@ class Solution(AbstractSolution):
         return in_order(self.saved["work"], self.system.forces, self.system.constraints)
 
     def check(self) -> "Solution":
-        """The motion itself, where it is ok; raises where it, or one of a batch, is not.
+        """The motion itself if it is ok; raises if it, or one of a batch, is not.
 
-        Under `jit` and `vmap` nothing can be raised: there it does nothing, states not reached are
-        NaN, and `ok` says so.
+        Under `jit` and `vmap` nothing can be raised: use `ok`. States not reached are NaN.
 
         Raises:
             SimulationError: a status other than ok, of a motion with concrete values; its `motion`
-                attribute holds the part that was reached.
+                attribute is the part that was reached.
         """
         if concrete(self.raw_status) and np.any(np.asarray(self.raw_status) != int(Status.ok)):
-            # Under grad the numbers are traced, and have values all the same.
+            # Under grad the numbers are traced, but have values.
             motion = stop_gradient(self)
             ended = "Simulation" if self.ts.ndim == 1 else "Simulations"
             raise SimulationError(f"{ended} ended with status {motion.message()}", motion)
         return self
 
     def message(self) -> str:
-        """How a motion ended, in words, with the coordinate and the likely remedy.
+        """How a motion ended, as text, with the coordinate and the likely remedy.
 
-        Of a batch: how many ended in each status, and the message of the first of each.
+        For a batch: the number of motions in each status, and the message of the first of each.
         """
         if self.ts.ndim != 1:
             return counted(self)
@@ -305,7 +303,7 @@ class Solution(AbstractSolution):
 
     @property
     def fallback(self) -> str:
-        """Why formulation "auto" took multipliers in place of quasi-velocities; "" where not."""
+        """Why formulation "auto" took multipliers instead of quasi-velocities; "" if it did not."""
         if self._singular is None or self.system.quasi is None:
             return ""
         time, index = self._singular
@@ -313,7 +311,7 @@ class Solution(AbstractSolution):
         return f"by multipliers, as dU/dv is singular at t = {float(time):.6g} ({name!r})"
 
     def _fallen(self, index: int) -> str:
-        """What has become of a quasi-velocity where it is singular, in words."""
+        """How a quasi-velocity has changed up to its singularity, as text."""
         quasi, (q, _) = self.system.quasi, self.last_state
         assert quasi is not None
         times, states = (self.ts[0], self.last_time), (self.q[0], q)
@@ -327,18 +325,18 @@ class Solution(AbstractSolution):
         return f"Since the start {what} has changed by a factor of {end / begin:.2g}."
 
     def explain(self) -> str:
-        """Why the solve took as many steps as it did, and what to change; for a single motion.
+        """Why the solve took this number of steps, and what to change; for a single motion.
 
-        Looks at up to 8 of the save times: the fastest rates of the linear equations there
-        (stiffness), rejected steps, cond(M), and, of an explicit step of order 8 from there as long
-        as the motion's were, the component with the largest error and the number of turns in which
-        it is moved back onto the constraints.
+        It examines up to 8 of the save times: the fastest rates of the linearized equations there
+        (stiffness), rejected steps and cond(M). It also takes an explicit step of order 8 from
+        there, of the mean length of the motion's steps: the component with the largest error, and
+        the number of iterations of the projection.
 
         Returns:
             A few lines of text, the last of them advice.
 
         Raises:
-            ValueError: of a batch, or inside jit or vmap.
+            ValueError: for a batch, or inside jit or vmap.
         """
         return explain(self)
 

@@ -1,4 +1,4 @@
-"""A solution in other forms: in words, as a dict, as a dataset, as a figure."""
+"""Views of a solution: as text, as a dict, as a dataset, as a figure."""
 
 from collections import Counter
 from typing import Any
@@ -11,7 +11,7 @@ from jaxlag._core._status import Status
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
 LINES = 16
-"""Motions of a batch that a figure shows."""
+"""Largest number of motions of a batch in a figure."""
 
 
 def described(motion: AbstractSolution) -> str:
@@ -40,7 +40,7 @@ def _ok_first(item: tuple[str, int]) -> tuple[bool, int]:
 
 
 def counted(motion: AbstractSolution) -> str:
-    """How the motions of a batch ended: counts by status, and of each but "ok" the first one."""
+    """How the motions of a batch ended: counts by status, and the first of each except "ok"."""
     status = np.asarray(motion.status)
     lines = [f"{status.size} motions: {_counts(motion)}"]
     for kind in sorted({int(x) for x in status.ravel()} - {int(Status.ok)}):
@@ -50,7 +50,7 @@ def counted(motion: AbstractSolution) -> str:
 
 
 def columns(motion: AbstractSolution) -> dict[str, Any]:
-    """Name -> what was moved through, without the times: coordinates, velocities, speeds."""
+    """Coordinates, their velocities and quasi-velocities by name, without the times."""
     system = motion.system
     found = {}
     for name in system.coordinates.names:
@@ -154,7 +154,7 @@ def _label(name: str, shape: tuple[int, ...], j: int) -> str:
 def _paths(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
     """Functions of the coordinates by name that return (x, y) of points in the plane.
 
-    Of x and y, x1 and y1, and so on, and of points of two components.
+    For x and y, x1 and y1, and so on, and for points of two components.
     """
     found: list[Any] = []
     scalars = {name for name, shape in shapes.items() if shape == ()}

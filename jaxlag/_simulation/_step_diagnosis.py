@@ -1,4 +1,4 @@
-"""What held the steps of a motion short: `Solution.explain`."""
+"""Diagnosis of short steps: `Solution.explain`."""
 
 from collections import Counter
 from functools import partial
@@ -20,13 +20,13 @@ from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
 from jaxlag._system._row_advice import advice_on_rows
 
-LOOKED_AT = 8  # states looked at, evenly along the motion
+LOOKED_AT = 8  # states examined, evenly along the motion
 STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
-FOLLOWED = (1.5, 25.0)  # steps per turn of an oscillation that they follow
-OFTEN = 1000  # turns within ts from which on following each is a reason to be slow
+FOLLOWED = (1.5, 25.0)  # steps per period of an oscillation that they resolve
+OFTEN = 1000  # periods within ts from which on resolving each makes a solve slow
 REJECTED = 0.3  # part of the attempts
-UNEVEN = 0.1  # from this part on steps are as long as the sharpest places let them
-TURNS = 3  # of the projection, after one step
+UNEVEN = 0.1  # part of the attempts from which on the sharpest places determine the steps
+TURNS = 3  # iterations of the projection, after one step
 
 
 class Look(NamedTuple):
@@ -35,9 +35,8 @@ class Look(NamedTuple):
     Attributes:
         rates: d(dy/dt)/dy, (m, m).
         mass: M, (n, n).
-        error: local error of a step of order 8 over the tolerance, (m,); over 1 where there is
-            none.
-        turns: of the projection at the end of this step.
+        error: local error of a step of order 8 over the tolerance, (m,); over 1 without tolerances.
+        turns: iterations of the projection at the end of this step.
     """
 
     rates: Float[Array, "m m"]
@@ -47,11 +46,11 @@ class Look(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """The fastest of the linear equations along a motion.
+    """The fastest rate of the linearized equations along a motion.
 
     Attributes:
         fastest: largest |lambda|, 1/s.
-        kind: what it does: "turns", "grows" or "decays".
+        kind: its kind: "turns", "grows" or "decays".
     """
 
     fastest: float
@@ -59,12 +58,12 @@ class Rates(NamedTuple):
 
 
 def is_stiff(motion: AbstractSolution) -> bool:
-    """Whether explicit steps are about as long as the fastest decay lets them be stable."""
+    """Whether the stability limit of the fastest decay determines the length of explicit steps."""
     return _stiffness(motion) is not None
 
 
 def _stiffness(motion: AbstractSolution) -> Rates | None:
-    """The decay that explicit steps are as short as they must be for; None where it is not so."""
+    """The decay that limits explicit steps by stability; None if there is none."""
     h = _mean_step(motion)
     if h is None or motion.scene.implicit:
         return None
@@ -75,10 +74,10 @@ def _stiffness(motion: AbstractSolution) -> Rates | None:
 
 
 def advice(motion: AbstractSolution, status: Status) -> str:
-    """What to do about the end of a single motion: about its rows where these are the cause."""
+    """Advice on the end of a single motion; on its rows if these are the cause."""
     of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
     if status in of_rows and motion.system.constraints:
-        # Under grad its numbers are traced, and have values all the same.
+        # Under grad its numbers are traced, but have values.
         at = stop_gradient((motion._given, motion.last_time, motion.last_state[0]))
         dependent = status is Status.projection_failed
         singular = advice_on_rows(motion.system, *at, dependent=dependent)
@@ -113,7 +112,7 @@ def advice(motion: AbstractSolution, status: Status) -> str:
 
 
 def explain(motion: AbstractSolution) -> str:
-    """What the steps of one motion were, what held them short, and what would change it.
+    """The steps of one motion, the reasons for their length, and advice.
 
     Raises:
         ValueError: a batch of motions, or a traced one.
@@ -168,7 +167,7 @@ def explain(motion: AbstractSolution) -> str:
     looks = _look(motion, h)
     lines += _about_rates(motion, h, _rates(looks), advice)
     lines += _about_mass(motion, looks, advice)
-    if not motion.scene.implicit:  # these are looked at in an explicit step
+    if not motion.scene.implicit:  # these are measured in an explicit step
         lines += [] if fixed else _about_errors(motion, looks)
         lines += _about_projection(motion, looks, advice)
     if not advice and fixed:
@@ -196,7 +195,7 @@ def _mean_step(motion: AbstractSolution) -> float | None:
 
 
 def _about_time(motion: AbstractSolution) -> str:
-    """Of times so far from 0 that what depends on them is rougher than the tolerance."""
+    """Advice on times so far from 0 that their rounding exceeds the tolerance."""
     h = _mean_step(motion)
     if h is None or motion.tolerances is None:
         return ""
@@ -257,7 +256,7 @@ def _about_errors(motion: AbstractSolution, looks: Look) -> list[str]:
 
 
 def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
-    """Of M with its diagonal scaled to 1: units cost no digits."""
+    """About M with its diagonal scaled to 1: units do not matter."""
     worst, label = 1.0, ""
     for M in np.asarray(looks.mass):
         size = np.sqrt(np.abs(np.diag(M)))
@@ -295,13 +294,13 @@ def _about_projection(motion: AbstractSolution, looks: Look, advice: list[str]) 
 
 
 def _rates(looks: Look) -> Rates | None:
-    """Of all states looked at; None where none is finite."""
+    """The fastest rate of all examined states; None if none is finite."""
     found = [J for J in np.asarray(looks.rates) if np.all(np.isfinite(J))]
     if not found:
         return None
     rates: Any = np.concatenate([np.linalg.eigvals(J) for J in found])
     size = np.abs(rates)
-    # Pairs of a saddle are equal up to what differences leave: it grows.
+    # Pairs of a saddle differ only by the error of the differences: the growth counts.
     largest = rates[size > 0.99 * np.max(size)] if np.max(size) > 0 else rates
     kind = "decays"
     if np.any(np.abs(largest.imag) > np.abs(largest.real)):

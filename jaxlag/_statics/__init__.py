@@ -1,4 +1,4 @@
-"""What needs no time stepping: assembly, equilibria, inverse dynamics."""
+"""Problems without time stepping: assembly, equilibria, inverse dynamics."""
 
 from typing import NoReturn
 

@@ -1,4 +1,4 @@
-"""Assembly: the consistent state nearest to a guess."""
+"""Assembly: the nearest state to a guess that satisfies the constraints."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -28,23 +28,23 @@ from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
 MAX_TURNS = 200
-NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out on the way, where they
-# are not quite dependent although they are on the constraints
+NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out during the search: dependent
+# rows are not quite dependent off the constraints
 FRACTIONS = 2.0 ** -np.arange(12)
 
 
 class Assembly(eqx.Module):
-    """A state (q, v) near a guess, and how well it satisfies the constraints.
+    """A state (q, v) near a guess, and its constraint residuals.
 
     Attributes:
-        system: whose state it is.
+        system: the mechanical system.
         q: coordinates (n,), m or rad.
         v: velocities (n,), m/s or rad/s.
         position_residual: phi(t, q) of the holonomic rows, (k,).
         velocity_residual: A v + b of all rows, (m,).
-        independent: (m,), a largest set of independent rows; the others follow from it.
+        independent: (m,), a largest set of independent rows; the others follow from these.
         status: int32, see `Status`: ok, contradictory_rows or nonfinite.
-        where: index of the row with the largest residual left, -1 where the status is ok.
+        where: index of the row with the largest residual, -1 if the status is ok.
     """
 
     system: System
@@ -64,7 +64,7 @@ class Assembly(eqx.Module):
 
     @property
     def dependent(self) -> tuple[str, ...]:
-        """Names of the rows that follow from the others, of a single assembly."""
+        """Names of the rows that depend on the others, for a single assembly."""
         if self.independent.ndim != 1:
             raise unsupported(
                 "`dependent` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
@@ -74,7 +74,7 @@ class Assembly(eqx.Module):
         )
 
     def message(self) -> str:
-        """How a single assembly ended, in words."""
+        """How a single assembly ended, as text."""
         if self.q.ndim != 1:
             raise unsupported(
                 "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
@@ -104,25 +104,26 @@ def assemble(
     weights: Any = None,
     throw: bool = True,
 ) -> Assembly:
-    """Consistent state near (q, v), a nearest one: phi(t, q) = 0 first, then A v + b = 0.
+    """A nearest consistent state to (q, v): first phi(t, q) = 0, then A v + b = 0.
 
-    Minimises (q* - q)^T W (q* - q) over phi(t, q*) = 0, then (v* - v)^T W (v* - v) over
+    Minimizes (q* - q)^T W (q* - q) over phi(t, q*) = 0, then (v* - v)^T W (v* - v) over
     A(t, q*) v* + b(t, q*) = 0; W = M at the guess, or the diagonal given. Newton's method on the
-    conditions of a minimum, steps shortened so that they lead downhill. What is found for q is a
-    local minimum: nearer than all consistent states around it. Another branch of them, as of a
-    linkage that can be assembled in two ways, may be nearer where the guess is far from all of
-    them; then give a better guess. Of 200 random four-bars none had a nearer one for guesses with
-    angles off by 0.5 rad (standard deviation), 14 for 1 rad. v is the nearest of all.
+    conditions of a minimum, with steps shortened so that a penalty function decreases. The result
+    for q is a local minimum: nearer than all consistent states around it. If the guess is far from
+    all consistent states, another branch of them may be nearer, as for a linkage that can be
+    assembled in two ways. Then give a better guess. Of 200 random four-bars none had a nearer
+    branch for guesses with angles off by 0.5 rad (standard deviation), 14 for 1 rad. v is the
+    global minimum.
 
-    The derivative is that of the implicit function, in every mode and order.
+    The derivative follows from the implicit function theorem, in every mode and order.
 
     Args:
-        system: whose state it is, n coordinates.
+        system: the mechanical system with n coordinates.
         q: guess, (n,) numbers or a dict by name; m or rad.
         v: guess in the same form; m/s or rad/s.
         params: as the Lagrangian takes them.
         t: instant, s.
-        hold: names of what may not move: a coordinate `"theta"` (all of its entries), one entry
+        hold: names of fixed values: a coordinate `"theta"` (all of its entries), one entry
             `"x[0,1]"`, or with a prime the velocity, `"theta'"`.
         weights: (n,) positive numbers or a dict by name, the diagonal of W; by default W = M, in
             which a coordinate moves the less the more inertia it has, and M + A^T D A with a
@@ -133,13 +134,13 @@ def assemble(
     Raises:
         ValueError: q, v, weights of wrong length or not finite; weights that are not positive; t
             not a finite number; names in `hold` that do not exist.
-        AssemblyError: no consistent state was found; names the row, and what must not be held.
+        AssemblyError: no consistent state was found; names the row, and values to release.
             With `throw=True` and concrete values.
 
     Source: Nocedal, Wright, Numerical Optimization, ch. 18 (sequential quadratic programming).
 
     Example:
-        A pendulum in Cartesian coordinates of length 1, guessed too long; x is kept:
+        A pendulum of length 1 in Cartesian coordinates, with too long a guess; x is held:
 
         >>> import jax, jax.numpy as jnp, jaxlag as jl
         >>> jax.config.update("jax_enable_x64", True)
@@ -190,7 +191,7 @@ def assemble(
 
 
 def assembled(system: System, q: Array, v: Array, params: Any, t: Array) -> Assembly:
-    """`assemble` with nothing held, for use while tracing."""
+    """`assemble` without held values, for use while tracing."""
     free = (False,) * system.size
     return _assembled(system, q, v, params, t, free, free, None)
 
@@ -249,7 +250,7 @@ def _assembled(
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
     _, void, size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))
-    floor = 0.5 * closed_to(q.dtype)  # a start is asked for no more
+    floor = 0.5 * closed_to(q.dtype)  # sufficient for the check of a start
 
     def residuals(q: Array, v: Array) -> tuple[Array, Array]:
         return rows.of_all(phi(q)), terms.velocity(t, q, v, params)
@@ -285,7 +286,7 @@ def _independent(
     turn: Sequence[int] | None = None,
     floor: float | None = None,
 ) -> Bool[Array, " m"]:
-    """A largest set of independent rows at q, rounding left out."""
+    """A largest set of independent rows at q, up to rounding."""
     W, q = jax.lax.stop_gradient((W, q))
     A = jax.lax.stop_gradient(rows(q))
     there = row_sizes(rows, q, A).there
@@ -293,7 +294,7 @@ def _independent(
 
 
 def _inertia(terms: ArrayTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
-    """M; with what all rows lend where it is not positive definite by itself."""
+    """M; plus A^T D A if it is not positive definite by itself."""
     M, (A, _) = terms.mass(t, q, v, params), terms.rows(t, q, v, params)
     regular = jnp.all(factor_mass(jax.lax.stop_gradient(M)).healthy)
     return jnp.where(regular, M, augmented(M, A)[0])
@@ -307,7 +308,7 @@ class _Search(NamedTuple):
 
 
 def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
-    """The q that minimises (q - start)^T W (q - start) / 2 over phi(q) = 0, a root of F."""
+    """The q that minimizes (q - start)^T W (q - start) / 2 over phi(q) = 0, as a root of F."""
 
     def rows(q: Array) -> Array:
         return jnp.where(free, jax.jacrev(phi)(q), 0.0)
@@ -356,7 +357,7 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
         floor = max(NEAR_DEPENDENCE, dependence_floor(start.dtype))
         kept = _independent(rows, W, s.q, floor=floor)
         step, lam = solve_kkt(W, A, W @ (start - s.q), c, kept)
-        # Down the exact penalty |q - start|^2 / 2 + nu |phi|_1, for nu larger than every |lam|.
+        # Decrease the exact penalty |q - start|^2 / 2 + nu |phi|_1, for nu larger than every |lam|.
         nu = 2.0 * jnp.max(jnp.abs(lam)) + jnp.finfo(start.dtype).tiny
 
         def penalty(fraction: Array) -> Array:
@@ -365,7 +366,7 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
 
         values = jax.vmap(penalty)(fractions)
         best = fractions[jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))]
-        # Near the end rounding hides what the penalty gains.
+        # Near the end, rounding exceeds the decrease of the penalty.
         tiny = jnp.max(jnp.abs(step) / (1.0 + jnp.abs(s.q))) < eps**0.25
         moved = jnp.where(tiny, 1.0, best) * step
         return _Search(s.q + moved, lam, step, s.count + 1)
@@ -381,7 +382,7 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
 
 
 def _polished(F: Callable, z: Array) -> Array:
-    """Newton's method with the curvature of the rows, as long as F becomes smaller."""
+    """Newton's method with the curvature of the rows, as long as F decreases."""
 
     def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
         z, _ = state
@@ -393,7 +394,7 @@ def _polished(F: Callable, z: Array) -> Array:
 
 
 def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
-    """The shortest steps onto phi = 0, as long as the residual becomes smaller."""
+    """The shortest steps onto phi = 0, as long as the residual decreases."""
 
     def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
         q, _ = state
@@ -406,7 +407,7 @@ def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
 
 
 def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
-    """For every coordinate, whether it is held, and whether its velocity is."""
+    """For every coordinate, whether it is held, and whether its velocity is held."""
     hold = name_sequence("assemble: hold", hold)
     coordinates = system.coordinates
     index = {label: [i] for i, label in enumerate(coordinates.labels)}
@@ -430,7 +431,7 @@ def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]
 def _what_to_release(
     system: System, held: tuple[tuple[bool, ...], tuple[bool, ...]], params: Any, *state: Any
 ) -> str:
-    """Which held coordinates or velocities are in the way, in words."""
+    """Held coordinates or velocities that prevent a solution, as text."""
     labels = system.coordinates.labels
     free = (False,) * system.size
     if int(_run((system, free, free), params, None, *state).status) != int(Status.ok):

@@ -32,26 +32,25 @@ from jaxlag._tracing._traced_function import warn_of_changes
 
 
 class Equilibrium(eqx.Module):
-    """A state of rest q in which all generalized forces balance, and what holds it there.
+    """A state of rest q in which all generalized forces balance, with its stability.
 
     Shapes are those of one search; after `jax.vmap` every array has the batch axes in front.
 
     Attributes:
-        system: what is at rest.
-        q: coordinates (n,), m or rad; the nearest point found where the status is not ok.
-        residual: Q - h + A^T lam at (q, v = 0), (n,): N or N m left unbalanced.
-        scale: (n,), N or N m: the forces that a residual is small against at a root,
-            |Q| + |h| + sum_j |K_ij| (|q_j| + |q_j - q0_j|), all of them at q.
+        system: the mechanical system.
+        q: coordinates (n,), m or rad; the nearest point found if the status is not ok.
+        residual: Q - h + A^T lam at (q, v = 0), (n,): the unbalanced force in N or N m.
+        scale: (n,), N or N m: the scale of the forces, |Q| + |h| + sum_j |K_ij| (|q_j| + |q_j -
+            q0_j|), all of them at q. A residual is small relative to it at a root.
         stiffness: K = -d(Q - h + A^T lam)/dq at rest and fixed lam, (n, n); the Hessian of
-            V - lam . phi where the forces derive from a potential.
+            V - lam . phi if the forces derive from a potential.
         damping: D = -d(Q - h)/dv at rest, (n, n): dissipation in its symmetric part, gyroscopic
             forces in the skew one.
-        variation: (n, n), by how much K differs a small displacement away in its softest
-            direction, eps^0.4 of what q and the distance searched are, or what is left
-            open in q.
+        variation: (n, n), the change of K over a small displacement in its softest
+            direction: eps^0.4 of q and the distance searched, or the uncertainty of q.
         rows: A of the constraints, (m, n).
         status: int32, see `Status`: ok, implicit_solve_failed or nonfinite.
-        iterations: int32, steps of the search that led to q, with those of its relaxation.
+        iterations: int32, steps of the search that found q, including those of its relaxation.
     """
 
     system: System
@@ -71,7 +70,7 @@ class Equilibrium(eqx.Module):
     def multipliers(self) -> dict[str, Float[Array, "..."]]:
         """Multipliers lam by the name of the row, with Q - h + A^T lam = 0.
 
-        Where rows depend on one another those of least norm sum_k (|A_k| lam_k)^2.
+        For dependent rows those of least norm sum_k (|A_k| lam_k)^2.
         """
         return self._layout.unflatten(self._lam)
 
@@ -86,9 +85,9 @@ class Equilibrium(eqx.Module):
 
     @property
     def eigenvalues(self) -> Float[Array, "*batch n"]:
-        """Eigenvalues of the symmetric part of K, ascending; under constraints on A x = 0.
+        """Eigenvalues of the symmetric part of K, ascending; with constraints on A x = 0.
 
-        Infinite for each direction that a constraint holds.
+        Infinite for each direction that is held by a constraint.
         """
         K = _symmetric(self.stiffness)
         if self.rows.shape[-2] == 0:
@@ -98,9 +97,9 @@ class Equilibrium(eqx.Module):
 
     @property
     def conservative(self) -> Bool[Array, "*batch"]:
-        """Whether K is symmetric up to rounding, as it is where the forces have a potential.
+        """Whether K is symmetric up to rounding, as for forces with a potential.
 
-        Velocities have no say: see `damping`.
+        Forces that depend on velocities do not matter: see `damping`.
         """
         K = _scaled(self.stiffness, _units(self.stiffness))
         return jnp.all(jnp.abs(K - jnp.swapaxes(K, -1, -2)) <= _slack(K), axis=(-2, -1))
@@ -109,17 +108,17 @@ class Equilibrium(eqx.Module):
     def stable(self) -> Bool[Array, "*batch"]:
         """Whether the symmetric part of K is positive definite and that of D not negative.
 
-        Under constraints on their tangent space A x = 0.
+        With constraints on their tangent space A x = 0.
 
-        Where the forces at rest have a potential K is the Hessian of V: a strict minimum, stable
-        by Lagrange's and Dirichlet's theorem, which gyroscopic and dissipative forces leave so
-        (Thomson and Tait); a D that feeds energy in makes the motion grow by itself. K must be
+        If the forces at rest have a potential, K is the Hessian of V: a strict minimum is stable
+        by Lagrange's and Dirichlet's theorem, also with gyroscopic and dissipative forces
+        (Thomson and Tait). With a D that supplies energy the motion grows by itself. K must be
         positive beyond rounding and beyond its own `variation`, D not negative beyond rounding.
 
         False means a saddle, a maximum, self-excitation, or that linear forces do not decide: a
-        coordinate on which nothing depends, a higher order (V = q^3, but also V = q^4), a D that
-        is not finite, or an edge of V such as zero length of a spring of length l0 > 0, where
-        `energy.spring` counts |r| as constant and so reports a balance. Follower forces
+        coordinate without any force, a higher order (V = q^3, but also V = q^4), a D that
+        is not finite, or a kink of V such as zero length of a spring of length l0 > 0, where
+        `energy.spring` treats |r| as constant and so reports a balance. Follower forces
         (`conservative` False) can make an equilibrium flutter although this is True.
 
         Source: Lagrange, Mecanique analytique; Gantmacher, Lectures in Analytical Mechanics,
@@ -130,7 +129,7 @@ class Equilibrium(eqx.Module):
         spread = jnp.linalg.norm(_scaled(self.variation, units), axis=(-2, -1))
         largest = jnp.max(jnp.abs(_scaled(self.damping, units)), axis=(-2, -1), initial=0.0)
         if self.rows.shape[-2] > 0:
-            # Displacements in these units are those times the units.
+            # Displacements in these units are displacements times the units.
             A = self.rows / units[..., None, :]
             softest, weakest = (jnp.min(_restricted(X, A)[0], axis=-1) for X in (K, D))
         else:
@@ -140,7 +139,7 @@ class Equilibrium(eqx.Module):
         return stiff & passive & (self.status == int(Status.ok))
 
     def message(self) -> str:
-        """How a single search ended, in words."""
+        """How a single search ended, as text."""
         if self.q.ndim != 1:
             raise unsupported(
                 "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
@@ -177,27 +176,27 @@ def equilibrium(
 ) -> Equilibrium:
     """State of rest in which the virtual work of all forces vanishes, near q0.
 
-    Solves Q_i(t, q, 0) - dV/dq_i = 0 for all i, more generally Q - h = 0 at v = 0, which keeps
-    the terms of rotating frames (T_0) and of L linear in v; under holonomic constraints
+    Solves Q_i(t, q, 0) - dV/dq_i = 0 for all i, more generally Q - h = 0 at v = 0, which includes
+    the terms of rotating frames (T_0) and of L linear in v. With holonomic constraints it solves
     Q - h + A^T lam = 0 and phi(t, q) = 0 for (q, lam). Levenberg-Marquardt on the n
-    equations, in units in which K is about 1, so that those of q, L and Q do not matter; M is not
+    equations, in units in which K is about 1, so that units of q, L and Q do not matter. M is not
     needed and may be singular or zero. For a system that depends on t this is the balance at the
-    instant t, not a motion. A root is told from forces that only die away by the Newton step
-    K^-1 (Q - h) left at q.
+    instant t, not a motion. The Newton step K^-1 (Q - h) at q distinguishes a root from forces that
+    only decay.
 
-    The search takes what is near, be it stable or not: from about upright a pendulum is found
-    upright. Only where it fails, as in a minimum of |Q - h| that is no root, the system is led
+    The search takes the nearest balance, stable or not: from about upright a pendulum is found
+    upright. If it fails, as in a minimum of |Q - h| that is no root, the system is moved
     onto its constraints and relaxed: damped motion (q' = Q - h + A^T lam) by implicit Euler steps.
-    Where the forces have a potential each of these leads downhill, to a minimum of V on the
-    constraints, in general. Another search makes its end exact. If that fails, too, the system is
-    relaxed from up to three places around q0, as far from it as has been searched.
+    If the forces have a potential, each of these steps reduces V, in general to a minimum on the
+    constraints. Another search refines its end. If that also fails, the system is
+    relaxed from up to three states around q0, as far from it as the search has gone.
 
-    The derivative is that of the implicit function, dq/dp = K^-1 d(Q - h)/dp, in every mode and
-    order. Where K is singular up to rounding it is the one of least norm, in the same units: zero
-    along coordinates on which nothing depends. It is NaN where the status is not ok.
+    The derivative follows from the implicit function theorem, dq/dp = K^-1 d(Q - h)/dp, in every
+    mode and order. If K is singular up to rounding it is the one of least norm, in the same units:
+    zero along coordinates without any force. It is NaN if the status is not ok.
 
     Args:
-        system: what is at rest, n coordinates.
+        system: the mechanical system with n coordinates.
         q0: start of the search: (n,) numbers or a dict by name; m or rad.
         params: as the Lagrangian takes them.
         t: instant, s.
@@ -214,12 +213,13 @@ def equilibrium(
         ValueError: q0 of wrong length or not finite; t not a finite number; rtol not a number
             between 0 and 1; max_steps not positive; constraints that are not holonomic, or forces
             that depend on multipliers.
-        EquilibriumError: none was found; says how near, and what force is left. With
+        EquilibriumError: none was found; reports the nearest point and its unbalanced force. With
             `throw=True` and concrete values.
 
     Source: Pila, eqs. 3.24, 3.25 (virtual work); Nocedal, Wright, Numerical Optimization,
     sec. 10.3 (Levenberg-Marquardt); Deuflhard, Newton Methods for Nonlinear Problems, ch. 2
-    (what a Newton step tells); Kelley, Keyes, SIAM J. Numer. Anal. 35 (1998) 508 (relaxation).
+    (interpretation of a Newton step); Kelley, Keyes, SIAM J. Numer. Anal. 35 (1998) 508
+    (relaxation).
 
     Example:
         A mass hanging on a spring stretches it by m g / k:
@@ -284,7 +284,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
     nothing = jnp.zeros((0,), q0.dtype)
 
     def idle_rows(t: Array, params: Any) -> Array:
-        """Rows that are 0 = 0 but for rounding at the start and nearby: their lam is 0."""
+        """Rows that are 0 = 0 up to rounding at the start and nearby: their lam is 0."""
         params = _params.join(params, params_static.tree)
 
         def of(q: Array) -> Array:
@@ -349,7 +349,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
     z = root(z)
     if rows.size:
-        # Of multipliers of dependent rows the search finds those nearest to where it began.
+        # For dependent rows the search finds the multipliers nearest to its start.
         q, lam = z[:n], z[n:]
         z = jnp.concatenate([q, least_norm(parts(q, rest)[2], lam, units=balance.units[:n])])
     z = differentiable_if(balance.found, z)
@@ -378,7 +378,7 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
 
 def _restricted(K: Array, A: Array) -> tuple[Array, Array]:
-    """(eigenvalues of K on A x = 0 among others above all of them, which these others are)."""
+    """(eigenvalues: of K on A x = 0, and larger ones for held directions; which are held)."""
     n = K.shape[-1]
     _, sizes, axes = jnp.linalg.svd(A, full_matrices=True)
     floor = 16 * n * float(jnp.finfo(K.dtype).eps)
@@ -400,7 +400,7 @@ def _symmetric(K: Array) -> Array:
 
 
 def _units(K: Array) -> Array:
-    """Units of the coordinates in which the diagonal of K is +-1 where it is not 0."""
+    """Units of the coordinates in which nonzero diagonal elements of K are +-1."""
     d = jnp.abs(jnp.diagonal(K, axis1=-2, axis2=-1))
     return jnp.sqrt(jnp.where(d > 0, d, 1.0).astype(K.dtype))
 
@@ -408,7 +408,7 @@ def _units(K: Array) -> Array:
 def _scaled(A: Array, units: Array) -> Array:
     """A matrix in these units.
 
-    Definiteness does not depend on units (Sylvester's law), rounding does.
+    Definiteness does not depend on units (Sylvester's law), but rounding does.
     """
     return A / (units[..., :, None] * units[..., None, :])
 

@@ -1,4 +1,4 @@
-"""Inverse dynamics: the generalized forces that a given motion needs."""
+"""Inverse dynamics: the generalized forces of a given motion."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -31,16 +31,16 @@ def inverse_dynamics(
     t: Any = 0.0,
     inputs: Mapping[str, Any] | None = None,
 ) -> Float[Array, "*s n"]:
-    """Generalized force M a + h - Q that a motion needs beyond the forces declared.
+    """Generalized force M a + h - Q that a motion needs in addition to the declared forces.
 
-    What the constraints of the system exert, A^T lam, is part of it.
+    It includes the generalized force of the constraints, A^T lam.
 
-    One derivative of the momentum along the motion: d/dt(dL/dv) - dL/dq - Q. M is neither formed
+    One derivative of the momentum along the motion: d/dt(dL/dv) - dL/dq - Q. M is neither computed
     nor factored, so it may be singular (massless links). Composes with jit, vmap and every
     derivative of JAX.
 
     Args:
-        system: what moves, n coordinates.
+        system: the mechanical system with n coordinates.
         q: coordinates, shape (n,), or (s, n) for s instants, or at one instant a dict by name;
             m or rad.
         v: velocities dq/dt, in the same form; m/s or rad/s.
@@ -50,18 +50,18 @@ def inverse_dynamics(
         inputs: dict from names to input objects or arrays, as in `simulate`.
 
     Returns:
-        Shape (n,) or (s, n): N where q_i is in m, N m where it is in rad; positive pushes towards
+        Shape (n,) or (s, n): N if q_i is in m, N m if it is in rad; positive acts towards
         larger q_i.
 
     Raises:
-        ValueError: q, v, a not real numbers of shape (n,) or (s, n), not one state at least, or,
-            where they have values, not finite (the coordinate is named); t not one instant for
-            each state; inputs that no force reads.
+        ValueError: q, v, a are not real numbers of shape (n,) or (s, n), have no state, or have
+            nonfinite values (the coordinate is named); t is not one instant for each state;
+            inputs that no force reads.
 
-    Source: Pila, secs. 2.7, 2.8 (motion prescribed, forces asked) and eq. 3.53.
+    Source: Pila, secs. 2.7, 2.8 (given motion, unknown forces) and eq. 3.53.
 
     Example:
-        What a driven pendulum's motor must supply, theta = 0.3 sin(2 t), at t = 0.5:
+        Torque of the motor of a driven pendulum, theta = 0.3 sin(2 t), at t = 0.5:
 
         >>> import jax, jax.numpy as jnp, jaxlag as jl
         >>> jax.config.update("jax_enable_x64", True)
@@ -130,7 +130,7 @@ def prescribed_motion(
 
 
 def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Array, Array, Array]:
-    """(q, v, a, t) of one shape and precision, or an error that names the odd one out."""
+    """(q, v, a, t) of one shape and precision; an error names an argument of another shape."""
     vectors: list[Array] = []
     n, labels = system.size, system.coordinates.labels
     for name, x in (("q", q), ("v", v), ("a", a)):
@@ -160,7 +160,7 @@ def _motion(system: System, q: Any, v: Any, a: Any, t: Any) -> tuple[Array, Arra
 
 
 def _check_finite(argument: str, x: Array, labels: tuple[str, ...]) -> None:
-    """Raise unless a vector or several with values are finite."""
+    """Raise unless all values of one or several vectors are finite."""
     if not concrete(x) or np.all(np.isfinite(x)):
         return
     values = np.asarray(x)

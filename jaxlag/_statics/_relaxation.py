@@ -1,4 +1,4 @@
-"""Relaxation: damped motion on the constraints until it comes to rest."""
+"""Relaxation: damped motion on the constraints to a state of rest."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,25 +11,26 @@ from jaxlag._statics._root_search import units
 
 CLOSING_STEPS = 48
 EASE, TIGHTEN = 1 / 8, 4.0  # factors of the damping after a good step and after a rejected one
-WORK, GOOD_WORK = 0.1, 0.75  # least work done, over the work expected, of a step that is accepted
+WORK, GOOD_WORK = 0.1, 0.75  # least work of an accepted step, over the expected work
 MISS, GOOD_MISS = 1.0, 0.25  # largest error of the predicted forces, over the forces at its start
 
 
 class RowsAt(NamedTuple):
     """Constraint rows in units of the coordinates, each of length 1, by singular values.
 
-    Rows that depend on others are left out. Such rows may be independent beside the constraints,
-    by as much as they are off: `floor` is the relative singular value below which they are not.
+    Rows that depend on others are left out. Off the constraints such rows may be independent, in
+    proportion to the deviation: `floor` is the relative singular value up to which they count as
+    dependent.
     """
 
     norms: Float[Array, " m"]
     left: Float[Array, "m k"]
     inverse: Float[Array, " k"]
-    axes: Float[Array, "n n"]  # orthonormal, those that the rows hold first
+    axes: Float[Array, "n n"]  # orthonormal, the held ones first
 
     @property
     def held(self) -> Bool[Array, " n"]:
-        """Which axes the rows hold."""
+        """The axes that the rows hold."""
         free = jnp.zeros((self.axes.shape[0] - self.inverse.shape[0],), bool)
         return jnp.concatenate([self.inverse > 0, free])
 
@@ -39,7 +40,7 @@ class RowsAt(NamedTuple):
         return part @ self.axes[: len(part)]
 
     def multipliers(self, F: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The lam that minimise |F + A^T lam|."""
+        """The lam that minimizes |F + A^T lam|."""
         part = self.inverse * (self.axes[: len(self.inverse)] @ F)
         return -(self.left @ part) / self.norms
 
@@ -100,20 +101,20 @@ class _State(NamedTuple):
 def relax(
     forces: Callable, phi: Callable, q0: Float[Array, " n"], max_steps: Int[Array, ""]
 ) -> tuple[Float[Array, " n"], Int[Array, ""]]:
-    """(where the motion comes to rest or is left, number of steps).
+    """(state at the end of the relaxation, number of steps).
 
     Implicit Euler steps of the damped motion (q' = F + A^T lam, phi(q) = 0) in units in which K is
-    about 1: (K + mu) p = F + A^T lam on the tangent space, then led back onto the constraints. mu
-    is at least such that K + mu is positive definite, so that where forces have a potential
-    every step leads downhill: this is Newton's method with a trust region on the constraint
-    manifold. A step is accepted if the forces do the work along it that is expected, and change as
-    expected. No potential is asked for, and M does not matter.
+    about 1: (K + mu) p = F + A^T lam on the tangent space, then a projection onto the constraints.
+    mu is at least such that K + mu is positive definite. If forces have a potential, every step
+    then reduces it: this is Newton's method with a trust region on the constraint
+    manifold. A step is accepted if the work of the forces and their change are as
+    expected. A potential is not required, and M is not used.
 
     Args:
         forces: q -> (F, A), forces and constraint rows.
         phi: q -> residuals of the constraints.
-        q0: start; the first step leads it onto the constraints.
-        max_steps: bound on the steps; where it is 0 nothing is computed.
+        q0: start; the first step projects it onto the constraints.
+        max_steps: bound on the steps; if it is 0 nothing is computed.
 
     Source: Absil, Mahony, Sepulchre, Optimization Algorithms on Matrix Manifolds, ch. 7 (trust
     regions on manifolds); Kelley, Keyes, SIAM J. Numer. Anal. 35 (1998) 508 (implicit Euler steps
@@ -126,7 +127,7 @@ def relax(
         done, as_expected, fair = _compared(s, there)
         fine = s.closed & (done >= WORK) & (as_expected <= MISS) & fair
         good = fine & (done >= GOOD_WORK) & (as_expected <= GOOD_MISS)
-        leads_on = s.count <= 1  # the start, and the start led onto the constraints
+        leads_on = s.count <= 1  # the start, and its projection onto the constraints
         damping = s.damping * jnp.where(good, EASE, jnp.where(fine, 1.0, TIGHTEN))
         damping = jnp.clip(jnp.where(leads_on, 1.0, damping), eps, 1 / eps)
         accepted = leads_on | fine
@@ -167,9 +168,9 @@ def _measured(forces: Callable, q: Float[Array, " n"]) -> Point:
 def _compared(s: _State, there: Point) -> tuple[Array, Array, Array]:
     """(work done over work expected, error of predicted forces over forces, all finite).
 
-    The work of F + A^T lam at constant lam, by the trapezoidal rule with end corrections: where F
-    has a potential V it is what V - lam . phi loses, and phi vanishes at both ends. Unlike a
-    difference of V it keeps its accuracy next to the minimum.
+    The work of F + A^T lam at constant lam, by the trapezoidal rule with end corrections. If F
+    has a potential V it is the decrease of V - lam . phi, and phi vanishes at both ends. Unlike a
+    difference of V it keeps its accuracy near the minimum.
     """
     lam, c, d = s.step.lam, s.step.c, there.q - s.base.q
     before, after = s.base.balance(lam), there.balance(lam)
@@ -184,7 +185,7 @@ def _compared(s: _State, there: Point) -> tuple[Array, Array, Array]:
 def _step(base: Point, damping: Float[Array, ""]) -> _Step:
     (m, n), dtype = base.A.shape, base.q.dtype
     eps = float(jnp.finfo(dtype).eps)
-    floor = eps ** (1 / 3)  # above what closing leaves, eps^3/4
+    floor = eps ** (1 / 3)  # above the residual of the projection, eps^3/4
     lam = _rows(base.A, _lengths(base.A), floor).multipliers(base.F)
     border = jnp.block([[base.stiffness(lam), base.A.T], [base.A, jnp.zeros((m, m), dtype)]])
     c = units(border, jnp.concatenate([base.balance(lam), jnp.zeros((m,), dtype)]))[:n]
@@ -199,7 +200,7 @@ def _step(base: Point, damping: Float[Array, ""]) -> _Step:
     above = jnp.where(free, 0, jnp.sum(jnp.abs(K)) + 1)
     least = jnp.linalg.eigvalsh(0.5 * (K + K.T) + jnp.diag(above))[0]
     size = jnp.max(jnp.abs(K), initial=0.0)
-    for other in (jnp.linalg.norm(g), 1.0):  # without stiffness: steps as long as forces are large
+    for other in (jnp.linalg.norm(g), 1.0):  # without stiffness: steps in proportion to the forces
         size = jnp.where(size > 0, size, other)
     mu = jnp.maximum(-least, 0) + damping * size
     p = jnp.linalg.solve(K + jnp.diag(jnp.where(free, mu, 1)), g)
@@ -223,17 +224,17 @@ def _closed(
     lengths: Float[Array, " m"],
     pull: Float[Array, ""],
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-    """(q0 led onto phi = 0 by the shortest steps in units c, whether it came there).
+    """(q0 projected onto phi = 0 by the shortest steps in units c, whether it converged).
 
-    Gauss-Newton's method, steps shortened where the residual would not become smaller.
+    Gauss-Newton's method, with shorter steps if the residual would not decrease.
 
     Args:
         forces: q -> (F, A).
         phi: q -> residuals.
         q0: start.
         c: units.
-        lengths: of the rows in these units, to compare residuals.
-        pull: how far forces would displace the system, beside q0 a measure of what is small.
+        lengths: lengths of the rows in these units, to compare residuals.
+        pull: displacement by the forces; with q0 it defines the scale of small displacements.
     """
     if not lengths.shape[0]:
         return q0, jnp.array(True)

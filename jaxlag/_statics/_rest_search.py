@@ -1,4 +1,4 @@
-"""A state of rest by several searches, each made only where those before it failed."""
+"""Sequence of searches for a state of rest; each runs only if those before it failed."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag._statics._relaxation import relax
 from jaxlag._statics._root_search import Balance, judge, search
 
-STARTS = 4  # of relaxation: q0, and places around it
+STARTS = 4  # of relaxation: q0, and states around it
 
 
 class Rest(NamedTuple):
-    """Where a search led, what is known about that point, and after how many steps."""
+    """The end point of a search, its balance of forces, and the number of steps."""
 
     z: Float[Array, " k"]
     balance: Balance
@@ -39,9 +39,9 @@ def find_rest(
 ) -> Rest:
     """The root of all equations near q0, else one at the end of a relaxation.
 
-    First a search from q0, then from where the system relaxes to from q0, then from where it does
-    from a few places around it, as far from q0 as has been searched. The first root that is found
-    counts, and without one where the first search led.
+    The first search starts at q0, the second where the system relaxes from q0, the others
+    where it relaxes from a few states around it, as far from q0 as the searches have gone. The
+    result is the first root found, or without one the end of the first search.
 
     Args:
         forces: q -> ((Q, h), A), forces and constraint rows.
@@ -49,7 +49,7 @@ def find_rest(
         whole: z -> all equations at z = (q, lam).
         q0: start.
         rtol: see `equilibrium`.
-        max_steps: bound on the steps of the first search, and of all that is made after it.
+        max_steps: bound on the steps of the first search, and of all later ones together.
     """
     n, m = q0.shape[0], phi(q0).shape[0]
 
@@ -72,7 +72,7 @@ def find_rest(
         around = jnp.asarray(_directions(n), q0.dtype)[s.count]
         bound = jnp.where((s.count == 0) | found, 0, max_steps - s.spent)
         q, steps = relax(net, phi, q0 + s.spread * around, bound)
-        # Lanes of a batch that are done begin where they ended: that takes fewest steps.
+        # Lanes of a batch that are done start where they ended: that takes fewest steps.
         q = jnp.where(found, s.rest.z[:n], q)
         now = attempt(q)
         now = now._replace(steps=now.steps + steps)
@@ -93,7 +93,7 @@ def find_rest(
 
 
 def _directions(n: int) -> np.ndarray:
-    """For each attempt a direction with entries in -1 to 1; none for the first two."""
+    """A direction for each attempt with entries in -1 to 1; zero for the first two."""
     around = np.random.default_rng(0).uniform(-1, 1, (STARTS + 1, n))
     around[:2] = 0
     return around

@@ -1,4 +1,4 @@
-"""Search for a balance of forces that does not depend on the units of forces and coordinates."""
+"""Root search for a balance of forces, independent of the units of forces and coordinates."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,14 +12,14 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._core._custom_jvp import CustomJVP
 
 Forces = Callable[[Array], Array]
-"""F(q): what is to vanish, (n,) in and out."""
+"""F(q), the equations F = 0, (n,) in and out."""
 
 
 class Newton(NamedTuple):
     """F and its derivative J at a point, in units c of the coordinates in which J is about 1.
 
-    `c * F` and `c J c` are in units of one energy, whatever the units of the coordinates are.
-    Directions in which c J c is singular up to rounding are left out of the pseudo-inverse.
+    `c * F` and `c J c` are in units of one energy, for all units of the coordinates.
+    The pseudo-inverse omits directions in which c J c is singular up to rounding.
     """
 
     F: Float[Array, " n"]
@@ -31,18 +31,18 @@ class Newton(NamedTuple):
     regular: Bool[Array, " n"]
 
     def solve(self, y: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The x of least norm in these units with J x = y, as nearly as can be."""
+        """The x of least norm in these units with J x = y, in the least-squares sense."""
         part = self.left.T @ (self.c * y) / jnp.where(self.regular, self.sizes, 1)
         return self.c * (self.right @ jnp.where(self.regular, part, 0))
 
     @property
     def step(self) -> Float[Array, " n"]:
-        """Step to where the linearised F vanishes."""
+        """Step to the root of the linearized F."""
         return self.solve(-self.F)
 
 
 def newton(forces: Forces, q: Float[Array, " n"]) -> Newton:
-    """What Newton's method needs at q."""
+    """F, J and the singular values for Newton's method at q."""
     F, J = forces(q), jax.jacfwd(forces)(q)
     return _newton(F, J, jnp.zeros_like(J))
 
@@ -56,9 +56,9 @@ def _newton(F: Array, J: Array, noise: Array) -> Newton:
 def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
     """Units c of the coordinates in which c J c has rows and columns of largest element about 1.
 
-    First c_j = |J_jj|^-1/2, free of units up to a common factor; then, for diagonals that are
-    zero or small, a few sweeps of Ruiz's scaling. A coordinate without any stiffness gets the
-    unit in which its force is that of the others.
+    First c_j = |J_jj|^-1/2, independent of units up to a common factor. Then, for diagonals that
+    are zero or small, a few sweeps of Ruiz's scaling. A coordinate without any stiffness has the
+    unit in which its force equals that of the others.
 
     Source: Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices,
     RAL-TR-2001-034.
@@ -76,7 +76,7 @@ def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _decompose(J: Array, floor: Any = 0.0) -> tuple[Array, Array, Array, Array]:
-    """(U, s, V, regular) with J = U diag(s) V^T; regular beyond rounding and this floor."""
+    """(U, s, V, regular) with J = U diag(s) V^T; regular values exceed rounding and `floor`."""
     left, sizes, right = jnp.linalg.svd(J)
     rounding = 16 * J.shape[0] * float(jnp.finfo(J.dtype).eps) * sizes[0]
     return left, sizes, right.T, (sizes > rounding) & (sizes > floor)
@@ -91,11 +91,11 @@ class _Damped(NamedTuple):
 
 
 class RelativeDamping(optx.AbstractDescent):
-    """Levenberg-Marquardt steps damped relative to the Jacobian of the moment.
+    """Levenberg-Marquardt steps damped relative to the current Jacobian.
 
     Solves min |J d + r|^2 + lam gain^2 |d / c|^2, with c_j the inverse norms of J's columns and
-    gain = |r| / |Newton step / c|: lam = 1 about halves the Newton step, however flat r has
-    become. optimistix's own descent has lam against the constant 1.
+    gain = |r| / |Newton step / c|: lam = 1 about halves the Newton step, also if r has become
+    flat. optimistix's own descent has lam against the constant 1.
 
     Attributes:
         first: lam at the start.
@@ -127,7 +127,7 @@ class RelativeDamping(optx.AbstractDescent):
 
 
 class Marquardt(optx.AbstractGaussNewton):
-    """Levenberg-Marquardt with `RelativeDamping`, loosened wherever the model is a fair one."""
+    """Levenberg-Marquardt with `RelativeDamping`, reduced after each step with a good model."""
 
     rtol: float
     atol: float
@@ -145,7 +145,7 @@ class Marquardt(optx.AbstractGaussNewton):
 def search(
     max_steps: int, forces: Forces, q0: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """(root or nearest point, number of steps: as a float, which has a tangent)."""
+    """(root or nearest point, number of steps as a float, which has a tangent)."""
     eps = float(jnp.finfo(q0.dtype).eps)
     start = newton(forces, q0)
     damping = _first_damping(forces, q0, start)
@@ -153,7 +153,7 @@ def search(
     length = jnp.where((length > 0) & jnp.isfinite(length), length, 1)
     size = jnp.linalg.norm(start.c * start.F)
     size = jnp.where((size > 0) & jnp.isfinite(size), size, 1)
-    wide = jnp.result_type(float)  # optimistix keeps its damping in this dtype, whatever q's
+    wide = jnp.result_type(float)  # optimistix keeps its damping in this dtype
 
     def place(z: Array) -> Array:
         return q0 + start.c * length * z.astype(q0.dtype)
@@ -173,8 +173,8 @@ def search(
 def _first_damping(forces: Forces, q0: Array, start: Newton) -> Array:
     """Damping by the curvature of F along the Newton step s.
 
-    With k = |F''[s, s]| / |F|, twice what the step misses by, lam = k (1, k): one exact step
-    where F is linear; where J is all but singular the step that F'' allows, as for the minimum
+    With k = |F''[s, s]| / |F|, twice the error of the step, lam = k (1, k): one exact step
+    if F is linear; if J is almost singular the step that F'' allows, as for the minimum
     of |F|^2.
     """
     eps = float(jnp.finfo(q0.dtype).eps)
@@ -189,7 +189,7 @@ def _first_damping(forces: Forces, q0: Array, start: Newton) -> Array:
 def solve_tangent(linear: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
     """The x of least norm with linear(x) = y, for `jax.lax.custom_root`; linear in y.
 
-    Singular directions are projected out by matrices without a derivative of their own.
+    Singular directions are projected out by matrices that are not differentiated.
     """
     A = jax.jacfwd(linear)(y)
     fixed = jax.lax.stop_gradient(A)
@@ -202,9 +202,9 @@ def solve_tangent(linear: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 class Balance(NamedTuple):
-    """What is known about a point that a search has led to; `scale` as in `Equilibrium`.
+    """The assessment of the end point of a search; `scale` as in `Equilibrium`.
 
-    `units` are those of the coordinates in which K is about 1.
+    `units` are the units of the coordinates in which K is about 1.
     """
 
     found: Bool[Array, ""]
@@ -221,20 +221,19 @@ def judge(
     q0: Float[Array, " n"],
     rtol: Float[Array, ""],
 ) -> Balance:
-    """Whether q is a root of F, judged at q alone: forces at the start have no say.
+    """Whether q is a root of F, judged by the forces at q alone and not by those at the start.
 
-    A root is where every component of the Newton step s is small against the coordinate or the
-    distance searched, or so small that F is linear over it up to `rtol`: at a place where F only
-    dies away, s is as long as F takes to change. Where only rounding is left of F, as it is
-    around a root of higher order, rtol^0.4 will do. Besides, nothing but rounding may be left
-    in directions in which J is singular, and the search must not have come along these, as it
-    does towards forces that vanish at infinity. J is singular where it is so up to what moving q
-    by its rounding changes.
+    At a root every component of the Newton step s is small relative to the coordinate or the
+    distance searched, or so small that F is linear over it up to `rtol`. Where F only decays, s is
+    as long as the distance over which F changes. If F is only rounding, as near a root of higher
+    order, rtol^0.4 is sufficient. In addition, F must be only rounding in directions in which J is
+    singular, and the search must not have moved along these, as it does towards forces that vanish
+    at infinity. J counts as singular up to its change when q moves by its rounding.
 
     Args:
         forces: F.
         present: |Q| + |h| at q, the forces that balance.
-        q: the point.
+        q: the end point.
         q0: start of the search.
         rtol: see `equilibrium`.
     """
@@ -247,7 +246,7 @@ def judge(
     scale = present + jnp.abs(here.J) @ reach
     s = here.step
     bend = 0.5 * jnp.abs(here.solve(jax.jvp(forces, (q + s,), (s,))[1] - here.J @ s))
-    # Forces that cancel inside F leave more rounding than its own size tells.
+    # If forces cancel inside F, its rounding is larger than its own size indicates.
     slack = jnp.asarray(4 * eps * (-1.0) ** np.arange(n), q.dtype) * reach
     beside = jax.lax.map(forces, jnp.stack([q + slack, q - slack]))
     rounding = 8 * n * eps * scale + 4 * jnp.max(jnp.abs(beside - F[None]), axis=0)
@@ -271,11 +270,11 @@ def judge(
 def _variation(
     forces: Forces, here: Newton, present: Array, rounding: Array, q: Array, reach: Array
 ) -> Array:
-    """How much J differs a small displacement away, to and fro in its softest direction.
+    """Change of J over a small displacement in both directions along its softest axis.
 
-    The displacement is eps^0.4 of the coordinates there or the distance searched; where both
-    are zero, of the displacement that the forces present would make; failing these, eps^0.65.
-    It is no less than four Newton steps, nor than what rounding of F leaves open in q.
+    The displacement is eps^0.4 of the coordinates there or the distance searched. If both
+    are zero, it is that of the displacement by the forces present; if these are zero, eps^0.65.
+    It is at least four Newton steps, and at least the uncertainty of q by rounding of F.
     """
     eps = float(jnp.finfo(q.dtype).eps)
     J = here.c[:, None] * here.J * here.c[None]
@@ -301,7 +300,7 @@ def _variation(
 
 @CustomJVP
 def differentiable_if(known: Bool[Array, ""], x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """x, with NaN for its derivatives unless `known`."""
+    """x, with NaN derivatives unless `known`."""
     return x
 
 

@@ -1,4 +1,4 @@
-"""What a declaration reads: traced values that it closes over, and params."""
+"""Captured values of a declaration: traced values in its closures, and params."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -23,10 +23,10 @@ from jaxlag._tracing._traced_function import functions_of
 def lift_closure_tracers(
     system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
 ) -> Any:
-    """Params, and beside them whatever traced values the declared functions close over.
+    """Params, with the traced values in closures of the declared functions, if any.
 
-    A Lagrangian written inside a function that is being differentiated may read its arguments:
-    derivatives in them are those in params. Without inputs the forces are left out.
+    A Lagrangian defined inside a differentiated function may read the arguments of that function:
+    their derivatives are computed like those of params. Without inputs the forces are left out.
     """
     declared = (system.lagrangian, system.constraints, system.quasi)
     if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
@@ -38,10 +38,10 @@ def lift_closure_tracers(
 def declared(
     system: System, t: Array, q: Array, v: Array, params: Any, values: Any, lam: Array | None
 ) -> Any:
-    """Everything that is declared, at one state; without values of the inputs, no forces.
+    """All declared terms at one state; without values of the inputs, no forces.
 
     Args:
-        system: whose functions are called.
+        system: its functions are called.
         t: time.
         q: coordinates.
         v: velocities.
@@ -63,12 +63,12 @@ def declared(
 
 
 def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> None:
-    """Raise on numbers that are not finite and that anything declared reads.
+    """Raise on nonfinite numbers that a declared function reads.
 
-    And on objects that no program can be keyed by. Without inputs the forces read nothing.
+    Also on objects that cannot be part of a program's key. Without inputs the forces are ignored.
 
     Raises:
-        ValueError: with the leaf by its path.
+        ValueError: with the path of the leaf.
     """
     _params.check_keys(params)
     faults = _params.not_finite(params)
@@ -84,14 +84,14 @@ def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any
 
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
-    """What the declared functions close over."""
+    """Values in the closures of the declared functions."""
     return _program(system, params, q, inputs).consts
 
 
 def _program(
     system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
 ) -> ClosedJaxpr:
-    """Everything that is declared as a program of (t, q, v, params, inputs)."""
+    """All declared terms as a program of (t, q, v, params, inputs)."""
     traced, static = _params.halves((params, inputs))
 
     def everything(t: Array, q: Array, v: Array, traced: Any) -> Any:

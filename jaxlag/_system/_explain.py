@@ -22,12 +22,12 @@ def _list(names: frozenset[str]) -> str:
 def explain(
     system: AbstractQuantities, structure: Structure, lowered: Lowered | None, rows: ConstraintRows
 ) -> str:
-    """What was found in `system` and what follows for the compiled program.
+    """The properties found in `system`, and their effects on the compiled program.
 
     Args:
         system: the declaration.
         structure: dependencies of its terms.
-        lowered: its scalar program, or why there is none; None where it was not asked for.
+        lowered: its scalar program, or why there is none; None if it was not requested.
         rows: its constraint rows.
     """
     forces = [f"{force.name} ({type(force).__name__})" for force in system.forces]
@@ -123,7 +123,7 @@ def _inputs(labels: Sequence[str], inputs: Iterable[tuple[str, int]]) -> list[st
 
 
 def _in_quasi(lowered: Lowered, equations: Equations) -> list[str]:
-    """The same where the state is made of quasi-velocities."""
+    """The same for a state of quasi-velocities."""
     operations = _operations(equations.program, "v and u'")
     return [
         f"lowering      scalar program: {operations}",

@@ -1,4 +1,4 @@
-"""Inspection of a declaration: its shapes by tracing, its mass matrix and rows by numbers."""
+"""Inspection of a declaration: shapes by tracing, mass matrix and rows by numbers."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,18 +17,18 @@ from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
 
 APART = 1e-3
-"""Least singular value of rows of unit length that count as clearly independent."""
+"""Least singular value of clearly independent rows of unit length."""
 
 
 def mass_definite(
     system: AbstractReactions, params: Any, t: Any, q: Array, v: Array | None
 ) -> bool | None:
-    """Whether M is positive definite for these params without the help of constraints.
+    """Whether M is positive definite for these params without the constraints.
 
-    Looked at in the given state, where it is known, and in one other, as the mass of a link is
-    zero everywhere or nowhere; where the state is traced and M depends on it, in some where
-    inertias vanish, as that of polar coordinates does at r = 0. None where the params have no
-    values, since they are traced. Of use to a system with constraints alone.
+    Tested in the given state, if it is known, and in one other: the mass of a link is zero
+    everywhere or nowhere. If the state is traced and M depends on it, it is also tested in states
+    where inertias vanish, as in polar coordinates at r = 0. None if the params are traced. Only
+    used with constraints.
     """
     if not system.constraints:
         return False
@@ -67,7 +67,7 @@ def contact_rows_independent(
 ) -> bool:
     """Whether rows whose multipliers forces read are clearly independent of one another.
 
-    In the given state, where all has values; else False.
+    Tested in the given state; False if anything is traced.
     """
     v = jnp.zeros_like(q) if v is None else v
     if not system.constraints or not concrete(params, t, q, v, inputs):
@@ -121,7 +121,7 @@ def _mass(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v
 def check_declaration(
     system: AbstractReactions, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
 ) -> None:
-    """What shapes and names alone can tell of L, the forces and the inputs; run while tracing."""
+    """Check L, the forces and the inputs by shapes and names alone; run while tracing."""
     values = evaluate(inputs, t, q, v, params)
     check_traceable(system, params, q.dtype, values)
     for name in inputs:

@@ -1,4 +1,4 @@
-"""Power: where the energy H of a motion comes from and goes to."""
+"""Power: the terms of dH/dt along a motion."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,8 +16,8 @@ from jaxlag._tracing._signature import gradient
 class Power(eqx.Module):
     """dH/dt = sum_k v . Q_k - b . lam - dL/dt at fixed (q, v), term by term, H = v . dL/dv - L.
 
-    Every force has its term under its own name; EXPLICIT_TIME exists where L depends on t. So
-    has every constraint with rows A v + b = 0 whose b is not zero: v . A^T lam = -b . lam.
+    Every force has its term under its own name. EXPLICIT_TIME exists if L depends on t. Every
+    constraint with rows A v + b = 0 and a nonzero b has the term v . A^T lam = -b . lam.
 
     Source: Goldstein, Classical Mechanics, sec. 2.7 (the energy function h) with applied forces;
     Pila, eq. 3.194 holds without them.
@@ -68,7 +68,7 @@ def in_order(
     forces: Sequence[AbstractForce],
     constraints: Sequence[AbstractConstraint],
 ) -> dict[str, Any]:
-    """Terms of dH/dt as declared, explicit time last: a dict leaves jit in alphabetical order."""
+    """Terms of dH/dt in the order of declaration, explicit time last: jit sorts dicts by name."""
     rows = [name for constraint in constraints for name in constraint.all_names]
     names = (*(force.name for force in forces), *rows, EXPLICIT_TIME)
     return {name: terms[name] for name in names if name in terms}

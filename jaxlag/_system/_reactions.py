@@ -16,7 +16,7 @@ from jaxlag._tracing._input_values import InputValues
 
 
 class AbstractReactions(AbstractQuantities):
-    """What M a + h = Q + A^T lam, A a + gamma = 0 gives at one state, besides its terms."""
+    """Forces, accelerations and reactions from M a + h = Q + A^T lam, A a + gamma = 0."""
 
     @state_first
     def generalized_force(
@@ -69,8 +69,8 @@ class AbstractReactions(AbstractQuantities):
     ) -> Float[Array, " n"]:
         """Acceleration a with M a + h = Q + A^T lam, shape (n,), m/s^2 or rad/s^2.
 
-        NaN where M is singular, under constraints where it is so on their tangent space, and where
-        no acceleration satisfies all rows, as in turning through a dead point.
+        NaN if M is singular (with constraints: on their tangent space), and if no acceleration
+        satisfies all rows, as in passing a dead point.
 
         Args:
             q: shape (n,).
@@ -99,13 +99,13 @@ class AbstractReactions(AbstractQuantities):
     ) -> dict[str, Float[Array, "..."]]:
         """Multipliers lam of M a + h = Q + A^T lam, A a + gamma = 0, by the name of the row.
 
-        Where rows depend on one another, those of least norm sum_k (|A_k| lam_k)^2, in which
-        |A_k lam_k| is the generalized force of row k alone; where forces read multipliers, of least
-        norm among the rows that they read, as they see them, and among the others. |A_k| is the
-        Euclidean length of the row in the units of the coordinates, so that metres against
-        millimetres, or radians against degrees, share otherwise; A^T lam is the same, to rounding,
-        whatever the units and however short the levers. The unit is J
-        over that of the row's residual, for a `Pfaffian` W over it: N for a length or a velocity.
+        For dependent rows the multipliers have least norm sum_k (|A_k| lam_k)^2, in which
+        |A_k lam_k| is the generalized force of row k alone. If forces read multipliers, those that
+        they read have least norm first, in the form that the forces read them, then the others.
+        |A_k| is the Euclidean length of the row in the units of the coordinates: meters instead of
+        millimeters, or radians instead of degrees, change the distribution. A^T lam is the same, to
+        rounding, for all units and lever lengths. The unit is J over that of the row's residual,
+        for a `Pfaffian` W over it: N for a length or a velocity.
 
         Args:
             q: shape (n,), consistent with the constraints.
@@ -130,9 +130,9 @@ class AbstractReactions(AbstractQuantities):
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> Float[Array, " n"]:
-        """A^T lam, shape (n,), N or N m: what all constraints exert on the system.
+        """A^T lam, shape (n,), N or N m: the generalized force of all constraints.
 
-        Unique even where rows depend on one another.
+        Unique also for dependent rows.
 
         Args:
             q: shape (n,), consistent with the constraints.
@@ -163,7 +163,7 @@ class AbstractReactions(AbstractQuantities):
 
         "a", shape (n,), from u' and v = B u + c; "multipliers", by the name of the row, from
         A^T lam = M a + h - Q, of least norm as in `multipliers`; "constraint_force", A^T lam. To
-        rounding these are `acceleration`, `multipliers` and `constraint_force`, which solve for
+        rounding these equal `acceleration`, `multipliers` and `constraint_force`, which solve for
         the multipliers.
 
         Args:
@@ -201,7 +201,7 @@ class AbstractReactions(AbstractQuantities):
     def _reactions(
         self, t: Array, q: Array, v: Array, params: Any, values: Mapping[str, Any]
     ) -> tuple[Array, Array, Array]:
-        """(a, lam, A), compiled as one: there are many small operations."""
+        """(a, lam, A), compiled as one program because of many small operations."""
         self._rows(params, q.dtype)
         return _reactions((self,), params, dict(values), t, q, v)
 

@@ -1,4 +1,4 @@
-"""What constraint rows are like at one state: whether they say there what they are to say."""
+"""Advice on the constraint rows at one state: dependent, void or singular rows."""
 
 from typing import Any
 
@@ -10,22 +10,22 @@ from jaxtyping import Array
 from jaxlag._linalg._kkt import units_of
 
 EVEN = 0.25
-"""How much a residual may differ on two sides, over their sum, to count as the same on both."""
+"""Difference of a residual on two sides, over their sum, up to which it counts as even."""
 SINGULAR = 1e-2
-"""Of the least sine nearby: below it rows are all but dependent at a place."""
+"""Least sine over that nearby, below which rows count as almost dependent at a state."""
 NEARBY = 1e-2
-"""As far away rows are compared with, over 1 + |q|."""
+"""Distance of the states for comparison, over 1 + |q|."""
 
 
 def advice_on_rows(system: Any, params: Any, t: Any, q: Any, dependent: bool = True) -> str:
-    """What is singular about the rows at a state, and what is to be done; "" where nothing is.
+    """Advice on singular rows at a state; "" if there are none.
 
     Args:
-        system: whose rows they are.
+        system: its rows are examined.
         params: as the Lagrangian takes them.
         t: time, s.
         q: coordinates, (n,), m or rad.
-        dependent: whether it is said, too, that rows depend on one another there alone.
+        dependent: whether to report rows that are dependent at this state alone, too.
     """
     vanishing = vanishing_rows(system, params, t, q)
     if vanishing:
@@ -44,7 +44,7 @@ def advice_on_rows(system: Any, params: Any, t: Any, q: Any, dependent: bool = T
 
 
 def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
-    """Holonomic rows that have an extremum of 0 here, as squares and lengths have."""
+    """Holonomic rows with an extremum of value 0 here, as squares and lengths have."""
     if not system.constraints:
         return []
     t, q = jnp.asarray(t, float), jnp.asarray(q)
@@ -68,7 +68,7 @@ def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
 
 
 def is_singular(system: Any, params: Any, t: Any, q: Any) -> bool:
-    """Whether rows that are independent nearby are all but dependent here."""
+    """Whether rows that are independent nearby are almost dependent here."""
     if not system.constraints:
         return False
     t, q = jnp.asarray(t, float), jnp.asarray(q)
@@ -90,7 +90,7 @@ def is_singular(system: Any, params: Any, t: Any, q: Any) -> bool:
 
 
 def _ways(q: Array) -> Array:
-    """A few directions, as long as q is large."""
+    """A few directions of length 1 + |q|."""
     draw = np.random.default_rng(0).uniform(0.3, 1.0, (4, q.shape[0]))
     signs = np.where(np.arange(q.shape[0])[None] % np.arange(1, 5)[:, None], -1.0, 1.0)
     return jnp.asarray(draw * signs, q.dtype) * (1.0 + jnp.abs(q))

@@ -1,4 +1,4 @@
-"""What is known of a system at one state: the terms of its equations, speeds, energies."""
+"""Functions of one state: terms of the equations, velocities, energies."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ from jaxlag._tracing._traced_function import warn_of_changes
 class AbstractQuantities(eqx.Module):
     """Quantities of a declared system as functions of (q, v, params, t).
 
-    `params` is any pytree, q and v have shape (n,), in SI units (m or rad, and per s), t is in s.
+    `params` is any pytree. q and v have shape (n,), in SI units (m or rad, and per s); t is in s.
 
     Attributes:
         lagrangian: L(t, q, v, params).
@@ -64,7 +64,7 @@ class AbstractQuantities(eqx.Module):
 
     @abstractmethod
     def _rows(self, params: Any, dtype: Any) -> ConstraintRows:
-        """Names and shapes of the constraint rows, for params like these."""
+        """Names and shapes of the constraint rows, for such params."""
 
     @abstractmethod
     def _structure(self, params: Any, dtype: Any) -> Structure:
@@ -76,7 +76,7 @@ class AbstractQuantities(eqx.Module):
     ) -> Float[Array, "n n"]:
         """M(t, q, v) = d2L/dv2, shape (n, n), kg, kg m or kg m^2 by the pair of coordinates.
 
-        Symmetric; `v` may be left out where M does not depend on it.
+        Symmetric; `v` may be left out if M does not depend on it.
 
         Source: Siciliano et al., Robotics, eq. 7.30.
 
@@ -99,10 +99,10 @@ class AbstractQuantities(eqx.Module):
     def bias(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, " n"]:
         """h(t, q, v) = (dp/dq) v + dp/dt - dL/dq, shape (n,), N or N m.
 
-        The generalized force needed to hold a = 0; gravity and explicit time included, applied
-        forces not.
+        The generalized force for a = 0. It includes gravity and explicit time, but not the applied
+        forces.
 
-        Source: d/dt(dL/dv) - dL/dq (Pila, eq. 3.53) less M a.
+        Source: d/dt(dL/dv) - dL/dq (Pila, eq. 3.53) minus M a.
         """
         t, q, v, params = self._state(q, v, params, t)
         return self._terms.bias(t, q, v, params)
@@ -114,8 +114,8 @@ class AbstractQuantities(eqx.Module):
         """C(t, q, v) from the Christoffel symbols of M, shape (n, n).
 
         C_ij = sum_k 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_jk/dq_i) v_k, so that
-        (v . grad_q) M - 2 C is skew-symmetric. C v is the part of h that is quadratic in v;
-        gravity, terms of L linear in v and explicit time are the rest.
+        (v . grad_q) M - 2 C is skew-symmetric. C v is the part of h that is quadratic in v. The
+        other parts are gravity, terms of L linear in v and explicit time.
 
         Source: Siciliano et al., Robotics, eq. 7.45.
 
@@ -159,7 +159,7 @@ class AbstractQuantities(eqx.Module):
     def velocities(self, q: Any, u: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, " n"]:
         """v = B u + c, shape (n,), m/s or rad/s, from all quasi-velocities u, shape (k,).
 
-        NaN where dU/dv is singular. `u` may be a dict by name, constrained ones left out.
+        NaN if dU/dv is singular. `u` may be a dict by name, without the constrained ones.
 
         Source: Pila, eq. 4.32.
 
@@ -191,7 +191,7 @@ class AbstractQuantities(eqx.Module):
     def energy(self, q: Any, v: Any, params: Any = None, *, t: Any = 0.0) -> Float[Array, ""]:
         """H = v . dL/dv - L, scalar, J.
 
-        T + V where T is homogeneous quadratic in v (Pila, eq. 3.207); constant along a motion
+        T + V if T is homogeneous quadratic in v (Pila, eq. 3.207). It is constant along a motion
         without applied forces if L does not contain t.
         """
         t, q, v, params = self._state(q, v, params, t)
@@ -212,9 +212,8 @@ class AbstractQuantities(eqx.Module):
         """Terms of dH/dt = sum_k v . Q_k - b . lam - dL/dt at fixed (q, v), by name, W.
 
         One term for each force under its name, one for each constraint whose rows A v + b = 0
-        have a b that is not zero, and "explicit time" where L depends on t. A force
-        is credited with v . Q, which is all of its power unless its point of application moves
-        at fixed q.
+        have a nonzero b, and "explicit time" if L depends on t. The power of a force is v . Q.
+        This is its whole power unless its point of application moves at fixed q.
 
         Args:
             q: shape (n,).
@@ -230,7 +229,7 @@ class AbstractQuantities(eqx.Module):
         return self._power_terms(params, q.dtype)(t, q, v, params, values)
 
     def _power_terms(self, params: Any, dtype: Any) -> Power:
-        """The terms of dH/dt that this system has."""
+        """The terms of dH/dt of this system."""
         explicit_time = self._structure(params, dtype).explicit_time
         rows = self._rows(params, dtype)
         return Power(self.lagrangian, self.forces, explicit_time, self._terms, rows)

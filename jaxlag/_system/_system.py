@@ -55,36 +55,36 @@ class System(AbstractReactions):
 
     Equations of motion: d/dt(dL/dv) - dL/dq = Q + A^T lam with A v + b = 0, that is
     M a + h = Q + A^T lam with M = d2L/dv2. L may contain t, terms linear in v, and need not be
-    quadratic in v; M must be positive definite where A v = 0, so that links without mass are
-    possible. What needs no params is checked here, everything else at first use or by `check`.
+    quadratic in v. M must be positive definite where A v = 0, so that links without mass are
+    possible. Checks without params are made here, all others at first use or by `check`.
 
-    Methods that take a state are called as (q, v, params, t=t): `params` any pytree, q and v of
-    shape (n,) in SI units (m or rad, and per s), t in s. Of params arrays and floats are traced,
-    with derivatives in the real ones; Python ints, truth values, text and functions are part of the
-    program, which compiles anew for each of their values. They compose with jit, vmap and every
+    Methods of a state are called as (q, v, params, t=t): `params` any pytree, q and v of
+    shape (n,) in SI units (m or rad, and per s), t in s. Arrays and floats in params are traced,
+    with derivatives in the real ones. Python ints, truth values, text and functions are part of the
+    program, which recompiles for each of their values. The methods compose with jit, vmap and every
     derivative of JAX. A system hashes by the identity of its functions: declare it once, not
-    in a loop, or every declaration compiles anew. Every function is traced once for each kind of
-    arguments (shapes, dtypes, static params), and what it reads from globals and closures holds as
-    it was then, for motions, energies and accelerations alike; where a number, an array or a
-    function that it read is another one later, a warning names it.
+    in a loop, or every declaration recompiles. Every function is traced once for each kind of
+    arguments (shapes, dtypes, static params). The values of its globals and closures at that time
+    are used from then on, for motions, energies and accelerations. If a number, an array or a
+    function among them changes later, a warning names it.
 
     Args:
         lagrangian: scalar function `L(t, q, v, params)`, in J. Either this, or both of
             `kinetic` and `potential`.
         coordinates: names, or names with shapes `{"x": (8, 3), "y": 3, "theta": ()}`; L receives q
-            and v flat, `unflatten` gives the parts.
+            and v flat, `unflatten` returns the parts.
         kinetic: scalar function `T(t, q, v, params)`, in J; then L = T - V.
         potential: scalar function `V(t, q, params)`, in J.
         forces: applied forces, each with its own name: `PointForce`, `Torque`,
             `GeneralizedForce`, `Rayleigh`.
         constraints: `Holonomic` and `Pfaffian` constraints, each row with its own name.
-        quasi: `QuasiVelocities` to move by in place of v; the constrained ones among them are
-            rows of their own, beside `constraints`.
-        written_in: the velocities that L, or T, is a function of: "v", or "u", all
-            quasi-velocities, as in L(t, q, u, params); constrained ones must not be left out, since
+        quasi: `QuasiVelocities` for the state in place of v; the constrained ones among them are
+            additional rows, beside `constraints`.
+        written_in: the velocities in the arguments of L, or T: "v", or "u" for all
+            quasi-velocities, as in L(t, q, u, params). L must contain the constrained ones, since
             their momenta enter the equations.
-        lowering: how accelerations are compiled: "auto", as straight-line code on scalars where
-            it exists and is short, else on arrays; "scalar", however long it is; "array".
+        lowering: how accelerations are compiled: "auto", as straight-line code on scalars if
+            this exists and is short, else on arrays; "scalar", for any length; "array".
 
     Raises:
         ValueError: neither or both ways of giving L, functions that cannot be called in these
@@ -181,7 +181,7 @@ class System(AbstractReactions):
         return (*parts, self.quasi, self.lowering)
 
     def _taken(self, rows: Sequence[AbstractConstraint]) -> dict[str, str]:
-        """Names that quasi-velocities must not bear -> what bears them."""
+        """Names that quasi-velocities must not have -> their owners."""
         taken = dict.fromkeys(self.coordinates.names, "a coordinate")
         taken |= {force.name: "a force" for force in self.forces}
         fix = "a constraint (the row of a constrained name is declared by that name alone)"
@@ -206,10 +206,10 @@ class System(AbstractReactions):
         return ScalarProgram(self._terms, OPERATIONS if self.lowering == "auto" else None)
 
     def with_forces(self, *forces: AbstractForce) -> "System":
-        """The same system under further forces.
+        """The same system with additional forces.
 
         Raises:
-            ValueError: a force that is none, a name that is taken.
+            ValueError: an object that is no force, a name that is already used.
         """
         both = check_forces((*self.forces, *forces))
         check_reactions(self.constraints, both)
@@ -227,10 +227,10 @@ class System(AbstractReactions):
         return self.coordinates.flatten(parts)
 
     def _rows(self, params: Any, dtype: Any) -> ConstraintRows:
-        """Names and shapes of the constraint rows, for params like these.
+        """Names and shapes of the constraint rows, for such params.
 
         Raises:
-            ValueError: quasi-velocities that are not affine; fewer than constraints leave.
+            ValueError: quasi-velocities that are not affine, or fewer than the constraints leave.
         """
         if self.quasi is not None:
             check_kinematics(self.quasi, params, self.size, dtype)
@@ -255,10 +255,10 @@ class System(AbstractReactions):
         t: Any = 0.0,
         inputs: Mapping[str, Any] | None = None,
     ) -> None:
-        """Examine the declaration at one state, with these params; silent if all is well.
+        """Examine the declaration at one state, with these params; no output if it is valid.
 
-        Traces L and the forces, then looks at the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
-        positive definite by its pivots (under constraints on their tangent space), the rows of
+        Traces L and the forces, then checks the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
+        positive definite by its pivots (with constraints on their tangent space), the rows of
         the constraints affine in v, a with M a + h = Q + A^T lam finite.
 
         Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
@@ -297,11 +297,11 @@ class System(AbstractReactions):
             raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
 
     def explain(self, params: Any) -> str:
-        """What was found in M a + h = Q of this system, and what is therefore skipped, as text.
+        """Structure found in M a + h = Q of this system, and operations skipped by it, as text.
 
         Dependencies of M, h and L on t, q, v and params are read from the traced program, never
-        from numbers; so are cyclic coordinates, blocks of M and the like. Forces that read inputs
-        are left out of the operations counted.
+        from numbers. The same holds for cyclic coordinates, blocks of M and the like. The counted
+        operations do not include forces that read inputs.
         """
         traced, static = _params.split(params)
         params = _params.join(traced, static)

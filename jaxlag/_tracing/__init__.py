@@ -1,1 +1,1 @@
-"""Functions of the user's as programs: what they take, read and return."""
+"""User functions as traced programs: their arguments, captured values and results."""

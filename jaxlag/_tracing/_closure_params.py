@@ -1,4 +1,4 @@
-"""Params, and beside them the traced values that a declaration closes over."""
+"""Params together with the traced values in the closures of a declaration."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Functions of params and inputs as compiled programs, keyed by what of these is not traced."""
+"""Compiled functions of params and inputs, cached by the untraced parts of these."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,7 @@
-"""Functions of the user's with a rule for reverse derivatives alone: forward ones follow from it.
+"""Forward derivatives of user functions that have only a reverse rule (`jax.custom_vjp`).
 
-JAX refuses forward derivatives of them, which rates along a motion, Jacobians of implicit steps and
-`jax.jacfwd` are made of. With the rule x, y -> J(x)^T y the rows of J are known, and so is J(x) x'.
+JAX refuses forward derivatives of them. Rates along a motion, Jacobians of implicit steps and
+`jax.jacfwd` need these. The rule x, y -> J(x)^T y gives the rows of J, and so J(x) x'.
 """
 
 from dataclasses import dataclass

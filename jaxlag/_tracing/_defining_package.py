@@ -1,4 +1,4 @@
-"""Which package something is of."""
+"""The package that defines an object."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""What the outputs of a traced program depend on."""
+"""Dependence of the outputs of a traced program on its inputs."""
 
 from collections.abc import Callable
 from typing import Any

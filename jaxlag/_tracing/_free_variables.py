@@ -1,4 +1,4 @@
-"""What a Python function reads from outside its arguments: globals, closures, attributes."""
+"""Free variables of a Python function: globals, closures, attributes that it reads."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Python functions, and what wraps them: their code, names in it, attributes."""
+"""Code of Python functions and of their wrappers: names and attributes in it."""
 
 import re
 from collections.abc import Iterator

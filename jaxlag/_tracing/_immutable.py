@@ -1,4 +1,4 @@
-"""What of a program's key can change: a compiled program would answer as of what it was."""
+"""Mutability of the values in a program's key: a mutated value would leave the cache outdated."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass

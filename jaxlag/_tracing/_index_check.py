@@ -1,4 +1,4 @@
-"""Indices out of range in what the user wrote: JAX would take the nearest element in silence."""
+"""Check of out-of-range indices in user functions: JAX silently clamps them."""
 
 from collections.abc import Sequence
 from typing import Any

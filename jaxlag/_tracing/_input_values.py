@@ -1,4 +1,4 @@
-"""Values of the inputs at one state, as forces read them."""
+"""Values of the inputs at one state, for the forces."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""A jaxpr run on numpy arrays, nothing compiled: what programs are compared with.
+"""Interpreter of a jaxpr on numpy arrays, without compilation: the reference for programs.
 
 NUMPY holds primitives as functions of (equation, operands).
 """

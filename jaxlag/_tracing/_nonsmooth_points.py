@@ -1,8 +1,8 @@
-"""Where a traced program bends or jumps: the comparisons in it, and how they come out.
+"""Kinks and jumps of a traced program: the outcomes of its comparisons.
 
-A function of `max`, `where`, `abs` and the like is smooth as long as every comparison within comes
-out as before. Of a loop the integers that come out are looked at (an interval of a table), not the
-comparisons in its body; so with `cond`, whose index is looked at.
+A function of `max`, `where`, `abs` and the like is smooth as long as all comparisons in it keep
+their outcome. For a loop only its integer results are examined (an interval of a table), not the
+comparisons in its body. For a `cond` its index is examined.
 """
 
 from collections.abc import Iterator, Sequence

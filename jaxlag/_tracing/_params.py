@@ -1,4 +1,4 @@
-"""Parameters: any pytree, split into what JAX traces and what the compiled program is keyed by."""
+"""Params: a pytree, split into traced leaves and the static part of the program's key."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""A program with constants of its own: arrays of numpy's, and views of them, change in place."""
+"""Copies of a program's constants: numpy arrays and views of them can change in place."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What functions of the user's take and return."""
+"""Signatures of user functions: arguments and results."""
 
 from collections.abc import Callable
 from inspect import Parameter, signature

@@ -1,4 +1,4 @@
-"""Where in the user's source an operation of a traced program was asked for."""
+"""The user's source line of an operation in a traced program."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
-"""Values that compare equal and are not alike: 1, True and 1.0; 0.0 and -0.0; named tuples.
+"""Strict equality of keys: values and types, for 1, True and 1.0; 0.0 and -0.0; named tuples.
 
-A program for the one is none for the other: keys of programs count the types of what they hold.
+Such values compare equal, but their programs differ: keys include the types of their contents.
 """
 
 from dataclasses import fields, is_dataclass

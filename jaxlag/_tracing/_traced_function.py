@@ -1,7 +1,7 @@
-"""A function of the user's as a program: traced once for each kind of arguments.
+"""A user function as a program, traced once for each kind of arguments.
 
-What it reads from globals and closures is read then, and holds for everything that is ever computed
-of it: the motion, its energy, its derivatives.
+The values of its globals and closures are read at that time. They are used for all results: the
+motion, its energy, its derivatives.
 """
 
 import logging

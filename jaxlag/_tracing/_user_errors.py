@@ -1,4 +1,4 @@
-"""What goes wrong inside a function of the user's, said in the form of every other error."""
+"""Errors inside user functions, reported in the form of all other errors."""
 
 import linecache
 import re

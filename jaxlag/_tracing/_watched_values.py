@@ -1,4 +1,4 @@
-"""Values from outside of a function: as they were, and whether they are still the same."""
+"""Snapshots of captured values of a function, and the check whether they have changed."""
 
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum

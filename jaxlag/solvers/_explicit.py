@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta steps, written out stage by stage or in a loop over their stages."""
+"""Explicit Runge-Kutta methods, unrolled stage by stage or in a loop over their stages."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -17,8 +17,8 @@ from jaxlag._core._arrays import elements
 from jaxlag._core._xla import opaque_one
 from jaxlag.solvers._unweighted_stages import at_least, unseen, unstacked, unweighted_stages
 
-# Lines of dy/dt times stages up to which steps are written out. Measured with order 8, seconds of
-# tracing and compiling and microseconds per step, written out | in a loop: elastic pendulum (21
+# Lines of dy/dt times stages up to which steps are unrolled. Measured with order 8, seconds of
+# tracing and compiling and microseconds per step, unrolled | in a loop: elastic pendulum (21
 # lines) 0.9, 0.25 | 0.6, 0.37; heavy top (39) 1.2, 0.44 | 1.1, 0.87; 3 links (85) 1.7, 1.2 | 0.7,
 # 1.8; 4 links (156) 2.0, 1.5 | 0.8, 1.6; 15 coordinates of 5 bodies (223) 2.4, 2.2 | 0.8, 2.0;
 # double pendulum with constraints (242) 4.9, 0.7 | 3.1, 1.3; aircraft (366) 5.4, 4.7 | 2.9, 5.5; 6
@@ -27,11 +27,11 @@ WRITTEN_OUT = 1600
 
 
 def in_loop_over_stages(lines: int | None, stages: int) -> bool:
-    """Whether a step is a loop over its stages: the program then holds dy/dt once.
+    """Whether a step is a loop over its stages: the program then contains dy/dt once.
 
     Args:
-        lines: of straight-line code for dy/dt; None for a program on arrays.
-        stages: of the method.
+        lines: number of lines of straight-line code for dy/dt; None for a program on arrays.
+        stages: number of stages of the method.
     """
     return lines is None or lines * stages > WRITTEN_OUT
 
@@ -42,35 +42,35 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     k_i = f(t + c_i h, y + h sum_{j<i} a_ij k_j), y1 = y + h sum_i b_i k_i; the error estimate is
     h sum_i e_i k_i. The units are those of the problem; y is any pytree of arrays.
 
-    Written out, a stage is a sum of the stages before it with the zeros of the tableau left out,
-    so that a step is straight-line code and a loop of steps over a small system one function
-    without calls. In a loop over stages the program holds f once: it compiles in a fraction of
-    the time and runs as fast where f is long.
+    Unrolled, a stage is a sum of the stages before it without the zeros of the tableau. A step is
+    then straight-line code, and a loop of steps over a small system is one function
+    without calls. In a loop over stages the program contains f once: it compiles in a fraction of
+    the time, and runs as fast if f is long.
 
-    Where the terms say that they are of `second_order`, y = (q, v) with dq/dtau = sigma v, dv/dtau
-    = sigma a, sigma = -1 where time runs backwards, a step that is written out is taken in
+    If the terms are of `second_order`, y = (q, v) with dq/dtau = sigma v, dv/dtau
+    = sigma a, sigma = -1 if time runs backwards, an unrolled step has
     Nystrom's form with k_i = sigma a_i,
 
         v_i = v + h sum_j a_ij k_j,    q_i = q + h sigma (c_i v + h sum_j (A A)_ij k_j).
 
-    This is the same method, but stages meet only through accelerations, and q_i does not depend
-    on the one before it: its sines and cosines need not wait for that. Where terms are written to
+    This is the same method, but stages are coupled only by accelerations, and q_i does not depend
+    on the previous stage: its sines and cosines can be computed earlier. If terms are compiled to
     be used `in_lanes`, every number of the state is a row of lanes, and sums are of such rows, not
     of tables.
 
     The last stage of a method whose last row of the tableau is its weights (FSAL) is the first
     one of the next step.
 
-    Steps, error estimates and interpolation are those of `stock`, up to the order of sums, but
-    where stages without weight meet what others do not: there the estimate is larger, see
-    `unseen`, so that no step passes through a wall that one of its stages met. With a
+    Steps, error estimates and interpolation are those of `stock`, up to the order of sums. But if
+    stages without weight meet a force that the others miss, the estimate is larger, see
+    `unseen`: no step passes through a wall that one of its stages met. With a
     loop over stages, reverse derivatives need `made_jump` to be known while tracing.
 
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.1, II.14.
 
     Attributes:
-        looped: whether there is a loop over stages. None: as `simulate` finds it faster, and
-            written out elsewhere.
+        looped: whether there is a loop over stages. None: the faster choice in `simulate`, and
+            unrolled elsewhere.
     """
 
     looped: bool | None = eqx.field(static=True, default=None)
@@ -96,7 +96,7 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
 
     @property
     def steps_as_declared(self) -> bool:
-        """Whether a step is that of the coefficients, and no subclass takes another."""
+        """Whether a step is that of the coefficients, and no subclass overrides it."""
         return type(self).step is AbstractExplicit.step
 
     def order(self, terms: Any) -> int:
@@ -110,7 +110,7 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
         return self.stock.error_order(terms)
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
-        """The first stage of the first step, where steps share one."""
+        """The first stage of the first step, if steps share a stage."""
         return terms.vf(t0, y0, args) if tableau_of(type(self)).fsal else None
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
@@ -122,7 +122,7 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     ) -> tuple[Any, Any, dict[str, Any], Any, diffrax.RESULTS]:
         """One step from t0 to t1: (y1, error estimate, stages, first stage of the next, result).
 
-        Where `made_jump` is the constant True, `solver_state` is not read.
+        If `made_jump` is the constant True, `solver_state` is not read.
         """
         y1, error, beside, k, last = self.attempt(terms, t0, t1, y0, args, solver_state, made_jump)
         # diffrax's interpolation takes the stages as increments.
@@ -132,7 +132,7 @@ class AbstractExplicit(diffrax.AbstractAdaptiveSolver):
     def attempt(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> "Attempt":
-        """The same, with the parts of its error estimate apart."""
+        """The same, with the two parts of its error estimate separate."""
         tableau = tableau_of(type(self))
         fresh = True if not tableau.fsal else made_jump
         written_out = _nystrom if getattr(terms, "second_order", False) else _written_out
@@ -146,9 +146,9 @@ class Attempt(NamedTuple):
     Attributes:
         y1: the state at its end.
         error: h sum_i e_i k_i.
-        unseen: what that takes no notice of; None of methods all of whose stages have a weight.
+        unseen: error of unweighted stages; None for methods without such stages.
         k: h dy/dt at every stage.
-        last: dy/dt at the last one where steps share it.
+        last: dy/dt at the last stage, if steps share it.
     """
 
     y1: Any
@@ -161,7 +161,7 @@ class Attempt(NamedTuple):
 class Tableau(NamedTuple):
     """Coefficients of stages 2, 3, ...; weights of the step and of its error estimate.
 
-    And the products of all three with A, for Nystrom's form.
+    Also the products of all three with A, for Nystrom's form.
     """
 
     rows: np.ndarray  # a_ij, (s - 1, s)
@@ -172,7 +172,7 @@ class Tableau(NamedTuple):
     b_squared: np.ndarray
     e_squared: np.ndarray
     fsal: bool
-    unweighted: tuple[int, ...]  # stages that neither b nor e weighs
+    unweighted: tuple[int, ...]  # stages without weight in b and e
 
 
 @lru_cache
@@ -189,7 +189,7 @@ def tableau_of(method: type[AbstractExplicit]) -> Tableau:
 
 
 def _by(x: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """x A, with what is zero up to rounding set to zero; A lacks its first row, of zeros."""
+    """x A, with zero for values of rounding size; A lacks its first row, of zeros."""
     product, size = x[..., 1:] @ A, np.abs(x[..., 1:]) @ np.abs(A)
     return np.where(np.abs(product) <= 2 * len(A) * np.finfo(float).eps * size, 0.0, product)
 
@@ -227,7 +227,7 @@ def _first(terms: Any, t0: Any, y0: Any, known: Any, fresh: Any, args: Any) -> A
 
 
 def _kept(x: list[Array]) -> list[Array]:
-    """The same numbers, each read from the table it is in once."""
+    """The same numbers, each loaded from its array once."""
     one = opaque_one(x[0].dtype)
     return [number / one for number in x]
 
@@ -235,7 +235,7 @@ def _kept(x: list[Array]) -> list[Array]:
 def _written_out(
     tableau: Tableau, terms: Any, t0: Any, t1: Any, y0: Any, known: Any, fresh: Any, args: Any
 ) -> Attempt:
-    """A step, its stages one after the other."""
+    """An unrolled step."""
     per_step = lax.optimization_barrier(1.0 / terms.contr(t0, t1))
     lanes = getattr(terms, "in_lanes", False)
 
@@ -246,7 +246,7 @@ def _written_out(
         return jnp.stack(y) if lanes else y
 
     def increments(rates: Any) -> Any:
-        """They are read in every later stage: they end in divisions, which XLA computes once."""
+        """All later stages read them: they end in divisions, which XLA computes once."""
         return jax.tree.map(lambda x: x / per_step, parts(rates))
 
     first = _first(terms, t0, y0, known, fresh, args)
@@ -285,7 +285,7 @@ def _nystrom(
     kicks, rates, last = [kick], [first], None
 
     def per_time(row: np.ndarray, squared: np.ndarray, c: float) -> Any:
-        """What q and v gain, over h."""
+        """The changes of q and v, over h."""
         drifts = [] if c == 0.0 else [_scaled(c, y[1])]
         if np.any(squared):
             drifts.append(_scaled(h, _sum(squared, kicks)))

@@ -1,4 +1,4 @@
-"""Methods that keep a structure of the equations, with steps of fixed length."""
+"""Structure-preserving methods with steps of fixed length."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -10,10 +10,10 @@ class AbstractFixedStep(diffrax.AbstractSolver):
     """A one-step method that keeps a structure of the equations as long as the step is constant.
 
     A step chosen by an error estimate depends on the state, and the map from state to state is
-    then no longer symplectic: these methods have no estimate and take no step-size controller.
+    then no longer symplectic. These methods have no estimate and take no step-size controller.
 
-    The terms must know the mechanical system, as those of `simulate` do; the methods that solvers
-    ask them for stand with each solver.
+    The terms must contain the mechanical system, as those of `simulate` do. Each solver documents
+    the methods of the terms that it needs.
 
     Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.1.
     """
@@ -22,7 +22,7 @@ class AbstractFixedStep(diffrax.AbstractSolver):
     interpolation_cls: ClassVar[Callable] = diffrax.LocalLinearInterpolation
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        """Nothing is carried from step to step."""
+        """Nothing is passed from step to step."""
         return
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:

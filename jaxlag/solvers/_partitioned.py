@@ -23,8 +23,8 @@ class Pair(NamedTuple):
     Attributes:
         c: nodes.
         b: weights.
-        a: of velocities in coordinates.
-        ah: of forces in momenta.
+        a: weights of velocities in coordinates.
+        ah: weights of forces in momenta.
     """
 
     c: np.ndarray
@@ -41,14 +41,15 @@ class AbstractPartitioned(AbstractFixedStep):
         q1 = q0 + h sum_j b_j V_j,    p1 = p0 + h sum_j b_j (F_j + A_j^T Lam_j),
 
     F = dL/dq + Q. It is the variational integrator of the discrete Lagrangian h sum_i b_i
-    L(t_i, Q_i, V_i), and with forces Q that of the discrete Lagrange-d'Alembert principle: without
-    forces symplectic, with the momenta of all symmetries that act linearly on q. The state is
-    (q, v); momenta are taken from it at the start of a step and turned into velocities at its end.
+    L(t_i, Q_i, V_i), and with forces Q that of the discrete Lagrange-d'Alembert principle. Without
+    forces it is symplectic and keeps the momenta of all symmetries that act linearly on q. The
+    state is (q, v): momenta are computed from it at the start of a step, and velocities from
+    momenta at its end.
 
-    The equations are solved for the velocities V_i until the increments stop falling; a step
-    where they do not is reported as not solved, and velocities are NaN where d2L/dv2 is not
-    positive definite. Work that is asked for follows by the weights b.
-    Second derivatives are taken in every order of modes.
+    The equations are solved for the velocities V_i until the increments stop decreasing. A step
+    without convergence is reported as not solved. Velocities are NaN if d2L/dv2 is not
+    positive definite. Work is integrated with the weights b.
+    Second derivatives exist in every order of modes.
 
     The terms have the methods `sections`, `joined` (as for `Splitting`) and `canonical(args)`, an
     object with
@@ -59,7 +60,7 @@ class AbstractPartitioned(AbstractFixedStep):
         reaction(tau, q, lam) -> A^T lam,    position(tau, q, lam) -> phi,
         velocity(tau, q, v, lam) -> A v + b,
 
-    of which the last two are lam itself, and the first reads none, in rows that follow from others.
+    of which the last two are lam itself, and the first does not use lam, for dependent rows.
 
     Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VI.4, VI.6; Marsden,
     West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001), sec. 2.6, 3.2.
@@ -79,14 +80,14 @@ class AbstractPartitioned(AbstractFixedStep):
         pair, form, (q0, v0, work) = self.pair, terms.canonical(args), terms.sections(y0)
         b, a, ah = (jnp.asarray(x, q0.dtype) for x in pair[1:])
         h = form.span(t0, t1).astype(q0.dtype)
-        # A step of no length, which nobody asks for, would divide 0 by 0 in its derivative.
+        # A step of zero length, which is not used, would divide 0 by 0 in its derivative.
         h = jnp.where(h == 0, jnp.sqrt(jnp.finfo(h.dtype).eps), h)
         s, n, rows = self.stages, q0.shape[0], form.rows
         ts = t0 + jnp.asarray(pair.c, t0.dtype) * (t1 - t0)
         p0, _ = form.canonical(t0, q0, v0)
 
         def unpacked(z: Array) -> tuple[Array, Array]:
-            """Velocities and impulses h Lam of the stages; of the last one by what follows."""
+            """Velocities and impulses h Lam of the stages; of the last one 0."""
             lam = z[s * n :].reshape(s - 1, rows) if rows else jnp.zeros((s - 1, 0), z.dtype)
             return z[: s * n].reshape(s, n), jnp.concatenate([lam, jnp.zeros((1, rows), z.dtype)])
 
@@ -106,7 +107,7 @@ class AbstractPartitioned(AbstractFixedStep):
             return jnp.concatenate([motion.reshape(-1), held.reshape(-1)])
 
         still = jnp.zeros(((s - 1) * rows,), q0.dtype)
-        # Positions are rounded, and held by velocities over h.
+        # Positions are rounded; over h they define velocities.
         rounded = jax.lax.stop_gradient(jnp.abs(q0 / h) + jnp.abs(v0))
         guess = jnp.concatenate([jnp.tile(v0, s), still])
         z, found = root(residual, guess, jnp.tile(rounded, s))
@@ -127,7 +128,7 @@ class AbstractPartitioned(AbstractFixedStep):
         z, ended = root(last, guess, rounded)
         if terms.works:
             work = work + h * (b @ jax.vmap(form.power)(ts, Q, V))
-        # Momenta tell velocities where M is indefinite, too, but no motion.
+        # Momenta define velocities also for an indefinite M, but no motion.
         v1 = jnp.where(form.regular(t1, q1, z[:n]), z[:n], jnp.nan)
         y1 = terms.joined(q1, v1, work)
         results: Any = diffrax.RESULTS
@@ -139,8 +140,8 @@ class AbstractPartitioned(AbstractFixedStep):
 class GaussLegendre(AbstractPartitioned):
     """Gauss's methods: nodes are the roots of the Legendre polynomial; order twice the stages.
 
-    The same coefficients for q and p. Symmetric, and exact in every quadratic invariant. Not for
-    constraints, which hold at the nodes alone.
+    The same coefficients for q and p. Symmetric, and exact for every quadratic invariant. Not for
+    constraints, which would hold only at the nodes.
 
     Attributes:
         stages: their number, at least 1 (the implicit midpoint rule).
@@ -166,8 +167,8 @@ class GaussLegendre(AbstractPartitioned):
 class LobattoIIIAB(AbstractPartitioned):
     """Lobatto's methods IIIA for q and IIIB for p; order 2 s - 2 with s stages.
 
-    Holonomic constraints hold at every stage, the end among them, and their velocities at the
-    end: inside the step, nothing is projected afterwards. With 2 stages and L = T - V this is
+    Holonomic constraints hold at every stage, including the end, and their velocities at the
+    end: this is part of the step, and there is no projection. With 2 stages and L = T - V this is
     Verlet's method, with constraints RATTLE.
 
     Attributes:
@@ -217,7 +218,7 @@ def _lobatto(stages: int) -> Pair:
         inner = inner - top.deriv()(inner) / top.deriv(2)(inner)
     x = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
     w = 2.0 / (stages * (stages - 1) * top(x) ** 2)
-    # The rule squares all but the highest polynomial exactly.
+    # The rule integrates the squares of all polynomials but the highest exactly.
     norms = [2.0 / (2 * k + 1) for k in range(stages - 1)] + [2.0 / (stages - 1)]
     a, b = _collocation(x, w, norms), 0.5 * w
     a[0], a[-1] = 0.0, b

@@ -13,7 +13,7 @@ from jaxlag.solvers._explicit import AbstractExplicit
 
 # fmt: off
 
-# a_ij of the stages 2 to 18; the last are the weights, so that steps share a stage.
+# a_ij of the stages 2 to 18; the last row are the weights, so that steps share a stage.
 _A = (
     (0.1037037037037037,),
     (0.03888888888888889, 0.11666666666666667),
@@ -63,14 +63,14 @@ _C = (
     0.36, 2 / 21, 22 / 45, 7 / 11, 14 / 15, 1.0, 1.0,
 )
 
-# Weights of the method of order 7, over which the error is estimated.
+# Weights of the method of order 7 for the error estimate.
 _LOWER = (
     -0.12769053757764634, 0, 0, 0, -0.95, 0, 0.025, 0.420967933030045, 0.47333793027026716,
     0.25, -0.04318556047042588, 1.1842135780322893, -0.1523460330481535, 0.027921240846299173,
     -0.21386274865359162, 0.0543489879984277, 0.05129520957248896, 0,
 )
 
-# Weights between the ends: powers 1 to 8 of the part of the step that has passed.
+# Weights between the ends: powers 1 to 8 of the elapsed fraction of the step.
 _OUTPUT = (
     (1.0, -27.773511689355068, 251.65978861779362, -1086.263919242814, 2533.5653992488556,
      -3242.3025017139994, 2130.5528491162313, -560.4073244096642),
@@ -120,7 +120,7 @@ def _tableau() -> diffrax.ButcherTableau:
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """y0 + sum_j k_j p_j(s), of order 8, with s the part of the step that has passed."""
+    """y0 + sum_j k_j p_j(s), of order 8, with s the elapsed fraction of the step."""
 
     t0: Any
     t1: Any
@@ -161,8 +161,8 @@ class _Stock(diffrax.AbstractERK):
 class Prince9(AbstractExplicit):
     """Order 9 with an embedded method of order 7, 18 stages of which two steps share one.
 
-    For tolerances of 1e-12 and below. What was compared, on a double pendulum for 10 s from
-    (1, 0.5) rad, one core (steps by plain control with a safety of 0.9):
+    For tolerances of 1e-12 and below. Comparison on a double pendulum for 10 s from
+    (1, 0.5) rad, one core (proportional step-size control with a safety of 0.9):
 
     =====================================  =====================  =================================
     method                                 evaluations to 1e-12   remarks
@@ -178,10 +178,10 @@ class Prince9(AbstractExplicit):
                                                                   5000 operations in a line
     =====================================  =====================  =================================
 
-    On a Kepler orbit of e = 0.6, ten times round, to 1e-11: this one 12 000, order 8 14 500, and
-    Feagin's 14(12) beyond 17 500. Order 12 by series takes 0.3 ms to 7e-12, as long as this method
-    does, and has to be written anew for every function that a Lagrangian may call; nodes of one
-    step beside one another would fill vector registers, but XLA takes 0.5 us for a sweep over 8.
+    On a Kepler orbit of e = 0.6, ten revolutions, to 1e-11: this method 12 000, order 8 14 500, and
+    Feagin's 14(12) more than 17 500. Order 12 by Taylor series takes 0.3 ms to 7e-12, as this
+    method does, but needs a new rule for every function in a Lagrangian. The 8 nodes of one step
+    could fill vector registers, but XLA takes 0.5 us for a sweep over 8.
 
     Source: Prince, Parallel Derivation of Efficient Continuous/Discrete Explicit Runge-Kutta
     Methods, 2018 (www.peteprince.co.uk/parallel.pdf), with its output of order 8 between steps.

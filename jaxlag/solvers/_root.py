@@ -1,4 +1,4 @@
-"""Implicit equations of a step, solved to rounding."""
+"""Newton's method for the implicit equations of a step, converged to rounding."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,34 +12,35 @@ from jaxtyping import PyTree
 
 from jaxlag._core._custom_jvp import CustomJVP
 
-MOST, EACH = 8, 12  # derivatives taken anew, iterations with each
-MEMORY = 3  # iterations in which increments halve while they fall
+MOST, EACH = 8, 12  # Jacobians, iterations with each
+MEMORY = 3  # iterations over which decreasing increments must halve
 
 
 def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tuple[Array, Array]:
-    """(z with residual(z) = 0, whether it was found), by Newton's method with the derivative kept.
+    """(z with residual(z) = 0, whether it was found), by the simplified Newton method.
 
-    Iterates until no component's increment falls any more, or is the last digit of the component
-    itself: increments are roundings then, so that no tolerance adds an error of one sign in every
-    step. Roundings may fall again by chance: where all increments are small, a component that
-    stopped has stopped. If they are not small beside z by themselves, as near an equilibrium, where
-    z is all rounding, the derivative is taken anew: where it is what it was, the iteration
-    contracts, and what does not fall is noise. Slow iterations go on with the new derivative.
+    The Jacobian is kept between iterations. They stop when the increment of no component decreases,
+    or when it is the last digit of the component. Increments are then rounding, so that no
+    tolerance adds an error of one sign in every step. Rounding may decrease again by chance: if all
+    increments are small, a component that has stopped stays so. Near an equilibrium z itself is
+    rounding, and increments are not small relative to z. The Jacobian is then recomputed: if it is
+    unchanged, the iteration contracts, and increments that do not decrease are noise. Slow
+    iterations also continue with the new Jacobian.
 
-    The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr, forward, reverse, and forward
-    over reverse to any order; reverse over reverse through a loop of steps JAX refuses.
+    The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr: forward, reverse, and forward
+    over reverse to any order. JAX refuses reverse over reverse through a loop of steps.
 
     Args:
-        residual: of z, shape (m,), as many components.
-        guess: near the solution. It is returned if nothing was found, nan where the residual is
+        residual: of z, shape (m,), with m components.
+        guess: near the solution. It is returned if no solution was found, nan if the residual is
             not finite there.
-        rounded: what the first components of z, velocities, may be roundings of; these are looked
-            at. It says what increments are small, not where the iteration stops.
+        rounded: scale of the rounding of the first components of z, the velocities; only these
+            are tested. It defines small increments, not the end of the iteration.
 
     Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.6 (iterations until
     convergence, and their round-off).
     """
-    # All that it closes over, truth values too, which `jax.closure_convert` leaves where they are.
+    # All values of its closure, also truth values, which `jax.closure_convert` leaves inside.
     given, static = eqx.partition(eqx.filter_closure_convert(residual, guess), eqx.is_array)
 
     def function(z: Array, given: PyTree) -> Array:
@@ -62,12 +63,12 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
 
 
 def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Array]:
-    """(z, 1.0 if found): a number, as a truth value has no derivative."""
+    """(z, 1.0 if found): a float, as a truth value has no derivative."""
     count, eps = rounded.shape[0], jnp.finfo(guess.dtype).eps
     no, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
 
     def iterate(factor: Any, z: Array) -> tuple[Array, Array, Array]:
-        """(z, whether increments stopped falling, whether they are small)."""
+        """(z, whether increments stopped decreasing, whether they are small)."""
 
         def turn(carry: tuple) -> tuple:
             z, least, stopped, was_small, k = carry
@@ -108,7 +109,7 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
 
 
 def _radius(matrix: Array) -> Array:
-    """About the spectral radius, which units do not change."""
+    """An approximation of the spectral radius, which does not depend on units."""
     power = matrix
     for _ in range(3):
         power = power @ power

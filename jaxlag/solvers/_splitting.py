@@ -17,16 +17,17 @@ from jaxlag.solvers._fixed import AbstractFixedStep
 class Splitting(AbstractFixedStep):
     """Composition of drifts q += h a_i v and kicks v += h b_i M^-1 F(t, q), explicit, symplectic.
 
-    For systems with constant M in which nothing that accelerates depends on v: L = T(v) - V(t, q)
-    with T quadratic, and forces Q(t, q). Both parts are solved exactly, so every composition
-    keeps the symplectic form, momenta of symmetries of T and V, and, being symmetric, reverses.
-    A drift comes first, with order 6 a kick, and drifts take time along. The work that is asked for
-    is that of every kick; with order 6, whose composition is one for accelerations that depend on q
+    For systems with constant M and accelerations that do not depend on v: L = T(v) - V(t, q)
+    with T quadratic, and forces Q(t, q). Both parts are solved exactly. So every composition
+    keeps the symplectic form and the momenta of symmetries of T and V. It is symmetric and
+    therefore reversible. A drift comes first, with order 6 a kick; drifts advance the time. The
+    work is that of every kick. With order 6, whose composition requires accelerations that depend
+    on q alone, the work is of order 4.
     alone, it is of order 4.
 
     In `diffrax.diffeqsolve` y is a pair (q, v) of pytrees, `vf(t, y, args)` the pair (v, M^-1 F).
-    The terms of `simulate` take y apart by `sections(y) -> (q, v, work)`, put it together by
-    `joined(q, v, work)` and say by `works` whether there is work.
+    The terms of `simulate` have `sections(y) -> (q, v, work)`, its inverse
+    `joined(q, v, work)`, and `works`, whether there is work.
 
     Args:
         order: 2 (Stormer's and Verlet's), 4 (6 kicks), 6 (12 kicks) or 8 (17 kicks).
@@ -78,7 +79,7 @@ class Splitting(AbstractFixedStep):
 
 
 def _form(terms: Any) -> tuple[Callable, Callable, bool]:
-    """How the parts of a state are found and put together, and whether it has work."""
+    """The functions that split and join a state, and whether it has work."""
     if hasattr(terms, "sections"):
         return terms.sections, terms.joined, terms.works
     return lambda y: (*y, ()), lambda q, v, work: (q, v), False
@@ -126,7 +127,7 @@ _GAMMAS = [
 ]
 
 
-# Drifts and kicks of each order, a drift first; one that is 0 is left out.
+# Drifts and kicks of each order, a drift first; zeros are skipped.
 _COEFFICIENTS = {
     2: _of_verlet_steps([1.0]),
     4: (

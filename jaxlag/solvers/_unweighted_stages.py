@@ -1,4 +1,4 @@
-"""What the error estimate of an explicit step does not see: stages without weight in it."""
+"""Error of unweighted stages: a supplement to the error estimate of an explicit step."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-# Parts of the largest rate of three stages. Steps that the estimate accepts in a smooth field stay
-# far below: at tolerances of 1e-6 and less none of 1,800 motions (pendulums, Kepler orbits up to
-# e = 0.97, oscillators of two rates, coupled ones) had a step turned back by either.
+# Fractions of the largest rate of three stages. Steps that the estimate accepts in a smooth field
+# stay far below: at tolerances of 1e-6 and less none of 1,800 motions (pendulums, Kepler orbits up
+# to e = 0.97, oscillators of two rates, coupled ones) had a step rejected by either.
 _APART = 0.3
 _KICK = 3.0
 
 
 def unweighted_stages(b: Any, e: Any) -> tuple[int, ...]:
-    """Stages that have no weight in the step nor in its error estimate, without the last.
+    """Stages without weight in the step and in its error estimate, except the last.
 
     Args:
         b: weights of the step.
@@ -28,19 +28,19 @@ def unweighted_stages(b: Any, e: Any) -> tuple[int, ...]:
 
 
 def unseen(k: Sequence[Any], stages: tuple[int, ...]) -> Any:
-    """What an error estimate takes no notice of: it is at least this, where it is not 0.
+    """Error of stages without weight: a lower bound on the error estimate if it is not 0.
 
-    Early stages of methods of high order weigh nothing in the step and in its estimate. Where they
-    alone meet a short, stiff force (a wall, a cord that goes taut), it throws the stages after them
-    out again, and the estimate is that of a motion without it. Component by component this is the
-    larger of
+    Early stages of methods of high order have no weight in the step and in its estimate. If only
+    they meet a short, stiff force (a wall, a cord that becomes taut), it deflects the later stages
+    away from it, and the estimate is that of a motion without the force. For each component the
+    result is the larger of
 
-        |k_s - k_{s-1}|    where it is above 0.3 of the largest of |k_1|, |k_{s-1}|, |k_s|,
-        |k_i|              where it is above 3 times that, of stages i without weight:
+        |k_s - k_{s-1}|    if it is above 0.3 of the largest of |k_1|, |k_{s-1}|, |k_s|,
+        |k_i|              if it is above 3 times that, for stages i without weight:
 
-    k_s and k_{s-1} are both of the end of the step, from the end itself and from a stage that the
-    ones before led to. The former applies where two stages or more weigh nothing: one alone does
-    not throw all others out.
+    k_s and k_{s-1} are both at the end of the step, from the end itself and from the last
+    stage before it. The former applies if two or more stages have no weight: a single one does
+    not deflect all others.
 
     Args:
         k: dy/dt of every stage, pytrees of arrays; the last at the end of the step.
@@ -60,13 +60,13 @@ def unseen(k: Sequence[Any], stages: tuple[int, ...]) -> Any:
 
 
 def at_least(error: Any, unseen: Any) -> Any:
-    """The error estimate with what it takes no notice of; as it is where that is None."""
+    """The error estimate, at least `unseen`; unchanged if that is None."""
     if unseen is None:
         return error
     return jax.tree.map(lambda e, x: jnp.where(x > jnp.abs(e), x, e), error, unseen)
 
 
 def unstacked(k: Any) -> list[Any]:
-    """The stages one by one, of all of them along a first axis."""
+    """A list of the stages, from arrays of all stages along a first axis."""
     count = jax.tree.leaves(k)[0].shape[0]
     return [jax.tree.map(lambda x: x[i], k) for i in range(count)]  # noqa: B023

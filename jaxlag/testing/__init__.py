@@ -1,4 +1,4 @@
-"""Checks that users run on what they declare."""
+"""Checks that users apply to their declarations."""
 
 from jaxlag.testing._check_derivatives import STATES as STATES
 from jaxlag.testing._check_derivatives import Finding as Finding

@@ -1,4 +1,4 @@
-"""Checks that users run on what they declare."""
+"""`check_derivatives`: checks of the derivatives of a declared system."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from jaxlag.testing import _declared_functions
 from jaxlag.testing._nan_origins import Origin
 
 STATES = _declared_functions.STATES
-"""States at which `check_derivatives` looks."""
+"""States examined by `check_derivatives`."""
 
 _MASKED = (
     "Only its reverse derivative is not finite: a where() leaves the value out, but multiplies the "
@@ -52,23 +52,23 @@ _HINTS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A derivative that is not finite, or wrong, at one state.
+    """A derivative that is nonfinite or wrong at one state.
 
     Attributes:
         function: the declared function: "lagrangian", "force 'drag': Q", ...
-        kind: "not finite", or "wrong" where two ways to one derivative disagree.
-        order: of the derivative; 0 for the value itself.
-        variables: what it is taken by, as few arguments as it takes: "q", "q or v" where either
-            alone will do, "q and params" for a mixed one; "" for a value.
+        kind: "not finite", or "wrong" if two ways to compute one derivative disagree.
+        order: order of the derivative; 0 for the value itself.
+        variables: variables of the derivative, as few arguments as necessary: "q", "q or v" if
+            each alone is sufficient, "q and params" for a mixed one; "" for a value.
         state: name of the state.
         q: coordinates there, m or rad.
         v: velocities there, m/s or rad/s; quasi-velocities for a function of them.
-        vmapped: whether it is so under `jax.vmap` alone.
+        vmapped: whether it occurs only under `jax.vmap`.
         mode: "value", "forward", "reverse" (taken first), or "reverse twice" (first and last).
-        primitive: JAX's name of the operation of the function where it is born; "" if unknown.
-        file: of the user's code that asks for that operation; "" if unknown.
-        line: of this file; 0 if unknown.
-        hint: what to do about it, or the numbers that disagree.
+        primitive: JAX's name of the operation that produces it; "" if unknown.
+        file: file of the user's code with that operation; "" if unknown.
+        line: line of this file; 0 if unknown.
+        hint: remedy, or the numbers that disagree.
     """
 
     function: str
@@ -87,7 +87,7 @@ class Finding:
 
     @property
     def where(self) -> str:
-        """`sqrt at model.py:17`, as far as it is known."""
+        """`sqrt at model.py:17`, if it is known."""
         place = f" at {Path(self.file).name}:{self.line}" if self.file else ""
         return (self.primitive or "an operation without a name") + place
 
@@ -101,13 +101,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """What `check_derivatives` found; `print` shows it as a table.
+    """The result of `check_derivatives`; `print` shows it as a table.
 
     Attributes:
         findings: by function and state; empty if all is well.
-        functions: (name, order) of what was looked at.
+        functions: (name, order) of the examined functions.
         states: name -> (q, v).
-        omitted: function -> derivatives that could not be taken, and why.
+        omitted: function -> derivatives that could not be computed, and why.
     """
 
     findings: tuple[Finding, ...]
@@ -117,7 +117,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether every derivative that was taken is finite and right."""
+        """Whether every computed derivative is finite and correct."""
         return not self.findings
 
     def __str__(self) -> str:
@@ -155,12 +155,12 @@ def check_derivatives(
     inputs: Mapping[str, Any] | None = None,
     states: Sequence[str] = STATES,
 ) -> Report:
-    """Look for derivatives of a system's functions that are not finite, or wrong.
+    """Find derivatives of a system's functions that are nonfinite or wrong.
 
-    One that is not finite spoils all of an acceleration, or a gradient, however small its part in
-    it; one that is wrong spoils it silently. Every function that was declared is differentiated to
-    one order more than M a + h = Q + A^T lam, A a + gamma = 0 take of it, so that what is looked at
-    is what forward and reverse derivatives of a motion need:
+    One nonfinite derivative makes a whole acceleration or gradient nonfinite, even if its part is
+    small. A wrong one makes it wrong without a message. Every declared function is differentiated
+    to one order more than M a + h = Q + A^T lam, A a + gamma = 0 need. So the check covers the
+    forward and reverse derivatives of a motion:
 
     | function                                                   | order |
     |------------------------------------------------------------|-------|
@@ -170,9 +170,9 @@ def check_derivatives(
     | `position`, `angular_velocity`, `R` of `Rayleigh`          | 2     |
     | `Q`, `force`, `torque`                                     | 1     |
 
-    by t, q, v (or u), the real inexact leaves of params, and lam where a force reads it (taken as
-    1), all at once, along dense random directions: forwards only, reverse first, and reverse
-    first and last; plainly and under `jax.vmap`. The states:
+    by t, q, v (or u), the real inexact leaves of params, and lam if a force reads it (taken as
+    1), all at once, along dense random directions: forward only, reverse first, and reverse
+    first and last; without and with `jax.vmap`. The states:
 
     | name     | q                                    | v                               |
     |----------|--------------------------------------|---------------------------------|
@@ -183,33 +183,33 @@ def check_derivatives(
     | "one"    | the first that entry, the others 0   | likewise                        |
     | "random" | 3 of them, each entry between 1/2 and 3/2 of that given (within 1/2 of 0) |
 
-    with 1 where all of q, or v, is 0, so that a chain is stretched out at "one" if its angles are
-    relative and at "equal" if they are absolute. A state met before is left out.
+    with 1 if all of q, or v, is 0: a chain is stretched out at "one" if its angles are
+    relative and at "equal" if they are absolute. Repeated states are left out.
 
-    For a derivative that is not finite the operation is named in which it is born, with its line:
-    the derivative's program is followed back from its result, through what inherits, to where all
-    operands are finite. What is not finite but left out of a finite result is no finding. At the
-    given and the random states the modes are compared with one another, and each order with
+    For a nonfinite derivative the report names the operation that produces it, with its line:
+    the derivative's program is traced back from its result to an operation whose
+    operands are finite. A nonfinite value that a finite result does not contain is no finding. At
+    the given and the random states the modes are compared with one another, and each order with
     differences of the order below, (4 D(h/2) - D(h))/3 with central D; a kink is no finding.
 
-    What vmap does to the program is seen, what XLA's simplifications do to it is not. Fourth
-    derivatives, as Hessians of a motion need, are not taken.
+    The check includes the changes of a program by vmap, but not XLA's simplifications. Fourth
+    derivatives, as Hessians of a motion need, are not checked.
 
     Args:
         system: the declaration.
-        q: coordinates, shape (n,), m or rad; not needed to satisfy constraints.
+        q: coordinates, shape (n,), m or rad; they need not satisfy constraints.
         v: generalized velocities, shape (n,), m/s or rad/s.
         params: as its functions take them.
         t: s.
-        inputs: dict from names to input objects or arrays, as far as forces read them.
-        states: which of the states to look at: leave out "zero" where a coordinate cannot be 0.
+        inputs: dict from names to input objects or arrays, if forces read them.
+        states: the states to examine: leave out "zero" if a coordinate cannot be 0.
 
     Returns:
         The `Report`: `report.ok`, `report.findings`; `print(report)` shows a table.
 
     Raises:
-        ValueError: as `System.check` does for functions of wrong shapes; q, v, t or params not
-            finite, or traced; unknown states.
+        ValueError: as `System.check` for functions of wrong shapes; q, v, t or params nonfinite or
+            traced; unknown states.
 
     Source: Griewank, Walther, Evaluating Derivatives, ch. 3 (modes) and 13 (directions); Richardson
     extrapolation: Press et al., Numerical Recipes, sec. 5.7.
@@ -261,12 +261,12 @@ def _require_numbers(name: str, values: Any) -> None:
 
 
 class _Search:
-    """One function at all states.
+    """The search of one function at all states.
 
     Args:
-        function: as declared.
+        function: the declared function.
         ladder: its derivatives.
-        at: name of a state -> all that the function may take.
+        at: name of a state -> all arguments that the function may take.
     """
 
     def __init__(
@@ -275,19 +275,19 @@ class _Search:
         self.function, self.ladder, self.at = function, ladder, at
         rng = np.random.default_rng(1)
         self.along = {name: _direction(rng, z) for name, z in at.items()}
-        # As many roundings as the coarsest of the numbers has.
+        # The eps of the least precise of the numbers.
         some = next(iter(at.values()))
         kinds = [x.dtype for x in jax.tree.leaves([some[name] for name in ladder.groups])]
         self.eps = max((float(jnp.finfo(kind).eps) for kind in kinds), default=0.0)
 
     def findings(self) -> list[Finding]:
-        """At every state the lowest order at which something is wrong."""
+        """The lowest order with an error at every state."""
         states = list(self.at)
         smooth = [name for name in states if name == "given" or name.startswith("random")]
         h = _check.step(self.eps)
         points = [self.at[name] for name in states]
         along = [self.along[name] for name in states]
-        # Along all arguments at once, and along each alone: a kink in one excuses no other.
+        # Along all arguments at once, and along each alone: a kink in one must not hide another.
         lines = [(name, group) for name in smooth for group in self._groups()]
         for name, group in lines:
             d = self._along(name, group)
@@ -316,7 +316,7 @@ class _Search:
         return found
 
     def _groups(self) -> list[str | None]:
-        """Arguments along which differences are taken; None for all of them at once."""
+        """Arguments for the differences; None for all of them at once."""
         groups = self.ladder.groups
         return [None, *(groups if len(groups) > 1 else [])]
 
@@ -387,7 +387,7 @@ class _Search:
 
 
 def _direction(rng: np.random.Generator, z: dict) -> dict:
-    """A dense random direction, in the units of the arguments: of their size, or 1 where 0."""
+    """A dense random direction in the units of the arguments: of their size, or 1 for zeros."""
 
     def along(x: Array) -> Array:
         size = np.where(np.asarray(x) == 0, 1.0, np.abs(x))
@@ -397,7 +397,7 @@ def _direction(rng: np.random.Generator, z: dict) -> dict:
 
 
 def _first(values: Mapping[tuple[str, int], Any]) -> tuple[str, int] | None:
-    """(mode, order) of the first derivative that is not finite."""
+    """(mode, order) of the first nonfinite derivative."""
     for step, value in values.items():
         if not _check.finite(value):
             return step

@@ -1,8 +1,8 @@
-"""Derivatives of a declared function in every mode, and what they disagree on.
+"""Derivatives of a declared function in every mode, and their differences.
 
-A function f of (t, q, v, params) is looked at through g = w . f with a dense random w, along a
-dense random direction d of all its arguments at once: D^k g = d^k/ds^k g(z + s d) holds every
-partial derivative of order k, and one that is not finite leaves no finite sum.
+A function f of (t, q, v, params) is reduced to g = w . f with a dense random w, along a dense
+random direction d of all its arguments: D^k g = d^k/ds^k g(z + s d) contains every partial
+derivative of order k. One nonfinite derivative makes the sum nonfinite.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,13 +35,13 @@ def dot(a: Any, b: Any) -> Array:
 class Derivatives:
     """Derivatives of a scalar function g(z) by some of its arguments, along d, as programs.
 
-    Each is traced from the program of the order below: to differentiate it at one stroke would
+    Each is traced from the program of the order below: to differentiate it in one pass would
     trace g 2^k times.
 
     Args:
-        g: of a dict of arrays.
-        z: the dict, of which shapes and dtypes matter.
-        active: names of the arguments; the others are held.
+        g: function of a dict of arrays.
+        z: the dict; only shapes and dtypes are used.
+        active: names of the arguments; the others are held constant.
     """
 
     def __init__(self, g: Callable, z: Mapping[str, Any], active: Sequence[str]) -> None:
@@ -53,8 +53,8 @@ class Derivatives:
 
         Args:
             mode: FORWARD, D^k g; REVERSE, the gradient of D^(k-1) g, with the reverse derivative
-                taken first; TWICE, the same with a reverse derivative first and last, as those of
-                motions are; VALUE at order 0.
+                taken first; TWICE, the same with a reverse derivative first and last, as for
+                motions; VALUE at order 0.
             order: k.
             lanes: length of a first axis of all leaves, under vmap; 0 for none.
         """
@@ -97,10 +97,10 @@ class Ladder:
     """A declared function with its derivatives of every order and mode.
 
     Attributes:
-        groups: its arguments that derivatives are taken by.
+        groups: its arguments for the derivatives.
         program: the function.
         steps: (mode, order), lower orders first.
-        omitted: why a mode is left out, if one is.
+        omitted: why a mode is omitted, if one is.
     """
 
     def __init__(self, function: Declared, z: Mapping[str, Any]) -> None:
@@ -118,22 +118,22 @@ class Ladder:
         self.steps += [(m, k) for k in orders for m in modes if m != TWICE or k > 1]
 
     def values(self, z: Any, d: Any, lanes: int = 0) -> dict[tuple[str, int], Any]:
-        """Every derivative at (z, d), or under vmap at many of them along a first axis."""
+        """Every derivative at (z, d), or under vmap at many pairs along a first axis."""
         return {step: self._value(*step, tuple(self.groups), z, d, lanes) for step in self.steps}
 
     def origins(
         self, mode: str, order: int, z: Any, d: Any, *, vmapped: bool
     ) -> list[tuple[Origin, str]]:
-        """(operation, variables): where a derivative stops being finite, and by what it is taken.
+        """(operation, variables): the origin of a nonfinite derivative, and its variables.
 
-        By as few of the arguments as it takes, all others held.
+        With as few of the arguments as necessary, all others constant.
 
         Args:
-            mode: of the derivative.
-            order: of the derivative.
+            mode: mode of the derivative.
+            order: order of the derivative.
             z: the state.
             d: the direction.
-            vmapped: whether to look at it under vmap.
+            vmapped: whether to evaluate it under vmap.
         """
         if vmapped:
             z, d = jax.tree.map(lambda x: x[None], (z, d))
@@ -176,7 +176,7 @@ def finite(value: Any) -> bool:
 
 
 def dense(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Random numbers of either sign between 1/2 and 1 in size: none is zero, or nearly."""
+    """Random numbers of either sign with sizes between 1/2 and 1: none is close to zero."""
     return np.asarray(rng.uniform(0.5, 1.0, shape) * rng.choice([-1.0, 1.0], shape))
 
 
@@ -184,14 +184,14 @@ def dense(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Mismatch(NamedTuple):
-    """Two numbers for one derivative.
+    """Two different values of one derivative.
 
     Attributes:
-        order: of the derivative.
-        mode: of the derivative that is compared.
-        against: what with.
+        order: order of the derivative.
+        mode: mode of the derivative that is compared.
+        against: the mode or quotient that it is compared with.
         value: of the derivative along d.
-        other: what it is compared with.
+        other: the value that it is compared with.
     """
 
     order: int
@@ -202,13 +202,13 @@ class Mismatch(NamedTuple):
 
 
 # Modes differ by the rounding of their sums: by at most 15 eps of the largest terms among the
-# catalogue's systems. 2^10 eps leaves room for longer programs; a wrong rule is far outside.
+# catalog's systems. 2^10 eps leaves room for longer programs; a wrong rule is far outside.
 MODES_DIFFER = 2.0**10
-# The error of the extrapolated quotient is O(h^2) of its correction, which is h^2 f'''/8. What
-# exceeds that is not smooth: a jump at the centre is 7 corrections, an infinite slope 11 or so.
+# The error of the extrapolated quotient is O(h^2) of its correction, which is h^2 f'''/8. A larger
+# one is not smooth: a jump at the center is 7 corrections, an infinite slope 11 or so.
 CORRECTIONS = 30.0
 # Rounding of the values, weighted by (8 + 1)/3h: at most 0.4 eps/h of the largest terms among the
-# catalogue's systems, beyond the doubt above.
+# catalog's systems, in addition to the correction above.
 ROUNDINGS = 2.0**6
 
 
@@ -223,13 +223,13 @@ def mismatch(
     d: Any,
     eps: float,
 ) -> Mismatch | None:
-    """The first derivative that contradicts the other modes, or differences of the order below.
+    """The first derivative that differs from other modes, or from differences of the order below.
 
     Args:
         at: every derivative at a state where all are finite.
         around: the same at z + s h d for s = 1, -1, 1/2, -1/2.
         d: the direction.
-        eps: of the precision.
+        eps: eps of the precision.
     """
     h, scale, below = step(eps), 0.0, [float(x[VALUE, 0]) for x in (at, *around)]
     scale = abs(below[0])
@@ -250,19 +250,19 @@ def mismatch(
 
 
 def _quotient(values: Sequence[float], h: float) -> tuple[float, float]:
-    """(central quotient extrapolated to h = 0, doubt in it where the function is not smooth)."""
+    """(central quotient extrapolated to h = 0, its uncertainty if the function is not smooth)."""
     at, up, down, near_up, near_down = values
     if not np.all(np.isfinite(values)):
         return 0.0, np.inf
     wide, narrow = (up - down) / (2 * h), (near_up - near_down) / h
-    # One-sided slopes differ by h f'' where f is smooth, and by the jump of f' in a kink.
+    # One-sided slopes differ by h f'' if f is smooth, and by the jump of f' at a kink.
     jump = abs(4 * (near_up - 2 * at + near_down) - (up - 2 * at + down)) / h
     correction = (narrow - wide) / 3
     return narrow + correction, CORRECTIONS * abs(correction) + jump
 
 
 def _along_d(value: Any, d: Any) -> float:
-    """D^k g, of which a reverse derivative is the gradient in the last direction."""
+    """D^k g; a reverse derivative is its gradient in the last direction."""
     if not isinstance(value, dict):
         return float(value)
     return float(sum(np.sum(x * y) for x, y in _pairs(value, d)))

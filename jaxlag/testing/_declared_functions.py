@@ -1,4 +1,4 @@
-"""What a check of derivatives looks at: the functions that a system declares, and states."""
+"""Functions that a system declares, and states, for the check of derivatives."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from jaxlag._tracing import _params
 STATES = ("given", "rest", "zero", "equal", "one", "random")
 _RANDOM = 3  # states of that kind
 
-# Orders that the equations of motion take of a function, and one more for their derivatives.
+# Orders of derivatives in the equations of motion, plus one for derivatives of these.
 _ENERGY = 2 + 1  # M = d2L/dv2
 _HOLONOMIC = 2 + 1  # gamma, the second time derivative
 _PFAFFIAN = 1 + 1  # gamma, the first one
@@ -33,10 +33,10 @@ class Declared(NamedTuple):
     """A function that the user declared.
 
     Attributes:
-        name: what the report calls it.
-        function: of the values of its arguments by name, returning an array of real numbers.
-        arguments: those among t, q, v, u, params and lam that it depends on.
-        order: to which its derivatives are taken.
+        name: its name in the report.
+        function: function of its arguments by name, returning an array of real numbers.
+        arguments: its arguments among t, q, v, u, params and lam.
+        order: highest order of its derivatives.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Declared(NamedTuple):
 
 
 class Params:
-    """Params as a list of their real leaves, which are differentiated, and all the rest."""
+    """Params as a list of their real leaves, which are differentiated, and the rest."""
 
     def __init__(self, params: Any) -> None:
         traced, self._static = _params.split(params)
@@ -69,7 +69,7 @@ class Params:
 def declared(
     system: System, params: Params, inputs: Mapping[str, AbstractInput | Array]
 ) -> list[Declared]:
-    """The functions of a system, one by one as the user wrote them."""
+    """The functions of a system, as the user wrote them."""
     found: list[Declared] = []
 
     def add(name: str, function: Callable, names: str, order: int, driven: bool = False) -> None:
@@ -132,7 +132,7 @@ def _numbers(value: Any) -> Array:
 
 
 def states(names: Sequence[str], q: Array, v: Array, u: Array | None) -> dict[str, dict]:
-    """Name -> q, v and, unless it is None, u, of those states asked for that are distinct."""
+    """Name -> q, v and, unless it is None, u, of the distinct states among those requested."""
     if isinstance(names, str) or not names or not set(names) <= set(STATES):
         must, was = f"be names among {list(STATES)}", f"it was {names!r}"
         raise invalid("check_derivatives: states", must, was, 'Write states=("given", "rest").')

@@ -1,8 +1,8 @@
-"""Where numbers that are not finite are born in a program, and in the derivatives of a program.
+"""Origins of nonfinite numbers in a program and in its derivatives.
 
-A derivative is a program of its own, whose equations bear the names of others: that of sqrt(x)
-divides by 2 sqrt(x). So the equations of a traced function are labelled before it is
-differentiated; JAX hands the labels on, through every transform, to what it makes of each.
+A derivative is a separate program, whose equations have the names of other operations: the
+derivative of sqrt(x) divides by 2 sqrt(x). So the equations of a traced function are labeled before
+it is differentiated. JAX passes each label on to all equations derived from it.
 """
 
 import re
@@ -26,7 +26,7 @@ _NOT_THE_USERS = (
     str(Path(__file__).parents[1]),
     *(str(Path(getfile(package)).parent) for package in (eqx, jaxtyping)),
 )
-_LONG = 64  # turns of a loop that is not run equation by equation, unless it has to be searched
+_LONG = 64  # longer loops are not run equation by equation, unless they have to be searched
 _RULES = {"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"}
 
 
@@ -35,8 +35,8 @@ class Origin(NamedTuple):
 
     Attributes:
         primitive: its name in JAX, as in a jaxpr.
-        file: where the user's code asks for it; "" where that is not known.
-        line: of the file, from 1; 0 where that is not known.
+        file: file of the user's code with the operation; "" if unknown.
+        line: line of the file, from 1; 0 if unknown.
     """
 
     primitive: str
@@ -45,11 +45,11 @@ class Origin(NamedTuple):
 
 
 class TracedProgram:
-    """A function traced once; called, it can be differentiated, and `origins` knows its operations.
+    """A function traced once; it can be called and differentiated, and finds origins of NaN.
 
     Args:
         function: of one pytree of arrays, returning an array.
-        example: the pytree, of which shapes and dtypes matter.
+        example: the pytree; only shapes and dtypes are used.
     """
 
     def __init__(self, function: Callable, example: Any) -> None:
@@ -62,14 +62,14 @@ class TracedProgram:
         return jaxpr_as_fun(self.closed)(*jax.tree.leaves(z))[0]
 
     def contains(self, *primitives: str) -> bool:
-        """Whether it does one of these, in nested programs too."""
+        """Whether it contains one of these operations, also in nested programs."""
         return any(operation.primitive in primitives for operation in self.operations)
 
     def origins(self, derivative: ClosedJaxpr, *args: Any) -> list[Origin]:
-        """Operations of this program where a derivative of it stops being finite, first one first.
+        """Operations of this program at which a derivative becomes nonfinite, in order.
 
-        Only those from which the results inherit it: what a `where` leaves out is not asked. ""
-        is the primitive of what has no counterpart in this program.
+        Only those that reach the results: values that a `where` excludes are ignored. The
+        primitive is "" for an operation without counterpart in this program.
         """
         with np.errstate(all="ignore"):
             known = _run(derivative, [np.asarray(x) for x in jax.tree.leaves(args)])
@@ -82,7 +82,7 @@ class TracedProgram:
         return self.operations[int(labels[-1])] if labels else Origin("")
 
     def _labelled(self, jaxpr: Jaxpr, outer: tuple[str, int]) -> Jaxpr:
-        """The program with a label on every equation; `outer` is the line that called it."""
+        """The program with a label on every equation; `outer` is the line of its call."""
         eqns = []
         for eqn in jaxpr.eqns:
             name, info = eqn.primitive.name, eqn.source_info
@@ -107,9 +107,9 @@ class TracedProgram:
 
 
 def _line(traceback: Any) -> tuple[str, int] | None:
-    """The innermost line of the user's code, JAX's and ours skipped.
+    """The innermost line of the user's code; lines of JAX and of jaxlag are skipped.
 
-    What called us is not among the frames: those of a traced function begin where its tracing does.
+    Callers are not among the frames: those of a traced function begin where its tracing begins.
     """
     for frame in source_info_util.user_frames(traceback):
         if _is_users(frame.file_name):
@@ -122,7 +122,7 @@ def _is_users(file: str) -> bool:
 
 
 def _rule(eqn: Any) -> list[Origin]:
-    """The function that a custom rule of the user's belongs to."""
+    """The function that has a custom rule of the user."""
     info = eqn.params["call_jaxpr"].jaxpr.debug_info
     found = re.fullmatch(r".* at (.*):(\d+)", info.func_src_info or "")
     if not found or not _is_users(found[1]) or not source_info_util.is_user_filename(found[1]):
@@ -134,9 +134,9 @@ def _rule(eqn: Any) -> list[Origin]:
 
 
 def evaluate(closed: ClosedJaxpr, *args: Any) -> list[np.ndarray]:
-    """The results of a program at given arrays, equation by equation, nothing compiled.
+    """The results of a program at given arrays, equation by equation, without compilation.
 
-    Unlike `interpret` it goes through choices and short loops itself.
+    Unlike `interpret` it runs choices and short loops itself.
     """
     with np.errstate(all="ignore"):
         return _results(closed, [np.asarray(x) for x in args])
@@ -162,15 +162,15 @@ def _run(closed: ClosedJaxpr, args: list) -> dict:
 
 
 def _back(closed: ClosedJaxpr, known: dict, wanted: list) -> tuple[list, list]:
-    """Equations, in order, where the wanted entries of the results stop being finite.
+    """Equations, in order, at which the wanted entries of the results become nonfinite.
 
     Args:
         closed: the program.
         known: what `_run` returned for it.
-        wanted: for every result which of its entries are asked for, none of them finite.
+        wanted: for every result a mask of the examined entries, none of them finite.
 
     Returns:
-        Those equations, and for every input which of its entries the results inherit it from.
+        Those equations, and for every input a mask of its nonfinite entries that reach the results.
     """
     asked: dict[Any, np.ndarray] = {}
 
@@ -205,7 +205,7 @@ def _bad(x: np.ndarray) -> np.ndarray:
     return np.asarray(~np.isfinite(x)) if inexact else np.zeros(x.shape, bool)
 
 
-# Entry by entry: a result that is not finite is not due to other entries of the operands.
+# Elementwise: a nonfinite result does not depend on other entries of the operands.
 _ENTRYWISE = frozenset(
     """abs acos acosh add add_any asin asinh atan atan2 atanh cbrt clamp convert_element_type copy
     copy_p cos cosh div erf exp exp2 expm1 integer_pow log log1p logistic max min mul neg pow
@@ -214,9 +214,9 @@ _ENTRYWISE = frozenset(
 
 
 def _sources(eqn: Any, operands: list, masks: list) -> list:
-    """For every operand the entries that are not finite and reach what is asked for.
+    """For every operand a mask of the nonfinite entries that reach the wanted results.
 
-    Numbers that the program itself states count as finite: it is born where they are used.
+    Literals of the program count as finite: the origin is the operation that uses them.
     """
     stated = [isinstance(atom, Literal) for atom in eqn.invars]
     bad = [_bad(x) & (not s) for x, s in zip(operands, stated, strict=True)]
@@ -233,7 +233,7 @@ def _sources(eqn: Any, operands: list, masks: list) -> list:
 
 
 class _Call(NamedTuple):
-    """An equation that runs one program on its operands, the first `offset` of them left out."""
+    """An equation that runs one program on its operands, except the first `offset` of them."""
 
     body: ClosedJaxpr
     operands: list[np.ndarray]
@@ -241,7 +241,7 @@ class _Call(NamedTuple):
 
     @property
     def results(self) -> list[np.ndarray]:
-        """Of the equation."""
+        """Results of the equation."""
         return _results(self.body, self.operands[self.offset :])
 
     def back(self, masks: list) -> tuple[list, list]:
@@ -251,14 +251,14 @@ class _Call(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """An equation that runs a program in turns, each of which takes up what the last one left.
+    """An equation that runs a program repeatedly, each time on the results of the last one.
 
     Attributes:
         body: the program of one turn.
-        operands: of the equation: `offset` that the body does not take, `fixed` that all turns
-            share, `carried` from turn to turn, and one row for each turn of what remains.
-        turns: (row, arguments of the body) in the order in which they were done.
-        results: of the equation: what is carried at the end, and the rows that the turns made.
+        operands: operands of the equation: `offset` that the body does not take, `fixed` that all
+            turns share, `carried` from turn to turn, and one row of the rest for each turn.
+        turns: (row, arguments of the body) in the order of execution.
+        results: results of the equation: the carried values at the end, and the rows of the turns.
     """
 
     body: ClosedJaxpr
@@ -298,7 +298,7 @@ def _nothing(operands: list) -> list[np.ndarray]:
 
 
 def _nested(eqn: Any, operands: list) -> _Call | _Loop | None:
-    """An equation with its programs, run as far as they are chosen; None if it has none."""
+    """An equation with its nested programs, for the chosen branch; None if it has none."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
         branches = params["branches"]

@@ -1,1 +1,1 @@
-"""From expressions back to programs of JAX."""
+"""Conversion of expressions to JAX programs."""

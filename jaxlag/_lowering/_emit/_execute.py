@@ -1,4 +1,4 @@
-"""Straight-line code, line by line, as JAX operations on scalars."""
+"""Execution of straight-line code, line by line, as JAX operations on scalars."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,9 +1,9 @@
-"""Straight-line code as a function that XLA does not inline, with derivatives of the same kind.
+"""Outlining: straight-line code as a function that XLA does not inline, with its derivatives.
 
-In a loop of steps every stage evaluates the accelerations, and backwards every stage evaluates
-their transposed derivative. Copied into the loop XLA's fusion would compute shared lines anew in
-each use. The derivatives start from the arguments again, but for sines and cosines: these are most
-of the work, and few numbers to keep.
+In a loop of steps every stage evaluates the accelerations. In reverse mode every stage evaluates
+their transposed derivative. If the code were copied into the loop, XLA's fusion would compute
+shared lines again for each use. The derivatives start from the arguments again. Only sines and
+cosines are kept: these are most of the work, and few numbers to store.
 """
 
 from collections.abc import Callable

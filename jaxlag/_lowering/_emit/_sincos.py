@@ -1,8 +1,8 @@
 """Sine and cosine without branches or calls.
 
-On CPU, XLA computes the sine of a double by a call of the C library, in a row of them by one call
-after another; that is most of the time of a solve of a pendulum. A polynomial is code among the
-rest, and for a row of numbers vector code.
+On CPU, XLA computes the sine of a double by a call of the C library, and the sines of a row by one
+call after another. These calls take most of the time of a solve of a pendulum. A polynomial is
+inlined, and is vectorized for a row of numbers.
 """
 
 from collections.abc import Sequence

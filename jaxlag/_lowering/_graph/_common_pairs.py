@@ -1,6 +1,6 @@
-"""Pairs of operands that several sums or products contain, to be computed once.
+"""Common pairs of operands: pairs that several sums or products contain, computed once.
 
-A token is a node, or a pair of tokens found worth sharing.
+A token is a node, or a pair of tokens that is shared.
 """
 
 from collections import Counter, defaultdict

@@ -1,4 +1,4 @@
-"""M a = r on the graph: blocks apart, elimination along the pattern of nonzeros."""
+"""Gaussian elimination of M a = r on the graph, by independent blocks and the nonzero pattern."""
 
 from collections.abc import Sequence
 

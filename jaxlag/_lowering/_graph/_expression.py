@@ -1,4 +1,4 @@
-"""Scalar expressions as a hash-consed graph: equal expressions are one node.
+"""Scalar expressions as a hash-consed graph (CSE): equal expressions are one node.
 
 Sums are n-ary with number coefficients, products n-ary with integer exponents; both are kept in
 a normal form, so that like terms merge and cancel and structural zeros never exist. Everything

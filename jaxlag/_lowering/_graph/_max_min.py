@@ -1,8 +1,8 @@
-"""The largest and the smallest of several scalars, as JAX derives those of an array.
+"""Maximum and minimum of several scalars, with the derivative that JAX uses for arrays.
 
-Nested pairs would do for the value. Where k of them tie, the derivative is the mean of theirs; that
-of nested pairs counts the last one as much as all before it. Scalars in one array would do as well,
-but XLA does not turn operations on rows of them into vector instructions.
+Nested pairs would give the value. If k of the scalars are equal, the derivative is the mean of
+theirs; nested pairs would weigh the last one as much as all before it. An array of the scalars
+would give the derivative, but XLA does not turn operations on such rows into vector instructions.
 """
 
 from collections.abc import Callable

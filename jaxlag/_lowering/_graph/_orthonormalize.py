@@ -1,4 +1,4 @@
-"""Vectors of nodes: inner products, and rows made orthonormal."""
+"""Orthonormalization of vectors of nodes, with their inner products."""
 
 from collections.abc import Sequence
 

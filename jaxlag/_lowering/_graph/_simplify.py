@@ -1,8 +1,8 @@
-"""Simplification: expressions as polynomials in atoms, and back as products of few factors.
+"""Simplification: expressions are expanded to polynomials in atoms, then factored.
 
 An atom is an input, a call of a function of simplified arguments, the reciprocal of a simplified
-sum, or a sum that is left as it is written. Only velocities, sines and cosines are multiplied out:
-a difference of coordinates or of parameters keeps digits that its terms, multiplied, would lose.
+sum, or a sum that stays unexpanded. Only velocities, sines and cosines are multiplied out:
+the expansion of a difference of coordinates or of parameters would lose digits.
 Of sines and cosines m sin^2 + m cos^2 = m is used, and m - m cos^2 = m sin^2, never the reverse.
 """
 

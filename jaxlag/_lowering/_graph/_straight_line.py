@@ -1,6 +1,7 @@
-"""From a graph to straight-line code: one operation a line, what is shared computed once.
+"""Straight-line code from a graph: one operation a line, shared expressions computed once.
 
-What depends on params alone makes the prelude, computed once per solve; the rest is the body.
+Lines that depend on params alone form the prelude, computed once per solve. The others form the
+body.
 """
 
 from collections import Counter, defaultdict

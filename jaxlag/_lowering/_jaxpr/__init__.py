@@ -1,1 +1,1 @@
-"""From programs of JAX to expressions of scalars."""
+"""Conversion of JAX programs to scalar expressions."""

@@ -1,4 +1,4 @@
-"""Operations of whole arrays of nodes: moving elements, sums and products along axes."""
+"""Array primitives on nodes: moves of elements, sums and products along axes."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

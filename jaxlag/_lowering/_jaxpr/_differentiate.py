@@ -1,4 +1,4 @@
-"""Derivatives on the graph, forward and reverse; a structural zero never becomes a node."""
+"""Forward and reverse derivatives on the graph; structural zeros create no nodes."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Operations element by element."""
+"""Elementwise primitives on nodes."""
 
 import math
 from collections.abc import Callable

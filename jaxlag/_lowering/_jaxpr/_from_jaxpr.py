@@ -1,8 +1,8 @@
-"""From a jaxpr to scalar nodes: the user's program run on arrays of nodes.
+"""Scalar nodes from a jaxpr: the user's program is run on arrays of nodes.
 
-An array is a numpy array of nodes (dtype object) or, where its values are known while tracing
-(constants, indices, shapes), an ordinary numpy array. What only moves elements is run once on an
-array of positions; what is known is evaluated by JAX itself.
+An array is a numpy array of nodes (dtype object). If its values are known while tracing
+(constants, indices, shapes), it is an ordinary numpy array. Operations that only move elements run
+once on an array of positions. JAX itself evaluates operations on known values.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,1 +1,1 @@
-"""A system as expressions, and its equations derived from them."""
+"""A system as expressions, and the equations derived from them."""

@@ -1,4 +1,4 @@
-"""The inverse of a small general matrix on the graph, such as dU/dv."""
+"""Cofactor inverse of a small general matrix on the graph, such as dU/dv."""
 
 from collections.abc import Sequence
 from functools import partial, reduce

@@ -1,4 +1,4 @@
-"""Constraint rows on the graph, and accelerations under them."""
+"""Constraint rows on the graph, and the solve for accelerations with constraints."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

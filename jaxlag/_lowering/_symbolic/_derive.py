@@ -1,4 +1,4 @@
-"""Lagrange's equations on the graph: several ways to write them, the cheapest kept."""
+"""Lagrange's equations on the graph: the cheapest of several forms."""
 
 from functools import partial
 

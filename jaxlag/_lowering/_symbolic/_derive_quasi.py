@@ -1,4 +1,4 @@
-"""Equations of motion in quasi-velocities on the graph: several ways to write them, one kept."""
+"""Equations of motion in quasi-velocities on the graph: one of several forms."""
 
 from collections.abc import Sequence
 from functools import partial

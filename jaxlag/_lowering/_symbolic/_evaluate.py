@@ -1,4 +1,4 @@
-"""A graph evaluated at numbers: the interpreter that compiled programs are checked with."""
+"""Numeric evaluation of a graph: the interpreter that checks compiled programs."""
 
 from collections.abc import Mapping, Sequence
 from functools import reduce

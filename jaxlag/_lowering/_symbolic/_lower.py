@@ -1,4 +1,4 @@
-"""From a declared system to its scalar program, or to the reason why it has none."""
+"""Lowering of a declared system to its scalar program, or to the reason why it has none."""
 
 from functools import lru_cache
 from typing import NamedTuple

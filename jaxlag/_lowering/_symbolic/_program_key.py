@@ -1,4 +1,4 @@
-"""What a scalar program is made for, and the programs that it is read from."""
+"""The cache key of a scalar program, and the jaxprs that the program is derived from."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,4 +1,4 @@
-"""Code for a projection onto constraints."""
+"""Straight-line code of a projection onto constraints."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""A declared system read as scalars."""
+"""Conversion of a declared system to scalar expressions."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""How rows that depend on one another share what forces read of their multipliers."""
+"""Multipliers of dependent rows that forces read: their distribution among the rows."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

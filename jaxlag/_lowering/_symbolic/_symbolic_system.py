@@ -1,4 +1,4 @@
-"""A system as scalars, and the code that comes of it."""
+"""A system as scalar expressions, and the code generated from it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

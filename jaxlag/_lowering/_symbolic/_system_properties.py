@@ -1,4 +1,4 @@
-"""What the derived equations show of a system, read from the graph."""
+"""Findings about a system from its derived equations on the graph."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""A scalar program against the array program, at random states and without compiling."""
+"""Verification of a scalar program against the array program, at random states, uncompiled."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
