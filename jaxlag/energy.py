@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag import math, rotation
+from jaxlag._core._arguments import renamed
 from jaxlag._core._arrays import common, concrete, real, reals
 from jaxlag._core._errors import invalid
 from jaxlag._model import _inertia
@@ -172,13 +173,14 @@ def inertia_matrix(
     return _inertia.of_products(values[:3], values[3:])
 
 
-def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
+@renamed(centre="center=")
+def parallel_axis(inertia: Any, mass: Any, center: Any) -> Float[Array, "3 3"]:
     """I_O = I_G + m (|c|^2 E - c c^T): central inertia transferred to a point O, kg m^2.
 
     Args:
         inertia: I_G about the center of mass, shape (3, 3), or (3,) principal moments.
         mass: m, kg.
-        centre: c from O to the center of mass in the same axes, m, shape (3,).
+        center: c from O to the center of mass in the same axes, m, shape (3,).
 
     Raises:
         ValueError: wrong shapes; a negative or nonfinite mass (if its value is known).
@@ -186,7 +188,7 @@ def parallel_axis(inertia: Any, mass: Any, centre: Any) -> Float[Array, "3 3"]:
     inertia = _inertia.matrix("parallel_axis: inertia", inertia)
     mass = _inertia.number("parallel_axis: mass", mass)
     _inertia.check_mass("parallel_axis: mass", mass)
-    return _inertia.carried(inertia, mass, _inertia.place("parallel_axis: centre", centre))
+    return _inertia.carried(inertia, mass, _inertia.place("parallel_axis: center", center))
 
 
 class RigidBody(eqx.Module):
@@ -201,7 +203,7 @@ class RigidBody(eqx.Module):
         inertia: I_O about O along the body axes, kg m^2, shape (3, 3) symmetric, or (3,) for
             principal axes. Moments may be zero: a slender rod's own axis, or the axes in the
             plane of a planar motion, which are not used.
-        centre: c from O to the center of mass, body components, m, shape (3,); by default O itself.
+        center: c from O to the center of mass, body components, m, shape (3,); by default O itself.
 
     Raises:
         ValueError: wrong shapes, or not real numbers. For known values: a negative mass, nonfinite
@@ -215,17 +217,18 @@ class RigidBody(eqx.Module):
 
     mass: Float[Array, ""]
     inertia: Float[Array, "3 3"]
-    centre: Float[Array, "3"] | None
+    center: Float[Array, "3"] | None
 
-    def __init__(self, mass: Any, inertia: Any, centre: Any = None) -> None:
+    @renamed(centre="center=")
+    def __init__(self, mass: Any, inertia: Any, center: Any = None) -> None:
         self.mass = _inertia.number("RigidBody: mass", mass)
         self.inertia = _inertia.matrix("RigidBody: inertia", inertia)
-        self.centre = None if centre is None else _inertia.place("RigidBody: centre", centre)
+        self.center = None if center is None else _inertia.place("RigidBody: center", center)
         _inertia.check_mass("RigidBody: mass", self.mass)
         _inertia.check_inertia("RigidBody: inertia", self.inertia)
-        if self.centre is not None:
-            _inertia.check_finite("RigidBody: centre", self.centre)
-            body = (self.inertia, self.mass, self.centre)
+        if self.center is not None:
+            _inertia.check_finite("RigidBody: center", self.center)
+            body = (self.inertia, self.mass, self.center)
             _inertia.check_about_origin("RigidBody: inertia", *body)
 
     def kinetic(self, pose: Pose, t: Any, q: Any, v: Any, params: Any) -> Float[Array, ""]:
@@ -253,9 +256,9 @@ class RigidBody(eqx.Module):
         V, w = reals(("V", V, (3,)), ("w", w, (3,)))
         mass, inertia = self.mass.astype(V.dtype), self.inertia.astype(V.dtype)
         T = 0.5 * mass * (V @ V) + 0.5 * w @ (inertia @ w)
-        if self.centre is None:
+        if self.center is None:
             return T
-        return T + mass * (V @ jnp.cross(w, self.centre.astype(V.dtype)))
+        return T + mass * (V @ jnp.cross(w, self.center.astype(V.dtype)))
 
     def gravity(self, pose: Pose, t: Any, q: Any, params: Any, g: Any) -> Float[Array, ""]:
         """V = -m g . (r_O + R c), J, zero if the center of mass is at the inertial origin.
@@ -268,8 +271,8 @@ class RigidBody(eqx.Module):
             g: acceleration of free fall, inertial components, m/s^2, shape (3,).
         """
         R, r = _placed(pose)(t, q, params)
-        if self.centre is not None:
-            r = r + R @ self.centre.astype(R.dtype)
+        if self.center is not None:
+            r = r + R @ self.center.astype(R.dtype)
         return gravity(self.mass, r, g)
 
 

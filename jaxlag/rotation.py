@@ -159,7 +159,7 @@ def space_rates(R: Any, R_dot: Any) -> Float[Array, "3"]:
     return unskew(_times(R_dot, R.T))
 
 
-class AbstractParametrisation(eqx.Module):
+class AbstractParametrization(eqx.Module):
     """Coordinates x of a rotation: `yaw_pitch_roll`, `zxz` and `quaternion`.
 
     The methods are smooth except where stated, and raise `ValueError` for arguments of wrong
@@ -260,7 +260,7 @@ def _direction(y: Array, x: Array) -> Array:
 
 
 @final
-class YawPitchRoll(AbstractParametrisation):
+class YawPitchRoll(AbstractParametrization):
     """x = (psi, theta, phi), in rad: R = Rz(psi) Ry(theta) Rx(phi).
 
     Yaw psi about Z, then pitch theta about the new y, then roll phi about the new x. The body
@@ -309,7 +309,7 @@ class YawPitchRoll(AbstractParametrisation):
 
 
 @final
-class ZXZ(AbstractParametrisation):
+class ZXZ(AbstractParametrization):
     """x = (phi, theta, psi), in rad: R = Rz(phi) Rx(theta) Rz(psi).
 
     Precession phi about Z, nutation theta about the new x, spin psi about the new z. The body
@@ -358,7 +358,7 @@ class ZXZ(AbstractParametrisation):
 
 
 @final
-class Quaternion(AbstractParametrisation):
+class Quaternion(AbstractParametrization):
     """x = (e0, e1, e2, e3), scalar first, of any norm but 0: r_inertial = e r_body e^-1.
 
     A rotation by alpha about the unit axis n is e = (cos(alpha/2), n sin(alpha/2)); e and every

@@ -4,7 +4,7 @@ import pytest
 
 
 def mostly_full(values, *plain):
-    """Values to parametrise by; those that are not among `plain` are left to -m full."""
+    """Values to parametrize by; those that are not among `plain` are left to -m full."""
 
     def left(x):
         return pytest.param(*(x if isinstance(x, tuple) else (x,)), marks=pytest.mark.full)

@@ -173,7 +173,7 @@ NOTHING = 1e-7
 
 
 @eqx.filter_jit
-def linearised(free: Unknowns, found: SearchResult) -> tuple[Array, Array, Array]:
+def linearized(free: Unknowns, found: SearchResult) -> tuple[Array, Array, Array]:
     """(a factor of the weighted derivatives by z, derivatives of the numbers by z, those at 0)."""
     numbers, z = jax.jacfwd(free.numbers), found.guess.z
     assert found.rows is not None
@@ -222,7 +222,7 @@ def effective_parameters(problem: MultipleShooting, found: SearchResult) -> floa
     plain = len(problem.free.u0) + np.count_nonzero(moves[first])
     if found.rows is None:
         return float(plain)
-    factor = np.asarray(linearised(problem.free, found)[0])
+    factor = np.asarray(linearized(problem.free, found)[0])
     if not np.all(np.isfinite(factor)):
         return float(plain)
     rows = jax.tree.map(np.asarray, _without_failed(found.rows, found))

@@ -14,7 +14,7 @@ from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
-from jaxlag._fit._fit_result import FitResult, summarised
+from jaxlag._fit._fit_result import FitResult, summarized
 from jaxlag._fit._free_parameters import NO_PRIOR, Unknowns, paths, prior_rows, unknowns
 from jaxlag._fit._initial_guess import start_freedom
 from jaxlag._fit._multiple_shooting import (
@@ -179,7 +179,7 @@ def fit(
         linear = len(unknown.u0) <= LARGEST_COVARIANCE
         found = _judged(problem, guess, optimizer, costs, linear)
     told = (where, noise, own, costs, solves, compared)
-    result = summarised(problem, found, experiments, *told)
+    result = summarized(problem, found, experiments, *told)
     _warn_after(result)
     return result
 

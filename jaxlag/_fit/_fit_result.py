@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
-from jaxlag._fit._covariance import Spectrum, distance, linearised, saturated
+from jaxlag._fit._covariance import Spectrum, distance, linearized, saturated
 from jaxlag._fit._dissipation import feeding
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._free_parameters import Unknowns, paths
@@ -190,7 +190,7 @@ class FitResult(eqx.Module):
         return "\n".join(lines)
 
 
-def summarised(
+def summarized(
     problem: MultipleShooting,
     found: SearchResult,
     experiments: tuple[Experiment, ...],
@@ -301,7 +301,7 @@ def _uncertainty(
     nothing = _Uncertainty(unknown, np.full(len(names), np.nan), (), (), (), (), np.nan)
     if found.rows is None:
         return nothing
-    factor, by_z, at_first = map(np.asarray, linearised(problem.free, found))
+    factor, by_z, at_first = map(np.asarray, linearized(problem.free, found))
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
     told = np.linalg.norm(factor, axis=0) > INSENSITIVE * np.linalg.norm(factor)

@@ -80,10 +80,10 @@ def _channel(
     ts, measured = experiment.ts, experiment.channels[name]
     sparse = slice(None, None, max(1, len(ts) // DOTS))
     for k in range(measured.shape[1]):
-        colour = f"C{k}"
-        above.plot(ts, measured[:, k] + residuals[:, k], color=colour, linewidth=1)
+        color = f"C{k}"
+        above.plot(ts, measured[:, k] + residuals[:, k], color=color, linewidth=1)
         above.plot(ts[sparse], measured[sparse, k], "k.", markersize=3)
-        below.plot(ts, residuals[:, k], color=colour, linewidth=0.8)
+        below.plot(ts, residuals[:, k], color=color, linewidth=0.8)
     below.axhline(0.0, color="black", linewidth=0.5)
 
 

@@ -83,7 +83,7 @@ class AccelerationProgram(eqx.Module):
     def acceleration(
         self, state: State, constants: Any = None, reacting: RowChoice | None = None
     ) -> Float[Array, " n"]:
-        """a, with one factorisation; NaN where M is not positive definite where A a = 0."""
+        """a, with one factorization; NaN where M is not positive definite where A a = 0."""
 
     @abstractmethod
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:

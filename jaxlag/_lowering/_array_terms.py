@@ -67,7 +67,7 @@ class ArrayTerms(eqx.Module):
         forces: applied forces.
         constraints: constraints.
         formulation: how accelerations are solved for under constraints.
-        baumgarte: stabilisation added to gamma.
+        baumgarte: stabilization added to gamma.
         regular: whether M is known to be positive definite by itself, which the scalar program
             makes use of.
         apart: whether rows whose multipliers forces read are known to be independent.

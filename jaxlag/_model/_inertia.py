@@ -62,12 +62,12 @@ def of_products(moments: list[Array], products: list[Array]) -> Array:
         return jnp.asarray(xp.stack([xp.stack(row) for row in rows]))
 
 
-def carried(inertia: Array, mass: Array, centre: Array) -> Array:
+def carried(inertia: Array, mass: Array, center: Array) -> Array:
     """I_G + m (|c|^2 E - c c^T)."""
-    with stated(inertia, mass, centre):
-        xp, given = _numbers(*common(inertia, mass, centre))
-        inertia, mass, centre = given
-        return jnp.asarray(inertia + _offset(xp, mass, centre))
+    with stated(inertia, mass, center):
+        xp, given = _numbers(*common(inertia, mass, center))
+        inertia, mass, center = given
+        return jnp.asarray(inertia + _offset(xp, mass, center))
 
 
 def check_mass(argument: str, mass: Array) -> None:
@@ -107,29 +107,29 @@ def check_inertia(argument: str, inertia: Float[Array, "3 3"]) -> None:
         )
 
 
-def check_about_origin(argument: str, inertia: Array, mass: Array, centre: Array) -> None:
+def check_about_origin(argument: str, inertia: Array, mass: Array, center: Array) -> None:
     """Raise unless I_O - m (|c|^2 E - c c^T), the central inertia, has no negative eigenvalue.
 
     Only on the axes whose row of I_O is not zero: the other axes of a planar body or of a slender
     rod do not rotate. The slack is some roundings of the terms of the difference.
     """
-    if not concrete(inertia, mass, centre):
+    if not concrete(inertia, mass, center):
         return
-    J, c = np.asarray(inertia, np.float64), np.asarray(centre, np.float64)
+    J, c = np.asarray(inertia, np.float64), np.asarray(center, np.float64)
     turning = np.flatnonzero(np.any(J != 0, axis=1))
     if turning.size == 0:
         return
-    at_centre = _offset(np, float(mass), c)
-    moments, axes = np.linalg.eigh((J - at_centre)[np.ix_(turning, turning)])
-    eps = max(float(jnp.finfo(x.dtype).eps) for x in (inertia, mass, centre))
-    if moments[0] >= -64 * eps * max(np.max(np.abs(J)), np.max(np.abs(at_centre))):
+    at_center = _offset(np, float(mass), c)
+    moments, axes = np.linalg.eigh((J - at_center)[np.ix_(turning, turning)])
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in (inertia, mass, center))
+    if moments[0] >= -64 * eps * max(np.max(np.abs(J)), np.max(np.abs(at_center))):
         return
     axis = np.zeros(3)
     axis[turning] = axes[:, 0]
     raise invalid(
         argument,
-        "be at least that of the mass at its centre, m (|c|^2 E - c c^T)",
-        f"what is left, the inertia about the mass centre, has the eigenvalue {moments[0]:.6g} "
+        "be at least that of the mass at its center, m (|c|^2 E - c c^T)",
+        f"what is left, the inertia about the mass center, has the eigenvalue {moments[0]:.6g} "
         f"kg m^2 about the axis {_axis(axis)}",
         "The inertia is about the body's origin: use energy.parallel_axis.",
     )

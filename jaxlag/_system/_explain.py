@@ -164,7 +164,7 @@ def _batches() -> str:
 _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "select", "gt", "ge", "lt", "le", "eq", "ne")
 
 
-def _factorisation(n: int) -> str:
+def _factorization(n: int) -> str:
     if n <= UNROLL_UP_TO:
         return "unrolled"
     if n <= LOOP_UP_TO:
@@ -179,7 +179,7 @@ def _array(system: AbstractQuantities, structure: Structure, reason: str) -> lis
         ways.append("h by one forward derivative of (dL/dq, dL/dv)")
     return [
         f"lowering      array program ({reason}): {', '.join(ways)}",
-        f"mass solve    one factorisation {often}, {_factorisation(system.size)}",
+        f"mass solve    one factorization {often}, {_factorization(system.size)}",
         _steps(None),
         "batches       by jax.vmap: all trajectories in one loop",
     ]

@@ -1,4 +1,9 @@
-"""Free variables of a Python function: globals, closures, attributes that it reads."""
+"""Free variables of a Python function: globals, closures, attributes that it reads.
+
+A function is traced once, and its program keeps the values that it read. A later change of them
+would give the results of before in silence: JAX detects no such change. From the free variables
+jaxlag warns of it by name, and refuses functions in params that read a mutable object.
+"""
 
 import re
 import sys

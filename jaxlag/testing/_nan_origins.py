@@ -56,7 +56,7 @@ class TracedProgram:
         closed = jax.make_jaxpr(function)(example)
         self.operations: list[Origin] = []
         self.rules: list[Origin] = []
-        self.closed = closed.replace(jaxpr=self._labelled(closed.jaxpr, ("", 0)))
+        self.closed = closed.replace(jaxpr=self._labeled(closed.jaxpr, ("", 0)))
 
     def __call__(self, z: Any) -> Any:
         return jaxpr_as_fun(self.closed)(*jax.tree.leaves(z))[0]
@@ -81,7 +81,7 @@ class TracedProgram:
         labels = _LABEL.findall(str(eqn.source_info.name_stack))
         return self.operations[int(labels[-1])] if labels else Origin("")
 
-    def _labelled(self, jaxpr: Jaxpr, outer: tuple[str, int]) -> Jaxpr:
+    def _labeled(self, jaxpr: Jaxpr, outer: tuple[str, int]) -> Jaxpr:
         """The program with a label on every equation; `outer` is the line of its call."""
         eqns = []
         for eqn in jaxpr.eqns:
@@ -98,9 +98,9 @@ class TracedProgram:
 
     def _inside(self, value: Any, outer: tuple[str, int]) -> Any:
         if isinstance(value, ClosedJaxpr):
-            return value.replace(jaxpr=self._labelled(value.jaxpr, outer))
+            return value.replace(jaxpr=self._labeled(value.jaxpr, outer))
         if isinstance(value, Jaxpr):
-            return self._labelled(value, outer)
+            return self._labeled(value, outer)
         if type(value) in (tuple, list):
             return type(value)(self._inside(item, outer) for item in value)
         return value

@@ -16,16 +16,16 @@ def heads(lengths: Array, angles: Array) -> Array:
     return jnp.cumsum(along(lengths, angles), axis=0)
 
 
-def centres(lengths: Array, angles: Array) -> Array:
-    """Positions of the mass centres, shape (k, 2) [m]."""
+def centers(lengths: Array, angles: Array) -> Array:
+    """Positions of the mass centers, shape (k, 2) [m]."""
     return heads(lengths, angles) - 0.5 * along(lengths, angles)
 
 
 def kinetic(masses: Array, lengths: Array, angles: Array, rates: Array) -> Array:
-    """T of the mass centres and of the turns about them, m l^2/12 each [J]."""
+    """T of the mass centers and of the turns about them, m l^2/12 each [J]."""
 
     def position(t: Array, q: Array, params: None) -> Array:
-        return centres(lengths, q)
+        return centers(lengths, q)
 
     moving = jl.energy.particles(position, masses, 0.0, angles, rates, None)
     return moving + 0.5 * jnp.sum(masses * lengths**2 / 12 * rates**2)
@@ -33,4 +33,4 @@ def kinetic(masses: Array, lengths: Array, angles: Array, rates: Array) -> Array
 
 def potential(masses: Array, lengths: Array, angles: Array, g: Array) -> Array:
     """V of the weights [J], y upward, zero at the height of the origin."""
-    return g * jnp.sum(masses * centres(lengths, angles)[:, 1])
+    return g * jnp.sum(masses * centers(lengths, angles)[:, 1])

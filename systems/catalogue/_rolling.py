@@ -5,10 +5,10 @@ from jax import Array
 
 
 def of_ball(v: Array, omega: Array, radius: Array) -> Array:
-    """From the velocity (x', y') of the centre and the angular velocity along X, Y, Z."""
+    """From the velocity (x', y') of the center and the angular velocity along X, Y, Z."""
     return v + radius * jnp.stack([-omega[1], omega[0]])
 
 
 def of_upright_wheel(v: Array, heading: Array, roll: Array, radius: Array) -> Array:
-    """From the velocity (x', y') of the centre, the heading from X and the rate of the roll."""
+    """From the velocity (x', y') of the center, the heading from X and the rate of the roll."""
     return v - radius * roll * jnp.stack([jnp.cos(heading), jnp.sin(heading)])

@@ -22,12 +22,12 @@ FREE_FALL = 9.81
 
 
 def _pendulum_pose(t, q, params):
-    centre = _pendulum_centre(params)
-    R = jl.rotation.about_z(q[0] - jnp.arctan2(centre[1], centre[0]))
-    return R, R @ (centre - jnp.array([params["xb"], params["yb"], 0.0]))
+    center = _pendulum_center(params)
+    R = jl.rotation.about_z(q[0] - jnp.arctan2(center[1], center[0]))
+    return R, R @ (center - jnp.array([params["xb"], params["yb"], 0.0]))
 
 
-def _pendulum_centre(params):
+def _pendulum_center(params):
     r, alpha = params["r"], params["alpha"]
     along = params["xb"] - r * jnp.sin(alpha), params["yb"] - r * jnp.cos(alpha)
     return jnp.array([*along, 0.0])

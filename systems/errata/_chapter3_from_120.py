@@ -136,7 +136,7 @@ _sliding = around({"m": 0.5, "L": 1.0, "g": 9.81, "mu": 0.3, "N": 4.0}, (0.0, 1.
 
 def _stick(t, q, params):
     """(x, y, theta) of the stick on the ground."""
-    return jnp.concatenate([falling_stick.centre(t, q, params), q[1:]])
+    return jnp.concatenate([falling_stick.center(t, q, params), q[1:]])
 
 
 def _friction_moment(s: State):

@@ -13,7 +13,7 @@ MASSES = {"m1": 0.5, "m2": 1.5, "m3": 0.8, "m4": 1.2}
 SIZES = {"a": 0.9, "b": 0.7, "c": 0.5}
 """Parameters of the body below."""
 
-# A rigid body of four particles, its mass centre away from its origin O.
+# A rigid body of four particles, its mass center away from its origin O.
 
 
 def _arms(params):
@@ -45,8 +45,8 @@ def kinetic(t, q, v, params):
     return energy.particles(particles, masses(params), t, q, v, params)
 
 
-def centre(t, q, params):
-    """The mass centre, inertial components."""
+def center(t, q, params):
+    """The mass center, inertial components."""
     return masses(params) @ particles(t, q, params) / jnp.sum(masses(params))
 
 
@@ -64,7 +64,7 @@ def rotational_rate(s: State):
 
 
 def mass_properties(s: State):
-    """(m, rc, I_O) of the formulas: mass, mass centre and inertia matrix about O."""
+    """(m, rc, I_O) of the formulas: mass, mass center and inertia matrix about O."""
     m, r = array(s.values(*MASSES)), array(_arms(s.params))
     products = (m[:, None] * r).T @ r
     return m.sum(), m @ r / m.sum(), products.trace() * eye(3) - products
@@ -112,14 +112,14 @@ def _euler(s: State, second: int, third: int):
     return inertia * w_rate[[0, second, third]] + cross(w, inertia * w)
 
 
-# Body axes at an origin that is not the mass centre.
+# Body axes at an origin that is not the mass center.
 
 
 def _arm_rate(s: State):
     """Body components of d(r_c - r_O)/dt."""
 
     def arm(t, q, params):
-        return centre(t, q, params) - q[:3]
+        return center(t, q, params) - q[:3]
 
     velocity = energy.velocity(arm, s.t, s.q, s.v, s.params)
     return attitude.turned(s.q[3:]).T @ velocity
@@ -131,7 +131,7 @@ def _momentum(s: State):
     return attitude.turned(s.q[3:]).T @ by_velocity
 
 
-def _centre_velocity(s: State):
+def _center_velocity(s: State):
     V, _ = attitude.body_speeds(s)
     return V + _omega_cross_rc(s)
 
@@ -185,20 +185,20 @@ ERRATA = (
         right=lambda s: _euler(s, 1, 2),
     ),
     Erratum(
-        place="4.153-4.163, rate of the arm rc from O to the mass centre",
+        place="4.153-4.163, rate of the arm rc from O to the mass center",
         wrong="V_c for omega x rc; 0 in body axes",
         draw=_flying,
         engine=_arm_rate,
-        printed=_centre_velocity,
+        printed=_center_velocity,
         right=_omega_cross_rc,
     ),
     Erratum(
-        place="4.169, momentum of the mass centre",
+        place="4.169, momentum of the mass center",
         wrong="without the factor m",
         draw=_flying,
         engine=_momentum,
-        printed=_centre_velocity,
-        right=lambda s: mass_properties(s)[0] * _centre_velocity(s),
+        printed=_center_velocity,
+        right=lambda s: mass_properties(s)[0] * _center_velocity(s),
     ),
     Erratum(
         place="4.170, third term of the equation of moments about O",
@@ -216,6 +216,6 @@ TEXT_ONLY = (
         "4.130, K",
         "not constant: the transpose of the matrix that takes (p, q, r) to angle rates",
     ),
-    ("4.141", "right only where the origin is the mass centre or a fixed point"),
+    ("4.141", "right only where the origin is the mass center or a fixed point"),
     ("4.145, 4.173", "(xc', yc', zc') is the velocity of O; rc does not change in body axes"),
 )

@@ -41,7 +41,7 @@ _AIRCRAFT = jl.System(
     potential=lambda t, q, params: jnp.zeros_like(q[0]),
     forces=(
         jl.PointForce(lambda t, q, params: q[:3], _force, "at O"),
-        jl.PointForce(body.centre, _force, "at the mass centre"),
+        jl.PointForce(body.center, _force, "at the mass center"),
         jl.Torque(_body_rates, _torque, "torque"),
     ),
 )
@@ -127,9 +127,9 @@ def _torque_formula(s: State):
 
 
 def _hubs(t, q, params):
-    R, centre = attitude.pose(t, q, params)
+    R, center = attitude.pose(t, q, params)
     arms = jnp.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    return centre + params["l"] * arms @ R.T
+    return center + params["l"] * arms @ R.T
 
 
 def _thrusts(params):
@@ -312,10 +312,10 @@ ERRATA = (
         right=lambda s: _rotation_formula(s, +1) + _third_term(s),
     ),
     Erratum(
-        place="4.197, moment about O of a force at the mass centre",
+        place="4.197, moment about O of a force at the mass center",
         wrong="-rc x F for +rc x F",
         draw=_aircraft,
-        engine=lambda s: _applied(s, "at the mass centre"),
+        engine=lambda s: _applied(s, "at the mass center"),
         printed=lambda s: -_lever(s),
         right=_lever,
     ),
@@ -362,10 +362,10 @@ ERRATA = (
 )
 
 TEXT_ONLY = (
-    ("4.178, 4.187, 4.196-4.197", "(xp, yp, zp) is the mass centre (xc, yc, zc)"),
+    ("4.178, 4.187, 4.196-4.197", "(xp, yp, zp) is the mass center (xc, yc, zc)"),
     (
         "4.185, 4.193, 4.197",
-        "rc x F belongs there if F is given at the mass centre; one given at O has no moment",
+        "rc x F belongs there if F is given at the mass center; one given at O has no moment",
     ),
     (
         "4.204",

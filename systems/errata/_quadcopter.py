@@ -16,9 +16,9 @@ def _pose(t, q, params):
 
 
 def _hubs(t, q, params):
-    R, centre = _pose(t, q, params)
+    R, center = _pose(t, q, params)
     arms = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return centre + params["l"] * arms @ R.T
+    return center + params["l"] * arms @ R.T
 
 
 def _lifts(t, q, v, params):
@@ -205,7 +205,7 @@ ERRATA = (
         right=lambda s: _gyroscopic(s, _SIGNED, +1),
     ),
     Erratum(
-        place="3.83, motion of the quadcopter's mass centre",
+        place="3.83, motion of the quadcopter's mass center",
         wrong="m X'' - (0, 0, m g) for m X'' + (0, 0, m g)",
         draw=_any,
         engine=_force_of_translation,

@@ -50,7 +50,7 @@ def _fork_kinetic(t, q, v, params):
 
 
 def _body_kinetic(t, q, v, params):
-    """T of the frame, with its mass centre d ahead of the rear axle."""
+    """T of the frame, with its mass center d ahead of the rear axle."""
 
     def pose(t, q, params):
         return jl.rotation.about_z(q[2]), jnp.stack([q[0], q[1], jnp.zeros_like(q[0])])

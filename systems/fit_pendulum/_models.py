@@ -13,7 +13,7 @@ Coordinate
 
 Parameters (of a free swing, which cannot tell a scale of torque: J = 1, the others are over J)
     J      moment of inertia about the axis [kg m^2]
-    mgl    mass times gravity times distance of the centre of mass from the axis [N m]
+    mgl    mass times gravity times distance of the center of mass from the axis [N m]
     c      viscous friction [N m s]
     f      Coulomb friction [N m], made smooth below |q'| = V_S
     k      quadratic drag [N m s^2]
@@ -140,7 +140,7 @@ def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:
 def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
     """Params, without friction, by linear regression of q'' on sin q, and on u and 1 where driven.
 
-    Rates are differences of neighbouring samples: rough, but their errors are in q'' alone.
+    Rates are differences of neighboring samples: rough, but their errors are in q'' alone.
     """
     rows, q2 = [], []
     for each in windows:

@@ -70,9 +70,9 @@ def links(t, q, v, params):
     across = jnp.stack([jnp.cos(q), jnp.sin(q)], -1) * lengths[:, None]
     rates = jnp.stack([-jnp.sin(q), jnp.cos(q)], -1) * (lengths * v)[:, None]
     heads = jnp.cumsum(rates, 0)
-    centres = heads - 0.5 * rates
+    centers = heads - 0.5 * rates
     height = jnp.cumsum(across[:, 1]) - 0.5 * across[:, 1]
-    T = 0.5 * jnp.sum(lengths * jnp.sum(centres**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
+    T = 0.5 * jnp.sum(lengths * jnp.sum(centers**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
     return T - G * jnp.sum(lengths * height)
 
 

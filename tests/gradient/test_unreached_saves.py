@@ -8,7 +8,7 @@ import pytest
 import jaxlag as jl
 from jaxlag._gradient._unreached_saves import unreached
 
-# V = p/x: repelled for p > 0, drawn into the centre for p < 0, which no motion survives.
+# V = p/x: repelled for p > 0, drawn into the center for p < 0, which no motion survives.
 central = jl.System(lambda t, q, v, p: 0.5 * v @ v - p / q[0], ("x",))
 TS = jnp.array([0.0, 0.1, 2.0])
 P = 3.0

@@ -180,7 +180,7 @@ def polar(t, q, v, params):
 
 @pytest.mark.parametrize("traced", mostly_full([False, True], False))
 def test_a_start_where_a_coordinate_has_no_inertia(traced):
-    """A slot through the centre of polar coordinates: r = sin(t)."""
+    """A slot through the center of polar coordinates: r = sin(t)."""
     slot = jl.Holonomic(lambda t, q, params: q[1] - 0.3, "slot")
     system = jl.System(polar, ("r", "phi"), constraints=(slot,))
 
@@ -192,7 +192,7 @@ def test_a_start_where_a_coordinate_has_no_inertia(traced):
 
 
 def test_whether_a_coordinate_has_inertia_is_asked_of_traced_states_too():
-    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the centre as well."""
+    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the center as well."""
     turn = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
     system = jl.System(
         lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2),

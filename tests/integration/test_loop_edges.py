@@ -237,7 +237,7 @@ def test_the_first_step_is_one_that_the_control_allows():
 
 
 @pytest.mark.full
-def test_a_stiff_motion_backwards_in_time_is_recognised():
+def test_a_stiff_motion_backwards_in_time_is_recognized():
     """x'' = -x + 1e4 x' from 0 to -10 s."""
     damped = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,

@@ -46,7 +46,7 @@ def test_no_heading_is_special():
 
 
 def offset(t, q, v, params):
-    """A sleigh whose mass centre is params ahead of the blade."""
+    """A sleigh whose mass center is params ahead of the blade."""
     x = v[0] - params * jnp.sin(q[2]) * v[2]
     y = v[1] + params * jnp.cos(q[2]) * v[2]
     return 0.65 * (x * x + y * y) + 0.1 * v[2] ** 2

@@ -92,7 +92,7 @@ def blown(t, q, v, params):
 
 
 def sprung(t, q, v, params):
-    """A sleigh on springs, its mass centre ahead of the blade."""
+    """A sleigh on springs, its mass center ahead of the blade."""
     m, J, a = params["m"]
     x, y = v[0] - a * jnp.sin(q[2]) * v[2], v[1] + a * jnp.cos(q[2]) * v[2]
     return 0.5 * m * (x * x + y * y) + 0.5 * J * v[2] ** 2 - 0.5 * (1.0 + 0.1 * t) * (q @ q)

@@ -153,7 +153,7 @@ REST = np.array([0.0, HIGH, 0.0])
 @pytest.mark.full
 @pytest.mark.parametrize("mu", [0.2, 1.2])
 def test_a_sledge_brakes(mu):
-    """N_front - N_rear = mu m g h / w about the centre; beyond mu = w/h it tips over."""
+    """N_front - N_rear = mu m g h / w about the center; beyond mu = w/h it tips over."""
     v = np.array([3.0, 0.0, 0.0])
     np.testing.assert_allclose(SLEDGE.acceleration(REST, v, mu), [-mu * G, 0, 0], atol=1e-13)
     lam = SLEDGE.multipliers(REST, v, mu)
@@ -337,7 +337,7 @@ def test_known_contacts_are_not_looked_at_again():
 
 
 def table(t, q, v, params):
-    """A table of mass 1 that slides upright; q: x, y, z of its mass centre, roll, pitch."""
+    """A table of mass 1 that slides upright; q: x, y, z of its mass center, roll, pitch."""
     return 0.5 * (v @ v) - G * q[2]
 
 
@@ -345,7 +345,7 @@ FEET = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 def feet(t, q, params):
-    """Heights of the feet, for small angles; params: (friction, where the mass centre is)."""
+    """Heights of the feet, for small angles; params: (friction, where the mass center is)."""
     arms = FEET - params[1]
     return q[2] + arms[:, 1] * q[3] - arms[:, 0] * q[4]
 

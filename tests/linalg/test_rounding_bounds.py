@@ -65,7 +65,7 @@ def test_rows_that_are_rounding_everywhere_are_void(dtype):
         assert there.tolist() == [False, False, False, True]
         assert void.tolist() == [True, True, False, False]
         assert float(size[1]) > 0.1
-    q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometres
+    q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometers
     there, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
     assert there.tolist() == [True]
     assert void.tolist() == [False]

@@ -74,7 +74,7 @@ def test_the_reason_reaches_the_user_and_the_array_program_takes_over():
     np.testing.assert_array_equal(a, [0.0, -1.0])
 
 
-def test_rules_of_their_own_are_honoured():
+def test_rules_of_their_own_are_honored():
     """Twice the derivative of the sine, as declared; a stopped factor is not differentiated."""
     _, x, node = scalars(PROBES["custom rule"])
     graph, x, node = scalars(PROBES["custom rule"])

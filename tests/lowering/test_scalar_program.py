@@ -133,7 +133,7 @@ def test_a_rule_of_its_own_keeps_its_derivatives_of_any_order():
     np.testing.assert_array_equal(slope(jnp.array([1.0, 0.0])), -3.0 * np.eye(2))
 
 
-def test_cancelled_terms_stay_cancelled():
+def test_canceled_terms_stay_canceled():
     """0 x = 0 and x / x = 1 for every x, where the array program gives NaN; sqrt(x^2) is no |x|."""
 
     def lagrangian(t, q, v, params):

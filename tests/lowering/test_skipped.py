@@ -76,7 +76,7 @@ QUASI = {  # the same in quasi-velocities: v and u', no rows; the inertia is con
     mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"})),  # long to derive
 )
 def test_an_evaluation_stays_below_its_ceilings(name):
-    """Scalar arithmetic and nothing else: no product of arrays, no factorisation, no matrix."""
+    """Scalar arithmetic and nothing else: no product of arrays, no factorization, no matrix."""
     program = evaluation(case(name))
     functions, divisions = CEILINGS[name]
     assert count(program, "sincos") <= functions
@@ -207,7 +207,7 @@ CALLED_TOGETHER = re.compile(r"(?:branch|called)_computations=\{([^}]*)\}")
 
 @cache
 def compiled(name):
-    """The optimised HLO of a whole solve."""
+    """The optimized HLO of a whole solve."""
     end, start = solve(case(name))
     return jax.jit(end).lower(*start).compile().as_text()
 

@@ -367,13 +367,13 @@ def test_explain_says_how_the_mass_matrix_is_solved():
         (17, "by library Cholesky (n > 16)"),
     ):
         explained = chain(n, lowering="array").explain(GENERAL["chain"].params)
-        assert f"mass solve    one factorisation per evaluation, {said}" in explained
+        assert f"mass solve    one factorization per evaluation, {said}" in explained
 
 
 def test_explain_says_that_a_constant_mass_matrix_is_factored_once():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR, lowering="array")
     explained = system.explain(None)
-    assert "mass solve    one factorisation once per solve, unrolled" in explained
+    assert "mass solve    one factorization once per solve, unrolled" in explained
     assert "h by" not in explained
 
 

@@ -21,7 +21,7 @@ from systems.catalogue import ENTRIES
 
 SMALL, MIDDLE, LARGE = 5, 12, LOOP_UP_TO + 2
 chain = partial(any_chain, lowering="array")
-FACTORISATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
+FACTORIZATIONS = {"cholesky", "lu", "eigh", "eig", "svd", "qr", "geqrf", "schur", "tridiagonal"}
 MARK = 3  # entries of the marked array
 
 
@@ -57,7 +57,7 @@ def tangent(function):
     return moved
 
 
-# ---- One factorisation -------------------------------------------------------------------------
+# ---- One factorization -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("derivative", [None, gradient, tangent])
@@ -66,7 +66,7 @@ def test_large_systems_take_one_cholesky(n, derivative):
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
     assert count(program, "cholesky") == 1
-    assert names(program) & FACTORISATIONS == {"cholesky"}
+    assert names(program) & FACTORIZATIONS == {"cholesky"}
 
 
 @pytest.mark.parametrize("derivative", [None, gradient, tangent])
@@ -75,7 +75,7 @@ def test_small_systems_take_one_elimination(n, derivative):
     """The only divisions are n (n - 1)/2 of the elimination, and 2 n of each solve."""
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
-    assert names(program) & FACTORISATIONS == set()
+    assert names(program) & FACTORIZATIONS == set()
     assert count(program, "div", without=("custom_linear_solve",)) == n * (n - 1) // 2
     solves = count(program, "custom_linear_solve")
     assert solves == (2 if derivative else 1)
@@ -88,12 +88,12 @@ def test_middling_systems_take_one_elimination_by_rows(n, derivative):
     """One row of divisions a turn of the elimination, one division a turn of each solve's loops."""
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
-    assert names(program) & FACTORISATIONS == set()
+    assert names(program) & FACTORIZATIONS == set()
     assert count(program, "div", without=("custom_linear_solve",)) == n
     assert count(program, "div") == n + 2 * n * (2 if derivative else 1)
 
 
-def test_the_counts_see_a_second_factorisation():
+def test_the_counts_see_a_second_factorization():
     """The counter itself: the two forms that the tests above forbid."""
 
     def twice(M, r):
@@ -265,9 +265,9 @@ def swung(lagrangian, n, params, t1=0.2):
 
 @pytest.mark.parametrize("n", [SMALL, LARGE])
 def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
-    """Inside the loop of a whole solve there are solves and no factorisation."""
+    """Inside the loop of a whole solve there are solves and no factorization."""
 
-    def factorisations(program):
+    def factorizations(program):
         if n > UNROLL_UP_TO:
             return count(program, "cholesky")
         return count(program, "div", without=("custom_linear_solve",)) // (n * (n - 1) // 2)
@@ -278,8 +278,8 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
         inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, turns=1))
         solves = count(inside, "custom_linear_solve")
         assert solves > 0
-        assert names(inside) & FACTORISATIONS <= {"cholesky"}
-        found[lagrangian] = factorisations(inside)
+        assert names(inside) & FACTORIZATIONS <= {"cholesky"}
+        found[lagrangian] = factorizations(inside)
     assert found[coupled] == 0
     assert found[hidden] > 0
 

@@ -79,7 +79,7 @@ def test_reaction_vectors():
     lam = led_pendulum.multipliers(q, v, LED)
     assert list(lam) == ["pin"]
     a = led_pendulum.acceleration(q, v, LED)
-    # Newton: the pin carries m (a - g) of the mass centre.
+    # Newton: the pin carries m (a - g) of the mass center.
     expected = LED["m"] * (a[:2] - jnp.array([0.0, -9.81]))
     np.testing.assert_allclose(lam["pin"], expected, rtol=1e-14)
 

@@ -54,8 +54,8 @@ def test_check_finds_it_in_a_declared_system():
 def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
     """Literals are values under jit too, each by itself; what is traced is left alone."""
 
-    def kinetic(mass, inertia, centre=None):
-        return energy.RigidBody(mass, inertia, centre).kinetic_from_rates(np.ones(3), np.ones(3))
+    def kinetic(mass, inertia, center=None):
+        return energy.RigidBody(mass, inertia, center).kinetic_from_rates(np.ones(3), np.ones(3))
 
     principal, central = "have no negative principal moment", "use energy.parallel_axis"
     for function, given, message in [
@@ -64,7 +64,7 @@ def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
         (lambda m: kinetic(1.0, energy.inertia_matrix(1.0, 2.0, -3.0)), 1.0, principal),
         (lambda m: kinetic(m, energy.inertia_matrix(1, 1, 1, 3)), 1.0, principal),
         (lambda inertia: kinetic(-1.0, inertia), np.ones(3), "`mass` must not be negative"),
-        (lambda m: kinetic(m, [1, 1, 1], [0, 0, np.nan]), 1.0, "`centre` must be finite"),
+        (lambda m: kinetic(m, [1, 1, 1], [0, 0, np.nan]), 1.0, "`center` must be finite"),
         (lambda m: kinetic(1.0, [0.1, 0.1, 0.1], [1, 0, 0]), 1.0, central),
     ]:
         with pytest.raises(ValueError, match=message):
@@ -75,12 +75,12 @@ def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_an_inertia_about_the_mass_centre_is_refused(dtype):
+def test_an_inertia_about_the_mass_center_is_refused(dtype):
     """I_G given for I_O: T = -0.45 J for a motion of 1 m/s and 1 rad/s, were it taken."""
     central, c = np.full(3, 0.1, dtype), np.array([1.0, 0.0, 0.0], dtype)
     message = (
-        "RigidBody: `inertia` must be at least that of the mass at its centre, m (|c|^2 E - c c^T)"
-        ", but what is left, the inertia about the mass centre, has the eigenvalue -0.9 kg m^2 "
+        "RigidBody: `inertia` must be at least that of the mass at its center, m (|c|^2 E - c c^T)"
+        ", but what is left, the inertia about the mass center, has the eigenvalue -0.9 kg m^2 "
         "about the axis (0, "
     )
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
@@ -94,7 +94,7 @@ def test_an_inertia_about_the_mass_centre_is_refused(dtype):
 
 
 def test_a_point_mass_is_a_body():
-    """Nothing is left about the mass centre, up to rounding, wherever that is."""
+    """Nothing is left about the mass center, up to rounding, wherever that is."""
     for c in np.random.default_rng(5).normal(size=(100, 3)):
         for dtype in (np.float64, np.float32):
             c_mass, zero = np.array([*c, 0.7], dtype), np.zeros((3, 3), dtype)

@@ -23,12 +23,12 @@ def orientation(q):
     return rotation.yaw_pitch_roll.matrix(q[3:])
 
 
-def centre(t, q, params):
+def center(t, q, params):
     return q[:3]
 
 
 def corner(t, q, params):
-    """A point fixed in the body at `arm` from its centre."""
+    """A point fixed in the body at `arm` from its center."""
     return q[:3] + orientation(q) @ params["arm"]
 
 
@@ -144,15 +144,15 @@ def test_a_plane_couple_is_a_scalar():
 
 
 def test_a_force_is_worth_one_elsewhere_with_a_couple():
-    """F at a point = F at the centre + the couple (R arm) x F (Pila, sec. 3.12)."""
+    """F at a point = F at the center + the couple (R arm) x F (Pila, sec. 3.12)."""
 
     def moment(t, q, v, params):
         return jnp.cross(orientation(q) @ params["arm"], params["F"])
 
     at_corner = force_of(jl.PointForce(corner, constant, "pull"))
-    at_centre = force_of(jl.PointForce(centre, constant, "pull"))
+    at_center = force_of(jl.PointForce(center, constant, "pull"))
     couple = force_of(jl.Torque(space_rates, moment, "moment"))
-    np.testing.assert_allclose(at_corner, at_centre + couple, atol=32 * EPS)
+    np.testing.assert_allclose(at_corner, at_center + couple, atol=32 * EPS)
     assert np.max(np.abs(couple)) > 0.1
 
 

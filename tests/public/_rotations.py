@@ -1,4 +1,4 @@
-"""Samples of rotations, in all parametrisations, and how results are compared."""
+"""Samples of rotations, in all parametrizations, and how results are compared."""
 
 import itertools
 

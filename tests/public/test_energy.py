@@ -18,7 +18,7 @@ RNG = np.random.default_rng(7)
 MASSES = jnp.asarray(RNG.uniform(0.2, 1.0, 6))
 PLACES = jnp.asarray(RNG.uniform(-0.5, 0.5, (6, 3)))
 MASS = jnp.sum(MASSES)
-CENTRE = MASSES @ PLACES / MASS
+CENTER = MASSES @ PLACES / MASS
 INERTIA = jnp.sum(
     MASSES[:, None, None]
     * (
@@ -27,21 +27,21 @@ INERTIA = jnp.sum(
     ),
     axis=0,
 )
-BODY = energy.RigidBody(MASS, INERTIA, CENTRE)
+BODY = energy.RigidBody(MASS, INERTIA, CENTER)
 G = jnp.array([0.3, -0.2, -9.81])
 
-PARAMETRISATIONS = {
+PARAMETRIZATIONS = {
     "yaw_pitch_roll": (rotation.yaw_pitch_roll, 3),
     "zxz": (rotation.zxz, 3),
     "quaternion": (rotation.quaternion, 4),
 }
 
 
-def pose_of(parametrisation):
+def pose_of(parametrization):
     def pose(t, q, params):
         """Turned by the coordinates on a table that turns and rises by itself."""
         table = rotation.about_z(0.7 * t)
-        return table @ parametrisation.matrix(q[3:]), table @ q[:3] + jnp.stack(
+        return table @ parametrization.matrix(q[3:]), table @ q[:3] + jnp.stack(
             [0 * t, 0 * t, t**2]
         )
 
@@ -56,23 +56,23 @@ def points_of(pose):
     return points
 
 
-@pytest.fixture(params=PARAMETRISATIONS)
+@pytest.fixture(params=PARAMETRIZATIONS)
 def moving(request):
-    parametrisation, size = PARAMETRISATIONS[request.param]
+    parametrization, size = PARAMETRIZATIONS[request.param]
     rng = np.random.default_rng(11)
     q, v = jnp.asarray(rng.uniform(0.2, 1.0, 3 + size)), jnp.asarray(rng.uniform(-2, 2, 3 + size))
-    return pose_of(parametrisation), q, v
+    return pose_of(parametrization), q, v
 
 
 def test_a_rigid_body_moves_like_its_particles(moving):
-    """Eq. 2.16 with an offset mass centre against sum 1/2 m_k v_k^2, in any parametrisation."""
+    """Eq. 2.16 with an offset mass center against sum 1/2 m_k v_k^2, in any parametrization."""
     pose, q, v = moving
     body = BODY.kinetic(pose, T, q, v, None)
     particles = energy.particles(points_of(pose), MASSES, T, q, v, None)
     np.testing.assert_allclose(body, particles, rtol=64 * EPS)
 
 
-def test_gravity_acts_on_the_mass_centre(moving):
+def test_gravity_acts_on_the_mass_center(moving):
     pose, q, _ = moving
     body = BODY.gravity(pose, T, q, None, G)
     particles = energy.gravity(MASSES, points_of(pose)(T, q, None), G)
@@ -90,16 +90,16 @@ def test_body_velocity_is_that_of_the_axes(moving):
 
 
 def test_the_origin_of_a_body_is_free():
-    """The same body about its mass centre: the same T and V, by the parallel axis theorem."""
+    """The same body about its mass center: the same T and V, by the parallel axis theorem."""
     pose = pose_of(rotation.yaw_pitch_roll)
     rng = np.random.default_rng(3)
     q, v = jnp.asarray(rng.uniform(0.2, 1, 6)), jnp.asarray(rng.uniform(-2, 2, 6))
 
     def central_pose(t, q, params):
         R, r = pose(t, q, params)
-        return R, r + R @ CENTRE
+        return R, r + R @ CENTER
 
-    central = INERTIA - energy.parallel_axis(np.zeros((3, 3)), MASS, CENTRE)
+    central = INERTIA - energy.parallel_axis(np.zeros((3, 3)), MASS, CENTER)
     body = energy.RigidBody(MASS, central)
     args = (T, q, v, None)
     np.testing.assert_allclose(
@@ -108,7 +108,7 @@ def test_the_origin_of_a_body_is_free():
     np.testing.assert_allclose(
         body.gravity(central_pose, T, q, None, G), BODY.gravity(pose, T, q, None, G), rtol=64 * EPS
     )
-    back = energy.parallel_axis(central, MASS, CENTRE)
+    back = energy.parallel_axis(central, MASS, CENTER)
     np.testing.assert_allclose(back, INERTIA, atol=8 * EPS)
 
 
@@ -125,7 +125,7 @@ def test_the_mass_matrix_of_a_free_body_is_the_books():
     def kinetic(Vw):
         return BODY.kinetic_from_rates(Vw[:3], Vw[3:])
 
-    m, c = MASS, rotation.skew(CENTRE)
+    m, c = MASS, rotation.skew(CENTER)
     expected = jnp.block([[m * jnp.eye(3), -m * c], [m * c, INERTIA]])
     np.testing.assert_allclose(jax.hessian(kinetic)(jnp.ones(6)), expected, atol=16 * EPS)
 
@@ -226,9 +226,9 @@ def test_bodies_may_be_params_and_fitted():
     V, w = jnp.array([0.4, -1.0, 2.0]), jnp.array([0.3, 0.7, -0.5])
     gradient = jax.jit(jax.grad(kinetic))(BODY, V, w)
     np.testing.assert_allclose(gradient.inertia, 0.5 * np.outer(w, w), rtol=8 * EPS)
-    expected = 0.5 * V @ V + V @ jnp.cross(w, CENTRE)
+    expected = 0.5 * V @ V + V @ jnp.cross(w, CENTER)
     np.testing.assert_allclose(gradient.mass, expected, rtol=16 * EPS)
-    np.testing.assert_allclose(gradient.centre, MASS * jnp.cross(V, w), rtol=16 * EPS)
+    np.testing.assert_allclose(gradient.center, MASS * jnp.cross(V, w), rtol=16 * EPS)
 
 
 def test_coordinates_and_velocities_are_brought_to_one_precision():
@@ -285,9 +285,9 @@ def wrong():
         "`mass` must be a number, but its sh",
     )
     yield (
-        "centre",
+        "center",
         lambda: energy.RigidBody(1.0, unit, [0.1, 0.2]),
-        "`centre` must be a vector of 3",
+        "`center` must be a vector of 3",
     )
     yield (
         "g",
@@ -372,12 +372,12 @@ def wrong():
     yield (
         "infinite",
         lambda: energy.RigidBody(1.0, unit, [0, np.inf, 0]),
-        "RigidBody: `centre` must be finite, but it was [0.0, inf, 0.0]",
+        "RigidBody: `center` must be finite, but it was [0.0, inf, 0.0]",
     )
     yield (
-        "axis centre",
+        "axis center",
         lambda: energy.parallel_axis(unit, 1.0, [1.0, 2.0]),
-        "parallel_axis: `centre` must be a vector of 3 components, but its shape was (2,)",
+        "parallel_axis: `center` must be a vector of 3 components, but its shape was (2,)",
     )
     yield (
         "axis mass",

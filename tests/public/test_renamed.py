@@ -73,6 +73,7 @@ def select_model(**options):
         (lambda **x: jl.simulate(SYSTEM, Q, V, TS, PARAMS, **x), "project", "stabilization="),
         (lambda **x: jl.equilibrium(SYSTEM, Q, PARAMS, **x), "tol", "rtol="),
         (lambda **x: jl.lyapunov(None, **x), "tol", "step_rtol= and step_atol="),
+        (lambda **x: jl.energy.RigidBody(1.0, [1.0] * 3, **x), "centre", "center="),
         (fit, "tolerance", "rtol= and atol="),
         (fit, "max_iterations", "max_steps="),
         (fit, "optimiser", "optimizer="),

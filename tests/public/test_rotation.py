@@ -1,4 +1,4 @@
-"""Rotations: matrices, rates and parametrisations, against the book's tables, scipy and jvp.
+"""Rotations: matrices, rates and parametrizations, against the book's tables, scipy and jvp.
 
 Entries of R are at most 1 and take some three roundings, so identities of one or two products of
 them hold to some 10 EPS; the worst found over the samples is written beside each bound.

@@ -62,7 +62,7 @@ def test_from_matrix_is_differentiable_along_rotations(kind):
     assert worst(batch(moved, x, w), batch(p.from_body_rates, x, w)) <= 50 * EPS  # worst 16
 
 
-def by_parametrisation(p, x, a, b):
+def by_parametrization(p, x, a, b):
     x_dot = p.from_body_rates(x, a)
     rates = x_dot, p.from_space_rates(x, a), p.body_rates(x, x_dot), p.space_rates(x, x_dot)
     return p.matrix(x), p.from_matrix(p.matrix(x)), p.body_rate_matrix(x), rates
@@ -86,7 +86,7 @@ def by_quaternion(p, x, a, b):
 @pytest.mark.parametrize(
     ("kind", "function"),
     [
-        *((kind, by_parametrisation) for kind in ALL),
+        *((kind, by_parametrization) for kind in ALL),
         ("zxz", by_matrix),
         ("quaternion", by_quaternion),
     ],

@@ -34,7 +34,7 @@ def one(params, q0, v0, torques):
 
 
 def test_lanes_equal_single_runs(lanes):
-    """Fixed steps: every lane to round-off of its own run, whatever its neighbours do."""
+    """Fixed steps: every lane to round-off of its own run, whatever its neighbors do."""
     batch = jax.jit(jax.vmap(one))(*lanes)
     single = jax.jit(one)
     for i in [*range(0, LANES, 17), BAD - 1, BAD, BAD + 1]:

@@ -102,7 +102,7 @@ def test_motions_by_different_methods_are_of_one_form():
 
 @pytest.mark.full
 def test_tolerances_in_large_units():
-    """An orbit in metres for a day, to 0.1 mm: as order 8 has it."""
+    """An orbit in meters for a day, to 0.1 mm: as order 8 has it."""
 
     def earth(t, q, v, params):
         return 0.5 * (v @ v) + 3.986004418e14 / jnp.sqrt(q @ q)

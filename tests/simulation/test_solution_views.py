@@ -68,7 +68,7 @@ def test_a_dict_has_everything_by_name(motion, batch):
     assert batch.to_dict()["arm"].shape == (5, 5, 2, 2)
 
 
-def test_a_dataset_is_labelled(motion, batch):
+def test_a_dataset_is_labeled(motion, batch):
     pytest.importorskip("xarray")
     found = motion.to_xarray()
     np.testing.assert_array_equal(found["t"], TS)

@@ -362,7 +362,7 @@ points = jl.System(
 
 
 def test_roundings_that_fall_again_by_chance_are_no_failure():
-    """x2 and y2' are small here: this step failed, and 1 in 3000 of its neighbours' to 1e-15.
+    """x2 and y2' are small here: this step failed, and 1 in 3000 of its neighbors' to 1e-15.
 
     As many lanes at once have hung in XLA's threads.
     """

@@ -69,7 +69,7 @@ def test_energy_stays_and_angular_momentum_is_kept():
     kepler = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 1.0 / jnp.sqrt(q @ q), ("x", "y"))
     e, period = 0.5, 2 * np.pi
     q0, v0 = [1 - e, 0.0], [0.0, np.sqrt((1 + e) / (1 - e))]
-    ts = np.arange(0, 51) * period  # at the pericentre, where the error is largest
+    ts = np.arange(0, 51) * period  # at the pericenter, where the error is largest
     motion = jl.simulate(kepler, q0, v0, ts, method="splitting6", dt=period / 400, max_steps=20_100)
     spin = motion.q[:, 0] * motion.v[:, 1] - motion.q[:, 1] * motion.v[:, 0]
     np.testing.assert_allclose(spin, np.sqrt(1 - e**2), rtol=2 * np.sqrt(20_000 * 12) * EPS)

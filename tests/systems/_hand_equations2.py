@@ -36,7 +36,7 @@ def physical_pendulum_three_origins(t, q, v, M, Ic, r, alpha, xb, yb, g):
 
 def _lamina(q, v, M, Iz, xb, yb):
     c, s, w = cos(q[2]), sin(q[2]), v[2]
-    X, Y = xb * c - yb * s, xb * s + yb * c  # mass centre from O, along x and y
+    X, Y = xb * c - yb * s, xb * s + yb * c  # mass center from O, along x and y
     mass = [[M, 0.0, -M * Y], [0.0, M, M * X], [-M * Y, M * X, Iz]]
     return mass, [M * w**2 * X, M * w**2 * Y, 0.0]
 

@@ -96,7 +96,7 @@ def disk_on_moving_cart(t, q, v, m0, m, R, theta, K1, K2, b, F1, Omega, g):
 
 
 def drive_on_disk(t, theta, F1, Omega):
-    """(Q_X, Q_x1) of the force on the disk's centre."""
+    """(Q_X, Q_x1) of the force on the disk's center."""
     F = F1 * cos(Omega * t)
     return [F, F * cos(theta)]
 
@@ -116,7 +116,7 @@ def hockey_puck_cord(t, q, v, M, kappa, R, F1, gamma):
 
 
 def push_on_puck(direction, R, F1):
-    """(Q_theta, Q_x, Q_y) of a force at the arm R about the centre."""
+    """(Q_theta, Q_x, Q_y) of a force at the arm R about the center."""
     return [F1 * R, F1 * cos(direction), F1 * sin(direction)]
 
 

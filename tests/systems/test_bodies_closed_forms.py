@@ -244,9 +244,9 @@ POINT = np.array([0.7, -0.4, 0.2])
 """A point of the body, from O."""
 
 
-def about_centre(p):
-    """(parameters with the mass centre as origin, rc): moments by Steiner and Varignon."""
-    rc, force = (np.array([p[name] for name in names]) for names in (CENTRE, FORCE))
+def about_center(p):
+    """(parameters with the mass center as origin, rc): moments by Steiner and Varignon."""
+    rc, force = (np.array([p[name] for name in names]) for names in (CENTER, FORCE))
     moments, products, torque = (
         np.array([p[name] for name in names]) for names in (MOMENTS, PRODUCTS, TORQUE)
     )
@@ -254,7 +254,7 @@ def about_centre(p):
     products = products - p["m"] * np.array([rc[0] * rc[1], rc[0] * rc[2], rc[1] * rc[2]])
     torque = torque - np.cross(rc, force)
     new = {
-        **dict.fromkeys(CENTRE, 0.0),
+        **dict.fromkeys(CENTER, 0.0),
         **dict(zip(MOMENTS, moments, strict=True)),
         **dict(zip(PRODUCTS, products, strict=True)),
         **dict(zip(TORQUE, torque, strict=True)),
@@ -262,14 +262,14 @@ def about_centre(p):
     return p | new, rc
 
 
-CENTRE, FORCE, TORQUE = ("xc", "yc", "zc"), ("Fx", "Fy", "Fz"), ("Mx", "My", "Mz")
+CENTER, FORCE, TORQUE = ("xc", "yc", "zc"), ("Fx", "Fy", "Fz"), ("Mx", "My", "Mz")
 MOMENTS, PRODUCTS = ("Ix", "Iy", "Iz"), ("Ixy", "Ixz", "Iyz")
 
 
 @pytest.mark.full
-def test_the_aircraft_moves_alike_from_its_mass_centre():
+def test_the_aircraft_moves_alike_from_its_mass_center():
     """Positions of one point of the body, turns and energies."""
-    from_G, rc = about_centre(FROM_O)
+    from_G, rc = about_center(FROM_O)
     angles, V, w = np.array([0.1, 0.2, 0.4]), np.array([18.0, 1.0, 2.0]), np.array([0.3, 0.2, -0.2])
     times, at_O = np.linspace(0.0, 2.0, 6), np.array([10.0, -5.0, -100.0])
     at_G = at_O + space_axes(angles) @ rc
@@ -287,10 +287,10 @@ def test_the_aircraft_moves_alike_from_its_mass_centre():
 
 
 @pytest.mark.full
-def test_the_mass_centre_of_the_aircraft_falls_freely():
+def test_the_mass_center_of_the_aircraft_falls_freely():
     """Without forces on a parabola, though O does not."""
     p = FROM_O | dict.fromkeys((*FORCE, *TORQUE), 0.0)
-    rc, times = np.array([p[name] for name in CENTRE]), np.linspace(0.0, 1.5, 6)
+    rc, times = np.array([p[name] for name in CENTER]), np.linspace(0.0, 1.5, 6)
     motion = move("rigid_aircraft", p, [0.0] * 6, (5.0, 0.5, -0.4, 0.6, -0.8, 0.5), times)
     fallen = np.array([q[:3] + space_axes(q[3:]) @ rc for q in np.asarray(motion.q)])
     rate = np.array([5.0, 0.5, -0.4]) + np.cross([0.6, -0.8, 0.5], rc)

@@ -89,7 +89,7 @@ def test_a_parameter_may_be_an_array(capsys):
     assert "omega = (516, 512, 511, 515) rad/s" in capsys.readouterr().out
 
 
-def test_an_unknown_name_gets_its_neighbours(capsys):
+def test_an_unknown_name_gets_its_neighbors(capsys):
     with pytest.raises(UnknownSystem, match=r"'duble_pendulum'\. Did you mean double_pendulum"):
         find("duble_pendulum")
     with pytest.raises(UnknownSystem, match=r"'zzz'\. Known: rotating_body_on_frame, disk_"):

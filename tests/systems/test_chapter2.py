@@ -29,7 +29,7 @@ EPS = np.finfo(float).eps
 
 
 def rotating_body_on_frame(t, q, v, M, A, B, C, xb, yb, zb, theta, **others):
-    """1/2 omega . I omega of the body, and of its mass at the centre, which moves at omega x c."""
+    """1/2 omega . I omega of the body, and of its mass at the center, which moves at omega x c."""
     (_, phi), (psi_rate, phi_rate) = q, v
     p, r = psi_rate * sin(theta) * sin(phi), phi_rate + psi_rate * cos(theta)
     q_ = psi_rate * sin(theta) * cos(phi)
@@ -38,7 +38,7 @@ def rotating_body_on_frame(t, q, v, M, A, B, C, xb, yb, zb, theta, **others):
 
 
 def disk_pose(t, q, params):
-    """The disk's axes and its centre, which moves with them on the tilted shaft."""
+    """The disk's axes and its center, which moves with them on the tilted shaft."""
     R = jl.rotation.zxz.matrix((q[0] + jnp.pi / 2, params["theta"], q[1]))
     return R, R @ jnp.array([0.0, 0.0, params["s"]])
 
@@ -123,17 +123,17 @@ def test_the_pendulum_has_one_energy_from_three_origins():
     """The errors are those of the parts of l^2, which add up to (r + |c|)^2, c = (xb, yb)."""
     entry = ENTRIES["physical_pendulum_three_origins"]
     for t, q, v, p in random_states(entry):
-        third, centre = from_pivot(p)
-        hang = -np.pi / 2 - atan2(centre[1], centre[0])  # turns the centre to below the pivot
+        third, center = from_pivot(p)
+        hang = -np.pi / 2 - atan2(center[1], center[0])  # turns the center to below the pivot
         l2_parts = (p["r"] + np.hypot(p["xb"], p["yb"])) ** 2
-        inertia, lever = p["Ic"] + p["M"] * l2_parts, l2_parts / np.linalg.norm(centre)
-        for origin in (np.zeros(3), centre, third):
+        inertia, lever = p["Ic"] + p["M"] * l2_parts, l2_parts / np.linalg.norm(center)
+        for origin in (np.zeros(3), center, third):
 
             def pose(t, q, params, origin=origin, hang=hang):
                 R = jl.rotation.about_z(q[0] + hang)
                 return R, R @ origin
 
-            c = centre - origin
+            c = center - origin
             body = jl.energy.RigidBody(p["M"], (0.0, 0.0, p["Ic"] + p["M"] * (c @ c)), c)
             T = entry.system.kinetic(q, v, p, t=t)
             tolerance = K * EPS * 0.5 * inertia * v[0] ** 2

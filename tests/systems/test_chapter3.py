@@ -16,7 +16,7 @@ from jax.numpy import cos, sin
 import jaxlag as jl
 from jaxlag import energy, rotation
 from systems.catalogue import ENTRIES
-from systems.catalogue.chapter3.falling_stick import centre as stick_centre
+from systems.catalogue.chapter3.falling_stick import center as stick_center
 from systems.catalogue.chapter3.falling_stick import normal_force
 from systems.catalogue.chapter3.spherical_pendulum_fixed import tension
 from systems.catalogue.chapter3.symmetric_plane_pendulum import pin_reaction
@@ -30,14 +30,14 @@ def straight(t, q, v, *masses):
     return energy.particles(lambda t, q, _: q[:, None], jnp.stack(masses), t, q, v, None)
 
 
-def planar(mass, about_origin, pose, t, q, v, centre=(0.0, 0.0, 0.0)):
+def planar(mass, about_origin, pose, t, q, v, center=(0.0, 0.0, 0.0)):
     """T of a body in the plane; `pose(q)` gives its turn and the x, y of its origin."""
 
     def in_space(t, q, _):
         angle, x, y = pose(q)
         return rotation.about_z(angle), jnp.stack([x, y, 0.0])
 
-    body = energy.RigidBody(mass, jnp.stack([0.0, 0.0, about_origin]), jnp.array(centre))
+    body = energy.RigidBody(mass, jnp.stack([0.0, 0.0, about_origin]), jnp.array(center))
     return body.kinetic(in_space, t, q, v, None)
 
 
@@ -82,8 +82,8 @@ def sleeve_pendulum(t, q, v, M1, M2, IA, IG, **others):
 
 def cart_pendulum(t, q, v, m1, m2, l, **others):  # noqa: E741
     """The rod about its pin, where its inertia is m2 l^2/3; body y points up the rod."""
-    centre = (0.0, -0.5 * l, 0.0)
-    rod = planar(m2, m2 * l**2 / 3, lambda q: (q[1], q[0], 0.0), t, q, v, centre)
+    center = (0.0, -0.5 * l, 0.0)
+    rod = planar(m2, m2 * l**2 / 3, lambda q: (q[1], q[0], 0.0), t, q, v, center)
     return straight(t, q[:1], v[:1], m1) + rod
 
 
@@ -117,8 +117,8 @@ def quadcopter(t, q, v, m, Ix, Iy, Iz, **others):
 
 def disk_on_moving_cart(t, q, v, m0, m, theta, **others):
     X_rate, x1_rate = v
-    centre_squared = X_rate**2 + 2 * X_rate * x1_rate * cos(theta) + x1_rate**2
-    return 0.5 * m0 * X_rate**2 + 0.5 * m * centre_squared + 0.25 * m * x1_rate**2
+    center_squared = X_rate**2 + 2 * X_rate * x1_rate * cos(theta) + x1_rate**2
+    return 0.5 * m0 * X_rate**2 + 0.5 * m * center_squared + 0.25 * m * x1_rate**2
 
 
 def puck(t, q, v, M, kappa, **others):
@@ -126,7 +126,7 @@ def puck(t, q, v, M, kappa, **others):
 
 
 def symmetric_plane_pendulum(t, q, v, M, IG, L, **others):
-    """The body about its mass centre."""
+    """The body about its mass center."""
     return planar(M, IG, lambda q: (q[0], L * sin(q[0]), -L * cos(q[0])), t, q, v)
 
 
@@ -139,8 +139,8 @@ def atwood_machine(t, q, v, m1, m2, m3, kappa, R, g):
 
 def falling_stick(t, q, v, m, L, g):
     x_rate, w = v
-    centre_squared = x_rate**2 + 0.25 * L**2 * cos(q[1]) ** 2 * w**2
-    return 0.5 * m * centre_squared + 0.5 * (m * L**2 / 12) * w**2
+    center_squared = x_rate**2 + 0.25 * L**2 * cos(q[1]) ** 2 * w**2
+    return 0.5 * m * center_squared + 0.5 * (m * L**2 / 12) * w**2
 
 
 KINETIC = {
@@ -287,7 +287,7 @@ def test_hand_generalized_forces_are_those_of_points(name, by_hand, by_point):
         np.testing.assert_allclose(Q, other, rtol=0, atol=tolerance)
 
 
-def plane_centre(t, q, params):
+def plane_center(t, q, params):
     return params["L"] * jnp.stack([sin(q[0]), -cos(q[0])])
 
 
@@ -300,27 +300,27 @@ def along_string(force, q, params):
 
 
 @pytest.mark.parametrize(
-    ("name", "reaction", "mass", "centre", "component"),
+    ("name", "reaction", "mass", "center", "component"),
     [
         ("spherical_pendulum_fixed", tension, "m", bob, along_string),
         (
             "symmetric_plane_pendulum",
             pin_reaction,
             "M",
-            plane_centre,
+            plane_center,
             lambda force, q, params: force,
         ),
-        ("falling_stick", normal_force, "m", stick_centre, lambda force, q, params: force[1]),
+        ("falling_stick", normal_force, "m", stick_center, lambda force, q, params: force[1]),
     ],
 )
-def test_reactions_are_what_mass_times_acceleration_lacks(name, reaction, mass, centre, component):
-    """m (a_G - g) of the mass centre, whatever the accelerations are."""
+def test_reactions_are_what_mass_times_acceleration_lacks(name, reaction, mass, center, component):
+    """m (a_G - g) of the mass center, whatever the accelerations are."""
     rng = np.random.default_rng(3)
     for t, q, v, params in random_states(ENTRIES[name]):
         a = rng.uniform(-5.0, 5.0, len(q))
 
         def velocity(q, v, t=t, params=params):
-            return energy.velocity(centre, t, q, v, params)
+            return energy.velocity(center, t, q, v, params)
 
         _, acceleration = jax.jvp(velocity, (q, v), (v, a))
         force = params[mass] * acceleration.at[-1].add(params["g"])

@@ -214,7 +214,7 @@ def test_the_nonholonomic_particle_slows_by_its_constraint():
 
 @pytest.mark.full
 def test_the_disk_rolls_steadily():
-    """Where w1' = 0 by hand: inclined, its centre on a circle about a point at rest."""
+    """Where w1' = 0 by hand: inclined, its center on a circle about a point at rest."""
     m, R, I_d, I_a, g = 1.0, 0.5, 0.0625, 0.125, 9.81
     theta, w2, psi0 = 1.1, 1.4, 0.3
     c, s = cos(theta), sin(theta)
@@ -274,7 +274,7 @@ def by_dop853(rates, start, times):
 
 @pytest.mark.full
 def test_the_ball_keeps_energy_and_momentum_about_the_contact():
-    """By hand, not by the file: I omega + a n x m r', with n from contact to centre."""
+    """By hand, not by the file: I omega + a n x m r', with n from contact to center."""
     params = {"m": 1.3, "a": 0.3, "I1": 0.02, "I2": 0.03, "I3": 0.045}
     u0 = {"wx": 0.9, "wy": 0.6, "wz": -0.7}
     motion = move("chaplygin_ball", params, (0.0, 0.0, 0.2, 0.1, -0.3), u0, np.linspace(0, 1.2, 7))

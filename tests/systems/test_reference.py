@@ -99,7 +99,7 @@ REFUSED = [
     (("coordinates",), ["y"], "coordinates must be ['x'], but it was ['y']."),
     (("quasi_velocities",), ["u"], "quasi_velocities must be [], for mass_spring has none, but"),
     (("constraints",), ["f"], "constraints must be [], for mass_spring has none, but"),
-    (("colour",), "red", "the file must hold known fields only (schema, system, coordinates,"),
+    (("color",), "red", "the file must hold known fields only (schema, system, coordinates,"),
     (("notes",), 3, "notes must be text or null, but it was 3.0."),
     (
         ("parameters",),

@@ -315,7 +315,7 @@ def _add(total: Polynomial, other: Polynomial, factor: float) -> None:
 
 
 def _nonzero(polynomial: Polynomial) -> Polynomial:
-    """Without the terms that cancelled, rounding of the coefficients included."""
+    """Without the terms that canceled, rounding of the coefficients included."""
     return {m: c for m, c in polynomial.items() if c != 0.0}
 
 

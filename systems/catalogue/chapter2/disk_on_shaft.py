@@ -22,13 +22,13 @@ Coordinates
 
 Parameters
     M        mass of the disk [kg]
-    It, Ia   its inertias about the centre [kg m^2]: transverse, and about the shaft
-    s        distance of its centre from the bend b along the shaft [m]
+    It, Ia   its inertias about the center [kg m^2]: transverse, and about the shaft
+    s        distance of its center from the bend b along the shaft [m]
     theta    angle between the shafts [rad], constant
     tau0     amplitude of the torque on psi [N m]
     Omega    angular frequency of the torque [rad/s]
     c        drag of the disk's bearing [N m s]
-    x, y, z  a particle of the disk from its centre, in body axes, Z along the shaft [m]
+    x, y, z  a particle of the disk from its center, in body axes, Z along the shaft [m]
 
     omega = (psi' sin(theta) sin(phi), psi' sin(theta) cos(phi), phi' + psi' cos(theta))     (2.8)
           = (phi' sin(theta) cos(psi), phi' sin(theta) sin(psi), psi' + phi' cos(theta))     (2.9)

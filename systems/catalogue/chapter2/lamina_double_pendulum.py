@@ -11,7 +11,7 @@ and 2.8, eqs. 2.23-2.25).
         |   |\   \
      theta  | \   \    Y is 90 deg counterclockwise from X
             |  \ + \
-           phi  \___\  + mass centre (xb, yb); M, Iz
+           phi  \___\  + mass center (xb, yb); M, Iz
                  X
 
 Coordinates
@@ -23,7 +23,7 @@ Parameters
     M        mass of the lamina [kg]
     Iz       its inertia about O [kg m^2], more than M (xb^2 + yb^2)
     r        length of the string [m]
-    xb, yb   mass centre from O in body axes [m]
+    xb, yb   mass center from O in body axes [m]
     g        gravity [m/s^2]
 
     T = 1/2 M r^2 theta'^2 + 1/2 Iz phi'^2
@@ -51,8 +51,8 @@ def pose(t, q, params):
 
 def lamina(params):
     """The lamina by its inertia about O."""
-    centre = (params["xb"], params["yb"], 0.0)
-    return jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), centre)
+    center = (params["xb"], params["yb"], 0.0)
+    return jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), center)
 
 
 def kinetic(t, q, v, params):
@@ -61,7 +61,7 @@ def kinetic(t, q, v, params):
 
 
 def potential(t, q, params):
-    """V of the weight [J], zero with the mass centre at the height of the support."""
+    """V of the weight [J], zero with the mass center at the height of the support."""
     return lamina(params).gravity(pose, t, q, params, (params["g"], 0.0, 0.0))
 
 

@@ -10,7 +10,7 @@ eqs. 2.26-2.27). Gravity is an addition: the book stops at T.
           .    |    .  |\   \
              . | .     | \   \    Y is 90 deg counterclockwise from X
     -----------+-------|--\ + \------> x1
-                      phi  \___\  + mass centre (xb, yb); M, Iz
+                      phi  \___\  + mass center (xb, yb); M, Iz
                             X
 
 Coordinates
@@ -21,7 +21,7 @@ Parameters
     M        mass of the lamina [kg]
     Iz       its inertia about O [kg m^2], more than M (xb^2 + yb^2)
     b        shape of the parabola [1/m]
-    xb, yb   mass centre from O in body axes [m]
+    xb, yb   mass center from O in body axes [m]
     g        gravity [m/s^2]
 
     T = 1/2 M (x1'^2 + y1'^2) + 1/2 Iz phi'^2
@@ -46,8 +46,8 @@ def pose(t, q, params):
 
 def lamina(params):
     """The lamina by its inertia about O."""
-    centre = (params["xb"], params["yb"], 0.0)
-    return jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), centre)
+    center = (params["xb"], params["yb"], 0.0)
+    return jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), center)
 
 
 def kinetic(t, q, v, params):
@@ -56,7 +56,7 @@ def kinetic(t, q, v, params):
 
 
 def potential(t, q, params):
-    """V of the weight [J], zero with the mass centre at the height of the vertex."""
+    """V of the weight [J], zero with the mass center at the height of the vertex."""
     return lamina(params).gravity(pose, t, q, params, (params["g"], 0.0, 0.0))
 
 

@@ -7,7 +7,7 @@ eqs. 2.20-2.22).
       ^        Y                    f1
       |         \      _________   /
       |          \    /         \ /
-      |           \  /    +      o (x1, y1)    + mass centre (xb, yb)
+      |           \  /    +      o (x1, y1)    + mass center (xb, yb)
       |            \/            |
       |            O___          |
       |            |   ---___    |      O   at (x, y)
@@ -22,7 +22,7 @@ Coordinates
 Parameters
     M               mass [kg]
     Iz              inertia about O [kg m^2]
-    xb, yb          mass centre in body axes [m]
+    xb, yb          mass center in body axes [m]
     x1, y1, x2, y2  points where the forces act, in body axes [m]
     f1x, f1y        force at the first point, components along the BODY axes [N], constant
     f2x, f2y        force at the second point, likewise [N]
@@ -53,8 +53,8 @@ def pose(t, q, params):
 
 def kinetic(t, q, v, params):
     """T of the lamina [J] (2.16, 2.21)."""
-    centre = (params["xb"], params["yb"], 0.0)
-    lamina = jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), centre)
+    center = (params["xb"], params["yb"], 0.0)
+    lamina = jl.energy.RigidBody(params["M"], (0.0, 0.0, params["Iz"]), center)
     return lamina.kinetic(pose, t, q, v, params)
 
 
@@ -85,7 +85,7 @@ def applied_force(t, q, v, a, params):
 
 
 def spin_less_impulse(t, q, v, a, params):
-    """Angular momentum about the mass centre less the torque about it times t [N m s]."""
+    """Angular momentum about the mass center less the torque about it times t [N m s]."""
     xb, yb = params["xb"], params["yb"]
     first = (params["x1"] - xb) * params["f1y"] - (params["y1"] - yb) * params["f1x"]
     second = (params["x2"] - xb) * params["f2y"] - (params["y2"] - yb) * params["f2x"]

@@ -7,7 +7,7 @@ eqs. 2.20-2.22), read with the forces resolved on the fixed axes.
       ^        Y                 F1, at the same angle to X1 always
       |         \      _________/
       |          \    /        /\
-      |           \  /    +   o  \     (x1, y1);   + mass centre (xb, yb)
+      |           \  /    +   o  \     (x1, y1);   + mass center (xb, yb)
       |            \/            |
       |            O___          |
       |            |   ---___    |      O   at (x, y)
@@ -22,7 +22,7 @@ Coordinates
 Parameters
     M               mass [kg]
     Iz              inertia about O [kg m^2]
-    xb, yb          mass centre in body axes [m]
+    xb, yb          mass center in body axes [m]
     x1, y1, x2, y2  points where the forces act, in body axes [m]
     F1X, F1Y        force at the first point, components along X1, Y1 [N], constant
     F2X, F2Y        force at the second point, likewise [N]
@@ -35,7 +35,7 @@ T is that of `lamina_two_forces`, V = 0, and
 
 Here the book's F_x and F_y after 2.22 are right, but 2.22 itself holds only at theta = 0. Such
 forces have a potential, -F1 . r1 - F2 . r2; the lamina swings about the angle at which they have
-no moment about its mass centre.
+no moment about its mass center.
 """
 
 import jax.numpy as jnp

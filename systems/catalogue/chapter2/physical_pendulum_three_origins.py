@@ -8,22 +8,22 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 2, sec. 2.5, Example 3 (Fig. 2.
          |  \ l   `-.
          |   \       (3)     origin of the body axes X, Y
          |    \     .'
-         |     (2)-'         mass centre, at (xb, yb) in them; M, Ic
+         |     (2)-'         mass center, at (xb, yb) in them; M, Ic
        theta
 
-    The origins of the book: (1) the pivot, (2) the mass centre, (3) any point of the body.
+    The origins of the book: (1) the pivot, (2) the mass center, (3) any point of the body.
 
 Coordinates
-    theta   angle of the line from the pivot to the mass centre from the downward
+    theta   angle of the line from the pivot to the mass center from the downward
             vertical [rad], positive counterclockwise
 
 Parameters
     M        mass [kg]
-    Ic       inertia about the mass centre [kg m^2]
+    Ic       inertia about the mass center [kg m^2]
     r        distance of origin (3) from the pivot [m]
     alpha    direction of that line: in the body axes (3) lies at
              -r (sin(alpha), cos(alpha)) from the pivot [rad]
-    xb, yb   mass centre from origin (3) in body axes [m]
+    xb, yb   mass center from origin (3) in body axes [m]
     g        gravity [m/s^2]
 
     l^2 = xb^2 + yb^2 + r^2 - 2 r (xb sin(alpha) + yb cos(alpha)),   Iz = Ic + M (xb^2 + yb^2)
@@ -45,19 +45,19 @@ from systems.catalogue._entry import Entry, Example
 
 
 def overlap(params):
-    """xb sin(alpha) + yb cos(alpha): mass centre from (3), along the line to the pivot [m]."""
+    """xb sin(alpha) + yb cos(alpha): mass center from (3), along the line to the pivot [m]."""
     return params["xb"] * jnp.sin(params["alpha"]) + params["yb"] * jnp.cos(params["alpha"])
 
 
-def centre_distance(params):
-    """l, from the pivot to the mass centre [m]."""
+def center_distance(params):
+    """l, from the pivot to the mass center [m]."""
     r, xb, yb = params["r"], params["xb"], params["yb"]
     return jnp.sqrt(xb**2 + yb**2 + r**2 - 2 * r * overlap(params))
 
 
 def pivot_inertia(params):
     """Ic + M l^2 [kg m^2]."""
-    return params["Ic"] + params["M"] * centre_distance(params) ** 2
+    return params["Ic"] + params["M"] * center_distance(params) ** 2
 
 
 def kinetic(t, q, v, params):
@@ -69,12 +69,12 @@ def kinetic(t, q, v, params):
 
 def potential(t, q, params):
     """V = -M g l cos(theta) [J], zero at the pivot."""
-    return -params["M"] * params["g"] * centre_distance(params) * jnp.cos(q[0])
+    return -params["M"] * params["g"] * center_distance(params) * jnp.cos(q[0])
 
 
-def kinetic_from_centre(t, q, v, a, params):
+def kinetic_from_center(t, q, v, a, params):
     """T from origin (2) [J] (2.18)."""
-    speed = centre_distance(params) * v[0]
+    speed = center_distance(params) * v[0]
     return 0.5 * params["M"] * speed**2 + 0.5 * params["Ic"] * v[0] ** 2
 
 
@@ -83,7 +83,7 @@ system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)
 
 def exact(t, q0, v0, params):
     """The swing by Jacobi's functions, while the body does not turn over."""
-    moment = params["M"] * params["g"] * centre_distance(params)
+    moment = params["M"] * params["g"] * center_distance(params)
     return _exact.swinging(t, q0, v0, jnp.sqrt(moment / pivot_inertia(params)))
 
 
@@ -108,9 +108,9 @@ entry = Entry(
         duration=6.0,
     ),
     extras={
-        "l": lambda t, q, v, a, params: centre_distance(params),
+        "l": lambda t, q, v, a, params: center_distance(params),
         "I_pivot": lambda t, q, v, a, params: pivot_inertia(params),
-        "T_origin_cm": kinetic_from_centre,
+        "T_origin_cm": kinetic_from_center,
     },
     exact=exact,
 )

@@ -7,7 +7,7 @@ T from eq. 2.16). Gravity and the drive torque are additions: the book stops at 
            |             /
            |   theta    /
            |          _/__
-           |         /  / \    body: M; A, B, C; mass centre (xb, yb, zb)
+           |         /  / \    body: M; A, B, C; mass center (xb, yb, zb)
            |        (  /   )       phi, spin about Z
            |         \/___/
            |         /
@@ -23,8 +23,8 @@ Coordinates
 
 Parameters
     M            mass of the body [kg]
-    A, B, C      principal inertias about the mass centre, along the body axes X, Y, Z [kg m^2]
-    xb, yb, zb   mass centre from O in body axes [m]; O is the crossing of shaft and vertical
+    A, B, C      principal inertias about the mass center, along the body axes X, Y, Z [kg m^2]
+    xb, yb, zb   mass center from O in body axes [m]; O is the crossing of shaft and vertical
     theta        tilt of the shaft from the vertical [rad], constant
     g            gravity [m/s^2]
     tau          torque on the frame about the vertical [N m], constant

@@ -46,9 +46,9 @@ def kinetic(t, q, v, params):
     m2, length = params["m2"], params["l"]
     _, theta = q
     x_rate, w = v
-    centre_squared = x_rate**2 + 0.25 * (length * w) ** 2 + length * x_rate * w * jnp.cos(theta)
+    center_squared = x_rate**2 + 0.25 * (length * w) ** 2 + length * x_rate * w * jnp.cos(theta)
     cart = 0.5 * params["m1"] * x_rate**2
-    return cart + 0.5 * m2 * centre_squared + 0.5 * (m2 * length**2 / 12) * w**2
+    return cart + 0.5 * m2 * center_squared + 0.5 * (m2 * length**2 / 12) * w**2
 
 
 def potential(t, q, params):

@@ -1,4 +1,4 @@
-r"""Particle under a central force: an attracting centre and a spring to it.
+r"""Particle under a central force: an attracting center and a spring to it.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 19; the book leaves V(r) general,
 here V(r) = -K/r + c r^2/2.
@@ -9,10 +9,10 @@ here V(r) = -K/r + c r^2/2.
             .
          .  )  phi
         +------------------- fixed axis
-     centre
+     center
 
 Coordinates
-    r     distance from the centre [m], positive
+    r     distance from the center [m], positive
     phi   angle of the radius from a fixed axis [rad], positive counterclockwise
 
 Parameters

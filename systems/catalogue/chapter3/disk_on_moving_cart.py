@@ -4,7 +4,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 12 (Fig. 3.22, eqs. 
 
            K1
           o\/\/\._
-    |/|   |'.     (_)--> F1 cos(Omega t), at the centre of the disk m, R
+    |/|   |'.     (_)--> F1 cos(Omega t), at the center of the disk m, R
     |/| K2|  '.     '.
     |/|/\/|    '.     'x1
     |/|-[=|  m0  '._ theta
@@ -13,7 +13,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 12 (Fig. 3.22, eqs. 
 
 Coordinates
     X       displacement of the cart to the right, zero with K2 unstretched [m]
-    x1      displacement of the disk's centre down the slope, relative to the cart, from
+    x1      displacement of the disk's center down the slope, relative to the cart, from
             its static position [m], where K1 holds the disk: K1 x_static = m g sin(theta)
 
 Parameters
@@ -22,7 +22,7 @@ Parameters
     theta   slope against the horizontal [rad], falling to the right, constant
     K1      spring between disk and cart [N/m]
     K2, b   spring [N/m] and damper [N s/m] between cart and wall
-    F1      amplitude of the horizontal force on the disk's centre [N]
+    F1      amplitude of the horizontal force on the disk's center [N]
     Omega   its angular frequency [rad/s]
     g       gravity [m/s^2]
 
@@ -47,8 +47,8 @@ from systems.catalogue import _exact
 from systems.catalogue._entry import Entry, Example
 
 
-def disk_centre(t, q, params):
-    """Centre of the disk, to the right and upward [m], from its static position at X = 0."""
+def disk_center(t, q, params):
+    """Center of the disk, to the right and upward [m], from its static position at X = 0."""
     X, x1 = q
     slope = params["theta"]
     return jnp.stack([X + x1 * jnp.cos(slope), -x1 * jnp.sin(slope)])
@@ -58,7 +58,7 @@ def kinetic(t, q, v, params):
     """T of the cart and of the rolling disk [J]."""
     cart = 0.5 * params["m0"] * v[0] ** 2
     rolling = 0.25 * params["m"] * v[1] ** 2
-    return cart + energy.particles(disk_centre, params["m"], t, q, v, params) + rolling
+    return cart + energy.particles(disk_center, params["m"], t, q, v, params) + rolling
 
 
 def potential(t, q, params):
@@ -91,7 +91,7 @@ system = jl.System(
     coordinates=("X", "x1"),
     kinetic=kinetic,
     potential=potential,
-    forces=(jl.PointForce(disk_centre, drive, "drive"), jl.Rayleigh(dissipation, "damper")),
+    forces=(jl.PointForce(disk_center, drive, "drive"), jl.Rayleigh(dissipation, "damper")),
 )
 
 

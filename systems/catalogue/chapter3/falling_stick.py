@@ -14,7 +14,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 17 (Fig. 3.31, eqs. 
               | N
 
 Coordinates
-    x_c     horizontal position of the mass centre G [m]
+    x_c     horizontal position of the mass center G [m]
     theta   angle of the stick from the ground [rad], 0 lying, pi/2 upright
 
 Parameters
@@ -40,21 +40,21 @@ from jaxlag import energy
 from systems.catalogue._entry import Entry, Example
 
 
-def centre(t, q, params):
-    """Mass centre, to the right and upward [m]."""
+def center(t, q, params):
+    """Mass center, to the right and upward [m]."""
     x_c, theta = q
     return jnp.stack([x_c, 0.5 * params["L"] * jnp.sin(theta)])
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the turn about it [J]."""
+    """T of the mass center and of the turn about it [J]."""
     IG = params["m"] * params["L"] ** 2 / 12
-    return energy.particles(centre, params["m"], t, q, v, params) + 0.5 * IG * v[1] ** 2
+    return energy.particles(center, params["m"], t, q, v, params) + 0.5 * IG * v[1] ** 2
 
 
 def potential(t, q, params):
     """V = m g (L/2) sin(theta) [J], zero on the ground."""
-    return energy.gravity(params["m"], centre(t, q, params), jnp.array([0.0, -params["g"]]))
+    return energy.gravity(params["m"], center(t, q, params), jnp.array([0.0, -params["g"]]))
 
 
 def normal_force(t, q, v, a, params):

@@ -15,7 +15,7 @@ moment of the friction that the book leaves out).
     slides    |
 
 Coordinates
-    x_c, y_c   position of the mass centre G, y upward [m]
+    x_c, y_c   position of the mass center G, y upward [m]
     theta      angle of the stick from the ground [rad], 0 lying, pi/2 upright
 
 Parameters
@@ -75,7 +75,7 @@ def sliding_velocity(t, q, v, a, params):
 
 def on_ground(t, q, params):
     """(x_c, y_c, theta) of the stick on the ground, from (x_c, theta)."""
-    return jnp.concatenate([falling_stick.centre(t, q, params), q[1:]])
+    return jnp.concatenate([falling_stick.center(t, q, params), q[1:]])
 
 
 system = jl.System(

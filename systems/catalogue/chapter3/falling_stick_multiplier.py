@@ -14,7 +14,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 17 (Fig. 3.31).
               | N
 
 Coordinates
-    x_c, y_c   position of the mass centre G, y upward [m]
+    x_c, y_c   position of the mass center G, y upward [m]
     theta      angle of the stick from the ground [rad], 0 lying, pi/2 upright
 
 Parameters
@@ -37,7 +37,7 @@ from systems.catalogue._entry import Entry, Example
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the turn about it [J]."""
+    """T of the mass center and of the turn about it [J]."""
     x_rate, y_rate, w = v
     IG = params["m"] * params["L"] ** 2 / 12
     return 0.5 * params["m"] * (x_rate**2 + y_rate**2) + 0.5 * IG * w**2

@@ -1,4 +1,4 @@
-r"""Hockey puck on smooth ice, pushed off its centre by a force that turns with it.
+r"""Hockey puck on smooth ice, pushed off its center by a force that turns with it.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 3, secs. 3.11-3.12 (Figs. 3.25-3.28,
 eqs. 3.161-3.168).
@@ -14,7 +14,7 @@ eqs. 3.161-3.168).
 
 Coordinates
     theta   turn of the puck [rad], positive counterclockwise from above
-    x, y    its centre G in the plane of the ice [m]
+    x, y    its center G in the plane of the ice [m]
 
 Parameters
     M       mass [kg]

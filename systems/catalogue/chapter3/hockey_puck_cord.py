@@ -14,7 +14,7 @@ eqs. 3.161-3.162 and 3.167-3.168).
 
 Coordinates
     theta   turn of the puck [rad], positive counterclockwise from above
-    x, y    its centre G in the plane of the ice [m]
+    x, y    its center G in the plane of the ice [m]
 
 Parameters
     M       mass [kg]

@@ -5,7 +5,7 @@ stops at the constraint; masses, slope and drives are additions.
 
        Y ^        j      i, along the edge
          |         \   /
-         |          \ /   G   mass centre, a ahead of A
+         |          \ /   G   mass center, a ahead of A
          |         / A    m, I
          |        /    theta
          |      edge
@@ -17,7 +17,7 @@ Coordinates
 
 Parameters
     m          mass [kg]
-    I          inertia about the mass centre G [kg m^2]
+    I          inertia about the mass center G [kg m^2]
     a          distance of G ahead of A [m]; 0 in the simplest reading of the book
     g          gravity [m/s^2]
     beta       slope of the plane [rad]
@@ -46,8 +46,8 @@ def edge(t, q, params):
     return q[:2]
 
 
-def centre(t, q, params):
-    """Position of the mass centre G [m]."""
+def center(t, q, params):
+    """Position of the mass center G [m]."""
     return q[:2] + params["a"] * forward(q)
 
 
@@ -57,15 +57,15 @@ def forward(q):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the turn about it [J]."""
-    moving = energy.particles(centre, params["m"], t, q, v, params)
+    """T of the mass center and of the turn about it [J]."""
+    moving = energy.particles(center, params["m"], t, q, v, params)
     return moving + 0.5 * params["I"] * v[2] ** 2
 
 
 def potential(t, q, params):
     """V = -m g sin(beta) (X + a cos(theta)) [J]."""
     downhill = params["g"] * jnp.sin(params["beta"]) * jnp.array([1.0, 0.0])
-    return energy.gravity(params["m"], centre(t, q, params), downhill)
+    return energy.gravity(params["m"], center(t, q, params), downhill)
 
 
 def drive(t, q, v, params):

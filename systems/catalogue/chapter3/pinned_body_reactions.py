@@ -13,7 +13,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 15 (Fig. 3.29, eqs. 
                   v  M g
 
 Coordinates
-    x, y    position of the mass centre G from the pin, to the right and upward [m]
+    x, y    position of the mass center G from the pin, to the right and upward [m]
     theta   angle of the line A-G from the downward vertical [rad], positive
             counterclockwise (G to the right)
 

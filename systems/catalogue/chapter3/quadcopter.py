@@ -11,7 +11,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, Example 5 (Fig. 3.10, eqs. 3
                         (3)
 
 Coordinates
-    X, Y, Z           mass centre G [m], Z upward
+    X, Y, Z           mass center G [m], Z upward
     psi, theta, phi   yaw, pitch, roll [rad]: R = Rz(psi) Ry(theta) Rx(phi)    (3.81)
 
 Parameters
@@ -56,7 +56,7 @@ def angular_velocity(t, q, v, params):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the rotation [J] (3.79)."""
+    """T of the mass center and of the rotation [J] (3.79)."""
     omega = angular_velocity(t, q, v, params)
     inertia = jnp.array([params["Ix"], params["Iy"], params["Iz"]])
     return 0.5 * params["m"] * v[:3] @ v[:3] + 0.5 * inertia @ omega**2
@@ -67,8 +67,8 @@ def potential(t, q, params):
     return params["m"] * params["g"] * q[2]
 
 
-def centre(t, q, params):
-    """Position of the mass centre [m]."""
+def center(t, q, params):
+    """Position of the mass center [m]."""
     return q[:3]
 
 
@@ -123,7 +123,7 @@ system = jl.System(
     kinetic=kinetic,
     potential=potential,
     forces=(
-        jl.PointForce(centre, thrust_force, "thrust"),
+        jl.PointForce(center, thrust_force, "thrust"),
         jl.Torque(angular_velocity, torque, "rotor torque"),
     ),
 )

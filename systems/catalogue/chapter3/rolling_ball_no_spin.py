@@ -4,21 +4,21 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 3, sec. 3.1 (Fig. 3.5). The boo
 constraints; inertia and drive are additions.
 
        Y ^       .---.
-         |     .       .    centre at (x, y), R above the plane
+         |     .       .    center at (x, y), R above the plane
          |    (    +----)--> (Fx0 cos(Omega t), Fy0 sin(Omega t))
          |     .       .
          |       '---'      turned by yaw psi, pitch theta, roll phi
          +--------------------> X
 
 Coordinates
-    x, y              centre of the ball [m]
+    x, y              center of the ball [m]
     psi, theta, phi   yaw, pitch, roll [rad]: Rz(psi) Ry(theta) Rx(phi)    (3.81)
 
 Parameters
     m                 mass [kg]
     R                 radius [m]
-    I                 inertia about any axis through the centre [kg m^2]
-    Fx0, Fy0          amplitudes of the force at the centre along X, Y [N]
+    I                 inertia about any axis through the center [kg m^2]
+    Fx0, Fy0          amplitudes of the force at the center along X, Y [N]
     Omega             its angular frequency [rad/s]
 
     omega_X = phi' cos(theta) cos(psi) - theta' sin(psi)
@@ -51,7 +51,7 @@ def angular_velocity(q, v):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the rotation [J]."""
+    """T of the mass center and of the rotation [J]."""
     omega = angular_velocity(q, v)
     return 0.5 * params["m"] * v[:2] @ v[:2] + 0.5 * params["I"] * omega @ omega
 
@@ -61,8 +61,8 @@ def potential(t, q, params):
     return jnp.zeros_like(q[0])
 
 
-def centre(t, q, params):
-    """Position of the centre in the plane [m]."""
+def center(t, q, params):
+    """Position of the center in the plane [m]."""
     return q[:2]
 
 
@@ -87,7 +87,7 @@ system = jl.System(
     coordinates=("x", "y", "psi", "theta", "phi"),
     kinetic=kinetic,
     potential=potential,
-    forces=(jl.PointForce(centre, drive, "drive"),),
+    forces=(jl.PointForce(center, drive, "drive"),),
     constraints=(jl.Pfaffian(slip_and_spin, ("rolling_x", "rolling_y", "no_spin")),),
 )
 

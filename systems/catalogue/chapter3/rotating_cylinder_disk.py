@@ -18,7 +18,7 @@ Coordinates
 
 Parameters
     m1, l    rod: mass [kg], length [m]
-    m2       mass of the disk [kg], its centre at the end of the rod
+    m2       mass of the disk [kg], its center at the end of the rod
     Iy, Iz   its central inertia about the rod and across it [kg m^2]
     tau_z0   amplitude of the torque on the rod about the vertical [N m]
     tau_b    torque on the spin [N m], constant

@@ -9,20 +9,20 @@ eqs. 3.93-3.100 and 3.158-3.160).
         | \     from A to the upper end of the sleeve
         |  /
         |  \\\
-        |   \\\  sleeve M2, length L2, mass centre at x1 from A
+        |   \\\  sleeve M2, length L2, mass center at x1 from A
         |    \\\
         |      \ --> F0 cos(omega t), horizontal, at its lower end
         |       \
      theta       \  rod M1, length L1
 
 Coordinates
-    x1      distance of the sleeve's mass centre from the hinge A along the rod [m]
+    x1      distance of the sleeve's mass center from the hinge A along the rod [m]
     theta   angle of the rod from the downward vertical [rad], positive
             counterclockwise (rod to the right)
 
 Parameters
     M1, IA, L1   rod: mass [kg], inertia about A [kg m^2], length [m]
-    M2, IG, L2   sleeve: mass [kg], inertia about its mass centre [kg m^2], length [m]
+    M2, IG, L2   sleeve: mass [kg], inertia about its mass center [kg m^2], length [m]
     k, L0        spring: stiffness [N/m], unstretched length [m];
                  its stretch is x1 - L0 - L2/2
     F0, omega    force: amplitude [N], to the right, angular frequency [rad/s]

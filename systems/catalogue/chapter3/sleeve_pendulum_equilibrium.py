@@ -8,12 +8,12 @@ eq. 3.100).
         \     spring k, unstretched length L0,
         /     from A to the upper end of the sleeve
         |
-       |||    sleeve M2, length L2, mass centre at x1 from A
+       |||    sleeve M2, length L2, mass center at x1 from A
        |||
         |     rod M1, length L1, hanging at theta = 0
 
 Coordinates
-    x1      distance of the sleeve's mass centre from the hinge A along the rod [m]
+    x1      distance of the sleeve's mass center from the hinge A along the rod [m]
     theta   angle of the rod from the downward vertical [rad]
 
 Parameters

@@ -18,7 +18,7 @@ Coordinate
 
 Parameters
     M       mass [kg]
-    IG      inertia about the mass centre G [kg m^2]
+    IG      inertia about the mass center G [kg m^2]
     L       distance from the pin A to G [m]
     g       gravity [m/s^2]
 
@@ -51,10 +51,10 @@ def potential(t, q, params):
 def pin_reaction(t, q, v, a, params):
     """(Rx, Ry) on the body, to the right and upward [N]."""
     c, s = jnp.cos(q[0]), jnp.sin(q[0])
-    centre_acceleration = params["L"] * jnp.stack(
+    center_acceleration = params["L"] * jnp.stack(
         [a[0] * c - v[0] ** 2 * s, a[0] * s + v[0] ** 2 * c]
     )
-    return params["M"] * (centre_acceleration + jnp.array([0.0, params["g"]]))
+    return params["M"] * (center_acceleration + jnp.array([0.0, params["g"]]))
 
 
 system = jl.System(coordinates=("theta",), kinetic=kinetic, potential=potential)

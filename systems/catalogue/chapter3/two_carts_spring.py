@@ -22,7 +22,7 @@ Parameters
     m1 x1'' = k (x2 - x1 - l0) + F1
     m2 x2'' = -k (x2 - x1 - l0)
 
-The mass centre accelerates at F1/(m1 + m2), so m1 x1' + m2 x2' - F1 t stays constant. Misprint:
+The mass center accelerates at F1/(m1 + m2), so m1 x1' + m2 x2' - F1 t stays constant. Misprint:
 the parentheses of V are not balanced.
 """
 
@@ -63,18 +63,18 @@ system = jl.System(
 
 
 def exact(t, q0, v0, params):
-    """The mass centre under a constant push, and the carts swinging about it."""
+    """The mass center under a constant push, and the carts swinging about it."""
     m1, m2, k, F1 = params["m1"], params["m2"], params["k"], params["F1"]
     total = m1 + m2
     weights = jnp.stack([m1, m2]) / total
-    centre, speed = _exact.accelerated(t, weights @ q0, weights @ v0, F1 / total)
+    center, speed = _exact.accelerated(t, weights @ q0, weights @ v0, F1 / total)
     w = jnp.sqrt(k * total / (m1 * m2))
     rest = params["l0"] - F1 / (m1 * w**2)
     stretch, rate = q0[1] - q0[0] - rest, v0[1] - v0[0]
     c, s = jnp.cos(w * t), jnp.sin(w * t)
     apart, opening = rest + stretch * c + rate / w * s, rate * c - stretch * w * s
     shares = jnp.stack([-m2, m1]) / total
-    return centre + shares * apart, speed + shares * opening
+    return center + shares * apart, speed + shares * opening
 
 
 entry = Entry(

@@ -29,7 +29,7 @@ Parameters
     Iy wy' + (Ix - Iz) wx wz = t2 cos(nu t) - c wy
     Iz wz' + (Iy - Ix) wx wy = t3 - c wz
 
-O is the mass centre or a fixed point. The rates do not determine phi' and psi' at
+O is the mass center or a fixed point. The rates do not determine phi' and psi' at
 theta = +-pi/2.
 
 Misprint: the second and third line of 4.141 have the rate of the first component; it is that of

@@ -11,7 +11,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.5, Example 6 (eqs. 4.
                         (3)
 
 Coordinates
-    X, Y, Z              mass centre G [m], Z downward
+    X, Y, Z              mass center G [m], Z downward
     phi, theta, psi      roll, pitch, yaw [rad]: Rz(psi) Ry(theta) Rx(phi)
 
 Quasi-velocities
@@ -63,8 +63,8 @@ def potential(t, q, params):
     return -params["m"] * params["g"] * q[2]
 
 
-def centre(t, q, params):
-    """Position of the mass centre [m]."""
+def center(t, q, params):
+    """Position of the mass center [m]."""
     return q[:3]
 
 
@@ -98,7 +98,7 @@ system = jl.System(
     kinetic=kinetic,
     potential=potential,
     forces=(
-        jl.PointForce(centre, thrust, "thrust"),
+        jl.PointForce(center, thrust, "thrust"),
         jl.Torque(_attitude.angular_velocity, rotor_torque, "rotor torque"),
         jl.Torque(_attitude.angular_velocity, gyroscopic_torque, "gyroscopic torque"),
     ),

@@ -1,4 +1,4 @@
-r"""Rigid aircraft in body axes whose origin is not its mass centre.
+r"""Rigid aircraft in body axes whose origin is not its mass center.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.5, Example 5 (eqs. 4.172-4.197).
 
@@ -7,7 +7,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.5, Example 5 (eqs. 4.
         _            _\ \_________ /
        | \__________/        O    `--.
        |______________ + ___/ \______.'      O  origin of the body axes
-                     / / G     y    v, q     G  mass centre at (xc, yc, zc)
+                     / / G     y    v, q     G  mass center at (xc, yc, zc)
                     /_/
                                 z    w, r    X, Y level, Z down
 
@@ -22,7 +22,7 @@ Quasi-velocities
 Parameters
     m                    mass [kg]
     g                    gravity [m/s^2]
-    xc, yc, zc           mass centre from O, body components rc [m]
+    xc, yc, zc           mass center from O, body components rc [m]
     Ix, Iy, Iz           moments of inertia about O [kg m^2]
     Ixy, Ixz, Iyz        products of inertia about O, integrals of xy, xz, yz dm [kg m^2]
     Fx, Fy, Fz           force at O along the body axes [N], constant
@@ -38,7 +38,7 @@ The rates do not determine phi' and psi' at theta = +-pi/2.
 Errors in the book: the term m V.(omega x rc) has the wrong sign in 4.172-4.175, 4.180 and 4.186
 (2.16 has the right one), and with it the terms in rc of 4.181-4.184 and 4.188-4.197. 4.197 lacks
 V x dT/dV, which 4.170 takes to be zero: the equations as printed lose or gain energy without any
-force. Its -rc x F must be +rc x F, and belongs there only for a force at the mass centre. The
+force. Its -rc x F must be +rc x F, and belongs there only for a force at the mass center. The
 potential of 4.178 and 4.187 leaves out the height of O; the last element of the inertia matrix
 after 4.175 is +Iz.
 """
@@ -57,11 +57,11 @@ def pose(t, q, params):
 
 
 def body(params):
-    """Mass, inertia about O and mass centre."""
+    """Mass, inertia about O and mass center."""
     moments = (params["Ix"], params["Iy"], params["Iz"])
     products = (params["Ixy"], params["Ixz"], params["Iyz"])
-    centre = jnp.stack([params["xc"], params["yc"], params["zc"]])
-    return energy.RigidBody(params["m"], energy.inertia_matrix(*moments, *products), centre)
+    center = jnp.stack([params["xc"], params["yc"], params["zc"]])
+    return energy.RigidBody(params["m"], energy.inertia_matrix(*moments, *products), center)
 
 
 def kinetic(t, q, u, params):

@@ -1,4 +1,4 @@
-r"""Rigid body that turns about its mass centre, in body rates.
+r"""Rigid body that turns about its mass center, in body rates.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 1 (eqs. 4.59-4.70).
 

@@ -6,7 +6,7 @@ kinetic energy is that of a rigid body with a fork, not the book's.
     Y ^                    / phi
       |              _ . (/)  front wheel, driven along itself by F_v
       |         _ .-'  l
-      |    |.-' G            G  mass centre, d ahead of the rear axle
+      |    |.-' G            G  mass center, d ahead of the rear axle
       |   _|_- - - theta
       |    |  (x, y)
       +------------------------> X
@@ -66,8 +66,8 @@ def across(angle):
     return jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
 
 
-def centre(t, q, params):
-    """Position of the mass centre [m]."""
+def center(t, q, params):
+    """Position of the mass center [m]."""
     return q[:2] + params["d"] * ahead(q[2])
 
 
@@ -77,8 +77,8 @@ def front(t, q, params):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre, of the body's turn and of the fork's [J]."""
-    moving = energy.particles(centre, params["m"], t, q, v, params)
+    """T of the mass center, of the body's turn and of the fork's [J]."""
+    moving = energy.particles(center, params["m"], t, q, v, params)
     turning = 0.5 * params["I_body"] * v[2] ** 2
     return moving + turning + 0.5 * params["I_steer"] * (v[2] + v[3]) ** 2
 

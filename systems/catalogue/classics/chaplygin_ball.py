@@ -6,13 +6,13 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 2.
        Z ^        .---.
          |      .       .     m, a; I1, I2, I3 about the body axes x, y, z
          |     (    o    )
-         |      .       .     mass centre at the centre, above (x, y)
+         |      .       .     mass center at the center, above (x, y)
          |        '---'
          +----------o-----------> X, Y
                  contact
 
 Coordinates
-    x, y              centre of the ball [m]
+    x, y              center of the ball [m]
     phi, theta, psi   roll, pitch, yaw of the ball [rad]: Rz(psi) Ry(theta) Rx(phi)
 
 Quasi-velocities
@@ -52,7 +52,7 @@ def inertia(params):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the rotation [J]."""
+    """T of the mass center and of the rotation [J]."""
     rates = angular_velocity(t, q, v, params)
     return 0.5 * params["m"] * v[:2] @ v[:2] + 0.5 * inertia(params) @ rates**2
 

@@ -6,7 +6,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 2.
 
        y ^        v_n     v
          |          \    /  along the blade
-         |           \  /  G   mass centre, a ahead of the blade
+         |           \  /  G   mass center, a ahead of the blade
          |         blade     m, I
          |           /  theta
          +--------------------> x
@@ -22,7 +22,7 @@ Quasi-velocities
 
 Parameters
     m          mass [kg]
-    I          inertia about the mass centre G [kg m^2]
+    I          inertia about the mass center G [kg m^2]
     a          distance of G ahead of the blade [m]
 
     T = 1/2 m |velocity of G|^2 + 1/2 I theta'^2      V = 0
@@ -47,14 +47,14 @@ def ahead(q):
     return jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
 
 
-def centre(t, q, params):
-    """Position of the mass centre [m]."""
+def center(t, q, params):
+    """Position of the mass center [m]."""
     return q[:2] + params["a"] * ahead(q)
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the turn about it [J]."""
-    moving = energy.particles(centre, params["m"], t, q, v, params)
+    """T of the mass center and of the turn about it [J]."""
+    moving = energy.particles(center, params["m"], t, q, v, params)
     return moving + 0.5 * params["I"] * v[2] ** 2
 
 

@@ -7,7 +7,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 1.
            |        _    /   \ .  axis of the top: e3, spin psi
            |     .'     /  G  \
            |   .'       \   .'
-           |           . '-'           G  mass centre, l from O
+           |           . '-'           G  mass center, l from O
            |       . '  l
            | . '                       e1  horizontal, normal to Z and the axis
            O--------------> X          e2 = e3 x e1
@@ -21,7 +21,7 @@ Quasi-velocities
 Parameters
     m                 mass [kg]
     g                 gravity [m/s^2]
-    l                 distance of the mass centre from O [m]
+    l                 distance of the mass center from O [m]
     I1                inertia about O across the axis [kg m^2]
     I3                inertia about the axis [kg m^2]
 

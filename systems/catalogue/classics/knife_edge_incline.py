@@ -1,4 +1,4 @@
-r"""Knife edge on an inclined plane, its mass centre above the edge.
+r"""Knife edge on an inclined plane, its mass center above the edge.
 
 Not in the book; Bloch, Nonholonomic Mechanics and Control (2003), ch. 1. The quasi-velocities are
 declared as in

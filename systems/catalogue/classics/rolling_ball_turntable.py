@@ -13,7 +13,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 2.
          +--------------------> x, downhill where the table is tilted by alpha
 
 Coordinates
-    x, y              centre of the ball [m]
+    x, y              center of the ball [m]
     phi, theta, psi   roll, pitch, yaw of the ball [rad]: Rz(psi) Ry(theta) Rx(phi)
 
 Quasi-velocities
@@ -23,7 +23,7 @@ Quasi-velocities
 Parameters
     m                 mass [kg]
     a                 radius [m]
-    I                 inertia about any axis through the centre [kg m^2]
+    I                 inertia about any axis through the center [kg m^2]
     Omega             rate of the table [rad/s]
     g                 gravity [m/s^2]
     alpha             tilt of the table [rad]
@@ -54,7 +54,7 @@ def angular_velocity(t, q, v, params):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the rotation [J]."""
+    """T of the mass center and of the rotation [J]."""
     omega = angular_velocity(t, q, v, params)
     return 0.5 * params["m"] * v[:2] @ v[:2] + 0.5 * params["I"] * omega @ omega
 

@@ -13,7 +13,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 2.
            +----------------------> x, y
 
 Coordinates
-    x, y         position of the centre over the plane [m]; its height is R sin(theta)
+    x, y         position of the center over the plane [m]; its height is R sin(theta)
     psi          heading of the horizontal diameter from x [rad]
     theta        angle between disk and plane [rad], pi/2 for the upright disk
     phi          spin about the axle [rad]
@@ -55,7 +55,7 @@ def angular_velocity(t, q, v, params):
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre and of the rotation [J]."""
+    """T of the mass center and of the rotation [J]."""
     w1, w2, w3 = angular_velocity(t, q, v, params)
     rise = params["R"] * jnp.cos(q[3]) * v[3]
     moving = 0.5 * params["m"] * (v[0] ** 2 + v[1] ** 2 + rise**2)

@@ -13,7 +13,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 2.
          +------------------------> x
 
 Coordinates
-    x, y         centre of the board [m]
+    x, y         center of the board [m]
     theta        direction of the board from x [rad]
     psi          angle of the rotor from the board [rad]
     phi          front wheels from the board [rad]; the back ones stand at -phi

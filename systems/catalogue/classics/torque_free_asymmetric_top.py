@@ -7,7 +7,7 @@ Pila, "Introduction to Lagrangian Dynamics", ch. 4, sec. 4.3, Example 1.
              /               /|
             /_______________/ |      x, y, z    principal axes
             |               | |
-            |       G       | /      turns about the mass centre G
+            |       G       | /      turns about the mass center G
             |_______________|/
 
 Coordinates

@@ -46,7 +46,7 @@ from systems.catalogue._entry import Entry, Example
 
 
 def kinetic(t, q, v, params):
-    """T of the mass centre, of the roll and of the turn [J]."""
+    """T of the mass center, of the roll and of the turn [J]."""
     moving = 0.5 * params["m"] * v[:2] @ v[:2]
     return moving + 0.5 * params["I"] * v[2] ** 2 + 0.5 * params["J"] * v[3] ** 2
 
