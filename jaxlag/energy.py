@@ -91,7 +91,7 @@ def particles(
         params: passed to `position`.
 
     Raises:
-        ValueError: positions are not vectors, masses not one for each of them; as `velocity`.
+        ValueError: positions are not vectors, or the number of masses differs; as `velocity`.
     """
     rates = velocity(position, t, q, v, params)
     if rates.ndim not in (1, 2):

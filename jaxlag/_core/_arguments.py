@@ -67,7 +67,7 @@ def required(**fixes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator that raises with a message if required arguments are left out.
 
     Args:
-        **fixes: by the argument's name, what to write.
+        **fixes: by the argument's name, the code to write.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:

@@ -163,7 +163,7 @@ def _together(names: tuple[str, ...], row: np.ndarray) -> str:
     return "change together without a trace: " + ", ".join(f"{n} by {x:+.3g} %" for n, x in moved)
 
 
-# ---- The linear problem where a search ended, states eliminated ----------------------------------
+# ---- The linear problem at the end of a search, states eliminated --------------------------------
 
 
 REGULARIZATION = 1e-20

@@ -32,7 +32,7 @@ def rms_of(residuals: Sequence[Mapping[str, np.ndarray]], channel: str) -> Float
     return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-# ---- What a motion shows of a name that was measured ---------------------------------------------
+# ---- Channels of a motion by name ----------------------------------------------------------------
 
 
 Reader = Callable[[Solution], Array]

@@ -106,7 +106,7 @@ class _OfTime(eqx.Module):
 
 
 class _OfState(eqx.Module):
-    """The same for functions some of which read the state, u(t, q, v, params)."""
+    """The same for functions that may read the state, u(t, q, v, params)."""
 
     name: str = eqx.field(static=True)
     which: Int[Array, ""]

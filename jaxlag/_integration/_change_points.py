@@ -361,7 +361,7 @@ def same_sense(
         y0: state at its start.
         y1: state at its end.
         args: arguments of the step.
-        turn: h dy/dt at the start less that at the end; None where it is not known.
+        turn: h dy/dt at the start minus that at the end; None if it is unknown.
     """
     columns, m = dynamics.projector(t0, y0, args).columns, dynamics.rows.size
     assert columns is not None

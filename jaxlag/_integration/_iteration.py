@@ -111,7 +111,7 @@ def iterate(loop: Loop, c: LoopState) -> LoopState:
     return advance(loop, c, aim, step._replace(settled=settled), across, keep_step, *following)
 
 
-# ---- Where does the step end --------------------------------------------------------------------
+# ---- Aim ----------------------------------------------------------------------------------------
 
 
 def aimed(loop: Loop, c: LoopState) -> Aim:
@@ -303,7 +303,7 @@ def failure_of(loop: Loop, aim: Aim, step: Attempt, smooth: Array) -> Array:
     return status
 
 
-# ---- Save and go on -----------------------------------------------------------------------------
+# ---- Save and advance ---------------------------------------------------------------------------
 
 
 def saved_on(

@@ -59,7 +59,7 @@ def integrate(
         args: passed to the vector field, after `stepper.windows`.
         times: anchors and save times.
         first_step: the fixed step without a controller; else the first step, None for automatic.
-        allowed: False where the trajectory must not start (status set by the caller).
+        allowed: False if the trajectory must not start (status set by the caller).
         max_steps: bound on attempted steps.
         record: whether to record the steps so that they can be repeated.
         room: capacity for states on the way, an even number. When it is full, every second state is

@@ -238,7 +238,7 @@ def solve_kkt(
     def solve(_: object, right: Array) -> Array:
         return jnp.concatenate(factor.solve(rows, right[:n], right[n:]))
 
-    # One vector: pairs meet symbolic zeros that JAX's rule does not take.
+    # One vector: pairs could contain symbolic zeros, which JAX's rule does not accept.
     z = jax.lax.custom_linear_solve(bordered, jnp.concatenate([r, c]), solve, symmetric=True)
     x, lam = z[:n], z[n:]
     fine = jnp.all(jnp.concatenate(factor.healthy))

@@ -18,12 +18,12 @@ from jaxlag._tracing import _params
 
 
 class State(NamedTuple):
-    """One state and what the equations read there.
+    """One state and the values that the equations read there.
 
     Attributes:
         t: time, s.
         q: coordinates, m or rad.
-        w: velocities, or the quasi-velocities that the state is made of; m/s or rad/s.
+        w: velocities, or the quasi-velocities of the state; m/s or rad/s.
         params: as the Lagrangian takes them.
         inputs: VALUES of the inputs there, by name.
     """
@@ -36,15 +36,15 @@ class State(NamedTuple):
 
 
 class Choices(NamedTuple):
-    """What is chosen once per solve.
+    """Choices made once per solve.
 
     Attributes:
-        sample: values of the params where these are traced.
-        kept: rows that states are projected by; None for all.
-        reacting: independent rows that imply the others, to solve accelerations with; None for all.
+        sample: values of the params if these are traced.
+        kept: rows for the projection of states; None for all.
+        reacting: independent rows that imply the others, for accelerations; None for all.
         time_direction: 1, or -1 backwards in time.
-        definite: function that says whether M is positive definite without the constraints, in all
-            lanes; None where that is known while tracing.
+        definite: function that returns whether M is positive definite without the constraints, in
+            all lanes; None if that is known while tracing.
     """
 
     sample: _params.Sample = _params.UNKNOWN
@@ -58,11 +58,11 @@ AS_USUAL = Choices()
 
 
 class AccelerationProgram(eqx.Module):
-    """What a solver evaluates in its loop: accelerations, and projections onto the constraints.
+    """The functions that a solver evaluates in its loop: accelerations and projections.
 
     M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
 
-    All programs agree to round-off. `constants` are what `precompute` returned for the same params.
+    All programs agree to rounding. `constants` are the result of `precompute` for the same params.
 
     Attributes:
         array: the terms of these equations, on arrays.
@@ -74,16 +74,16 @@ class AccelerationProgram(eqx.Module):
     def precompute(
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices = AS_USUAL
     ) -> Any:
-        """What the other methods need of what depends on params alone, once per solve.
+        """Values that depend on params alone, for the other methods, once per solve.
 
-        Of q and the inputs' values only shapes and dtypes matter.
+        Only shapes and dtypes of q and of the inputs' values are used.
         """
 
     @abstractmethod
     def acceleration(
         self, state: State, constants: Any = None, reacting: RowChoice | None = None
     ) -> Float[Array, " n"]:
-        """a, with one factorization; NaN where M is not positive definite where A a = 0."""
+        """a, with one factorization; NaN if M is not positive definite on A a = 0."""
 
     @abstractmethod
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
@@ -91,45 +91,45 @@ class AccelerationProgram(eqx.Module):
 
     @abstractmethod
     def velocities(self, state: State, constants: Any) -> Float[Array, " n"]:
-        """v of a state; of quasi-velocities v = B u + c."""
+        """v of a state; from quasi-velocities v = B u + c."""
 
     @abstractmethod
     def determinants(self, state: State, constants: Any) -> Float[Array, " b"]:
-        """What is 0 or infinite where quasi-velocities are singular; none where nothing changes."""
+        """Determinants that are 0 or infinite at singular quasi-velocities, if not constant."""
 
     @abstractmethod
     def multipliers(
         self, state: State, constants: Any, reacting: RowChoice | None = None
     ) -> Float[Array, " m"]:
-        """The multipliers as forces see them."""
+        """The multipliers as forces read them."""
 
     @abstractmethod
     def projector(
         self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
     ) -> ConstraintProjector:
-        """The projection onto the constraints near a state; of quasi-velocities onto positions."""
+        """The projection onto the constraints near a state; of positions with quasi-velocities."""
 
     def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
-        """Lines of the scalar program of accelerations; None where there is none."""
+        """Number of lines of the scalar program of accelerations; None if there is none."""
         return None
 
 
 @final
 class ArrayProgram(AccelerationProgram):
-    """Accelerations by the terms on arrays themselves."""
+    """Accelerations directly from the terms on arrays."""
 
     array: ArrayTerms
 
     def precompute(
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices = AS_USUAL
     ) -> Any:
-        """M and its factor where M depends on params alone."""
+        """M and its factor if M depends on params alone."""
         return self.array.precompute(q, params, choices.time_direction)
 
     def acceleration(
         self, state: State, constants: Any = None, reacting: RowChoice | None = None
     ) -> Float[Array, " n"]:
-        """Solve M a = Q - h, under constraints with their rows."""
+        """Solve M a = Q - h, with constraints together with their rows."""
         return self.array.acceleration(*state, constants, reacting)
 
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
@@ -138,12 +138,12 @@ class ArrayProgram(AccelerationProgram):
         return jnp.concatenate([moving.v, moving.accelerations()])
 
     def velocities(self, state: State, constants: Any) -> Float[Array, " n"]:
-        """By the solve of U(t, q, v) = u, or by the kinematics given."""
+        """From U(t, q, v) = u, or from the given kinematics."""
         quasi, (t, q, w, params, _) = self.array.quasi, state
         return w if quasi is None else quasi.velocities(t, q, quasi.full(w), params)
 
     def determinants(self, state: State, constants: Any) -> Float[Array, " b"]:
-        """That of dU/dv, or of dv/du where that is given."""
+        """The determinant of dU/dv, or of dv/du if that is given."""
         quasi, (t, q, _, params, _) = self.array.quasi, state
         assert quasi is not None
         if not quasi.moves(q, params):
@@ -153,13 +153,13 @@ class ArrayProgram(AccelerationProgram):
     def multipliers(
         self, state: State, constants: Any, reacting: RowChoice | None = None
     ) -> Float[Array, " m"]:
-        """Solved with the rows that react."""
+        """Solved with the rows in `reacting`."""
         return self.array.multipliers(*state, constants, reacting)
 
     def projector(
         self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
     ) -> ConstraintProjector:
-        """By M^-1 A^T (A M^-1 A^T)^-1 at the state; of holonomic rows alone for q."""
+        """By M^-1 A^T (A M^-1 A^T)^-1 at the state; with holonomic rows alone for q."""
         t, q, _, params, _ = state
         v = self.velocities(state, constants)
         holonomic = np.flatnonzero(rows.holonomic).tolist()

@@ -36,13 +36,13 @@ from jaxlag._tracing._signature import gradient
 
 
 class SolveConstants(eqx.Module):
-    """What the array program computes once per solve, and what it leaves out.
+    """Values that the array program computes once per solve, and terms that it omits.
 
     Attributes:
-        mass: M where it depends on params alone, else None.
+        mass: M if it depends on params alone, else None.
         factor: its factor.
         bias_zero: whether h = 0 in every state.
-        time_direction: -1 where time runs backwards.
+        time_direction: -1 if time runs backwards.
     """
 
     mass: Float[Array, "n n"] | None
@@ -54,10 +54,10 @@ class SolveConstants(eqx.Module):
 class ArrayTerms(eqx.Module):
     """M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
 
-    The terms of a system from its Lagrangian, for any L that JAX differentiates twice. One state at
-    a time: t scalar (s), q and v of shape (n,), `inputs` the dict of input VALUES there. Everything
-    returned is in the units of the coordinates: M_ij a_j and h_i in N where q_i is in m, in N m
-    where it is in rad.
+    The terms of a system from its Lagrangian, for any L that JAX differentiates twice. Methods take
+    one state: t scalar (s), q and v of shape (n,), `inputs` the dict of input VALUES there. Results
+    are in the units of the coordinates: M_ij a_j and h_i in N if q_i is in m, in N m
+    if it is in rad.
 
     M takes n forward-over-reverse columns in one batch, h a single forward derivative of the
     reverse pass, so the number of evaluations of L in h does not grow with n.
@@ -66,14 +66,14 @@ class ArrayTerms(eqx.Module):
         lagrangian: L.
         forces: applied forces.
         constraints: constraints.
-        formulation: how accelerations are solved for under constraints.
+        formulation: how accelerations are solved for with constraints.
         baumgarte: stabilization added to gamma.
-        regular: whether M is known to be positive definite by itself, which the scalar program
-            makes use of.
+        regular: whether M is known to be positive definite by itself; used by the scalar
+            program.
         apart: whether rows whose multipliers forces read are known to be independent.
-        quasi: quasi-velocities, where the state is (q, u) with those that are not constrained.
-        in_u: L as a function of (t, q, u, params), where it was written so.
-        crossing: whether rows that come to depend on others are left out there; else all is NaN.
+        quasi: quasi-velocities, if the state is (q, u) with the free ones.
+        in_u: L as a function of (t, q, u, params), if it was written so.
+        crossing: whether rows that become dependent are left out; otherwise results are NaN.
     """
 
     lagrangian: Callable = eqx.field(static=True)
@@ -141,7 +141,7 @@ class ArrayTerms(eqx.Module):
         inputs: Mapping[str, Any],
         lam: Float[Array, " m"] | None = None,
     ) -> Float[Array, " n"]:
-        """Q, summed over the declared forces; those that read lam only where it is given."""
+        """Q, summed over the declared forces; those that read lam only if it is given."""
         total = jnp.zeros_like(q)
         for force in self.forces:
             if not reads_lam(force):
@@ -201,7 +201,7 @@ class ArrayTerms(eqx.Module):
     def rows(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
     ) -> tuple[Float[Array, "m n"], Float[Array, " m"]]:
-        """A by one reverse derivative per row, b as what is left at rest."""
+        """A by one reverse derivative per row, b as the residual at rest."""
 
         def along(v: Array) -> Array:
             return self.velocity(t, q, v, params)
@@ -218,9 +218,9 @@ class ArrayTerms(eqx.Module):
         params: Any,
         time_direction: Array | float = 1.0,
     ) -> Float[Array, " m"]:
-        """One derivative of A v + b along (t', q') = (1, v), and Baumgarte's terms if asked for.
+        """One derivative of A v + b along (t', q') = (1, v), with Baumgarte's terms if requested.
 
-        Residuals are to decay where time runs backwards, too: alpha has the sense of time.
+        Residuals must also decay backwards in time: alpha has the sign of time.
         """
 
         def along(t: Array, q: Array) -> Array:
@@ -250,7 +250,7 @@ class ArrayTerms(eqx.Module):
     def precompute(
         self, q: Float[Array, " n"], params: Any, time_direction: Array | float = 1.0
     ) -> SolveConstants:
-        """M and its factor where M depends on params alone."""
+        """M and its factor if M depends on params alone."""
         structure = self.structure(params, q.shape[0], q.dtype)
         if not structure.mass_constant:
             return SolveConstants(None, None, structure.bias_zero, time_direction)
@@ -270,7 +270,7 @@ class ArrayTerms(eqx.Module):
         constants: Any = None,
         reacting: RowChoice | None = None,
     ) -> Float[Array, " n"]:
-        """Solve M a = Q - h; M and h as the structure says, force code only where declared."""
+        """Solve M a = Q - h; constant M and zero h are not recomputed, absent forces skipped."""
         constants = self.precompute(q, params) if constants is None else constants
         M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
@@ -287,7 +287,7 @@ class ArrayTerms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam), of least norm where rows depend on one another; NaN where rows contradict."""
+        """(a, lam), of least norm for dependent rows; NaN for contradictory rows."""
         M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params))
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
@@ -327,7 +327,7 @@ class ArrayTerms(eqx.Module):
         constants: SolveConstants,
         reacting: RowChoice | None,
     ) -> Float[Array, " m"]:
-        """The multipliers as forces see them, solved with these rows."""
+        """The multipliers as forces read them, solved with these rows."""
         M, right = self._balance(t, q, v, params, inputs, constants)
         return self._solved(M, right, t, q, v, params, inputs, reacting, constants.time_direction)[
             1
@@ -345,7 +345,7 @@ class ArrayTerms(eqx.Module):
         reacting: RowChoice | None,
         time_direction: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """(a, lam) under constraints; lam as forces read it where some do."""
+        """(a, lam) with constraints; lam as forces read it, if they do."""
         (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, time_direction)
         kept = None if reacting is None else reacting.kept
         if not any(map(reads_lam, self.forces)):
@@ -375,7 +375,7 @@ class ArrayTerms(eqx.Module):
         constants: Any = None,
         kept: Bool[Array, " m"] | None = None,
     ) -> Float[Array, "n m"]:
-        """M^-1 A^T (A M^-1 A^T)^-1 over the rows kept, the others' columns zero."""
+        """M^-1 A^T (A M^-1 A^T)^-1 over the kept rows; the columns of the others are zero."""
         return self.corrections(t, q, v, params, constants, kept)[0]
 
     def corrections(
@@ -390,7 +390,7 @@ class ArrayTerms(eqx.Module):
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
         """The same, and the diagonal of (A M^-1 A^T)^-1.
 
-        Of the chosen rows by themselves; all of them lend an M that may be singular inertia.
+        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular.
         """
         M = (
             self.mass(t, q, v, params)

@@ -15,7 +15,7 @@ from jaxlag._tracing._signature import gradient
 
 
 class QuasiState:
-    """One state (t, q, u), u the quasi-velocities that are not constrained, and its rates.
+    """One state (t, q, u), u the free quasi-velocities, and its rates.
 
     Attributes:
         v: velocities.
@@ -49,7 +49,7 @@ class QuasiState:
         return self._along(self._velocities, (self.u, du))
 
     def accelerations(self) -> Float[Array, " r"]:
-        """u' of the quasi-velocities that are not constrained; NaN where there is none."""
+        """u' of the free quasi-velocities; NaN if it does not exist."""
         mass, right = self._projected() if self.terms.in_u is None else self._hamel()
         return solve_mass(mass, right)
 
@@ -74,10 +74,10 @@ class QuasiState:
     def _hamel(self) -> tuple[Array, Array]:
         """(dp/du, B^T (Q + dL/dq - Gamma p) - dp/dt at u' = 0) from L(t, q, u), p = dL/du.
 
-        Gamma p = d/dt(Theta) p - (dU/dq)^T p at fixed p and v, without Gamma: one derivative of
-        Theta p along the motion, one gradient.
+        Gamma p = d/dt(Theta) p - (dU/dq)^T p at fixed p and v. It is computed without Gamma: one
+        derivative of Theta p along the motion, one gradient.
 
-        Source: Pila, eqs. 4.44 to 4.58, with what comes of explicit time and of affine U.
+        Source: Pila, eqs. 4.44 to 4.58, with the terms of explicit time and of affine U.
         """
         t, q, v, params, free = self.t, self.q, self.v, self.params, self.quasi.free
         assert self.terms.in_u is not None
@@ -104,7 +104,7 @@ class QuasiState:
         return mass, self._vjp_fn(effort)[0] - rate
 
     def reactions(self) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam) with A^T lam = M a + h - Q, lam of least norm where rows depend on others."""
+        """(a, lam) with A^T lam = M a + h - Q, lam of least norm for dependent rows."""
         terms, t, q, v, params = self.terms, self.t, self.q, self.v, self.params
         a = self.velocity_rate(self.accelerations())
         left = terms.euler_lagrange(t, q, v, a, params) - self._force()

@@ -22,17 +22,17 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._index_check import check_indices
 
-LIMIT = 20_000  # scalar operations: beyond, reading them takes longer than their detail is worth
+LIMIT = 20_000  # scalar operations: beyond, the analysis takes too long for its benefit
 
 
 class Contents(NamedTuple):
-    """What holds in every state and for all params.
+    """Properties of a row that hold in every state and for all params.
 
     Attributes:
-        affine: whether the row is of first degree in v, as far as its program tells.
+        affine: whether the row is affine in v according to its program.
         empty: whether A is zero.
-        driven: whether b may differ from zero: False only where it certainly is zero.
-        sure: whether A certainly is none that vanishes wherever it holds, as rounding does.
+        driven: whether b may differ from zero: False only if it certainly is zero.
+        sure: whether A certainly does not vanish wherever the row holds, as rounding would.
         zero: whether the residual is 0, and phi as well.
     """
 
@@ -46,7 +46,7 @@ class Contents(NamedTuple):
 def layout(
     constraints: tuple[AbstractConstraint, ...], params: Any, n: int, dtype: Any
 ) -> ConstraintRows:
-    """The rows of all constraints, for params like these; checked to be affine in v."""
+    """The rows of all constraints, for such params; checked to be affine in v."""
     if not constraints:
         return NO_ROWS
     traced, static = _params.split(params)
@@ -119,7 +119,7 @@ def _examine(
     n: int,
     dtype: Any,
 ) -> list[Contents]:
-    """Of each row; raises for rows that are not affine in v, or free of v where they are not 0."""
+    """Contents of each row; raises for rows that are not affine in v, or nonzero without v."""
     position = constraint.position if constraint.holonomic else None
     rows = examine(constraint.velocity, position, like, static, n, dtype)
     bent = [label for label, row in zip(labels, rows, strict=True) if not row.affine]
@@ -148,7 +148,7 @@ _AFFINE = (
 
 
 def check_kinematics(quasi: QuasiVelocities, params: Any, n: int, dtype: Any) -> None:
-    """Raise unless U, or the kinematics, are affine and fit the names, for params like these."""
+    """Raise unless U, or the kinematics, are affine and fit the names, for such params."""
     traced, static = _params.split(params)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced)
     _checked(quasi, _params.Static(like), _params.Static(static), n, jnp.dtype(dtype))
@@ -205,11 +205,11 @@ def examine(
     dtype: Any,
     speeds: int | None = None,
 ) -> list[Contents]:
-    """Contents of every row, each on its own where the rows can be written as scalars.
+    """Contents of every row, separately if the rows have a scalar form.
 
     Args:
         rows: function (t, q, v, params) -> A v + b.
-        positions: function (t, q, params) -> phi whose rate they are, if there is one.
+        positions: function (t, q, params) -> phi, the integral of the rows, if there is one.
         like: shapes and dtypes of the traced params.
         static: values of the other params.
         n: number of coordinates.
@@ -246,13 +246,13 @@ def examine(
         driven = True
         if positions is not None:
             driven = "t" in _reached(jax.make_jaxpr(phi)(t, q, v, like.tree), "tqv")
-        # As one array the rows share what any of them contains.
+        # As one array all rows have the dependences of any of them.
         shared = Contents("v" not in slope, "w" not in slope, driven)
         return [shared] * closed.out_avals[0].shape[0]
 
 
 def _reached(closed: ClosedJaxpr, names: str) -> frozenset[str]:
-    """Arguments that the result depends on; they are called by one letter each, params last."""
+    """Arguments on which the result depends; their names are one letter each, params last."""
     rest = len(closed.jaxpr.invars) - len(names)
     given = [frozenset({name}) for name in names] + [frozenset({"params"})] * rest
     return frozenset().union(*outputs_depend_on(closed.jaxpr, given))
@@ -271,7 +271,7 @@ def _scalars(closed: ClosedJaxpr) -> tuple[Graph, list[Node], list[np.ndarray]]:
     """(graph, rows, arguments) of a program of one array.
 
     Raises:
-        Unsupported: it has no such form, or a long one.
+        Unsupported: it has no scalar form, or a long one.
     """
     if any(jnp.issubdtype(aval.dtype, jnp.integer) for aval in closed.in_avals):
         raise Unsupported("integers among the params, which divide in a way of their own")
@@ -283,7 +283,7 @@ def _scalars(closed: ClosedJaxpr) -> tuple[Graph, list[Node], list[np.ndarray]]:
 
 
 def _effort(eqn: Any) -> int:
-    """About how many scalar operations an equation stands for."""
+    """Approximate number of scalar operations of an equation."""
     avals = [x.aval for x in (*eqn.invars, *eqn.outvars)]
     if eqn.primitive.name == "dot_general":
         ((contracted, _), _) = eqn.params["dimension_numbers"]
@@ -311,16 +311,17 @@ def _contents(graph: Graph, row: Node, at_rest: Node, q: set[Node], v: set[Node]
 
 
 SMALL = 1e-3
-"""Numbers below may be what rounding has left of larger ones."""
+"""Smaller numbers may be rounding of larger ones."""
 
 _ANALYTIC = frozenset(["sin", "cos", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "atan"])
 
 
 def _moving(slopes: Sequence[Node], q: set[Node]) -> dict[Node, frozenset[Node]]:
-    """For every node the coordinates that it certainly depends on, at almost every place.
+    """For every node the coordinates on which it certainly depends, at almost every state.
 
-    Where just one term of a sum, or factor of a product whose others are not 0, holds a coordinate
-    and moves with it, then so does the whole: terms with nothing in common do not cancel.
+    If only one term of a sum contains a coordinate and depends on it, then so does the sum: terms
+    without common coordinates do not cancel. The same holds for one factor of a product whose
+    other factors are not 0.
     """
     none: frozenset[Node] = frozenset()
     held: dict[Node, frozenset[Node]] = {}
@@ -344,9 +345,9 @@ def _counts(number: float | None) -> bool:
 
 
 def _bends(present: Sequence[Node], v: set[Node]) -> bool:
-    """Whether anything but sums, products and functions with rules of their own reads v.
+    """Whether anything but sums, products and functions with custom rules reads v.
 
-    A jump, as in floor(v) or a choice by v, has no slope that would show it.
+    A jump, as in floor(v) or a choice by v, does not appear in the slope.
     """
     reading = set(v)
     for node in present:

@@ -30,14 +30,14 @@ from jaxlag._tracing import _params
 
 
 class ScalarSolveConstants(NamedTuple):
-    """What each program needs of what does not change during a solve.
+    """Values of each program that do not change during a solve.
 
-    Where nobody knows while tracing whether M is positive definite without the constraints, there
+    If it is unknown while tracing whether M is positive definite without the constraints, there
     are programs for both cases.
 
     Attributes:
         definite: whether it is, in all lanes.
-        alone: what the shorter programs for such a mass matrix need; None where it is known.
+        alone: values of the shorter programs for such a mass matrix; None if it is known.
     """
 
     acceleration: Array
@@ -53,19 +53,19 @@ class ScalarSolveConstants(NamedTuple):
 
 
 _WITH_INPUTS = ("acceleration", "lam")
-_BY_MASS = ("acceleration", "lam", "shift", "kick")  # where M is divided by
+_BY_MASS = ("acceleration", "lam", "shift", "kick")  # programs that divide by M
 
 
 @final
 class ScalarProgram(AccelerationProgram):
     """Accelerations as straight-line code on scalars, derived on a graph.
 
-    A system that has no scalar program, or one of more operations than `limit`, gets its
-    accelerations from the array program.
+    A system without a scalar program, or with one of more operations than `limit`, uses the
+    array program.
 
     Attributes:
         array: the terms of the same system on arrays.
-        limit: operations up to which the scalar program is used; None for no limit.
+        limit: largest number of operations of a scalar program; None for no limit.
         lanes: whether terms are vmapped, so that every scalar is a row of numbers.
         in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
     """
@@ -84,7 +84,7 @@ class ScalarProgram(AccelerationProgram):
     ) -> Lowered:
         """The scalar program for these shapes, or the reason why there is none.
 
-        It is compared with the array program when it is made: with `params` where their values
+        It is compared with the array program when it is made: with `params` if their values
         are known, else with the sample.
         """
         key = key_of(self.array, q, params, inputs, self.limit)
@@ -93,7 +93,7 @@ class ScalarProgram(AccelerationProgram):
     def precompute(
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices = AS_USUAL
     ) -> ScalarSolveConstants | SolveConstants:
-        """All that accelerations and projections need of what depends on params alone."""
+        """Values for accelerations and projections that depend on params alone."""
         given = q, params, inputs, choices
         constants = self._precomputed(*given)
         if constants is None:
@@ -107,7 +107,7 @@ class ScalarProgram(AccelerationProgram):
     def _precomputed(
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices
     ) -> ScalarSolveConstants | None:
-        """The same of this program; None where there is none."""
+        """The same of this program; None if it does not exist."""
         equations = self.lowered(q, params, inputs, choices.sample).equations
         if equations is None:
             return None
@@ -139,10 +139,10 @@ class ScalarProgram(AccelerationProgram):
     def acceleration(
         self, state: State, constants: Any = None, reacting: RowChoice | None = None
     ) -> Float[Array, " n"]:
-        """Acceleration a; NaN, whole, where M is not positive definite.
+        """Acceleration a; all NaN if M is not positive definite.
 
-        In a solve, where `constants` are known, of blocks of M that nothing couples the others keep
-        their values: the step fails by the one that is NaN.
+        In a solve, where `constants` are known, only the singular block of M gives NaN, and the
+        others keep their values: the step fails by the NaN.
         """
         given = state.q, state.params, state.inputs
         if self.lowered(*given).equations is None:
@@ -160,13 +160,13 @@ class ScalarProgram(AccelerationProgram):
         return self._run("acceleration", state, constants)
 
     def velocities(self, state: State, constants: Any) -> Float[Array, " n"]:
-        """v by a program of its own."""
+        """v by a separate program."""
         if self.array.quasi is None or not isinstance(constants, ScalarSolveConstants):
             return self._on_arrays.velocities(state, constants)
         return self._run("rates", state, constants)
 
     def determinants(self, state: State, constants: Any) -> Float[Array, " b"]:
-        """Determinants of the blocks of dU/dv, or of dv/du, without those that do not change."""
+        """Determinants of the blocks of dU/dv, or of dv/du, without constant ones."""
         if not isinstance(constants, ScalarSolveConstants) or constants.determinants is None:
             return self._on_arrays.determinants(state, constants)
         code = self._equations(state).determinants
@@ -176,7 +176,7 @@ class ScalarProgram(AccelerationProgram):
         return self._run("determinants", state, constants)
 
     def _run(self, name: str, state: State, constants: ScalarSolveConstants) -> Array:
-        """The results of one of the programs, whose prelude has this name."""
+        """The results of the program whose prelude has this name."""
 
         def by(program: "ScalarProgram", constants: ScalarSolveConstants) -> Array:
             code, carried = program._equations(state).code(name), getattr(constants, name)
@@ -185,7 +185,7 @@ class ScalarProgram(AccelerationProgram):
             read = state.inputs if name in _WITH_INPUTS else {}
             return _emit.body(code, carried, *state[:3], read, program.lanes, program.in_loop)
 
-        # Equations in quasi-velocities are projected: of them the projection alone divides by M.
+        # Equations in quasi-velocities are projected: only their projection divides by M.
         projected = self.array.quasi is not None and name == "acceleration"
         if constants.alone is None or name not in _BY_MASS or projected:
             return by(self, constants)
@@ -193,7 +193,7 @@ class ScalarProgram(AccelerationProgram):
         return lax.cond(constants.definite, alone, partial(by, self, constants))
 
     def regular(self) -> "ScalarProgram":
-        """The same where M is positive definite without the constraints."""
+        """The same for an M that is positive definite without the constraints."""
         return replace(self, array=replace(self.array, regular=True))
 
     def _equations(self, state: State) -> Equations:
@@ -204,7 +204,7 @@ class ScalarProgram(AccelerationProgram):
     def projector(
         self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
     ) -> ConstraintProjector:
-        """By the matrices of the program at the state."""
+        """By the matrices that the program computes at the state."""
         if not isinstance(constants, ScalarSolveConstants):
             return self._on_arrays.projector(state, constants, rows, kept)
         code, q, v = self._equations(state).surface, state.q, state.w
@@ -236,12 +236,12 @@ class ScalarProgram(AccelerationProgram):
     def multipliers(
         self, state: State, constants: Any, reacting: RowChoice | None = None
     ) -> Float[Array, " m"]:
-        """The multipliers that forces depend on."""
+        """The multipliers as forces read them."""
         if not isinstance(constants, ScalarSolveConstants):
             return self._on_arrays.multipliers(state, constants, reacting)
         return self._run("lam", state, constants)
 
     def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
-        """Of the part that is evaluated at every state."""
+        """Number of lines of the body, which is evaluated at every state."""
         equations = self.lowered(q, params, inputs).equations
         return None if equations is None else len(equations.program.body)

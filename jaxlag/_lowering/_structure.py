@@ -24,7 +24,7 @@ class Structure(NamedTuple):
 
     @property
     def quadratic(self) -> bool:
-        """Whether M is free of v."""
+        """Whether M does not depend on v."""
         return "v" not in self.mass
 
     @property
@@ -63,9 +63,9 @@ def find_structure(
 
 
 def _vanishes(function: Any, state: tuple, params: Any) -> bool:
-    """Whether a function that depends on none of its arguments is zero: one value decides.
+    """Whether a function that depends on none of its arguments is zero, from one value.
 
-    Where it has none, as under a transform that traces what the function closes over, it is not.
+    False if it has no value, as under a transform that traces its closure.
     """
     with jax.ensure_compile_time_eval():
         state, params = jax.tree.map(_ones, (state, params))

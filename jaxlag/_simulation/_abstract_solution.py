@@ -53,12 +53,12 @@ class AbstractSolution(eqx.Module):
     @property
     @abstractmethod
     def params(self) -> Any:
-        """As the user gave them."""
+        """Params as the user gave them."""
 
     @property
     @abstractmethod
     def inputs(self) -> dict[str, Any]:
-        """By name."""
+        """Inputs by name."""
 
     @property
     @abstractmethod

@@ -206,7 +206,7 @@ def check_tolerances(
     """(rtol, atol) of the default controller, or of the one that `method` brings."""
     if isinstance(method, tuple):
         rtol, atol = (getattr(method[-1], name, None) for name in ("rtol", "atol"))
-        if np.ndim(atol):  # of every component of the state, which the controller knows
+        if np.ndim(atol):  # for every component of the state
             atol = jnp.max(jnp.asarray(atol))
     elif isinstance(atol, Mapping):
         atol = system.coordinates.flatten(atol, "atol")

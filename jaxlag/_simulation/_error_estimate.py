@@ -12,7 +12,7 @@ from jaxlag._simulation._solution import Solution
 
 # Factor for the error of the finer motion.
 SHARE = 1.5
-# A method of higher order at a tenth of the tolerance leaves a hundredth of the error, or less.
+# A method of higher order at a tenth of the tolerance has a hundredth of the error, or less.
 LEFT = 0.02
 # Rounding, over eps sqrt(steps) |y|: both motions round, and their difference may be 0.
 ROUNDED = 32.0

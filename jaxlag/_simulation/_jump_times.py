@@ -203,7 +203,7 @@ def warned(jumps: Jumps, given: tuple[Any, Any], ts: Any) -> tuple[Any, Any]:
 
     Args:
         jumps: of the declaration.
-        given: traced halves of the params, with what functions close over, and of the inputs.
+        given: traced halves of the params, with values in closures, and of the inputs.
         ts: times of the motion.
     """
     names = names_of(*given)

@@ -46,7 +46,7 @@ class ProgramKey(NamedTuple):
     params: _params.Static
     inputs: _params.Static
     stepper: _params.Static
-    time_direction: int | None  # +1 or -1 where ts is concrete, None where it is traced
+    time_direction: int | None  # +1 or -1 if ts is concrete, None if it is traced
     max_steps: int
     save: tuple[str, ...]
     sample: _params.Sample

@@ -343,18 +343,18 @@ class Solution(AbstractSolution):
     def at(self, t: Any) -> "Solution":
         """The motion between its save times, as accurate as there.
 
-        The equations are solved anew from the last save time before, by the same method and
+        The equations are solved again from the last save time before, by the same method and
         tolerances.
 
         Args:
             t: a number or several in any order, (k,), from ts[0] to last_time, s.
 
         Returns:
-            A Solution at these times, and what was saved there; work from ts[0] on.
+            A Solution at these times, with the same saved quantities; work from ts[0] on.
 
         Raises:
             ValueError: times outside of the motion; a batch, fixed steps or a method without a
-                name: there times have to be asked for when simulating.
+                name: in these cases pass the times to `simulate`.
         """
         return states_at(self, t, self._solve)
 
@@ -368,16 +368,16 @@ class Solution(AbstractSolution):
     def to_dict(self) -> dict[str, np.ndarray]:
         """Numpy arrays by name: "t", s; every coordinate "x" and its velocity "x'", (s, *shape).
 
-        Quasi-velocities, and what `save=` named, are in it, too; of a batch every array has its
-        axes in front.
+        Quasi-velocities and the quantities in `save=` are included. For a batch every array has
+        its axes in front.
         """
         return as_dict(self)
 
     def to_xarray(self) -> Any:
-        """What `to_dict` has as an `xarray.Dataset` over "t"; needs the extra "xarray".
+        """The arrays of `to_dict` as an `xarray.Dataset` over "t"; needs the extra "xarray".
 
-        Of a batch over "motion" as well (or "motion_0", ...); where its motions have times of their
-        own, over "save" in place of "t". "status" is a variable.
+        For a batch also over "motion" (or "motion_0", ...). If its motions have different times,
+        "save" replaces "t". "status" is a variable.
 
         Raises:
             ValueError: xarray is not installed.
@@ -385,13 +385,13 @@ class Solution(AbstractSolution):
         return as_dataset(self)
 
     def plot(self) -> Any:
-        """Coordinates and energy over time, and in the plane the paths; needs the extra "plot".
+        """Coordinates and energy over time, and paths in the plane; needs the extra "plot".
 
-        In the plane are coordinates called x and y, or x1 and y1, and points of two components. Of
-        a batch up to 16 motions are drawn.
+        Paths are drawn for coordinates called x and y, or x1 and y1, and for points of two
+        components. For a batch up to 16 motions are drawn.
 
         Returns:
-            A matplotlib `Figure`, which notebooks show; `figure.savefig("motion.png")` keeps it.
+            A matplotlib `Figure`, which notebooks show; `figure.savefig("motion.png")` saves it.
 
         Raises:
             ValueError: matplotlib is not installed.

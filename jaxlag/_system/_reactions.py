@@ -100,8 +100,8 @@ class AbstractReactions(AbstractQuantities):
         """Multipliers lam of M a + h = Q + A^T lam, A a + gamma = 0, by the name of the row.
 
         For dependent rows the multipliers have least norm sum_k (|A_k| lam_k)^2, in which
-        |A_k lam_k| is the generalized force of row k alone. If forces read multipliers, those that
-        they read have least norm first, in the form that the forces read them, then the others.
+        |A_k lam_k| is the generalized force of row k alone. If forces read multipliers, the norm is
+        least within the rows that they read, and within the other rows.
         |A_k| is the Euclidean length of the row in the units of the coordinates: meters instead of
         millimeters, or radians instead of degrees, change the distribution. A^T lam is the same, to
         rounding, for all units and lever lengths. The unit is J over that of the row's residual,

@@ -6,7 +6,7 @@ import jax
 
 
 class Programs(dict[Any, Any]):
-    """Programs made on the way, which are no part of what they are made for: all are equal."""
+    """A cache that does not take part in equality or hashing."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Programs)
@@ -17,18 +17,18 @@ class Programs(dict[Any, Any]):
 
 @jax.tree_util.register_pytree_node_class
 class ParamsWithClosure:
-    """Params together with what stands for the tracers in the closures of declared functions.
+    """Params, with the values of the tracers in the closures of declared functions.
 
-    In this way these are arguments of every program, as params are, and have derivatives. Functions
-    of the user's never see it: they are handed the params.
+    The tracers are thus arguments of every program, as params are, and have derivatives. User
+    functions receive only the params.
 
     Attributes:
         params: as the user gave them.
-        values: what stands for the tracers.
-        tracers: which is for which, by their identity.
-        programs: those functions that read the tracers, as programs. By the time that reverse
-            derivatives are written the tracers may be of the past, and nothing can be traced that
-            reads them.
+        values: values of the tracers.
+        tracers: identities of the tracers, in the order of `values`.
+        programs: traced programs of the functions that read the tracers. When reverse
+            derivatives are traced, the original tracers may no longer be valid, and these functions
+            cannot be traced again.
     """
 
     def __init__(
@@ -39,22 +39,22 @@ class ParamsWithClosure:
 
     @property
     def by_tracer(self) -> dict[int, Any]:
-        """Identity of a tracer -> what stands for it."""
+        """Identity of a tracer -> its value."""
         return dict(zip(self.tracers, self.values, strict=True))
 
     def tree_flatten(self) -> tuple[tuple[Any, Any], tuple[tuple[int, ...], "Programs"]]:
-        """As JAX asks for it."""
+        """For JAX's pytree registry."""
         return (self.params, self.values), (self.tracers, self.programs)
 
     @classmethod
     def tree_unflatten(
         cls, fixed: tuple[tuple[int, ...], "Programs"], parts: Any
     ) -> "ParamsWithClosure":
-        """As JAX asks for it."""
+        """For JAX's pytree registry."""
         (params, values), (tracers, programs) = parts, fixed
         return cls(params, values, tracers, programs)
 
 
 def plain(params: Any) -> Any:
-    """Params as the user gave them; anything else as it is."""
+    """Params as the user gave them; any other object unchanged."""
     return params.params if isinstance(params, ParamsWithClosure) else params

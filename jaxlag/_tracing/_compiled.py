@@ -12,12 +12,12 @@ from jaxlag._tracing import _params
 class Compiled:
     """`jax.jit` of `function(*key, params, inputs, *arrays)`.
 
-    The program is keyed by `key`, a tuple of hashable values, and by what of params and inputs is
-    static. With `batch` axes in front of params, inputs and arrays it is vmapped over these.
+    The program is keyed by `key`, a tuple of hashable values, and by the static parts of params and
+    inputs. With `batch` axes in front of params, inputs and arrays it is vmapped over these.
 
     Attributes:
-        program: the same of halves, `(key, static params, static inputs, batch, traced)`, for
-            callers that have these at hand; traced are (params, inputs, *arrays).
+        program: the same for split arguments, `(key, static params, static inputs, batch, traced)`;
+            traced are (params, inputs, *arrays).
     """
 
     def __init__(self, function: Callable) -> None:

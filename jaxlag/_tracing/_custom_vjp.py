@@ -19,7 +19,7 @@ from jaxlag._core._linear_map import LinearMap, linear
 
 @dataclass(frozen=True, eq=False)
 class _Pulled(AbstractRule):
-    """The rule of an equation that `jax.custom_vjp` made."""
+    """The rule of an equation made by `jax.custom_vjp`."""
 
     eqn: Any
 
@@ -54,7 +54,7 @@ class _Pulled(AbstractRule):
 
     @cached_property
     def _pull(self) -> ClosedJaxpr:
-        """(arguments, y) -> J^T y, written out: the rule itself has no derivative in JAX."""
+        """(arguments, y) -> J^T y as a jaxpr: the rule itself has no derivative in JAX."""
         given = [x.aval for x in self.eqn.invars]
         moving = [i for i, x in enumerate(given) if _is_inexact(x)]
 
@@ -80,7 +80,7 @@ class _Pulled(AbstractRule):
 
 
 def with_forward_derivatives(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program; functions with a rule by `jax.custom_vjp` have forward derivatives."""
+    """The same program; functions with a `jax.custom_vjp` rule have forward derivatives."""
     return rewritten(program, _pulled)
 
 

@@ -14,23 +14,23 @@ _LIBRARIES = {*_ARRAYS, *sys.stdlib_module_names}
 
 
 def of_library(x: Any) -> bool:
-    """Whether a module, a class, a function or an object is of Python or of a library of JAX's."""
+    """Whether Python or a JAX library defines a module, a class, a function or an object."""
     return _home(x) in _LIBRARIES
 
 
 def of_arrays(x: Any) -> bool:
-    """Whether it is of a library of JAX's, or of this one."""
+    """Whether a JAX library or jaxlag defines it."""
     return _home(x) in _ARRAYS
 
 
 def is_installed(x: Any) -> bool:
-    """Whether the file of a module, or of a function, is that of an installed package."""
+    """Whether a module or a function belongs to an installed package."""
     file = x.__code__.co_filename if isinstance(x, FunctionType) else getattr(x, "__file__", None)
     return isinstance(file, str) and _INSTALLED.search(file) is not None
 
 
 def _home(x: Any) -> str:
-    """The name of the package that it is of."""
+    """The name of its package."""
     if isinstance(x, ModuleType):
         name = x.__name__
     elif isinstance(x, FunctionType):

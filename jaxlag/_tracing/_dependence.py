@@ -19,18 +19,18 @@ Seen = Callable[[Any, list[Names]], None]
 def outputs_depend_on(
     jaxpr: Jaxpr, given: list[Names], seen: Seen | None = None, continuous: bool = False
 ) -> list[Names]:
-    """Names that each output of a traced program depends on.
+    """Names on which each output of a traced program depends.
 
     A dependence that cancels only algebraically is still listed; one that is not listed is
     certainly absent. Calls, loops and branches are followed output by output.
 
     Args:
         jaxpr: the traced program.
-        given: names that each of its inputs stands for; its constants stand for none.
+        given: names of each of its inputs; its constants have none.
         seen: called with every operation, and the names of its operands; within calls, but not
             within loops and branches.
         continuous: whether integers and truth values, which change in jumps, depend on nothing;
-            but within loops and branches.
+            except within loops and branches.
     """
     known: dict[Any, Names] = dict(zip(jaxpr.invars, given, strict=True))
     numbers: dict[Any, Any] = {}
@@ -39,7 +39,7 @@ def outputs_depend_on(
         return _NOTHING if isinstance(atom, Literal) else known.get(atom, _NOTHING)
 
     def number(atom: Any) -> Any:
-        """Its value if it is a number that the program itself states, else None."""
+        """The value of a scalar literal, or of a difference of two; else None."""
         if not isinstance(atom, Literal):
             return numbers.get(atom)
         return np.asarray(atom.val) if np.ndim(atom.val) == 0 else None
@@ -60,7 +60,7 @@ def outputs_depend_on(
 
 
 def _is_one(eqn: Any, stated: list[Any]) -> bool:
-    """Whether it is x**0, which is 1 for every x and what differentiating x**1 leaves."""
+    """Whether it is x**0, which is 1 for every x and results from differentiating x**1."""
     if eqn.primitive.name == "pow":
         return stated[1] is not None and bool(stated[1] == 0)
     return eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0
@@ -85,14 +85,14 @@ def _open(jaxpr: Any) -> Any:
 
 
 def _cond(params: Any, operands: list[Names]) -> list[Names]:
-    """Of any branch, and of the index that chooses it."""
+    """Dependences of all branches, and of the index."""
     index, *rest = operands
     branches = [outputs_depend_on(_open(branch), rest) for branch in params["branches"]]
     return [index.union(*outputs) for outputs in zip(*branches, strict=True)]
 
 
 def _scan(params: Any, operands: list[Names]) -> list[Names]:
-    """Of the start or of any turn, and of what enters a turn through the other carries."""
+    """Dependences of the start and of all turns, also through the other carries."""
     body, (consts, carries) = _open(params["jaxpr"]), scan_sizes(params)
     fixed, carry, rows = (
         operands[:consts],
@@ -109,7 +109,7 @@ def _scan(params: Any, operands: list[Names]) -> list[Names]:
 
 
 def _while(params: Any, operands: list[Names]) -> list[Names]:
-    """As in a scan; what decides on the number of turns reaches every carry that they change."""
+    """As in a scan; the condition affects every carry that the body changes."""
     body, condition = _open(params["body_jaxpr"]), _open(params["cond_jaxpr"])
     first = params["cond_nconsts"]
     second = first + params["body_nconsts"]
@@ -125,7 +125,7 @@ def _while(params: Any, operands: list[Names]) -> list[Names]:
 
 
 def _fixpoint(turn: Callable[[list[Names]], list[Names]], carry: list[Names]) -> list[Names]:
-    """The carries of a loop once further turns add no name to them; the start is kept."""
+    """The carries of a loop when further turns add no name; the start is included."""
     while True:
         grown = [x | y for x, y in zip(carry, turn(carry), strict=True)]
         if grown == carry:

@@ -36,11 +36,11 @@ DEPTH = 12  # of functions that call functions, and of objects in objects
 
 
 class Reading(NamedTuple):
-    """All that a function, or a class, reads from outside.
+    """All values that a function, or a class, reads from outside.
 
     Attributes:
-        found: what can be compared with what it is later.
-        sources: the objects themselves, each with its name; of the user's own code only.
+        found: values that can be compared with later ones.
+        sources: the objects themselves, each with its name; of user code only.
     """
 
     found: Outside
@@ -48,30 +48,30 @@ class Reading(NamedTuple):
 
 
 _STORES = ("STORE_GLOBAL", "STORE_DEREF")
-# Types of functions that users write attributes to; others keep their own there.
+# Types of functions with attributes of the user's; other types have their own attributes.
 _WRITTEN_TO = (
     *(FunctionType, type(jax.jit(abs)), type(lru_cache(abs))),
     *(jax.custom_jvp, jax.custom_vjp),
 )
 _GLOBALS = ("LOAD_GLOBAL", "LOAD_NAME")
-_LOOKED_UP = {"globals", "eval", "exec", "__globals__"}  # names are texts then
+_LOOKED_UP = {"globals", "eval", "exec", "__globals__"}  # names are then strings
 _IMPORTED = {"__import__", "import_module"}
 _CHANGING = (dict, list, set, bytearray, MutableMapping)
-# Methods that make an instance: what they read is in its fields.
+# Methods that make an instance: the values that they read are in its fields.
 _MAKING = {"__init__", "__new__", "__post_init__", "__check_init__", "__init_subclass__"}
 _GENERATED = {"_abc_impl", "_fields", "_field_defaults", "_make", "_replace", "_asdict"}
 
 
 def outside(function: Any) -> Outside:
-    """By name, what a function reads from outside: numbers, arrays, and functions of the user's.
+    """The values that a function reads from outside, by name: numbers, arrays, user functions.
 
-    Containers of numbers are read whole, of other objects the attributes that the code names.
+    Containers of numbers are read whole; of other objects, the attributes that the code names.
     """
     return _reading(function).found
 
 
 def reading(x: Any) -> Reading:
-    """The same of a function with its own attributes, or of the methods of a class with its own."""
+    """The same for a function with its attributes, or for the methods and attributes of a class."""
     if isinstance(x, type):
         reader = _Reader()
         reader.kind(x)
@@ -89,10 +89,10 @@ def _reading(function: Any) -> "_Reader":
 
 
 class _Reader:
-    """Follows what code names, from functions to objects and on to their methods.
+    """Follows the names in code, from functions to objects and to their methods.
 
     Attributes:
-        found: what was read, to be compared.
+        found: the values read, for comparison.
         sources: the objects themselves, by name.
     """
 
@@ -101,13 +101,13 @@ class _Reader:
         self.sources: list[tuple[str, Any]] = []
         self._met: set[Any] = set()
         self._places: dict[str, Any] = {}
-        self._stored: set[str] = set()  # attributes that the code writes: counters and the like
-        self._watching = False  # whether sources are of no interest, but only changes
+        self._stored: set[str] = set()  # attributes that the code writes, such as counters
+        self._watching = False  # whether only changes are watched, without sources
         self._making: list[Any] = []
-        self._apart = False  # whether installed packages are left alone: methods plot and save
+        self._apart = False  # whether installed packages are skipped: methods plot and save
 
     def function(self, x: Any, depth: int) -> None:
-        """All that something callable reads; of those of libraries, what they were made with."""
+        """All values that a callable reads; for library callables, their arguments."""
         if depth == 0 or not self._is_new(x):
             return
         if isinstance(x, partial):
@@ -141,7 +141,7 @@ class _Reader:
             self.function(_inner(x), depth)
 
     def kind(self, kind: type) -> None:
-        """What methods of a class read, its attributes, and those of its members if it has any."""
+        """The values read by methods of a class, its attributes, and those of its members."""
         self._apart = not is_installed(sys.modules.get(kind.__module__))
         members = [*kind] if issubclass(kind, Enum) else []
         skipped = {*_GENERATED, *getattr(kind, "__members__", ())}
@@ -172,13 +172,13 @@ class _Reader:
         self._watching = watching
 
     def makers(self) -> None:
-        """What the methods read that make an instance: last, as it is watched only."""
+        """The values read by constructors: last, as these are only watched."""
         self._watching = True
         for part in self._making:
             self.function(part, DEPTH)
 
     def own(self, x: Any) -> None:
-        """The attributes of a function itself."""
+        """The attributes of a function."""
         users = isinstance(x, _WRITTEN_TO) and not of_library(unwrapped(x))
         if users or isinstance(x, partial) or not of_library(type(x)):
             self._own(getattr(unwrapped(x), "__name__", type(x).__name__), x)
@@ -193,7 +193,7 @@ class _Reader:
         watching = self._watching
         installed = is_installed(x)
         self._watching = watching or installed
-        if not of_library(x):  # notebooks that load modules again write to functions
+        if not of_library(x):  # reloaded modules in notebooks modify functions
             place = id(x), "__code__"
             self._keep(f"{x.__name__}.__code__", place, lambda: x.__code__, x.__code__)
         if not (installed and self._apart):
@@ -203,7 +203,7 @@ class _Reader:
     def _code(self, x: FunctionType, depth: int) -> None:
         codes = list(codes_of(x.__code__))
         lines = [i for code in codes for i in get_instructions(code)]
-        stored = {i.argval for i in lines if i.opname in _STORES}  # counters and the like
+        stored = {i.argval for i in lines if i.opname in _STORES}  # such as counters
         self._stored |= {i.argval for i in lines if i.opname == "STORE_ATTR"}
         names, space = named_in(x), x.__globals__
         looks: dict[str, tuple[Any, Callable[[], Any]]] = {}
@@ -221,7 +221,7 @@ class _Reader:
             if looked_up and not self._watching:
                 self.sources += [(min(looked_up), space)]
         for name, cell in zip(x.__code__.co_freevars, x.__closure__ or (), strict=True):
-            if not of_library(x) or unwrapped(x) is x:  # else what it wraps is looked at itself
+            if not of_library(x) or unwrapped(x) is x:  # else the inner function is used
                 looks[name] = id(cell), partial(_content, cell)
         count = x.__code__.co_argcount
         given = x.__code__.co_varnames[count - len(x.__defaults__ or ()) : count]
@@ -236,9 +236,9 @@ class _Reader:
     def _source(
         self, name: str, place: Any, look: Callable[[], Any], names: set[str], depth: int
     ) -> None:
-        """Something that a name stands for, in a place, for code that names these attributes."""
+        """An object that a name refers to, in code that uses these attributes."""
         x = look()
-        if depth == 0 or isinstance(x, Logger):  # no number comes from one
+        if depth == 0 or isinstance(x, Logger):  # it provides no number
             return
         if isinstance(unwrapped(x), (*FUNCTIONS, partial, BuiltinFunctionType)):
             self._keep(name, place, look, x)
@@ -263,7 +263,7 @@ class _Reader:
         opaque = value is OPAQUE
         if not opaque:
             self._keep(name, place, look, value)
-            names = names - set(getattr(x, "_fields", ()))  # of a named tuple: kept as a whole
+            names = names - set(getattr(x, "_fields", ()))  # a named tuple is kept as a whole
         elif isinstance(x, dict | list | tuple):
             self._items(name, place, look, names, depth)
             opaque = False
@@ -272,7 +272,7 @@ class _Reader:
             self.function(x, depth - 1)
 
     def _made(self, x: Any, depth: int) -> None:
-        """What the code of a class reads that it may make an instance of: watched only."""
+        """Values read by the constructors of a class: watched only."""
         watching, self._watching = self._watching, True
         for name in _MAKING if isinstance(x, type) else ():
             if isinstance(part := getattr_static(x, name, None), FunctionType):
@@ -281,13 +281,13 @@ class _Reader:
 
     def _keep(self, name: str, place: Any, look: Callable[[], Any], value: Any) -> None:
         while self._places.setdefault(name, place) != place:
-            name += "'"  # another one of the same name, of another function
+            name += "'"  # the same name in another function
         self.found.setdefault(name, Read(look, value))
 
     def _items(
         self, name: str, place: Any, look: Callable[[], Any], names: set[str], depth: int
     ) -> None:
-        """Of a container of objects."""
+        """The elements of a container of objects."""
         x = look()
         self._keep(f"len({name})", place, lambda: _length(look()), len(x))
         keys = list(x) if isinstance(x, dict) else range(len(x))
@@ -298,7 +298,7 @@ class _Reader:
     def _attributes(
         self, owner: str, place: Any, look: Callable[[], Any], names: set[str], depth: int
     ) -> None:
-        """Those attributes that the code names, and what methods and properties among them read."""
+        """The attributes that the code names, and values read by their methods and properties."""
         x = look()
         if not self._is_new((owner, frozenset(names)), x):
             return
@@ -332,7 +332,7 @@ def _of_class(kind: type, name: str) -> Any:
 
 
 def _inner(x: Any) -> Any:
-    """What a wrapper wraps."""
+    """The wrapped object."""
     return x.__wrapped__
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 FUNCTIONS = (FunctionType, MethodType)
-# Attributes that enum writes; those that functools and JAX write, and wrappers copy.
+# Attributes written by enum; those written by functools and JAX, and copied by wrappers.
 _OF_ENUM = {"_value_", "_name_", "_sort_order_", "_inverted_", "__objclass__"}
 _OF_WRAPPERS = {
     *("cache_parameters", "register", "dispatch", "registry", "_clear_cache"),
@@ -22,10 +22,10 @@ _OF_WRAPPERS = {
 
 
 def own_attributes(x: Any) -> dict[str, Any]:
-    """What was written to a function, or to a member of an enumeration, as an attribute."""
+    """Attributes added to a function, or to a member of an enumeration."""
     found = getattr(x, "__dict__", {})
     internal = _OF_ENUM if isinstance(x, Enum) else _OF_WRAPPERS if "__wrapped__" in found else ()
-    if all(name in internal for name in found):  # nearly always
+    if all(name in internal for name in found):  # the usual case
         return {}
     return {
         name: value
@@ -36,10 +36,10 @@ def own_attributes(x: Any) -> dict[str, Any]:
 
 
 def unwrapped(x: Any) -> Any:
-    """The function inside jit and the like."""
+    """The function inside jit and similar wrappers."""
     try:
         return unwrap(x)
-    except ValueError:  # whatever has every attribute
+    except ValueError:  # objects with arbitrary attributes
         return x
 
 
@@ -68,7 +68,7 @@ def behind(own: Any) -> Iterator[Any]:
 
 
 def codes_of(code: CodeType) -> Iterator[CodeType]:
-    """A code and those of the functions written inside it."""
+    """A code object and those of its nested functions."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -76,14 +76,14 @@ def codes_of(code: CodeType) -> Iterator[CodeType]:
 
 
 def texts_of(codes: list[CodeType]) -> set[str]:
-    """All words in the texts of a code, and the attributes that it asks for."""
+    """All words in the string constants of code, and the attributes that it uses."""
     texts = [x for code in codes for x in code.co_consts if isinstance(x, str)]
     words = (x for text in texts for x in re.findall(r"\w+|[\w.]+", text))
     return {*texts, *words, *(name for code in codes for name in code.co_names)}
 
 
 def named_in(function: Any) -> set[str]:
-    """The attributes that a function may ask for, by getattr as well."""
+    """The attributes that a function may use, also by getattr."""
     if not isinstance(function, FunctionType):
         return set()
     codes = list(codes_of(function.__code__))
@@ -92,5 +92,5 @@ def named_in(function: Any) -> set[str]:
 
 
 def is_called(kind: type) -> bool:
-    """Whether its instances are called by a function of the user's."""
+    """Whether a user function implements calls of its instances."""
     return isinstance(getattr_static(kind, "__call__", None), FunctionType)

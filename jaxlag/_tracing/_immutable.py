@@ -45,12 +45,12 @@ _CHANGES = "can change in place"
 _shown = Repr()
 _shown.maxother = _shown.maxstring = 60
 
-# Not a setting: what functions and classes in params read from outside when they were first given.
+# Not a setting: values first read from outside by functions and classes in params.
 _READ: WeakKeyDictionary[Any, Outside] = WeakKeyDictionary()
 
 
 class _Place(NamedTuple):
-    """What can change of an object, and where it is: from the outermost part to the inmost."""
+    """A mutable part of an object, and its path from the outermost part inwards."""
 
     path: tuple[str, ...]
     thing: Any
@@ -58,29 +58,29 @@ class _Place(NamedTuple):
 
 
 class _Fault(NamedTuple):
-    """What stands against something as part of a key, and what to write."""
+    """The reason why an object cannot be part of a key, and the remedy."""
 
     text: str
     fix: str
 
 
 def is_fixed(leaf: Any) -> bool:
-    """Whether a leaf without numbers to trace is the same for ever, so that programs may key it."""
+    """Whether an untraced leaf is immutable, so that it may be part of a program's key."""
     return type(leaf) in _PLAIN or _fault(leaf) is None
 
 
 def refusal(leaf: Any, name: str) -> ValueError:
-    """Why it is not, and what to write."""
+    """The error for a leaf that is mutable."""
     fault = _fault(leaf)
     assert fault is not None
     return _refusal(leaf, name, fault)
 
 
 def check_nodes(tree: Any, name: str) -> None:
-    """Raise where a node of a pytree has data, or methods, that can change.
+    """Raise if a node of a pytree has mutable data or methods.
 
     Raises:
-        ValueError: with these by their path.
+        ValueError: with the path of these.
     """
     try:
         structure = jax.tree.structure(tree)
@@ -99,14 +99,14 @@ def _refusal(leaf: Any, name: str, fault: _Fault) -> ValueError:
 
 
 def _fault(x: Any, data: bool = False) -> _Fault | None:
-    """What stands against a leaf, or the data of a node, as part of a key."""
+    """The reason why a leaf, or the data of a node, cannot be part of a key."""
     search = _Search()
     place = search.data(x) if data else search.place(x, ())
     return _found(search, place, x, not data)
 
 
 def _fault_of_kind(kind: type) -> _Fault | None:
-    """What stands against the methods and the attributes of a class of the user's."""
+    """The reason why methods and attributes of a user class cannot be part of a key."""
     search = _Search()
     return _found(search, search.kind(kind, ()), kind, False)
 
@@ -131,7 +131,7 @@ def _found(search: "_Search", place: _Place | None, x: Any, hashed: bool) -> _Fa
 
 
 def _changed(readers: Iterable[Any]) -> tuple[Any, str, str, str] | None:
-    """The first of what functions and classes read that is not any more what it was."""
+    """The first value read by functions and classes that has changed."""
     for reader in readers:
         for name, before, now in changes(_READ.get(reader, {})):
             return reader, name, before, now
@@ -139,10 +139,10 @@ def _changed(readers: Iterable[Any]) -> tuple[Any, str, str, str] | None:
 
 
 class _Search:
-    """Looks through an object for what can change.
+    """Searches an object for mutable parts.
 
     Attributes:
-        readers: functions, and classes with methods, on the way.
+        readers: functions, and classes with methods, found in it.
     """
 
     def __init__(self) -> None:
@@ -151,13 +151,13 @@ class _Search:
         self._read: list[tuple[Any, Outside]] = []
 
     def keep(self) -> None:
-        """What the readers read is what they are compared with from now on."""
+        """Store the values of the readers for later comparison."""
         for reader, found in self._read:
             if not any(isinstance(value, Tracer) for _, value in found.values()):
                 _READ.setdefault(reader, found)
 
     def place(self, x: Any, path: tuple[str, ...]) -> _Place | None:
-        """Where and what of x can change; None where nothing can."""
+        """The mutable part of x; None if there is none."""
         kind = type(x)
         if kind in _PLAIN or id(x) in self._met or isinstance(x, _ARRAYS):
             return None
@@ -187,7 +187,7 @@ class _Search:
         return self._other(x, path)
 
     def data(self, x: Any) -> _Place | None:
-        """The same of what a library keeps in a node: of functions and objects of the user's."""
+        """The same for library data in a node: only functions and user objects in it."""
         if isinstance(x, tuple | list | dict) and of_library(x):
             items = x if not isinstance(x, dict) else x.values()
             return _first(self.data(y) for y in items)
@@ -195,7 +195,7 @@ class _Search:
         return None if known else self.place(x, ())
 
     def kind(self, kind: type, path: tuple[str, ...]) -> _Place | None:
-        """The same of the methods and the attributes of a class."""
+        """The same for the methods and the attributes of a class."""
         if of_library(kind):
             return None
         return self._reader(kind, path, "which its methods read from outside")
@@ -206,7 +206,7 @@ class _Search:
                 self.place(x.__func__, path)
             )
         if not _hashes(x):
-            return None  # which is said of it
+            return None  # reported elsewhere
         return self._reader(x, path, "which it reads from outside")
 
     def _reader(self, x: Any, path: tuple[str, ...], reads: str) -> _Place | None:
@@ -237,7 +237,7 @@ class _Search:
     def _instance(
         self, x: Any, parts: Iterable[tuple[str, Any]], path: tuple[str, ...]
     ) -> _Place | None:
-        """Of an object with methods."""
+        """The same for an object with methods."""
         if _form(type(x)).compares:
             return _Place(path, x, "is compared by a method of its own, __eq__")
         return self._parts(parts, path) or self.kind(type(x), path)
@@ -277,12 +277,12 @@ def _hashes(x: Any) -> bool:
 
 
 class _Form(NamedTuple):
-    """What is the same of all objects of a class.
+    """Properties common to all objects of a class.
 
     Attributes:
         names: fields of a dataclass.
-        uncompared: one of them that does not count where two objects are compared.
-        compares: whether it has an __eq__ that somebody wrote.
+        uncompared: a field that is ignored in comparisons.
+        compares: whether it has a custom __eq__.
     """
 
     names: dict[str, None]
@@ -308,10 +308,10 @@ def _form(kind: Any) -> _Form:
 
 @lru_cache(maxsize=1024)
 def _held(structure: Any, types: Any) -> tuple[Any, ...]:
-    """The functions and the classes of the user's in the nodes of a pytree with data of such types.
+    """The functions and user classes in the nodes of a pytree with data of such types.
 
     Raises:
-        TypeError: what they hold besides their children can change.
+        TypeError: the nodes contain mutable data.
     """
     held, rest = {}, [structure]
     while rest:
@@ -326,7 +326,7 @@ def _held(structure: Any, types: Any) -> tuple[Any, ...]:
 
 
 def _fault_of_node(kind: type, data: Any, search: "_Search") -> _Fault | None:
-    """What stands against the data and the class of a node."""
+    """The reason why the data and the class of a node cannot be part of a key."""
     if is_bare(kind, data):
         return None
     if _is_known(kind):
@@ -336,12 +336,12 @@ def _fault_of_node(kind: type, data: Any, search: "_Search") -> _Fault | None:
 
 
 def _is_known(kind: type) -> bool:
-    """Whether a node keeps there what is its library's own business, besides what it was given."""
+    """Whether the data of a node is internal to its library, apart from the given values."""
     return of_arrays(kind) or kind.__module__ in ("builtins", "collections")
 
 
 def _data(tree: Any, name: str) -> Iterator[tuple[str, Any, _Fault | None]]:
-    """What nodes of a pytree hold besides their children, by path, and what stands against it."""
+    """Data of the nodes of a pytree, by path, with the reasons against it."""
     kind, data = jax.tree.structure(tree).node_data() or (NoneType, None)
     children, _ = jax.tree_util.tree_flatten_with_path(tree, lambda x: x is not tree)
     if not is_bare(kind, data):
@@ -367,7 +367,7 @@ _OF_CLASS = "Make it a field, or hand it over in params; numbers and arrays of j
 
 
 def _fix(x: Any, place: _Place | None) -> str:
-    """What to write in its place."""
+    """The remedy."""
     if place is not None and "methods read" in " ".join(place.path):
         return _OF_CLASS
     if _is_function(x) or (place is not None and "it reads" in " ".join(place.path)):

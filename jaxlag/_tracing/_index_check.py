@@ -21,15 +21,15 @@ class OutOfRange(ValueError):
 def check_indices(
     closed: ClosedJaxpr, watched: Sequence[str | None], of: str = "lagrangian and forces"
 ) -> None:
-    """Raise where a fixed index reaches beyond a vector of coordinates or velocities.
+    """Raise if a fixed index is beyond a vector of coordinates or velocities.
 
-    Indices with a stated mode (`jnp.take(..., mode="clip")`) mean what they do, and those that
-    depend on values are not known here.
+    Indices with an explicit mode (`jnp.take(..., mode="clip")`) are accepted. Indices that
+    depend on values are unknown here.
 
     Args:
         closed: a traced function.
         watched: names of its arguments that are such vectors; None for others.
-        of: what errors call the function.
+        of: name of the function in errors.
 
     Raises:
         OutOfRange: an index is out of range.

@@ -38,7 +38,7 @@ class InputValues(Mapping[str, Any]):
         return dict(self._values)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """The value, or `default` where there is no such input."""
+        """The value, or `default` if there is no such input."""
         if name not in self:
             return default
         return self[name]

@@ -15,13 +15,13 @@ from jaxlag._core._jaxprs import called
 
 
 def interpret(closed: ClosedJaxpr, *args: Any) -> list:
-    """The results of a program at given arrays; overflows and the like give inf and nan."""
+    """The results of a program at given arrays; overflow gives inf or nan."""
     with np.errstate(all="ignore"):
         return _run(closed.jaxpr, list(map(held, closed.consts)), list(args))
 
 
 def held(value: Any) -> Any:
-    """A known value as numpy has it; random keys stay what they are."""
+    """A known value as a numpy array; random keys are unchanged."""
     kind = getattr(value, "dtype", None)
     extended = kind is not None and jax.dtypes.issubdtype(kind, jax.dtypes.extended)
     return value if extended else np.asarray(value)
@@ -117,7 +117,7 @@ def _select(eqn: Any, which: np.ndarray, *cases: np.ndarray) -> Any:
 
 
 def _pad(eqn: Any, x: np.ndarray, filling: np.ndarray) -> list:
-    """Entries apart by `interior`, within `low` and `high`, which cut off where negative."""
+    """Entries spaced by `interior`, padded by `low` and `high`, which crop if negative."""
     config = eqn.params["padding_config"]
     sizes = [max(n + (n - 1) * gap, 0) for n, (_, _, gap) in zip(x.shape, config, strict=True)]
     apart = np.full(sizes, filling, x.dtype)
@@ -142,7 +142,7 @@ def _convert(eqn: Any, x: np.ndarray) -> Any:
 
 
 def _whole(x: np.ndarray, y: np.ndarray) -> Any:
-    """The quotient of integers, cut off towards zero."""
+    """The quotient of integers, rounded towards zero."""
     return np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))
 
 
@@ -221,5 +221,5 @@ def _iota(eqn: Any) -> list:
     return [np.broadcast_to(along.reshape((-1,) + (1,) * (len(shape) - axis - 1)), shape)]
 
 
-# What else derivatives are full of; not among NUMPY, the primitives that have a scalar form.
+# Other primitives of derivatives; not in NUMPY, which holds primitives with a scalar form.
 _PARTS: dict[str, Callable] = {"pad": _pad, "split": _split, "unstack": _unstack, "iota": _iota}

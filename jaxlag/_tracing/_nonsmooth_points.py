@@ -17,24 +17,24 @@ from jaxlag._core._jaxprs import called
 
 _SMOOTH = "jaxlag smooth"
 smooth = jax.named_scope(_SMOOTH)
-"""Decorator of a function that compares, and is smooth all the same."""
+"""Decorator of a function that contains comparisons but is smooth."""
 
-# Of a single place, and the order of an elimination, which its results do not depend on.
+# Comparisons at single points, and pivoting, which does not affect the results of an elimination.
 _GUARDS = ("eq", "ne", "is_finite", "lu")
 
 
 def outcomes(
     program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool], only: Any = None
 ) -> Array | None:
-    """How the comparisons of what moves come out, as numbers in a row; None where there are none.
+    """Outcomes of the comparisons of moving values, as a row of numbers; None if there are none.
 
-    A comparison with == or != is taken for the guard of a single place, and not listed.
+    A comparison with == or != counts as the guard of a single point, and is not listed.
 
     Args:
         program: the traced program.
         args: its arguments.
-        moving: which of these move.
-        only: the equation that is looked at; None for all.
+        moving: which of these vary.
+        only: the equation to examine; None for all.
     """
     found: list[Array] = []
     _run(program, list(args), list(moving), found, only)
@@ -44,7 +44,7 @@ def outcomes(
 def _run(
     program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array], only: Any
 ) -> tuple[list[Any], list[bool]]:
-    """(results, which of them move); outcomes of comparisons are added to `found`."""
+    """(results, which of them vary); outcomes of comparisons are added to `found`."""
     jaxpr = program.jaxpr
     known = dict(zip(jaxpr.constvars, program.consts, strict=True))
     known |= dict(zip(jaxpr.invars, args, strict=True))
@@ -70,7 +70,7 @@ def _run(
 
 
 def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:
-    """Those of one operation."""
+    """Outcomes of one operation."""
     name, first = eqn.primitive.name, given[0]
     if name in _GUARDS or not any(_is_inexact(x) for x in given):
         return

@@ -18,10 +18,10 @@ _TRACED = {float: True, int: False, bool: False, str: False}  # of plain leaves
 
 
 class _Frozen:
-    """A concrete array of truth values, or a number of numpy's, hashable by value."""
+    """A concrete array of truth values, or a numpy scalar, hashable by value."""
 
     def __init__(self, array: Any) -> None:
-        self.array = np.array(array)  # a copy: the caller may change theirs
+        self.array = np.array(array)  # a copy: the caller may change the original
         self.key = (self.array.shape, str(self.array.dtype), self.array.tobytes())
 
     def __hash__(self) -> int:
@@ -40,7 +40,7 @@ def is_array(leaf: Any) -> bool:
 
 
 def known(x: Any) -> np.ndarray | None:
-    """The value of a number or an array of numbers, of tracers where they have one; else None."""
+    """The value of a number or an array, also of a tracer that has one; else None."""
     look = getattr(x, "to_concrete_value", None) if isinstance(x, Tracer) else None
     x = look() if look is not None else x
     if x is None or isinstance(x, Tracer) or _is_key(x) or not eqx.is_array_like(x):
@@ -49,9 +49,9 @@ def known(x: Any) -> np.ndarray | None:
 
 
 def not_finite(params: Any) -> list[tuple[str, str, Any]]:
-    """(Path, path of the number, the number) for every leaf with one that is not finite."""
+    """(path, path of the number, the number) for every leaf with a nonfinite number."""
     params = plain(params)
-    if all(map(_is_finite, jax.tree.leaves(params))):  # nearly always, and without any paths
+    if all(map(_is_finite, jax.tree.leaves(params))):  # the usual case, without paths
         return []
     found = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
@@ -68,13 +68,13 @@ def not_finite(params: Any) -> list[tuple[str, str, Any]]:
 
 
 def paths(params: Any) -> list[str]:
-    """Of the leaves that are traced."""
+    """Paths of the traced leaves."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(halves(plain(params))[0])
     return [f"params{jax.tree_util.keystr(path)}" for path, _ in leaves]
 
 
 def check_keys(params: Any, name: str = "params") -> None:
-    """Raise on what can change, and would be part of the key of compiled programs.
+    """Raise on mutable objects, which would be part of the key of compiled programs.
 
     Raises:
         ValueError: with the leaf, or the static field, by its path.
@@ -103,7 +103,7 @@ def _is_finite(leaf: Any) -> bool:
 
 
 def _is_fine(leaf: Any) -> bool:
-    # Numbers with a fraction are traced, whatever their class.
+    # Numbers with a fraction are traced, for all classes.
     return is_array(leaf) or isinstance(leaf, float | complex | _Frozen) or is_fixed(leaf)
 
 
@@ -123,20 +123,20 @@ def _is_traced(leaf: Any) -> bool:
 
 
 def split(params: Any) -> tuple[Any, Any]:
-    """(traced, static) halves of params, put together again by `join`.
+    """(traced, static) halves of params; `join` is the inverse.
 
     Arrays of numbers, Python floats, random keys and tracers are traced; Python ints, truth values,
     strings and functions are static: part of the key under which the compiled program is cached.
 
     Raises:
-        ValueError: something static can change, by its path.
+        ValueError: a static part is mutable, with its path.
     """
     check_keys(params)
     return halves(params)
 
 
 def halves(tree: Any) -> tuple[Any, Any]:
-    """The same of any pytree, whatever its leaves."""
+    """The same for any pytree, without checks."""
     leaves, form = jax.tree.flatten(tree)
     are = [_is_traced(x) for x in leaves]
     traced = [jnp.asarray(x) if is_it else None for x, is_it in zip(leaves, are, strict=True)]
@@ -154,7 +154,7 @@ def join(traced: Any, static: Any) -> Any:
 
 
 def shapes(traced: Any) -> Any:
-    """Traced params without their values: shapes, dtypes, and which of them give way to others."""
+    """Traced params without their values: shapes, dtypes and weak types."""
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(
             x.shape, x.dtype, weak_type=bool(getattr(x, "weak_type", False))
@@ -164,7 +164,7 @@ def shapes(traced: Any) -> Any:
 
 
 class Static:
-    """A pytree without traced leaves, hashable, to key compiled programs by."""
+    """A hashable pytree without traced leaves, for the keys of compiled programs."""
 
     def __init__(self, tree: Any) -> None:
         leaves, self.treedef = jax.tree.flatten(tree)
@@ -173,7 +173,7 @@ class Static:
 
     @property
     def types(self) -> Any:
-        """Those of all that it holds, as far as equal values may be of others."""
+        """The types of all contents, where equal values may have different types."""
         if self._types is None:
             self._types = types_in(self.treedef), tuple(map(types_of, self.leaves))
         return self._types
@@ -195,10 +195,10 @@ class Static:
 
 
 class Sample:
-    """Values that a program may be checked with, but is not keyed by: all samples are equal.
+    """Values for the check of a program, which are not part of its key: all samples are equal.
 
     Attributes:
-        leaves: the traced leaves of the params; None where their values are not known.
+        leaves: the traced leaves of the params; None if their values are unknown.
     """
 
     def __init__(self, leaves: list[Any] | None) -> None:

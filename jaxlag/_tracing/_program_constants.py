@@ -12,7 +12,7 @@ from jaxlag._core._jaxprs import rewritten
 
 
 def copy_constants(code: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program, no constant of which anybody else can change."""
+    """The same program with copies of all constants that can be changed elsewhere."""
     return rewritten(code, _equation, _copied)
 
 

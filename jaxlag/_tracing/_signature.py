@@ -14,7 +14,7 @@ from jaxlag._tracing._source_lines import line_of
 
 
 def real_scalar(argument: str, function: Callable) -> Callable:
-    """`function`, raising in our form while it is traced unless it returns a real scalar."""
+    """`function`, with an error in our form while tracing unless it returns a real scalar."""
 
     def checked(*arguments: Any) -> Any:
         value = function(*arguments)
@@ -34,9 +34,9 @@ def real_scalar(argument: str, function: Callable) -> Callable:
 
 
 def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) -> Callable:
-    """The gradient of a real scalar function of (t, q, v, params), as `jax.grad` has it.
+    """The gradient of a real scalar function of (t, q, v, params), as by `jax.grad`.
 
-    It raises in our form where a loop in the function has no reverse derivative.
+    Raises in our form if a loop in the function has no reverse derivative.
     """
     scalar = real_scalar(argument, function)
 
@@ -60,7 +60,7 @@ def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) 
 
 
 def _narrowed(params: Any) -> str:
-    """What to do about a parameter of one entry, which makes arrays of scalars."""
+    """The remedy for a parameter of shape (1,), which makes arrays of scalars."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(plain(params))[0]:
         if jnp.shape(leaf) == (1,):
             return f"params{jax.tree_util.keystr(path)} has shape (1,): give a number, or index it."
@@ -68,7 +68,7 @@ def _narrowed(params: Any) -> str:
 
 
 def wants(function: Callable, position: int, name: str) -> bool:
-    """Whether `function` asks for a positional argument there: required, or called `name`."""
+    """Whether `function` has a positional argument there that is required or called `name`."""
     try:
         parameters = list(signature(function).parameters.values())
     except ValueError:
@@ -114,7 +114,7 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
 
 
 def _positional(function: Callable) -> list[str]:
-    """Names of the arguments that it takes by position, as far as they are known."""
+    """Names of its positional arguments, if known."""
     try:
         parameters = signature(function).parameters.values()
     except ValueError:

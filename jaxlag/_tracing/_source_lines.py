@@ -8,10 +8,10 @@ from jaxlag._core._jaxprs import equations
 
 
 def line_of(program: Any, *primitives: str) -> str:
-    """File, line and function of the first of these operations; "" where it does none of them.
+    """File, line and function of the first of these operations; "" if there is none.
 
     Args:
-        program: traced; programs within it are searched, too.
+        program: traced; nested programs are searched, too.
         primitives: names of operations.
     """
     for eqn in equations(program):

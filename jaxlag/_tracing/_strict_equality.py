@@ -14,12 +14,12 @@ BUILTIN = (dict, list, tuple, NoneType)
 
 
 def is_bare(kind: type, data: Any) -> bool:
-    """Whether a node of a pytree holds nothing besides its children but their names."""
+    """Whether a node of a pytree contains only its children and their names."""
     return kind in BUILTIN and all(type(key) is str for key in data or ())
 
 
 def types_of(x: Any) -> Any:
-    """The types of a value and of what is in it, and the signs of zeros."""
+    """The types of a value and of its contents, and the signs of zeros."""
     kind = type(x)
     if kind in _ALONE:
         return kind
@@ -35,7 +35,7 @@ def types_of(x: Any) -> Any:
 
 
 def types_in(structure: Any) -> Any:
-    """The same of the nodes of a pytree."""
+    """The same for the nodes of a pytree."""
     if _is_bare_throughout(structure):
         return None
     found, rest = [], [structure]

@@ -38,7 +38,7 @@ class _Program(NamedTuple):
 
     Attributes:
         code: from the traced leaves of the arguments to those of the result.
-        form: the structure of the latter.
+        form: the structure of the result's leaves.
         static: the rest of the result.
         inputs: names of the inputs that were read.
     """
@@ -50,16 +50,16 @@ class _Program(NamedTuple):
 
 
 class _Traced(NamedTuple):
-    """In the place of a traced value that a function closes over: which one it is."""
+    """A placeholder for a traced value in a closure, with its identity."""
 
     id: int
 
 
 class TracedFunction:
-    """A function that is traced once for every kind of arguments, and never called again.
+    """A function that is traced once for every kind of arguments, and then not called again.
 
-    It hashes and compares as the function does, and is one object as long as it lives: systems made
-    of one function share what it read.
+    It hashes and compares as the function does. There is one object per function as long as it
+    exists: systems of one function share the values that it has read.
 
     Attributes:
         function: as the user wrote it.
@@ -72,7 +72,7 @@ class TracedFunction:
         self._programs: dict[Any, _Program] = {}
         self._outside: Outside | None = None
         self._told: set[str] = set()  # paths of Python ints that were warned about
-        update_wrapper(self, function, updated=())  # an object's own attributes are its own
+        update_wrapper(self, function, updated=())  # attributes of an object are not copied
 
     def __hash__(self) -> int:
         return hash(self.function)
@@ -84,22 +84,22 @@ class TracedFunction:
         return traced_function, (self.function,)
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """What the function returns."""
+        """The result of the function."""
         if keywords:
             arguments = signature(self.function).bind(*arguments, **keywords).args
         closed = [x for x in arguments if isinstance(x, ParamsWithClosure)]
         return self.call_with_closure(closed[0] if closed else None, *arguments)
 
     def call_with_closure(self, params: Any, *arguments: Any) -> Any:
-        """The same; what stands for traced values of its closure comes with the params."""
+        """The same; values of traced values in its closure come with the params."""
         named = tuple(i for i, x in enumerate(arguments) if isinstance(x, InputValues))
         given = [x.peek() if isinstance(x, InputValues) else plain(x) for x in arguments]
         traced, rest = _params.halves(given)
         leaves, tree = jax.tree.flatten(traced)
-        if len({x.dtype for x in leaves}) == 1:  # numbers of Python's have nothing to give way to
+        if len({x.dtype for x in leaves}) == 1:  # Python numbers then need no weak type
             leaves = [jnp.asarray(x, x.dtype) for x in leaves]
         static = _params.Static(rest)
-        if not _params.are_keys(rest):  # no compiled program knows such params either
+        if not _params.are_keys(rest):  # compiled programs cannot have such params either
             return _called(self.function, [plain(x) for x in arguments])
         kind = (tree, static, tuple(_params.shapes(leaves)), named, _config())
         program = self._programs.get(kind)
@@ -113,13 +113,13 @@ class TracedFunction:
         return eqx.combine(jax.tree.unflatten(program.form, found), program.static)
 
     def _closing(self, params: Any, kind: Any, leaves: list) -> _Program:
-        """One that isn't kept, or not yet: with what stands for traced values of its closure."""
+        """A program that is not cached: with values for the traced values in its closure."""
         if not isinstance(params, ParamsWithClosure):
             return self._trace(kind, leaves)
         instead, made = params.by_tracer, params.programs
         if (self, kind) not in made:
             program = self._trace(kind, leaves)
-            # Without the tracers, which programs in a cache would keep alive.
+            # Without the tracers, which cached programs would keep alive.
             reads = [_Traced(id(x)) if id(x) in instead else x for x in program.code.consts]
             if not concrete(reads):
                 return program
@@ -129,7 +129,7 @@ class TracedFunction:
         return program._replace(code=ClosedJaxpr(program.code.jaxpr, consts))
 
     def _trace(self, kind: Any, leaves: list) -> _Program:
-        """The program for a new kind of arguments; kept, unless it closes over traced values."""
+        """The program for a new kind of arguments; cached unless its closure has traced values."""
         read = outside(self.function) if self._outside is None else {}
         tree, static, _, named, _ = kind
         program = self._traced(tree, static, leaves, named)
@@ -139,7 +139,7 @@ class TracedFunction:
             _count(self.function)
         self._warn_of_counts(kind)
         if self._outside is None:
-            # What the function changes itself is no business of its results: counters, records.
+            # Ignore variables that the function itself modifies, such as counters.
             own = {name for name, _, _ in changes(read)}
             self._outside = {name: x for name, x in read.items() if name not in own}
         return self._programs.setdefault(kind, program)
@@ -168,9 +168,9 @@ class TracedFunction:
         return _Program(code, form, static_part, frozenset(read))
 
     def _warn_of_counts(self, kind: Any) -> None:
-        """Say where ints of Python's are given as if they were numbers: each value compiles anew.
+        """Warn of Python ints that are used as numbers: each value recompiles.
 
-        That is so at the third value of one and the same leaf.
+        The warning is given at the third value of the same leaf.
         """
         tree, static, *rest = kind
         given, _ = jax.tree_util.tree_flatten_with_path(static.tree)
@@ -197,11 +197,11 @@ class TracedFunction:
 
     @property
     def known(self) -> bool:
-        """Whether it has been traced, and closes over no traced value."""
+        """Whether it has been traced, without traced values in its closure."""
         return bool(self._programs)
 
     def warn(self) -> None:
-        """Say what the function reads from outside and is not any more what it read."""
+        """Warn of outside values that have changed since the function read them."""
         for name, before, now in changes(self._outside or {}):
             message = (
                 f"{name}, which {_named(self.function)} reads from outside, was {before} when it "
@@ -211,11 +211,11 @@ class TracedFunction:
             warnings.warn(message, UserWarning, stacklevel=1)
 
 
-MANY_VALUES = 3  # of one int among the params, after which it looks like a number
-MANY_FUNCTIONS = 20  # made of one piece of code, after which it looks like a loop
+MANY_VALUES = 3  # values of one int among the params from which on it looks like a number
+MANY_FUNCTIONS = 20  # functions from one piece of code from which on it looks like a loop
 _logger = logging.getLogger("jaxlag")
-# Not settings: how often a piece of code was declared anew; the object for a function, as long as
-# anybody holds it.
+# Not settings: number of functions from each piece of code; the object of each function as long as
+# it is referenced.
 _MADE: WeakKeyDictionary[CodeType, int] = WeakKeyDictionary()
 _ALIVE: WeakValueDictionary[Callable, TracedFunction] = WeakValueDictionary()
 
@@ -226,7 +226,7 @@ def _leaf(path: Any) -> str:
 
 
 def _count(function: Callable) -> None:
-    """Say once where a function is made anew again and again, as a lambda in a loop is."""
+    """Log once if a function is made again and again, such as a lambda in a loop."""
     code = getattr(unwrap(function), "__code__", None)
     if code is None:
         return
@@ -241,7 +241,7 @@ def _count(function: Callable) -> None:
 
 
 def _called(function: Callable, arguments: list[Any]) -> Any:
-    """What the function returns; what goes wrong in it is said in our form where that helps."""
+    """Call the function; errors in it are raised in our form if that helps."""
     try:
         return function(*arguments)
     except Exception as error:
@@ -252,10 +252,10 @@ def _called(function: Callable, arguments: list[Any]) -> Any:
 
 
 def traced_function(function: Callable) -> TracedFunction:
-    """The function as one that is traced once; the same object for the same function.
+    """The `TracedFunction` of a function; the same object for the same function.
 
     Raises:
-        ValueError: it does not hash, as modules that hold arrays do not.
+        ValueError: it does not hash, such as modules with arrays.
     """
     if isinstance(function, TracedFunction):
         return function
@@ -274,20 +274,20 @@ def traced_function(function: Callable) -> TracedFunction:
 
 
 def traced_unless_module(function: Any) -> Any:
-    """The same of a plain function; a module, whose arrays are traced, as it is.
+    """The same for a plain function; a module is unchanged, as its arrays are traced.
 
     Raises:
-        ValueError: a module whose static fields can change.
+        ValueError: a module whose static fields are mutable.
     """
     if not isinstance(function, eqx.Module):
         return traced_function(function)
-    if not of_library(function):  # of one, whoever made its parts has asked
+    if not of_library(function):  # library modules check their own parts
         _params.check_keys(function, type(function).__name__)
     return function
 
 
 def as_written(function: Any) -> Any:
-    """The function of the user's itself, which sees numbers where it is given numbers."""
+    """The user's function itself, which receives numbers for numbers."""
     if isinstance(function, TracedFunction):
         return function.function
     if not isinstance(function, eqx.Module):
@@ -302,7 +302,7 @@ def functions_of(declared: Any) -> Iterator[TracedFunction]:
 
 
 def warn_of_changes(*declared: Any) -> None:
-    """Say what in declarations, or in inputs, reads something from outside that has changed."""
+    """Warn of outside values read by declarations or inputs that have changed."""
     for part in _parts_of(declared):
         if isinstance(part, TracedFunction):
             part.warn()
@@ -324,7 +324,7 @@ def _parts_of(declared: Any) -> Iterator[Any]:
 
 
 def _config() -> tuple:
-    """What else tracing depends on."""
+    """The JAX settings that affect tracing."""
     config: Any = jax.config
     return (
         config.jax_enable_x64,

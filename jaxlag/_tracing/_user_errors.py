@@ -13,7 +13,7 @@ import jax.errors
 
 from jaxlag._core._errors import invalid
 
-_LONGEST = 80  # characters of a line of the user's code that are shown
+_LONGEST = 80  # characters of a shown line of user code
 _CONVERTED = (
     (
         jax.errors.TracerArrayConversionError,
@@ -43,12 +43,12 @@ _CONVERTED = (
 
 
 def translate(function: Callable, arguments: Sequence[Any], error: Exception) -> Exception | None:
-    """The error in our form, for faults that are common; None where JAX or Python says it best.
+    """The error in our form, for common mistakes; None if the message of JAX or Python is better.
 
     Args:
-        function: of the user's, that raised it.
-        arguments: what it was called with.
-        error: what it raised.
+        function: the user function that raised it.
+        arguments: its arguments.
+        error: the error.
     """
     named = _arguments(function, arguments)
     name, place = f"function {_name(function)}", _place(function, error.__traceback__)
@@ -63,7 +63,7 @@ def translate(function: Callable, arguments: Sequence[Any], error: Exception) ->
 
 
 def _missing(name: str, place: str, named: Mapping[str, Any], key: str) -> Exception | None:
-    """For a key that a dict among the arguments does not have."""
+    """The error for a missing key of a dict among the arguments."""
     lacking = {
         argument: sorted(map(str, value))
         for argument, value in named.items()
@@ -78,7 +78,7 @@ def _missing(name: str, place: str, named: Mapping[str, Any], key: str) -> Excep
 
 
 def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | None:
-    """For params that are no numbers."""
+    """The error for params that are no numbers."""
     if "params" not in named:
         return None
     params = named["params"]
@@ -102,7 +102,7 @@ def _of_params(name: str, place: str, named: Mapping[str, Any]) -> Exception | N
 
 
 def _arguments(function: Callable, arguments: Sequence[Any]) -> dict[str, Any]:
-    """What it was called with, by our names: the fourth argument is called params."""
+    """The arguments by our names: the fourth argument is called params."""
     try:
         names = list(signature(function).parameters)
     except (TypeError, ValueError):
@@ -123,7 +123,7 @@ def _name(function: Callable) -> str:
 
 
 def _place(function: Callable, traceback: TracebackType | None) -> str:
-    """The line of the function's file that the error came through last, in words."""
+    """The last line of the function's file in the traceback, as text."""
     code = getattr(unwrap(function), "__code__", None)
     found = None
     while traceback is not None:

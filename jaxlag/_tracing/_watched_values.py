@@ -13,10 +13,10 @@ from jax.core import Tracer
 from jaxlag._tracing._defining_package import of_library
 from jaxlag._tracing._function_code import FUNCTIONS, unwrapped
 
-LEAVES = 1000  # of a container that are looked at
-ELEMENTS = 100_000  # of an array
+LEAVES = 1000  # largest number of leaves examined in a container
+ELEMENTS = 100_000  # largest number of elements compared in an array
 GONE = object()
-OPAQUE = object()  # no value that could be compared
+OPAQUE = object()  # no comparable value
 _NUMBERS = (bool, int, float, complex, str, np.generic)
 _PLAIN = (*_NUMBERS, bytes, NoneType, Enum, range, np.dtype)
 
@@ -25,8 +25,8 @@ class Read(NamedTuple):
     """A value from outside.
 
     Attributes:
-        look: how to read it again.
-        value: as it was; arrays that can be changed in place are copied.
+        look: function that reads it again.
+        value: its value when first read; arrays that can be changed in place are copied.
     """
 
     look: Callable[[], Any]
@@ -37,10 +37,10 @@ Outside = dict[str, Read]
 
 
 def changes(read: Outside) -> Iterator[tuple[str, str, str]]:
-    """(name, what it was, what it is now) of all that has changed."""
+    """(name, old value, new value) of all changed values."""
     for name, (look, before) in read.items():
         there = look()
-        if there is before:  # nearly always
+        if there is before:  # the usual case
             continue
         now = value_of(there)
         if not _same(before, now):
@@ -48,7 +48,7 @@ def changes(read: Outside) -> Iterator[tuple[str, str, str]]:
 
 
 def value_of(x: Any) -> Any:
-    """A number, an array or a container of them as it is now; OPAQUE for anything else."""
+    """The current value of a number, an array or a container of these; else OPAQUE."""
     if x is GONE or isinstance(x, (*_PLAIN, jax.Array)) or isinstance(unwrapped(x), FUNCTIONS):
         return x
     if isinstance(x, type | partial) or (callable(x) and of_library(x)):
@@ -68,12 +68,12 @@ def value_of(x: Any) -> Any:
 
 
 def _sampled(x: np.ndarray) -> np.ndarray:
-    """A copy; of a large array, of evenly spread numbers of it."""
+    """A copy; for a large array, of evenly spaced elements."""
     return x.copy() if x.size <= ELEMENTS else x.flat[:: -(-x.size // ELEMENTS)].copy()
 
 
 def _leaves(x: dict | list | tuple) -> Any:
-    """The structure and the numbers of a container of nothing else."""
+    """The structure and the numbers of a container of numbers only."""
     try:
         leaves, tree = jax.tree.flatten(x)
     except (TypeError, ValueError):  # keys that do not sort

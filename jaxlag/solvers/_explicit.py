@@ -292,7 +292,7 @@ def _nystrom(
         return terms.signed(reduce(_added, drifts), args), _sum(row, kicks)
 
     def whole(gain: Any) -> Any:
-        """h times it. What a step returns is read in many places: XLA computes divisions once."""
+        """h times it. The results of a step have many uses: XLA computes divisions once."""
         return jax.tree.map(lambda x: x / per_step, gain)
 
     def end(row: np.ndarray, squared: np.ndarray) -> Any:

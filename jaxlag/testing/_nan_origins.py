@@ -130,7 +130,7 @@ def _rule(eqn: Any) -> list[Origin]:
     return [Origin(eqn.primitive.name, found[1], int(found[2]))]
 
 
-# ---- A program run forwards, then asked backwards ---------------------------------------------
+# ---- A program run forwards, then traced backwards --------------------------------------------
 
 
 def evaluate(closed: ClosedJaxpr, *args: Any) -> list[np.ndarray]:
@@ -166,7 +166,7 @@ def _back(closed: ClosedJaxpr, known: dict, wanted: list) -> tuple[list, list]:
 
     Args:
         closed: the program.
-        known: what `_run` returned for it.
+        known: the result of `_run` for it.
         wanted: for every result a mask of the examined entries, none of them finite.
 
     Returns:

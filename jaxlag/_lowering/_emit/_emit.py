@@ -16,10 +16,10 @@ from jaxlag._lowering._graph._expression import FIXED
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._tracing import _params
 
-# Code of more lines is one function that XLA does not inline: copied into every stage of a solver
-# it compiles in many times the time, and XLA's fusion computes shared lines anew in each use.
+# Longer code is one function that XLA does not inline. Copied into every stage of a solver
+# it would take many times as long to compile, and XLA's fusion would recompute shared lines.
 INLINE_UP_TO = 60
-# In a loop over one trajectory or a few lanes. On wider arrays XLA may want to split the work of a
+# In a loop over one trajectory or a few lanes. On wider arrays XLA may split the work of a
 # function among threads, which it cannot do inside a loop that is one native function.
 INLINE_IN_LOOP = 14
 
@@ -32,15 +32,15 @@ def prelude(
     there: Array | None = None,
     time_direction: Array | float = 1.0,
 ) -> Float[Array, " k"]:
-    """What the body needs of what does not change during a solve, as one array.
+    """Values for the body that do not change during a solve, as one array.
 
     Args:
         program: straight-line code.
         params: as the Lagrangian takes them.
         dtype: of the results.
-        kept: for every constraint row whether it is solved with; None for all.
-        there: for every one whether it is more than rounding; None for all.
-        time_direction: -1 where time runs backwards.
+        kept: for every constraint row whether it is used in solves; None for all.
+        there: for every row whether it is more than rounding; None for all.
+        time_direction: -1 if time runs backwards.
     """
     slots = numbers(program, dtype)
     for given in FIXED:
@@ -70,7 +70,7 @@ def body(
 
     Args:
         program: straight-line code.
-        carried: what `prelude` returned.
+        carried: the result of `prelude`.
         t: time.
         q: coordinates.
         v: velocities.
@@ -94,7 +94,7 @@ def body(
 
 @lru_cache(maxsize=256)
 def _function(program: Program, dtype: Any, lanes: bool) -> Any:
-    """The body as a function that is traced once, however many stages call it."""
+    """The body as a function that is traced once for all stages."""
 
     def results(carried: Array, given: Sequence[Array]) -> tuple[Array, ...]:
         return straight(program, dtype, elements(carried), given, lanes)

@@ -17,7 +17,7 @@ from jaxlag._lowering._graph._straight_line import Line, Program
 from jaxlag._lowering._jaxpr._from_jaxpr import Rule
 
 # From this many lines on, sines and cosines are kept by a division by 1: XLA's CPU backend would
-# compute them anew for every result that they lead to, but never does so with a division. In short
+# recompute them for every result that depends on them, but never repeats a division. In short
 # code on scalars the compiler finds the repetitions itself.
 KEEP_FROM = 120
 KEEP_FROM_IN_LANES = 14
@@ -39,7 +39,7 @@ def straight(
 ) -> tuple[Array, ...]:
     """The results of the body.
 
-    `pairs` receives the sine and cosine of every argument of one, by slot; those that are known
+    `pairs` receives the sine and cosine of every argument, by slot; known ones
     are taken from `known`.
     """
     slots = numbers(program, dtype)
@@ -62,9 +62,9 @@ def run(
     pairs: Pairs | None = None,
     known: Pairs | None = None,
 ) -> None:
-    """Line after line, each a new slot.
+    """Execute line after line, each into a new slot.
 
-    XLA would move constants out of powers of what is `whole`, and out of the range of numbers.
+    XLA would move constants out of powers of `whole` slots, which could then overflow.
     """
     ruled: dict[Any, Array] = {}
     pairs = {} if pairs is None else pairs
@@ -96,7 +96,7 @@ def is_trig(line: Line) -> bool:
 
 @CustomJVP
 def _quotient(x: Array, y: Array) -> Array:
-    """x / y, whose derivative (dx - x/y dy) / y forms no square of y, as that of JAX does."""
+    """x / y with the derivative (dx - x/y dy) / y, which, unlike JAX's, does not square y."""
     return x / y
 
 
@@ -123,7 +123,7 @@ def _line(line: Line, args: list[Any]) -> Any:
 
 
 def _by_rule(rule: Rule, args: Sequence[Any]) -> Array:
-    """All results of a function with a derivative rule of its own, as one array."""
+    """All results of a function with a custom derivative rule, as one array."""
     operands, start = [], 0
     for aval in rule.avals:
         part = [jnp.asarray(x, aval.dtype) for x in args[start : start + aval.size]]

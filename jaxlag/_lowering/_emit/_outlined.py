@@ -21,16 +21,16 @@ from jaxlag._core._xla import not_inlined
 from jaxlag._lowering._emit._execute import Pairs, is_trig, stacked, straight
 from jaxlag._lowering._graph._straight_line import Program
 
-Halves = tuple[Array, Array]  # (what does not change during a solve, state and inputs)
+Halves = tuple[Array, Array]  # (constants of a solve, state and inputs)
 
 
 @lru_cache(maxsize=256)
 def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array], Array]:
-    """(what does not change, state and inputs) -> results, each as one array."""
+    """(constants of a solve, state and inputs) -> results, each as one array."""
     slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
 
     def both(numbers: Halves, kept: Array | None = None) -> tuple[Array, Array]:
-        """Results, and the sines and cosines they are made from, which may be known."""
+        """Results, and their sines and cosines, which may be known already."""
         pairs: Pairs = {}
         known: Pairs | None = None
         if kept is not None:
@@ -71,10 +71,10 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
 
 
 def _by_numbers(function: Callable, dtype: Any) -> Callable:
-    """A function of arrays that is not inlined; every number comes in and goes out by itself.
+    """A function of arrays that is not inlined; every number is a separate argument or result.
 
-    In lanes each is an array of its own. Code for a table of them would find out for every number
-    of it which array that is in, and compute all arrays for each.
+    In lanes each number is an array. For a table of them, the code would search for each number
+    the array that contains it, and compute all arrays for each.
     """
 
     def whole(arrays: Any) -> Any:
@@ -94,7 +94,7 @@ def _derivative(maps: dict, at: tuple, tangents: tuple) -> Any:
 
 
 def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
-    """The derivative of function(row, kept) in the row, by which halves of it move."""
+    """The derivative of function(row, kept) in the row, for each choice of varying halves."""
 
     def pushed(at: tuple, dot: tuple) -> Any:
         numbers, kept = at

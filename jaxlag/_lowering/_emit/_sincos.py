@@ -41,10 +41,10 @@ _COSINE = (
     4.616134911812934e-14,
 )
 
-# pi/2 and what the rounding of x/pi adds to r; past 2^53 nothing is left of r but rounding.
+# pi/2 plus the effect of the rounding of x/pi on r; past 2^53 r is only rounding.
 _MOST = 1.6
 
-# Added to an integer of less than 2^51 it makes a number that ends with the integer's last bit.
+# The sum with an integer below 2^51 is a number whose last bit is that of the integer.
 _INTEGER = 1.5 * 2.0**52
 
 
@@ -53,9 +53,9 @@ def sincos(x: Float[Array, "*s"]) -> tuple[Float[Array, "*s"], Float[Array, "*s"
     """(sin x, cos x); NaN for infinite x.
 
     On CPU in float64 by Cody and Waite's reduction modulo pi and polynomials. Up to |x| = 1e6 the
-    sine is within 2 eps |sin x| of the exact value and the cosine within 2 eps; up to 1e13 both
-    are those of one x that is off by 2 eps |x|. Beyond, nothing of x is left but rounding in the
-    end; the results stay within [-1, 1].
+    sine is within 2 eps |sin x| of the exact value and the cosine within 2 eps. Up to 1e13 both
+    are exact for an x that differs by 2 eps |x|. For larger x the results become meaningless, but
+    stay within [-1, 1].
 
     Source: Cody, Waite, Software Manual for the Elementary Functions (1980), ch. 8.
     """
@@ -73,7 +73,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple:
 
 @CustomJVP
 def recalled(x: Array, s: Array, c: Array) -> tuple[Array, Array]:
-    """(sin x, cos x) = (s, c), found before."""
+    """(sin x, cos x) = (s, c), from an earlier evaluation."""
     return s, c
 
 
@@ -93,9 +93,9 @@ def by_polynomials(x: Array) -> tuple[Array, Array]:
     r = lax.clamp(-_MOST, r, _MOST)
     z = r * r
     sign = _parity(n)
-    # The sign is ready before the sine's polynomial is.
+    # The sign is available before the sine's polynomial.
     r = sign * r
-    s = lax.clamp(-1.0, r + (r * z) * _polynomial(_SINE, z), 1.0)  # roundings may lead past 1
+    s = lax.clamp(-1.0, r + (r * z) * _polynomial(_SINE, z), 1.0)  # rounding may exceed 1
     c = (1.0 - 0.5 * z) + (z * z) * _polynomial(_COSINE, z)
     return s, sign * c
 

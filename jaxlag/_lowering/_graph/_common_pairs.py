@@ -12,11 +12,11 @@ from jaxlag._lowering._graph._expression import Node, node_id
 
 Term = tuple[Any, float]  # (token, coefficient)
 
-LONGEST = 32  # factors of a product that is looked through
+LONGEST = 32  # factors of the longest product that is searched
 
 
 class Shared:
-    """Finds pairs, and puts tokens in an order: nodes by id, then pairs by age.
+    """Finds common pairs, and orders tokens: nodes by id, then pairs by age.
 
     Args:
         first: the rank of the first pair, above the ids of all nodes.
@@ -27,15 +27,15 @@ class Shared:
         self._ranks: dict[Any, int] = {}
 
     def sums(self, given: Mapping[Node, list[Term]]) -> dict[Node, list[Term]]:
-        """The sums with pairs x + k y that several contain in place of their terms.
+        """The sums with common pairs x + k y in place of their terms.
 
-        The most frequent pair comes first, of equally frequent ones the one met first.
+        The most frequent pair comes first; of equally frequent ones the first found.
         """
         groups = {node: list(terms) for node, terms in given.items()}
         occurs = Counter(token for terms in groups.values() for token, _ in terms)
         places: dict[Any, set[Node]] = {}
         ages: dict[Any, int] = {}
-        queue: list[tuple[int, int, Any]] = []  # (- of how many sums at least, age, pair)
+        queue: list[tuple[int, int, Any]] = []  # (- least number of sums, age, pair)
 
         def pairs(terms: list[Term]) -> Iterable[tuple[Any, ...]]:
             shared = [(x, a) for x, a in terms if occurs[x] > 1]
@@ -72,10 +72,10 @@ class Shared:
         return groups
 
     def factors(self, groups: dict[Node, list[Any]]) -> None:
-        """In place: products x y that several products contain, or one contains twice.
+        """Replace in place products x y that several products contain, or one contains twice.
 
-        The most frequent pair comes first, of equally frequent ones the one met first. Products of
-        more than LONGEST factors stay as they are: their pairs would take seconds to count.
+        The most frequent pair comes first; of equally frequent ones the first found. Products of
+        more than LONGEST factors are unchanged: counting their pairs would take seconds.
         """
         powers = {
             node: Counter(factors) for node, factors in groups.items() if len(factors) <= LONGEST
@@ -83,7 +83,7 @@ class Shared:
         counts: dict[Any, int] = {}
         ages: dict[Any, int] = {}
         places: dict[Any, set[Node]] = defaultdict(set)
-        queue: list[tuple[int, int, Any]] = []  # (- of how often, age, pair), some out of date
+        queue: list[tuple[int, int, Any]] = []  # (minus the count, age, pair), some outdated
 
         def change(node: Node, pair: tuple[Any, ...], old: int, new: int) -> None:
             if old == new:
@@ -99,7 +99,7 @@ class Shared:
                 change(node, pair, 0, times)
         while queue:
             count, _, best = heappop(queue)
-            if counts[best] != -count:  # entered again when it became another one
+            if counts[best] != -count:  # re-entered with its new count
                 continue
             self._rank(best)
             _, x, y = best
@@ -115,7 +115,7 @@ class Shared:
                 for z in sorted(rank, key=rank.__getitem__):
                     for w in touched:
                         if z in touched and rank[w] < rank[z]:
-                            continue  # met from the other side
+                            continue  # found from the other side
                         first, second = (z, w) if rank[z] <= rank[w] else (w, z)
                         then, now = (_times(each, first, second) for each in (old, own))
                         change(node, ("times", first, second), then, now)
@@ -123,7 +123,7 @@ class Shared:
             groups[node] = list(own.elements())
 
     def _factor_pairs(self, powers: Mapping[Any, int]) -> Iterable[tuple[Any, int]]:
-        """Pairs of factors, each as often as disjoint pairs of it fit."""
+        """Pairs of factors, each with the number of disjoint pairs."""
         tokens = sorted(powers, key=self._rank)
         for i, x in enumerate(tokens):
             for y in tokens[i:]:
@@ -131,7 +131,7 @@ class Shared:
                     yield ("times", x, y), times
 
     def _rank(self, token: Any) -> int:
-        """Place in an order of tokens: nodes by id, then what is shared by age."""
+        """Place in the order of tokens: nodes by id, then pairs by age."""
         if isinstance(token, Node):
             return token.id
         return self._ranks.setdefault(token, self._first + len(self._ranks))
@@ -144,14 +144,14 @@ class Shared:
 
 
 def _times(powers: Mapping[Any, int], x: Any, y: Any) -> int:
-    """How many disjoint pairs x y there are."""
+    """Number of disjoint pairs x y."""
     if x == y:
         return powers.get(x, 0) // 2
     return min(powers.get(x, 0), powers.get(y, 0))
 
 
 def _without(terms: list[Term], pair: tuple[Any, ...]) -> tuple[list[Term], float]:
-    """The terms without the pair, and the factor it had."""
+    """The terms without the pair, and the factor of the pair."""
     _, x, y, _ = pair
     factor = next(c for t, c in terms if t == x)
     return [(t, c) for t, c in terms if t not in (x, y)], factor

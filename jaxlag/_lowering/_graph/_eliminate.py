@@ -6,14 +6,14 @@ import numpy as np
 
 from jaxlag._lowering._graph._expression import Graph, Node, named
 
-DOUBLE = 1e-12  # eps of double precision lies below, that of single precision above
+DOUBLE = 1e-12  # larger than eps of double precision, smaller than that of single precision
 GREATER = named("gt")
 NO_LESS = named("ge")
 _ABS = named("abs")
 
 
 def blocks(M: Sequence[Sequence[Node]], zero: Node) -> list[list[int]]:
-    """Coordinates that inertia couples: connected by nonzero entries of M."""
+    """Groups of coordinates coupled by nonzero entries of M."""
     n = len(M)
     left, found = set(range(n)), []
     while left:
@@ -29,7 +29,7 @@ def blocks(M: Sequence[Sequence[Node]], zero: Node) -> list[list[int]]:
 
 
 def least_operations(pattern: Sequence[Sequence[bool]]) -> int:
-    """Multiplications and subtractions of an elimination along a pattern, fill included."""
+    """Multiplications and subtractions of an elimination with a nonzero pattern, with fill-in."""
     n, total = len(pattern), 0
     near = {i: {j for j in range(n) if pattern[i][j] and j != i} for i in range(n)}
     while near:
@@ -43,11 +43,11 @@ def least_operations(pattern: Sequence[Sequence[bool]]) -> int:
 
 
 def solve(graph: Graph, M: Sequence[Sequence[Node]], r: Sequence[Node], eps: float) -> list[Node]:
-    """The a with M a = r, each ending in a division; NaN where M is not positive definite.
+    """The a with M a = r, each ending in a division; NaN if M is not positive definite.
 
     L D L^T (Golub, Van Loan, Matrix Computations, sec. 4.1) of every block in order of least
     coupling; in double precision the last two unknowns by Cramer's rule. A pivot must exceed
-    4 n eps M_ii, as in `_mass_solve.factor_mass`, also where nothing is divided by it.
+    4 n eps M_ii, as in `_mass_solve.factor_mass`, even if it divides nothing.
     """
     return bordered(graph, M, [], [(r, [])], eps, checked=True)[0]
 
@@ -65,9 +65,9 @@ def bordered(
     """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0.
 
     The same elimination of [M, A^T; A, 0] with the unknowns (x, -lam), whose pivots are positive
-    for coordinates and negative for rows: a row comes after the coordinates that it contains. Its
-    pivot must exceed eps^(2/3) times what the coordinates alone made it, as in
-    `_kkt.factor_kkt`.
+    for coordinates and negative for rows: a row comes after its coordinates. Its
+    pivot must exceed eps^(2/3) times its value after the elimination of the coordinates alone, as
+    in `_kkt.factor_kkt`.
 
     Args:
         graph: of all nodes.
@@ -75,11 +75,11 @@ def bordered(
         A: rows.
         right: right-hand sides.
         eps: of the numbers.
-        kept: for every row 1, or 0 where it is left out; None for all 1.
-        checked: whether an x that is 0 whatever M is, as nothing pushes there, is NaN as well where
+        kept: for every row 1, or 0 if it is left out; None for all 1.
+        checked: whether an x that is 0 for every M, as it has no load, is also NaN if
             a pivot of coordinates is too small.
-        crossing: whether a row whose pivot is too small is left out; else x is NaN. Then -lam comes
-            after x.
+        crossing: whether a row whose pivot is too small is left out; otherwise x is NaN. With it
+            -lam follows x in the results.
     """
     n, m = len(M), len(A)
     whole = [[*M[i], *(row[i] for row in A)] for i in range(n)]
@@ -100,11 +100,11 @@ def bordered(
 def solve_general(
     graph: Graph, S: Sequence[Sequence[Node]], right: Sequence[Node], relative: float
 ) -> list[Node]:
-    """The x with S x = right, as `_kkt.solve_general`; NaN where a pivot is too small."""
+    """The x with S x = right, as `_kkt.solve_general`; NaN if a pivot is too small."""
     m, zero = len(S), graph.zero
     lines = [[*row, side] for row, side in zip(S, right, strict=True)]
     for k in range(m):
-        # Nothing was taken off the first one.
+        # The first pivot has had no subtraction.
         least = graph.scale(graph.call(_ABS, S[k][k]), relative) if k else zero
         fine = graph.call(GREATER, lines[k][k], least)
         lines[k][k] = graph.let(graph.select(fine, lines[k][k], graph.const(np.nan)))
@@ -139,7 +139,7 @@ class _Elimination:
         self.graph, self.block, self.coordinates, self.kept = graph, block, coordinates, kept
         self.crossing = crossing
         self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
-        # Products of two entries of M leave the range of single precision in common units.
+        # Products of two entries of M overflow single precision in usual units.
         self.cramer = eps < DOUBLE
         self.entry = {(i, j): graph.let(matrix[i][j]) for i in block for j in block}
         self.right = {i: [graph.let(side[i]) for side in right] for i in block}
@@ -176,7 +176,7 @@ class _Elimination:
         return [found[i] for i in self.block]
 
     def checked(self, x: Node) -> Node:
-        """A solution that is zero without a division, NaN where M is not positive definite."""
+        """A solution that is zero without a division; NaN if M is not positive definite."""
         if x is self.graph.zero:
             for healthy in self.sound.values():
                 x = self.graph.select(healthy, x, self.graph.const(np.nan))
@@ -195,7 +195,7 @@ class _Elimination:
         return sum(self.entry[i, j] is not self.graph.zero for j in left)
 
     def _pivot(self, i: int) -> Node:
-        """D_i, NaN where it does not have its sign to working precision."""
+        """D_i; NaN if it does not have its sign to working precision."""
         graph, pivot = self.graph, self.entry[i, i]
         nan = graph.const(np.nan)
         if i < self.coordinates:
@@ -213,7 +213,7 @@ class _Elimination:
         return graph.let(graph.select(keep, pivot, left_out))
 
     def _bound(self, i: int) -> Node:
-        """What cancellation may leave of a pivot that is zero; nothing was taken off the first."""
+        """Bound on the rounding of a pivot that is zero; 0 for pivots without subtraction."""
         graph = self.graph
         return graph.scale(self.diagonal[i], self.floor) if i in self.touched else graph.zero
 
@@ -228,7 +228,7 @@ class _Elimination:
                     reduced = graph.let(graph.sub(self.entry[i, j], taken))
                     self.entry[i, j] = self.entry[j, i] = reduced
                     if i == j and i >= self.coordinates > k:
-                        # What the coordinates make of a row's pivot, before other rows reduce it.
+                        # The pivot of a row from the coordinates alone, before other rows.
                         self.diagonal[i] = graph.sub(self.diagonal[i], taken)
             for s, right in enumerate(self.right[k]):
                 if right is not graph.zero:
@@ -241,7 +241,7 @@ class _Elimination:
         graph = self.graph
         a, b, c = self._pivot(i), self.entry[i, j], self.entry[j, j]
         determinant = graph.let(graph.sub(graph.mul(a, c), graph.power(b, 2)))
-        # Rounding left its share of M_ii in a and of M_jj in c.
+        # a has rounding in proportion to M_ii, and c to M_jj.
         shares = graph.add(graph.mul(a, self.diagonal[j]), graph.mul(c, self.diagonal[i]))
         bound = graph.scale(shares, self.floor)
         healthy = self.sound[j] = graph.call(GREATER, determinant, bound)

@@ -1,11 +1,11 @@
 """Scalar expressions as a hash-consed graph (CSE): equal expressions are one node.
 
 Sums are n-ary with number coefficients, products n-ary with integer exponents; both are kept in
-a normal form, so that like terms merge and cancel and structural zeros never exist. Everything
-else is a call of a JAX primitive on scalars, looked at only by its name.
+a normal form, so that like terms merge and cancel and structural zeros never exist. All other
+operations are calls of a JAX primitive on scalars, identified by its name.
 
-Rules of real algebra that the normal form uses and floating point does not know: 0 x = 0 and
-x / x = 1 for every x, inf and NaN included, and sqrt(x)^2 = x. sqrt(x^2) stays as it is.
+The normal form uses rules of real algebra that floating point does not satisfy: 0 x = 0 and
+x / x = 1 for every x, inf and NaN included, and sqrt(x)^2 = x. sqrt(x^2) is not simplified.
 """
 
 from collections.abc import Container, Iterable, Sequence
@@ -22,13 +22,13 @@ Factors = tuple[tuple["Node", int], ...]
 
 
 FIXED = ("params", "kept", "there", "time_direction")
-"""Names of the inputs that do not change during a solve: parameters, the rows solved with, and
-whether time runs forwards (+1) or backwards (-1)."""
+"""Names of the inputs that do not change during a solve: parameters, the rows used in solves, and
+the direction of time (+1 or -1)."""
 
 
 POWERS = 2
-"""Powers beyond are taken of a product with numbers or parameters as a whole: (q / a)^32 stays in
-the range of numbers where q^32 / a^32 does not."""
+"""A product with numbers or parameters is raised to higher powers as a whole: (q / a)^32 does not
+overflow where q^32 / a^32 does."""
 
 
 class Node:
@@ -38,9 +38,9 @@ class Node:
         op: "const", "input", "sum", "product", "call", "select", "custom", "stop" or "let".
         data: const: its value. input: (name, index). sum: (constant, terms). product: factors.
             call: (primitive, its parameters). custom: (Rule, index of the result). Others: None.
-        args: the nodes that it is computed from, factors and terms included.
+        args: the nodes of its arguments, factors and terms included.
         id: its place in an order in which arguments come first.
-        fixed: whether it depends on nothing that changes during a solve.
+        fixed: whether all its inputs are constant during a solve.
     """
 
     __slots__ = ("args", "data", "fixed", "id", "op")
@@ -54,7 +54,7 @@ class Node:
 
     @property
     def constant(self) -> float | None:
-        """Its value where it is a number."""
+        """Its value if it is a number."""
         number = self.op == "const" and not isinstance(self.data, bool)
         return self.data if number else None
 
@@ -97,7 +97,7 @@ LARGEST, SMALLEST = Primitive(largest_p, {}), Primitive(smallest_p, {})
 
 
 class Graph:
-    """Builds nodes; every node of an expression comes from one graph."""
+    """Builds nodes; all nodes of an expression belong to one graph."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -136,7 +136,7 @@ class Graph:
         for node, coefficient in terms:
             constant += _collect(total, node, coefficient)
         kept = [(node, c) for node, c in total.items() if c != 0.0]
-        # A sum inside a sum is opened only where that merges terms: it may be shared.
+        # A sum inside a sum is opened only if that merges terms: it may be shared.
         for node, c in kept:
             if node.op == "sum" and _merges(node, constant, total):
                 del total[node]
@@ -183,7 +183,7 @@ class Graph:
         powers: dict[Node, int] = {}
         for node, exponent in factors:
             coefficient *= self._multiply(powers, node, exponent)
-        # sqrt(x)^k leaves at most one root.
+        # At most one root remains of sqrt(x)^k.
         for node in [node for node in powers if node.op == "call" and node.data == SQRT]:
             whole = int(powers[node] / 2)
             if whole:
@@ -210,7 +210,7 @@ class Graph:
         return found
 
     def _multiply(self, powers: dict[Node, int], node: Node, exponent: int) -> float:
-        """Multiply node^exponent into `powers`; the number that comes out of it."""
+        """Multiply node^exponent into `powers`; returns the numeric factor."""
         if exponent == 0:
             return 1.0
         if node.op == "const":
@@ -223,7 +223,7 @@ class Graph:
                 powers[base] = powers.get(base, 0) + inner * exponent
             return 1.0
         if node.op == "sum":
-            # The size that all terms share comes out, with the sign of the first.
+            # A factor of common size is extracted, with the sign of the first term.
             constant, terms = node.data
             size = terms[0][1]
             shared = all(abs(c) == abs(size) for _, c in terms)
@@ -248,7 +248,7 @@ class Graph:
     # ---- Everything else ---------------------------------------------------------------------
 
     def call(self, primitive: Primitive, *args: Node) -> Node:
-        """A primitive that acts element by element."""
+        """An elementwise primitive."""
         if all(arg.op == "const" for arg in args):
             with jax.ensure_compile_time_eval():
                 return self.const(np.asarray(primitive(*(arg.data for arg in args))).item())
@@ -266,10 +266,10 @@ class Graph:
         return self._node("call", primitive, args)
 
     def is_extreme(self, node: Node, others: Sequence[Node], primitive: Primitive) -> Node:
-        """Whether the node is the largest or smallest, by comparing it with every other.
+        """Whether the node is the largest or smallest, by comparisons with all others.
 
-        So asks the derivative of max in JAX: x == max(x, y). XLA's CPU backend may compute x
-        twice, once with a fused multiply-add and once without, and x differs from itself then.
+        JAX's derivative of max uses x == max(x, y). XLA's CPU backend may compute x
+        twice, once with a fused multiply-add and once without, and x then differs from itself.
         """
         order = named(_ORDER[primitive.name])
         truths = [self.call(order, node, other) for other in others if other is not node]
@@ -282,7 +282,7 @@ class Graph:
         return self.call(SQRT, node)
 
     def select(self, condition: Node, on_true: Node, on_false: Node) -> Node:
-        """One of two, decided by a truth value."""
+        """One of two nodes, selected by a truth value."""
         if condition.op == "const":
             return on_true if condition.data else on_false
         if on_true is on_false:
@@ -290,7 +290,7 @@ class Graph:
         return self._node("select", None, (condition, on_true, on_false))
 
     def custom(self, rule: Any, index: int, args: Sequence[Node]) -> Node:
-        """Result `index` of a function with a derivative rule of its own."""
+        """Result `index` of a function with a custom derivative rule."""
         return self._node("custom", (rule, index), tuple(args))
 
     def stop(self, node: Node) -> Node:
@@ -303,7 +303,7 @@ class Graph:
 
 
 def scaled(node: Node) -> bool:
-    """Whether a node is something times a number or a parameter."""
+    """Whether a node has a numeric or parameter factor."""
     if node.op == "sum":
         constant, terms = node.data
         return abs(terms[0][1]) != 1.0 or constant not in (0.0, 1.0, -1.0)
@@ -315,7 +315,7 @@ def _by_id(item: tuple[Node, Any]) -> int:
 
 
 def _collect(total: dict[Node, float], node: Node, coefficient: float) -> float:
-    """Add coefficient times node to `total`; the constant that comes out of it."""
+    """Add coefficient times node to `total`; returns the constant part."""
     if coefficient == 0.0:
         return 0.0
     if node.op == "const":
@@ -334,12 +334,12 @@ def _merges(node: Node, constant: float, total: dict[Node, float]) -> bool:
 
 
 def _negative(node: Node) -> bool:
-    """Whether the leading coefficient is negative: exactly one of x and -x has it."""
+    """Whether the leading coefficient is negative: true for exactly one of x and -x."""
     return node.op == "sum" and node.data[1][0][1] < 0
 
 
 def _operands(node: Node, primitive: Primitive) -> list[Node]:
-    """Everything that a nested maximum, or minimum, is taken of."""
+    """All operands of a nested maximum, or minimum."""
     if node.op == "call" and node.data == primitive:
         return [x for arg in node.args for x in _operands(arg, primitive)]
     return [node]
@@ -351,9 +351,9 @@ def _power(base: float, exponent: int) -> float:
 
 
 def order(roots: Iterable[Node], known: Container[Node] = ()) -> list[Node]:
-    """Every node that the roots are computed from, themselves included, arguments first.
+    """All nodes below the roots, the roots included, arguments first.
 
-    Nodes that are known, and what only they are computed from, are left out.
+    Known nodes, and nodes used only by them, are left out.
     """
     found: set[Node] = set()
     stack = [root for root in roots if root not in known]
@@ -366,12 +366,12 @@ def order(roots: Iterable[Node], known: Container[Node] = ()) -> list[Node]:
 
 
 def node_id(node: Node) -> int:
-    """Sorts nodes so that arguments come first."""
+    """Sort key that puts arguments first."""
     return node.id
 
 
 def dependencies(roots: Iterable[Node]) -> dict[Node, frozenset[tuple[str, int]]]:
-    """node -> the inputs that it depends on, for every node under the roots."""
+    """node -> its inputs, for every node under the roots."""
     known: dict[Node, frozenset[tuple[str, int]]] = {}
     for node in order(roots):
         if node.op == "input":
@@ -382,7 +382,7 @@ def dependencies(roots: Iterable[Node]) -> dict[Node, frozenset[tuple[str, int]]
 
 
 def rebuilt(graph: Graph, node: Node, args: list[Node], values: dict[Node, Node]) -> Node:
-    """The node computed from other arguments."""
+    """The node with new arguments."""
     if node.op == "input":
         return values.get(node, node)
     if node.op == "const":

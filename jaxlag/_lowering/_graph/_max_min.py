@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir
 
 
 def _made(name: str, pair: Callable, order: Callable) -> Primitive:
-    """The primitive; `order` tells whether one may be the extreme beside another."""
+    """The primitive; `order` compares two scalars, true for an extreme or a tie."""
     primitive = Primitive(name)
 
     def value(*args: Any) -> Any:

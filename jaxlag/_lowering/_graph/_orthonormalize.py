@@ -9,7 +9,7 @@ from jaxlag._lowering._graph._expression import Graph, Node
 
 
 def products(graph: Graph, x: Sequence[Node], y: Sequence[Node]) -> list[tuple[Node, float]]:
-    """Those of two vectors, as terms of a sum."""
+    """The products of the entries of two vectors, as terms of a sum."""
     return [(graph.mul(a, b), 1.0) for a, b in zip(x, y, strict=True)]
 
 
@@ -25,10 +25,10 @@ def orthonormal(
     floor: float = 0.0,
     crossing: bool = False,
 ) -> tuple[list[list[Node]], list[list[Node]]]:
-    """(L, Y) with rows = L Y, each made orthonormal to those before it, twice (Gram-Schmidt).
+    """(L, Y) with rows = L Y by Gram-Schmidt orthonormalization, each row twice.
 
-    Rows that are not kept have 0 in Y and 1 in L. Where a square is no more than `floor` of what it
-    was, there is NaN, or, when `crossing`, 0 in Y and infinity in L.
+    Rows that are not kept have 0 in Y and 1 in L. If a remaining square is at most `floor` times
+    the original, the result is NaN, or with `crossing` 0 in Y and infinity in L.
     """
     Y: list[list[Node]] = []
     L: list[list[Node]] = []
@@ -58,7 +58,7 @@ def orthonormal(
 def without(
     graph: Graph, x: Sequence[Node], parts: Sequence[tuple[Node, Sequence[Node]]]
 ) -> list[Node]:
-    """x less the sum of factors times vectors."""
+    """x minus the sum of factors times vectors."""
     return [
         graph.let(graph.sum([(a, 1.0), *((graph.mul(f, y[i]), -1.0) for f, y in parts)]))
         for i, a in enumerate(x)

@@ -15,7 +15,7 @@ Monomial = tuple[tuple[int, int], ...]  # (id of an atom, exponent), ascending
 Polynomial = dict[Monomial, float]
 
 CAP = 2000  # terms of a polynomial
-WORK = 200_000  # terms met in all, about half a second; a chain of 12 links takes 36,000
+WORK = 200_000  # terms processed in total, about half a second; a chain of 12 links takes 36,000
 SPEEDS = ("v", "speed", "bound")
 
 
@@ -24,10 +24,10 @@ class TooLong(Exception):
 
 
 class Expansion:
-    """Polynomials of the nodes of one graph; `params` tells the nodes that are known beforehand.
+    """Polynomials of the nodes of one graph.
 
-    A polynomial is put back together as a sum over the products of what varies; all that a
-    product is multiplied with and that is known beforehand makes one coefficient.
+    A polynomial is converted back to a sum over the products of varying factors. All known
+    factors of a product form one coefficient.
     """
 
     def __init__(self, graph: Graph, cap: int = CAP) -> None:
@@ -92,7 +92,7 @@ class Expansion:
         return {tuple(sorted((base.id, e) for base, e in factors)): coefficient}
 
     def _atom(self, node: Node) -> Node:
-        """The node with its arguments simplified."""
+        """The node with simplified arguments."""
         graph = self.graph
         if node.op in ("input", "const"):
             return node
@@ -158,7 +158,7 @@ class Expansion:
         return {((atom.id, 1),): number}
 
     def _is(self, atom: int) -> str:
-        """What an atom is: "speed", "kept" as it is written, or one that is multiplied out."""
+        """The kind of an atom: "speed", "kept" unexpanded, or "plain" for expanded ones."""
         node = self.graph.nodes[atom]
         if node.fixed or atom in self._cosine or atom in self._sine:
             return "plain"
@@ -167,7 +167,7 @@ class Expansion:
         return "kept"
 
     def _paired(self, polynomial: Polynomial) -> Polynomial:
-        """With m sin^2 + m cos^2 = m."""
+        """Apply m sin^2 + m cos^2 = m."""
         waiting = list(polynomial)
         while waiting:
             monomial = waiting.pop()
@@ -189,7 +189,7 @@ class Expansion:
         return polynomial
 
     def _near(self, monomial: Monomial, polynomial: Polynomial) -> list[Monomial]:
-        """Those that the monomial may pair with."""
+        """Monomials that may pair with this one."""
         out = []
         for atom, exponent in monomial:
             other = self._cosine.get(atom, self._sine.get(atom))
@@ -223,7 +223,7 @@ class Expansion:
     # ---- Together ----------------------------------------------------------------------------
 
     def build(self, polynomial: Polynomial) -> Node:
-        """A node of few operations that equals the polynomial."""
+        """A node with few operations that equals the polynomial."""
         if len(polynomial) == 1:  # an atom by itself may be a truth value
             ((monomial, coefficient),) = polynomial.items()
             if coefficient == 1.0 and len(monomial) == 1 and monomial[0][1] == 1:
@@ -245,7 +245,7 @@ class Expansion:
         return self._factored(terms)
 
     def _with_sines(self, groups: Mapping[Monomial, Polynomial]) -> dict[Monomial, Polynomial]:
-        """m - m cos^2 as m sin^2, and the like with both interchanged: it removes a term."""
+        """Replace m - m cos^2 by m sin^2, and vice versa: one term less."""
         groups = dict(groups)
         again = True
         while again:
@@ -267,7 +267,7 @@ class Expansion:
         return groups
 
     def _factored(self, terms: list[tuple[float, dict[int, int]]]) -> Node:
-        """Sum of coefficient times powers, the factor that most terms share taken out first."""
+        """Sum of coefficient times powers; the most frequent factor is taken out first."""
         graph = self.graph
         done: list[tuple[Node, float]] = []
         while terms:
@@ -315,7 +315,7 @@ def _add(total: Polynomial, other: Polynomial, factor: float) -> None:
 
 
 def _nonzero(polynomial: Polynomial) -> Polynomial:
-    """Without the terms that canceled, rounding of the coefficients included."""
+    """Without the terms that canceled."""
     return {m: c for m, c in polynomial.items() if c != 0.0}
 
 
@@ -324,7 +324,7 @@ def _opposite(a: Polynomial, b: Polynomial) -> bool:
 
 
 def _split(node: Node) -> tuple[float, Node | None]:
-    """(number, rest) of a coefficient; no rest where it is a number."""
+    """(number, rest) of a coefficient; no rest if it is a number."""
     if node.op == "const":
         return node.data, None
     if node.op == "sum":

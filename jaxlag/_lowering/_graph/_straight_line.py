@@ -25,14 +25,14 @@ class Program(NamedTuple):
     """Straight-line code from inputs to results.
 
     Attributes:
-        prelude: lines on params alone.
+        prelude: lines that depend on params alone.
         carried: slots of the prelude that the body reads.
         body: lines evaluated at every state.
         results: slots, or numbers, of the results.
         inputs: (name, index) -> slot of the inputs that are read.
         numbers: slot -> value of the constants.
-        truths: slots that hold truth values.
-        whole: slots of what is raised to a high power as a whole.
+        truths: slots of truth values.
+        whole: slots that are raised to a high power as a whole.
     """
 
     prelude: tuple[Line, ...]
@@ -57,7 +57,7 @@ class Program(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """What the body costs, in additions (measured: a division 5, a sine 15)."""
+        """Cost of the body, in additions (measured: a division 5, a sine 15)."""
         return float(sum(_cost(line) for line in self.body))
 
     def count(self, *names: str) -> int:
@@ -100,7 +100,7 @@ def _open(node: Node) -> Node:
 
 
 class _Hoist:
-    """Rewrites sums and products so that what depends on params alone is one node of each."""
+    """Rewrites sums and products so that their parts on params alone are one node each."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -130,7 +130,7 @@ class _Hoist:
         return rebuilt(graph, node, args, {})
 
     def _term(self, node: Node, coefficient: float) -> tuple[Node, float]:
-        """A coefficient other than +-1 goes into the known factor of its product."""
+        """A coefficient other than +-1 is moved into the known factor of its product."""
         inner = _open(node)
         if abs(coefficient) == 1.0 or inner.op != "product":
             return node, coefficient
@@ -160,10 +160,10 @@ class _Assembly:
         self.nodes = self._reachable(self.roots)
         self.slot: dict[Any, int] = {}
         self.lines: list[Line] = []
-        self.known: list[bool] = []  # by slot: whether on params alone
+        self.known: list[bool] = []  # by slot: whether it depends on params alone
         self.inputs: dict[tuple[str, int], int] = {}
         self.numbers: dict[int, float | bool] = {}
-        # Operands as lists of tokens: a token is a node, or a pair of tokens found worth sharing.
+        # Operands as lists of tokens: a token is a node, or a pair of tokens that is shared.
         self.sums: dict[Node, list[tuple[Any, float]]] = {}
         self.over: dict[Node, list[Any]] = {}
         self.under: dict[Node, list[Any]] = {}
@@ -250,7 +250,7 @@ class _Assembly:
         return found
 
     def _at(self, token: Any) -> int:
-        """The slot of a node, or of something shared; written when first needed."""
+        """The slot of a token; its lines are written at the first use."""
         stack = [token]
         while stack:
             top = stack[-1]

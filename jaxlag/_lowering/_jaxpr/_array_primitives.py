@@ -15,7 +15,7 @@ from jaxlag._tracing._interpret import NUMPY
 
 # ---- Moving elements -------------------------------------------------------------------------
 
-# Number of leading operands that hold elements; the rest are indices. None: all of them.
+# Number of leading operands with elements; the rest are indices. None: all have elements.
 MOVES: dict[str, int | None] = {
     "broadcast_in_dim": 1,
     "reshape": 1,
@@ -38,12 +38,12 @@ MOVES: dict[str, int | None] = {
 }
 
 
-# Those among them that the interpreter has in numpy; nothing else is shared with it.
+# Those among them that the interpreter has in numpy; nothing else is common to both.
 SHIFTS = frozenset(MOVES) & frozenset(NUMPY)
 
 
 def move(graph: Graph, eqn: Any, operands: list) -> list:
-    """Run the primitive on positions in a row of all elements."""
+    """Run the primitive on an array of positions of all elements."""
     count = MOVES[eqn.primitive.name]
     count = len(operands) if count is None else count
     return _moved(graph, eqn, operands, range(count))
@@ -63,12 +63,12 @@ def _moved(graph: Graph, eqn: Any, operands: list, data: Sequence[int]) -> list:
         else:
             positions.append(array)
     params, nowhere = dict(eqn.params), None
-    if "fill_value" in params:  # of what lies outside; NaN unless it is stated
+    if "fill_value" in params:  # value outside of the array; NaN by default
         given, params["fill_value"] = params["fill_value"], len(pool)
         nowhere = graph.const(np.nan if given is None else float(given))
     row = np.empty(len(pool) + 1, object)
     row[:] = [*pool, nowhere]
-    if eqn.primitive.name in SHIFTS:  # in numpy: JAX would compile each
+    if eqn.primitive.name in SHIFTS:  # with numpy: JAX would compile each
         moved = [NUMPY[eqn.primitive.name](eqn, *positions)]
     else:
         with jax.ensure_compile_time_eval():
@@ -100,7 +100,7 @@ def _moved_scatter(graph: Graph, primitive: Any, params: dict, operands: list) -
 
 
 def _scatter_with(combine: Callable) -> Callable:
-    """Updates that join what is there; each lands on one element, found one at a time."""
+    """Scatter that combines updates with elements; the target of each update is found singly."""
 
     def scattered(graph: Graph, eqn: Any, operands: list) -> np.ndarray:
         operand, indices, updates = operands
@@ -185,7 +185,7 @@ def _pairwise(name: str) -> Callable:
 
 
 def _of_row(name: str, many: Primitive) -> Callable:
-    """The largest, or smallest; of two by the primitive that takes two."""
+    """The largest, or smallest; of two nodes by the primitive for two."""
     pair = _pairwise(name)
 
     def combine(graph: Graph, nodes: list[Node]) -> Node:
@@ -198,7 +198,7 @@ _LARGEST, _SMALLEST = _of_row("max", LARGEST), _of_row("min", SMALLEST)
 
 
 def _scanned(combine: Callable) -> Callable:
-    """Running extremes by pairs, paired as JAX pairs them: so the derivative is shared by ties."""
+    """Running extremes in the pairing of JAX's scan, so that ties share the derivative equally."""
 
     def scan(graph: Graph, rows: list[np.ndarray]) -> list[np.ndarray]:
         if len(rows) < 2:

@@ -21,7 +21,7 @@ def partials(graph: Graph, node: Node) -> list[Node]:
 
 
 def tangents(graph: Graph, roots: Sequence[Node], seeds: Mapping[Node, Node]) -> list[Node]:
-    """Derivatives of the roots along the direction that moves each input by its seed."""
+    """Derivatives of the roots along the direction given by the seed of each input."""
     known: dict[Node, Node] = {}
     ruled: dict[tuple, list[Node]] = {}
     for node in order(roots):
@@ -63,7 +63,7 @@ def _tangent(
 
 
 def gradient(graph: Graph, root: Node, inputs: Sequence[Node]) -> list[Node]:
-    """Derivatives of one root with respect to inputs, by one sweep from the root down."""
+    """Derivatives of one root with respect to inputs, by one reverse sweep."""
     wanted = set(inputs)
     nodes = order([root])
     active: set[Node] = set()
@@ -85,7 +85,7 @@ def gradient(graph: Graph, root: Node, inputs: Sequence[Node]) -> list[Node]:
 
 
 def _pull(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node, float]]:
-    """What reaches each argument: (argument, node, coefficient)."""
+    """The cotangents of the arguments: (argument, node, coefficient)."""
     if node.op == "sum":
         return [(arg, total, c) for arg, c in node.data[1]]
     if node.op == "product":
@@ -116,7 +116,7 @@ def _pull(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node, float
 
 
 def _lowered(node: Node, i: int) -> list[tuple[Node, int]]:
-    """The factors of a product with the i-th exponent one less."""
+    """The factors of a product with the i-th exponent reduced by one."""
     return [(base, e - (k == i)) for k, (base, e) in enumerate(node.data)]
 
 
@@ -173,7 +173,7 @@ def _atan2(graph: Graph, node: Node, y: Node, x: Node) -> list[Node]:
 
 
 def _extreme(graph: Graph, node: Node, *args: Node) -> list[Node]:
-    """1/k for each of the k that tie, as in JAX."""
+    """1/k for each of k equal arguments, as in JAX."""
     ties = [graph.is_extreme(arg, args, node.data) for arg in args]
     count = graph.add(*(graph.select(tie, graph.one, graph.zero) for tie in ties))
     share = graph.power(count, -1)

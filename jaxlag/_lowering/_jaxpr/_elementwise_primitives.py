@@ -49,7 +49,7 @@ def _quotient(graph: Graph, eqn: Any, x: Node, y: Node) -> Node:
 
 
 def _polynomial(graph: Graph, eqn: Any, x: Node, *coefficients: Node) -> Node:
-    """Nested multiplication; the constant term comes first."""
+    """Horner's scheme; the constant term comes first."""
     total = graph.zero
     for c in reversed(coefficients):
         total = graph.add(graph.mul(total, x), c)

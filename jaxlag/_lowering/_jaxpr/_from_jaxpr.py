@@ -23,16 +23,16 @@ from jaxlag._lowering._jaxpr._elementwise_primitives import ELEMENTWISE, element
 from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, nodes
 from jaxlag._tracing._interpret import NUMPY, held
 
-LIMIT = 50_000  # nodes of a graph: far beyond what a scalar program is good for
-TURNS = 10_000  # of a loop that is unrolled
+LIMIT = 50_000  # nodes of a graph: far beyond the useful size of a scalar program
+TURNS = 10_000  # largest number of iterations of an unrolled loop
 
 
 class Unsupported(Exception):
-    """What keeps a program from becoming scalars: says what, and where the user wrote it."""
+    """An operation without scalar form, with its place in the user's source."""
 
 
 class Rule:
-    """A function with a derivative rule of its own, as one call of it.
+    """One call of a function with a custom derivative rule.
 
     Attributes:
         avals: shapes and dtypes of its operands.
@@ -55,7 +55,7 @@ class Rule:
         return isinstance(other, Rule) and self.key == other.key
 
     def call(self, *operands: Any) -> list[Any]:
-        """The results, as arrays; derivatives follow the rule."""
+        """The results, as arrays; derivatives use the rule."""
         return self.eqn.primitive.bind(*operands, **self.eqn.params)
 
     @cached_property
@@ -87,7 +87,7 @@ def read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarra
     """The results of a program on arrays of nodes.
 
     Raises:
-        Unsupported: an operation that has no scalar form, with its place in the user's source.
+        Unsupported: an operation without scalar form, with its place in the user's source.
     """
     if not concrete(*closed.consts):
         raise Unsupported("a value traced by a transform comes from outside the arguments")
@@ -113,7 +113,7 @@ def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list:
         try:
             results = _equation(graph, eqn, operands)
         except Missing as missing:
-            # Inside functions of JAX there is no place of the user's: the call of them has it.
+            # Operations inside JAX functions have no user line: the line of the call is used.
             where = source_info_util.summarize(eqn.source_info)
             if not where:
                 raise
@@ -121,7 +121,7 @@ def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list:
         if len(graph.nodes) > LIMIT:
             raise Unsupported(f"more than {LIMIT} scalar operations")
         for var, array in zip(eqn.outvars, results, strict=True):
-            # Nothing holds no nodes: it is known.
+            # An empty array contains no nodes: its values are known.
             empty = array.dtype == object and array.size == 0
             aval: Any = var.aval
             known[var] = np.zeros(aval.shape, aval.dtype) if empty else array
@@ -148,7 +148,7 @@ def _equation(graph: Graph, eqn: Any, operands: list) -> list:
 
 
 def _known(eqn: Any, operands: list) -> list:
-    """What is known while tracing, computed by JAX, but for what numpy moves alike."""
+    """Known values, computed by JAX; moves of elements by numpy."""
     name = eqn.primitive.name
     if name in SHIFTS:
         return [np.asarray(NUMPY[name](eqn, *operands))]
@@ -159,7 +159,7 @@ def _known(eqn: Any, operands: list) -> list:
 
 
 def _check_kinds(eqn: Any, operands: list) -> None:
-    """Numbers made from truth values are computed with as real ones: as far as that is the same."""
+    """Raise on integers and truth values unless real arithmetic gives the same result."""
     name = eqn.primitive.name
     kinds = [v.aval.dtype for v, x in zip(eqn.invars, operands, strict=True) if x.dtype == object]
     if name not in _OF_TRUTHS and any(kind == np.bool_ for kind in kinds):

@@ -9,7 +9,7 @@ from jaxlag._lowering._graph._expression import Graph
 
 
 class Missing(Exception):
-    """An operation that has no scalar form."""
+    """An operation without scalar form."""
 
 
 def broadcast(graph: Graph, make: Callable, *operands: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxlag._lowering._symbolic._symbolic_system import SymbolicSystem
 
 
 def attempt(make: Callable) -> list[Node] | None:
-    """What `make` returns, None where a polynomial grows too long."""
+    """The result of `make`; None if a polynomial becomes too long."""
     try:
         return make()
     except TooLong:
@@ -43,8 +43,8 @@ def momentum_form(scene: SymbolicSystem, L: Node) -> list[Node]:
 def christoffel_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> list[Node]:
     """h_i = sum_jk (dM_ij/dq_k - dM_jk/dq_i / 2) v_j v_k + the rest of L, for L quadratic in v.
 
-    The rest, L - v.Mv/2, is linear in v: c . v + L_0, with c and L_0 read off at v = 0. With
-    time in M or c, dM/dt v + dc/dt join in.
+    The rest, L - v.Mv/2, is linear in v: c . v + L_0, with c and L_0 evaluated at v = 0. If M or c
+    depends on time, dM/dt v + dc/dt is added.
     """
     graph, n = scene.graph, len(scene.q)
     at_rest = dict.fromkeys(scene.v, graph.zero)
@@ -99,10 +99,10 @@ def rate_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> li
 
 
 def degree(roots: Sequence[Node], variables: Sequence[Node]) -> float:
-    """Of polynomials in the variables with coefficients free of them; inf where it is none.
+    """Degree of polynomials in the variables with coefficients free of them; else inf.
 
-    What the graph shows: a function, a choice or a stopped derivative of a variable counts as
-    none, whatever becomes of it.
+    The graph alone decides: a function, a choice or a stopped derivative of a variable counts as
+    inf, even if it cancels.
     """
     wanted, known = set(variables), dict[Node, float]()
     for node in order(roots):
@@ -133,5 +133,5 @@ def nonzeros(graph: Graph, M: Sequence[Sequence[Node]]) -> int:
 
 
 def cost(graph: Graph, M: Sequence[Sequence[Node]]) -> float:
-    """Cost of the entries by themselves."""
+    """Cost of the entries alone."""
     return assemble(graph, [x for row in M for x in row]).cost

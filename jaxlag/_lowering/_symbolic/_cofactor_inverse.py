@@ -9,25 +9,25 @@ from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._bias_forms import attempt
 
-LARGEST = 4  # of a block, solved by its cofactors
-FLOOR = 64.0  # roundings, of a determinant against the lengths of the rows
+LARGEST = 4  # size of a block, solved by its cofactors
+FLOOR = 64.0  # roundings of a determinant, over the lengths of the rows
 
 
 class Inverse:
-    """x = J^-1 r, by divisions by factors of det J alone.
+    """x = J^-1 r, with divisions by factors of det J alone.
 
-    A row with one unknown gives it, a column with one row is solved for last, and what is left
-    falls into blocks, solved by cofactors: none divides by what may vanish where J is regular,
-    as a fixed pivot in a matrix of sines and cosines would.
+    A row with one unknown gives it directly. A column with one row is solved for last. The rest
+    forms blocks, solved by cofactors. No division is by an expression that may vanish for a regular
+    J, as a fixed pivot in a matrix of sines and cosines could.
 
     Args:
         graph: of all nodes.
-        expansion: of the same graph, to simplify cofactors by.
+        expansion: of the same graph, to simplify cofactors.
         J: n rows.
-        eps: of the numbers; 0 leaves out the truth values.
+        eps: of the numbers; 0 for no truth values.
 
     Attributes:
-        healthy: truth values, all of which hold where J is regular to working precision.
+        healthy: truth values, all true if J is regular to working precision.
         determinants: of the blocks; their product is det J up to its sign.
 
     Raises:

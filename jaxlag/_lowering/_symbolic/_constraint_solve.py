@@ -12,20 +12,20 @@ from jaxlag._lowering._symbolic._shared_reactions import Sharing, shared
 
 
 class Constrained(NamedTuple):
-    """Residuals as read from the declaration, and how they are solved with.
+    """Residuals from the declaration, and options of their solve.
 
     Attributes:
         velocity: A v + b of all rows.
         position: phi of the holonomic rows, in their order.
         holonomic: for every row, whether it is one of them.
-        kept: for every row 1, or 0 where it is left out; None where there is no choice.
+        kept: for every row 1, or 0 if it is left out; None if all are kept.
         formulation: "multipliers" or "null_space".
-        damping: Baumgarte's (2 alpha, beta^2), None without; alpha against the sense of time.
+        damping: Baumgarte's (2 alpha, beta^2), None without; alpha changes its sign with time.
         regular: whether M is known to be positive definite by itself.
         reaction: the forces that depend on multipliers; None without.
-        lam: the multipliers that they depend on.
-        sharing: how rows that depend on one another share what forces read; None where none do.
-        crossing: whether rows that come to depend on others are left out there; else all is NaN.
+        lam: their multipliers.
+        sharing: distribution of multipliers among dependent rows; None if forces do not need it.
+        crossing: whether rows that become dependent are left out; otherwise results are NaN.
     """
 
     velocity: Sequence[Node]
@@ -54,7 +54,7 @@ def rows(
     """A from the residuals' slopes in v, gamma from their rate along the motion.
 
     Raises:
-        Unsupported: a residual that is affine in v, but not so that its slopes show it.
+        Unsupported: a residual that is affine in v, but whose slopes contain v on the graph.
     """
     columns = [tangents(graph, c.velocity, {x: graph.one}) for x in v]
     A = [[column[k] for column in columns] for k in range(len(c.velocity))]
@@ -128,8 +128,8 @@ def solve_with_reactions(
 ) -> tuple[list[Node], list[Node]]:
     """(a, lam) with M a = r + Q_0 + (A^T + G) lam, A a + gamma = 0.
 
-    As `_kkt.solve_reactions`: S = A M^-1 (A^T + G) by L U with row exchanges. S is not
-    symmetric, and where its determinant is not positive the friction has turned its sense.
+    As `_kkt.solve_reactions`: S = A M^-1 (A^T + G) by LU factorization. S is not
+    symmetric. If its determinant is not positive, friction has reversed its sense.
     """
     m = len(rows.A)
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
@@ -179,11 +179,11 @@ def _augmented(
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     kept: Sequence[Node] | None,
 ) -> tuple[list[list[Node]], list[tuple[list[Node], Sequence[Node]]]]:
-    """M + A^T W A and r - A^T W c, for an M that may be singular: the x is the same."""
+    """M + A^T W A and r - A^T W c, for an M that may be singular: x does not change."""
     n, m = len(M), len(A)
     weights = _weights(graph, M, A)
     if kept is not None:
-        # Chosen, not multiplied: that of a row of rounding alone may be beyond all numbers.
+        # Selected, not multiplied: the weight of a row that is only rounding may overflow.
         half, zero = graph.const(0.5), graph.zero
         weights = [
             graph.select(graph.call(GREATER, kept[k], half), w, zero) for k, w in enumerate(weights)
@@ -210,7 +210,7 @@ def _weights(graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Nod
     zero, one = graph.zero, graph.one
 
     def inverse(x: Node) -> tuple[Node, Node]:
-        """(whether x > 0, 1/x there and 1 elsewhere)."""
+        """(whether x > 0, 1/x if it is, else 1)."""
         there = graph.call(GREATER, x, zero)
         return there, graph.let(graph.div(one, graph.let(graph.select(there, x, one))))
 
@@ -231,7 +231,7 @@ def _weights(graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Nod
 
 
 def _size(graph: Graph, M: Sequence[Sequence[Node]]) -> Node:
-    """The trace of M; 1 where there is no inertia at all, as in a motion led throughout."""
+    """The trace of M; 1 if M = 0 (motion fully prescribed by constraints)."""
     trace = graph.let(graph.sum([(M[i][i], 1.0) for i in range(len(M))]))
     return graph.select(graph.call(GREATER, trace, graph.zero), trace, graph.one)
 
@@ -245,7 +245,7 @@ def _null_space(
     kept: Sequence[Node] | None,
     crossing: bool,
 ) -> list[list[Node]]:
-    """As `_kkt.NullSpace`: rows made orthonormal, M on what they leave free."""
+    """As `_kkt.NullSpace`: orthonormal rows, M on their null space."""
     n, m = len(M), len(A)
     units = _units(graph, M, A, False)
     M = [[graph.mul(units[i], M[i][j], units[j]) for j in range(n)] for i in range(n)]
@@ -291,7 +291,7 @@ def _null_space(
 def _units(
     graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]], regular: bool
 ) -> list[Node]:
-    """1 / sqrt of the inertia of every coordinate, of what rows lend where it has none."""
+    """1 / sqrt of the inertia of every coordinate; of A^T W A if M has none."""
     inertias = [M[i][i] for i in range(len(M))]
     if regular:
         return [graph.let(graph.div(graph.one, graph.sqrt(x))) for x in inertias]
@@ -316,11 +316,11 @@ def correction(
     chosen: Sequence[int],
     crossing: bool,
 ) -> tuple[list[list[Node]], list[Node]]:
-    """Columns of M^-1 A^T (A M^-1 A^T)^-1, one for each of the chosen rows, solved by themselves.
+    """Columns of M^-1 A^T (A M^-1 A^T)^-1 for the chosen rows, solved without the others.
 
-    And, when `crossing`, the diagonal of (A M^-1 A^T)^-1.
+    With `crossing` also the diagonal of (A M^-1 A^T)^-1.
 
-    An M that may be singular is augmented by all rows: on the chosen ones alone it need not be
+    An M that may be singular is augmented by all rows: with the chosen ones alone it may not be
     positive definite.
     """
     if not regular:

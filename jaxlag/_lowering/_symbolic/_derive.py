@@ -31,7 +31,7 @@ from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSyste
 
 
 def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
-    """The cheapest of the forms that exist.
+    """Derive the equations in the cheapest of the available forms.
 
     Raises:
         Unsupported: the solve or the mass matrix alone takes more operations than the limit.
@@ -59,7 +59,7 @@ def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
     mass = min(masses, key=lambda M: (nonzeros(graph, M), cost(graph, M)))
     if limit is not None:
         alone = assemble(graph, [x for row in mass for x in row]).operations
-        if alone > limit:  # no need to look for the bias
+        if alone > limit:  # the bias is then not needed
             raise Unsupported(f"{alone} operations in the mass matrix alone, more than {limit}")
 
     forms: list[tuple[str, list[Node]]] = []
@@ -110,7 +110,7 @@ def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
 
 
 def pattern(scene: SymbolicSystem) -> list[list[bool]]:
-    """Which entries of M may differ from zero: p_i depends on v_j, on u_j where L is of u."""
+    """Which entries of M may differ from zero: p_i depends on v_j (on u_j if L depends on u)."""
     known = scene.kinematics
     v = scene.v if known is None or not known.in_u else known.u
     momentum = gradient(scene.graph, scene.lagrangian, v)

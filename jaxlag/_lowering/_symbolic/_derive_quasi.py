@@ -19,20 +19,20 @@ from jaxlag._lowering._symbolic._constraint_solve import rows
 from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, SymbolicSystem
 
-WRITTEN_OUT = 3  # forms of the right side, shortest first
+WRITTEN_OUT = 3  # forms of the right side that are compared, shortest first
 
 
 class _Moved(NamedTuple):
-    """v = V(t, q, u) and what follows from it.
+    """v = V(t, q, u) and its derivatives.
 
     Attributes:
-        V: v of all quasi-velocities.
+        V: v from all quasi-velocities.
         v: the same with the bound ones zero.
         B: columns dv/du of the free ones.
         s: dv/dt at u' = 0, the bound ones zero.
-        healthy: truth values, all of which hold where v follows from u.
-        determinants: of blocks of dU/dv or dV/du, which vanish or grow beyond bounds where one of
-            v and u does not follow from the other. None where they are too long.
+        healthy: truth values, all true if u determines v.
+        determinants: of blocks of dU/dv or dV/du, which are 0 or infinite at singular
+            quasi-velocities. None if they are too long.
     """
 
     V: list[Node]
@@ -46,8 +46,8 @@ class _Moved(NamedTuple):
 def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
     """v and u' of the free quasi-velocities, the bound ones zero, by the cheapest of several forms.
 
-    These are the projected equations, B^T M B u' = B^T (Q - h - M s) for v = B u + c and s = v' at
-    u' = 0, where L is a function of v; and those of Boltzmann and Hamel.
+    If L is a function of v, these are the projected equations, B^T M B u' = B^T (Q - h - M s) for
+    v = B u + c and s = v' at u' = 0. Others are the Boltzmann-Hamel equations.
 
     Raises:
         Unsupported: the kinematics have no short inverse on scalars.
@@ -63,7 +63,7 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
         for words, L in _written(expansion, declared):
             forms.append((f"projected, {words}", *_projected(scene, moved, L)))
         if len(kinematics.u) == len(scene.v):
-            # With fewer u, momenta along what they leave out would be lost.
+            # With fewer u, momenta of the omitted ones would be lost.
             (of_u,) = substitute(graph, [declared], dict(zip(scene.v, moved.V, strict=True)))
     if of_u is not None:
         U = _quasi(scene, kinematics, expansion)
@@ -79,7 +79,7 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
         short = attempt(partial(expansion.simplified, right))
         if short is not None:
             sides.append((f"{words}, expanded", short))
-    # Long ones are not worth being written out to be compared.
+    # Long forms are not compared: generating their code takes too much time.
     sides.sort(key=lambda side: len(order(side[1])))
     found = []
     for words, right in sides[:WRITTEN_OUT]:
@@ -130,7 +130,7 @@ def _moved(
 
 
 def _determinants(graph: Graph, expansion: Expansion, B: list[list[Node]]) -> list[Node] | None:
-    """Determinants of blocks of B, or of B^T B where it is tall; None where they are too long."""
+    """Determinants of blocks of B, or of B^T B for a tall B; None if they are too long."""
     k = len(B[0])
     try:
         square = B if len(B) == k else _gram(graph, expansion, B)
@@ -157,9 +157,9 @@ def affine(
 
 
 def _quasi(scene: SymbolicSystem, kinematics: Kinematics, expansion: Expansion) -> list[Node]:
-    """U(t, q, v); where it is not given, B^-1 (v - c), or (B^T B)^-1 B^T (v - c) of a tall B.
+    """U(t, q, v); if it is not given, B^-1 (v - c), or (B^T B)^-1 B^T (v - c) for a tall B.
 
-    A square B has digits that its square has not, above all between coordinates of unlike units.
+    B^T B would lose digits of a square B, above all for coordinates of different units.
     """
     graph = scene.graph
     if kinematics.U is not None:
@@ -202,13 +202,13 @@ def _projected(
 def _hamel(
     scene: SymbolicSystem, kinematics: Kinematics, moved: _Moved, U: Sequence[Node], L: Node
 ) -> tuple[list[list[Node]], list[Node]]:
-    """(d2L/du2, the right side of it u' = ...) from L(t, q, u), with p = dL/du.
+    """(d2L/du2, the right side of d2L/du2 u' = ...) from L(t, q, u), with p = dL/du.
 
     d/dt p + B^T (Gamma p - dL/dq) = B^T Q,  Gamma p = d/dt(Theta) p - (dU/dq)^T p at fixed p and v.
 
-    Only then are the bound quasi-velocities zero: their p is not.
+    The bound quasi-velocities are set to zero only at the end, because their p is nonzero.
 
-    Source: Pila, eqs. 4.44 to 4.58, with what comes of explicit time and of affine U.
+    Source: Pila, eqs. 4.44 to 4.58, with the terms of explicit time and of affine U.
     """
     graph, q, v, u = scene.graph, scene.q, scene.v, kinematics.u
     p = gradient(graph, L, u)
@@ -239,7 +239,7 @@ def _hamel(
 
 
 def _written(expansion: Expansion, L: Node) -> list[tuple[str, Node]]:
-    """L as written and simplified, where these differ."""
+    """L as written and, if different, simplified."""
     short = attempt(partial(expansion.simplified, [L]))
     forms = [("L as written", L)]
     if short is not None and short[0] is not L:
@@ -248,7 +248,7 @@ def _written(expansion: Expansion, L: Node) -> list[tuple[str, Node]]:
 
 
 def _guarded(graph: Graph, v: list[Node], healthy: list[Node]) -> list[Node]:
-    """v, its first element NaN where u does not determine it."""
+    """v, with a NaN first element if u does not determine it."""
     first, *rest = v
     for truth in healthy:
         first = graph.select(truth, first, graph.const(np.nan))

@@ -12,7 +12,7 @@ from jaxlag._tracing._interpret import interpret
 
 
 def evaluate(roots: Sequence[Node], values: Mapping[tuple[str, int], Any]) -> list:
-    """The roots at given values of the inputs, arrays of one shape: one entry for each state."""
+    """The roots at given values of the inputs, arrays of one shape with one entry per state."""
     known: dict[Node, Any] = {}
     with np.errstate(all="ignore"):
         for node in order(roots):

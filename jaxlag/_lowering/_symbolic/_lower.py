@@ -15,9 +15,10 @@ from jaxlag._lowering._symbolic._verify import compare
 from jaxlag._tracing import _params
 from jaxlag._tracing._index_check import OutOfRange
 
-# Operations, those once per solve included, and functions of weighted sums (the units of networks)
-# up to which "auto" takes the scalar program. Seconds of tracing and compiling a solve of order 8,
-# and milliseconds of its run, scalar | array. Chains of 8 links: 2.4, 0.42 | 1.8, 1.1; of 10: 3.8,
+# Largest number of operations, those once per solve included, and of functions of weighted sums
+# (network units) for which "auto" takes the scalar program. Seconds of tracing and compiling a
+# solve of order 8, and milliseconds of its run, scalar | array. Chains of 8 links: 2.4, 0.42 |
+# 1.8, 1.1; of 10: 3.8,
 # 0.75 | 1.6, 2.6; of 12 (1636 operations): 5.9, 1.3 | 1.8, 4.5; of 16: 10, 2.9 | 1.9, 9.8. Five
 # bodies: 1.5, 0.34 | 1.4, 3.5. A full stiffness matrix of 16 coordinates (816): 2.5, 0.14 | 0.75,
 # 0.30; of 24 (1800): 5.6, 0.22 | 1.8, 0.80; full constant matrices of mass and stiffness of 12
@@ -31,8 +32,8 @@ class Lowered(NamedTuple):
     """The scalar program of a system, or why there is none.
 
     Attributes:
-        equations: M, h and the code for a; None where the array program is used.
-        reason: in words, why there is no scalar program, or how it compared.
+        equations: M, h and the code for a; None if the array program is used.
+        reason: why there is no scalar program, or the result of its comparison, as text.
         scene: L and Q as nodes.
     """
 
@@ -43,14 +44,13 @@ class Lowered(NamedTuple):
 
 @lru_cache(maxsize=256)
 def lower(key: Key, sample: _params.Sample) -> Lowered:
-    """The scalar program for a key; compared with the array program before it is used.
+    """The scalar program for a key, verified against the array program.
 
-    Whatever fails on the way, there is the array program; what is wrong with the declaration
-    itself comes to light there.
+    After any failure the array program is used; it also reports errors of the declaration.
 
     Args:
-        key: what it is made for.
-        sample: params to compare with where they are known, else random ones are used.
+        key: key of the program.
+        sample: params for the comparison if they are known; otherwise they are random.
     """
     try:
         return _lowered(key, sample)
@@ -80,13 +80,13 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
 
 
 def _written(scene: SymbolicSystem) -> int:
-    """Operations on what varies in L and Q, as they are written."""
+    """Operations of varying parts in L and Q, as they are written."""
     roots = [scene.lagrangian, *(scene.force or ())]
     return sum(max(len(node.args) - 1, 1) for node in order(roots) if not node.fixed)
 
 
 def _units(scene: SymbolicSystem) -> int:
-    """Functions of weighted sums, as networks have them: products of matrices do them better."""
+    """Number of functions of weighted sums, as in networks: matrix products are faster for them."""
     return sum(
         node.op == "call" and _weighted(node.args[0])
         for node in order([scene.lagrangian, *(scene.force or ())])
@@ -98,7 +98,7 @@ def _weighted(node: Node) -> bool:
     if node.op != "sum":
         return False
     moving = [(term, weight) for term, weight in node.data[1] if not term.fixed]
-    if len(moving) == 1:  # a sum beside a bias
+    if len(moving) == 1:  # a sum plus a bias
         return _weighted(moving[0][0])
     return len(moving) > 1 and all(
         abs(weight) != 1.0

@@ -15,7 +15,7 @@ from jaxlag._tracing._input_values import InputValues
 
 
 class Key(NamedTuple):
-    """What a scalar program is made for: one for each combination of shapes and static values."""
+    """The key of a scalar program: one program for each combination of shapes and static values."""
 
     lagrangian: Callable
     forces: tuple
@@ -75,9 +75,9 @@ def traced(
     multipliers: int = 0,
     speeds: int | None = None,
 ) -> Any:
-    """The jaxpr of a function of (t, q, v, params), with inputs, with multipliers after them.
+    """The jaxpr of a function of (t, q, v, params), with inputs and multipliers after them.
 
-    With `speeds`, of (t, q, u, params) for so many u.
+    With `speeds` it is a function of (t, q, u, params) with that number of u.
     """
     t, q, v = _state(key)
     if speeds is not None:

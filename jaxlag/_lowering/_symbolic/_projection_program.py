@@ -9,15 +9,15 @@ from jaxlag._lowering._symbolic._constraint_solve import Constrained, correction
 
 
 class ProjectionCode(NamedTuple):
-    """Straight-line code for a projection: residuals, and what takes them to corrections.
+    """Straight-line code for a projection: residuals, and matrices of their corrections.
 
     Attributes:
         position: phi of the holonomic rows.
         velocity: A v + b.
-        shift: columns that take phi to a change of q.
-        kick: columns that take A v + b to a change of v; None where they are those of `shift`.
-            Those of all rows come before the diagonal of (A M^-1 A^T)^-1 where that is asked for.
-        lam: multipliers; None where no force depends on them.
+        shift: columns from phi to a change of q.
+        kick: columns from A v + b to a change of v; None if they equal those of `shift`.
+            Columns of all rows are followed by the diagonal of (A M^-1 A^T)^-1 if requested.
+        lam: multipliers; None if no force depends on them.
     """
 
     position: Program

@@ -25,7 +25,7 @@ def read_scene(key: Key) -> SymbolicSystem:
     """L, Q, the constraints and the kinematics as nodes of one graph.
 
     Raises:
-        Unsupported: something in them has no scalar form.
+        Unsupported: a part without scalar form.
     """
     for name, like in (("params", key.params), ("inputs", key.inputs)):
         kinds = {leaf.dtype for leaf in jax.tree.leaves(like.tree)}
@@ -33,7 +33,7 @@ def read_scene(key: Key) -> SymbolicSystem:
             raise Unsupported(f"integers among the {name}, which divide in a way of their own")
     graph, n = Graph(), key.size
     t = graph.input("t", 0)
-    # The velocities of a state (q, u) are no input of its equations.
+    # The velocities of a state (q, u) are not inputs of its equations.
     names = "q", "v" if key.quasi is None else "speed"
     q, v = ([graph.input(name, i) for i in range(n)] for name in names)
     params, inputs = _inputs(graph, "params", key.params), _inputs(graph, "inputs", key.inputs)
@@ -56,7 +56,7 @@ def read_scene(key: Key) -> SymbolicSystem:
 
 
 def _own(key: Key) -> tuple[AbstractConstraint, ...]:
-    """The constraints that the equations hold; velocities take care of theirs themselves."""
+    """The constraints in the equations; quasi-velocities satisfy Pfaffian ones by definition."""
     if key.quasi is None:
         return key.constraints
     return tuple(c for c in key.constraints if c.holonomic)

@@ -10,11 +10,11 @@ from jaxlag._lowering._graph._orthonormalize import backward, dot, orthonormal, 
 
 
 class Sharing(NamedTuple):
-    """Rows whose multipliers are of least norm among themselves where they depend on one another.
+    """Rows whose multipliers have least norm within their group if they are dependent.
 
     Attributes:
-        chosen: these.
-        there: for every row 1, or 0 where it is no more than rounding.
+        chosen: indices of these rows.
+        there: for every row 1, or 0 if it is only rounding.
     """
 
     chosen: Sequence[int]
@@ -29,9 +29,9 @@ def shared(
     sharing: Sharing,
     eps: float,
 ) -> list[list[Node]]:
-    """What takes multipliers of the rows kept to those that forces see, m rows.
+    """The matrix from multipliers of the kept rows to those that forces read, m rows.
 
-    As `_independent_rows.shared`, in whose words these are a_k, C, z and weights.
+    As `_independent_rows.shared`, with the same a_k, C, z and weights.
     """
     m, chosen = len(A), sharing.chosen
     zero, one, places = graph.zero, graph.one, range(len(chosen))
@@ -39,7 +39,7 @@ def shared(
     scaled = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
 
     def length(x: Sequence[Node]) -> Node:
-        """Of a vector; 1 where it is 0."""
+        """Length of a vector; 1 if it is 0."""
         square = graph.let(dot(graph, x, x))
         some = graph.let(graph.select(graph.call(GREATER, square, zero), square, one))
         return graph.let(graph.sqrt(some))
@@ -59,7 +59,7 @@ def shared(
         near = graph.call(GREATER, graph.const(eps), dot(graph, rest, rest))
         follows = graph.let(graph.select(near, graph.sum([(flag, -1.0)], 1.0), zero))
         others.append(follows)
-        # What a row has of another by rounding alone may be much to one of smaller weight.
+        # Coefficients that are rounding could be large for a row of smaller weight.
         found = [(x, graph.let(graph.power(x, 2))) for x in backward(graph, L, parts)]
         found = [graph.select(graph.call(GREATER, s, rounding), x, zero) for x, s in found]
         C.append([graph.let(graph.mul(follows, x)) for x in found])
@@ -70,7 +70,7 @@ def shared(
         ]
         for j in places
     ]
-    # In units in which the diagonal is 1: weights may be as unlike as forces and short levers.
+    # In units in which the diagonal is 1: weights may differ as much as forces and short levers.
     lengths = [length(x) for x in moved]
     moved = [[graph.let(graph.div(x, s)) for x in y] for y, s in zip(moved, lengths, strict=True)]
     square = [[dot(graph, x, y) for y in moved] for x in moved]
@@ -86,7 +86,7 @@ def shared(
             taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
             own = [(flags[i], 1.0)] if i == j else []
             shares.append(graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken])))
-        # What all exert together stays what it is.
+        # The total generalized force does not change.
         exerted = [graph.mul(flags[j], x) for x in unit[j]]
         left = without(graph, exerted, list(zip(shares, unit, strict=True)))
         more = backward(graph, L, [dot(graph, y, left) for y in Y])

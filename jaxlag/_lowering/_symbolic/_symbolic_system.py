@@ -10,15 +10,15 @@ from jaxlag._lowering._symbolic._projection_program import ProjectionCode
 
 
 class Kinematics(NamedTuple):
-    """How u and v go together, as scalars; at least one of U and V is given.
+    """The relation of u and v, as scalars; at least one of U and V is given.
 
     Attributes:
         u: all quasi-velocities.
-        free: those among them that make the state.
+        free: the ones in the state.
         bound: the others.
         U: u as functions of v.
         V: v as functions of u.
-        in_u: whether L is a function of u in place of v.
+        in_u: whether L is a function of u instead of v.
     """
 
     u: Sequence[Node]
@@ -45,22 +45,22 @@ class SymbolicSystem(NamedTuple):
 class Equations(NamedTuple):
     """M a + h = Q, and the straight-line code for a.
 
-    Where quasi-velocities make the state, a stands for (v, u') and M, h and Q for what is left of
-    them in the equations of u', Q on the left, too.
+    With quasi-velocities in the state, a stands for (v, u'), and M, h and Q for their projections
+    in the equations of u', with Q on the left side.
 
     Attributes:
-        lagrangian: L, simplified where that is possible.
+        lagrangian: L, simplified if possible.
         mass: M, n rows.
-        bias: h; of quasi-velocities h - Q.
+        bias: h; with quasi-velocities h - Q.
         accelerations: a.
         program: straight-line code for a.
-        form: how h was written, in words.
-        rows: A and gamma, where there are constraints.
+        form: the form of h, as text.
+        rows: A and gamma, if there are constraints.
         surface: their projection.
-        lam: multipliers, where forces depend on them.
-        velocity: code for v alone, where the state is made of quasi-velocities.
-        determinants: code for what vanishes where these are singular, without what never does; None
-            where that is too long.
+        lam: multipliers, if forces depend on them.
+        velocity: code for v alone, if the state has quasi-velocities.
+        determinants: code for their determinants, without constant ones; None if it is too
+            long.
     """
 
     lagrangian: Node

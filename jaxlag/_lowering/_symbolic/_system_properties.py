@@ -10,13 +10,13 @@ from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSyste
 
 
 class Findings(NamedTuple):
-    """Each true for all values of the params; coordinates by their index.
+    """Findings that hold for all values of the params; coordinates by their index.
 
     Attributes:
-        cyclic: coordinates that L, simplified, does not contain.
-        mass_depends: inputs that M depends on: ("q", i), ("v", i) or ("t", 0).
-        mass_blocks: coordinates coupled by inertia.
-        subsystems: coordinates coupled at all, forces included.
+        cyclic: coordinates that the simplified L does not contain.
+        mass_depends: inputs on which M depends: ("q", i), ("v", i) or ("t", 0).
+        mass_blocks: coordinates coupled by M.
+        subsystems: coordinates coupled by M, h or forces.
         bias_zero: whether h = 0.
         separable: whether L = T(v) - V(q) with a constant M.
         quadratic: whether L is a polynomial of degree 2 in v.

@@ -20,19 +20,19 @@ from jaxlag._model._forces import reads_lam
 from jaxlag._tracing._interpret import interpret
 
 STATES = 8  # random states at which both programs are compared
-LEAST = 6  # of them that must have been comparable
-DRAWS = 32  # to find them among
-SLACK = 1e4  # of roundings, between two ways to compute one acceleration
-NUDGES = 3  # of one rounding each of q and v, where that is not enough
-SENSITIVE = 1e-3  # states that change their acceleration so much by it compare nothing
+LEAST = 6  # least number of comparable states
+DRAWS = 32  # largest number of states drawn
+SLACK = 1e4  # roundings between two ways to compute one acceleration
+NUDGES = 3  # changes of q and v by one rounding each, if the slack is exceeded
+SENSITIVE = 1e-3  # relative change of an acceleration by a nudge beyond which a state is not used
 
 
 class Verification(NamedTuple):
-    """How a program compares with the array program.
+    """The comparison of a program with the array program.
 
     Attributes:
-        states: at how many states both have been compared.
-        difference: the worst, in units of SLACK roundings; inf where one has no value alone.
+        states: number of compared states.
+        difference: the largest, in units of SLACK roundings; inf if only one has a value.
     """
 
     states: int
@@ -40,7 +40,7 @@ class Verification(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What is said of it."""
+        """The result as text."""
         if not self.difference <= 1.0:
             if np.isinf(self.difference):
                 return "differs from the array program: one of them has no value"
@@ -51,19 +51,19 @@ class Verification(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether they are equal at states enough."""
+        """Whether they are equal at enough states."""
         return bool(self.difference <= 1.0) and self.states >= LEAST
 
 
 def compare(
     key: Key, scene: SymbolicSystem, equations: Equations, known: list | None
 ) -> Verification:
-    """A program beside the array program, with the known params and with random ones.
+    """Compare a program with the array program, with the known params and with random ones.
 
-    What is known may be special, and random params may be none that a system has: both are drawn
-    with, until there are states enough. Where M is not positive definite, M, h, Q, A and gamma are
-    compared in place of the acceleration, with quasi-velocities what is left of them, and v; where
-    forces read multipliers, such states are left out. Where the array program has no value the
+    Known params may be special, and random ones may be impossible for a system: both are used,
+    until there are enough states. If M is not positive definite, M, h, Q, A and gamma are
+    compared instead of the acceleration, with quasi-velocities their projections, and v. If
+    forces read multipliers, such states are left out. If the array program has no value, the
     other must have none.
     """
     expected = _Plain(key) if key.quasi is None else _Quasi(key)
@@ -74,7 +74,7 @@ def compare(
     like, given = jax.tree.leaves(key.params.tree), jax.tree.leaves(key.inputs.tree)
 
     def drawn(own: bool) -> float | None:
-        """The difference at one more state; None where there is nothing to compare."""
+        """The difference at one more state; None if there is nothing to compare."""
         t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
         params = [
             rng.uniform(0.5, 1.5, leaf.shape)
@@ -108,7 +108,7 @@ def compare(
             return np.inf if np.all(np.isfinite(found)) else None
         off = float(np.max(np.abs(found - right.x) / right.allowed, initial=0.0))
         if 1.0 < off < np.inf:
-            # Sines of a million lose digits in either program: as many as a nudge changes.
+            # Sines of a million lose digits in both programs: as many as a nudge changes.
             change = 0.0
             for _ in range(NUDGES):
                 signs = 1.0 + eps * rng.choice([-1.0, 1.0], (2, max(n, speeds)))
@@ -136,12 +136,12 @@ def compare(
 
 
 class _Right(NamedTuple):
-    """What the array program gives.
+    """The result of the array program.
 
     Attributes:
         x: the acceleration, or M, h and Q.
-        allowed: how far off a sound program may be.
-        kept: rows that are solved with.
+        allowed: allowed difference.
+        kept: rows used in solves.
         defined: whether there is a value.
         parts: whether x is M, h, Q, A and gamma; with quasi-velocities B^T M B, B^T (h + M s - Q)
             and v.
@@ -158,7 +158,7 @@ _NONE = _Right(np.zeros(0), 0.0, defined=False)
 
 
 def _solved(key: Key, M: Any, right: Any) -> tuple[Any, float] | None:
-    """(x with M x = right, how far off another way to it may be); None where that means little."""
+    """(x with M x = right, allowed difference of another method); None if M is ill-conditioned."""
     if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
         return None
     if not np.linalg.cond(M) < 1e9:
@@ -222,11 +222,11 @@ class _Plain:
         return None if found is None else _Right(found[0][:n], found[1], kept)
 
     def _parts(self, v: Any, M: Any, *others: Any) -> _Right | None:
-        """What accelerations follow from, in place of these; None where it has no value."""
+        """M, h, Q, A and gamma instead of the accelerations; None if one has no value."""
         parts = np.concatenate([np.ravel(x) for x in (M, *others)])
         if not np.all(np.isfinite(parts)):
             return None
-        # Terms of h and gamma that cancel are of the size of M v v and A v v.
+        # Terms of h and gamma that cancel have the size of M v v and A v v.
         size = 1.0 + sum(map(norm, others)) + (norm(M) + sum(map(norm, others[2:]))) * norm(v) ** 2
         eps = float(jnp.finfo(self.key.dtype).eps)
         return _Right(parts, SLACK * eps * (size + norm(M)), parts=True)
@@ -269,7 +269,7 @@ class _Quasi:
         (h,) = interpret(self.bias, t, q, v, *params)
         Q = interpret(self.force, t, q, v, *params, *inputs)[0] if self.force is not None else 0.0
         reduced, right = B.T @ M @ B, B.T @ (Q - h - M @ s)
-        # What is projected is larger than what is left of it, and B has errors of its own.
+        # The terms are larger than their projections, and B has errors of its own.
         parts = norm(Q) + norm(h) + norm(M) * norm(s)
         eps, size = float(jnp.finfo(self.key.dtype).eps), norm(B)
         if not _definite(reduced):
@@ -287,7 +287,7 @@ class _Quasi:
 
 
 def _slopes_of(function: Callable) -> Callable:
-    """(slopes in the third argument, value where it is zero) of an affine function of it."""
+    """(slopes in the third argument, value at zero) of a function that is affine in it."""
 
     def slopes(t: Any, q: Any, x: Any, params: Any) -> Any:
         return jax.jacfwd(lambda x: function(t, q, x, params))(x), function(t, q, 0.0 * x, params)
@@ -325,7 +325,7 @@ def _bordered(M: Any, A: Any, r: Any, c: Any, G: Any) -> tuple[Any, Any]:
 
 
 def _pressing(whole: Any, n: int) -> Any:
-    """[M + A^T A, -(A^T + G); A, 0], of a positive determinant where rows press as they should."""
+    """[M + A^T A, -(A^T + G); A, 0]; its determinant is positive for a regular sense of rows."""
     whole = whole.copy()
     A = whole[n:, :n]
     whole[:n, :n] += A.T @ A
@@ -334,13 +334,13 @@ def _pressing(whole: Any, n: int) -> Any:
 
 
 def _augmented(M: Any, A: Any) -> np.ndarray:
-    """What the scalar program divides by where M may be singular, in numbers while tracing."""
+    """M + A^T W A, the divisor of the scalar program for a possibly singular M, as numbers."""
     with jax.ensure_compile_time_eval():
         return np.asarray(augmented(jnp.asarray(M), jnp.asarray(A))[0])
 
 
 def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
-    """What takes multipliers of the rows kept to those that forces see, in numbers."""
+    """The matrix from multipliers of the kept rows to those that forces read, as numbers."""
     with jax.ensure_compile_time_eval():
         rows, given = jnp.asarray(A), (jnp.asarray(kept), jnp.asarray(norm(A, axis=1) > 0))
         columns = [shared(rows, e, *given, read) for e in jnp.eye(len(A), dtype=rows.dtype)]
@@ -348,7 +348,7 @@ def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
 
 
 def _independent(A: Any, read: Sequence[bool]) -> np.ndarray:
-    """A largest set of clearly independent rows, first of those that are read."""
+    """A largest set of clearly independent rows; rows that forces read come first."""
     kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
     for k in sorted(range(len(A)), key=lambda k: bool(read) and not read[k]):
         rest = A[k] - (Y @ A[k]) @ Y
