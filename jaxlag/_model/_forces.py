@@ -215,8 +215,8 @@ class Torque(AbstractForce):
         angular_velocity: function `angular_velocity(t, q, v, params)` returning w, in rad/s,
             affine in v: shape (3,), () for a rotation about one fixed axis, or (k, 3).
         torque: function `torque(t, q, v, params, inputs)` or `torque(t, q, v, params)` returning
-            tau, in N m, in the shape of the angular velocity; positive by the right hand.
             tau, in N m, in the shape of the angular velocity; positive by the right-hand rule.
+        name: shown in `explain()` and used to select this force.
 
     Raises:
         ValueError: a function cannot be called in these forms, or the name is empty. While

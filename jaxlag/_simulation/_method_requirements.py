@@ -32,7 +32,6 @@ def check_requirements(
         formulation: kind of the state.
         params: as the Lagrangian takes them.
         inputs: the inputs.
-        inputs: the inputs.
         dtype: of the state.
 
     Raises:

@@ -23,7 +23,6 @@ class Splitting(AbstractFixedStep):
     therefore reversible. A drift comes first, with order 6 a kick; drifts advance the time. The
     work is that of every kick. With order 6, whose composition requires accelerations that depend
     on q alone, the work is of order 4.
-    alone, it is of order 4.
 
     In `diffrax.diffeqsolve` y is a pair (q, v) of pytrees, `vf(t, y, args)` the pair (v, M^-1 F).
     The terms of `simulate` have `sections(y) -> (q, v, work)`, its inverse
