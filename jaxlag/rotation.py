@@ -448,3 +448,9 @@ def _multiply(a: Array, b: Array) -> Array:
 yaw_pitch_roll = YawPitchRoll()
 zxz = ZXZ()
 quaternion = Quaternion()
+
+
+def __getattr__(name: str) -> object:
+    if name == "AbstractParametrisation":
+        raise AttributeError(f"rotation.{name} is rotation.AbstractParametrization now")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

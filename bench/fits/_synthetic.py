@@ -18,7 +18,7 @@ from jax import Array
 import jaxlag as jl
 from bench._harness.timing import Reference, Target
 from bench.fits._report import Figure, Part
-from jaxlag._fit._covariance import linearised
+from jaxlag._fit._covariance import linearized
 from jaxlag._fit._fit import last_gap
 from jaxlag._fit._free_parameters import NO_PRIOR, unknowns
 from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, search
@@ -152,7 +152,7 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
     def one(values: Array, guess: FitVariables, join: Array) -> tuple[FitVariables, Array, Array]:
         own = eqx.tree_at(lambda x: x.segments.values, problem, values)
         found = search(own, guess, join, jnp.asarray(1e-6), 50)
-        factor, by_z, _ = linearised(problem.free, found)
+        factor, by_z, _ = linearized(problem.free, found)
         root = by_z @ jnp.linalg.inv(factor)
         return found.guess, problem.free.numbers(found.guess.z), jnp.linalg.norm(root, axis=1)
 

@@ -6,8 +6,9 @@ from typing import Any
 _MANY = 8
 """Numbers of an array that are shown; of longer arrays the first and the last three are shown."""
 _EXPRESSION = re.compile(r"[A-Za-z_]\w*(\.\w+|\[[^\]]+\])*(=\S+)?")
-_NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf|True|False)"
-_ARRAY = re.compile(rf"\[[\[\]\s,]*{_NUMBER}(?:[\[\]\s,]+{_NUMBER}){{{_MANY},}}[\[\]\s,]*\]")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?j?|nan|inf|True|False")
+_ONLY_NUMBERS = re.compile(r"[-+\d.eEjnaifTruFls,\s\[\]]*")
+_QUOTED = re.compile(r"(`[^`\n]*`|'[^'\n]*'|\"[^\"\n]*\")")
 
 
 class SimulationError(RuntimeError):
@@ -66,14 +67,34 @@ def unsupported(what: str, why: str, fix: str = "") -> ValueError:
 
 
 def shortened(text: Any) -> str:
-    """The text, with only the first and the last three numbers of arrays of more than 8."""
+    """The text; of arrays of more than 8 numbers the first and the last three alone.
 
-    def few(array: re.Match) -> str:
-        numbers = re.findall(_NUMBER, array[0])
-        first, last = ", ".join(numbers[:3]), ", ".join(numbers[-3:])
-        return f"[{first}, ..., {last}] ({len(numbers)} numbers)"
+    Quoted parts, such as lines of code, stay as they are.
+    """
+    parts = _QUOTED.split(str(text))
+    return "".join(part if k % 2 else _without_arrays(part) for k, part in enumerate(parts))
 
-    return _ARRAY.sub(few, str(text))
+
+def _without_arrays(text: str) -> str:
+    """The same of a text without quotes, in one pass."""
+    found, depth, begin, end = [], 0, 0, 0
+    for k, letter in enumerate(text):
+        if letter == "[":
+            begin, depth = (k if depth == 0 else begin), depth + 1
+        elif letter == "]" and depth:
+            depth -= 1
+            if depth == 0:
+                found += [text[end:begin], _few(text[begin : k + 1])]
+                end = k + 1
+    return "".join([*found, text[end:]])
+
+
+def _few(array: str) -> str:
+    numbers = _NUMBER.findall(array) if _ONLY_NUMBERS.fullmatch(array) else ()
+    if len(numbers) <= _MANY:
+        return array
+    first, last = ", ".join(numbers[:3]), ", ".join(numbers[-3:])
+    return f"[{first}, ..., {last}] ({len(numbers)} numbers)"
 
 
 def _ticked(argument: str) -> str:

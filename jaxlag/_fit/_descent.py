@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxlag._core._arguments import positive_integer
+from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._multiple_shooting import FitVariables, MultipleShooting, SegmentOutputs
 
@@ -39,6 +39,7 @@ class Descent(eqx.Module):
     seed: int = eqx.field(static=True)
     gap: float = eqx.field(static=True)
 
+    @renamed(optimiser="optimizer=")
     def __init__(
         self,
         optimizer: Any,

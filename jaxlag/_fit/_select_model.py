@@ -16,7 +16,7 @@ from jaxlag._fit._fit import fit
 from jaxlag._fit._fit_result import FitResult
 from jaxlag._fit._free_parameters import Prior
 from jaxlag._fit._predict import Prediction
-from jaxlag._fit._setup import NO_OPTIONS, experiments_of, spreads
+from jaxlag._fit._setup import FORMER, NO_OPTIONS, experiments_of, spreads
 from jaxlag._fit._transforms import AbstractTransform
 from jaxlag._model._forces import AbstractForce
 from jaxlag._system._system import System
@@ -118,7 +118,19 @@ def _numbers(values: np.ndarray) -> str:
 _OF_FIT = ("segments", "channels", "loss", "optimizer", "rtol", "atol", "max_steps")
 
 
-@renamed(**{name: f"fit_options={{{name!r}: ...}}" for name in (*_OF_FIT, "simulate_options")})
+_FORMER = {name: f"fit_options={{{name!r}: ...}}" for name in (*_OF_FIT, "simulate_options")} | {
+    name: f"fit_options={{'simulate_options': {{{name!r}: ...}}}}"
+    for name in FORMER
+    if name not in ("tolerance", "max_iterations", "project")
+}
+
+
+@renamed(
+    tolerance="fit_options={'rtol': ..., 'atol': ...}",
+    max_iterations="fit_options={'max_steps': ...}",
+    optimiser="fit_options={'optimizer': ...}",
+    **_FORMER,
+)
 def select_model(
     system: System,
     experiments: Any,
@@ -166,6 +178,7 @@ def select_model(
     """
     experiments, held_out = experiments_of(experiments), experiments_of(held_out)
     _check(system, params0, candidates, most, free)
+    _check_fit_options(fit_options)
     models = []
     for count in range(most + 1):
         for names in combinations(candidates, count):
@@ -238,6 +251,16 @@ def _allowed(transform: AbstractTransform | None, name: str, value: Any) -> bool
     except ValueError:
         return False
     return not on_bound
+
+
+def _check_fit_options(options: Any) -> None:
+    """Raise unless they are arguments of `fit` that `select_model` does not decide."""
+    if not isinstance(options, Mapping):
+        raise invalid("fit_options", "be a dict of arguments of jl.fit", f"it was {options!r}")
+    for name in options:
+        if name not in (*_OF_FIT, "simulate_options"):
+            known = [*_OF_FIT, "simulate_options"]
+            raise invalid("fit_options", f"be among {known}", f"one was {name!r}")
 
 
 def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> None:

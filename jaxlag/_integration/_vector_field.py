@@ -291,8 +291,7 @@ class VectorField(eqx.Module):
         """The same by the program; it does not depend on inputs."""
         if self.quasi is None:
             return w
-        values = self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
-        state = State(t, q, w, self.given(args)[0], values)
+        state = State(t, q, w, self.given(args)[0], self.shapes_of_inputs(q, args))
         return self.program.velocities(state, args.constants)
 
     def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
@@ -330,8 +329,15 @@ class VectorField(eqx.Module):
 
     def projector(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
         """The projection onto the constraints near a predicted state."""
-        state = self.state_at(tau, y, args)
+        t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
+        state = State(t, q, w, params, self.shapes_of_inputs(q, args))
         return self.program.projector(state, args.constants, self.rows, args.kept)
+
+    def shapes_of_inputs(self, q: Array, args: Arguments) -> Any:
+        """Values of the inputs anywhere, for programs keyed by their shapes; else none."""
+        if not self.program.keyed_by_inputs(args.constants):
+            return {}
+        return self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
 
     def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
         """The state as programs take it, with quasi-velocities if it has them."""

@@ -109,6 +109,10 @@ class AccelerationProgram(eqx.Module):
     ) -> ConstraintProjector:
         """The projection onto the constraints near a state; of positions with quasi-velocities."""
 
+    def keyed_by_inputs(self, constants: Any) -> bool:
+        """Whether velocities, determinants and projections need the inputs' shapes."""
+        return False
+
     def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
         """Number of lines of the scalar program of accelerations; None if there is none."""
         return None

@@ -241,6 +241,10 @@ class ScalarProgram(AccelerationProgram):
             return self._on_arrays.multipliers(state, constants, reacting)
         return self._run("lam", state, constants)
 
+    def keyed_by_inputs(self, constants: Any) -> bool:
+        """The scalar programs are."""
+        return isinstance(constants, ScalarSolveConstants)
+
     def lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> int | None:
         """Number of lines of the body, which is evaluated at every state."""
         equations = self.lowered(q, params, inputs).equations

@@ -45,7 +45,10 @@ def check_options(
     if not isinstance(assemble, bool):
         raise invalid("assemble", "be True or False", f"it was {assemble!r}")
     baumgarte = isinstance(stabilization, Baumgarte)
-    if not baumgarte and stabilization is not None and stabilization != "projection":
+    known = stabilization is None or (
+        isinstance(stabilization, str) and stabilization == "projection"
+    )
+    if not baumgarte and not known:
         must = "be 'projection', None or a jl.Baumgarte(alpha, beta)"
         raise invalid("stabilization", must, f"it was {stabilization!r}")
     if baumgarte and not system.constraints:

@@ -178,7 +178,7 @@ class AbstractReactions(AbstractQuantities):
         Raises:
             ValueError: the system has no quasi-velocities.
         """
-        self._with_quasi("quasi_reactions")
+        self._with_quasi("quasi_velocities")
         t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         rows = self._rows(params, q.dtype)

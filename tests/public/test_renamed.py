@@ -81,6 +81,9 @@ def select_model(**options):
         (fit, "project", "simulate_options={'stabilization': ...}"),
         (lambda **x: jl.predict(SYSTEM, DATA, PARAMS, **x), "dt", "simulate_options={'dt': ...}"),
         (select_model, "segments", "fit_options={'segments': ...}"),
+        (select_model, "tolerance", "fit_options={'rtol': ..., 'atol': ...}"),
+        (select_model, "method", "fit_options={'simulate_options': {'method': ...}}"),
+        (lambda **x: jl.Descent(**x), "optimiser", "optimizer="),
     ],
 )
 def test_a_former_keyword_says_the_present_one(call, former, present):
@@ -107,6 +110,24 @@ def test_options_of_a_simulation_are_those_that_it_has():
     ):
         with pytest.raises(ValueError, match=message):
             fit(simulate_options=wrong)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_options_of_a_fit_are_those_that_a_comparison_leaves_to_it():
+    candidates = {"drag": jl.Candidate(jl.Rayleigh(lambda t, q, v, p: v @ v, "drag"), params0={})}
+    for wrong, message in (
+        ({"free": ("k",)}, r"^`fit_options` must be among .*'segments'.* but one was 'free'"),
+        (3, "^`fit_options` must be a dict of arguments of jl.fit, but it was 3"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jl.select_model(
+                SYSTEM, DATA, PARAMS, candidates, held_out=DATA, free=("k",), fit_options=wrong
+            )
+
+
+def test_a_renamed_class_of_rotations_says_so():
+    with pytest.raises(AttributeError, match=r"is rotation\.AbstractParametrization now$"):
+        jl.rotation.AbstractParametrisation  # noqa: B018
 
 
 def test_multipliers_go_by_one_name():

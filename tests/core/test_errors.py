@@ -1,0 +1,54 @@
+"""The form of errors: names in back-ticks, long arrays shortened, quoted text as it is."""
+
+import numpy as np
+import pytest
+
+from jaxlag._core._errors import invalid, shortened, unsupported
+
+
+@pytest.mark.parametrize(
+    ("argument", "shown"),
+    [
+        ("rtol", "`rtol`"),
+        ("rtol and atol", "`rtol` and `atol`"),
+        ("params['a'][0].law", "`params['a'][0].law`"),
+        ("lyapunov: motion", "lyapunov: `motion`"),
+        ("force 'drag'", "force 'drag'"),
+        ("force 'drag': Q", "force 'drag': `Q`"),
+        ("names of the inputs", "names of the inputs"),
+    ],
+)
+def test_a_name_stands_in_back_ticks(argument, shown):
+    error = invalid(argument, "be finite", "it was nan", "Leave it out.")
+    assert str(error) == f"{shown} must be finite, but it was nan. Leave it out."
+
+
+def test_what_no_argument_is_wrong_with_is_not_supported():
+    error = unsupported("`at` of a batch", "its shape is (2,)", "Take one of them.")
+    assert str(error) == "`at` of a batch is not supported: its shape is (2,). Take one of them."
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (f"it was {np.arange(8)}", "it was [0 1 2 3 4 5 6 7]"),
+        (f"it was {np.arange(9)} m", "it was [0, 1, 2, ..., 6, 7, 8] (9 numbers) m"),
+        (f"q = {np.arange(9.0)}, v", "q = [0., 1., 2., ..., 6., 7., 8.] (9 numbers), v"),
+        (str(np.full((3, 4), np.nan)), "[nan, nan, nan, ..., nan, nan, nan] (12 numbers)"),
+        ("[[1, 2, 3], [4, 5, 6]] and [7, 8, 9]", "[[1, 2, 3], [4, 5, 6]] and [7, 8, 9]"),
+        (
+            "line 3 (`a = [1, 2, 3, 4, 5, 6, 7, 8, 9]`)",
+            "line 3 (`a = [1, 2, 3, 4, 5, 6, 7, 8, 9]`)",
+        ),
+        ("it was '[1, 2, 3, 4, 5, 6, 7, 8, 9]'", "it was '[1, 2, 3, 4, 5, 6, 7, 8, 9]'"),
+        ("among ['a', 'b', 'c', 'd', 'e', 'f', 'g', 'h', 'i']",) * 2,
+        ("left [ open 1 2 3 4 5 6 7 8 9",) * 2,
+    ],
+)
+def test_long_arrays_are_shortened(text, shown):
+    assert shortened(text) == shown
+
+
+@pytest.mark.parametrize("piece", ["[", "[1 ", "[1     ", "1 ", "]"])
+def test_what_never_closes_stays_as_it_is(piece):
+    assert shortened(piece * 10_000) == piece * 10_000
