@@ -15,6 +15,7 @@ from jaxlag import rotation as rotation
 from jaxlag import solvers as solvers
 from jaxlag import testing as testing
 from jaxlag import transforms as transforms
+from jaxlag._core._arguments import former_names as _former_names
 from jaxlag._core._errors import AssemblyError as AssemblyError
 from jaxlag._core._errors import EquilibriumError as EquilibriumError
 from jaxlag._core._errors import SimulationError as SimulationError
@@ -43,12 +44,12 @@ from jaxlag._model._input_signals import TimeFunction as TimeFunction
 from jaxlag._model._input_signals import ZeroOrderHold as ZeroOrderHold
 from jaxlag._model._named import named as named
 from jaxlag._model._quasi_velocities import QuasiVelocities as QuasiVelocities
-from jaxlag._simulation._lyapunov import PerturbationGrowth as PerturbationGrowth
 from jaxlag._simulation._lyapunov import lyapunov as lyapunov
+from jaxlag._simulation._perturbation_growth import PerturbationGrowth as PerturbationGrowth
 from jaxlag._simulation._simulate import simulate as simulate
 from jaxlag._simulation._solution import Solution as Solution
-from jaxlag._statics._assemble import Assembly as Assembly
 from jaxlag._statics._assemble import assemble as assemble
+from jaxlag._statics._assembly import Assembly as Assembly
 from jaxlag._statics._equilibrium import Equilibrium as Equilibrium
 from jaxlag._statics._equilibrium import equilibrium as equilibrium
 from jaxlag._statics._inverse_dynamics import inverse_dynamics as inverse_dynamics
@@ -72,8 +73,4 @@ _RENAMED = {
     "GradientGrowth": "PerturbationGrowth",
 }
 
-
-def __getattr__(name: str) -> object:
-    if name in _RENAMED:
-        raise AttributeError(f"jaxlag.{name} is jaxlag.{_RENAMED[name]} now")
-    raise AttributeError(f"module 'jaxlag' has no attribute {name!r}")
+__getattr__ = _former_names(__name__, _RENAMED)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import former_names
 from jaxlag._core._arrays import reals
 from jaxlag._core._errors import invalid
 
@@ -449,8 +450,4 @@ yaw_pitch_roll = YawPitchRoll()
 zxz = ZXZ()
 quaternion = Quaternion()
 
-
-def __getattr__(name: str) -> object:
-    if name == "AbstractParametrisation":
-        raise AttributeError(f"rotation.{name} is rotation.AbstractParametrization now")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = former_names(__name__, {"AbstractParametrisation": "AbstractParametrization"})

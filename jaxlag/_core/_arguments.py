@@ -1,6 +1,6 @@
 """Decorators and checks for the arguments of public functions: order, names, types."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from inspect import Parameter, signature
 from typing import Any, ParamSpec, TypeVar
@@ -104,3 +104,19 @@ def name_sequence(argument: str, x: Any, fix: str | None = None) -> tuple[str, .
     if not isinstance(x, Sequence):
         raise invalid(argument, "be a sequence of names", f"it was {x!r}", fix or "")
     return tuple(x)
+
+
+def former_names(module: str, present: Mapping[str, str]) -> Callable[[str], object]:
+    """A module's `__getattr__` that refuses former names and says the present ones.
+
+    Args:
+        module: its name.
+        present: by the former name, the present one.
+    """
+
+    def refuse(name: str) -> object:
+        if name in present:
+            raise AttributeError(f"{module}.{name} is {module}.{present[name]} now")
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+
+    return refuse

@@ -55,6 +55,7 @@ class Choices(NamedTuple):
 
 
 AS_USUAL = Choices()
+"""All rows, forwards in time, and what is known while tracing."""
 
 
 class AccelerationProgram(eqx.Module):

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number
@@ -21,6 +21,7 @@ from jaxlag._core._status import ADVICE, Status
 from jaxlag._linalg._mass_solve import rank_floor
 from jaxlag._model._inputs import all_knots
 from jaxlag._simulation._methods import default_tolerances
+from jaxlag._simulation._perturbation_growth import SURE, PerturbationGrowth, effective_rtol
 from jaxlag._simulation._solution import Solution
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -32,97 +33,6 @@ SEGMENTS_AT_ONCE = 64  # in one loop, at most
 STAGES_IN_BYTES = 2**18
 TRANSIENT = 0.25  # part of the motion left out of the exponent
 BLOCKS = 8  # of the rest, at most
-SURE = 3.0  # standard errors by which an exponent must exceed zero
-
-
-class PerturbationGrowth(eqx.Module):
-    """Growth of perturbations of a motion y = (q, v), Phi' = df/dy Phi along y' = f(t, y).
-
-    Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
-    the batch axes in front. All values are NaN if the status is not ok.
-
-    Attributes:
-        ts: (s,), s.
-        transition: (s - 1, 2n, 2n), Phi(ts[i + 1], ts[i]) P(ts[i]) in (q, v), with P the orthogonal
-            projector onto perturbations that the constraints allow; the identity without
-            constraints.
-        log_kappa: (s,), logarithm of `kappa`.
-        log_norm: (s,), logarithm of |W(t)^-1 Phi(t, ts[0]) W(ts[0])|.
-        exponent: largest Lyapunov exponent, 1/s.
-        exponent_error: its standard error, 1/s.
-        horizon: time after ts[0], s, beyond which a single gradient is meaningless; inf for never.
-        rtol: of the weights W.
-        atol: of the weights W.
-        status: int32, see `Status`: ok, or that of the motion or of the segment that failed.
-    """
-
-    ts: Float[Array, "*batch s"]
-    transition: Float[Array, "*batch s-1 m m"]
-    log_kappa: Float[Array, "*batch s"]
-    log_norm: Float[Array, "*batch s"]
-    exponent: Float[Array, "*batch"]
-    exponent_error: Float[Array, "*batch"]
-    horizon: Float[Array, "*batch"]
-    rtol: Float[Array, "*batch"]
-    atol: Float[Array, "*batch"]
-    status: Int[Array, "*batch"]
-
-    @property
-    def kappa(self) -> Float[Array, "*batch s"]:
-        """Condition number (s,): the largest |W(t)^-1 Phi(t, s) W(s)| over save times s up to t.
-
-        Infinite on overflow; see `log_kappa`.
-        """
-        return jnp.exp(self.log_kappa)
-
-    @property
-    def exponential(self) -> Bool[Array, "*batch"]:
-        """Whether the exponent is positive by more than three standard errors."""
-        return self.exponent > SURE * self.exponent_error
-
-    def message(self) -> str:
-        """The kind of growth along a single motion, and a remedy, as text."""
-        if self.ts.ndim != 1:
-            raise unsupported(
-                "`message` of a batch",
-                f"its shape is {self.ts.shape[:-1]}",
-                "Take one of them, as batch[3].",
-            )
-        status = Status(int(self.status))
-        if status is not Status.ok:
-            return f"{status.name}: the motion, or a segment of it, could not be followed."
-        rate, error = float(self.exponent), float(self.exponent_error)
-        exponent = f"largest Lyapunov exponent {rate:.4g} +- {error:.2g} 1/s"
-        if self.exponential:
-            kind = f"exponential: {exponent}"
-        elif rate < -SURE * error:
-            kind = f"that of an error that dies out: {exponent}"
-        elif abs(rate) <= error:
-            kind = f"like a power of time at most: {exponent}, not significantly other than 0"
-        else:
-            kind = f"not decided by a motion as short as this: {exponent}"
-        span, decades = abs(float(self.ts[-1] - self.ts[0])), float(self.log_kappa[-1]) / np.log(10)
-        grown = f"{10**decades:.3g}" if decades < 300 else f"10^{decades:.0f}"
-        text = (
-            f"In {span:.6g} s an error of the state becomes at most {grown} times as large, "
-            f"measured by atol + rtol |y|. The growth is {kind}."
-        )
-        horizon, tolerance = float(self.horizon), float(_tolerance(self.rtol))
-        if horizon == np.inf:
-            return f"{text} Up to its end one gradient along the motion means what it says."
-        beyond = ", beyond its end (extrapolated)," if horizon > span else ""
-        return (
-            f"{text} From {horizon:.4g} s after its start{beyond} an error of {tolerance:.1g} is "
-            "as large as the state: neither the motion nor a gradient along it means anything "
-            "there. Use segments well shorter than that (multiple shooting), or a loss that ends "
-            "earlier."
-        )
-
-    def __str__(self) -> str:
-        return self.message() if self.ts.ndim == 1 else repr(self)
-
-    def __repr__(self) -> str:
-        return f"PerturbationGrowth(exponent {self.exponent} 1/s, horizon {self.horizon} s)"
 
 
 @renamed(tol="step_rtol= and step_atol=")
@@ -310,7 +220,7 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
 
         tau = jnp.abs(ts - ts[0]).astype(y.dtype)
         exponent, error = _exponent(tau, log_size)
-        horizon = _horizon(tau, log_kappa, exponent, error, -jnp.log(_tolerance(rtol)))
+        horizon = _horizon(tau, log_kappa, exponent, error, -jnp.log(effective_rtol(rtol)))
 
         status = jnp.where(status == int(Status.ok), jnp.max(statuses), status)
         found = (Phi, log_kappa, log_norm, exponent, error, horizon)
@@ -330,10 +240,6 @@ def _rate(system: System, formulation: str, params: Any, inputs: Any, t: Array, 
     else:
         a = system.acceleration(q, v, params, t=t, inputs=inputs)
     return jnp.concatenate([v, a])
-
-
-def _tolerance(rtol: Array) -> Array:
-    return jnp.maximum(rtol, jnp.finfo(rtol.dtype).eps)
 
 
 def _tangent(system: System, params: Any, t: Array, y: Array, w: Array) -> Array:

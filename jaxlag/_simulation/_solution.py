@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arrays import concrete, stop_gradient
-from jaxlag._core._errors import SimulationError, invalid, unsupported
+from jaxlag._core._errors import SimulationError, invalid, shortened, unsupported
 from jaxlag._core._status import CONCERNS_ROW, Status
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
@@ -295,7 +295,7 @@ class Solution(AbstractSolution):
                     more = " The kinematics v = B u + c do not satisfy it."
         about = f" ({labels[index]!r})" if index >= 0 else ""
         q, v = self.last_state
-        return (
+        return shortened(
             f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
             f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
             f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()

@@ -4,23 +4,22 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool
 
 from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import concrete, number, real, stop_gradient
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import AssemblyError, invalid, unsupported
+from jaxlag._core._errors import AssemblyError, invalid
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import independent_rows, row_sizes, without_rounding
 from jaxlag._linalg._kkt import augmented, solve_kkt
 from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
 from jaxlag._lowering import ArrayTerms
-from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import state_vectors
+from jaxlag._statics._assembly import Assembly
 from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
@@ -31,66 +30,6 @@ MAX_TURNS = 200
 NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out during the search: dependent
 # rows are not quite dependent off the constraints
 FRACTIONS = 2.0 ** -np.arange(12)
-
-
-class Assembly(eqx.Module):
-    """A state (q, v) near a guess, and its constraint residuals.
-
-    Attributes:
-        system: the mechanical system.
-        q: coordinates (n,), m or rad.
-        v: velocities (n,), m/s or rad/s.
-        position_residual: phi(t, q) of the holonomic rows, (k,).
-        velocity_residual: A v + b of all rows, (m,).
-        independent: (m,), a largest set of independent rows; the others follow from these.
-        status: int32, see `Status`: ok, contradictory_rows or nonfinite.
-        where: index of the row with the largest residual, -1 if the status is ok.
-    """
-
-    system: System
-    q: Float[Array, "*batch n"]
-    v: Float[Array, "*batch n"]
-    position_residual: Float[Array, "*batch k"]
-    velocity_residual: Float[Array, "*batch m"]
-    independent: Bool[Array, "*batch m"]
-    status: Int[Array, "*batch"]
-    where: Int[Array, "*batch"]
-    _rows: ConstraintRows = eqx.field(static=True)
-
-    @property
-    def rank(self) -> Int[Array, "*batch"]:
-        """Number of independent rows."""
-        return jnp.sum(self.independent, axis=-1, dtype=jnp.int32)
-
-    @property
-    def dependent(self) -> tuple[str, ...]:
-        """Names of the rows that depend on the others, for a single assembly."""
-        if self.independent.ndim != 1:
-            raise unsupported(
-                "`dependent` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
-            )
-        return tuple(
-            name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
-        )
-
-    def message(self) -> str:
-        """How a single assembly ended, as text."""
-        if self.q.ndim != 1:
-            raise unsupported(
-                "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
-            )
-        status = Status(int(self.status))
-        if status is Status.ok:
-            more = f"; dependent rows: {', '.join(self.dependent)}" if self.dependent else ""
-            return f"ok at q = {self.q}, v = {self.v}, rank {int(self.rank)}{more}"
-        row, more = self._rows.labels[int(self.where)], ""
-        if status is Status.contradictory_rows:
-            more = self._rows.contradiction(self.system.size)
-        return (
-            f"{status.name} ({row!r}): the nearest state was q = {self.q}, v = {self.v}, with "
-            f"residuals {self.position_residual} of position and {self.velocity_residual} of "
-            f"velocity.{more}"
-        )
 
 
 def assemble(

@@ -14,7 +14,7 @@ from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import EquilibriumError, invalid, unsupported
+from jaxlag._core._errors import EquilibriumError, invalid, shortened, unsupported
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm, row_sizes, without_rounding
 from jaxlag._model._constraints import ConstraintRows
@@ -147,13 +147,13 @@ class Equilibrium(eqx.Module):
         labels = self.system.coordinates.labels
         status = Status(int(self.status))
         if status is Status.ok:
-            return f"ok at q = {self.q} after {int(self.iterations)} steps"
+            return f"ok at q = {shortened(self.q)} after {int(self.iterations)} steps"
         left, scale = np.abs(self.residual), np.asarray(self.scale)
         with np.errstate(invalid="ignore"):
             relative = np.divide(left, scale, out=np.zeros_like(left), where=left != 0)
         worst = int(np.argmax(np.where(np.isfinite(relative), relative, np.inf)))
         on = " on the constraints" if self.rows.shape[-2] else ""
-        return (
+        return shortened(
             f"{status.name}: no equilibrium was found. After {int(self.iterations)} steps the "
             f"nearest point was q = {self.q}; the force on {labels[worst]!r} left there is "
             f"{self.residual[worst]:.6g}, {relative[worst]:.1e} of its scale "

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxlag as jl
 from jaxlag._core._errors import invalid, shortened, unsupported
 
 
@@ -52,3 +53,23 @@ def test_long_arrays_are_shortened(text, shown):
 @pytest.mark.parametrize("piece", ["[", "[1 ", "[1     ", "1 ", "]"])
 def test_what_never_closes_stays_as_it_is(piece):
     assert shortened(piece * 10_000) == piece * 10_000
+
+
+def test_messages_of_results_shorten_their_states():
+    n = 12
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v, {"x": n})
+    motion = jl.simulate(
+        system,
+        np.ones(n),
+        np.zeros(n),
+        [0.0, 1.0],
+        max_steps=1,
+        dt=0.1,
+        throw=False,
+        method="euler",
+    )
+    assert "q = [1., 1., 1., ..., 1., 1., 1.] (12 numbers), v = [0., 0." in motion.message()
+    rest = jl.equilibrium(jl.System(lambda t, q, v, p: 0.5 * v @ v - q @ q, {"x": n}), np.zeros(n))
+    assert "q = [0., 0., 0., ..., 0., 0., 0.] (12 numbers) after" in rest.message()
+    near = jl.assemble(system, np.ones(n), np.zeros(n))
+    assert "(12 numbers), rank 0" in near.message()

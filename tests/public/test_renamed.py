@@ -126,7 +126,7 @@ def test_options_of_a_fit_are_those_that_a_comparison_leaves_to_it():
 
 
 def test_a_renamed_class_of_rotations_says_so():
-    with pytest.raises(AttributeError, match=r"is rotation\.AbstractParametrization now$"):
+    with pytest.raises(AttributeError, match=r"is jaxlag\.rotation\.AbstractParametrization now$"):
         jl.rotation.AbstractParametrisation  # noqa: B018
 
 
