@@ -45,54 +45,75 @@ class Multipliers(NamedTuple):
         return self.mass.healthy, self.schur.healthy
 
 
-class NullSpace(NamedTuple):
-    """A = L Y with orthonormal rows Y, and P M P + s (1 - P) factored, P = 1 - Y^T Y.
+class TangentSpace(NamedTuple):
+    """The tangent space A x = 0 and its complement, A = L Y with orthonormal rows Y.
 
-    Acceleration without multipliers: x = P y - Y^T L^-1 c (Siciliano et al., Robotics, sec. 9.4).
-    All in units of coordinates in which their inertias are 1.
+    All in units of coordinates in which their inertias are 1. P = 1 - Y^T Y projects onto the
+    tangent space. A row that depends on others has NaN, or with `crossing` 0 in Y and infinity
+    in L.
     """
 
     units: Float[Array, " n"]
-    mass: MassFactor
     M: Float[Array, "n n"]
     L: tuple[tuple[Array, ...], ...]
     Y: Float[Array, "m n"]
-    rows_healthy: Bool[Array, " m"]
 
-    def solve(
-        self, A: Float[Array, "m n"], r: Float[Array, " n"], c: Float[Array, " m"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(x, lam)."""
-        M, Y, r = self.M, self.Y, self.units * r
-        given = -(jnp.stack(self._forward(c)) @ Y)
-        y = eliminate(self.mass, self._tangent(r - M @ given))
-        x = given + self._tangent(y)
-        return self.units * x, jnp.stack(self._backward(Y @ (M @ x - r)))
+    def inertia(self) -> Float[Array, "n n"]:
+        """P M P + s (1 - P), with the mean inertia s of the coordinates."""
+        M, Y = self.M, self.Y
+        M_P = M - (M @ Y.T) @ Y
+        return M_P - Y.T @ (Y @ M_P) + _size(M) / M.shape[0] * (Y.T @ Y)
 
-    def _tangent(self, x: Array) -> Array:
-        """P x."""
-        return x - (self.Y @ x) @ self.Y
-
-    def _forward(self, c: Array) -> list[Array]:
-        """L^-1 c."""
+    def loads(
+        self, r: Float[Array, " n"], c: Float[Array, " m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """(-Y^T L^-1 c, the part of x across the tangent space; the load left for y)."""
         z: list[Array] = []
         for k, row in enumerate(self.L):
-            z.append((c[k] - sum(row[j] * z[j] for j in range(k))) / row[k])
-        return z
+            z.append((-c[k] - sum(row[j] * z[j] for j in range(k))) / row[k])
+        across = jnp.stack(z) @ self.Y
+        return across, self._along(self.units * r - self.M @ across)
 
-    def _backward(self, y: Array) -> list[Array]:
-        """L^-T y."""
+    def acceleration(self, y: Float[Array, " n"], across: Float[Array, " n"]) -> Float[Array, " n"]:
+        """x = P y - Y^T L^-1 c."""
+        return self.units * (across + self._along(y))
+
+    def multipliers(self, x: Float[Array, " n"], r: Float[Array, " n"]) -> Float[Array, " m"]:
+        """lam = L^-T Y (M x - r)."""
+        y = self.Y @ (self.M @ (x / self.units) - self.units * r)
         m = len(self.L)
         z: list[Array] = [jnp.zeros((), y.dtype)] * m
         for k in reversed(range(m)):
             known = sum(self.L[j][k] * z[j] for j in range(k + 1, m))
             z[k] = (y[k] - known) / self.L[k][k]
-        return z
+        return jnp.stack(z)
+
+    def _along(self, x: Array) -> Array:
+        """P x."""
+        return x - (self.Y @ x) @ self.Y
+
+
+class NullSpace(NamedTuple):
+    """The inertia on the tangent space, factored once.
+
+    Acceleration without multipliers: x = P y - Y^T L^-1 c (Siciliano et al., Robotics, sec. 9.4).
+    """
+
+    space: TangentSpace
+    mass: MassFactor
+
+    def solve(
+        self, A: Float[Array, "m n"], r: Float[Array, " n"], c: Float[Array, " m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """(x, lam)."""
+        across, load = self.space.loads(r, c)
+        x = self.space.acceleration(eliminate(self.mass, load), across)
+        return x, self.space.multipliers(x, r)
 
     @property
     def healthy(self) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
         """Pivots of coordinates and of rows that are positive to working precision."""
-        return self.mass.healthy, self.rows_healthy
+        return self.mass.healthy, jnp.stack([row[-1] for row in self.space.L]) > 0
 
 
 Factor = Multipliers | NullSpace
@@ -117,7 +138,8 @@ def factor_kkt(
     """
     A = masked(A, kept)
     if formulation == "null_space":
-        return _null_space(M, A, kept, crossing)
+        space = tangent_space(M, A, kept, crossing)
+        return NullSpace(space, factor_mass(space.inertia()))
     bordered, weights = augmented(M, A)
     mass = factor_mass(bordered)
     spread = jax.vmap(lambda row: eliminate(mass, row))(A)
@@ -130,20 +152,26 @@ def factor_kkt(
 def augmented(
     M: Float[Array, "n n"], A: Float[Array, "m n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, " m"]]:
-    """(M + A^T W A, W): positive definite if M is semidefinite, and definite on A x = 0.
+    """(M + A^T W A, W): positive definite if M is semidefinite, and definite on A x = 0."""
+    weights = row_weights(M, A)
+    return M + (A.T * weights[None]) @ A, weights
 
-    W is diagonal, 1 / sum_i A_ki^2 / M_ii over the coordinates with inertia: the term of a row is
-    as large as the inertia of its coordinates, also if inertias differ widely.
+
+def row_weights(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """The diagonal of W, 1 / sum_i A_ki^2 / M_ii over the coordinates with inertia.
+
+    The term of a row in M + A^T W A is then as large as the inertia of its coordinates, also if
+    inertias differ widely.
     """
     inertias = jnp.diagonal(M)
-    there = inertias > 0
-    mobility = jnp.sum(jnp.where(there, A**2 / jnp.where(there, inertias, 1.0)[None], 0.0), axis=1)
+    inertial = inertias > 0
+    mobilities = jnp.where(inertial, 1.0 / jnp.where(inertial, inertias, 1.0), 0.0)
+    mobility = jnp.sum(A**2 * mobilities[None], axis=1)
     square = jnp.sum(A**2, axis=1)
-    some = mobility > 0
+    mobile = mobility > 0
     alone = _size(M) / jnp.where(square > 0, square, 1.0)
-    weights = jnp.where(some, 1.0 / jnp.where(some, mobility, 1.0), alone)
-    weights = jnp.where(square > 0, weights, 0.0)
-    return M + (A.T * weights[None]) @ A, weights
+    weights = jnp.where(mobile, 1.0 / jnp.where(mobile, mobility, 1.0), alone)
+    return jnp.where(square > 0, weights, 0.0)
 
 
 def _size(M: Array) -> Array:
@@ -159,35 +187,40 @@ def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n
     return jax.lax.rsqrt(jnp.where(inertias > 0, inertias, 1.0))
 
 
-def _null_space(
-    M: Float[Array, "n n"], A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, crossing: bool
-) -> NullSpace:
-    """Gram-Schmidt orthonormalization of the rows, each row twice ("twice is enough")."""
+def tangent_space(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    kept: Bool[Array, " m"] | None,
+    crossing: bool,
+) -> TangentSpace:
+    """Units of coordinates in which their inertias are 1, and orthonormal rows in them."""
     units = units_of(M, A)
     M, A = units[:, None] * M * units[None], A * units[None]
-    m, n = A.shape
-    Y = jnp.zeros((m, n), A.dtype)
-    L, healthy = [], []
-    for k in range(m):
+    return TangentSpace(units, M, *orthonormal_rows(A, kept, rank_floor(A.dtype), crossing))
+
+
+def orthonormal_rows(
+    A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, floor: float, crossing: bool = False
+) -> tuple[tuple[tuple[Array, ...], ...], Float[Array, "m n"]]:
+    """(L, Y), A = L Y, by Gram-Schmidt orthonormalization, each row twice ("twice is enough").
+
+    Rows that are not kept have 0 in Y and 1 in L. A row depends on those before it if the part
+    that they leave has a square of at most `floor` times that of the row.
+    """
+    Y, L = jnp.zeros_like(A), []
+    for k in range(A.shape[0]):
         first = Y @ A[k]
         rest = A[k] - first @ Y
         second = Y @ rest
         rest = rest - second @ Y
-        norm = jnp.sqrt(jnp.sum(rest**2))
-        least = rank_floor(A.dtype) * jnp.sum(A[k] ** 2)
-        if crossing:
-            norm = jnp.where(norm**2 <= least, jnp.inf, norm)
-        fine = norm**2 > least
+        square = jnp.sum(rest**2)
+        independent = square > floor * jnp.sum(A[k] ** 2)
+        norm = jnp.sqrt(jnp.where(independent, square, jnp.inf if crossing else jnp.nan))
         if kept is not None:
             norm = jnp.where(kept[k], norm, 1.0)
-            fine = fine | ~kept[k]
-        healthy.append(fine)
         L.append((*(first + second)[:k], norm))
         Y = Y.at[k].set(rest / norm)
-    P = jnp.eye(n, dtype=M.dtype) - Y.T @ Y
-    size = _size(M) / n
-    mass = factor_mass(P @ M @ P + size * (Y.T @ Y))
-    return NullSpace(units, mass, M, tuple(L), Y, jnp.stack(healthy))
+    return tuple(L), Y
 
 
 def masked(A: Array, kept: Bool[Array, " m"] | None) -> Array:

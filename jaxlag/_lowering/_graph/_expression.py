@@ -97,10 +97,16 @@ LARGEST, SMALLEST = Primitive(largest_p, {}), Primitive(smallest_p, {})
 
 
 class Graph:
-    """Builds nodes; all nodes of an expression belong to one graph."""
+    """Builds nodes; all nodes of an expression belong to one graph.
+
+    Attributes:
+        nodes: all of them, arguments first.
+        once: names of JAX primitives whose results become atoms when a program is read.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
+        self.once: Container[str] = ()
         self._known: dict[Any, Node] = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 

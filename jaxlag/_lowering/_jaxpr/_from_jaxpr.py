@@ -5,7 +5,7 @@ An array is a numpy array of nodes (dtype object). If its values are known while
 once on an array of positions. JAX itself evaluates operations on known values.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,7 @@ from jaxlag._core._jaxprs import called, scan_sizes
 from jaxlag._lowering._graph._expression import Graph, Node, named
 from jaxlag._lowering._jaxpr._array_primitives import MOVES, SHIFTS, WHOLE, move
 from jaxlag._lowering._jaxpr._elementwise_primitives import ELEMENTWISE, elementwise
-from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, nodes
+from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, each, nodes
 from jaxlag._tracing._interpret import NUMPY, held
 
 LIMIT = 50_000  # nodes of a graph: far beyond the useful size of a scalar program
@@ -83,18 +83,29 @@ class Rule:
         return arrays
 
 
-def read(graph: Graph, closed: ClosedJaxpr, *args: np.ndarray) -> list[np.ndarray]:
+def read(
+    graph: Graph, closed: ClosedJaxpr, *args: np.ndarray, once: Container[str] = ()
+) -> list[np.ndarray]:
     """The results of a program on arrays of nodes.
+
+    Args:
+        graph: of all nodes.
+        closed: the program.
+        args: its arguments.
+        once: names of primitives whose results are computed once: no sum or product opens them.
 
     Raises:
         Unsupported: an operation without scalar form, with its place in the user's source.
     """
     if not concrete(*closed.consts):
         raise Unsupported("a value traced by a transform comes from outside the arguments")
+    before, graph.once = graph.once, once
     try:
         return _read(graph, closed, *args)
     except Missing as missing:
         raise Unsupported(str(missing)) from None
+    finally:
+        graph.once = before
 
 
 def _read(graph: Graph, closed: ClosedJaxpr, *args: Any) -> list:
@@ -120,6 +131,8 @@ def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list:
             raise Unsupported(f"{missing} at {where}") from None
         if len(graph.nodes) > LIMIT:
             raise Unsupported(f"more than {LIMIT} scalar operations")
+        if eqn.primitive.name in graph.once:
+            results = [each(graph.let, array) for array in results]
         for var, array in zip(eqn.outvars, results, strict=True):
             # An empty array contains no nodes: its values are known.
             empty = array.dtype == object and array.size == 0

@@ -31,6 +31,16 @@ def nodes(graph: Graph, array: np.ndarray) -> np.ndarray:
     return out
 
 
+def each(make: Callable, array: np.ndarray) -> np.ndarray:
+    """One node for each node; known values stay."""
+    if array.dtype != object:
+        return array
+    out = np.empty(array.shape, object)
+    for index in np.ndindex(array.shape):
+        out[index] = make(array[index])
+    return out
+
+
 def scalar(node: Any) -> np.ndarray:
     out = np.empty((), object)
     out[()] = node

@@ -1,13 +1,19 @@
 """Constraint rows on the graph, and the solve for accelerations with constraints."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+from jax import Array
+
+from jaxlag._linalg._kkt import TangentSpace, row_weights, tangent_space, units_of
 from jaxlag._lowering._graph._eliminate import GREATER, bordered, solve_general
 from jaxlag._lowering._graph._expression import Graph, Node, dependencies, substitute
-from jaxlag._lowering._graph._orthonormalize import dot, orthonormal, products, without
+from jaxlag._lowering._graph._vectors import dot, products
 from jaxlag._lowering._jaxpr._differentiate import tangents
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+from jaxlag._lowering._symbolic._read_function import read_function
 from jaxlag._lowering._symbolic._shared_reactions import Sharing, shared
 
 
@@ -88,7 +94,7 @@ def solve_with_rows(
     if formulation == "null_space":
         return _null_space(graph, M, A, right, eps, kept, crossing)
     if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
-        M, right = _augmented(graph, M, A, right, kept)
+        M, right = _augmented(graph, M, A, right, eps, kept)
     found = bordered(graph, M, A, right, eps, kept, checked=True, crossing=crossing)
     return [x[: len(M)] for x in found]
 
@@ -135,7 +141,9 @@ def solve_with_reactions(
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
     seen = None
     if kept is not None and sharing is not None:
-        seen = shared(graph, A, _units(graph, M, A, regular), kept, sharing, eps)
+        roots = [graph.let(graph.div(graph.one, graph.sqrt(M[i][i]))) for i in range(len(M))]
+        units = roots if regular else read_function(graph, eps, units_of, M, A)
+        seen = shared(graph, A, units, kept, sharing, eps)
     if seen is not None:
         of_rows = zip(*seen, strict=True)
         G = [[dot(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
@@ -145,7 +153,7 @@ def solve_with_reactions(
         gamma = [graph.mul(kept[k], x) for k, x in enumerate(gamma)]
     sides = [([graph.add(*pair) for pair in zip(r, found.rest, strict=True)], gamma)]
     if not regular:
-        M, sides = _augmented(graph, M, A, sides, None)
+        M, sides = _augmented(graph, M, A, sides, eps, None)
     pushes = [
         [graph.add(a, g) for a, g in zip(row, column, strict=True)]
         for row, column in zip(A, G, strict=True)
@@ -177,11 +185,12 @@ def _augmented(
     M: Sequence[Sequence[Node]],
     A: Sequence[Sequence[Node]],
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
+    eps: float,
     kept: Sequence[Node] | None,
 ) -> tuple[list[list[Node]], list[tuple[list[Node], Sequence[Node]]]]:
     """M + A^T W A and r - A^T W c, for an M that may be singular: x does not change."""
     n, m = len(M), len(A)
-    weights = _weights(graph, M, A)
+    weights = read_function(graph, eps, row_weights, M, A)
     if kept is not None:
         # Selected, not multiplied: the weight of a row that is only rounding may overflow.
         half, zero = graph.const(0.5), graph.zero
@@ -205,37 +214,6 @@ def _augmented(
     return full, sides
 
 
-def _weights(graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]]) -> list[Node]:
-    """W of `_kkt.augmented`."""
-    zero, one = graph.zero, graph.one
-
-    def inverse(x: Node) -> tuple[Node, Node]:
-        """(whether x > 0, 1/x if it is, else 1)."""
-        there = graph.call(GREATER, x, zero)
-        return there, graph.let(graph.div(one, graph.let(graph.select(there, x, one))))
-
-    mobilities = [
-        zero if M[i][i] is zero else graph.select(*inverse(M[i][i]), zero) for i in range(len(M))
-    ]
-    weights = []
-    for row in A:
-        pairs = zip(row, mobilities, strict=True)
-        mobility = graph.let(graph.sum([(graph.mul(x, x, m), 1.0) for x, m in pairs]))
-        square = graph.let(graph.sum([(graph.power(x, 2), 1.0) for x in row]))
-        any_at_all, alone = inverse(square)
-        weight = graph.select(any_at_all, graph.mul(_size(graph, M), alone), zero)
-        if mobility is not zero:
-            weight = graph.select(*inverse(mobility), weight)
-        weights.append(graph.let(weight))
-    return weights
-
-
-def _size(graph: Graph, M: Sequence[Sequence[Node]]) -> Node:
-    """The trace of M; 1 if M = 0 (motion fully prescribed by constraints)."""
-    trace = graph.let(graph.sum([(M[i][i], 1.0) for i in range(len(M))]))
-    return graph.select(graph.call(GREATER, trace, graph.zero), trace, graph.one)
-
-
 def _null_space(
     graph: Graph,
     M: Sequence[Sequence[Node]],
@@ -245,65 +223,25 @@ def _null_space(
     kept: Sequence[Node] | None,
     crossing: bool,
 ) -> list[list[Node]]:
-    """As `_kkt.NullSpace`: orthonormal rows, M on their null space."""
-    n, m = len(M), len(A)
-    units = _units(graph, M, A, False)
-    M = [[graph.mul(units[i], M[i][j], units[j]) for j in range(n)] for i in range(n)]
-    A = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
-    right = [([graph.mul(x, s) for x, s in zip(r, units, strict=True)], c) for r, c in right]
-
-    L, Y = orthonormal(graph, A, kept, eps ** (2 / 3), crossing)
-
-    def tangent(x: Sequence[Node]) -> list[Node]:
-        return without(graph, x, [(dot(graph, y, x), y) for y in Y])
-
-    size = graph.let(graph.scale(_size(graph, M), 1.0 / n))
-    columns = [tangent([M[i][j] for i in range(n)]) for j in range(n)]  # P M
-    lines = [tangent([columns[j][i] for j in range(n)]) for i in range(n)]  # P M P
-    full: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
-    for i in range(n):
-        for j in range(i, n):
-            held = [(graph.mul(size, y[i], y[j]), 1.0) for y in Y]
-            full[i][j] = full[j][i] = graph.let(graph.sum([(lines[i][j], 1.0), *held]))
-
-    sides, offsets = [], []
-    for r, c in right:
-        z: list[Node] = []
-        for k in range(m):
-            known = [(graph.mul(L[k][j], z[j]), -1.0) for j in range(k)]
-            value = c[k] if kept is None else graph.mul(kept[k], c[k])
-            top = graph.sum([(value, 1.0), *known])
-            z.append(top if top is graph.zero else graph.let(graph.div(top, L[k][k])))
-        offset = without(graph, [graph.zero] * n, list(zip(z, Y, strict=True)))
-        moved = [
-            graph.sum([(r[i], 1.0), *((graph.mul(M[i][j], offset[j]), -1.0) for j in range(n))])
-            for i in range(n)
-        ]
-        sides.append((tangent(moved), []))
-        offsets.append(offset)
-    out = []
-    for y, offset in zip(bordered(graph, full, [], sides, eps), offsets, strict=True):
-        x = zip(units, offset, tangent(y), strict=True)
-        out.append([graph.let(graph.mul(s, graph.add(a, b))) for s, a, b in x])
-    return out
+    """As `_kkt.NullSpace`, whose programs are read; the elimination is that of the graph."""
+    if kept is not None:
+        A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
+        right = [(r, [graph.mul(k, x) for k, x in zip(kept, c, strict=True)]) for r, c in right]
+    read = partial(read_function, graph, eps)
+    space = read(_tangent_space, M, A, kept, crossing=crossing)
+    found = [read(TangentSpace.loads, space, *side) for side in right]
+    inertia, sides = read(TangentSpace.inertia, space), [(load, ()) for _, load in found]
+    symmetric = np.where(np.tri(len(M), dtype=bool), inertia.T, inertia)
+    solved = bordered(graph, symmetric, [], sides, eps)
+    return [
+        list(read(TangentSpace.acceleration, space, y, across))
+        for y, (across, _) in zip(solved, found, strict=True)
+    ]
 
 
-def _units(
-    graph: Graph, M: Sequence[Sequence[Node]], A: Sequence[Sequence[Node]], regular: bool
-) -> list[Node]:
-    """1 / sqrt of the inertia of every coordinate; of A^T W A if M has none."""
-    inertias = [M[i][i] for i in range(len(M))]
-    if regular:
-        return [graph.let(graph.div(graph.one, graph.sqrt(x))) for x in inertias]
-    full = _augmented(graph, M, A, [], None)[0]
-    units = []
-    for i, inertia in enumerate(inertias):
-        there = graph.call(GREATER, inertia, graph.zero)
-        lent = graph.select(there, inertia, full[i][i])
-        there = graph.call(GREATER, lent, graph.zero)
-        lent = graph.let(graph.select(there, lent, graph.one))
-        units.append(graph.let(graph.div(graph.one, graph.sqrt(lent))))
-    return units
+def _tangent_space(M: Array, A: Array, kept: Array | None, crossing: bool) -> TangentSpace:
+    """With the kept rows as numbers, 1 or 0."""
+    return tangent_space(M, A, None if kept is None else kept > 0.5, crossing)
 
 
 def correction(
@@ -324,7 +262,7 @@ def correction(
     positive definite.
     """
     if not regular:
-        M, _ = _augmented(graph, M, A, [], kept)
+        M, _ = _augmented(graph, M, A, [], eps, kept)
     A = [A[k] for k in chosen]
     kept = None if kept is None else [kept[k] for k in chosen]
     n, m = len(M), len(A)

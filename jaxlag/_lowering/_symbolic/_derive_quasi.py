@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
-from jaxlag._lowering._graph._orthonormalize import products
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._graph._vectors import products
 from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._bias_forms import attempt, cost, mass_matrix

@@ -1,12 +1,17 @@
 """Multipliers of dependent rows that forces read: their distribution among the rows."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
 
 from jaxlag._linalg._independent_rows import ROUNDINGS
+from jaxlag._linalg._kkt import orthonormal_rows
 from jaxlag._lowering._graph._eliminate import GREATER, bordered
 from jaxlag._lowering._graph._expression import Graph, Node
-from jaxlag._lowering._graph._orthonormalize import backward, dot, orthonormal, without
+from jaxlag._lowering._graph._vectors import backward, dot, without
+from jaxlag._lowering._symbolic._read_function import read_function
 
 
 class Sharing(NamedTuple):
@@ -19,6 +24,11 @@ class Sharing(NamedTuple):
 
     chosen: Sequence[int]
     there: Sequence[Node]
+
+
+def _orthonormal_rows(A: Array, kept: Array) -> Any:
+    """With the kept rows as numbers, 1 or 0."""
+    return orthonormal_rows(jnp.where(kept[:, None] > 0.5, A, 0.0), kept > 0.5, 0.0)
 
 
 def shared(
@@ -51,7 +61,7 @@ def shared(
         for row, size in zip(scaled, sizes, strict=True)
     ]
     flags = [kept[k] for k in chosen]
-    L, Y = orthonormal(graph, unit, flags)
+    L, Y = read_function(graph, eps, _orthonormal_rows, unit, flags)
     C, others, rounding = [], [], graph.const((ROUNDINGS * eps) ** 2)
     for row, flag in zip(unit, flags, strict=True):
         parts = [dot(graph, y, row) for y in Y]
