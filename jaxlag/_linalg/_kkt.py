@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._mass_solve import (
@@ -163,7 +164,7 @@ def row_weights(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, 
     The term of a row in M + A^T W A is then as large as the inertia of its coordinates, also if
     inertias differ widely.
     """
-    inertias = jnp.diagonal(M)
+    inertias = _diagonal(M)
     inertial = inertias > 0
     mobilities = jnp.where(inertial, 1.0 / jnp.where(inertial, inertias, 1.0), 0.0)
     mobility = jnp.sum(A**2 * mobilities[None], axis=1)
@@ -176,14 +177,19 @@ def row_weights(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, 
 
 def _size(M: Array) -> Array:
     """The trace of M; 1 if M = 0 (motion fully prescribed by constraints)."""
-    trace = jnp.trace(M)
+    trace = jnp.sum(_diagonal(M))
     return jnp.where(trace > 0, trace, jnp.ones_like(trace))
+
+
+def _diagonal(M: Array) -> Array:
+    """The diagonal as masked sums: unlike a gather they need no program to be read on scalars."""
+    return jnp.sum(jnp.where(np.eye(M.shape[0], dtype=bool), M, jnp.zeros_like(M)), axis=1)
 
 
 def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n"]:
     """1 / sqrt of the inertia of every coordinate; of A^T W A if M has none."""
-    inertias = jnp.diagonal(M)
-    inertias = jnp.where(inertias > 0, inertias, jnp.diagonal(augmented(M, A)[0]))
+    inertias = _diagonal(M)
+    inertias = jnp.where(inertias > 0, inertias, _diagonal(augmented(M, A)[0]))
     return jax.lax.rsqrt(jnp.where(inertias > 0, inertias, 1.0))
 
 
@@ -207,20 +213,22 @@ def orthonormal_rows(
     Rows that are not kept have 0 in Y and 1 in L. A row depends on those before it if the part
     that they leave has a square of at most `floor` times that of the row.
     """
-    Y, L = jnp.zeros_like(A), []
+    L: list[tuple[Array, ...]] = []
+    Y: list[Array] = []
     for k in range(A.shape[0]):
-        first = Y @ A[k]
-        rest = A[k] - first @ Y
-        second = Y @ rest
-        rest = rest - second @ Y
+        rest, parts = A[k], jnp.zeros((k,), A.dtype)
+        for _ in range(2 if Y else 0):
+            before = jnp.stack(Y)
+            part = before @ rest
+            rest, parts = rest - part @ before, parts + part
         square = jnp.sum(rest**2)
         independent = square > floor * jnp.sum(A[k] ** 2)
         norm = jnp.sqrt(jnp.where(independent, square, jnp.inf if crossing else jnp.nan))
         if kept is not None:
             norm = jnp.where(kept[k], norm, 1.0)
-        L.append((*(first + second)[:k], norm))
-        Y = Y.at[k].set(rest / norm)
-    return tuple(L), Y
+        L.append((*parts, norm))
+        Y.append(rest / norm)
+    return tuple(L), jnp.stack(Y)
 
 
 def masked(A: Array, kept: Bool[Array, " m"] | None) -> Array:

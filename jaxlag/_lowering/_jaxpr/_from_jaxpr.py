@@ -21,7 +21,7 @@ from jaxlag._lowering._graph._expression import Graph, Node, named
 from jaxlag._lowering._jaxpr._array_primitives import MOVES, SHIFTS, WHOLE, move
 from jaxlag._lowering._jaxpr._elementwise_primitives import ELEMENTWISE, elementwise
 from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, each, nodes
-from jaxlag._tracing._interpret import NUMPY, held
+from jaxlag._tracing._interpret import NUMPY, equation, held
 
 LIMIT = 50_000  # nodes of a graph: far beyond the useful size of a scalar program
 TURNS = 10_000  # largest number of iterations of an unrolled loop
@@ -161,14 +161,25 @@ def _equation(graph: Graph, eqn: Any, operands: list) -> list:
 
 
 def _known(eqn: Any, operands: list) -> list:
-    """Known values, computed by JAX; moves of elements by numpy."""
+    """Known values, computed by JAX, which compiles each operation; exact ones by numpy."""
     name = eqn.primitive.name
     if name in SHIFTS:
         return [np.asarray(NUMPY[name](eqn, *operands))]
+    if name == "iota" or _exact(eqn):
+        return equation(eqn, operands)
     params = eqn.primitive.get_bind_params(eqn.params)
     with jax.ensure_compile_time_eval():
         found = eqn.primitive.bind(*operands, **params)
     return [held(x) for x in (found if eqn.primitive.multiple_results else [found])]
+
+
+def _exact(eqn: Any) -> bool:
+    """Whether numpy's result is JAX's: integers, truth values, and conversions of them."""
+    kinds = [v.aval.dtype for v in (*eqn.invars, *eqn.outvars)]
+    whole = [kind == np.bool_ or np.issubdtype(kind, np.integer) for kind in kinds]
+    if eqn.primitive.name == "convert_element_type":
+        return whole[0] or kinds[0] == kinds[1]
+    return all(whole) and eqn.primitive.name in _OF_INTEGERS & NUMPY.keys()
 
 
 def _check_kinds(eqn: Any, operands: list) -> None:
