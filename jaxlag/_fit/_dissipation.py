@@ -15,6 +15,7 @@ from jaxlag._model._inputs import evaluate
 from jaxlag._simulation._jump_times import names_of
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._dependence import outputs_depend_on
 
 STATES = 32
@@ -58,7 +59,8 @@ def feeding(
             def powers(
                 given: Any, force: Any = force, each: Any = each, states: Any = states
             ) -> _Powers:
-                return _powers(force, each.inputs_at(given), states, given)
+                found = _POWERS((force,), given, each.inputs_at(given), *states)
+                return _Powers(*(np.where(np.isfinite(x), x, 0.0) for x in map(np.asarray, found)))
 
             then, now = powers(before), powers(params)
             meant = isinstance(force, Rayleigh) or not (_gives(then) or np.any(now.resting))
@@ -103,17 +105,19 @@ def _states(
 
 
 def _powers(
-    force: AbstractForce, inputs: Mapping[str, Any], states: _States, params: Any
-) -> _Powers:
+    force: AbstractForce, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
+) -> tuple[Array, Array, Array]:
     def of(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
-        still = jnp.zeros_like(v)
         moving, resting = (
-            force(t, q, x, params, evaluate(inputs, t, q, x, params)) for x in (v, still)
+            force(t, q, x, params, evaluate(inputs, t, q, x, params))
+            for x in (v, jnp.zeros_like(v))
         )
         return v @ moving, jnp.abs(v) @ jnp.abs(moving), resting
 
-    found = map(np.asarray, jax.vmap(of)(*states))
-    return _Powers(*(np.where(np.isfinite(x), x, 0.0) for x in found))
+    return jax.vmap(of)(t, q, v)
+
+
+_POWERS = Compiled(_powers)
 
 
 def _read(
