@@ -1,10 +1,10 @@
-"""Batches of double pendulums by `jax.vmap`: time per trajectory, and how well lanes are used.
+"""Batches of double pendulums by `jax.vmap`: time per trajectory, and utilization of the lanes.
 
 The lanes start at rest from angles drawn from (-2, 2) rad, so that some swing and some tumble.
-A vmapped solve runs until its slowest lane is done: `lane_use` is the mean number of attempted
-steps over the largest. The driven row draws parameters, rates and a zero-order-hold torque as
-well. To compare: the same solves one after another (`lax.map`), and diffrax vmapped on equations
-written by hand and on naive autodiff.
+A vmapped solve runs until its slowest lane is finished. `lane_use` is the mean number of attempted
+steps divided by the largest. The driven case also draws parameters, rates and a zero-order-hold
+torque. For comparison: the same solves one after another (`lax.map`), and diffrax vmapped on
+equations written by hand and on naive autodiff.
 """
 
 from collections.abc import Callable

@@ -25,7 +25,7 @@ _FORCE_UNITS = {"m": "N", "rad": "N m"}
 
 
 class Report(NamedTuple):
-    """What a run found: lines to print, panels to draw, and whether all went well."""
+    """The results of a run: lines to print, panels to draw, and whether it was successful."""
 
     lines: list[str]
     panels: list[Panel]
@@ -33,7 +33,7 @@ class Report(NamedTuple):
 
 
 def main(entry: AbstractEntry, plot: Path | None) -> int:
-    """Run the example and print it, with a figure at `plot` if given; 0 if all went well."""
+    """Run the example and print it, with a figure at `plot` if given; 0 if successful."""
     report = run(entry)
     params = entry.example.params
     print(f"{entry.name}: {entry.book}")
@@ -52,7 +52,7 @@ def main(entry: AbstractEntry, plot: Path | None) -> int:
 
 @singledispatch
 def run(entry: AbstractEntry) -> Report:
-    """The example of a system, run."""
+    """Run the example of a system."""
     raise NotImplementedError(f"examples of {entry.kind} systems cannot be run")
 
 
@@ -148,7 +148,7 @@ def _motion_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
 def _free_quasi_velocities(
     entry: Entry, motion: jl.Solution
 ) -> tuple[tuple[str, ...], jax.Array, np.ndarray, tuple[str, ...]]:
-    """(names, times, rows, units) of those that do not vanish."""
+    """(names, times, values, units) of the quasi-velocities that do not vanish."""
     names = entry.free_quasi_velocities
     columns = [entry.quasi_velocities.index(name) for name in names]
     units = tuple(entry.quasi_units[column] for column in columns)
@@ -193,9 +193,9 @@ def _static_lines(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> Ite
 
 
 def _static_panels(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> list[Panel]:
-    """The force on every coordinate as this coordinate alone moves away from rest.
+    """The force on every coordinate as a function of this coordinate, the others at rest.
 
-    Under constraints on the independent ones, from which the others follow.
+    With constraints, only the independent coordinates have panels; they determine the others.
     """
     zero, own = jnp.zeros_like(rest.q), rest.q[entry.file_columns]
 

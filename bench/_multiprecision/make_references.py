@@ -1,10 +1,10 @@
-"""References of 20 digits and more for motions of the systems.
+"""Reference motions of the systems, to 20 digits or more.
 
-Two motions of every system that moves, from the starts in `bench._problems.starts`, go into one
-file of `bench/references/`. The equations are plain derivatives of the declaration (`equations`),
-in 50 digits, integrated by extrapolation of order 26 to 1e-26 per step; the engine takes no part. A
-second integration of another order and tolerance says how far to trust the first: the file holds
-the largest difference of the two.
+Each system that moves has a file in `bench/references/` with two motions, from the starts in
+`bench._problems.starts`. The equations are plain derivatives of the declaration (`equations`), in
+50 digits. They are integrated by extrapolation of order 26 to 1e-26 per step. The engine is not
+used. A second integration has another order and tolerance. The file holds the largest difference
+of the two, which shows the accuracy of the first.
 
     python -m bench._multiprecision.make_references                     all, in half an hour
     python -m bench._multiprecision.make_references double_pendulum     some
@@ -38,13 +38,13 @@ AGREEMENT = 1e-18  # of the two integrations, relative to 1 + |y|
 
 
 class Reference(NamedTuple):
-    """One motion, as a benchmark wants it.
+    """One motion, as the benchmarks read it.
 
     Attributes:
-        start: what the start is called.
+        start: name of the start.
         times: (s,), s.
         y: (s, 2n), the doubles nearest to (q, v).
-        agreement: of two integrations, relative to 1 + |y|.
+        agreement: largest difference of the two integrations, relative to 1 + |y|.
     """
 
     start: str
@@ -69,7 +69,7 @@ def load(name: str, folder: Path = FOLDER) -> tuple[Mapping[str, Any], list[Refe
 
 
 def made(system: Any, params: Mapping[str, Any], starts: Sequence[Start]) -> list[dict[str, Any]]:
-    """The motions of a system, as they are written into its file."""
+    """The motions of a system, as written to its file."""
     motion = Motion(system, params)
     return [_followed(motion, start) for start in starts]
 
@@ -97,7 +97,7 @@ def apart(rows: Sequence[Sequence], others: Sequence[Sequence]) -> float:
 
 
 def differences(motion: Mapping[str, Any], again: Mapping[str, Any]) -> float:
-    """How far a motion of a file is from the same made again, relative to 1 + |y|."""
+    """Largest difference of a motion of a file and the same made again, relative to 1 + |y|."""
     if motion["times"] != again["times"] or motion["start"] != again["start"]:
         return float("inf")
     import gmpy2
@@ -123,7 +123,7 @@ def _entries() -> Mapping[str, Any]:
 
 
 def plain(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters as files have them: numbers and lists."""
+    """Parameters as stored in the files: numbers and lists."""
     return {name: np.asarray(value).tolist() for name, value in params.items()}
 
 
@@ -139,7 +139,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         begin, entry = perf_counter(), entries[name]
         try:
             motions = made(entry.system, entry.example.params, STARTS[name])
-        except ArithmeticError as error:  # the others go on
+        except ArithmeticError as error:  # continue with the others
             print(f"{name:<36} {error}", flush=True)
             good = False
             continue

@@ -1,6 +1,7 @@
-"""Motions to wait for: a declaration as a user writes it, and the same equations by hand.
+"""Motions of the benchmark `first-result`: as a user declares them, and as equations by hand.
 
-By hand for JAX: scalars for few coordinates, arrays for many. For heyoka: expressions.
+The equations by hand are written for JAX on scalars for few coordinates and on arrays for many.
+For heyoka they are expressions.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,9 +27,9 @@ class Beginning(NamedTuple):
     """A system, a start and a span of 2 s or less.
 
     Attributes:
-        rates: the explicit equations on scalars; None where nobody would write them so.
-        field: dy/dt on arrays, where a hand would write that for JAX.
-        turning: (q, v) to what y holds behind the coordinates; None: v.
+        rates: the explicit equations on scalars; None if these would not be written by hand.
+        field: dy/dt on arrays, if one would write arrays for JAX by hand.
+        turning: function of (q, v) that gives the part of y after the coordinates; None: v.
     """
 
     system: jl.System
@@ -71,7 +72,7 @@ def simple_pendulum(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> l
 
 
 def on_cart(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: the cart, the angle of the rod from the downward vertical, their rates."""
+    """y: position of the cart, angle of the rod from the downward vertical, their rates."""
     half, push = 0.5 * p["l"], f.sin(p["Omega"] * t) * p["F2"]
     x, theta, x_rate, w = y
     s, c = f.sin(theta), f.cos(theta)
@@ -84,7 +85,7 @@ def on_cart(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]
 
 
 def hovering(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: position, yaw, pitch, roll; velocity, turning rates in body axes."""
+    """y: position, yaw, pitch, roll; velocity, angular velocity in body axes."""
     _, _, _, psi, theta, phi, *V, w1, w2, w3 = y
     f1, f2, f3, f4 = (p["k"] * p[name] * p[name] for name in ("w1", "w2", "w3", "w4"))
     h = p["Im"] * (p["w2"] + p["w4"] - p["w1"] - p["w3"])
@@ -113,7 +114,7 @@ def _body_rates(q: Any, v: Any) -> Any:
 
 
 def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: turn of the frame, spin of the body, their rates; Euler's equations projected."""
+    """y: angles of the frame and of the body on it, their rates; Euler's equations projected."""
     M, c = p["M"], (p["xb"], p["yb"], p["zb"])
     squares = [x * x for x in c]
     I1 = p["A"] + M * (squares[1] + squares[2])
@@ -149,7 +150,7 @@ def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
 
 
 def chain_on_arrays(n: int) -> Callable[[Any, Array, Any], Array]:
-    """dy/dt of `bench._problems.scenes.links(n)`, as a hand would write it for JAX."""
+    """dy/dt of `bench._problems.scenes.links(n)`, written by hand for JAX."""
     later = np.maximum.outer(np.arange(n), np.arange(n))
 
     def field(t: Any, y: Array, p: Any) -> Array:
@@ -193,7 +194,7 @@ def _bodies_on_arrays(t: Any, y: Array, p: Any) -> Array:
 
 
 def bodies(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: positions of the bodies one after the other, velocities."""
+    """y: positions of the bodies one after the other, then their velocities."""
     half = BODIES * AXES
     a: list[Any] = [0.0] * half
     for i, j in PAIRS:

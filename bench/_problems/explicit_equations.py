@@ -1,9 +1,9 @@
 """Equations of motion y' = f(y) as a good engineer writes them, for any library of functions.
 
-Each takes the functions to call, the parameters and the numbers y, and returns the rates: plain
-sums, products and quotients, so that the same lines serve JAX, numba, CasADi, heyoka and Python's
-own numbers. y starts with the coordinates. What depends on parameters alone is computed first,
-linear systems are solved in closed form or by Cholesky's factors.
+Each function takes the elementary functions to call, the parameters and the numbers y. It returns
+the rates as plain sums, products and quotients. So the same lines work for JAX, numba, CasADi,
+heyoka and Python numbers. y starts with the coordinates. Terms that depend on parameters alone are
+computed first. Linear systems are solved in closed form or by Cholesky factors.
 """
 
 import math
@@ -14,10 +14,10 @@ Numbers = Sequence[Any]
 
 
 class Functions(NamedTuple):
-    """What the equations call.
+    """Elementary functions that the equations call.
 
     Attributes:
-        over_cube: x^(-3/2), in the form that suits a library.
+        over_cube: x^(-3/2), in the form best for the library.
     """
 
     sin: Callable[[Any], Any]
@@ -27,13 +27,13 @@ class Functions(NamedTuple):
 
 
 def functions(module: Any) -> Functions:
-    """Those of a module with the usual names."""
+    """The functions of a module with the usual names."""
     sqrt = module.sqrt
     return Functions(module.sin, module.cos, sqrt, lambda x: 1.0 / (x * sqrt(x)))
 
 
 def of_expressions(module: Any) -> Functions:
-    """Those of a module on its expressions, whose roots of plain numbers are numbers."""
+    """The functions of a module for expressions; roots of plain numbers stay plain numbers."""
 
     def sqrt(x: Any) -> Any:
         return math.sqrt(x) if isinstance(x, float) else module.sqrt(x)
@@ -58,7 +58,7 @@ def double_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]
 
 
 def kepler(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: position from the centre, velocity."""
+    """y: position from the center, velocity."""
     pull = p["mu"] * f.over_cube(y[0] * y[0] + y[1] * y[1])
     return [y[2], y[3], -(pull * y[0]), -(pull * y[1])]
 
@@ -74,11 +74,11 @@ def heavy_top(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
 
 
 def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: position, roll, pitch, yaw; velocity of the origin and turning rates in body axes."""
+    """y: position, roll, pitch, yaw; velocity of the origin, angular velocity, in body axes."""
     m, g = p["m"], p["g"]
     c = (p["xc"], p["yc"], p["zc"])
     push = (p["Fx"] / m, p["Fy"] / m, p["Fz"] / m)
-    # Inertia and moment about the mass centre (parallel axes).
+    # Inertia and moment about the mass center (parallel axes).
     xx, yy, zz = (
         p[name] - m * (c[i] * c[i] + c[j] * c[j])
         for name, i, j in (("Ix", 1, 2), ("Iy", 0, 2), ("Iz", 0, 1))
@@ -100,12 +100,12 @@ def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
     torque = [a - b for a, b in zip(moment, _cross(w, spun), strict=True)]
     w_rate = [per_det * _dot(row, torque) for row in rows]
     weight = (-g * s_theta, g * (s_phi * c_theta), g * (c_phi * c_theta))
-    swung = [a + b for a, b in zip(V, _cross(w, c), strict=True)]  # velocity of the mass centre
+    swung = [a + b for a, b in zip(V, _cross(w, c), strict=True)]  # velocity of the mass center
     V_rate = [
         force + fall - a - b
         for force, fall, a, b in zip(push, weight, _cross(w_rate, c), _cross(w, swung), strict=True)
     ]
-    # R = Rz Ry Rx, one turn after the other.
+    # R = Rz Ry Rx, one rotation after the other.
     level, down = c_phi * V[1] - s_phi * V[2], s_phi * V[1] + c_phi * V[2]
     ahead, sink = c_theta * V[0] + s_theta * down, c_theta * down - s_theta * V[0]
     turn = (s_phi * w[1] + c_phi * w[2]) / c_theta
@@ -122,7 +122,7 @@ def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
 
 
 def cartesian_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: positions of both bobs, velocities; the tensions from the second derivatives of phi."""
+    """y: positions of both bobs, velocities; tensions from phi'' = 0."""
     g, per_m1, per_m2 = p["g"], 1.0 / p["m1"], 1.0 / p["m2"]
     x1, y1, x2, y2, u1, v1, u2, v2 = y
     dx, dy, du, dv = x2 - x1, y2 - y1, u2 - u1, v2 - v1
@@ -144,9 +144,9 @@ def cartesian_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[A
 
 
 def rolling_disk(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: centre, heading, inclination, spin; rates w along e1, e2, e3 of the catalogue's disk.
+    """y: center, heading, inclination, spin; rates w along e1, e2, e3 of the catalogue's disk.
 
-    The equations of its docstring: the rows of rolling are solved for the velocity of the centre.
+    The equations of its docstring; the rolling constraints are solved for the center's velocity.
     """
     R, I_d, I_a = p["R"], p["I_d"], p["I_a"]
     edge = p["m"] * R * R
@@ -178,7 +178,7 @@ def elastic_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any
 
 
 def chain(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: absolute angles of the links, their rates; masses at the ends, M by Cholesky's factors."""
+    """y: absolute angles of the links, their rates; masses at the ends, M by Cholesky factors."""
     n = len(y) // 2
     A, pull = chain_constants(p, n)
     q, v = y[:n], y[n:]
@@ -209,7 +209,10 @@ def chain(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
 
 
 def chain_constants(p: Mapping[str, Any], n: int) -> tuple[list[list[Any]], list[Any]]:
-    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j (masses from max(i, j) on); weights by arms."""
+    """(A, b) of a chain, for M_ij = A_ij cos(q_i - q_j) and gravity torques -b_i sin(q_i).
+
+    A_ij = l_i l_j times the sum of the masses from max(i, j) on, b_i = g l_i times that from i on.
+    """
     m, rods = p["m"], p["l"]
     carried = [sum(m[j] for j in range(i, n)) for i in range(n)]
     A = [[rods[i] * rods[j] * carried[max(i, j)] for j in range(n)] for i in range(n)]

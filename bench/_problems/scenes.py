@@ -1,4 +1,4 @@
-"""Systems to measure the lowering on: each as a Lagrangian written the way a user would write it.
+"""Systems for the benchmark of the lowering: each is a Lagrangian as a user would write it.
 
 Angles in rad, lengths in m, masses in kg; params are dicts of numbers or vectors.
 """
@@ -17,7 +17,7 @@ G = 9.81
 
 
 class Scene(NamedTuple):
-    """A Lagrangian with n coordinates and parameters; q0, v0: a state to evaluate it near."""
+    """A Lagrangian with n coordinates and its parameters; it is evaluated near (q0, v0)."""
 
     lagrangian: Callable
     q0: tuple[float, ...]
@@ -84,7 +84,7 @@ def elastic_pendulum(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def kepler(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Motion about a centre of attraction, in polar coordinates from the position."""
+    """Motion about a center of attraction, in polar coordinates from the position."""
     r, dr = along(lambda q: q[0] * jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])]), q, v)
     return 0.5 * p["m"] * dr @ dr + p["k"] / jnp.sqrt(r @ r)
 
@@ -115,14 +115,14 @@ def top(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def rigid_body(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Rigid body in space, q = (x, y, z, yaw, pitch, roll), about its mass centre."""
+    """Rigid body in space, q = (x, y, z, yaw, pitch, roll), about its mass center."""
     _, w = _rates(lambda q: rotation.yaw_pitch_roll.matrix(q[3:]), q, v)
     T = 0.5 * p["m"] * v[:3] @ v[:3] + 0.5 * w @ (p["I"] * w)
     return T - p["m"] * p["g"] * q[2]
 
 
 def aircraft(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Rigid body in space with a full inertia matrix and a mass centre off the origin."""
+    """Rigid body in space with a full inertia matrix and a mass center off the origin."""
     R, w = _rates(lambda q: rotation.yaw_pitch_roll.matrix(q[3:]), q, v)
     J = p["J"]
     J = jnp.stack([J[0], J[3], J[4], J[3], J[1], J[5], J[4], J[5], J[2]]).reshape(3, 3)

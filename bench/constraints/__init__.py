@@ -1,24 +1,27 @@
-"""Constraint drift over a million steps: residuals, energy, and time per step of stabilisation.
+"""Constraint drift over a million steps: residuals, energy, and time per step of stabilization.
 
-Two linkages (bench/_problems/mechanisms.py), by both formulations with multipliers, with nothing
-against drift ("none"), with Baumgarte's damping and with projection; and two systems that roll, by
-multipliers without and with projection, and in quasi-velocities, in which nothing can drift. Steps
-are fixed: 0.01 s of order 8. Baumgarte's alpha = beta = 0.1 / step damp residuals critically, over
-ten steps.
+The cases are two linkages (bench/_problems/mechanisms.py) and two rolling systems. The linkages
+have both formulations with multipliers, each without stabilization ("none"), with Baumgarte's
+damping and with projection. The rolling systems have multipliers without and with projection, and
+quasi-velocities, in which the constraints cannot drift. Steps are fixed: 0.01 s of order 8.
+Baumgarte's alpha = beta = 0.1 / step damp residuals critically, over ten steps.
 
-A quick run takes 20 000 steps, of the linkages the first by multipliers without Baumgarte's
-damping, of what rolls the first: most of its time goes into compilation.
+A quick run has 20 000 steps. It takes the first linkage by multipliers without Baumgarte's
+damping, and the first rolling system. Most of its time is compilation.
 
-Motions that tumble are chaotic and soon differ between the cases. Compared is what should stay as
-it was at the start, in 1001 rows (quick: 201) evenly over the run; nan where a run failed.
-`position`: the largest |phi_k| / |A_k| of any row k, about the distance from the constraint, in m
-(double pendulum) or rad (four-bar), 0 for what has none; `growth`: that over the largest of the
-first tenth of the run;
-`velocity`: the largest |A v + b|_k / |A_k|, in m/s or rad/s; `energy`: the largest |H - H0| / T0,
-T0 the kinetic energy at the start; `slope`: that of a line through the second half of
-(H - H0) / T0, per million steps. `min_us` and `median_us` are per step; `ratio` is min_us over that
-of "none" with the same mechanism and formulation, of quasi-velocities over that of multipliers with
-projection.
+Tumbling motions are chaotic and soon differ between the cases. So the benchmark compares quantities
+that should be constant, at 1001 save times (quick: 201) evenly over the run. They are nan if a run
+failed. The columns are:
+
+`position`: the largest |phi_k| / |A_k| of any constraint row k. This is about the distance from the
+constraint, in m (double pendulum) or rad (four-bar); 0 without phi.
+`growth`: `position` divided by its value for the first tenth of the run.
+`velocity`: the largest |A v + b|_k / |A_k|, in m/s or rad/s.
+`energy`: the largest |H - H0| / T0, where T0 is the initial kinetic energy.
+`slope`: slope of a line through the second half of (H - H0) / T0, per million steps.
+`min_us`, `median_us`: time per step.
+`ratio`: min_us divided by that of "none" with the same mechanism and formulation, for
+quasi-velocities by that of multipliers with projection.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +54,7 @@ Row = dict[str, Any]
 
 
 class Case(NamedTuple):
-    """What is compared."""
+    """One case; its fields are columns of the table."""
 
     mechanism: str
     formulation: str
@@ -59,7 +62,7 @@ class Case(NamedTuple):
 
 
 def cases(quick: bool) -> list[Case]:
-    """All that is compared."""
+    """All cases that are compared."""
     linkages, rolling = list(LINKAGES), list(ROLLING)
     forms, ways = list(FORMULATIONS), list(STABILISATIONS)
     if quick:
@@ -72,10 +75,10 @@ def cases(quick: bool) -> list[Case]:
 
 
 class Record(NamedTuple):
-    """One run at its rows: the columns of the same names before the largest is taken.
+    """One run at its save times: the columns of the same names before the largest is taken.
 
     Attributes:
-        steps: steps up to the row.
+        steps: number of steps before each save time.
         position: largest |phi_k| / |A_k|.
         velocity: largest |A v + b|_k / |A_k|.
         energy: (H - H0) / T0.
@@ -88,7 +91,7 @@ class Record(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run reached its end."""
         return all(np.isfinite(each).all() for each in self)
 
 
@@ -124,14 +127,14 @@ def run(quick: bool) -> Report:
 
 
 def against(case: Case) -> Case:
-    """What a step of this case is timed against."""
+    """The case whose time per step is the reference for this case."""
     if case.formulation == QUASI:
         return Case(case.mechanism, FORMULATIONS[0], PROJECTION)
     return case._replace(stabilisation=NONE)
 
 
 def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program:
-    """(q0, v0) -> (q, v), evenly over `steps` steps; nan from where the run failed."""
+    """(q0, v0) -> (q, v) at times evenly over `steps` steps; nan after a failure."""
     ts = np.linspace(0.0, steps * STEP, rows)
 
     def solve(q0: Array, v0: Array) -> tuple[Array, Array]:
@@ -143,7 +146,7 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
             mechanism.params,
             method=METHOD,
             dt=STEP,
-            max_steps=steps + 1,  # the times of steps are rounded, and may leave a short last one
+            max_steps=steps + 1,  # step times are rounded: a short last step may remain
             formulation=case.formulation,
             stabilization=STABILISATIONS[case.stabilisation],
             throw=False,
@@ -154,7 +157,7 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
 
 
 def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
-    """Of states (q, v), the first at the start and the last after `steps` steps."""
+    """Record of states (q, v), the first at the start and the last after `steps` steps."""
 
     def rows(q: Array, v: Array) -> tuple[Array, Array]:
         position, velocity = mechanism.system.residuals(q, v, mechanism.params)
@@ -177,7 +180,7 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
 
 
 def figures(record: Record) -> dict[str, float]:
-    """The columns on one record."""
+    """The columns computed from one record."""
     count = len(record.steps)
     early, late = slice(1, count // 10 + 1), slice(count // 2, None)
     position = float(np.max(record.position))
@@ -192,7 +195,7 @@ def figures(record: Record) -> dict[str, float]:
 
 
 def times(samples: Sequence[float], record: Record) -> Row:
-    """The columns on time: per step, and nan for a run that failed, since it ended early."""
+    """The columns about time, per step; nan for a failed run, because it ended early."""
     columns = spread(samples, "us", round(record.steps[-1]))
     if record.complete:
         return columns
@@ -200,7 +203,7 @@ def times(samples: Sequence[float], record: Record) -> Row:
 
 
 def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
-    """Targets for each formulation, its worst mechanism named; references for the rest."""
+    """Targets for each formulation, named after the worst mechanism; references for the rest."""
     found = {Case(*(row[name] for name in Case._fields)): row for row in rows}
     targets = []
     for formulation in FORMULATIONS:
@@ -237,7 +240,7 @@ def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
 
 
 def _worst(words: str, figure: Mapping[Case, float], bound: float) -> Target:
-    """The target that no mechanism exceeds the bound, the worst named."""
+    """The target that no mechanism exceeds the bound, named after the worst one."""
     # nan is worse than any number.
     worst = max(figure, key=lambda case: np.nan_to_num(figure[case], nan=np.inf))
     return Target(f"{words} ({worst.mechanism})", figure[worst], "<=", bound)

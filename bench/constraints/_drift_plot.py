@@ -17,15 +17,15 @@ FLOOR = 1e-18  # shown for 0
 
 
 def save(records: Mapping[tuple[str, str, str], Any], path: Path) -> str:
-    """Write the figure: a column for each mechanism, curves of the largest value so far.
+    """Write the figure: one column per mechanism, curves of the running maximum.
 
     Args:
         records: (mechanism, formulation, stabilisation) -> an object with the attributes `steps`
-            and those of `PANELS`, (rows,) each. A curve ends at the first nan.
-        path: the file, whose folder is made.
+            and those of `PANELS`, (saves,) each. A curve ends at the first nan.
+        path: the file, whose folder is created.
 
     Returns:
-        The name of the file, or why there is none.
+        The name of the file, or why it was not written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -1,8 +1,8 @@
 """A cube in free flight, tracked by cameras (Pfrommer, Halm, Posa, ContactNets, CoRL 2020).
 
-State: centre (m), unit quaternion from the cube to space, velocity (m/s, space), angular velocity
-(rad/s, cube). Found are g, in lengths of the tracking, and the ratios of the moments of inertia,
-which are 1 for a cube.
+State: center (m), unit quaternion from the cube to space, velocity (m/s, space), angular velocity
+(rad/s, cube). The fit estimates g, in the length unit of the tracking, and the ratios of the
+moments of inertia, which are 1 for a cube.
 """
 
 from pathlib import Path
@@ -17,18 +17,18 @@ from bench.fits._data import pieces, table
 from bench.fits._report import Figure, Part, estimates, timed
 from jaxlag import rotation
 
-HALF = 0.0524  # m, of an edge
+HALF = 0.0524  # m, half an edge
 CLEAR = 8e-3  # m, between the lowest corner and the board
-FEWEST = 6  # rows
+FEWEST = 6  # samples
 TRAINING = 90  # tosses
 OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-8, "atol": 1e-8}}
 START = {"g": 9.81, "I2": 1.0, "I3": 1.0}
-# g by parabolas through the heights; the ratios of a cube.
+# g from parabolas through the heights; the ratios of a cube.
 OTHERS = {"g": 9.61, "I2": 1.0, "I3": 1.0}
 
 
 def lagrangian(t: Any, q: Array, u: Array, p: Any) -> Array:
-    """L = 1/2 v^2 - g z + 1/2 w I w, per mass, and I over its first moment."""
+    """L = 1/2 v^2 - g z + 1/2 w I w per mass, with I divided by its first moment of inertia."""
     w = u[3:]
     return (
         0.5 * u[:3] @ u[:3]
@@ -38,7 +38,7 @@ def lagrangian(t: Any, q: Array, u: Array, p: Any) -> Array:
 
 
 def rates(t: Any, q: Array, u: Array, p: Any) -> Array:
-    """v of u."""
+    """q' from u."""
     return jnp.concatenate([u[:3], rotation.quaternion.from_body_rates(q[3:], u[3:])])
 
 
@@ -58,7 +58,7 @@ CUBE = jl.System(
 
 
 def flight(rows: dict[str, np.ndarray]) -> int:
-    """How many rows of a toss come before a corner is close to the board."""
+    """Number of samples of a toss before a corner is close to the board."""
     e = np.stack([rows[x] for x in ("qw", "qx", "qy", "qz")], axis=1)
     w, x, y, z = e.T
     third = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
@@ -75,7 +75,7 @@ def tosses(path: Path) -> list[jl.Experiment]:
             continue
         own = {name: x[:n] for name, x in rows.items()}
         e = np.stack([own[x] for x in ("qw", "qx", "qy", "qz")], axis=1)
-        # e and -e are one attitude: without a jump.
+        # e and -e are the same attitude: choose the signs without jumps.
         e = (
             e
             * np.cumprod(np.append(1.0, np.where(np.sum(e[1:] * e[:-1], axis=1) < 0, -1.0, 1.0)))[
@@ -94,7 +94,7 @@ def tosses(path: Path) -> list[jl.Experiment]:
 
 
 def measured(path: Path, quick: bool) -> Part:
-    """g and the ratios, and how well flights are predicted."""
+    """g and the ratios, and the errors of predicted flights."""
     name, model = "cube in flight", "free body"
     all_of_them = tosses(path)
     train, test = all_of_them[:TRAINING], all_of_them[TRAINING:]

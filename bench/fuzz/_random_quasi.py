@@ -1,8 +1,8 @@
-"""Systems in quasi-velocities at random, each at one consistent state.
+"""Random systems in quasi-velocities, each at one consistent state.
 
-U with a regular dU/dv, by chance singular at the state, with names that vanish and rows that say so
-once more; kinematics v = B u + c, square, or tall where they satisfy rows by themselves. L is
-a function of v, or of u.
+U has a regular dU/dv, which is singular at the state for some systems. Some quasi-velocities vanish
+(constraints), and additional rows may repeat this. Kinematics v = B u + c are square, or they are
+tall and satisfy the rows identically. L is a function of v or of u.
 """
 
 import numpy as np
@@ -12,10 +12,10 @@ from bench.fuzz._random_systems import Trees, text
 
 
 class _Speeds(_Drawing):
-    """What quasi-velocities are drawn with."""
+    """The generator of quasi-velocities."""
 
     def affine(self, name: str, i: int, units: tuple[float, ...]) -> str:
-        """One row of a regular matrix times these velocities in units, and what is left at rest."""
+        """A component affine in these velocities in units, from a regular matrix."""
         rng, trees = self.rng, self.trees
         own = f"(1.6 + 0.4 * jnp.sin({text(trees.grow(1))}))"
         parts = [f"{own} * {name}[{i}] / {units[i]!r}"]
@@ -28,7 +28,7 @@ class _Speeds(_Drawing):
         return " + ".join(parts)
 
     def by_u(self) -> tuple[Quasi, list[Row]]:
-        """U, some of them constrained, and rows that follow from these."""
+        """U with some constrained components, and rows that depend on these."""
         rng, n = self.rng, self.n
         rows = [self.affine("v", i, self.units) for i in rng.permutation(n)]
         bound = ()
@@ -61,7 +61,7 @@ class _Speeds(_Drawing):
         return Quasi(None, f"jnp.stack([{', '.join(rows)}])", n), []
 
     def tall(self) -> tuple[Quasi, list[Row]]:
-        """Kinematics that satisfy rows by themselves."""
+        """Kinematics that satisfy the rows identically."""
         rng, n, units = self.rng, self.n, self.units
         led = sorted(int(k) for k in rng.choice(n, size=int(rng.integers(1, n)), replace=False))
         free = [k for k in range(n) if k not in led]
@@ -108,9 +108,9 @@ def draw(seed: int, reach: float = 12.0, smooth: bool = False) -> Mechanism:
     """The system of a seed.
 
     Args:
-        seed: what it follows from.
+        seed: of the random numbers.
         reach: decades of the units and of the energies.
-        smooth: whether nothing in L may have kinks.
+        smooth: whether L must be smooth.
     """
     by = _Speeds(seed, reach, smooth)
     rng = by.rng

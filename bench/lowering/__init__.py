@@ -1,18 +1,22 @@
-"""Accelerations as scalar code: time, operations and compilation, beside code by others.
+"""Accelerations as scalar code: time, operations and compilation, compared with other code.
 
 part "evaluation": one evaluation of the accelerations, as a quarter of a Runge-Kutta step in one
-jitted loop, the same for all (_rk4.py). jaxlag: the scalar program; array: jaxlag's array
-program, its state one vector; by hand: what a good engineer writes (_by_hand.py); sympy: L
-in symbols, differentiated, shared by cse, as derived and with trigsimp (_sympy.py). "called"
-is the same code as a function that every stage calls, as jaxlag compiles its own code of more
-than some lines: shown, not judged. part "chain": the same for chains of n links beside numba,
-MuJoCo and Pinocchio (_chains.py says what each does). part "compile": a whole `jl.simulate`
-from functions never seen before, `trace_s` holding the derivation. part "solve": the double
-pendulum to t = 10 at the loosest tolerance of a list that ends within 1e-9 of the reference, with
-XLA's setting and without.
+jitted loop, the same for all (_rk4.py). The contenders are
 
-`ratio` is to jaxlag's row of the same system, `error` to the array program's accelerations (part
-"solve": of the end state).
+- jaxlag: the scalar program;
+- array: jaxlag's array program, with the state as one vector;
+- by hand: equations as a good engineer writes them (_by_hand.py);
+- sympy: L in symbols, differentiated, with cse, as derived and with trigsimp (_sympy.py);
+- called: the same code as a function that every stage calls, which is how jaxlag compiles long
+  code; shown, not judged.
+
+part "chain": the same for chains of n links, compared with numba, MuJoCo and Pinocchio (see
+_chains.py). part "compile": a whole `jl.simulate` from new functions; `trace_s` includes the
+derivation. part "solve": the double pendulum to t = 10, with XLA's setting and without it. The
+tolerance is the loosest of a list with an end within 1e-9 of the reference.
+
+`ratio` is the time divided by that of jaxlag for the same system. `error` is relative to the array
+program's accelerations (part "solve": the error of the end state).
 """
 
 from collections.abc import Mapping
@@ -88,7 +92,7 @@ def contenders(name: str) -> dict[str, tuple[Equations, bool]]:
 
 
 def accelerations(name: str, chosen: Mapping[str, tuple[Equations, bool]]) -> dict[str, np.ndarray]:
-    """Of every contender, near the state of the scene with every rate different from zero."""
+    """Accelerations by every contender, near the state of the scene, with all rates nonzero."""
     scene = SCENES[name]
     q, v = np.array(scene.q0) + 0.1, np.array(scene.v0) + 0.1 * np.arange(1, len(scene.q0) + 1)
     params, found = _params(scene), {}
@@ -115,7 +119,7 @@ def evaluation(name: str, quick: bool) -> list[Row]:
 
 
 def chain(n: int, quick: bool) -> list[Row]:
-    """jaxlag as it comes, its array program and the neighbours in turn."""
+    """jaxlag with its defaults, its array program and the other libraries in turn."""
     name, scene, steps = f"chain_{n}", links(n), STEPS // n
     q, v = np.array(scene.q0), np.linspace(0.5, -0.4, n)
     calls, rows, values, lanes = {}, {}, {}, {}
@@ -147,7 +151,7 @@ def _params(scene: Scene) -> Any:
 def _agreed(
     name: str, values: Mapping[str, np.ndarray], bounds: Mapping[str, float]
 ) -> dict[str, float]:
-    """Relative differences from the array program; an error where one is too large."""
+    """Relative differences from the array program; raises an error if one is too large."""
     expected = values["array"]
     size = np.max(np.abs(expected))
     errors = {words: float(np.max(np.abs(a - expected)) / size) for words, a in values.items()}
@@ -175,7 +179,7 @@ def _finished(
 
 
 def compilation(name: str, scene: Scene, turns: int) -> Row:
-    """A solve from functions that nothing knows yet, at best; nothing runs."""
+    """The shortest compilation of a solve from new functions; nothing is run."""
     best = None
     for _ in range(turns):
         jax.clear_caches()
@@ -193,7 +197,7 @@ def compilation(name: str, scene: Scene, turns: int) -> Row:
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
-    """The solve in a process of its own: its call, and the columns known before."""
+    """The solve in its own process: its call, and the columns known before timing."""
     start, params = pendulum.start(), pendulum.params()
     program = build(pendulum.with_jaxlag(pendulum.times(2)), start, params, jnp.asarray(1e-9))
     expected, error = pendulum.reference(pendulum.times(2)), inf
@@ -207,7 +211,7 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
 
 
 def solves(quick: bool) -> list[Row]:
-    """The double pendulum with XLA's setting and without, in turn."""
+    """The double pendulum with XLA's setting and without it, in turn."""
     known, samples = under_both_settings("lowering", quick)
     rows = []
     for setting, all_facts in known.items():

@@ -1,8 +1,8 @@
 """Equations of motion as a good engineer writes them on scalars, by the names of the scenes.
 
-Shared subexpressions and reciprocals are computed once, linear systems solved in closed form,
-what depends on params alone is taken out of the loop. Rigid bodies follow Euler's equations in
-body rates (Goldstein, Classical Mechanics, sec. 5.5) instead of Lagrange's in angles.
+Shared subexpressions and reciprocals are computed once. Linear systems are solved in closed form.
+Terms that depend on params alone are computed outside the loop. Rigid bodies use Euler's equations
+in body rates (Goldstein, Classical Mechanics, sec. 5.5) instead of Lagrange's equations in angles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -123,7 +123,7 @@ def top(p: Any) -> Field:
 
 
 def _angles(q: Parts, v: Parts) -> tuple[Any, Any]:
-    """Sines and cosines of (yaw, pitch, roll) but for yaw, and body rates."""
+    """Sines and cosines of pitch and roll, and body rates."""
     sT, cT, sF, cF = jnp.sin(q[4]), jnp.cos(q[4]), jnp.sin(q[5]), jnp.cos(q[5])
     yaw, pitch, roll = v[3:]
     across = cT * yaw
@@ -156,7 +156,7 @@ def rigid_body(p: Any) -> Field:
 def aircraft(p: Any) -> Field:
     m, g, c = p["m"], p["g"], tuple(p["c"][i] for i in range(3))
     xx, yy, zz, xy, xz, yz = (p["J"][i] for i in range(6))
-    # About the mass centre (parallel axes), and its inverse.
+    # Inertia about the mass center (parallel axes), and its inverse.
     xx, yy, zz = (
         J - m * (c[i] ** 2 + c[j] ** 2)
         for J, i, j in zip((xx, yy, zz), (1, 0, 0), (2, 2, 1), strict=True)
@@ -174,7 +174,7 @@ def aircraft(p: Any) -> Field:
         torque = _cross([_dot(row, w) for row in J], w)
         d = [_dot(row, torque) for row in inverse]
         x, y, z = (a + b for a, b in zip(_cross(d, c), _cross(w, _cross(w, c)), strict=True))
-        # R = Rz Ry Rx, one turn after the other.
+        # R = Rz Ry Rx, one rotation after the other.
         y, z = cF * y - sF * z, sF * y + cF * z
         x, z = cT * x + sT * z, cT * z - sT * x
         return [sP * y - cP * x, -sP * x - cP * y, -g - z, *_turned(v, angles, d)]

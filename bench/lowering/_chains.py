@@ -1,10 +1,10 @@
-"""Forward dynamics of the chain by its neighbours, each as it is meant to be used.
+"""Forward dynamics of the chain by other libraries, each in its recommended use.
 
-numba: equations written by hand in absolute angles, dense, the loop compiled as well. MuJoCo:
-`mj_step` with RK4 and its loop in C, joint angles relative, contacts and constraints switched off;
-a step holds four evaluations and the integration. Pinocchio: articulated-body algorithm, joint
-angles relative, one call from Python for each evaluation, its overhead (about 1 us) included. A
-neighbour that cannot be imported is left out.
+numba: equations written by hand in absolute angles, with a dense M; the loop is also compiled.
+MuJoCo: `mj_step` with RK4 and its loop in C, relative joint angles, contacts and constraints off;
+a step consists of four evaluations and the integration. Pinocchio: articulated-body algorithm,
+relative joint angles, one call from Python per evaluation, with an overhead of about 1 us. A
+library that cannot be imported is left out.
 """
 
 from collections.abc import Callable
@@ -25,8 +25,8 @@ class Neighbour(NamedTuple):
 
     Attributes:
         acceleration: of the absolute angles, from absolute angles and rates.
-        call: many evaluations.
-        evaluations: how many.
+        call: runs many evaluations.
+        evaluations: their number.
     """
 
     acceleration: Callable[[Vector, Vector], Vector]
@@ -35,13 +35,13 @@ class Neighbour(NamedTuple):
 
 
 def neighbours(scene: Scene, steps: int) -> dict[str, Neighbour]:
-    """Those that can be imported, to be timed over so many steps."""
+    """The libraries that can be imported, to be timed over this number of steps."""
     absent = missing()
     return {name: make(scene, steps) for name, make in MAKERS.items() if name not in absent}
 
 
 def missing() -> list[str]:
-    """Those that cannot be imported."""
+    """The libraries that cannot be imported."""
     return [name for name, module in MODULES.items() if not _imports(module)]
 
 
@@ -54,7 +54,7 @@ def _imports(module: str) -> bool:
 
 
 def by_numba(scene: Scene, steps: int) -> Neighbour:
-    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j sum of the masses from max(i, j) on."""
+    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j times the sum of the masses from max(i, j) on."""
     m, rods, g, q0, v0 = _numbers(scene)
     carried = np.cumsum(m[::-1])[::-1]
     A = np.outer(rods, rods) * carried[np.maximum.outer(np.arange(rods.size), np.arange(rods.size))]
@@ -140,7 +140,7 @@ def _compiled() -> list[Callable]:
 
 
 def by_mujoco(scene: Scene, steps: int) -> Neighbour:
-    """Hinges about -y, each body a mass at the end of its link, with next to no inertia."""
+    """Hinges about -y; each body is a mass at the end of its link, with negligible inertia."""
     mujoco: Any = import_module("mujoco")
     m, rods, g, q0, v0 = _numbers(scene)
     inner = ""
@@ -174,7 +174,7 @@ def by_mujoco(scene: Scene, steps: int) -> Neighbour:
 
 
 def by_pinocchio(scene: Scene, steps: int) -> Neighbour:
-    """Joints about y against the sense of the angles, the bodies point masses."""
+    """Joints about y, so that joint angles have the opposite sign; the bodies are point masses."""
     pin: Any = import_module("pinocchio")
     m, rods, g, q0, v0 = _numbers(scene)
     model = pin.Model()

@@ -1,4 +1,4 @@
-"""What the rows of the benchmark `lowering` say: figures, targets and references."""
+"""Figures, targets and references from the table rows of the benchmark `lowering`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import exp, log
@@ -14,13 +14,13 @@ Row = Mapping[str, Any]
 
 
 class Figures:
-    """Figures of the rows by what they compare; none where no row has them."""
+    """Figures from the table rows, by the kind of comparison; empty if there are no rows."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self.rows = rows
 
     def of(self, part: str, **wanted: Any) -> list[Row]:
-        """The rows of one part with these entries."""
+        """The table rows of one part with these entries."""
         return [
             row
             for row in self.rows
@@ -28,7 +28,7 @@ class Figures:
         ]
 
     def ratios(self, admitted: Callable[[str], bool]) -> dict[str, float]:
-        """Times as long: jaxlag as the fastest of the contenders admitted, by system."""
+        """Time of jaxlag divided by that of the fastest admitted contender, by system."""
         found: dict[str, float] = {}
         for row in self.of("evaluation"):
             if admitted(row["contender"]):
@@ -36,11 +36,11 @@ class Figures:
         return found
 
     def gains(self, part: str, sizes: Sequence[int]) -> list[float]:
-        """Times faster: the scalar than the array program, for every system of these sizes."""
+        """Time of the array program over that of the scalar one, for systems of these sizes."""
         return [row["ratio"] for row in self.of(part, contender="array") if row["n"] in sizes]
 
     def neighbours(self) -> dict[int, tuple[float, str]]:
-        """Times as long: jaxlag as the fastest neighbour, and its name, by the length of chain."""
+        """(time of jaxlag over that of the fastest library, its name), by the length of chain."""
         found: dict[int, tuple[float, str]] = {}
         for row in self.of("chain"):
             if row["contender"] in NEIGHBOURS:
@@ -50,7 +50,7 @@ class Figures:
 
 
 def is_peer(contender: str) -> bool:
-    """Whether it is judged against: plain code by hand or by sympy."""
+    """Whether jaxlag is judged against it: plain code by hand or by sympy."""
     return is_any_peer(contender) and not contender.endswith("called")
 
 
@@ -66,7 +66,7 @@ def mean(ratios: Mapping[str, float]) -> float:
 def verdict(
     rows: Sequence[Row], operations: Mapping[str, int | None], missing: Sequence[str]
 ) -> tuple[list[Target], list[Reference]]:
-    """Targets and references of all parts that have rows."""
+    """Targets and references of all parts that have table rows."""
     figures = Figures(rows)
     targets: list[Target] = []
     references = [Reference("left out", f"{name}: cannot be imported") for name in missing]

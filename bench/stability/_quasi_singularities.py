@@ -1,9 +1,9 @@
-"""Motions that pass places where their quasi-velocities are singular, and others that stay clear.
+"""Motions through states with singular quasi-velocities, and motions that stay away from them.
 
-Where dU/dv loses rank v does not follow from u. The motions are known exactly, or by other
-quasi-velocities. One counts where it ends well with an error of q or v of more than a thousand
-tolerances, or of more than 1e-3 with fixed steps of 0.05 s; one that stays clear of such a place
-counts where it is refused, too.
+If dU/dv loses rank, u does not determine v. The motions are known in closed form, or are computed
+with other quasi-velocities. A motion counts as wrong if its status is ok and its error of q or v is
+above a thousand tolerances, or above 1e-3 with fixed steps of 0.05 s. A motion that stays away from
+singular states also counts if it is refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ rows = Rows()
 
 
 class Starts(NamedTuple):
-    """Starts and spans, all with a first axis of motions."""
+    """Starts and spans; the first axis is that of the motions."""
 
     q0: Any
     v0: Any
@@ -55,7 +55,7 @@ def counted(
     clear: bool,
     ways: Sequence[dict[str, Any]],
 ) -> Found:
-    """How many motions are wrong without a word, and, where all stay clear, how many refused."""
+    """Number of motions that are wrong with the status ok, plus, if `clear`, of refused ones."""
     wrong, statuses, details = 0, set[str](), []
     right = [np.asarray(x) for x in exact(*map(np.asarray, starts))]
     for way in ways:
@@ -86,7 +86,7 @@ def counted(
 def row(
     name: str, system: jl.System, draw: Draw, clear: bool = False, params: Any = None
 ) -> Callable[[Exact], Exact]:
-    """A decorator: the function gives (q, v) at the ends of the motions of this row."""
+    """A decorator that adds a case; the function returns the exact final (q, v) of its motions."""
 
     def added(exact: Exact) -> Exact:
         def run(quick: bool) -> Found:
@@ -135,7 +135,7 @@ row("cos(y) x', crossed", weighted(1), past)(dragged)
 row("cos(y)^2 x', touched", weighted(2), past)(dragged)
 
 
-# ---- The same, y swinging past 90 degrees and back, or not quite so far ------------------------
+# ---- The same, y swinging beyond 90 degrees and back, or just below ----------------------------
 
 
 def swinging(t: Any, q: Array, v: Array, params: Any) -> Array:
@@ -179,7 +179,7 @@ WHEELS = ("x", "y", "yaw", "steer")
 
 
 def wheeled(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """Mass centre at b ahead of the rear axle."""
+    """L of a two-wheeler with its mass center at b ahead of the rear axle."""
     x = v[0] - params["b"] * jnp.sin(q[2]) * v[2]
     y = v[1] + params["b"] * jnp.cos(q[2]) * v[2]
     turning = params["J"] * v[2] ** 2 + params["K"] * (v[2] + v[3]) ** 2
@@ -317,7 +317,7 @@ def seen(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
 
 
 def lines(low: float | None = None, high: float = 0.0) -> Draw:
-    """Straight lines past the pole, or 10^low to 10^high of their height beside it."""
+    """Straight lines over the pole, or with an offset of 10^low to 10^high of their height."""
 
     def draw(rng: np.random.Generator, count: int) -> Starts:
         x, z = rng.uniform(0.3, 2, count), rng.uniform(0.5, 2, count)

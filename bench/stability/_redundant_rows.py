@@ -1,8 +1,9 @@
-"""Redundant constraint rows and rows that say nothing: what they must not change.
+"""Redundant constraint rows and void rows: they must not change the results.
 
-Rollers of radius r on a rail, whose rows are alike but for levers of r metres, declared once and
-again in other words. And rows that are 0 = 0 but for rounding, in every kind of declaration, by
-every formulation: beside them the motion is what it is without; with a gap added they are told.
+Redundant rows: rollers of radius r on a rail, whose rows differ by levers of r meters only,
+declared with additional dependent rows. Void rows: rows that are 0 = 0 except for rounding, in
+every kind of declaration and formulation. They must not change the motion. With a gap added to
+such a row, the contradiction must be reported.
 """
 
 from itertools import product
@@ -34,7 +35,7 @@ AGAIN = {
 
 
 def imbalance(dtype: Any) -> Found:
-    """The largest |M a + h - A^T lam| over the sum of its terms, in roundings."""
+    """The largest |M a + h - A^T lam| divided by the sum of its terms, in units of eps."""
     worst, where = 0.0, ""
     for name, again in AGAIN.items():
         constraints = (jl.Holonomic(rolling, "rollers"),)
@@ -68,7 +69,7 @@ def single(quick: bool) -> Found:
     return imbalance(jnp.float32)
 
 
-# ---- Rows that say nothing -----------------------------------------------------------------------
+# ---- Void rows -----------------------------------------------------------------------------------
 
 
 def identity(x: Array) -> Array:
@@ -99,7 +100,7 @@ def moved(constraints: Any, lowering: str, gap: float, ways: Any) -> jl.Solution
 
 
 def beside(gap: float, quick: bool) -> Found:
-    """How many motions are not what they must be."""
+    """Number of motions that differ from the expected result."""
     wrong, count, found = 0, 0, set[str]()
     alone = [()] if quick else [(), (ROD,)]
     for others, lowering in product(alone, ["auto"] if quick else ["auto", "array"]):

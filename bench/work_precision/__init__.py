@@ -1,13 +1,14 @@
 """Time over achieved error: jaxlag, diffrax, heyoka, numba, SUNDIALS, CasADi, scipy, MuJoCo.
 
-Each line of a system is one way to solve it at many tolerances (or steps). Errors are against ends
-to 20 digits (`bench/references`): the largest of the coordinates at the end, over one plus its
-size. Times at an error are interpolated between neighbours on a line, never beyond its ends.
+Each line of a system is one way to solve it, at many tolerances (or steps). The error is the
+largest deviation of a final coordinate from a reference to 20 digits (`bench/references`), divided
+by one plus its size. Times at an error are interpolated between adjacent points of a line, never
+extrapolated.
 
-The processes take turns, all on one core: jax with XLA's loop setting, jax without it, another jax
-(`--python PATH` of an interpreter that has jax, diffrax and optimistix), and all that is not JAX.
-Compilation is apart, in `compile_s`. Runs of more than 40 ms are timed twice, where the line is
-made, and do not take turns. Of 16 pendulums at once times are those of one.
+The processes run in turn, all on one core: jax with XLA's loop setting, jax without it, another jax
+(`--python PATH` of an interpreter that has jax, diffrax and optimistix), and all libraries other
+than JAX. Compilation is given separately, in `compile_s`. Runs of more than 40 ms are timed only
+twice, when the line is built, and not in turn. For a batch of 16 pendulums, times are per pendulum.
 """
 
 import os
@@ -30,8 +31,8 @@ from jaxlag._core import _xla
 
 KIND, SYSTEM = "BENCH_KIND", "BENCH_SYSTEM"  # environment of a worker
 ROUNDS, QUICK_ROUNDS = 4, 2
-TURNS_S = 40e-3  # runs up to this length take turns
-BUDGET_S = 100e-3  # after which a point sits out
+TURNS_S = 40e-3  # runs up to this length are timed in turn
+BUDGET_S = 100e-3  # after which a point is not timed again
 PATIENCE_S = 0.5
 QUICK_SYSTEMS = ("double pendulum, regular",)
 QUICK_LINES = {"jaxlag dopri8", "diffrax Dopri8, by hand", "heyoka", "numba DOP853", "scipy DOP853"}
@@ -42,7 +43,7 @@ SETTINGS = {"on": "1", "off": "0", "newest": "1", "peers": "1"}
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
-    """Sweep every line of this process: what to time, and its points."""
+    """Sweep every line of this process: the calls to time, and the points of the lines."""
     name, kind = os.environ[SYSTEM], os.environ[KIND]
     motion = MOTIONS[name]()
     exact = exact_end(name)
@@ -56,7 +57,7 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
         try:
             line = built(make)
             found, points = swept(line, lambda q: motion.error(q, exact), PATIENCE_S)
-        except Exception as error:  # what a method says of a system not for it, a broken library
+        except Exception as error:  # the method does not apply, or a library is broken
             facts["none"][words] = f"{type(error).__name__}: {error}".splitlines()[0]
             continue
         if not points:
@@ -69,10 +70,10 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
 
 
 def _lines(motion: Motion, kind: str) -> tuple[Mapping[str, Callable[[], Line]], dict[str, str]]:
-    """Lines of one kind of process, and the error text of what cannot be imported."""
+    """Lines of one kind of process, and the error texts of libraries that cannot be imported."""
     if kind != "peers":
         ours = {"on": None, "off": (), "newest": ("tsit5", "dopri8")}[kind]
-        # A prototype runs as jax is found: without the setting.
+        # A prototype runs with jax's default: without the setting.
         return _jax.lines(motion, ours, prototype=kind == "off"), {}
     _silence()
     missing = _peers.missing()
@@ -85,13 +86,13 @@ def _lines(motion: Motion, kind: str) -> tuple[Mapping[str, Callable[[], Line]],
 
 
 def _silence() -> None:
-    """What libraries write of steps too short fills a terminal."""
+    """Discard output: warnings of libraries about short steps would fill a terminal."""
     nothing = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nothing, stream)
 
 
-# ---- Where it is put together --------------------------------------------------------------------
+# ---- The main process ----------------------------------------------------------------------------
 
 
 def run(quick: bool, system: list[str] | None = None, python: str | None = None) -> Report:
@@ -99,8 +100,8 @@ def run(quick: bool, system: list[str] | None = None, python: str | None = None)
 
     Args:
         quick: one system and a few lines.
-        system: names of the systems, all where left out.
-        python: interpreter with another version of jax; without it that is left out.
+        system: names of the systems; all by default.
+        python: interpreter with another version of jax; by default that version is left out.
     """
     chosen = system or (QUICK_SYSTEMS if quick else tuple(MOTIONS))
     unknown = [name for name in chosen if name not in MOTIONS]
@@ -112,7 +113,7 @@ def run(quick: bool, system: list[str] | None = None, python: str | None = None)
     for name in chosen:
         try:
             found, notes = contest(name, quick, python)
-        except RuntimeError as error:  # a process that dies must not take the other systems along
+        except RuntimeError as error:  # a crashed process must not stop the other systems
             said.append(Reference("failed", f"{name}: {error}"))
             continue
         rows += found
@@ -128,7 +129,7 @@ def run(quick: bool, system: list[str] | None = None, python: str | None = None)
 def contest(
     name: str, quick: bool, python: str | None
 ) -> tuple[list[dict[str, Any]], list[Reference]]:
-    """Rows of one system, and what is missing and why."""
+    """Table rows of one system, and notes about missing lines and versions."""
     kinds = ("on", "peers") if quick else tuple(SETTINGS)
     samples: dict[tuple[str, str], list[float]] = defaultdict(list)
     notes: list[Reference] = []

@@ -1,6 +1,6 @@
-"""Source code of equations: one line for each operation, none of them twice.
+"""Source code of equations: one line for each operation, without repetitions.
 
-Numba and Python's own numbers get the equations of `_problems.explicit_equations` in this form.
+Numba and plain Python use the equations of `_problems.explicit_equations` in this form.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from bench._problems.explicit_equations import Functions, Rates
 
 
 class _Line:
-    """A number that has been given a name."""
+    """A number with a name in the code."""
 
     def __init__(self, code: "_Code", name: str) -> None:
         self.code, self.name = code, name
@@ -69,7 +69,7 @@ def _word(x: Any) -> str:
 def source(rates: Rates, params: Mapping[str, Any], size: int, name: str = "rates") -> str:
     """A function `name(t, y, out)` that writes the rates into `out` and returns it.
 
-    It calls sin, cos and sqrt, which are to be in its namespace.
+    It calls sin, cos and sqrt, which must be in its namespace.
     """
     code = _Code()
     sin, cos, sqrt = (code.function(word) for word in ("sin", "cos", "sqrt"))

@@ -129,7 +129,7 @@ _STICK = jl.System(
     potential=falling_stick_multiplier.potential,
     forces=(jl.PointForce(_contact, _ground_force, "ground"),),
 )
-"""The stick with no ground but its force (mu N, N) at the lower end."""
+"""The stick without ground, with the ground's force (mu N, N) at its lower end."""
 
 _sliding = around({"m": 0.5, "L": 1.0, "g": 9.81, "mu": 0.3, "N": 4.0}, (0.0, 1.0))
 
@@ -140,7 +140,7 @@ def _stick(t, q, params):
 
 
 def _friction_moment(s: State):
-    """What the friction adds to the generalized force on theta."""
+    """Generalized force of the friction on theta."""
     q = _stick(s.t, s.q, s.params)
     rough, smooth = s.params, {**s.params, "mu": 0.0 * s.params["mu"]}
     Q, Q_smooth = (_STICK.generalized_force(q, jnp.zeros(3), p) for p in (rough, smooth))
@@ -148,7 +148,7 @@ def _friction_moment(s: State):
 
 
 def _sliding_acceleration(s: State):
-    """(x_c'', theta'') at which the ground's force (mu N, N) is all that the motion needs."""
+    """(x_c'', theta'') for which the ground's force (mu N, N) is the only applied force."""
 
     def missing(unknown):
         a, N = unknown[:2], unknown[2]

@@ -33,7 +33,7 @@ def particles(t, q, params):
 
 
 def needed(s: State):
-    """(force, torque about O), body components, that a motion of the body needs."""
+    """(force, torque about O), body components, required for a motion of the body."""
     r, _, acceleration = motion(particles, s, s.a)
     pulls = masses(s.params)[:, None] * acceleration
     R, origin = attitude.pose(s.t, s.q, s.params)
@@ -91,7 +91,7 @@ def _third_row_by_vI(s: State):
 
 
 def _turning_of_velocity(s: State):
-    """Body components of dV/dt less the rates of the body components of V."""
+    """Body components of dV/dt minus the rates of the body components of V."""
 
     def components(t, q, v):
         return energy.body_velocity(attitude.pose, t, q, v, s.params)[0]

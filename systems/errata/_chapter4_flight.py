@@ -12,7 +12,7 @@ from systems.errata import _attitude as attitude
 from systems.errata import _chapter4_body_axes as body
 from systems.errata._erratum import Erratum, State, around, rate
 
-# Aircraft, the engine's side: four particles, a force and a torque fixed in the body axes.
+# Aircraft by the engine: four particles, a force and a torque fixed in the body axes.
 
 
 def _weight_energy(s: State):
@@ -68,7 +68,7 @@ def _power(s: State):
     return rate(lambda t, q, v: body.kinetic(t, q, v, s.params), s, s.a)
 
 
-# Aircraft, the formulas' side.
+# Aircraft by the formulas.
 
 
 def _kinetic_formula(s: State, sign: int):
@@ -123,7 +123,7 @@ def _torque_formula(s: State):
     return array(s.values("Mx", "My", "Mz"))
 
 
-# Quadcopter, the engine's side: rotors in front, left, rear, right; y is to the right.
+# Quadcopter by the engine: rotors in front, left, rear, right; y is to the right.
 
 
 def _hubs(t, q, params):
@@ -185,7 +185,7 @@ _ROTORS = jl.System(
     kinetic=_spin_kinetic,
     potential=lambda t, q, params: jnp.zeros_like(q[0]),
 )
-"""Four rotors with given rates relative to a frame without mass."""
+"""Four rotors with given rates relative to a massless frame."""
 
 
 def _gyroscopic_torque(s: State):
@@ -195,7 +195,7 @@ def _gyroscopic_torque(s: State):
     return attitude.body_torque(s.q[3:], (without - needed)[3:])
 
 
-# Quadcopter, the formulas' side.
+# Quadcopter by the formulas.
 
 
 def _thrust_formula(s: State, sign: int):

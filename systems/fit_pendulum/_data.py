@@ -1,7 +1,7 @@
-"""Recordings of a swinging pendulum: read from a file, cut in windows.
+"""Recordings of a swinging pendulum: read from a file, cut into windows.
 
 Angles are in rad from the hanging position, positive counterclockwise, not wrapped. A recording
-is one or more segments sampled evenly, each with a number of its own; where the shaft is driven,
+consists of one or more evenly sampled segments, each with its own number. If the shaft is driven,
 the motor's torque (N m) is recorded with the angle.
 """
 
@@ -14,20 +14,20 @@ from jaxtyping import Float
 
 import jaxlag as jl
 
-# Columns of an angle, and what each shows where the pendulum hangs (rad).
+# Columns of an angle, and the value of each for the hanging pendulum (rad).
 ANGLES = {"q": 0.0, "theta1": np.pi}
-# Columns that may be there but are not used: recorded velocities are filtered, angles are not.
+# Columns that may exist but are not used: recorded velocities are filtered, angles are not.
 UNUSED = ("v", "omega1")
 LONGEST_GAP = 1.5  # between samples, over their median spacing
 FEWEST_SAMPLES = 10  # in a window
 SHORTEST = 0.2  # s, of a window
-# Hz, of the angles that are used: all samples of a free swing at 1 kHz moved its parameters by 0.2
-# of the standard errors found at 100 Hz. Torques are used as they were recorded.
+# Hz, of the angles that are used. All samples of a free swing at 1 kHz changed its parameters by
+# 0.2 of the standard errors at 100 Hz. Torques are used as recorded.
 RATE = 100.0
 
 
 class DataError(ValueError):
-    """A recording that cannot be used: which argument, what it must be, what it was."""
+    """A recording cannot be used; the message names the argument, the requirement and the value."""
 
 
 class Recording(NamedTuple):
@@ -35,8 +35,8 @@ class Recording(NamedTuple):
 
     Attributes:
         name: of the file.
-        segments: evenly sampled motion by number: channel "q" (rad, 0 hanging) and, where the
-            shaft is driven, input "torque" (N m).
+        segments: evenly sampled motion by number: channel "q" (rad, 0 hanging) and, if the shaft
+            is driven, input "torque" (N m).
     """
 
     name: str
@@ -53,13 +53,13 @@ class Recording(NamedTuple):
         return float(np.median(np.diff(next(iter(self.segments.values())).ts)))
 
     def thinned(self) -> "Recording":
-        """The same at RATE, or as it is where that is higher."""
+        """The recording thinned to RATE; unchanged if its own rate is not higher."""
         every = slice(None, None, max(1, round(1 / (RATE * self.spacing))))
         return Recording(self.name, {n: each.part(every) for n, each in self.segments.items()})
 
 
 class Split(NamedTuple):
-    """Windows to find parameters from, and windows to try them on."""
+    """Windows for the fit of the parameters, and windows for their test."""
 
     train: list[jl.Experiment]
     test: list[jl.Experiment]
@@ -78,9 +78,9 @@ def segment(
 ) -> jl.Experiment:
     """One piece of evenly sampled motion.
 
-    The torque is interpolated linearly between its samples: they are those of a motor current,
-    which is continuous, and not commands, which would be held. (Held instead, they made the rms
-    larger by 1 % in a recording at 500 Hz, by 4 % in one at 50 Hz.)
+    The torque is interpolated linearly between its samples. These come from a motor current, which
+    is continuous; commands would be held between samples. (A zero-order hold increased the rms by
+    1 % in a recording at 500 Hz, by 4 % in one at 50 Hz.)
 
     Args:
         name: of the piece.
@@ -93,13 +93,13 @@ def segment(
 
 
 def cut(recording: Recording, seconds: float) -> dict[int, list[jl.Experiment]]:
-    """Windows of `seconds`, side by side from each segment's start, by the segment's number.
+    """Adjacent windows of `seconds` from each segment's start, by the segment's number.
 
     A remainder shorter than a window is left out.
 
     Raises:
-        DataError: a window would be too short, no segment is as long as one, or angle or torque
-            never change.
+        DataError: a window would be too short, all segments are shorter than a window, or angle or
+            torque never change.
     """
     spacing = recording.spacing
     least = max(SHORTEST, FEWEST_SAMPLES * spacing)
@@ -134,15 +134,15 @@ def cut(recording: Recording, seconds: float) -> dict[int, list[jl.Experiment]]:
 
 
 def _length(piece: jl.Experiment, spacing: float) -> float:
-    """Seconds, with the one that its last sample stands for."""
+    """Duration in seconds, including the interval after the last sample."""
     return float(piece.ts[-1] - piece.ts[0]) + spacing
 
 
 def split(recording: Recording, other: Recording | None, seconds: float) -> Split:
     """Windows of `recording` to train on, and of `other`, or a third of `recording`, to test on.
 
-    That third is the segments whose number is divisible by 3; every third window where there is
-    one segment only.
+    That third consists of the segments whose number is divisible by 3, or of every third window if
+    there is only one segment.
 
     Raises:
         DataError: the recordings are too short, or only one of them has a torque.
@@ -179,7 +179,7 @@ def read(path: Path) -> Recording:
 
     Lines that start with # are skipped; the next line names the columns: `t` (s), the angle as
     `q` (rad, 0 hanging) or `theta1` (rad, 0 upright), and optionally `seg` (integer segment
-    numbers) and `tau_meas` (N m). Columns `v` and `omega1` are passed over.
+    numbers) and `tau_meas` (N m). Columns `v` and `omega1` are ignored.
 
     Raises:
         DataError: no such file, or its content is not such a table.

@@ -1,4 +1,4 @@
-"""What the fits of a pendulum say: tables and a figure."""
+"""Tables and a figure for the fits of a pendulum."""
 
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
@@ -19,7 +19,7 @@ from systems.fit_pendulum._models import (
     samples_each,
 )
 
-# Symbol and unit of each parameter where the torque is known, and in a free swing.
+# Symbol and unit of each parameter if the torque is known, and in a free swing.
 DRIVEN = {
     "J": ("J", "kg m^2"),
     "mgl": ("mgl", "N m"),
@@ -36,8 +36,8 @@ FREE = {
     "k": ("k/J", "1"),
     "zero": ("zero", "rad"),
 }
-# Figures to beat, mrad rms: quick fits by multiple shooting, made when these recordings were
-# chosen; in whole segments of the first, in windows of 1 s of the other two.
+# Reference errors, mrad rms: from quick fits by multiple shooting, made when these recordings were
+# selected. They are for whole segments of the first, for windows of 1 s of the other two.
 TO_BEAT = {
     "single.csv.gz": {"viscous": 7.8, "+ Coulomb": 6.7, "+ quadratic": 2.05},
     "ddp.csv.gz": {"+ Coulomb": 3.3},
@@ -67,7 +67,7 @@ def trials(
     trials: Mapping[str, Trial],
     truth: Mapping[str, float] | None = None,
 ) -> Iterator[str]:
-    """Lines of the table of models fitted to windows, and what it means."""
+    """Lines of the table of models fitted to windows, and its interpretation."""
     symbols = DRIVEN if recording.driven else FREE
     beat_train = TO_BEAT.get(recording.name, {}) if other else {}
     beat_test = TO_BEAT.get(other.name, {}) if other else {}
@@ -120,7 +120,7 @@ def segments(recording: Recording, fits: Mapping[str, jl.FitResult]) -> Iterator
 
 
 def mrad(found: jl.FitResult | jl.Prediction) -> float:
-    """Root mean square of the angle over all samples, of a prediction those predicted, mrad."""
+    """Root mean square of the angle's residuals over all, or all predicted, samples, mrad."""
     return 1e3 * float(found.rms("q")[0])
 
 
@@ -144,7 +144,7 @@ def _name(model: str, fitted: jl.FitResult) -> str:
 def _numbers(
     fitted: jl.FitResult, model: str, symbols: Mapping[str, object]
 ) -> tuple[list[str], list[str]]:
-    """Estimates and standard errors, to two figures of the error; blank where held."""
+    """Estimates and standard errors, to two digits of the error; blank if fixed."""
     values, errors = [], []
     for name in symbols:
         if name not in estimated(fitted, model):
@@ -199,7 +199,7 @@ def can_plot() -> bool:
 
 
 def require_figure(path: Path) -> None:
-    """Complain before the work begins.
+    """Check that a figure can be written, before the fits run.
 
     Raises:
         DataError: matplotlib is missing, or the folder, or the name ends in another way.
@@ -212,7 +212,7 @@ def require_figure(path: Path) -> None:
 
 
 def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
-    """Measured against simulated angles in some test windows, residuals beneath.
+    """Measured and simulated angles in some test windows, with the residuals below.
 
     Raises:
         DataError: the file cannot be written.

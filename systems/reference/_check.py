@@ -1,4 +1,4 @@
-"""Replay of reference files: from what a case starts with to every number that it holds."""
+"""Replay of reference files: all values of a case are computed from its initial data."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,11 +25,11 @@ STATE_TOLERANCE = 1e-10
 """Largest |x - reference| / (1 + |reference|) of q, v, u, energies, invariants, states of rest."""
 
 DERIVED_TOLERANCE = 1e-9
-"""The same for accelerations, reactions, extras and all else found from the state of a motion."""
+"""The same for accelerations, reactions, extras and other values computed from the states."""
 
 
 class Motion(NamedTuple):
-    """What a case was replayed to: name -> rows, shape (S, ...), and how that ended."""
+    """The replay of a case: name -> values, shape (S, ...), and the status at its end."""
 
     rows: Mapping[str, Array]
     status: Array
@@ -37,7 +37,7 @@ class Motion(NamedTuple):
 
 
 class Deviation(NamedTuple):
-    """Worst row of one field: |x - reference| / (1 + |reference|), the largest component."""
+    """The worst time of one field: |x - reference| / (1 + |reference|), largest component."""
 
     field: str
     row: int
@@ -90,7 +90,7 @@ def _quantities(
 
 @partial(jax.jit, static_argnums=0)
 def replay_rest(entry: StaticEntry, params: Mapping[str, Array]) -> Motion:
-    """Find the state of rest, a single row."""
+    """Find the state of rest; the values have one entry."""
     rest = entry.rest(params)
     rows = static_quantities(entry, params, rest)
     return Motion({name: x[None] for name, x in rows.items()}, rest.status, jnp.zeros(()))
@@ -100,9 +100,9 @@ def replay_rest(entry: StaticEntry, params: Mapping[str, Array]) -> Motion:
 def replay_prescribed(
     entry: PrescribedEntry, params: Mapping[str, Array], times: Array, q: Array, v: Array, a: Array
 ) -> Motion:
-    """The forces that the motion (q, v, a), each (S, n), needs at `times`.
+    """The forces required for the motion (q, v, a), each (S, n), at `times`.
 
-    The rows of q, v and a in the result are those of the entry's own motion law.
+    q, v and a in the result are computed from the entry's own motion.
     """
     rows = jax.vmap(partial(prescribed_quantities, entry, params))(times, q, v, a)
     law = jl.prescribed_motion(lambda t: entry.motion(t, params), times)
@@ -112,10 +112,10 @@ def replay_prescribed(
 
 @singledispatch
 def replay_case(entry: AbstractEntry, case: Case) -> Motion:
-    """Replay a case from what such a case starts with.
+    """Replay a case from its initial data.
 
-    A motion from its parameters, times and first row of q and v alone, a state of rest from its
-    parameters alone, a prescribed motion from all its q, v and a.
+    These are, for a motion, the parameters, the times and the first q and v; for a state of rest
+    the parameters; for a prescribed motion all of q, v and a.
     """
     raise NotImplementedError(f"cases of {entry.kind} systems cannot be replayed")
 
@@ -137,7 +137,7 @@ def _(entry: PrescribedEntry, case: Case) -> Motion:
 
 
 def compare(case: Case, rows: Mapping[str, Array]) -> list[Deviation]:
-    """The worst deviation of every field of the case from the replayed rows."""
+    """The worst deviation of every field of the case from the replayed values."""
     deviations = []
     for field, reference in case.fields.items():
         tolerance = DERIVED_TOLERANCE if _is_derived(field) else STATE_TOLERANCE
@@ -160,7 +160,7 @@ def main(paths: Sequence[Path]) -> int:
             continue
         cases += len(reference.cases)
         failed += sum(not _report(path, reference.entry, case) for case in reference.cases)
-        jax.clear_caches()  # no file needs another's programs, and all of them take gigabytes
+        jax.clear_caches()  # programs are not shared by files, and all of them take gigabytes
     verdicts = [f"{failed} out of tolerance" if failed else "all within tolerance"] * bool(cases)
     verdicts += [f"{refused} refused"] * bool(refused)
     print(f"files {len(paths)}, cases {cases}: {', '.join(verdicts)}")

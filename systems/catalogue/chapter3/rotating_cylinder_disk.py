@@ -63,7 +63,7 @@ def rod(params):
 
 
 def disk(params):
-    """The disk by its inertia about O; axes that do not spin with it serve as well."""
+    """The disk by its inertia about O; its axes need not spin with it, because it is symmetric."""
     m2, end = params["m2"], params["l"] * ALONG
     central = jnp.stack([params["Iz"], params["Iy"], params["Iz"]])
     return energy.RigidBody(m2, energy.parallel_axis(central, m2, end), end)

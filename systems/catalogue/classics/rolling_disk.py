@@ -1,4 +1,4 @@
-r"""Thin disk that rolls on a level plane without slipping and leans as it likes.
+r"""Thin disk that rolls on a level plane without slipping and leans freely.
 
 Not in the book; Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), and, low and without
 friction losses, Euler's disk. The quasi-velocities are declared as in

@@ -16,7 +16,7 @@ Coordinates
     x, y         center of the board [m]
     theta        direction of the board from x [rad]
     psi          angle of the rotor from the board [rad]
-    phi          front wheels from the board [rad]; the back ones stand at -phi
+    phi          front wheels from the board [rad]; the back ones are at -phi
 
 Quasi-velocities
     xi           rate of the motion that the wheels allow [rad/s]
