@@ -62,13 +62,13 @@ def _cases(sizes: tuple[int, ...]) -> list[Case]:
     starts = {lanes: (_starts(lanes), *common) for lanes in sizes}
     axes = (0, None, None)
 
-    def in_turn(y0: Array, params: Any, tolerance: Array) -> Ended:
+    def sequential(y0: Array, params: Any, tolerance: Array) -> Ended:
         return jax.lax.map(lambda y0: one(y0, params, tolerance), y0)
 
     return [
         *(Case("vmap", lanes, jax.vmap(one, axes), starts[lanes]) for lanes in sizes),
         Case("vmap, driven", COMPARED, jax.vmap(_driven), _driven_lanes(COMPARED)),
-        Case("lax.map", COMPARED, in_turn, starts[COMPARED]),
+        Case("lax.map", COMPARED, sequential, starts[COMPARED]),
         Case("by hand", COMPARED, jax.vmap(by_hand, axes), starts[COMPARED]),
         Case("naive", COMPARED, jax.vmap(naive, axes), starts[COMPARED]),
     ]

@@ -205,11 +205,11 @@ def _judged(
         claim = "times as sensitive to the inputs as the state: the gradient, whatever computes it"
         more.append(Reference(f"{more_sensitive:.3g}", claim))
     per_lane = lanes["min_ms"] / LANES / reverse["min_ms"]
-    apart = of(errors, REVERSE, LANES) / of(errors, SOLVE, LANES)
-    typical = jnp.exp(jnp.mean(jnp.log(apart)))
+    ratios = of(errors, REVERSE, LANES) / of(errors, SOLVE, LANES)
+    typical = jnp.exp(jnp.mean(jnp.log(ratios)))
     references = [
         Reference(
-            f"{typical:.3g}, {jnp.max(apart):.3g}",
+            f"{typical:.3g}, {jnp.max(ratios):.3g}",
             f"times the error of the solve: that of the gradient in {LANES} starts, mean and worst",
         ),
         Reference(f"{per_lane:.3g}", f"times as long per gradient: {LANES} lanes at once as one"),

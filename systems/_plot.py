@@ -33,13 +33,13 @@ class Panel(NamedTuple):
 
 
 def by_unit(
-    names: Sequence[str], ts: ArrayLike, rows: ArrayLike, units: Sequence[str]
+    names: Sequence[str], ts: ArrayLike, values: ArrayLike, units: Sequence[str]
 ) -> list[Panel]:
-    """One panel over time for every unit, with the components of `rows`, (S, n), in this unit."""
+    """One panel over time for every unit, with the components of `values`, (S, n), in this unit."""
     panels = []
     for unit in dict.fromkeys(units):
         columns = [i for i, own in enumerate(units) if own == unit]
-        curves = {names[i]: np.asarray(rows)[:, i] for i in columns}
+        curves = {names[i]: np.asarray(values)[:, i] for i in columns}
         panels.append(Panel("t [s]", ts, f"{', '.join(curves)} [{unit}]", curves))
     return panels
 

@@ -23,7 +23,7 @@ BENCHMARKS = (
     "fits",
 )
 
-RUNS_PER_TURN = 3
+RUNS_PER_ROUND = 3
 
 Call = Callable[[], Any]
 
@@ -96,8 +96,8 @@ def interleaved(
 ) -> dict[str, list[float]]:
     """Seconds of every run after one warm-up run.
 
-    The calls alternate, so that other load of the machine affects all of them equally. A turn
-    consists of three runs, because in the first one the caches hold the data of another call.
+    The calls alternate, so that other load of the machine affects all of them equally. In a round,
+    each call runs three times, because in its first run the caches hold the data of another call.
     A call that has used `budget_s` is left out of the remaining rounds.
     """
     samples: dict[str, list[float]] = {name: [] for name in calls}
@@ -106,7 +106,7 @@ def interleaved(
     for _ in range(rounds):
         for name, call in calls.items():
             if sum(samples[name]) < budget_s:
-                samples[name] += [seconds(call) for _ in range(RUNS_PER_TURN)]
+                samples[name] += [seconds(call) for _ in range(RUNS_PER_ROUND)]
     return samples
 
 

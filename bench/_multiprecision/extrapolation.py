@@ -53,16 +53,16 @@ def integrated(
 
 def _step(rates: Callable, t: Any, y: list, h: Any, columns: int) -> tuple[list, Any]:
     """(y at t + h, its estimated error relative to 1 + |y|)."""
-    slope, row = rates(t, y), []
+    slope, previous = rates(t, y), []
     for j in range(1, columns + 1):
         below = _midpoint(rates, t, y, slope, h, 2 * j)
         new = [below]
         for k in range(1, j):
             weight = 1 / ((precise().mpfr(j) / (j - k)) ** 2 - 1)
-            below = [b + (b - a) * weight for a, b in zip(row[k - 1], below, strict=True)]
+            below = [b + (b - a) * weight for a, b in zip(previous[k - 1], below, strict=True)]
             new.append(below)
-        row = new
-    last, before = row[-1], row[-2]
+        previous = new
+    last, before = previous[-1], previous[-2]
     differences = zip(last, before, strict=True)
     return last, max(abs(a - b) / (1 + abs(a)) for a, b in differences)
 

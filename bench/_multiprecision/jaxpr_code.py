@@ -220,7 +220,7 @@ def _dotted(tape: Tape, a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.nda
     groups = int(np.prod(batch))
     a, b = a.reshape(groups, -1, count), b.reshape(groups, -1, count)
     zero = int(tape.constants(0.0))
-    rows = [
+    products = [
         reduce(
             lambda total, pair: tape.infix("+", total, tape.infix("*", *map(int, pair))),
             zip(row, column, strict=True),
@@ -230,28 +230,28 @@ def _dotted(tape: Tape, a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.nda
         for row in a[g]
         for column in b[g]
     ]
-    return np.array(rows, np.int32).reshape(shape)
+    return np.array(products, np.int32).reshape(shape)
 
 
 def _reduced(ids: np.ndarray, axes: Sequence[int], fold: Callable[[int, int], int]) -> np.ndarray:
-    kept = [i for i in range(ids.ndim) if i not in axes]
-    lines = ids.transpose(*kept, *axes).reshape(int(np.prod([ids.shape[i] for i in kept])), -1)
+    rest = [i for i in range(ids.ndim) if i not in axes]
+    lines = ids.transpose(*rest, *axes).reshape(int(np.prod([ids.shape[i] for i in rest])), -1)
     results = [reduce(fold, map(int, line)) for line in lines]
-    return np.array(results, np.int32).reshape([ids.shape[i] for i in kept])
+    return np.array(results, np.int32).reshape([ids.shape[i] for i in rest])
 
 
 def _running(tape: Tape, ids: np.ndarray, axis: int, reverse: bool) -> np.ndarray:
     """Cumulative sums along an axis, from its start or, with `reverse`, from its end."""
     ids = np.moveaxis(ids, axis, 0)
-    rows = list(ids[::-1] if reverse else ids)
-    for i in range(1, len(rows)):
-        rows[i] = _mapped(lambda a, b: tape.infix("+", a, b), rows[i - 1], rows[i])
-    return np.moveaxis(np.stack(rows[::-1] if reverse else rows), 0, axis)
+    sums = list(ids[::-1] if reverse else ids)
+    for i in range(1, len(sums)):
+        sums[i] = _mapped(lambda a, b: tape.infix("+", a, b), sums[i - 1], sums[i])
+    return np.moveaxis(np.stack(sums[::-1] if reverse else sums), 0, axis)
 
 
 def _mapped(function: Callable[..., int], *ids: np.ndarray) -> np.ndarray:
     ids = np.broadcast_arrays(*ids)
-    found = [function(*map(int, row)) for row in zip(*(x.ravel() for x in ids), strict=True)]
+    found = [function(*map(int, args)) for args in zip(*(x.ravel() for x in ids), strict=True)]
     return np.array(found, np.int32).reshape(ids[0].shape)
 
 

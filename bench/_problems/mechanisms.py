@@ -68,10 +68,10 @@ def links(t: Any, q: Array, v: Array, params: Any) -> Array:
     """L of uniform slender links a, b, c joined head to tail from the origin; mass 1 kg/m."""
     lengths = jnp.stack([params["a"], params["b"], params["c"]])
     rates = jnp.stack([-jnp.sin(q), jnp.cos(q)], -1) * (lengths * v)[:, None]
-    centres = jnp.cumsum(rates, 0) - 0.5 * rates
+    centers = jnp.cumsum(rates, 0) - 0.5 * rates
     rises = lengths * jnp.sin(q)
     heights = jnp.cumsum(rises) - 0.5 * rises
-    T = 0.5 * jnp.sum(lengths * jnp.sum(centres**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
+    T = 0.5 * jnp.sum(lengths * jnp.sum(centers**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
     return T - G * jnp.sum(lengths * heights)
 
 

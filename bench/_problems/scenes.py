@@ -126,9 +126,9 @@ def aircraft(t: Any, q: Array, v: Array, p: Any) -> Array:
     R, w = _rates(lambda q: rotation.yaw_pitch_roll.matrix(q[3:]), q, v)
     J = p["J"]
     J = jnp.stack([J[0], J[3], J[4], J[3], J[1], J[5], J[4], J[5], J[2]]).reshape(3, 3)
-    centre = R @ p["c"]
+    center = R @ p["c"]
     T = 0.5 * p["m"] * v[:3] @ v[:3] + p["m"] * v[:3] @ (R @ jnp.cross(w, p["c"]))
-    return T + 0.5 * w @ (J @ w) - p["m"] * p["g"] * (q[2] + centre[2])
+    return T + 0.5 * w @ (J @ w) - p["m"] * p["g"] * (q[2] + center[2])
 
 
 def chain(t: Any, q: Array, v: Array, p: Any) -> Array:
@@ -152,7 +152,7 @@ def links(n: int) -> Scene:
 _PENDULUM = {"m": 1.0, "l": 0.8, "g": G}
 _DOUBLE = {"m1": 1.0, "m2": 0.8, "l1": 1.0, "l2": 0.9, "g": G}
 _BODY = {"m": 1.2, "I": np.array([0.02, 0.03, 0.05]), "g": G}
-_TURN = (0.3, 0.4, -0.2), (0.5, -0.7, 0.9)
+_ATTITUDE = (0.3, 0.4, -0.2), (0.5, -0.7, 0.9)
 
 SCENES: dict[str, Scene] = {
     "pendulum": Scene(pendulum, (1.0,), (0.3,), _PENDULUM),
@@ -175,9 +175,11 @@ SCENES: dict[str, Scene] = {
         top, (0.3, 0.5, 0.1), (0.4, 0.1, 30.0),
         {"I": np.array([0.02, 0.03, 0.01]), "m": 0.5, "l": 0.1, "g": G},
     ),
-    "rigid_body": Scene(rigid_body, (0.0, 0.0, 1.0, *_TURN[0]), (1.0, 0.5, -0.2, *_TURN[1]), _BODY),
+    "rigid_body": Scene(
+        rigid_body, (0.0, 0.0, 1.0, *_ATTITUDE[0]), (1.0, 0.5, -0.2, *_ATTITUDE[1]), _BODY
+    ),
     "aircraft": Scene(
-        aircraft, (0.0, 0.0, 1.0, *_TURN[0]), (1.0, 0.5, -0.2, *_TURN[1]),
+        aircraft, (0.0, 0.0, 1.0, *_ATTITUDE[0]), (1.0, 0.5, -0.2, *_ATTITUDE[1]),
         {"m": 1.2, "J": np.array([0.2, 0.3, 0.5, 0.01, 0.03, -0.02]),
          "c": np.array([0.1, 0.02, -0.05]), "g": G},
     ),

@@ -113,7 +113,7 @@ class Run:
         return Errors(
             saves=saves,
             ends=np.array(list(self._ends(rtol, chosen))),
-            saves_there=saves[chosen],
+            saves_at_ends=saves[chosen],
             estimates=scaled(_state(*motion.error)[1:], exact, rtol, rtol),
             size=scaled(exact, exact, rtol, rtol),
             kappa=kappa,
@@ -122,10 +122,10 @@ class Run:
 
     def _ends(self, rtol: float, chosen: np.ndarray) -> Iterator[float]:
         """Scaled errors of motions that end at these save times."""
-        for row in chosen + 1:
-            last = row == len(self.reference.times) - 1
-            motion = self.to(rtol, until=-1 if last else int(row))
-            found, exact = _state(motion.q, motion.v)[-1], self.reference.y[row]
+        for save in chosen + 1:
+            last = save == len(self.reference.times) - 1
+            motion = self.to(rtol, until=-1 if last else int(save))
+            found, exact = _state(motion.q, motion.v)[-1], self.reference.y[save]
             yield float(scaled(found - exact, exact, rtol, rtol))
 
 

@@ -26,7 +26,7 @@ class Errors(NamedTuple):
     Attributes:
         saves: (s,), scaled errors at the save times of one motion.
         ends: (e,), scaled errors of motions that end at some of these times, where a step ends.
-        saves_there: (e,), the entries of `saves` at the times of `ends`.
+        saves_at_ends: (e,), the entries of `saves` at the times of `ends`.
         estimates: (s,), scaled estimates of the error by `jl.simulate`.
         size: (s,), |y / w|.
         kappa: (s,), growth of perturbations.
@@ -35,7 +35,7 @@ class Errors(NamedTuple):
 
     saves: np.ndarray
     ends: np.ndarray
-    saves_there: np.ndarray
+    saves_at_ends: np.ndarray
     estimates: np.ndarray
     size: np.ndarray
     kappa: np.ndarray
@@ -92,13 +92,13 @@ def _lower(error: float, above: bool, steps: int) -> str:
 
 
 def _saves_to_ends(errors: Errors) -> float:
-    return _largest(errors.saves_there) / _largest(errors.ends)
+    return _largest(errors.saves_at_ends) / _largest(errors.ends)
 
 
 def _estimates(errors: Errors) -> np.ndarray:
     """Estimate over error at all times with an error above rounding, the largest error last."""
-    seen = np.flatnonzero(~(errors.saves <= rounding(errors)))
-    order = seen[np.argsort(errors.saves[seen], kind="stable")]
+    above = np.flatnonzero(~(errors.saves <= rounding(errors)))
+    order = above[np.argsort(errors.saves[above], kind="stable")]
     return errors.estimates[order] / errors.saves[order]
 
 
@@ -115,9 +115,11 @@ def conclusions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[R
     below = [row for row in rows if row["lower"] == "below"]
     at_saves = [row for row in rows if (row["saves_to_ends"] or 0.0) > AT_SAVES]
     low, high = ESTIMATE
-    told = [row for row in rows if row["estimate_least"] is not None]
-    off = [row for row in told if not low <= row["estimate_least"] <= row["estimate_most"] <= high]
-    largest_off = [row for row in told if not low <= row["estimate_of_largest"] <= high]
+    estimated = [row for row in rows if row["estimate_least"] is not None]
+    off = [
+        row for row in estimated if not low <= row["estimate_least"] <= row["estimate_most"] <= high
+    ]
+    largest_off = [row for row in estimated if not low <= row["estimate_of_largest"] <= high]
     targets = [
         Target("rows beyond 10 kappa + floor", len(beyond), "<=", 0),
         Target("rows below 1e-3 of the tolerance", len(below), "<=", 0),
@@ -133,8 +135,8 @@ def conclusions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[R
 def _counts(rows: Sequence[Mapping[str, Any]]) -> list[Reference]:
     kinds = [row["lower"] for row in rows]
     return [
-        Reference(str(kinds.count(kind)), f"rows of {len(rows)}: {words}")
-        for kind, words in (
+        Reference(str(kinds.count(kind)), f"rows of {len(rows)}: {text}")
+        for kind, text in (
             ("within", "judged by the lower bound, and within it"),
             ("few steps", f"fewer than {STEPS} steps"),
             ("floor", "error within the floor of round-off"),

@@ -44,17 +44,17 @@ STEP = 0.01  # s
 METHOD = "dopri8"
 GAIN = 0.1 / STEP  # 1/s
 NONE, BAUMGARTE, PROJECTION = "none", "Baumgarte", "projection"
-STABILISATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
+STABILIZATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
 FORMULATIONS = ("multipliers", "null_space")
 QUASI = "quasi"
-STEPS, ROWS = 1_000_000, 1001
-QUICK_STEPS, QUICK_ROWS = 20_000, 201
+STEPS, SAVES = 1_000_000, 1001
+QUICK_STEPS, QUICK_SAVES = 20_000, 201
 
 Row = dict[str, Any]
 
 
 class Case(NamedTuple):
-    """One case; its fields are columns of the table."""
+    """One case; its fields are columns of the table and of stored runs."""
 
     mechanism: str
     formulation: str
@@ -64,7 +64,7 @@ class Case(NamedTuple):
 def cases(quick: bool) -> list[Case]:
     """All cases that are compared."""
     linkages, rolling = list(LINKAGES), list(ROLLING)
-    forms, ways = list(FORMULATIONS), list(STABILISATIONS)
+    forms, ways = list(FORMULATIONS), list(STABILIZATIONS)
     if quick:
         linkages, rolling, forms, ways = linkages[:1], rolling[:1], forms[:1], [NONE, PROJECTION]
     found = [Case(*each) for each in product(linkages, forms, ways)]
@@ -97,14 +97,14 @@ class Record(NamedTuple):
 
 def run(quick: bool) -> Report:
     """All cases: recorded one after the other, timed in turn."""
-    steps, rows = (QUICK_STEPS, QUICK_ROWS) if quick else (STEPS, ROWS)
+    steps, saves = (QUICK_STEPS, QUICK_SAVES) if quick else (STEPS, SAVES)
     compared = cases(quick)
     starts = LINKAGES | ROLLING
     mechanisms = {name: starts[name]() for name in dict.fromkeys(c.mechanism for c in compared)}
     calls, programs, records = {}, {}, {}
     for case in compared:
         mechanism = mechanisms[case.mechanism]
-        programs[case] = program = compiled(mechanism, case, steps, rows)
+        programs[case] = program = compiled(mechanism, case, steps, saves)
         calls[", ".join(case)] = call = partial(program.call, mechanism.q0, mechanism.v0)
         q, v = call()
         records[case] = record(mechanism, q, v, steps)
@@ -133,9 +133,9 @@ def against(case: Case) -> Case:
     return case._replace(stabilisation=NONE)
 
 
-def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program:
+def compiled(mechanism: Mechanism, case: Case, steps: int, saves: int) -> Program:
     """(q0, v0) -> (q, v) at times evenly over `steps` steps; nan after a failure."""
-    ts = np.linspace(0.0, steps * STEP, rows)
+    ts = np.linspace(0.0, steps * STEP, saves)
 
     def solve(q0: Array, v0: Array) -> tuple[Array, Array]:
         motion = jl.simulate(
@@ -148,7 +148,7 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
             dt=STEP,
             max_steps=steps + 1,  # step times are rounded: a short last step may remain
             formulation=case.formulation,
-            stabilization=STABILISATIONS[case.stabilisation],
+            stabilization=STABILIZATIONS[case.stabilisation],
             throw=False,
         )
         return motion.q, motion.v
@@ -159,7 +159,7 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
 def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
     """Record of states (q, v), the first at the start and the last after `steps` steps."""
 
-    def rows(q: Array, v: Array) -> tuple[Array, Array]:
+    def residuals(q: Array, v: Array) -> tuple[Array, Array]:
         position, velocity = mechanism.system.residuals(q, v, mechanism.params)
         rates = jnp.concatenate([jnp.ravel(x) for x in velocity.values()])
         if not position:  # rows without phi
@@ -169,8 +169,10 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
     @jax.jit
     @jax.vmap
     def each(q: Array, v: Array) -> tuple[Array, Array, Array]:
-        A = jax.jacfwd(lambda v: rows(q, v)[1])(v)
-        position, velocity = (jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in rows(q, v))
+        A = jax.jacfwd(lambda v: residuals(q, v)[1])(v)
+        position, velocity = (
+            jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in residuals(q, v)
+        )
         return position, velocity, mechanism.system.energy(q, v, mechanism.params)
 
     position, velocity, H = (np.asarray(x) for x in each(q, v))
@@ -215,13 +217,13 @@ def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
         drifts = {
             case: row["energy"] / found[against(case)]["energy"] for case, row in projected.items()
         }
-        for words, figure, bound in (
+        for label, figure, bound in (
             ("position residual with projection", _of(projected, "position"), 1e-12),
             ("velocity residual with projection", _of(projected, "velocity"), 1e-12),
             ("times the energy drift: projection as none", drifts, 1.0),
             ("times as long: a step with projection as none", _of(projected, "ratio"), 1.5),
         ):
-            targets.append(_worst(f"{words}, {formulation}", figure, bound))
+            targets.append(_worst(f"{label}, {formulation}", figure, bound))
     rolling = {case: row for case, row in found.items() if case.formulation == QUASI}
     if rolling:
         drifts = {
@@ -239,11 +241,11 @@ def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
     return targets, _references(found)
 
 
-def _worst(words: str, figure: Mapping[Case, float], bound: float) -> Target:
+def _worst(label: str, figure: Mapping[Case, float], bound: float) -> Target:
     """The target that no mechanism exceeds the bound, named after the worst one."""
     # nan is worse than any number.
     worst = max(figure, key=lambda case: np.nan_to_num(figure[case], nan=np.inf))
-    return Target(f"{words} ({worst.mechanism})", figure[worst], "<=", bound)
+    return Target(f"{label} ({worst.mechanism})", figure[worst], "<=", bound)
 
 
 def _of(rows: Mapping[Case, Row], column: str) -> dict[Case, float]:
@@ -252,7 +254,7 @@ def _of(rows: Mapping[Case, Row], column: str) -> dict[Case, float]:
 
 def _references(rows: Mapping[Case, Row]) -> list[Reference]:
     references = []
-    for stabilisation, column, words in (
+    for stabilization, column, label in (
         (NONE, "position", "position residual without stabilisation"),
         (NONE, "growth", "times that of the first tenth of the run: the same"),
         (BAUMGARTE, "position", "position residual with Baumgarte's damping"),
@@ -262,10 +264,10 @@ def _references(rows: Mapping[Case, Row]) -> list[Reference]:
         values = [
             row[column]
             for case, row in rows.items()
-            if case[2] == stabilisation and case.mechanism not in ROLLING
+            if case[2] == stabilization and case.mechanism not in ROLLING
         ]
         if not values:
             continue
         ends = [f"{x:.2g}" for x in (np.min(values), np.max(values))]
-        references.append(Reference(" to ".join(dict.fromkeys(ends)), words))
+        references.append(Reference(" to ".join(dict.fromkeys(ends)), label))
     return references

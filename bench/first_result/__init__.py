@@ -27,7 +27,7 @@ SMALL = ("simple pendulum", "double pendulum", "cart pendulum", "rotating body")
 LARGE = ("chain of 8", "chain of 12", "5 bodies", "network potential")
 SCENES = (*SMALL[:3], "quadcopter", SMALL[3], *LARGE)
 ROUNDS = 2
-ROWS = CASES[:2]
+SOLVES = CASES[:2]
 # Run by its path: as a module of this package it would import jax before the timing starts.
 ONE_PROCESS = str(Path(__file__).with_name("_one_process.py"))
 # Of final states, over 1 + their size. The tolerance is 1e-9 per step, and errors are amplified.
@@ -86,7 +86,7 @@ def _row(
     )
     run_ms = {side: min(r[side]["run_ms"] for r in rounds) for side in ("cold", "diffrax")}
     apart = _apart(cold["end"], diffrax["end"])
-    if case in ROWS and not apart <= APART:
+    if case in SOLVES and not apart <= APART:
         raise RuntimeError(f"{scene}: jaxlag and the equations by hand end {apart:.1e} apart")
     return {
         "scene": scene,
@@ -102,7 +102,7 @@ def _row(
         "run_ms": run_ms["cold"],
         "diffrax_run_ms": run_ms["diffrax"],
         "heyoka_run_ms": heyoka.get("run_ms"),
-        "apart": apart if case in ROWS else None,
+        "apart": apart if case in SOLVES else None,
         "rounds": len(rounds),
     }
 
@@ -123,11 +123,14 @@ def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[Refere
         ("the quadcopter", ("quadcopter",), (2.5, 4.0)),
         ("chains, bodies, a network", LARGE, (4.0, 8.0)),
     ):
-        for what, cases, bound in (("rows", ROWS, bounds[0]), ("a gradient", ("grad",), bounds[1])):
+        for what, cases, bound in (
+            ("rows", SOLVES, bounds[0]),
+            ("a gradient", ("grad",), bounds[1]),
+        ):
             if names & set(wanted):
                 found = _worst(rows, wanted, cases, lambda row: row["cold_s"])
                 targets.append(Target(f"s to the first result: {what}, {kind}", found, "<=", bound))
-    for what, cases, bound in (("rows", ROWS, 1.2), ("a gradient", ("grad",), 1.0)):
+    for what, cases, bound in (("rows", SOLVES, 1.2), ("a gradient", ("grad",), 1.0)):
         found = _worst(rows, SCENES, cases, lambda row: row["cold_s"] / row["diffrax_s"])
         claim = f"times as long to the first result as diffrax by hand: {what}"
         targets.append(Target(claim, found, "<=", bound))

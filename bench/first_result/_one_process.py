@@ -98,8 +98,8 @@ def _program(solve: Callable, y0: Any, params: Any, case: str) -> Callable[[], A
 
     starts = y0 * (1.0 + 1e-3 * jnp.linspace(-1.0, 1.0, LANES)[:, None])
     if case.endswith("rows"):
-        rows = jax.jit(lambda y0, params: solve(y0, params))
-        return lambda: rows(y0, params)[-1]
+        coordinates = jax.jit(lambda y0, params: solve(y0, params))
+        return lambda: coordinates(y0, params)[-1]
     program = jax.jit(
         {
             "grad": gradient,

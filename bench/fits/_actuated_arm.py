@@ -112,9 +112,9 @@ ARMS = jl.System(
 
 def recording(path: Path, columns: tuple[str, ...], torques: tuple[str, ...], every: int) -> Any:
     """One run: angles at every `every`-th sample, torques at all samples."""
-    rows = table(path)
-    t = rows["t"]
-    angles, torque = (np.stack([rows[x] for x in names], axis=1) for names in (columns, torques))
+    samples = table(path)
+    t = samples["t"]
+    angles, torque = (np.stack([samples[x] for x in names], axis=1) for names in (columns, torques))
     return jl.Experiment(
         t[::every],
         {"q": angles[::every]},

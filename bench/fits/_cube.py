@@ -50,30 +50,30 @@ def unit(t: Any, q: Array, p: Any) -> Array:
 SPEEDS = ("vx", "vy", "vz", "wx", "wy", "wz")
 CUBE = jl.System(
     lagrangian,
-    {"centre": (3,), "e": (4,)},
+    {"center": (3,), "e": (4,)},
     constraints=(jl.Holonomic(unit, "unit"),),
     quasi=jl.QuasiVelocities(kinematics=rates, names=SPEEDS),
     written_in="u",
 )
 
 
-def flight(rows: dict[str, np.ndarray]) -> int:
+def flight(samples: dict[str, np.ndarray]) -> int:
     """Number of samples of a toss before a corner is close to the board."""
-    e = np.stack([rows[x] for x in ("qw", "qx", "qy", "qz")], axis=1)
+    e = np.stack([samples[x] for x in ("qw", "qx", "qy", "qz")], axis=1)
     w, x, y, z = e.T
     third = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    lowest = rows["z"] - HALF * np.sum(np.abs(third), axis=0)
+    lowest = samples["z"] - HALF * np.sum(np.abs(third), axis=0)
     return int(np.argmax(np.append(lowest, 0.0) < CLEAR))
 
 
 def tosses(path: Path) -> list[jl.Experiment]:
     """Flights of all tosses, in the order of their numbers."""
     found = []
-    for number, rows in pieces(table(path / "contactnets_cube" / "tosses.csv.gz"), "toss").items():
-        n = flight(rows)
+    for number, toss in pieces(table(path / "contactnets_cube" / "tosses.csv.gz"), "toss").items():
+        n = flight(toss)
         if n < FEWEST:
             continue
-        own = {name: x[:n] for name, x in rows.items()}
+        own = {name: x[:n] for name, x in toss.items()}
         e = np.stack([own[x] for x in ("qw", "qx", "qy", "qz")], axis=1)
         # e and -e are the same attitude: choose the signs without jumps.
         e = (
@@ -82,12 +82,12 @@ def tosses(path: Path) -> list[jl.Experiment]:
                 :, None
             ]
         )
-        centre = np.stack([own[x] for x in "xyz"], axis=1)
+        center = np.stack([own[x] for x in "xyz"], axis=1)
         start = np.array([own[x][0] for x in SPEEDS])
-        q0 = np.concatenate([centre[0], e[0]])
+        q0 = np.concatenate([center[0], e[0]])
         found.append(
             jl.Experiment(
-                own["t"], {"centre": centre, "e": e}, q0=q0, v0=start, name=f"toss {number}"
+                own["t"], {"center": center, "e": e}, q0=q0, v0=start, name=f"toss {number}"
             )
         )
     return found
@@ -108,9 +108,9 @@ def measured(path: Path, quick: bool) -> Part:
     figures += estimates(name, model, found, OTHERS, "parabolas of z; a cube")
     predicted = found.predict(test)
     for what, residuals in (("training", found), ("test", predicted)):
-        centre, e = residuals.rms("centre"), residuals.rms("e")
+        center, e = residuals.rms("center"), residuals.rms("e")
         figures.append(
-            Figure(name, model, f"rms of {what}, centre", "mm", 1e3 * np.sqrt(centre @ centre))
+            Figure(name, model, f"rms of {what}, centre", "mm", 1e3 * np.sqrt(center @ center))
         )
         # A small rotation is twice the vector part of its quaternion.
         figures.append(

@@ -38,8 +38,8 @@ def table(path: Path) -> dict[str, np.ndarray]:
     """Columns of a gzipped CSV file by name; comments (#), then a line of names are at its top."""
     with gzip.open(path, "rt") as file:
         head = next(line for line in file if not line.startswith("#"))
-        rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    return dict(zip(head.strip().split(","), rows.T, strict=True))
+        samples = np.loadtxt(file, delimiter=",", ndmin=2)
+    return dict(zip(head.strip().split(","), samples.T, strict=True))
 
 
 def pieces(columns: dict[str, np.ndarray], by: str) -> dict[int, dict[str, np.ndarray]]:

@@ -153,9 +153,9 @@ def recordings(path: Path, arms: int, every: int) -> dict[int, jl.Experiment]:
     """Segments by number, sampled every `every` milliseconds."""
     columns = table(path / "multiarm_pendulum" / f"{NAMES[arms]}.csv.gz")
     found = {}
-    for number, rows in pieces(columns, "seg").items():
-        angles = np.stack([rows[f"theta{i + 1}"] for i in range(arms)], axis=1)
-        t = rows["t"][::every] - rows["t"][0]
+    for number, samples in pieces(columns, "seg").items():
+        angles = np.stack([samples[f"theta{i + 1}"] for i in range(arms)], axis=1)
+        t = samples["t"][::every] - samples["t"][0]
         name = f"segment {number}"
         found[number] = jl.Experiment(t, {"theta": angles[::every]}, name=name)
     return found

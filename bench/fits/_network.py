@@ -68,7 +68,7 @@ def measured(path: Path, quick: bool) -> Part:
         start = physics.params | {"net": network}
         return jl.fit(both, train, start, free=(*free, "net"), optimizer=descent, **options)
 
-    found, figures = timed(name, model, fit, turns=1)
+    found, figures = timed(name, model, fit, repeats=1)
     figures.append(Figure(name, model, "numbers trained", "1", float(len(found.names))))
 
     def compared(what: str, others: list[jl.Experiment]) -> Figure:

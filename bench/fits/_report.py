@@ -46,11 +46,11 @@ class Part(NamedTuple):
 
 
 def timed(
-    recording: str, model: str, fit: Callable[[], jl.FitResult], turns: int = 2
+    recording: str, model: str, fit: Callable[[], jl.FitResult], repeats: int = 2
 ) -> tuple[jl.FitResult, list[Figure]]:
     """A fit and its cost: run time with all programs compiled, and that of the first run."""
     seconds = []
-    for _ in range(turns):
+    for _ in range(repeats):
         begun = perf_counter()
         found = fit()
         seconds.append(perf_counter() - begun)
@@ -67,13 +67,13 @@ def estimates(
 ) -> list[Figure]:
     """Estimates with their 95 % intervals."""
     intervals = found.interval()
-    rows = []
+    figures = []
     for name, value in zip(found.names, found.values.tolist(), strict=True):
         low, high = intervals[name]
         other = others.get(name)
         own = None if other is None else whose
-        rows.append(Figure(recording, model, name, "SI", value, low, high, other, own))
-    return rows
+        figures.append(Figure(recording, model, name, "SI", value, low, high, other, own))
+    return figures
 
 
 def missed(prediction: jl.Prediction, channel: str) -> Float[np.ndarray, " k"]:
@@ -91,10 +91,10 @@ def errors(
     whose: str = "",
 ) -> list[Figure]:
     """Root mean squares of angles, given in rad, as figures in mrad; `others` are in mrad."""
-    rows = []
+    figures = []
     for i, value in enumerate(rms):
         other = others[i] if len(others) else None
         name = f"{quantity}, angle {i + 1}"
         own = None if other is None else whose
-        rows.append(Figure(recording, model, name, "mrad", 1e3 * value, None, None, other, own))
-    return rows
+        figures.append(Figure(recording, model, name, "mrad", 1e3 * value, None, None, other, own))
+    return figures

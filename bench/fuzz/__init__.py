@@ -104,8 +104,8 @@ def kind_of(seed: int) -> Kind:
         return QUASI_MOTION
     if ones == 9 and tens % 40 == 6:
         return LOOPED_MOTION
-    turns = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
-    return turns[ones]
+    kinds = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
+    return kinds[ones]
 
 
 def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:

@@ -43,16 +43,16 @@ def compared(mechanism: Mechanism) -> Compared:
         motion = _motion(mechanism, prepared, way, tolerance)
         status = jl.Status(int(motion.status)).name
         singular = quasi is not None and quasi.singular and way == "quasi"
-        due = "kinematics" if singular and outcome == "solution" else outcome
-        if due in NAMED:
-            right = NAMED[due] | (NAMED["kinematics"] if singular else set())
-            if due == "contradictory" and not _holds(mechanism, prepared):
+        expected = "kinematics" if singular and outcome == "solution" else outcome
+        if expected in NAMED:
+            right = NAMED[expected] | (NAMED["kinematics"] if singular else set())
+            if expected == "contradictory" and not _holds(mechanism, prepared):
                 right = right | {"inconsistent_start"}
             wrong = status not in right
-            found[f"{way}: {status} where rows or masses are {due}"] = np.inf if wrong else 0.0
+            found[f"{way}: {status} where rows or masses are {expected}"] = np.inf if wrong else 0.0
         elif status == "ok":
             ends[way] = _end(mechanism, motion)
-        elif _sound_there(mechanism, motion):
+        elif _solvable_at_end(mechanism, motion):
             found[f"{way}: {status} without need"] = np.inf
     if len(ends) == 2:
         one, other = ends.values()
@@ -102,11 +102,11 @@ def _end(mechanism: Mechanism, motion: jl.Solution) -> np.ndarray:
     return np.concatenate([q, v])
 
 
-def _sound_there(mechanism: Mechanism, motion: jl.Solution) -> bool:
+def _solvable_at_end(mechanism: Mechanism, motion: jl.Solution) -> bool:
     """Whether the equations at the end of the motion also have a solution for certain."""
     q, v = (tuple(map(float, np.asarray(x))) for x in motion.last_state[:2])
-    there: Any = mechanism._replace(t=float(motion.last_time), q=q, v=v)
+    ended: Any = mechanism._replace(t=float(motion.last_time), q=q, v=v)
     try:
-        return prepare(there, 1).equations.outcome == "solution"
+        return prepare(ended, 1).equations.outcome == "solution"
     except Unclear:
         return False

@@ -94,21 +94,21 @@ def prepare(mechanism: Mechanism, nudges: int) -> Prepared:
     given = [np.asarray(x, drawn.dtype).astype(float) for x in (mechanism.q, mechanism.v)]
     given += [np.asarray(values(drawn)[name]).astype(float) for name in ("a", "b")]
     state = State(*given)
-    still = State(*(0.0 * x for x in state))
-    written = jax.make_jaxpr(everything)(*state, *still)
+    zero = State(*(0.0 * x for x in state))
+    written = jax.make_jaxpr(everything)(*state, *zero)
 
     def run(state: State, dots: State, *noise: Any) -> tuple[Terms, Terms]:
         found = [np.asarray(x, float) for x in evaluated(written, [*state, *dots], *noise)]
         return Terms(*found[:5]), Terms(*found[5:])
 
-    here, _ = run(state, still)
+    here, _ = run(state, zero)
     void = np.array([row.role == "void" for row in mechanism.all_rows], bool)
     units = np.array(drawn.units)
     if not np.all(np.isfinite(here.A)) or not np.all(np.isfinite(here.b)):
         raise Unclear("terms that are not finite")
     state = state._replace(v=_consistent(mechanism, here, void, units))
-    here, _ = run(state, still)
-    near = [run(state.nudged(eps, rng), still, eps, rng)[0] for _ in range(NEARBY)]
+    here, _ = run(state, zero)
+    near = [run(state.nudged(eps, rng), zero, eps, rng)[0] for _ in range(NEARBY)]
     equations = Equations(here, void, eps, near)
     if equations.outcome == "singular" and all(drawn.masses):  # as inertias differ in size
         raise Unclear("inertia that nearly vanishes")
@@ -203,8 +203,8 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     """Functions of (t, q, v, params) that return a, or (a, lam), by name."""
     system = mechanism.system
     array = ArrayTerms(system.lagrangian, system.forces, system.constraints)
-    kept = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
-    choice = RowChoice(jnp.asarray(kept), jnp.asarray(~prepared.equations.void))
+    selected = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
+    choice = RowChoice(jnp.asarray(selected), jnp.asarray(~prepared.equations.void))
 
     def by(program: Any) -> Any:
         def a(t: Any, q: Any, v: Any, params: Any) -> Any:

@@ -20,8 +20,8 @@ _KINKED_ALSO = ("maximum", "minimum", "jnp.max(")
 
 
 def _smooth(templates: tuple[str, ...]) -> tuple[str, ...]:
-    words = (*_KINKED, *_KINKED_ALSO)
-    return tuple(x for x in templates if not any(word in x for word in words))
+    fragments = (*_KINKED, *_KINKED_ALSO)
+    return tuple(x for x in templates if not any(fragment in x for fragment in fragments))
 
 
 SMOOTH_ONE, SMOOTH_TWO = _smooth(ONE), _smooth(TWO)

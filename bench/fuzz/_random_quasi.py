@@ -30,7 +30,7 @@ class _Speeds(_Drawing):
     def by_u(self) -> tuple[Quasi, list[Row]]:
         """U with some constrained components, and rows that depend on these."""
         rng, n = self.rng, self.n
-        rows = [self.affine("v", i, self.units) for i in rng.permutation(n)]
+        parts = [self.affine("v", i, self.units) for i in rng.permutation(n)]
         bound = ()
         if n > 1 and rng.random() < 0.5:
             bound = tuple(sorted(rng.choice(n, size=int(rng.integers(1, n)), replace=False)))
@@ -41,24 +41,24 @@ class _Speeds(_Drawing):
             k, i = int(rng.choice(free)), int(rng.integers(n))
             off = f"((q[{i}] - {self.q[i]!r}) / {self.units[i]!r})"
             others = [j for j in range(n) if j != k]
-            like = f" + ({rows[int(rng.choice(others))]})" if others and rng.random() < 0.5 else ""
-            rows[k] = f"jnp.sin({off}) * ({rows[k]}){like}"
-        u = tuple(f"{self.factor()!r} * ({row})" for row in rows)
-        base = [Row("Pfaffian", f"({rows[k]})") for k in bound]
-        again = []
+            like = f" + ({parts[int(rng.choice(others))]})" if others and rng.random() < 0.5 else ""
+            parts[k] = f"jnp.sin({off}) * ({parts[k]}){like}"
+        u = tuple(f"{self.factor()!r} * ({part})" for part in parts)
+        base = [Row("Pfaffian", f"({parts[k]})") for k in bound]
+        dependent = []
         if base and rng.random() < 0.4:
-            again = [self.following(base)]
+            dependent = [self.following(base)]
         if rng.random() < 0.1:
-            again.append(Row("Pfaffian", self.void("Pfaffian"), "void"))
-        return Quasi(u, None, n, bound, "v", singular), again
+            dependent.append(Row("Pfaffian", self.void("Pfaffian"), "void"))
+        return Quasi(u, None, n, bound, "v", singular), dependent
 
     def square(self) -> tuple[Quasi, list[Row]]:
         """Kinematics without rows."""
         n = self.n
         order = self.rng.permutation(n)
-        rows = [f"{self.units[i]!r} * ({self.affine('u', i, self.units)})" for i in order]
-        rows = [rows[k] for k in np.argsort(order)]
-        return Quasi(None, f"jnp.stack([{', '.join(rows)}])", n), []
+        parts = [f"{self.units[i]!r} * ({self.affine('u', i, self.units)})" for i in order]
+        parts = [parts[k] for k in np.argsort(order)]
+        return Quasi(None, f"jnp.stack([{', '.join(parts)}])", n), []
 
     def tall(self) -> tuple[Quasi, list[Row]]:
         """Kinematics that satisfy the rows identically."""

@@ -135,15 +135,15 @@ class Drawn(NamedTuple):
         return "; ".join(source)
 
     @property
-    def push(self) -> Callable:
+    def generalized_force(self) -> Callable:
         """The generalized force as a function."""
-        rows = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
-        return function("t, q, v, params", f"jnp.stack([{rows}])".replace("p[", "params["))
+        components = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
+        return function("t, q, v, params", f"jnp.stack([{components}])".replace("p[", "params["))
 
     @property
     def forces(self) -> tuple[jl.GeneralizedForce, ...]:
         """The generalized force as declared."""
-        return (jl.GeneralizedForce(self.push, "push"),) if self.force else ()
+        return (jl.GeneralizedForce(self.generalized_force, "push"),) if self.force else ()
 
     @property
     def system(self) -> jl.System:

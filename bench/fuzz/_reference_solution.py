@@ -91,7 +91,7 @@ def terms_of(mechanism: Mechanism) -> Any:
 
         h = along(momentum) - jax.grad(L, 1)(t, q, v, p)
         if drawn.force:
-            h = h - drawn.push(t, q, v, p)
+            h = h - drawn.generalized_force(t, q, v, p)
         M = jax.jacfwd(momentum, 2)(t, q, v, p)
         A = jax.jacfwd(velocity, 2)(t, q, v, p)
         return Terms(M, h, A, velocity(t, q, 0.0 * v, p), along(velocity))
@@ -104,14 +104,14 @@ def units_of(M: np.ndarray, A: np.ndarray) -> np.ndarray:
     inertias = np.diagonal(M).copy()
     if np.any(inertias < 0):
         raise Unclear("inertias that are negative")
-    there = inertias > 0
-    if not np.all(there):
-        met = np.sum(np.where(there, A**2 / np.where(there, inertias, 1.0), 0.0), axis=1)
+    nonzero = inertias > 0
+    if not np.all(nonzero):
+        met = np.sum(np.where(nonzero, A**2 / np.where(nonzero, inertias, 1.0), 0.0), axis=1)
         square = np.sum(A**2, axis=1)
         alone = (np.sum(inertias) or 1.0) / np.where(square > 0, square, 1.0)
         weights = np.where(met > 0, 1.0 / np.where(met > 0, met, 1.0), alone)
-        lent = weights @ A**2
-        inertias = np.where(there, inertias, lent)
+        estimated = weights @ A**2
+        inertias = np.where(nonzero, inertias, estimated)
     return 1.0 / np.sqrt(np.where(inertias > 0, inertias, 1.0))
 
 

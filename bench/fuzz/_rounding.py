@@ -21,8 +21,8 @@ _CHOSEN = ("abs", "neg", "sign", "max", "min", "clamp", "floor", "round", "selec
 _REDUCED = ("reduce_max", "reduce_min", "cummax", "cummin")
 _MOVED = ("slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "stack")
 _MOVED_ALSO = ("unstack", "split", "pad", "rev", "tile", "gather", "scatter", "dynamic_slice")
-_KEPT = ("stop_gradient", "copy", "optimization_barrier", "iota", "convert_element_type")
-EXACT = {*_CHOSEN, *_REDUCED, *_MOVED, *_MOVED_ALSO, *_KEPT, "dynamic_update_slice", "expand_dims"}
+_EQUAL = ("stop_gradient", "copy", "optimization_barrier", "iota", "convert_element_type")
+EXACT = {*_CHOSEN, *_REDUCED, *_MOVED, *_MOVED_ALSO, *_EQUAL, "dynamic_update_slice", "expand_dims"}
 CALLS = {  # primitive: the name of its parameter with the called program
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -202,10 +202,10 @@ def _run(jaxpr: Any, consts: Any, args: Any, eps: float, rng: Any) -> list[Any]:
 def _scanned(eqn: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
     p = eqn.params
     fixed, carries = scan_sizes(p)
-    consts, carry, rows = given[:fixed], given[fixed : fixed + carries], given[fixed + carries :]
+    consts, carry, slices = given[:fixed], given[fixed : fixed + carries], given[fixed + carries :]
     written = []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
-        found = evaluated(p["jaxpr"], [*consts, *carry, *(x[k] for x in rows)], eps, rng)
+        found = evaluated(p["jaxpr"], [*consts, *carry, *(x[k] for x in slices)], eps, rng)
         carry = found[:carries]
         written.append(found[carries:])
     written = written[:: -1 if p["reverse"] else 1]

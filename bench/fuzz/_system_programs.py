@@ -51,13 +51,13 @@ def _number(drawn: Drawn) -> Any:
     return k if drawn.dtype == "float64" else jnp.asarray(k, drawn.dtype)
 
 
-def _reason(said: str) -> str:
+def _reason(reason: str) -> str:
     for known in ("random states to compare", "operations", "weighted sums"):
-        if known in said:
+        if known in reason:
             return f"not used: {known}"
-    if said.startswith("differs"):
+    if reason.startswith("differs"):
         return "not used: differs where it was compared"
-    return f"not used: {said.split(' at ')[0]}"
+    return f"not used: {reason.split(' at ')[0]}"
 
 
 def _judged(
@@ -77,8 +77,8 @@ def _judged(
             return program.acceleration(State(jnp.asarray(0.3), q, v, params, {})) / units
 
         def of(x: Any) -> dict[str, Any]:
-            value, push = jax.linearize(a, x)
-            slopes = jax.vmap(push, out_axes=1)(jnp.eye(x.size, dtype=dtype))
+            value, jvp_fn = jax.linearize(a, x)
+            slopes = jax.vmap(jvp_fn, out_axes=1)(jnp.eye(x.size, dtype=dtype))
             found = {"a": value} | {name: slopes[:, part] for name, part in parts.items()}
             if drawn.second:
                 along = jnp.zeros_like(x).at[:n].set(jnp.linspace(0.5, 1.0, n, dtype=dtype))

@@ -85,10 +85,10 @@ def contenders(name: str) -> dict[str, tuple[Equations, bool]]:
 
         if name in _sympy.LAGRANGIANS:
             forms = _sympy.forms(name, scene)
-            peers |= {f"sympy {words}": equations for words, equations in forms.items()}
+            peers |= {f"sympy {label}": equations for label, equations in forms.items()}
     if len(scene.q0) > 2:
-        peers |= {f"{words}, called": _rk4.called(peer) for words, peer in peers.items()}
-    return found | {words: (peer, True) for words, peer in peers.items()}
+        peers |= {f"{label}, called": _rk4.called(peer) for label, peer in peers.items()}
+    return found | {label: (peer, True) for label, peer in peers.items()}
 
 
 def accelerations(name: str, chosen: Mapping[str, tuple[Equations, bool]]) -> dict[str, np.ndarray]:
@@ -96,11 +96,11 @@ def accelerations(name: str, chosen: Mapping[str, tuple[Equations, bool]]) -> di
     scene = SCENES[name]
     q, v = np.array(scene.q0) + 0.1, np.array(scene.v0) + 0.1 * np.arange(1, len(scene.q0) + 1)
     params, found = _params(scene), {}
-    for words, (equations, scalar) in chosen.items():
+    for label, (equations, scalar) in chosen.items():
         a = jax.jit(lambda q, v, p, equations=equations: equations(p)(q, v))(
             _rk4.parts(q, scalar), _rk4.parts(v, scalar), params
         )
-        found[words] = np.concatenate([np.atleast_1d(x) for x in a])
+        found[label] = np.concatenate([np.atleast_1d(x) for x in a])
     return found
 
 
@@ -109,9 +109,9 @@ def evaluation(name: str, quick: bool) -> list[Row]:
     scene, chosen = SCENES[name], contenders(name)
     errors = _agreed(name, accelerations(name, chosen), dict.fromkeys(chosen, AGREEMENT))
     calls, rows = {}, {}
-    for words, (equations, scalar) in chosen.items():
-        calls[words], cost = _timed(scene, equations, scalar, STEPS)
-        rows[words] = {"error": errors[words], **cost}
+    for label, (equations, scalar) in chosen.items():
+        calls[label], cost = _timed(scene, equations, scalar, STEPS)
+        rows[label] = {"error": errors[label], **cost}
     rows["jaxlag"]["operations"] = _rk4.operations(scene, "scalar")
     samples = interleaved(calls, 3 if quick else 10, 0.3 if quick else 2.0)
     lanes = dict.fromkeys(calls, _rk4.STAGES * STEPS)
@@ -123,17 +123,17 @@ def chain(n: int, quick: bool) -> list[Row]:
     name, scene, steps = f"chain_{n}", links(n), STEPS // n
     q, v = np.array(scene.q0), np.linspace(0.5, -0.4, n)
     calls, rows, values, lanes = {}, {}, {}, {}
-    for words, lowering in (("jaxlag", "auto"), ("array", "array")):
-        calls[words], cost = _timed(scene, *_rk4.by_jaxlag(scene, lowering), steps)
-        rows[words], lanes[words] = {**cost}, _rk4.STAGES * steps
-        rows[words]["operations"] = _rk4.operations(scene, lowering)
-        values[words] = np.asarray(_rk4.system(scene, lowering).acceleration(q, v, scene.params))
-    for words, peer in _chains.neighbours(scene, steps).items():
-        calls[words], rows[words], lanes[words] = peer.call, {}, peer.evaluations
-        values[words] = peer.acceleration(q, v)
+    for label, lowering in (("jaxlag", "auto"), ("array", "array")):
+        calls[label], cost = _timed(scene, *_rk4.by_jaxlag(scene, lowering), steps)
+        rows[label], lanes[label] = {**cost}, _rk4.STAGES * steps
+        rows[label]["operations"] = _rk4.operations(scene, lowering)
+        values[label] = np.asarray(_rk4.system(scene, lowering).acceleration(q, v, scene.params))
+    for label, peer in _chains.libraries(scene, steps).items():
+        calls[label], rows[label], lanes[label] = peer.call, {}, peer.evaluations
+        values[label] = peer.acceleration(q, v)
     bounds = dict.fromkeys(calls, PEER_AGREEMENT) | {"jaxlag": AGREEMENT}
-    for words, error in _agreed(name, values, bounds).items():
-        rows[words]["error"] = error
+    for label, error in _agreed(name, values, bounds).items():
+        rows[label]["error"] = error
     samples = interleaved(calls, 3 if quick else 6, 0.5 if quick else 3.0)
     return _finished("chain", name, scene, rows, samples, lanes)
 
@@ -154,10 +154,10 @@ def _agreed(
     """Relative differences from the array program; raises an error if one is too large."""
     expected = values["array"]
     size = np.max(np.abs(expected))
-    errors = {words: float(np.max(np.abs(a - expected)) / size) for words, a in values.items()}
-    for words, error in errors.items():
-        if not error <= bounds[words]:
-            raise RuntimeError(f"{name}: accelerations of '{words}' are off by {error:.1e}")
+    errors = {label: float(np.max(np.abs(a - expected)) / size) for label, a in values.items()}
+    for label, error in errors.items():
+        if not error <= bounds[label]:
+            raise RuntimeError(f"{name}: accelerations of '{label}' are off by {error:.1e}")
     return errors
 
 
@@ -172,16 +172,16 @@ def _finished(
     own = min(samples["jaxlag"]) / lanes["jaxlag"]
     fixed = {"part": part, "system": name, "n": len(scene.q0)}
     return [
-        _row(**fixed, contender=words, ratio=min(taken) / lanes[words] / own, **rows[words],
-             **spread(taken, "us", lanes[words]))
-        for words, taken in samples.items()
+        _row(**fixed, contender=label, ratio=min(taken) / lanes[label] / own, **rows[label],
+             **spread(taken, "us", lanes[label]))
+        for label, taken in samples.items()
     ]  # fmt: skip
 
 
-def compilation(name: str, scene: Scene, turns: int) -> Row:
+def compilation(name: str, scene: Scene, repeats: int) -> Row:
     """The shortest compilation of a solve from new functions; nothing is run."""
     best = None
-    for _ in range(turns):
+    for _ in range(repeats):
         jax.clear_caches()
         fresh = scene._replace(lagrangian=lambda t, q, v, p: scene.lagrangian(t, q, v, p))
         system, ts = _rk4.system(fresh), np.array([0.0, 1.0])
@@ -216,8 +216,8 @@ def solves(quick: bool) -> list[Row]:
     rows = []
     for setting, all_facts in known.items():
         facts = {key: value for key, value in all_facts.items() if key in COLUMNS}
-        words = f"setting {setting}, tolerance {all_facts['tolerance']:g}"
+        label = f"setting {setting}, tolerance {all_facts['tolerance']:g}"
         times = spread(samples[setting, "solve"], "us")
-        rows.append(_row(part="solve", system="double_pendulum", n=2, contender=words,
+        rows.append(_row(part="solve", system="double_pendulum", n=2, contender=label,
                          **facts, **times))  # fmt: skip
     return rows

@@ -103,7 +103,7 @@ def top(p: Any) -> Field:
     I1, I2, I3 = (p["I"][i] for i in range(3))
     weight = p["m"] * p["g"] * p["l"]
     k1, k2, k3 = (I2 - I3) / I1, (I3 - I1) / I2, (I1 - I2) / I3
-    pull1, pull2 = weight / I1, weight / I2
+    gravity1, gravity2 = weight / I1, weight / I2
 
     def field(q: Parts, v: Parts) -> Parts:
         s, c = jnp.sin(q[1]), jnp.cos(q[1])
@@ -114,7 +114,7 @@ def top(p: Any) -> Field:
         w2 = level * cP - nutation * sP
         w3 = c_rate + spin
         up = s * sP, s * cP  # the vertical in body axes
-        d1, d2 = k1 * w2 * w3 + pull1 * up[1], k2 * w3 * w1 - pull2 * up[0]
+        d1, d2 = k1 * w2 * w3 + gravity1 * up[1], k2 * w3 * w1 - gravity2 * up[0]
         a = (sP * d1 + cP * d2 + nutation * (spin - c_rate)) / s
         b = cP * d1 - sP * d2 - spin * level
         return [a, b, k3 * w1 * w2 - a * c + level * nutation]
@@ -131,7 +131,7 @@ def _angles(q: Parts, v: Parts) -> tuple[Any, Any]:
     return (sT, cT, sF, cF), rates
 
 
-def _turned(v: Parts, angles: Any, d: Sequence[Array]) -> list[Array]:
+def _angle_accelerations(v: Parts, angles: Any, d: Sequence[Array]) -> list[Array]:
     """Second derivatives of the angles from those of the body rates."""
     sT, cT, sF, cF = angles
     yaw, pitch, roll = v[3:]
@@ -148,7 +148,7 @@ def rigid_body(p: Any) -> Field:
     def field(q: Parts, v: Parts) -> Parts:
         angles, (w1, w2, w3) = _angles(q, v)
         d = k1 * w2 * w3, k2 * w3 * w1, k3 * w1 * w2
-        return [zero, zero, fall, *_turned(v, angles, d)]
+        return [zero, zero, fall, *_angle_accelerations(v, angles, d)]
 
     return field
 
@@ -163,9 +163,9 @@ def aircraft(p: Any) -> Field:
     )
     xy, xz, yz = xy + m * c[0] * c[1], xz + m * c[0] * c[2], yz + m * c[1] * c[2]
     J = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-    rows = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
-    per_det = 1.0 / _dot(J[0], rows[0])
-    inverse = [[x * per_det for x in row] for row in rows]
+    adjugate = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
+    per_det = 1.0 / _dot(J[0], adjugate[0])
+    inverse = [[x * per_det for x in row] for row in adjugate]
 
     def field(q: Parts, v: Parts) -> Parts:
         angles, w = _angles(q, v)
@@ -177,7 +177,7 @@ def aircraft(p: Any) -> Field:
         # R = Rz Ry Rx, one rotation after the other.
         y, z = cF * y - sF * z, sF * y + cF * z
         x, z = cT * x + sT * z, cT * z - sT * x
-        return [sP * y - cP * x, -sP * x - cP * y, -g - z, *_turned(v, angles, d)]
+        return [sP * y - cP * x, -sP * x - cP * y, -g - z, *_angle_accelerations(v, angles, d)]
 
     return field
 

@@ -63,13 +63,13 @@ def called(equations: Equations) -> Equations:
         field = equations(params)
 
         @jax.jit
-        def row(state: Array) -> Array:
+        def evaluate(state: Array) -> Array:
             q, v = jnp.split(state, 2)
             return jnp.stack(field(_elements(q), _elements(v)))
 
         def call(q: Parts, v: Parts) -> Parts:
             with set_xla_metadata(inlineable="false"):
-                return _elements(row(jnp.stack([*q, *v])))
+                return _elements(evaluate(jnp.stack([*q, *v])))
 
         return call
 

@@ -106,7 +106,7 @@ def symmetric_top(s: Model) -> sp.Expr:
     return T - m * g * rod * sp.cos(s.q[1])
 
 
-def _turn(axis: int, angle: Any) -> sp.Matrix:
+def _rotation(axis: int, angle: Any) -> sp.Matrix:
     """Rotation by `angle` about an axis, body to space."""
     s, c = sp.sin(angle), sp.cos(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -123,14 +123,14 @@ def _rates(s: Model, R: sp.Matrix) -> sp.Matrix:
 
 
 def top(s: Model) -> sp.Expr:
-    R = _turn(2, s.q[0]) * _turn(0, s.q[1]) * _turn(2, s.q[2])
+    R = _rotation(2, s.q[0]) * _rotation(0, s.q[1]) * _rotation(2, s.q[2])
     w = _rates(s, R)
     T = sum(moment * rate**2 for moment, rate in zip(s.p["I"], w, strict=True)) / 2
     return T - s.p["m"] * s.p["g"] * s.p["l"] * R[2, 2]
 
 
 def _yaw_pitch_roll(s: Model) -> sp.Matrix:
-    return _turn(2, s.q[3]) * _turn(1, s.q[4]) * _turn(0, s.q[5])
+    return _rotation(2, s.q[3]) * _rotation(1, s.q[4]) * _rotation(0, s.q[5])
 
 
 def rigid_body(s: Model) -> sp.Expr:
@@ -171,10 +171,10 @@ LAGRANGIANS: Mapping[str, Callable[[Model], sp.Expr]] = {
 def forms(name: str, scene: Scene) -> dict[str, Equations]:
     """The equations as derived, and simplified versions if sympy takes at most `PATIENCE_S`."""
     found = {"as derived": _equations(name, scene, _same, _same)}
-    for words, tidy, last in (("trigsimp in L", _tidy, _same), ("trigsimp", _tidy, _tidy)):
+    for label, tidy, last in (("trigsimp in L", _tidy, _same), ("trigsimp", _tidy, _tidy)):
         try:
             with _time_limit(PATIENCE_S):
-                found[words] = _equations(name, scene, tidy, last)
+                found[label] = _equations(name, scene, tidy, last)
         except TimeoutError:
             break
     return found

@@ -17,7 +17,7 @@ import jaxlag as jl
 from bench.stability._long_runs import ARMS
 from bench.stability._rows import Found, Rows, names
 
-SPAN, ROWS, COUNT = 22.0, 441, 8
+SPAN, SAVES, COUNT = 22.0, 441, 8
 TOLERANCES = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 LOST = 1e-2  # rad
 
@@ -27,7 +27,7 @@ rows = Rows()
 def solved_to(tolerance: float, method: str) -> jl.Solution:
     """The eight motions."""
     q0 = jnp.asarray(np.random.default_rng(5).uniform(1.8, 2.6, (COUNT, 2)))
-    ts = np.linspace(0.0, SPAN, ROWS)
+    ts = np.linspace(0.0, SPAN, SAVES)
     options: dict[str, Any] = {
         "rtol": tolerance,
         "atol": tolerance,
@@ -85,15 +85,15 @@ class Held(NamedTuple):
 def held(method: str) -> Held:
     """Horizons, s, and largest errors before them, divided by tolerance and growth."""
     true = exact()
-    ts, statuses = np.linspace(0.0, SPAN, ROWS), true.statuses
+    ts, statuses = np.linspace(0.0, SPAN, SAVES), true.statuses
     horizons, errors = [], []
     for tolerance in TOLERANCES:
         motions = solved_to(tolerance, method)
         off = np.abs(np.asarray(motions.q) - true.q)
         lost = np.max(off, -1) > LOST
-        first = np.where(np.any(lost, 1), np.argmax(lost, 1), ROWS - 1)
+        first = np.where(np.any(lost, 1), np.argmax(lost, 1), SAVES - 1)
         over = np.max(off / (tolerance * (1.0 + np.abs(true.q))), -1) / true.kappa
-        before = np.arange(ROWS) < first[:, None]
+        before = np.arange(SAVES) < first[:, None]
         horizons.append(ts[first])
         errors.append(np.max(np.where(before, over, 0.0), 1))
         statuses = statuses + names(motions.status)

@@ -66,9 +66,9 @@ def bob_starts(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Thrown sideways."""
     random = np.random.default_rng(3)
     angle, rate = random.uniform(0.6, 1.0, count), random.uniform(0.5, 1.0, count)
-    still = np.zeros(count)
-    q = np.stack([np.sin(angle), still, -np.cos(angle)], 1)
-    return q, np.stack([still, np.sin(angle) * rate, still], 1)
+    zero = np.zeros(count)
+    q = np.stack([np.sin(angle), zero, -np.cos(angle)], 1)
+    return q, np.stack([zero, np.sin(angle) * rate, zero], 1)
 
 
 class Long(NamedTuple):

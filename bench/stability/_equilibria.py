@@ -203,7 +203,7 @@ row("slider-cranks", 3, slider_potential, slider_open, slider)
 def joints(q: Array, params: Any) -> tuple[Array, Array, Array]:
     """Joints of the four-bar, the point on its coupler, joints of the dyad."""
     loop = tips(q[:3], params | {"l": params["l"][:3]})
-    at = loop[0] + params["arm"] * direction(q[1] + params["turn"])
+    at = loop[0] + params["arm"] * direction(q[1] + params["bend"])
     return loop, at, at + tips(q[3:], params | {"l": params["l"][3:]})
 
 
@@ -222,11 +222,11 @@ def six_potential(t: Any, q: Array, params: Any) -> Array:
 def six(rng: np.random.Generator) -> Linkage:
     four, q = chain(3)(rng)
     lengths = np.append(four["l"], rng.uniform(0.3, 1.5, 2))
-    arm, (turn, d, e) = rng.uniform(0.2, 1.0), rng.uniform(-np.pi, np.pi, 3)
-    at = lengths[0] * direction(q[0], np) + arm * direction(q[1] + turn, np)
+    arm, (bend, d, e) = rng.uniform(0.2, 1.0), rng.uniform(-np.pi, np.pi, 3)
+    at = lengths[0] * direction(q[0], np) + arm * direction(q[1] + bend, np)
     h = at + lengths[3:] @ direction(np.array([d, e]), np)
     k = rng.uniform(0, 1) * rng.choice([0, 10.0, 100.0])
-    params = {"l": lengths, "arm": arm, "turn": turn, "g": four["g"], "h": h, "k": k}
+    params = {"l": lengths, "arm": arm, "bend": bend, "g": four["g"], "h": h, "k": k}
     params |= {"m": 10 ** rng.uniform(-1, 1, 4), "anchor": rng.uniform(-2, 2, 2)}
     return Linkage(params, np.array([*q, d, e]))
 

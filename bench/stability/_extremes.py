@@ -22,8 +22,8 @@ rows = Rows()
 
 def driven(t: Any, q: Array, v: Array, params: Any) -> Array:
     """An oscillator driven by the force cos(w (t - t0))."""
-    push = jnp.cos(params["w"] * (t - params["t0"]))
-    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2 + push * q[0]
+    force = jnp.cos(params["w"] * (t - params["t0"]))
+    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2 + force * q[0]
 
 
 DRIVEN = jl.System(driven, ("x",))

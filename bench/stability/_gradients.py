@@ -166,8 +166,8 @@ def past_lock(quick: bool) -> Found:
 # 1e-11 per step over some dozen steps.
 @rows.row("gradient through gimbal lock, quaternions", "error of dR", 1e-9)
 def quaternions(quick: bool) -> Found:
-    still = [1.0, 0.0, 0.0, 0.0]
-    return turning(QUATERNION, still, np.array([0.0, 1.0, 0.0]), jl.rotation.quaternion)
+    identity = [1.0, 0.0, 0.0, 0.0]
+    return turning(QUATERNION, identity, np.array([0.0, 1.0, 0.0]), jl.rotation.quaternion)
 
 
 # Errors of the difference, h^4 and 1e-12 / h: 1e-8 each.

@@ -59,22 +59,22 @@ BOBS = jl.System(
 )
 
 
-def well_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def well_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Starts inside the well; its rim has the energy 1/6."""
     random = np.random.default_rng(1)
-    q = random.uniform(-0.25, 0.25, (count, 2)) + apart
+    q = random.uniform(-0.25, 0.25, (count, 2)) + offset
     return q, random.uniform(-0.2, 0.2, (count, 2))
 
 
-def small_arm_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def small_arm_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Starts of regular motions about the lowest position."""
     random = np.random.default_rng(2)
-    return random.uniform(-0.3, 0.3, (count, 2)) + apart, np.zeros((count, 2))
+    return random.uniform(-0.3, 0.3, (count, 2)) + offset, np.zeros((count, 2))
 
 
-def bob_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def bob_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """The same starts of free points."""
-    q, _ = small_arm_starts(count, apart)
+    q, _ = small_arm_starts(count, offset)
     first = np.stack([np.sin(q[:, 0]), -np.cos(q[:, 0])], 1)
     second = np.stack([np.sin(q[:, 1]), -np.cos(q[:, 1])], 1)
     return np.concatenate([first, first + second], 1), np.zeros((count, 4))
@@ -96,9 +96,9 @@ def solved(system: jl.System, starts: Any, ts: np.ndarray, method: str, dt: floa
 def kepler_starts(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(q0, v0, eccentricities) at the pericenter, semi-major axis 1, in random directions."""
     random = np.random.default_rng(3)
-    e, turn = random.uniform(0.05, 0.15, count), random.uniform(0, 2 * np.pi, count)
-    along = np.stack([np.cos(turn), np.sin(turn)], 1)
-    across = np.stack([-np.sin(turn), np.cos(turn)], 1)
+    e, angle = random.uniform(0.05, 0.15, count), random.uniform(0, 2 * np.pi, count)
+    along = np.stack([np.cos(angle), np.sin(angle)], 1)
+    across = np.stack([-np.sin(angle), np.cos(angle)], 1)
     return (1 - e)[:, None] * along, np.sqrt((1 + e) / (1 - e))[:, None] * across, e
 
 
@@ -148,19 +148,19 @@ QUICK_ORBITS = 30_000
 @cache
 def wandering(method: str, quick: bool) -> Wandering:
     """Orbits with steps so short that only rounding errors remain."""
-    turn, steps, whole = ORBITS[method]
+    per_revolution, steps, whole = ORBITS[method]
     steps, count = (QUICK_ORBITS, 32) if quick else (steps, 128)
-    part = turn if whole else 1
-    rows = np.unique((np.geomspace(steps / 100, steps, 15) / part).round()).astype(int) * part
+    part = per_revolution if whole else 1
+    saves = np.unique((np.geomspace(steps / 100, steps, 15) / part).round()).astype(int) * part
     q0, v0, e = kepler_starts(count)
-    dt = 2 * np.pi / turn
-    ts = np.concatenate([[0.0], rows * dt])
+    dt = 2 * np.pi / per_revolution
+    ts = np.concatenate([[0.0], saves * dt])
     motions = solved(ORBIT, (q0, v0), ts, method, dt)
     energy, q, v = (np.asarray(x) for x in (motions.energy, motions.q, motions.v))
     behind = np.sum((q - kepler(q0, v0, e, ts)) * v, -1) / np.sum(v**2, -1)
     spin = q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0]
     energy, behind, spin = ((x - x[:, :1])[:, 1:] for x in (energy, behind, spin))
-    return Wandering(rows, energy, behind, spin, names(motions.status))
+    return Wandering(saves, energy, behind, spin, names(motions.status))
 
 
 def power(method: str, quick: bool, what: str, expected: float) -> Found:
@@ -220,13 +220,13 @@ def reversal(system: jl.System, starts: Callable, method: str, dt: float, steps:
     """
     q0, v0 = starts(8)
     span = np.array([0.0, steps * dt])
-    there = solved(system, (q0, v0), span, method, dt)
-    beside = solved(system, starts(8, 1e-8), span, method, dt)
-    growth = 1.0 + np.max(np.abs(np.asarray(beside.q - there.q)[:, -1]), 1) / 1e-8
-    back = solved(system, (there.q[:, -1], there.v[:, -1]), span[::-1], method, dt)
+    forward = solved(system, (q0, v0), span, method, dt)
+    perturbed = solved(system, starts(8, 1e-8), span, method, dt)
+    growth = 1.0 + np.max(np.abs(np.asarray(perturbed.q - forward.q)[:, -1]), 1) / 1e-8
+    back = solved(system, (forward.q[:, -1], forward.v[:, -1]), span[::-1], method, dt)
     error = np.max(np.abs(np.asarray(back.q)[:, -1] - q0), 1) / growth
     details = f"growth {np.min(growth):.3g} to {np.max(growth):.3g}"
-    return Found(float(np.max(error) / EPS), names(there.status) + names(back.status), details)
+    return Found(float(np.max(error) / EPS), names(forward.status) + names(back.status), details)
 
 
 # A random walk forward and backward: 0.3 eps of the largest coordinate, times the square root of

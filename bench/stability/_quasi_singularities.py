@@ -158,10 +158,10 @@ def swings(low: float, high: float, beyond: int) -> Draw:
 
     def draw(rng: np.random.Generator, count: int) -> Starts:
         size = np.pi / 2 + beyond * 10 ** rng.uniform(low, high, count)
-        turn = rng.uniform(-1.2, 1.2, count)
+        phase = rng.uniform(-1.2, 1.2, count)
         vx = rng.choice([-1, 1], count) * rng.uniform(0.5, 2, count)
-        q0 = np.stack([np.zeros(count), size * np.sin(turn)], axis=1)
-        v0 = np.stack([vx, size * np.cos(turn)], axis=1)
+        q0 = np.stack([np.zeros(count), size * np.sin(phase)], axis=1)
+        v0 = np.stack([vx, size * np.cos(phase)], axis=1)
         return Starts(q0, v0, rng.uniform(np.pi, 8, count))
 
     return draw
@@ -231,9 +231,9 @@ def steered(rng: np.random.Generator, count: int) -> Starts:
     front = rng.choice([-1, 1], count) * rng.uniform(0.3, 1.5, count)
     zero, rear = np.zeros(count), front * np.cos(steer)
     along = [rear * np.cos(yaw), rear * np.sin(yaw), front * np.sin(steer) / PARAMS["l"]]
-    turn = rng.choice([-1, 1], count) * rng.uniform(1, 4, count)
+    steer_rate = rng.choice([-1, 1], count) * rng.uniform(1, 4, count)
     q0 = np.stack([zero, zero, yaw, steer], axis=1)
-    return Starts(q0, np.stack([*along, turn], axis=1), rng.uniform(1, 4, count))
+    return Starts(q0, np.stack([*along, steer_rate], axis=1), rng.uniform(1, 4, count))
 
 
 def by_front_speed(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
@@ -307,7 +307,7 @@ point = jl.System(
 )
 
 
-def seen(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
+def spherical_state(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
     """(q, v) of a point at (x, y, z) that moves along x; y >= 0, and x < 0 beyond the pole."""
     aside = np.where(y > 0, np.hypot(x, y), x)
     r, along = np.hypot(aside, z), speed * x / aside
@@ -324,19 +324,19 @@ def lines(low: float | None = None, high: float = 0.0) -> Draw:
         side = np.zeros(count) if low is None else z * 10 ** rng.uniform(low, high, count)
         speed = -rng.uniform(0.5, 2, count)
         span = -x / speed * rng.uniform(0.7, 2.5, count)
-        return Starts(*seen(x, side, z, speed), span)
+        return Starts(*spherical_state(x, side, z, speed), span)
 
     return draw
 
 
-def onwards(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
+def after_straight_line(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
     (r, theta, phi), (out, south, east) = q0.T, v0.T
     aside, z = r * np.sin(theta), r * np.cos(theta)
     along = out * np.sin(theta) + r * south * np.cos(theta)
     x, y = aside * np.cos(phi), aside * np.sin(phi)
     speed = along * np.cos(phi) - aside * east * np.sin(phi)
-    return seen(x + speed * span, y, z, speed)
+    return spherical_state(x + speed * span, y, z, speed)
 
 
-row("past the pole", point, lines())(onwards)
-row("beside the pole", point, lines(-2, 0), clear=True)(onwards)
+row("past the pole", point, lines())(after_straight_line)
+row("beside the pole", point, lines(-2, 0), clear=True)(after_straight_line)

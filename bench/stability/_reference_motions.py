@@ -27,8 +27,8 @@ def double_pendulum(
     def rate(_: float, y: np.ndarray) -> np.ndarray:
         (q1, q2), (w1, w2) = y[:2], y[2:]
         s, c = np.sin(q1 - q2), np.cos(q1 - q2)
-        push = m * s * (w2**2 + c * w1**2) + (1.0 + m) * G * np.sin(q1) - m * c * G * np.sin(q2)
-        a1 = -push / (1.0 + m * s**2)
+        torque = m * s * (w2**2 + c * w1**2) + (1.0 + m) * G * np.sin(q1) - m * c * G * np.sin(q2)
+        a1 = -torque / (1.0 + m * s**2)
         return np.array([w1, w2, a1, s * w1**2 - G * np.sin(q2) - c * a1])
 
     start = np.zeros(4, complex)

@@ -82,9 +82,9 @@ def verdict(case: Case, found: Found) -> str:
     "within" and "named" are expected results. "failed" is a status other than ok that is not among
     the expected ones. "silent" is a wrong result with the status ok.
     """
-    bad = sorted(set(found.statuses) - {OK})
-    if bad:
-        return "named" if set(bad) <= set(case.statuses) else "failed"
+    failures = sorted(set(found.statuses) - {OK})
+    if failures:
+        return "named" if set(failures) <= set(case.statuses) else "failed"
     if not found.figure <= case.bound:
         return "silent"
     return "within"

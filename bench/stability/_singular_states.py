@@ -34,9 +34,9 @@ rows = Rows()
 # Errors of 1e-12 per step grow with t and, by the period, with (1 - e)^-2: 1e-12 * 60 * 1e4.
 @rows.row("Kepler, e = 0.99", "error of q", 1e-6)
 def eccentric(quick: bool) -> Found:
-    e, turns = 0.99, 2 if quick else 10
+    e, revolutions = 0.99, 2 if quick else 10
     q0, v0 = np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
-    t = np.array([0.0, turns * 2 * np.pi + 2.0])
+    t = np.array([0.0, revolutions * 2 * np.pi + 2.0])
     exact = kepler(q0[None], v0[None], np.array([e]), t)[0, -1]
     return difference(run(ORBIT, q0, v0, t, {}, **TIGHT), exact)
 
@@ -134,7 +134,7 @@ def spinning(t: Any, q: Array, u: Array, params: Any) -> Array:
     return 0.5 * params["I"] @ u**2
 
 
-def still(t: Any, q: Array, params: Any) -> Array:
+def zero_potential(t: Any, q: Array, params: Any) -> Array:
     return jnp.zeros_like(q[0])
 
 
@@ -176,17 +176,17 @@ def attitude(map_: Any, motion: jl.Solution) -> np.ndarray:
 # angle is t, so every method is exact with any steps.
 @rows.row("through gimbal lock, angles", "error of R", 1e-6, LOCK)
 def through_lock(quick: bool) -> Found:
-    return turned(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0))
+    return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0))
 
 
 # The tenth step ends at gimbal lock, where the rates of the angles are undefined.
 @rows.row("a step that ends in gimbal lock, angles", "error of R", 1e-6, LOCK)
 def into_lock(quick: bool) -> Found:
     options = {"method": "dopri8", "dt": np.pi / 20}
-    return turned(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0, **options))
+    return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0, **options))
 
 
-def turned(motion: jl.Solution) -> Found:
+def pitch_error(motion: jl.Solution) -> Found:
     """Compare the attitude with a pitch of 2 rad."""
     exact = np.asarray(jl.rotation.about_y(2.0))
     error = np.max(np.abs(attitude(jl.rotation.yaw_pitch_roll, motion) - exact))

@@ -183,9 +183,9 @@ def around(radius: Any, angle: Any) -> Any:
 
 
 def in_ring(rng: np.random.Generator, count: int) -> Starts:
-    turn, heading = rng.uniform(0, 2 * np.pi, (2, count))
+    angle, heading = rng.uniform(0, 2 * np.pi, (2, count))
     speed, k = decades(rng, -0.5, 1, count), decades(rng, 4, 8, count)
-    q0 = around(rng.uniform(0, 0.8, count), turn)
+    q0 = around(rng.uniform(0, 0.8, count), angle)
     return Starts(q0, around(speed, heading), 10 / speed, {"k": k})
 
 

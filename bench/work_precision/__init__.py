@@ -31,7 +31,7 @@ from jaxlag._core import _xla
 
 KIND, SYSTEM = "BENCH_KIND", "BENCH_SYSTEM"  # environment of a worker
 ROUNDS, QUICK_ROUNDS = 4, 2
-TURNS_S = 40e-3  # runs up to this length are timed in turn
+IN_TURN_S = 40e-3  # runs up to this length are timed in turn
 BUDGET_S = 100e-3  # after which a point is not timed again
 PATIENCE_S = 0.5
 QUICK_SYSTEMS = ("double pendulum, regular",)
@@ -51,21 +51,21 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
     calls: dict[str, Call] = {}
     facts: dict[str, Any] = {"missing": missing, "jax": jax.__version__, "points": {}, "none": {}}
     facts["versions"] = _peers.versions() if kind == "peers" else {}
-    for words, make in lines.items():
-        if quick and words not in QUICK_LINES:
+    for label, make in lines.items():
+        if quick and label not in QUICK_LINES:
             continue
         try:
             line = built(make)
             found, points = swept(line, lambda q: motion.error(q, exact), PATIENCE_S)
         except Exception as error:  # the method does not apply, or a library is broken
-            facts["none"][words] = f"{type(error).__name__}: {error}".splitlines()[0]
+            facts["none"][label] = f"{type(error).__name__}: {error}".splitlines()[0]
             continue
         if not points:
-            facts["none"][words] = line.why_none(PATIENCE_S)
-        facts["points"][words] = points
-        calls |= {f"{words}|{value}": call for value, call in found.items()}
+            facts["none"][label] = line.why_none(PATIENCE_S)
+        facts["points"][label] = points
+        calls |= {f"{label}|{value}": call for value, call in found.items()}
         for value, point in zip(found, points, strict=True):
-            point["case"] = f"{words}|{value}"
+            point["case"] = f"{label}|{value}"
     return calls, facts
 
 
@@ -79,8 +79,8 @@ def _lines(motion: Motion, kind: str) -> tuple[Mapping[str, Callable[[], Line]],
     missing = _peers.missing()
     chosen = _peers.lines(motion)
     return {
-        words: partial(make, motion)
-        for words, (library, make) in chosen.items()
+        label: partial(make, motion)
+        for label, (library, make) in chosen.items()
         if library not in missing
     }, missing
 
@@ -108,21 +108,21 @@ def run(quick: bool, system: list[str] | None = None, python: str | None = None)
     if unknown:
         raise ValueError(f"--system must be one of {list(MOTIONS)}, but it was {unknown[0]!r}.")
     rows: list[dict[str, Any]] = []
-    said: list[Reference] = []
+    remarks: list[Reference] = []
     folder = results.FOLDER / "quick" if quick or system else results.FOLDER
     for name in chosen:
         try:
             found, notes = contest(name, quick, python)
         except RuntimeError as error:  # a crashed process must not stop the other systems
-            said.append(Reference("failed", f"{name}: {error}"))
+            remarks.append(Reference("failed", f"{name}: {error}"))
             continue
         rows += found
-        said += notes
-        said.append(Reference(_plot.save(name, found, folder), f"{name}: the diagram"))
+        remarks += notes
+        remarks.append(Reference(_plot.save(name, found, folder), f"{name}: the diagram"))
     if python is None:
-        said.append(Reference("left out", "another jax: no interpreter given by --python"))
+        remarks.append(Reference("left out", "another jax: no interpreter given by --python"))
     targets, profiles = _ranking.judged(rows, chosen)
-    references = _ranking.told(rows) + profiles + list(dict.fromkeys(said))
+    references = _ranking.fastest_references(rows) + profiles + list(dict.fromkeys(remarks))
     return Report(rows, targets, references, _ranking.fastest(rows))
 
 
@@ -151,7 +151,7 @@ def contest(
             for point in found
         }
         for key, point in points.items():
-            point["in_turn"] = min(point["swept_s"]) <= TURNS_S
+            point["in_turn"] = min(point["swept_s"]) <= IN_TURN_S
             if not point["in_turn"]:
                 samples[key] = point["swept_s"]
         for _ in range(QUICK_ROUNDS if quick else ROUNDS):
@@ -167,13 +167,13 @@ def contest(
         rows = [
             {
                 "system": name,
-                "line": _words(words, kind, worker.facts["jax"]),
+                "line": _label(label, kind, worker.facts["jax"]),
                 **{key: point[key] for key in ("knob", "value", "error", "steps")},
                 **spread(samples[kind, point["case"]], "us", lanes),
                 "compile_s": point["compile_s"],
             }
             for kind, worker in workers.items()
-            for words, found in worker.facts["points"].items()
+            for label, found in worker.facts["points"].items()
             for point in found
         ]
         for kind, worker in workers.items():
@@ -189,14 +189,14 @@ def _worker(name: str, kind: str, quick: bool, python: str | None) -> Worker:
     return Worker("work_precision", quick, settings, **options)
 
 
-def _words(line: str, kind: str, version: str) -> str:
+def _label(line: str, kind: str, version: str) -> str:
     return line + {"off": ", no setting", "newest": f", jax {version}"}.get(kind, "")
 
 
 def _notes(name: str, kind: str, facts: Mapping[str, Any]) -> list[Reference]:
     missing = [Reference("left out", f"{who}: {text}") for who, text in facts["missing"].items()]
     none = [
-        Reference("no line", f"{name}, {_words(line, kind, facts['jax'])}: {text}")
+        Reference("no line", f"{name}, {_label(line, kind, facts['jax'])}: {text}")
         for line, text in facts["none"].items()
     ]
     used = [Reference(number, f"version of {who}") for who, number in facts["versions"].items()]

@@ -139,12 +139,10 @@ def naive(motion: Motion) -> Callable[[Any, Array, Any], Array]:
         if motion.rows is None:
             return jnp.concatenate([v, jnp.linalg.solve(M, right)])
         A = jax.jacfwd(motion.rows, 1)(q, v, params)
-        turned = jax.jvp(lambda q: motion.rows(q, v, params), (q,), (v,))[1]
+        gamma = jax.jvp(lambda q: motion.rows(q, v, params), (q,), (v,))[1]
         zero = jnp.zeros((len(A), len(A)))
         K = jnp.block([[M, A.T], [A, zero]])
-        return jnp.concatenate(
-            [v, jnp.linalg.solve(K, jnp.concatenate([right, -turned]))[: len(q)]]
-        )
+        return jnp.concatenate([v, jnp.linalg.solve(K, jnp.concatenate([right, -gamma]))[: len(q)]])
 
     return field
 
@@ -167,8 +165,8 @@ def lines(
     if prototype:
         qv = jnp.concatenate([jnp.asarray(motion.q0), jnp.asarray(motion.v0)], axis=-1)
         forms["naive"] = naive(motion), qv
-    for words, (field, start) in forms.items():
+    for label, (field, start) in forms.items():
         for name in DIFFRAX:
             make = partial(with_diffrax, motion, field, name, start)
-            found[f"diffrax {name}, {words}"] = make
+            found[f"diffrax {name}, {label}"] = make
     return found

@@ -100,9 +100,9 @@ def top(library: Any, motion: Motion) -> Model:
 
     def read(data: Any) -> np.ndarray:
         w, x, y, z = data.qpos
-        total, apart = np.arctan2(z, w), np.arctan2(y, x)
+        total, difference = np.arctan2(z, w), np.arctan2(y, x)
         tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
-        angles = np.array([total + apart, tilt, total - apart])
+        angles = np.array([total + difference, tilt, total - difference])
         return angles + 2.0 * np.pi * np.round((near - angles) / (2.0 * np.pi))
 
     return _model(library, p["g"], body), put, read

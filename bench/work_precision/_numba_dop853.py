@@ -88,8 +88,8 @@ def _step_source(size: int) -> str:
     """`step(y, h, k, z, y_new, rtol, atol)`: new state and k[12], the norm of the error."""
     from scipy.integrate._ivp import dop853_coefficients as table
 
-    def total(row: np.ndarray) -> str:
-        return " + ".join(f"{float(a)!r} * k[{j}, i]" for j, a in enumerate(row) if a)
+    def total(coefficients: np.ndarray) -> str:
+        return " + ".join(f"{float(a)!r} * k[{j}, i]" for j, a in enumerate(coefficients) if a)
 
     lines = ["def step(y, h, k, z, y_new, rtol, atol):"]
     for s in range(1, table.N_STAGES):

@@ -145,7 +145,7 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
         y, start, n = ca.SX.sym("y", motion.start().size), motion.start(), len(motion.q0)
         rates = motion.rates(of_expressions(ca), motion.params, ca.vertsplit(y))
         problem = {"x": y, "ode": ca.vertcat(*rates)}
-        said: list[str] = []
+        messages: list[str] = []
 
         def make(tolerance: float) -> Callable[[], Any]:
             options = {
@@ -160,7 +160,7 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
                 try:
                     return solve(x0=start)["xf"]
                 except RuntimeError as error:  # CVODES failed
-                    said.append(str(error).strip().splitlines()[-1])
+                    messages.append(str(error).strip().splitlines()[-1])
                     return np.full(start.size, np.nan)
 
             return call
@@ -168,7 +168,7 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
         def read(end: Any) -> Solved:
             return Solved(np.asarray(end).ravel()[:n])
 
-        return Line("tolerance", tolerances(motion.loosest, 14.0), make, read, 0.0, said)
+        return Line("tolerance", tolerances(motion.loosest, 14.0), make, read, 0.0, messages)
 
     return line
 

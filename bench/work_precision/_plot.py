@@ -15,7 +15,7 @@ from bench.work_precision._ranking import is_ours
 from bench.work_precision._sweep import time_at
 
 ERRORS = 10.0 ** -np.arange(1.0, 14.01, 0.25)
-COLOURS = {
+COLORS = {
     "jaxlag": "tab:red",
     "heyoka": "black",
     "numba": "tab:green",
@@ -33,14 +33,14 @@ Curve = tuple[np.ndarray, np.ndarray]  # errors, us
 
 def name_of(system: str) -> str:
     """The file name of a system's diagram."""
-    words = "".join(x if x.isalnum() or x == "." else " " for x in system).split()
-    return f"work-precision-{'-'.join(words)}.png".lower()
+    parts = "".join(x if x.isalnum() or x == "." else " " for x in system).split()
+    return f"work-precision-{'-'.join(parts)}.png".lower()
 
 
 def group_of(line: str) -> str:
     """The group in which a line is drawn: jaxlag's methods separately, the others by library."""
     library = line.split()[0].rstrip(",")
-    ending = next((line[line.index(words) :] for words in STYLES if words in line), "")
+    ending = next((line[line.index(label) :] for label in STYLES if label in line), "")
     if library == "jaxlag":
         return line
     if library == "diffrax":
@@ -99,15 +99,15 @@ def save(system: str, rows: Sequence[dict[str, Any]], folder: Path) -> str:
     first, marks = leaders(found), iter(MARKS * 3)
     for name in sorted(found, key=lambda name: _rank(name, first)):
         errors, us = found[name]
-        colour = next(c for words, c in COLOURS.items() if name.startswith(words))
-        style = next((style for words, style in STYLES.items() if words in name), "-")
+        color = next(c for label, c in COLORS.items() if name.startswith(label))
+        style = next((style for label, style in STYLES.items() if label in name), "-")
         thick = name in first or name == "heyoka"
         ours = name.startswith("jaxlag")
         ax.loglog(
             errors,
             us,
             style,
-            color=colour,
+            color=color,
             marker=next(marks) if ours else None,
             markevery=4,
             markersize=5 if thick else 4,
@@ -131,5 +131,5 @@ def save(system: str, rows: Sequence[dict[str, Any]], folder: Path) -> str:
 
 
 def _rank(name: str, first: set[str]) -> tuple[int, bool, str]:
-    library = next(i for i, words in enumerate(COLOURS) if name.startswith(words))
+    library = next(i for i, label in enumerate(COLORS) if name.startswith(label))
     return library, name not in first, name

@@ -28,13 +28,13 @@ def is_peer(line: str) -> bool:
     return line.startswith(PEERS)
 
 
-def starts(*words: str) -> Belongs:
-    return lambda line: line.startswith(words)
+def starts(*prefixes: str) -> Belongs:
+    return lambda line: line.startswith(prefixes)
 
 
-def diffrax(words: str, setting: bool) -> Belongs:
+def diffrax(form: str, setting: bool) -> Belongs:
     """diffrax on equations "by hand" or "naive", with the setting or without."""
-    ending = words if setting else f"{words}, no setting"
+    ending = form if setting else f"{form}, no setting"
     return lambda line: line.startswith("diffrax") and line.endswith(ending)
 
 
@@ -77,16 +77,16 @@ def fastest(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for system in dict.fromkeys(row["system"] for row in rows):
         for error in ERRORS:
             cells: dict[str, Any] = {"system": system, "error": f"{error:.0e}"}
-            for words, belongs in groups.items():
+            for label, belongs in groups.items():
                 us, line = best(rows, system, error, belongs)
-                cells[f"{words}_us"] = us if us < math.inf else None
-                if words in ("jaxlag", "peer"):
-                    cells[words] = line
+                cells[f"{label}_us"] = us if us < math.inf else None
+                if label in ("jaxlag", "peer"):
+                    cells[label] = line
             table.append(cells)
     return table
 
 
-def told(rows: Sequence[Row]) -> list[Reference]:
+def fastest_references(rows: Sequence[Row]) -> list[Reference]:
     """References that name the fastest line at 1e-6, 1e-9 and 1e-12."""
     found = []
     for system in dict.fromkeys(row["system"] for row in rows):
@@ -103,8 +103,8 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
     """Targets of these systems, and the steps and times of both sides for every missed target."""
     plans: list[tuple[str, str, float, float, Belongs]] = []  # claim, system, error, bound, others
 
-    def at_most(bound: float, system: str, errors: Sequence[float], words: str, who: Belongs):
-        plans.extend((words, system, error, bound, who) for error in errors)
+    def at_most(bound: float, system: str, errors: Sequence[float], label: str, who: Belongs):
+        plans.extend((label, system, error, bound, who) for error in errors)
 
     at_most(1.0, REGULAR, (1e-6, 1e-9), "the best of heyoka and numba", starts(*COMPILED))
     at_most(1.3, REGULAR, (1e-12,), "the best of heyoka and numba", starts(*COMPILED))
@@ -116,15 +116,15 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
     at_most(1.25, LANES, (1e-9,), "heyoka's SIMD mode", starts("heyoka"))
     at_most(1.0, LANES, (1e-7,), "heyoka's SIMD mode", starts("heyoka"))
     targets, profiles = [], []
-    for words, system, error, bound, who in plans:
+    for label, system, error, bound, who in plans:
         if system not in systems:
             continue
         what = f"{system} at {error:.0e}"
-        claim = f"times as long: jaxlag as {words}, {what}"
+        claim = f"times as long: jaxlag as {label}, {what}"
         targets.append(Target(claim, ratio(rows, system, error, who), "<=", bound))
         if not targets[-1].met:
             profiles.append(
-                Reference(profile(rows, system, error, who), f"missed: as {words}, {what}")
+                Reference(profile(rows, system, error, who), f"missed: as {label}, {what}")
             )
     targets += overall(rows, systems)
     for system in systems:
@@ -137,8 +137,8 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
             figure = ratio(rows, system, error, others)
             if figure > 1.0:
                 text = profile(rows, system, error, others)
-                words = f"diffrax by hand with the setting: {system} at {error:.0e}"
-                profiles.append(Reference(text, f"{figure:.3g} times {words}"))
+                label = f"diffrax by hand with the setting: {system} at {error:.0e}"
+                profiles.append(Reference(text, f"{figure:.3g} times {label}"))
     return targets, profiles
 
 

@@ -56,13 +56,13 @@ class _Code:
         return self.known[expression]
 
     def line(self, operator: str, a: Any, b: Any) -> _Line:
-        return self.named(f"{_word(a)} {operator} {_word(b)}")
+        return self.named(f"{_operand(a)} {operator} {_operand(b)}")
 
     def function(self, name: str) -> Any:
-        return lambda x: self.named(f"{name}({_word(x)})")
+        return lambda x: self.named(f"{name}({_operand(x)})")
 
 
-def _word(x: Any) -> str:
+def _operand(x: Any) -> str:
     return x.name if isinstance(x, _Line) else f"({float(x)!r})"
 
 
@@ -72,9 +72,9 @@ def source(rates: Rates, params: Mapping[str, Any], size: int, name: str = "rate
     It calls sin, cos and sqrt, which must be in its namespace.
     """
     code = _Code()
-    sin, cos, sqrt = (code.function(word) for word in ("sin", "cos", "sqrt"))
+    sin, cos, sqrt = (code.function(function_name) for function_name in ("sin", "cos", "sqrt"))
     functions = Functions(sin, cos, sqrt, lambda x: 1.0 / (x * sqrt(x)))
     ends = rates(functions, params, [_Line(code, f"y{i}") for i in range(size)])
     body = [f"y{i} = y[{i}]" for i in range(size)]
-    body += code.lines + [f"out[{i}] = {_word(x)}" for i, x in enumerate(ends)] + ["return out"]
+    body += code.lines + [f"out[{i}] = {_operand(x)}" for i, x in enumerate(ends)] + ["return out"]
     return f"def {name}(t, y, out):\n" + "".join(f"    {line}\n" for line in body)

@@ -38,7 +38,7 @@ class Line(NamedTuple):
         make: function of one value that returns a call for one solve.
         read: function of the call's return value that gives the result.
         build_s: seconds to build the line, including compilation; `make` may take more.
-        said: messages of failed runs; each failure adds one.
+        messages: of failed runs; each failure adds one.
     """
 
     knob: str
@@ -46,12 +46,12 @@ class Line(NamedTuple):
     make: Callable[[float], Call]
     read: Callable[[Any], Solved]
     build_s: float
-    said: Sequence[str] = ()
+    messages: Sequence[str] = ()
 
     def why_none(self, patience_s: float) -> str:
         """The reason why a line has no points."""
-        if self.said:
-            return self.said[-1]
+        if self.messages:
+            return self.messages[-1]
         return f"no run of at most {FACTOR * patience_s:g} s ended with an error below {WRONG:g}"
 
 

@@ -126,8 +126,8 @@ class AbstractEntry:
                 f"{self.name}: multiplier_units must name the constraints {declared}, in this "
                 f"order, but it named {self.constraints}."
             )
-        kept = tuple(name for name in self.coordinates if name in self.file_coordinates)
-        if self.file_coordinates != kept:
+        ordered = tuple(name for name in self.coordinates if name in self.file_coordinates)
+        if self.file_coordinates != ordered:
             raise ValueError(
                 f"{self.name}: chart.coordinates must be among {', '.join(self.coordinates)}, in "
                 f"this order, but they were {', '.join(self.file_coordinates)}."

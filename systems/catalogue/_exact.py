@@ -41,8 +41,8 @@ def oscillating(
     n = len(f)
     rates = jnp.linalg.solve(M, jnp.column_stack([-K, -C, f, F, 0.0 * F]))
     forms = jnp.concatenate([jnp.eye(n, 2 * n + 3, n), rates])
-    turn = w * jnp.array([[0.0, -1.0], [1.0, 0.0]])
-    forcing = block_diag(jnp.zeros((1, 1)), turn)
+    rotation = w * jnp.array([[0.0, -1.0], [1.0, 0.0]])
+    forcing = block_diag(jnp.zeros((1, 1)), rotation)
     whole = jnp.concatenate([forms, jnp.pad(forcing, ((0, 0), (2 * n, 0)))])
     y = expm(t * whole) @ jnp.concatenate([q0, v0, jnp.array([1.0, 1.0, 0.0])])
     return y[:n], y[n : 2 * n]

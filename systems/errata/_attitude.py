@@ -12,14 +12,14 @@ from systems.errata._erratum import State, motion
 # By the engine.
 
 
-def turned(angles):
+def rotation_matrix(angles):
     """T_I/B, which transforms body components to inertial ones."""
     return yaw_pitch_roll.matrix(angles[::-1])
 
 
 def pose(t, q, params):
     """(T_I/B, r_O) of a body with q = (X, Y, Z, phi, theta, psi)."""
-    return turned(q[3:]), q[:3]
+    return rotation_matrix(q[3:]), q[:3]
 
 
 def body_torque(angles, Q):
@@ -31,14 +31,14 @@ def body_torque(angles, Q):
 def spinning(t, q, params):
     """Six particles of mass m/6 at -+a, -+b, -+c on the body axes, turned by q = angles."""
     arms = jnp.diag(jnp.stack([params["a"], params["b"], params["c"]]))
-    return jnp.concatenate([arms, -arms]) @ turned(q).T
+    return jnp.concatenate([arms, -arms]) @ rotation_matrix(q).T
 
 
 def needed_torque(s: State):
     """Torque, body components, required for a motion of `spinning`."""
     r, _, acceleration = motion(spinning, s, s.a)
     moment = s.params["m"] / 6 * jnp.sum(jnp.cross(r, acceleration), axis=0)
-    return turned(s.q).T @ moment
+    return rotation_matrix(s.q).T @ moment
 
 
 SPINNING = {"m": 3.0, "a": 0.5, "b": 0.8, "c": 0.3}

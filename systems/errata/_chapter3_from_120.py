@@ -164,9 +164,9 @@ def _sliding_formula(s: State, mu: float):
     c, sine, w = cos(s.q[1]), sin(s.q[1]), s.v[1]
     lever = c - mu * sine
     inertia = m * L**2 / 12 + 0.25 * m * L**2 * c * lever
-    turn = -0.5 * L * lever * (m * g - 0.5 * m * L * w**2 * sine) / inertia
-    N = m * g + 0.5 * m * L * (turn * c - w**2 * sine)
-    return [s.params["mu"] * N / m, turn]
+    theta_acceleration = -0.5 * L * lever * (m * g - 0.5 * m * L * w**2 * sine) / inertia
+    N = m * g + 0.5 * m * L * (theta_acceleration * c - w**2 * sine)
+    return [s.params["mu"] * N / m, theta_acceleration]
 
 
 # Spherical pendulum on a string of given length L(t), driven and damped.

@@ -26,7 +26,7 @@ def _body_rates(t, q, v, params):
 
 
 def _force(t, q, v, params):
-    return attitude.turned(q[3:]) @ jnp.stack([params["Fx"], params["Fy"], params["Fz"]])
+    return attitude.rotation_matrix(q[3:]) @ jnp.stack([params["Fx"], params["Fy"], params["Fz"]])
 
 
 def _torque(t, q, v, params):
@@ -157,7 +157,9 @@ _LIFTED = jl.System(
     forces=(
         jl.PointForce(
             _hubs,
-            lambda t, q, v, params: -jnp.outer(_thrusts(params), attitude.turned(q[3:])[:, 2]),
+            lambda t, q, v, params: (
+                -jnp.outer(_thrusts(params), attitude.rotation_matrix(q[3:])[:, 2])
+            ),
             "thrust",
         ),
     ),
@@ -190,8 +192,8 @@ _ROTORS = jl.System(
 
 def _gyroscopic_torque(s: State):
     """Torque of the spinning rotors on the frame, body components."""
-    still = {**s.params, **{f"w{i}": 0.0 * s.params[f"w{i}"] for i in range(1, 5)}}
-    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, still))
+    stopped = {**s.params, **{f"w{i}": 0.0 * s.params[f"w{i}"] for i in range(1, 5)}}
+    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, stopped))
     return attitude.body_torque(s.q[3:], (without - needed)[3:])
 
 

@@ -47,7 +47,7 @@ def _with_a22(s: State):
 
 def _quasi_velocities(q, v):
     def pose(t, q, params):
-        return attitude.turned(q), jnp.zeros(3)
+        return attitude.rotation_matrix(q), jnp.zeros(3)
 
     return energy.body_velocity(pose, 0.0, q, v, None)[1]
 

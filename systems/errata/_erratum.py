@@ -93,13 +93,13 @@ def examine(erratum: Erratum) -> Errors:
 
     def error(formula: Formula) -> float:
         with np.errstate(divide="ignore"):
-            rows = np.array([formula(state) for state in states])
-        if rows.shape != values.shape:
+            found = np.array([formula(state) for state in states])
+        if found.shape != values.shape:
             raise ValueError(
                 f"{erratum.place}: a formula must return what the engine does, shape "
-                f"{values.shape[1:]}, but it returned {rows.shape[1:]}."
+                f"{values.shape[1:]}, but it returned {found.shape[1:]}."
             )
-        return float(np.max(np.abs(rows - values)) / np.max(np.abs(values)))
+        return float(np.max(np.abs(found - values)) / np.max(np.abs(values)))
 
     return Errors(error(erratum.printed), error(erratum.right))
 

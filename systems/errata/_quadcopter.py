@@ -49,8 +49,8 @@ _BODY = jl.System(
 def _rotor_kinetic(t, q, v, params):
     """T of the rotors about their shafts: 1, 3 clockwise, 2, 4 counterclockwise from above."""
     relative = jnp.array([-1.0, 1.0, -1.0, 1.0]) * _speeds(params)
-    turn = quadcopter.angular_velocity(t, q, v, params)[2]
-    return 0.5 * params["Im"] * jnp.sum((turn + relative) ** 2)
+    frame_rate = quadcopter.angular_velocity(t, q, v, params)[2]
+    return 0.5 * params["Im"] * jnp.sum((frame_rate + relative) ** 2)
 
 
 _ROTORS = jl.System(
@@ -79,8 +79,8 @@ def _rotational_force(s: State):
 
 def _gyroscopic_torque(s: State):
     """Torque of the spinning rotors on the frame, body components; all angles are 0."""
-    still = {**s.params, **{name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}}
-    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, still))
+    stopped = {**s.params, **{name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}}
+    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, stopped))
     return (without - needed)[:2:-1]
 
 

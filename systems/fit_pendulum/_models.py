@@ -127,9 +127,9 @@ def fit(
 ) -> jl.FitResult:
     """One model of friction, fitted to windows or whole segments."""
     system = driven if experiments[0].inputs else free
-    told = [name for name in params0 if system is driven or name != "J"]
+    names = [name for name in params0 if system is driven or name != "J"]
     priors = {name: PRESENT if name in MODELS[model] else ABSENT for name in FRICTION}
-    return jl.fit(system, experiments, params0, free=told, priors=priors, simulate_options=OPTIONS)
+    return jl.fit(system, experiments, params0, free=names, priors=priors, simulate_options=OPTIONS)
 
 
 def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:
@@ -142,14 +142,14 @@ def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
 
     Rates are differences of neighboring samples. They are rough, but their errors are in q'' alone.
     """
-    rows, q2 = [], []
+    regressors, q2 = [], []
     for each in windows:
         q = each.channels["q"][:, 0]
         torque = each.inputs.get("torque")
         u = () if torque is None else (np.interp(each.ts, torque.times, torque.values),)
-        rows.append(np.stack([-np.sin(q), *u, *(np.ones_like(x) for x in u)], axis=1)[2:-2])
+        regressors.append(np.stack([-np.sin(q), *u, *(np.ones_like(x) for x in u)], axis=1)[2:-2])
         q2.append(np.gradient(np.gradient(q, each.ts), each.ts)[2:-2])
-    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(q2))[0].tolist()
+    found = np.linalg.lstsq(np.concatenate(regressors), np.concatenate(q2))[0].tolist()
     if len(found) == 1:
         return {"J": 1.0, "mgl": found[0], "zero": 0.0} | dict.fromkeys(FRICTION, 0.0)
     mgl, per_J, u0 = found
@@ -162,9 +162,9 @@ def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
 
 def correlation(found: jl.FitResult) -> float:
     """Correlation of residuals one sample apart."""
-    rows = [each["q"][:, 0] for each in found.residuals]
-    products = sum(float(np.nansum(r[1:] * r[:-1])) for r in rows)
-    return products / sum(float(np.nansum(r**2)) for r in rows)
+    residuals = [each["q"][:, 0] for each in found.residuals]
+    products = sum(float(np.nansum(r[1:] * r[:-1])) for r in residuals)
+    return products / sum(float(np.nansum(r**2)) for r in residuals)
 
 
 def samples_each(found: jl.FitResult) -> float:

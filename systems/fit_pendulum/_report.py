@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxlag as jl
-from systems.fit_pendulum._data import RATE, Recording, bad
+from systems.fit_pendulum._data import RATE, Recording, data_error
 from systems.fit_pendulum._models import (
     EARLY,
     FRICTION,
@@ -50,13 +50,13 @@ SUFFIXES = (".png", ".pdf", ".svg")
 def describe(recording: Recording) -> str:
     """A recording in one line."""
     segments = list(recording.segments.values())
-    rows = sum(len(segment.ts) for segment in segments)
+    sample_count = sum(len(segment.ts) for segment in segments)
     reach = max(float(np.max(np.abs(segment.channels["q"]))) for segment in segments)
     rate = 1 / recording.spacing
     used = f" (angles used at {RATE:.0f} Hz)" if rate > 1.5 * RATE else ""
     return (
         f"{recording.name}: {'driven' if recording.driven else 'free swing'}, "
-        f"{len(segments)} segment{'s' * (len(segments) > 1)}, {rows} samples at "
+        f"{len(segments)} segment{'s' * (len(segments) > 1)}, {sample_count} samples at "
         f"{rate:.0f} Hz{used}, up to {reach:.2f} rad from hanging"
     )
 
@@ -126,10 +126,10 @@ def mrad(found: jl.FitResult | jl.Prediction) -> float:
 
 def mean_mrad(found: jl.FitResult | jl.Prediction) -> float:
     """Mean over the experiments of each one's own rms, mrad."""
-    rows = [each["q"][:, 0] for each in found.residuals]
+    residuals = [each["q"][:, 0] for each in found.residuals]
     if isinstance(found, jl.Prediction):
-        rows = [x[own] for x, own in zip(rows, found.predicted, strict=True)]
-    return 1e3 * float(np.mean([np.sqrt(np.mean(x**2)) for x in rows]))
+        residuals = [x[own] for x, own in zip(residuals, found.predicted, strict=True)]
+    return 1e3 * float(np.mean([np.sqrt(np.mean(x**2)) for x in residuals]))
 
 
 def _head(symbols: Mapping[str, tuple[str, str]], rms_of: list[str]) -> Iterator[list[str]]:
@@ -205,10 +205,12 @@ def require_figure(path: Path) -> None:
         DataError: matplotlib is missing, or the folder, or the name ends in another way.
     """
     if not can_plot():
-        raise bad("--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB)
+        raise data_error(
+            "--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB
+        )
     if path.suffix not in SUFFIXES or not path.parent.is_dir():
         must = f"name a {', '.join(SUFFIXES)} in a folder that exists"
-        raise bad("--plot", must, f"it was {path}", "Rename it, or make the folder.")
+        raise data_error("--plot", must, f"it was {path}", "Rename it, or make the folder.")
 
 
 def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
@@ -228,4 +230,4 @@ def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
         figure.savefig(path)
     except OSError as error:
         must = "name a file that can be written"
-        raise bad("--plot", must, str(error), "Choose another folder.") from error
+        raise data_error("--plot", must, str(error), "Choose another folder.") from error

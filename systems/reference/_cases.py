@@ -60,7 +60,7 @@ def _(entry: Entry, index: int, raw: Any) -> Case:
     if not entry.file_constraints:
         things = "constraints in its files" if entry.constraints else "constraints"
         absent |= dict.fromkeys(_REACTIONS, things)
-    rows = tuple(field for field in (*_MOTION, "u", *_REACTIONS) if field not in absent)
+    fields = tuple(field for field in (*_MOTION, "u", *_REACTIONS) if field not in absent)
     required = ("name", "params", "times", *_MOTION, "u", *_REACTIONS, "energy", "invariants")
     where = _begin(index, raw, required, (*_OPTIONAL, "extras", "controls"))
     _check_controls(f"{where}: controls", raw.get("controls"))
@@ -69,7 +69,7 @@ def _(entry: Entry, index: int, raw: Any) -> Case:
             must = f"be null, for {entry.name} has no {things}"
             fail(f"{where}: {field}", must, f"it was {shown(raw[field])}")
     groups = {"energy": ("T", "V", "E"), "extras": (), "invariants": ()}
-    given = {field: raw[field] for field in rows} | _grouped(where, entry, raw, groups)
+    given = {field: raw[field] for field in fields} | _grouped(where, entry, raw, groups)
     return _case(where, entry, raw, _read_times(where, raw["times"]), given)
 
 
@@ -114,7 +114,7 @@ def _case(
         name=raw["name"],
         params=_read_params(where, entry, raw["params"]),
         times=times,
-        fields=_read_rows(where, entry, given, len(times)),
+        fields=_read_values(where, entry, given, len(times)),
     )
 
 
@@ -151,20 +151,20 @@ def _grouped(
     return given
 
 
-def _read_rows(
+def _read_values(
     where: str, entry: AbstractEntry, given: Mapping[str, Any], count: int
 ) -> dict[str, np.ndarray]:
     """Every quantity of the case, with `count` values of the shape that the system defines."""
     fields = {}
     for field, value in given.items():
-        rows = numbers(f"{where}: {field}", value)
+        values = numbers(f"{where}: {field}", value)
         shape = (count, *shapes(entry)[field])
-        if rows.shape == (count,) and shape == (count, 1):
-            rows = rows.reshape(shape)  # a vector of one component may be a plain number
-        if rows.shape != shape:
+        if values.shape == (count,) and shape == (count, 1):
+            values = values.reshape(shape)  # a vector of one component may be a plain number
+        if values.shape != shape:
             must = f"have shape {shape}, one row for each of {count} times"
-            fail(f"{where}: {field}", must, f"it had {rows.shape}")
-        fields[field] = rows
+            fail(f"{where}: {field}", must, f"it had {values.shape}")
+        fields[field] = values
     return fields
 
 

@@ -64,8 +64,8 @@ system = jl.System(
 def exact(t, q0, v0, params):
     """The slide and the spin under constant accelerations."""
     spin = params["F1"] * params["R"] / (params["M"] * params["kappa"] ** 2)
-    push = pull(t, q0, v0, params) / params["M"]
-    return _exact.accelerated(t, q0, v0, jnp.append(spin, push))
+    acceleration = pull(t, q0, v0, params) / params["M"]
+    return _exact.accelerated(t, q0, v0, jnp.append(spin, acceleration))
 
 
 entry = Entry(

@@ -71,9 +71,9 @@ def disk(params):
 
 def kinetic(t, q, v, params):
     """T of rod and disk [J]."""
-    still, omega = energy.body_velocity(pose, t, q, v, params)
-    spin = disk(params).kinetic_from_rates(still, omega + v[2] * ALONG)
-    return rod(params).kinetic_from_rates(still, omega) + spin
+    at_rest, omega = energy.body_velocity(pose, t, q, v, params)
+    spin = disk(params).kinetic_from_rates(at_rest, omega + v[2] * ALONG)
+    return rod(params).kinetic_from_rates(at_rest, omega) + spin
 
 
 def potential(t, q, params):
