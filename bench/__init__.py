@@ -1,10 +1,11 @@
 """Benchmarks of jaxlag: `python -m bench list`, `python -m bench NAME [--quick]`.
 
-Each module of this package is one benchmark: `run(quick)` measures and returns a `Report` of
-rows, targets (judged: one missed makes the exit status 1) and references (printed, not judged).
-A full run is kept in `bench/results/NAME.json`, which holds the latest run on every version of
-jax; a quick run, of fewer cases and repeats, in `bench/results/quick/NAME.json`, not in git.
+Each module of this package is one benchmark. `run(quick)` measures and returns a `Report` of table
+rows, targets and references. Targets are judged: one missed target makes the exit status 1.
+References are printed and not judged. A full run is stored in `bench/results/NAME.json`, which
+holds the latest run for each version of jax. A quick run has fewer cases and repeats. It is stored
+in `bench/results/quick/NAME.json`, which is not in git.
 
-What the numbers cannot show: small systems on one CPU. Ratios within a run carry over to
-another machine, milliseconds do not; references in time come from another machine.
+Limits: the benchmarks measure small systems on one CPU. Ratios within a run are valid on other
+machines, milliseconds are not. Times among the references come from another machine.
 """

@@ -16,7 +16,7 @@ from bench.fits._data import DataError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one benchmark; 0 if every target was met, 1 if one was missed, 2 without benchmark."""
+    """Run one benchmark; 0 if every target was met, 1 if one was missed, 2 if none could run."""
     parser = ArgumentParser(prog="python -m bench", description="Measure jaxlag.")
     parser.add_argument("name", metavar="NAME", help="a benchmark, or 'list'")
     parser.add_argument("--quick", action="store_true", help="fewer cases and repeats: a minute")
@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _headline(arguments.name),
         report,
         circumstances,
-        arguments.quick or "system" in options,  # in part is not what is kept
+        arguments.quick or "system" in options,  # a part of a run
         results.FOLDER,
     )
     print(results.text(report))

@@ -1,10 +1,10 @@
-"""Batches of double pendulums by `jax.vmap`: time per trajectory, and how well lanes are used.
+"""Batches of double pendulums by `jax.vmap`: time per trajectory, and utilization of the lanes.
 
 The lanes start at rest from angles drawn from (-2, 2) rad, so that some swing and some tumble.
-A vmapped solve runs until its slowest lane is done: `lane_use` is the mean number of attempted
-steps over the largest. The driven row draws parameters, rates and a zero-order-hold torque as
-well. To compare: the same solves one after another (`lax.map`), and diffrax vmapped on equations
-written by hand and on naive autodiff.
+A vmapped solve runs until its slowest lane is finished. `lane_use` is the mean number of attempted
+steps divided by the largest. The driven case also draws parameters, rates and a zero-order-hold
+torque. For comparison: the same solves one after another (`lax.map`), and diffrax vmapped on
+equations written by hand and on naive autodiff.
 """
 
 from collections.abc import Callable
@@ -62,13 +62,13 @@ def _cases(sizes: tuple[int, ...]) -> list[Case]:
     starts = {lanes: (_starts(lanes), *common) for lanes in sizes}
     axes = (0, None, None)
 
-    def in_turn(y0: Array, params: Any, tolerance: Array) -> Ended:
+    def sequential(y0: Array, params: Any, tolerance: Array) -> Ended:
         return jax.lax.map(lambda y0: one(y0, params, tolerance), y0)
 
     return [
         *(Case("vmap", lanes, jax.vmap(one, axes), starts[lanes]) for lanes in sizes),
         Case("vmap, driven", COMPARED, jax.vmap(_driven), _driven_lanes(COMPARED)),
-        Case("lax.map", COMPARED, in_turn, starts[COMPARED]),
+        Case("lax.map", COMPARED, sequential, starts[COMPARED]),
         Case("by hand", COMPARED, jax.vmap(by_hand, axes), starts[COMPARED]),
         Case("naive", COMPARED, jax.vmap(naive, axes), starts[COMPARED]),
     ]

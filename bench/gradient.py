@@ -1,11 +1,12 @@
-"""Derivatives of one solve and of 16: what they cost beside the solve, and how exact they are.
+"""Derivatives of one solve and of 16: their cost relative to the solve, and their errors.
 
 The loss is |y(10)|^2 of the double pendulum. Inputs are the start (2 angles, 2 rates) and four
-parameters (2 masses, 2 lengths). `ratio` is to the plain solve of as many lanes of the same
-system. `error` is the largest over the components, relative to the largest of them, against the
-same program at tolerance 1e-13; that of the solve is of its end state. Other systems are
-differentiated in their velocities at the start and in all params. `temp_mb` is what the compiled
-program sets aside, which for a reverse derivative is mostly what it keeps of the steps.
+parameters (2 masses, 2 lengths). `ratio` is the time divided by that of the plain solve with the
+same system and number of lanes. `error` is the largest error of a component divided by the largest
+component, against the same program at tolerance 1e-13. For the solve it is that of the end state.
+Other systems are differentiated with respect to initial velocities and all params. `temp_mb` is
+the temporary memory of the compiled program. For a reverse derivative this is mostly the memory
+of the stored steps.
 """
 
 from collections.abc import Callable
@@ -32,7 +33,7 @@ MAX_STEPS = (1024, 16384, 262144)  # bounds whose memory is compared
 
 
 class Case(NamedTuple):
-    """A function of (x, tolerance), batched where x has several lanes."""
+    """A function of (x, tolerance), batched if x has several lanes."""
 
     name: str
     lanes: int
@@ -86,7 +87,7 @@ def _others() -> list[Case]:
     found = []
     for name, solve, moving in (
         ("rigid aircraft", *_short(entry.system, *entry.start(), entry.example.params)),
-        # Other velocities or lengths would have to keep to the rods.
+        # Velocities and lengths are fixed: if changed, they could violate the rods' constraints.
         ("Cartesian double pendulum", *_short(bobs.system, bobs.q0, bobs.v0, bobs.params, masses)),
         ("chain of 8 links", *_short(links, chain.q0, chain.v0, chain.params)),
     ):
@@ -102,7 +103,7 @@ def _others() -> list[Case]:
 def _short(
     system: jl.System, q0: Any, v0: Any, params: Any, masses: Any = None
 ) -> tuple[Callable[[Array, Array], Array], Array]:
-    """(state after 2 s from what moves, what moves): v0 and all params, or only some of these."""
+    """(state after 2 s as a function of x, x), where x is v0 and all params, or only `masses`."""
     q0 = jnp.asarray(q0, float)
     given = {"v0": v0, "params": dict(params)} if masses is None else {"params": masses}
     moving, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), given))
@@ -148,7 +149,7 @@ def run(quick: bool) -> Report:
 
 
 def _inputs(lanes: int) -> Array:
-    """The start and four parameters; of several lanes, each within 10 %."""
+    """The start and four parameters; for several lanes, each changed by up to 0.1."""
     x = jnp.concatenate([pendulum.start(), jnp.ones(len(INPUTS))])
     if lanes == 1:
         return x
@@ -204,11 +205,11 @@ def _judged(
         claim = "times as sensitive to the inputs as the state: the gradient, whatever computes it"
         more.append(Reference(f"{more_sensitive:.3g}", claim))
     per_lane = lanes["min_ms"] / LANES / reverse["min_ms"]
-    apart = of(errors, REVERSE, LANES) / of(errors, SOLVE, LANES)
-    typical = jnp.exp(jnp.mean(jnp.log(apart)))
+    ratios = of(errors, REVERSE, LANES) / of(errors, SOLVE, LANES)
+    typical = jnp.exp(jnp.mean(jnp.log(ratios)))
     references = [
         Reference(
-            f"{typical:.3g}, {jnp.max(apart):.3g}",
+            f"{typical:.3g}, {jnp.max(ratios):.3g}",
             f"times the error of the solve: that of the gradient in {LANES} starts, mean and worst",
         ),
         Reference(f"{per_lane:.3g}", f"times as long per gradient: {LANES} lanes at once as one"),

@@ -1,10 +1,11 @@
-"""One solve of a double pendulum, with XLA's setting and without, beside diffrax alone.
+"""One solve of a double pendulum, with XLA's setting and without it, compared with diffrax.
 
-All cases use diffrax's Dopri8 and PID control, once on jaxlag's array program, once on equations
-written by hand and once on naive autodiff (`jax.hessian`, `jnp.linalg.solve`). "setting" is what
-importing jaxlag sets: XLA's bound on the loops it compiles to one native function (needed before
-jax 0.12); "native" is whether XLA does so. Errors are the largest over all saved states, against
-the hand-written equations at tolerance 1e-13 with a step ending on every save time.
+All cases use Dormand and Prince's method of order 8. jaxlag has its own `Dopri8` and its scalar
+program. diffrax has its `Dopri8` and PID control, on equations written by hand and on naive
+autodiff (`jax.hessian`, `jnp.linalg.solve`). "setting" is the setting that importing jaxlag makes:
+XLA's bound on the loops that it compiles to one native function (needed before jax 0.12). "native"
+is whether XLA does so. Errors are the largest over all saved states, against the hand-written
+equations at tolerance 1e-13 with a step ending on every save time.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,7 @@ SAVES = 501
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
-    """Compile every case in this process: what to time, and the columns known before."""
+    """Compile every case in this process: the calls to time, and the columns known before."""
     args = (pendulum.start(), pendulum.params(), jnp.asarray(pendulum.TOLERANCE))
     reference = pendulum.reference(pendulum.times(SAVES))
     calls: dict[str, Call] = {}

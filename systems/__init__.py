@@ -1,7 +1,7 @@
 """Systems of Pila, "Introduction to Lagrangian Dynamics", declared for jaxlag, and a few beyond.
 
 Read `catalogue/chapter3/simple_pendulum.py` first. Every system has a module like it, with its
-sketch, its energies and its forces as the book has them:
+sketch, its energies and its forces as in the book:
 
     from systems import simple_pendulum
 

@@ -1,4 +1,4 @@
-"""Figures: panels of curves below one another."""
+"""Figures: panels of curves, one below the other."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,16 +11,16 @@ from systems.catalogue._entry import AbstractEntry
 
 
 class PlotError(RuntimeError):
-    """A figure that could not be made, saying why."""
+    """The figure could not be made; the message says why."""
 
 
 class Panel(NamedTuple):
     """Curves over one axis.
 
     Attributes:
-        x_label: what the curves run over, with its unit.
+        x_label: name of the independent variable, with its unit.
         x: shape (S,).
-        y_label: what they show, with its unit.
+        y_label: names of the curves, with their unit.
         curves: label -> values, shape (S,).
         mark: a point (x, y) to show, if any.
     """
@@ -33,13 +33,13 @@ class Panel(NamedTuple):
 
 
 def by_unit(
-    names: Sequence[str], ts: ArrayLike, rows: ArrayLike, units: Sequence[str]
+    names: Sequence[str], ts: ArrayLike, values: ArrayLike, units: Sequence[str]
 ) -> list[Panel]:
-    """One panel over time for every unit: the components of `rows`, (S, n), that have it."""
+    """One panel over time for every unit, with the components of `values`, (S, n), in this unit."""
     panels = []
     for unit in dict.fromkeys(units):
         columns = [i for i, own in enumerate(units) if own == unit]
-        curves = {names[i]: np.asarray(rows)[:, i] for i in columns}
+        curves = {names[i]: np.asarray(values)[:, i] for i in columns}
         panels.append(Panel("t [s]", ts, f"{', '.join(curves)} [{unit}]", curves))
     return panels
 

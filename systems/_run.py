@@ -25,7 +25,7 @@ _FORCE_UNITS = {"m": "N", "rad": "N m"}
 
 
 class Report(NamedTuple):
-    """What a run found: lines to print, panels to draw, and whether all went well."""
+    """The results of a run: lines to print, panels to draw, and whether it was successful."""
 
     lines: list[str]
     panels: list[Panel]
@@ -33,7 +33,7 @@ class Report(NamedTuple):
 
 
 def main(entry: AbstractEntry, plot: Path | None) -> int:
-    """Run the example and print it, with a figure at `plot` if given; 0 if all went well."""
+    """Run the example and print it, with a figure at `plot` if given; 0 if successful."""
     report = run(entry)
     params = entry.example.params
     print(f"{entry.name}: {entry.book}")
@@ -52,7 +52,7 @@ def main(entry: AbstractEntry, plot: Path | None) -> int:
 
 @singledispatch
 def run(entry: AbstractEntry) -> Report:
-    """The example of a system, run."""
+    """Run the example of a system."""
     raise NotImplementedError(f"examples of {entry.kind} systems cannot be run")
 
 
@@ -90,13 +90,13 @@ def _(entry: PrescribedEntry) -> Report:
     example = entry.example
     ts = jnp.linspace(0.0, example.duration, SAMPLES)
     motion = jl.prescribed_motion(lambda t: entry.motion(t, example.params), ts)
-    rows = jax.vmap(partial(prescribed_quantities, entry, example.params))(ts, *motion)
-    forces = rows["generalized_force"]
+    values = jax.vmap(partial(prescribed_quantities, entry, example.params))(ts, *motion)
+    forces = values["generalized_force"]
     units = [_FORCE_UNITS[unit] for unit in entry.coordinate_units]
     heads = [*_heads(entry, ""), *_forces(entry)]
-    lines = [*_table(heads, (ts, rows["q"], forces)), "", f"at t = {ts[0]:g} s"]
-    lines += [f"{name} = {rows[f'extras.{name}'][0]:.6g}" for name in entry.extras]
-    panels = by_unit(entry.coordinates, ts, rows["q"], entry.coordinate_units)
+    lines = [*_table(heads, (ts, values["q"], forces)), "", f"at t = {ts[0]:g} s"]
+    lines += [f"{name} = {values[f'extras.{name}'][0]:.6g}" for name in entry.extras]
+    panels = by_unit(entry.coordinates, ts, values["q"], entry.coordinate_units)
     panels += [
         p._replace(y_label=f"force on {p.y_label}")
         for p in by_unit(entry.coordinates, ts, forces, units)
@@ -148,12 +148,12 @@ def _motion_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
 def _free_quasi_velocities(
     entry: Entry, motion: jl.Solution
 ) -> tuple[tuple[str, ...], jax.Array, np.ndarray, tuple[str, ...]]:
-    """(names, times, rows, units) of those that do not vanish."""
+    """(names, times, values, units) of the quasi-velocities that do not vanish."""
     names = entry.free_quasi_velocities
     columns = [entry.quasi_velocities.index(name) for name in names]
     units = tuple(entry.quasi_units[column] for column in columns)
-    rows = np.asarray(motion.u)[:, columns] if columns else np.zeros((len(motion.ts), 0))
-    return names, motion.ts, rows, units
+    values = np.asarray(motion.u)[:, columns] if columns else np.zeros((len(motion.ts), 0))
+    return names, motion.ts, values, units
 
 
 def _constraint_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
@@ -161,12 +161,12 @@ def _constraint_lines(entry: Entry, motion: jl.Solution) -> Iterator[str]:
         return entry.system.residuals(q, v, entry.example.params, t=t)
 
     positions, velocities = jax.jit(jax.vmap(residuals))(motion.q, motion.v, motion.ts)
-    kept = {"position": positions, "velocity": velocities}
+    both = {"position": positions, "velocity": velocities}
     multipliers = motion.multipliers
     yield f"{'constraint':<12}{'lambda at the end':>24}  largest residuals"
     for name, unit in entry.multiplier_units.items():
         last = f"{float(multipliers[name][-1]):.6g} {unit}"
-        sizes = {kind: jnp.max(jnp.abs(rows[name])) for kind, rows in kept.items() if name in rows}
+        sizes = {kind: jnp.max(jnp.abs(rows[name])) for kind, rows in both.items() if name in rows}
         yield f"{name:<12}{last:>24}  {', '.join(f'{k} {float(x):.1e}' for k, x in sizes.items())}"
 
 
@@ -193,9 +193,9 @@ def _static_lines(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> Ite
 
 
 def _static_panels(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> list[Panel]:
-    """The force on every coordinate as this coordinate alone moves away from rest.
+    """The force on every coordinate as a function of this coordinate, the others at rest.
 
-    Under constraints on the independent ones, from which the others follow.
+    With constraints, only the independent coordinates have panels; they determine the others.
     """
     zero, own = jnp.zeros_like(rest.q), rest.q[entry.file_columns]
 
@@ -210,8 +210,8 @@ def _static_panels(entry: StaticEntry, params: dict, rest: jl.Equilibrium) -> li
         x = own[i] + jnp.linspace(-1.0, 1.0, 201) * (1.0 if unit == "rad" else 0.5)
 
         def force(x: jax.Array, i: int = i) -> jax.Array:
-            q, pull = jax.vjp(configuration, own.at[i].set(x))
-            return -pull(jl.inverse_dynamics(entry.system, q, zero, zero, params))[0][i]
+            q, vjp_fn = jax.vjp(configuration, own.at[i].set(x))
+            return -vjp_fn(jl.inverse_dynamics(entry.system, q, zero, zero, params))[0][i]
 
         label = f"force on {name} [{_FORCE_UNITS[unit]}]"
         mark = (float(own[i]), float(force(own[i])))

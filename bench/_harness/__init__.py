@@ -1,1 +1,1 @@
-"""What every benchmark measures with: timing, child processes, result files."""
+"""Timing, child processes and result files, for all benchmarks."""

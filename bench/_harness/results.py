@@ -1,4 +1,4 @@
-"""Result files and their text."""
+"""Result files, and their text for the terminal."""
 
 import json
 import os
@@ -19,7 +19,7 @@ PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy", "jaxlag")
 
 
 def circumstances() -> dict[str, Any]:
-    """When, where and with what; to be taken before the measurement."""
+    """Date, commit, machine and versions; call this before the measurement."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
@@ -29,7 +29,7 @@ def circumstances() -> dict[str, Any]:
             if hasattr(os, "sched_getaffinity")
             else os.cpu_count(),
             "platform": platform.platform(),
-            "load": round(os.getloadavg()[0], 2),  # runnable processes of others at the start
+            "load": round(os.getloadavg()[0], 2),  # of other processes, before the start
         },
         "versions": {"python": platform.python_version()}
         | {package: version(package) for package in PACKAGES},
@@ -45,7 +45,7 @@ def save(
     quick: bool,
     folder: Path,
 ) -> Path:
-    """Put a run in the place of the one on the same jax; the path of the file."""
+    """Store a run, replacing the one with the same version of jax; return the path of the file."""
     run = {
         **circumstances,
         "quick": quick,
@@ -67,7 +67,7 @@ def save(
 
 
 def _compact(content: Mapping[str, Any]) -> str:
-    """JSON with a line for every row."""
+    """JSON with one line for each table row."""
     rows = [row for run in content["runs"] for row in run["rows"]]
     marks = iter(range(len(rows)))
     runs = [{**run, "rows": [f"row {next(marks)}" for _ in run["rows"]]} for run in content["runs"]]

@@ -1,4 +1,4 @@
-"""Timing of finished work, and what a benchmark reports."""
+"""Timing of completed computations, and the report of a benchmark."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,26 +23,26 @@ BENCHMARKS = (
     "fits",
 )
 
-RUNS_PER_TURN = 3
+RUNS_PER_ROUND = 3
 
 Call = Callable[[], Any]
 
 
 class Program(NamedTuple):
-    """A compiled function, and what it took to get it."""
+    """A compiled function, with the times to trace and to compile it."""
 
     call: Callable[..., Any]
     trace_s: float
     compile_s: float
 
     def cost(self) -> dict[str, float]:
-        """The columns on compilation."""
+        """The columns about compilation."""
         return {"trace_s": self.trace_s, "compile_s": self.compile_s}
 
 
 @dataclass(frozen=True)
 class Target:
-    """A claim with its figure: judged."""
+    """A claim with its measured figure and its bound; judged."""
 
     claim: str
     figure: float
@@ -51,22 +51,22 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """Whether the figure keeps the bound; nan does not."""
+        """Whether the figure satisfies the bound; nan does not."""
         return self.figure >= self.bound if self.relation == ">=" else self.figure <= self.bound
 
 
 class Reference(NamedTuple):
-    """A figure to read the rows by: not judged."""
+    """A figure for comparison with the table rows; not judged."""
 
     figure: str
     what: str
 
 
 class Report(NamedTuple):
-    """Rows with the same keys, units in the keys, and what is said of them.
+    """Table rows with the same keys, which name the units, and the targets and references.
 
     Attributes:
-        shown: rows for the terminal, where all are too many.
+        shown: table rows for the terminal, if all of them are too many.
     """
 
     rows: list[dict[str, Any]]
@@ -85,7 +85,7 @@ def build(function: Callable[..., Any], *args: Any) -> Program:
 
 
 def seconds(call: Call) -> float:
-    """How long until everything that `call` returns has been computed."""
+    """Seconds until all results of `call` have been computed."""
     start = perf_counter()
     jax.block_until_ready(call())
     return perf_counter() - start
@@ -94,11 +94,11 @@ def seconds(call: Call) -> float:
 def interleaved(
     calls: Mapping[str, Call], rounds: int, budget_s: float = math.inf
 ) -> dict[str, list[float]]:
-    """Seconds of every run after one to warm up.
+    """Seconds of every run after one warm-up run.
 
-    The calls take turns, so that whatever else the machine does hits all of them alike. A turn
-    is three runs, as the first finds the caches full of another call's data. A call that has
-    used up `budget_s` sits the remaining rounds out.
+    The calls alternate, so that other load of the machine affects all of them equally. In a round,
+    each call runs three times, because in its first run the caches hold the data of another call.
+    A call that has used `budget_s` is left out of the remaining rounds.
     """
     samples: dict[str, list[float]] = {name: [] for name in calls}
     for call in calls.values():
@@ -106,12 +106,12 @@ def interleaved(
     for _ in range(rounds):
         for name, call in calls.items():
             if sum(samples[name]) < budget_s:
-                samples[name] += [seconds(call) for _ in range(RUNS_PER_TURN)]
+                samples[name] += [seconds(call) for _ in range(RUNS_PER_ROUND)]
     return samples
 
 
 def spread(samples: Sequence[float], unit: Literal["ms", "us"], lanes: int = 1) -> dict[str, Any]:
-    """The columns on time, per lane."""
+    """The columns about time, per lane."""
     scale = {"ms": 1e3, "us": 1e6}[unit] / lanes
     return {
         f"min_{unit}": min(samples) * scale,

@@ -1,7 +1,7 @@
-"""Child processes that time the same cases under different settings, taking turns.
+"""Child processes that time the same cases under different settings, in turn.
 
-A setting that XLA reads once per process needs a process of its own. Each worker compiles its
-cases once, alone on the machine; then the workers are asked for a round of timings in turn.
+A setting that XLA reads once per process needs its own process. Each worker compiles its cases
+once, while the others wait. Then the workers run one round of timings each, in turn.
 """
 
 import json
@@ -26,11 +26,11 @@ ROOT = Path(__file__).parents[2]
 class Worker:
     """A process that has compiled the cases of a benchmark under `settings`.
 
-    It starts without XLA_FLAGS: those of this process hold what importing jaxlag here has put in.
-    `interpreter` is the Python it runs in, `core` the one core it keeps to.
+    It starts without XLA_FLAGS, because importing jaxlag has changed them in this process.
+    `interpreter` is its Python interpreter, `core` the only CPU core that it uses.
 
     Attributes:
-        facts: what the benchmark's `prepare` knows of its cases before they are timed.
+        facts: properties of the cases before timing, from the benchmark's `prepare`.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Worker:
         self.facts: dict[str, Any] = self._answer()
 
     def seconds(self, cases: Sequence[str] | None = None) -> dict[str, list[float]]:
-        """Seconds of every run in one turn of every case, or of those named."""
+        """Seconds of every run in one round of all cases, or of the named ones."""
         assert self._process.stdin is not None
         print(json.dumps(cases), file=self._process.stdin, flush=True)
         return self._answer()
@@ -64,7 +64,7 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.communicate()  # its input ends, and so does it
+        self._process.communicate()  # it exits when its input ends
 
     def _answer(self) -> Any:
         assert self._process.stdout is not None
@@ -92,8 +92,8 @@ def under_both_settings(
 
 
 def serve(benchmark: str, quick: bool) -> None:
-    """The other end: facts first, then the timings of one turn for every line read."""
-    # What libraries write to the output must not get between the answers.
+    """Run as a worker: print the facts, then the timings of one round for every line read."""
+    # Output of libraries must not mix with the answers.
     with os.fdopen(os.dup(sys.stdout.fileno()), "w") as answers:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         calls, facts = import_module(f"bench.{benchmark}").prepare(quick)

@@ -1,1 +1,1 @@
-"""Equations of motion and their solutions in numbers of many digits, apart from the engine."""
+"""Equations of motion and their solutions in multiprecision, independent of the engine."""

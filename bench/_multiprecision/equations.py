@@ -1,8 +1,8 @@
-"""Equations of motion in numbers of many digits, from a declaration but not by the engine.
+"""Equations of motion in multiprecision, from the declaration and without the engine.
 
 M a + h = Q + (A^T + C) lam and A a + gamma = 0, where C lam are forces that read the multipliers.
-M, h, Q, A and gamma are plain derivatives of what the user wrote; the whole is solved by
-elimination with pivots.
+M, h, Q, A and gamma are plain derivatives of the user's functions. The linear system is solved by
+elimination with pivoting.
 
 Source: Pila, Introduction to Lagrangian Dynamics, eqs. 3.50 to 3.56 and 3.118.
 """
@@ -18,11 +18,11 @@ import jaxlag as jl
 from bench._multiprecision.jaxpr_code import Floats, Tape, compiled, read
 
 DIGITS = 50
-ROUNDS = 60  # of Newton's method onto the constraints
+ROUNDS = 60  # iterations of Newton's method for a state on the constraints
 
 
 def precise() -> Any:
-    """gmpy2 at `DIGITS` decimal digits from here on."""
+    """gmpy2, after setting its precision to `DIGITS` decimal digits."""
     import gmpy2
 
     gmpy2.get_context().precision = int(DIGITS * 3.33) + 4
@@ -34,11 +34,12 @@ class Singular(ArithmeticError):
 
 
 class Motion:
-    """What a declaration says, for one set of parameters.
+    """The equations of a declared system for one set of parameters.
 
     Attributes:
         size: number n of coordinates.
-        rows: number m of constraint rows, of which `positions` have a position residual.
+        rows: number m of constraint rows.
+        positions: number of rows with a position residual.
     """
 
     def __init__(self, system: jl.System, params: Mapping[str, Any]) -> None:
@@ -48,8 +49,8 @@ class Motion:
         self.size = system.size
         self._declared = _Declared(system)
         tape = self._tape = Tape()
-        # Doubles that the program computes with stand for themselves: its sums and products of
-        # parameters are taken with all digits, too.
+        # Parameters are exact doubles in the program: their sums and products are also computed
+        # with all digits.
         self._params = {
             name: Floats(tape.constants(x)) if _inexact(x) else x for name, x in params.items()
         }
@@ -157,7 +158,7 @@ def _inexact(x: Any) -> bool:
 
 
 class _Declared:
-    """Derivatives of the functions of a declaration; forward ones alone."""
+    """Derivatives of the declared functions, by forward mode only."""
 
     def __init__(self, system: jl.System) -> None:
         self.system = system
@@ -204,7 +205,7 @@ class _Declared:
         raise NotImplementedError(f"forces of the kind {type(force).__name__}")
 
     def _by_name(self, at: Any, lam: Any) -> dict[str, Any]:
-        """Multipliers as forces read them."""
+        """Multipliers by name, as forces read them."""
         parts, start = {}, 0
         for constraint in self.system.constraints:
             names = constraint.all_names
@@ -250,5 +251,5 @@ class _Declared:
         return jax.jvp(along, (t, q), (jnp.ones_like(t), v))[1]
 
     def C(self, t: Any, q: Any, v: Any, params: Any, lam: Any) -> Any:
-        """What a multiplier adds to the forces, (n, m)."""
+        """Derivative of the forces with respect to the multipliers, (n, m)."""
         return jax.jacfwd(self.force, 4)(t, q, v, params, lam)

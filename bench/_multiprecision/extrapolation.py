@@ -1,4 +1,4 @@
-"""Extrapolated midpoint steps in numbers of many digits.
+"""Extrapolated midpoint steps in multiprecision.
 
 Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, sec. II.9 (Gragg's
 midpoint rule with an even number of substeps has an error expansion in h^2; Aitken, Neville).
@@ -10,8 +10,8 @@ from typing import Any
 from bench._multiprecision.equations import precise
 
 SAFETY = 0.8
-LEAST, MOST = 0.2, 4.0  # change of a step, at most
-SHORTEST = 1e-7  # step over span, below which a motion is taken to end in a singular place
+LEAST, MOST = 0.2, 4.0  # bounds on the ratio of successive steps
+SHORTEST = 1e-7  # step over span; a motion with shorter steps is taken to be singular there
 
 
 def integrated(
@@ -21,14 +21,14 @@ def integrated(
     tolerance: float,
     columns: int,
 ) -> tuple[list[list], int]:
-    """(y at every time, number of steps), of order 2 `columns`, steps ending on the times.
+    """(y at every time, number of steps), of order 2 `columns`; a step ends on every time.
 
     Args:
         rates: `rates(t, y)`, dy/dt.
         y: state at the first time.
-        times: in s, growing.
-        tolerance: of the last column but one of a step, relative to 1 + |y|.
-        columns: of the tableau; substeps are 2, 4, ..., 2 `columns`.
+        times: increasing, s.
+        tolerance: on the difference of the last two columns, relative to 1 + |y|.
+        columns: of the extrapolation table; substeps are 2, 4, ..., 2 `columns`.
     """
     gmpy2 = precise()
     times = [gmpy2.mpfr(float(t)) for t in times]
@@ -53,16 +53,16 @@ def integrated(
 
 def _step(rates: Callable, t: Any, y: list, h: Any, columns: int) -> tuple[list, Any]:
     """(y at t + h, its estimated error relative to 1 + |y|)."""
-    slope, row = rates(t, y), []
+    slope, previous = rates(t, y), []
     for j in range(1, columns + 1):
         below = _midpoint(rates, t, y, slope, h, 2 * j)
         new = [below]
         for k in range(1, j):
             weight = 1 / ((precise().mpfr(j) / (j - k)) ** 2 - 1)
-            below = [b + (b - a) * weight for a, b in zip(row[k - 1], below, strict=True)]
+            below = [b + (b - a) * weight for a, b in zip(previous[k - 1], below, strict=True)]
             new.append(below)
-        row = new
-    last, before = row[-1], row[-2]
+        previous = new
+    last, before = previous[-1], previous[-2]
     differences = zip(last, before, strict=True)
     return last, max(abs(a - b) / (1 + abs(a)) for a, b in differences)
 

@@ -1,9 +1,9 @@
-"""Straight-line code on numbers of many digits, from functions written in JAX.
+"""Straight-line code in multiprecision, from functions written in JAX.
 
-A function is traced once; every number in it becomes a node of a tape, and what is reached from
-the results becomes the lines of a Python function on `gmpy2.mpfr`. Primitives that only move
-numbers about are applied to the indices of the nodes. Constants are the doubles that the program
-holds, taken as exact.
+A function is traced once. Every number in it becomes a node of a tape. The nodes on which the
+results depend become the lines of a Python function on `gmpy2.mpfr`. Primitives that only move
+numbers are applied to the indices of the nodes. Constants are the doubles of the program, taken
+as exact.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,10 +33,10 @@ _CHOICES = {"max": ">=", "min": "<="}
 
 
 class Tape:
-    """Nodes (operation, arguments), no two of them alike.
+    """Nodes (operation, arguments), all different.
 
-    Constants are nodes of their own, and nothing is computed from constants alone here: rounding
-    is left to the many digits of the lines.
+    Constants are nodes. Operations on constants are not evaluated here in double precision: the
+    generated lines evaluate them in multiprecision.
     """
 
     def __init__(self) -> None:
@@ -44,7 +44,7 @@ class Tape:
         self._known: dict[tuple, int] = {}
 
     def add(self, *node: Any) -> int:
-        """Index of a node, which is new only where there is none like it."""
+        """Index of a node; an equal node is reused."""
         if node not in self._known:
             self._known[node] = len(self.nodes)
             self.nodes.append(node)
@@ -62,14 +62,14 @@ class Tape:
         return np.array(ids, np.int32).reshape(shape)
 
     def value(self, i: int) -> float | None:
-        """The number that a node is, if it is a constant."""
+        """The value of a node if it is a constant."""
         node = self.nodes[i]
         return node[1] if node[0] == "constant" else None
 
     def infix(self, sign: str, a: int, b: int) -> int:
-        """A sum, difference, product or quotient, without what adds 0 or multiplies by 0 or 1.
+        """A sum, difference, product or quotient, simplified if an operand is 0 or 1.
 
-        Derivatives of arrays are full of these; 0 times what is not finite is 0 here.
+        Derivatives of arrays contain many of these. 0 times a number that is not finite is 0 here.
         """
         x, y = self.value(a), self.value(b)
         if (sign in "+-" and y == 0) or (sign in "*/" and y == 1):
@@ -89,14 +89,14 @@ class Tape:
         return self.add("negative", a) if x is None else self.add("constant", -x)
 
     def reached(self, results: Sequence[int]) -> list[int]:
-        """The nodes that these need, in order."""
+        """The nodes on which these depend, in order of evaluation."""
         needed, left = set(), list(results)
         while left:
             i = left.pop()
             if i not in needed:
                 needed.add(i)
                 left += self.arguments(i)
-        return sorted(needed)  # arguments are older than what is made of them
+        return sorted(needed)  # arguments have smaller indices than their results
 
     def arguments(self, i: int) -> tuple[int, ...]:
         operation, *rest = self.nodes[i]
@@ -106,14 +106,14 @@ class Tape:
 
 
 class Floats:
-    """An array of nodes; what is not one while a program is read is a NumPy array of values."""
+    """An array of nodes; all other arrays of a program being read are NumPy arrays of values."""
 
     def __init__(self, ids: np.ndarray) -> None:
         self.ids = np.asarray(ids, np.int32)
 
 
 class Truths(Floats):
-    """An array of nodes that are true or false."""
+    """An array of nodes with Boolean values."""
 
 
 def read(tape: Tape, function: Callable, *args: Any) -> np.ndarray:
@@ -189,7 +189,7 @@ def _apply(tape: Tape, equation: Any, args: list[Any]) -> list[Any]:
 
 
 def _moved(equation: Any, args: list[Any]) -> list[Any]:
-    """What a primitive does to arrays, by what it does to the indices of their nodes."""
+    """A primitive that only moves numbers, applied to the indices of the nodes."""
     kind = next(type(x) for x in args if isinstance(x, Floats))
     plain = [x.ids if isinstance(x, Floats) else x for x in args]
     found = equation.primitive.bind(*plain, **equation.params)
@@ -220,7 +220,7 @@ def _dotted(tape: Tape, a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.nda
     groups = int(np.prod(batch))
     a, b = a.reshape(groups, -1, count), b.reshape(groups, -1, count)
     zero = int(tape.constants(0.0))
-    rows = [
+    products = [
         reduce(
             lambda total, pair: tape.infix("+", total, tape.infix("*", *map(int, pair))),
             zip(row, column, strict=True),
@@ -230,28 +230,28 @@ def _dotted(tape: Tape, a: np.ndarray, b: np.ndarray, dimensions: Any) -> np.nda
         for row in a[g]
         for column in b[g]
     ]
-    return np.array(rows, np.int32).reshape(shape)
+    return np.array(products, np.int32).reshape(shape)
 
 
 def _reduced(ids: np.ndarray, axes: Sequence[int], fold: Callable[[int, int], int]) -> np.ndarray:
-    kept = [i for i in range(ids.ndim) if i not in axes]
-    lines = ids.transpose(*kept, *axes).reshape(int(np.prod([ids.shape[i] for i in kept])), -1)
+    rest = [i for i in range(ids.ndim) if i not in axes]
+    lines = ids.transpose(*rest, *axes).reshape(int(np.prod([ids.shape[i] for i in rest])), -1)
     results = [reduce(fold, map(int, line)) for line in lines]
-    return np.array(results, np.int32).reshape([ids.shape[i] for i in kept])
+    return np.array(results, np.int32).reshape([ids.shape[i] for i in rest])
 
 
 def _running(tape: Tape, ids: np.ndarray, axis: int, reverse: bool) -> np.ndarray:
-    """Sums of each line up to every one of its elements, or from it on."""
+    """Cumulative sums along an axis, from its start or, with `reverse`, from its end."""
     ids = np.moveaxis(ids, axis, 0)
-    rows = list(ids[::-1] if reverse else ids)
-    for i in range(1, len(rows)):
-        rows[i] = _mapped(lambda a, b: tape.infix("+", a, b), rows[i - 1], rows[i])
-    return np.moveaxis(np.stack(rows[::-1] if reverse else rows), 0, axis)
+    sums = list(ids[::-1] if reverse else ids)
+    for i in range(1, len(sums)):
+        sums[i] = _mapped(lambda a, b: tape.infix("+", a, b), sums[i - 1], sums[i])
+    return np.moveaxis(np.stack(sums[::-1] if reverse else sums), 0, axis)
 
 
 def _mapped(function: Callable[..., int], *ids: np.ndarray) -> np.ndarray:
     ids = np.broadcast_arrays(*ids)
-    found = [function(*map(int, row)) for row in zip(*(x.ravel() for x in ids), strict=True)]
+    found = [function(*map(int, args)) for args in zip(*(x.ravel() for x in ids), strict=True)]
     return np.array(found, np.int32).reshape(ids[0].shape)
 
 
@@ -288,7 +288,7 @@ def _elementwise(tape: Tape, name: str, parameters: Any, args: list[Any], out: A
 
 
 def compiled(tape: Tape, results: Sequence[int], arguments: Sequence[str]) -> Callable:
-    """A Python function of sequences of mpfr, `f(*arguments)`, that gives a list of mpfr."""
+    """A Python function of sequences of mpfr, `f(*arguments)`, that returns a list of mpfr."""
     import gmpy2
 
     results = [int(i) for i in results]
@@ -306,7 +306,7 @@ def compiled(tape: Tape, results: Sequence[int], arguments: Sequence[str]) -> Ca
             continue
         lines.append(f"n{i} = {_line(operation, rest)}")
     body = "\n ".join([*lines, f"return [{', '.join(f'n{i}' for i in results)}]"])
-    # Constants as default values are local, which is faster to look up.
+    # Constants are default values: these are local variables, which are faster to look up.
     head = ", ".join([*arguments, *(f"{name}={name}" for name in held)])
     exec(f"def program({head}):\n {body}\n", space)
     return space["program"]

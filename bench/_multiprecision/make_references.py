@@ -1,10 +1,10 @@
-"""References of 20 digits and more for motions of the systems.
+"""Reference motions of the systems, to 20 digits or more.
 
-Two motions of every system that moves, from the starts in `bench._problems.starts`, go into one
-file of `bench/references/`. The equations are plain derivatives of the declaration (`equations`),
-in 50 digits, integrated by extrapolation of order 26 to 1e-26 per step; the engine takes no part. A
-second integration of another order and tolerance says how far to trust the first: the file holds
-the largest difference of the two.
+Each system that moves has a file in `bench/references/` with two motions, from the starts in
+`bench._problems.starts`. The equations are plain derivatives of the declaration (`equations`), in
+50 digits. They are integrated by extrapolation of order 26 to 1e-26 per step. The engine is not
+used. A second integration has another order and tolerance. The file holds the largest difference
+of the two, which shows the accuracy of the first.
 
     python -m bench._multiprecision.make_references                     all, in half an hour
     python -m bench._multiprecision.make_references double_pendulum     some
@@ -31,20 +31,20 @@ from bench._problems.starts import STARTS, Start
 MODULE = "bench._multiprecision.make_references"
 FOLDER = Path(__file__).parents[1] / "references"
 SAVES = 33
-KEPT = 25  # digits in the files
+STORED_DIGITS = 25  # digits in the files
 COLUMNS, TOLERANCE = 13, 1e-26
 OTHER_COLUMNS, OTHER_TOLERANCE = 11, 1e-24
 AGREEMENT = 1e-18  # of the two integrations, relative to 1 + |y|
 
 
 class Reference(NamedTuple):
-    """One motion, as a benchmark wants it.
+    """One motion, as the benchmarks read it.
 
     Attributes:
-        start: what the start is called.
+        start: name of the start.
         times: (s,), s.
         y: (s, 2n), the doubles nearest to (q, v).
-        agreement: of two integrations, relative to 1 + |y|.
+        agreement: largest difference of the two integrations, relative to 1 + |y|.
     """
 
     start: str
@@ -60,7 +60,7 @@ def load(name: str, folder: Path = FOLDER) -> tuple[Mapping[str, Any], list[Refe
         Reference(
             motion["start"],
             np.array(motion["times"]),
-            np.array([[float(x) for x in (*q, *v)] for q, v in _rows(motion)]),
+            np.array([[float(x) for x in (*q, *v)] for q, v in _states(motion)]),
             motion["agreement"],
         )
         for motion in content["motions"]
@@ -69,7 +69,7 @@ def load(name: str, folder: Path = FOLDER) -> tuple[Mapping[str, Any], list[Refe
 
 
 def made(system: Any, params: Mapping[str, Any], starts: Sequence[Start]) -> list[dict[str, Any]]:
-    """The motions of a system, as they are written into its file."""
+    """The motions of a system, as written to its file."""
     motion = Motion(system, params)
     return [_followed(motion, start) for start in starts]
 
@@ -77,43 +77,43 @@ def made(system: Any, params: Mapping[str, Any], starts: Sequence[Start]) -> lis
 def _followed(motion: Motion, start: Start) -> dict[str, Any]:
     times = [start.duration * i / (SAVES - 1) for i in range(SAVES)]
     y = motion.start(start.q0, start.v0)
-    rows, steps = integrated(motion.rates, y, times, TOLERANCE, COLUMNS)
+    states, steps = integrated(motion.rates, y, times, TOLERANCE, COLUMNS)
     others, _ = integrated(motion.rates, y, times, OTHER_TOLERANCE, OTHER_COLUMNS)
     n = motion.size
     return {
         "start": start.name,
         "times": times,
-        "q": [[_digits(x) for x in row[:n]] for row in rows],
-        "v": [[_digits(x) for x in row[n:]] for row in rows],
+        "q": [[_digits(x) for x in state[:n]] for state in states],
+        "v": [[_digits(x) for x in state[n:]] for state in states],
         "steps": steps,
-        "agreement": float(f"{apart(rows, others):.1e}"),
+        "agreement": float(f"{largest_difference(states, others):.1e}"),
     }
 
 
-def apart(rows: Sequence[Sequence], others: Sequence[Sequence]) -> float:
+def largest_difference(states: Sequence[Sequence], others: Sequence[Sequence]) -> float:
     """Largest difference relative to 1 + |y|."""
-    pairs = [(a, b) for x, y in zip(rows, others, strict=True) for a, b in zip(x, y, strict=True)]
+    pairs = [(a, b) for x, y in zip(states, others, strict=True) for a, b in zip(x, y, strict=True)]
     return max(float(abs(a - b) / (1 + abs(a))) for a, b in pairs)
 
 
-def differences(motion: Mapping[str, Any], again: Mapping[str, Any]) -> float:
-    """How far a motion of a file is from the same made again, relative to 1 + |y|."""
-    if motion["times"] != again["times"] or motion["start"] != again["start"]:
+def differences(motion: Mapping[str, Any], recomputed: Mapping[str, Any]) -> float:
+    """Largest difference of a motion of a file and the same made again, relative to 1 + |y|."""
+    if motion["times"] != recomputed["times"] or motion["start"] != recomputed["start"]:
         return float("inf")
     import gmpy2
 
     def numbers(motion: Mapping[str, Any]) -> list[list]:
-        return [[gmpy2.mpfr(x) for x in (*q, *v)] for q, v in _rows(motion)]
+        return [[gmpy2.mpfr(x) for x in (*q, *v)] for q, v in _states(motion)]
 
-    return apart(numbers(motion), numbers(again))
+    return largest_difference(numbers(motion), numbers(recomputed))
 
 
-def _rows(motion: Mapping[str, Any]) -> Any:
+def _states(motion: Mapping[str, Any]) -> Any:
     return zip(motion["q"], motion["v"], strict=True)
 
 
 def _digits(x: Any) -> str:
-    return f"{x:.{KEPT - 1}e}"
+    return f"{x:.{STORED_DIGITS - 1}e}"
 
 
 def _entries() -> Mapping[str, Any]:
@@ -123,7 +123,7 @@ def _entries() -> Mapping[str, Any]:
 
 
 def plain(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters as files have them: numbers and lists."""
+    """Parameters as stored in the files: numbers and lists."""
     return {name: np.asarray(value).tolist() for name, value in params.items()}
 
 
@@ -139,22 +139,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         begin, entry = perf_counter(), entries[name]
         try:
             motions = made(entry.system, entry.example.params, STARTS[name])
-        except ArithmeticError as error:  # the others go on
+        except ArithmeticError as error:  # continue with the others
             print(f"{name:<36} {error}", flush=True)
             good = False
             continue
-        apart = [motion["agreement"] for motion in motions]
+        deviations = [motion["agreement"] for motion in motions]
         if arguments.check:
-            kept = json.loads((FOLDER / f"{name}.json").read_text())["motions"]
-            pairs = zip(kept, motions, strict=True)
-            apart += [differences(*pair) for pair in pairs]
+            stored = json.loads((FOLDER / f"{name}.json").read_text())["motions"]
+            pairs = zip(stored, motions, strict=True)
+            deviations += [differences(*pair) for pair in pairs]
         else:
             _write(name, entry, motions)
-        fine = max(apart) <= AGREEMENT
+        fine = max(deviations) <= AGREEMENT
         good = good and fine
         seconds = perf_counter() - begin
         verdict = "ok" if fine else "NOT TRUSTED"
-        print(f"{name:<36} {max(apart):.1e} {verdict:<11} {seconds:6.1f} s", flush=True)
+        print(f"{name:<36} {max(deviations):.1e} {verdict:<11} {seconds:6.1f} s", flush=True)
     return 0 if good else 1
 
 
@@ -162,7 +162,7 @@ def _write(name: str, entry: Any, motions: list[dict[str, Any]]) -> None:
     content = {
         "system": name,
         "made_by": f"python -m {MODULE} {name}",
-        "arithmetic": f"gmpy2.mpfr, {DIGITS} digits; {KEPT} digits kept",
+        "arithmetic": f"gmpy2.mpfr, {DIGITS} digits; {STORED_DIGITS} digits kept",
         "integration": f"extrapolated midpoint rule, order {2 * COLUMNS}, {TOLERANCE:g} per step",
         "params": plain(entry.example.params),
         "motions": motions,

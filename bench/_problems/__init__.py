@@ -1,1 +1,1 @@
-"""Problems that several benchmarks solve, with their equations by hand and their exact answers."""
+"""Problems that several benchmarks solve, with hand-written equations and exact solutions."""

@@ -1,6 +1,7 @@
-"""Motions to wait for: a declaration as a user writes it, and the same equations by hand.
+"""Motions of the benchmark `first-result`: as a user declares them, and as equations by hand.
 
-By hand for JAX: scalars for few coordinates, arrays for many. For heyoka: expressions.
+The equations by hand are written for JAX on scalars for few coordinates and on arrays for many.
+For heyoka they are expressions.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,9 +27,9 @@ class Beginning(NamedTuple):
     """A system, a start and a span of 2 s or less.
 
     Attributes:
-        rates: the explicit equations on scalars; None where nobody would write them so.
-        field: dy/dt on arrays, where a hand would write that for JAX.
-        turning: (q, v) to what y holds behind the coordinates; None: v.
+        rates: the explicit equations on scalars; None if these would not be written by hand.
+        field: dy/dt on arrays, if one would write arrays for JAX by hand.
+        turning: function of (q, v) that gives the part of y after the coordinates; None: v.
     """
 
     system: jl.System
@@ -71,20 +72,20 @@ def simple_pendulum(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> l
 
 
 def on_cart(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: the cart, the angle of the rod from the downward vertical, their rates."""
-    half, push = 0.5 * p["l"], f.sin(p["Omega"] * t) * p["F2"]
+    """y: position of the cart, angle of the rod from the downward vertical, their rates."""
+    half, end_force = 0.5 * p["l"], f.sin(p["Omega"] * t) * p["F2"]
     x, theta, x_rate, w = y
     s, c = f.sin(theta), f.cos(theta)
     M11, M12, M22 = p["m1"] + p["m2"], p["m2"] * half * c, p["m2"] * half * p["l"] / 1.5
-    drive = p["F0"] * f.cos(p["Omega"] * t) + push
+    drive = p["F0"] * f.cos(p["Omega"] * t) + end_force
     r1 = drive + p["m2"] * half * s * w * w - p["k"] * x - p["b"] * x_rate
-    r2 = push * p["l"] * c - p["m2"] * p["g"] * half * s
+    r2 = end_force * p["l"] * c - p["m2"] * p["g"] * half * s
     det = M11 * M22 - M12 * M12
     return [x_rate, w, (M22 * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det]
 
 
 def hovering(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: position, yaw, pitch, roll; velocity, turning rates in body axes."""
+    """y: position, yaw, pitch, roll; velocity, angular velocity in body axes."""
     _, _, _, psi, theta, phi, *V, w1, w2, w3 = y
     f1, f2, f3, f4 = (p["k"] * p[name] * p[name] for name in ("w1", "w2", "w3", "w4"))
     h = p["Im"] * (p["w2"] + p["w4"] - p["w1"] - p["w3"])
@@ -92,13 +93,13 @@ def hovering(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
     lift = (f1 + f2 + f3 + f4) / p["m"]
     s, c = f.sin, f.cos
     s1, c1, s2, c2, s3, c3 = s(psi), c(psi), s(theta), c(theta), s(phi), c(phi)
-    turn = (s3 * w2 + c3 * w3) / c2
+    yaw_rate = (s3 * w2 + c3 * w3) / c2
     x, y_, z = p["Ix"], p["Iy"], p["Iz"]
     return [
         *V,
-        turn,
+        yaw_rate,
         c3 * w2 - s3 * w3,
-        w1 + s2 * turn,
+        w1 + s2 * yaw_rate,
         lift * (c1 * s2 * c3 + s1 * s3),
         lift * (s1 * s2 * c3 - c1 * s3),
         lift * (c2 * c3) - p["g"],
@@ -113,7 +114,7 @@ def _body_rates(q: Any, v: Any) -> Any:
 
 
 def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: turn of the frame, spin of the body, their rates; Euler's equations projected."""
+    """y: angles of the frame and of the body on it, their rates; Euler's equations projected."""
     M, c = p["M"], (p["xb"], p["yb"], p["zb"])
     squares = [x * x for x in c]
     I1 = p["A"] + M * (squares[1] + squares[2])
@@ -128,12 +129,12 @@ def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
             I13 * w[0] + I23 * w[1] + I3 * w[2],
         ]
 
-    _, phi, turn, spin = y
+    _, phi, psi_dot, spin = y
     tilt = p["theta"] + 0.0 * phi  # an expression, not a number
     s, k, s_phi, c_phi = f.sin(tilt), f.cos(tilt), f.sin(phi), f.cos(phi)
     axis = (s * s_phi, s * c_phi, k)
-    w = (turn * axis[0], turn * axis[1], spin + turn * k)
-    h, swung = moment(w), moment((turn * spin * axis[1], -turn * spin * axis[0], 0.0 * spin))
+    w = (psi_dot * axis[0], psi_dot * axis[1], spin + psi_dot * k)
+    h, swung = moment(w), moment((psi_dot * spin * axis[1], -psi_dot * spin * axis[0], 0.0 * spin))
     b = [
         swung[0] + w[1] * h[2] - w[2] * h[1],
         swung[1] + w[2] * h[0] - w[0] * h[2],
@@ -145,11 +146,11 @@ def on_frame(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any
     r1 = p["tau"] - (axis[0] * b[0] + axis[1] * b[1] + axis[2] * b[2])
     r2 = -M * p["g"] * s * (c[0] * c_phi - c[1] * s_phi) - b[2]
     det = M11 * M22 - M12 * M12
-    return [turn, spin, (M22 * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det]
+    return [psi_dot, spin, (M22 * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det]
 
 
 def chain_on_arrays(n: int) -> Callable[[Any, Array, Any], Array]:
-    """dy/dt of `bench._problems.scenes.links(n)`, as a hand would write it for JAX."""
+    """dy/dt of `bench._problems.scenes.links(n)`, written by hand for JAX."""
     later = np.maximum.outer(np.arange(n), np.arange(n))
 
     def field(t: Any, y: Array, p: Any) -> Array:
@@ -157,8 +158,8 @@ def chain_on_arrays(n: int) -> Callable[[Any, Array, Any], Array]:
         carried = jnp.cumsum(p["m"][::-1])[::-1]
         A = jnp.outer(p["l"], p["l"]) * carried[later]
         between = q[:, None] - q[None, :]
-        pull = carried * p["g"] * p["l"] * jnp.sin(q)
-        a = jnp.linalg.solve(A * jnp.cos(between), -(A * jnp.sin(between)) @ v**2 - pull)
+        gravity = carried * p["g"] * p["l"] * jnp.sin(q)
+        a = jnp.linalg.solve(A * jnp.cos(between), -(A * jnp.sin(between)) @ v**2 - gravity)
         return jnp.concatenate([v, a])
 
     return field
@@ -179,9 +180,9 @@ def attraction(t: Any, q: Array, v: Array, p: Any) -> Array:
     """L of bodies that attract each other."""
     r, v = q.reshape(BODIES, AXES), v.reshape(BODIES, AXES)
     first, second = np.array(PAIRS).T
-    apart = jnp.sqrt(jnp.sum((r[first] - r[second]) ** 2, axis=1))
+    distances = jnp.sqrt(jnp.sum((r[first] - r[second]) ** 2, axis=1))
     T = 0.5 * p["m"] @ jnp.sum(v**2, axis=1)
-    return T + p["gamma"] * jnp.sum(p["m"][first] * p["m"][second] / apart)
+    return T + p["gamma"] * jnp.sum(p["m"][first] * p["m"][second] / distances)
 
 
 def _bodies_on_arrays(t: Any, y: Array, p: Any) -> Array:
@@ -193,15 +194,15 @@ def _bodies_on_arrays(t: Any, y: Array, p: Any) -> Array:
 
 
 def bodies(f: Functions, p: Mapping[str, Any], t: Any, y: Numbers) -> list[Any]:
-    """y: positions of the bodies one after the other, velocities."""
+    """y: positions of the bodies one after the other, then their velocities."""
     half = BODIES * AXES
     a: list[Any] = [0.0] * half
     for i, j in PAIRS:
         d = [y[AXES * j + k] - y[AXES * i + k] for k in range(AXES)]
-        pull = p["gamma"] * f.over_cube(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        factor = p["gamma"] * f.over_cube(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         for k in range(AXES):
-            a[AXES * i + k] = a[AXES * i + k] + p["m"][j] * (pull * d[k])
-            a[AXES * j + k] = a[AXES * j + k] - p["m"][i] * (pull * d[k])
+            a[AXES * i + k] = a[AXES * i + k] + p["m"][j] * (factor * d[k])
+            a[AXES * j + k] = a[AXES * j + k] - p["m"][i] * (factor * d[k])
     return [*y[half:], *a]
 
 

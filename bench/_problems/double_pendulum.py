@@ -1,4 +1,4 @@
-"""The problem that all benchmarks share: a double pendulum, and three ways to solve it.
+"""A double pendulum that several benchmarks use, and three ways to solve it.
 
 m = l = 1, g = 9.81, both angles from the downward vertical, q0 = (1, 0.5), at rest, t = 10,
 tolerance 1e-9, float64.
@@ -59,7 +59,7 @@ def times(count: int) -> np.ndarray:
 
 
 def by_hand(t: Any, y: Array, params: Any) -> Array:
-    """The equations of motion as one would write them, M inverted in closed form."""
+    """The equations of motion written by hand, M inverted in closed form."""
     m1, m2, h1, h2, g = (params[name] for name in ("m1", "m2", "h1", "h2", "g"))
     theta1, theta2, w1, w2 = y
     sin, cos = jnp.sin(theta1 - theta2), jnp.cos(theta1 - theta2)
@@ -71,7 +71,7 @@ def by_hand(t: Any, y: Array, params: Any) -> Array:
 
 
 def naive(t: Any, y: Array, params: Any) -> Array:
-    """The equations of motion as a first prototype has them: Hessian, Jacobian, library solve."""
+    """The equations of motion as in a first prototype: Hessian, Jacobian, library solve."""
 
     def L(q: Array, v: Array) -> Array:
         return kinetic(t, q, v, params) - potential(t, q, params)
@@ -128,6 +128,6 @@ def with_diffrax(field: Field, ts: Any, land: bool = False) -> Callable[[Array, 
 
 
 def reference(ts: Any) -> Array:
-    """States after the start at the tight tolerance, free of any interpolation."""
+    """States after the start at the tight tolerance, without interpolation."""
     solve = jax.jit(with_diffrax(by_hand, ts, land=True))
     return solve(start(), params(), jnp.asarray(TIGHT)).states

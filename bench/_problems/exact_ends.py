@@ -1,8 +1,8 @@
-"""Coordinates at the ends of the motions of the benchmark `work-precision`, to 20 digits.
+"""Final coordinates of the motions of the benchmark `work-precision`, to 20 digits.
 
-`python -m bench._problems.exact_ends` makes them anew with heyoka in quadruple precision (113
-bits), from the starts in double precision as they are; with a tolerance of 1e-30 the digits kept
-are free of error even where the motion magnifies differences by 1e6.
+`python -m bench._problems.exact_ends` computes them again by heyoka in quadruple precision (113
+bits). The starts are exact doubles. With a tolerance of 1e-30 all stored digits are correct, even
+if the motion amplifies differences by 1e6.
 """
 
 import json
@@ -29,7 +29,7 @@ def exact_end(name: str) -> np.ndarray:
 
 
 def computed(motion: Motion) -> list[Any]:
-    """The same as decimal strings."""
+    """The final coordinates as decimal strings, computed."""
     if motion.lanes == 1:
         return _end(motion, motion.start())
     return [_end(motion, y0) for y0 in motion.start()]
@@ -52,7 +52,7 @@ def _end(motion: Motion, y0: np.ndarray) -> list[str]:
 
 
 def _wide(value: Any, hy: Any) -> Any:
-    """Parameters as expressions: what is computed from them is not rounded to double precision."""
+    """Parameters as expressions: results computed from them are not rounded to double precision."""
     if np.ndim(value):
         return [_wide(x, hy) for x in value]
     return hy.expression(hy.real128(float(value)))

@@ -1,9 +1,9 @@
 """Equations of motion y' = f(y) as a good engineer writes them, for any library of functions.
 
-Each takes the functions to call, the parameters and the numbers y, and returns the rates: plain
-sums, products and quotients, so that the same lines serve JAX, numba, CasADi, heyoka and Python's
-own numbers. y starts with the coordinates. What depends on parameters alone is computed first,
-linear systems are solved in closed form or by Cholesky's factors.
+Each function takes the elementary functions to call, the parameters and the numbers y. It returns
+the rates as plain sums, products and quotients. So the same lines work for JAX, numba, CasADi,
+heyoka and Python numbers. y starts with the coordinates. Terms that depend on parameters alone are
+computed first. Linear systems are solved in closed form or by Cholesky factors.
 """
 
 import math
@@ -14,10 +14,10 @@ Numbers = Sequence[Any]
 
 
 class Functions(NamedTuple):
-    """What the equations call.
+    """Elementary functions that the equations call.
 
     Attributes:
-        over_cube: x^(-3/2), in the form that suits a library.
+        over_cube: x^(-3/2), in the form best for the library.
     """
 
     sin: Callable[[Any], Any]
@@ -27,13 +27,13 @@ class Functions(NamedTuple):
 
 
 def functions(module: Any) -> Functions:
-    """Those of a module with the usual names."""
+    """The functions of a module with the usual names."""
     sqrt = module.sqrt
     return Functions(module.sin, module.cos, sqrt, lambda x: 1.0 / (x * sqrt(x)))
 
 
 def of_expressions(module: Any) -> Functions:
-    """Those of a module on its expressions, whose roots of plain numbers are numbers."""
+    """The functions of a module for expressions; roots of plain numbers stay plain numbers."""
 
     def sqrt(x: Any) -> Any:
         return math.sqrt(x) if isinstance(x, float) else module.sqrt(x)
@@ -58,9 +58,9 @@ def double_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]
 
 
 def kepler(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: position from the centre, velocity."""
-    pull = p["mu"] * f.over_cube(y[0] * y[0] + y[1] * y[1])
-    return [y[2], y[3], -(pull * y[0]), -(pull * y[1])]
+    """y: position from the center, velocity."""
+    attraction = p["mu"] * f.over_cube(y[0] * y[0] + y[1] * y[1])
+    return [y[2], y[3], -(attraction * y[0]), -(attraction * y[1])]
 
 
 def heavy_top(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
@@ -74,11 +74,11 @@ def heavy_top(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
 
 
 def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: position, roll, pitch, yaw; velocity of the origin and turning rates in body axes."""
+    """y: position, roll, pitch, yaw; velocity of the origin, angular velocity, in body axes."""
     m, g = p["m"], p["g"]
     c = (p["xc"], p["yc"], p["zc"])
-    push = (p["Fx"] / m, p["Fy"] / m, p["Fz"] / m)
-    # Inertia and moment about the mass centre (parallel axes).
+    specific_force = (p["Fx"] / m, p["Fy"] / m, p["Fz"] / m)
+    # Inertia and moment about the mass center (parallel axes).
     xx, yy, zz = (
         p[name] - m * (c[i] * c[i] + c[j] * c[j])
         for name, i, j in (("Ix", 1, 2), ("Iy", 0, 2), ("Iz", 0, 1))
@@ -87,9 +87,9 @@ def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
         m * c[i] * c[j] - p[name] for name, i, j in (("Ixy", 0, 1), ("Ixz", 0, 2), ("Iyz", 1, 2))
     )
     J = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-    rows = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
-    per_det = 1.0 / _dot(J[0], rows[0])
-    arm = _cross(c, [m * x for x in push])
+    adjugate = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
+    per_det = 1.0 / _dot(J[0], adjugate[0])
+    arm = _cross(c, [m * x for x in specific_force])
     moment = [p[name] - x for name, x in zip(("Mx", "My", "Mz"), arm, strict=True)]
 
     _, _, _, phi, theta, psi, *state = y
@@ -98,31 +98,33 @@ def rigid_aircraft(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
     s_psi, c_psi = f.sin(psi), f.cos(psi)
     spun = [_dot(row, w) for row in J]
     torque = [a - b for a, b in zip(moment, _cross(w, spun), strict=True)]
-    w_rate = [per_det * _dot(row, torque) for row in rows]
+    w_rate = [per_det * _dot(row, torque) for row in adjugate]
     weight = (-g * s_theta, g * (s_phi * c_theta), g * (c_phi * c_theta))
-    swung = [a + b for a, b in zip(V, _cross(w, c), strict=True)]  # velocity of the mass centre
+    swung = [a + b for a, b in zip(V, _cross(w, c), strict=True)]  # velocity of the mass center
     V_rate = [
         force + fall - a - b
-        for force, fall, a, b in zip(push, weight, _cross(w_rate, c), _cross(w, swung), strict=True)
+        for force, fall, a, b in zip(
+            specific_force, weight, _cross(w_rate, c), _cross(w, swung), strict=True
+        )
     ]
-    # R = Rz Ry Rx, one turn after the other.
+    # R = Rz Ry Rx, one rotation after the other.
     level, down = c_phi * V[1] - s_phi * V[2], s_phi * V[1] + c_phi * V[2]
     ahead, sink = c_theta * V[0] + s_theta * down, c_theta * down - s_theta * V[0]
-    turn = (s_phi * w[1] + c_phi * w[2]) / c_theta
+    yaw_rate = (s_phi * w[1] + c_phi * w[2]) / c_theta
     return [
         c_psi * ahead - s_psi * level,
         s_psi * ahead + c_psi * level,
         sink,
-        w[0] + s_theta * turn,
+        w[0] + s_theta * yaw_rate,
         c_phi * w[1] - s_phi * w[2],
-        turn,
+        yaw_rate,
         *V_rate,
         *w_rate,
     ]
 
 
 def cartesian_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: positions of both bobs, velocities; the tensions from the second derivatives of phi."""
+    """y: positions of both bobs, velocities; tensions from phi'' = 0."""
     g, per_m1, per_m2 = p["g"], 1.0 / p["m1"], 1.0 / p["m2"]
     x1, y1, x2, y2, u1, v1, u2, v2 = y
     dx, dy, du, dv = x2 - x1, y2 - y1, u2 - u1, v2 - v1
@@ -144,26 +146,26 @@ def cartesian_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[A
 
 
 def rolling_disk(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: centre, heading, inclination, spin; rates w along e1, e2, e3 of the catalogue's disk.
+    """y: center, heading, inclination, spin; rates w along e1, e2, e3 of the catalogue's disk.
 
-    The equations of its docstring: the rows of rolling are solved for the velocity of the centre.
+    The equations of its docstring; the rolling constraints are solved for the center's velocity.
     """
     R, I_d, I_a = p["R"], p["I_d"], p["I_a"]
     edge = p["m"] * R * R
     per_lean, per_spin = 1.0 / (I_d + edge), edge / (I_a + edge)
-    k2, k3, pull, per_d = I_a / I_d, (I_a + edge) * per_lean, p["m"] * p["g"] * R * per_lean, I_d
+    k2, k3, gravity, per_d = I_a / I_d, (I_a + edge) * per_lean, p["m"] * p["g"] * R * per_lean, I_d
     _, _, psi, theta, _, w1, w2, w3 = y
     s, c, s_psi, c_psi = f.sin(theta), f.cos(theta), f.sin(psi), f.cos(psi)
-    turn = w2 / s
-    swing = c * turn
+    heading_rate = w2 / s
+    swing = c * heading_rate
     along, across = R * w3, R * (w1 * s)
     return [
         across * s_psi - along * c_psi,
         -(along * s_psi) - across * c_psi,
-        turn,
+        heading_rate,
         w1,
         w3 - swing,
-        (per_d * per_lean) * (swing * w2) - k3 * (w2 * w3) - pull * c,
+        (per_d * per_lean) * (swing * w2) - k3 * (w2 * w3) - gravity * c,
         k2 * (w1 * w3) - swing * w1,
         per_spin * (w1 * w2),
     ]
@@ -178,17 +180,17 @@ def elastic_pendulum(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any
 
 
 def chain(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
-    """y: absolute angles of the links, their rates; masses at the ends, M by Cholesky's factors."""
+    """y: absolute angles of the links, their rates; masses at the ends, M by Cholesky factors."""
     n = len(y) // 2
-    A, pull = chain_constants(p, n)
+    A, gravity = chain_constants(p, n)
     q, v = y[:n], y[n:]
     s, c, w = [f.sin(x) for x in q], [f.cos(x) for x in q], [x * x for x in v]
-    a = [-(pull[i] * s[i]) for i in range(n)]
+    a = [-(gravity[i] * s[i]) for i in range(n)]
     L: list[list[Any]] = [[None] * n for _ in range(n)]
     for i in range(n):
         for j in range(i):
-            turn = A[i][j] * (s[i] * c[j] - c[i] * s[j])
-            a[i], a[j] = a[i] - turn * w[j], a[j] + turn * w[i]
+            coupling = A[i][j] * (s[i] * c[j] - c[i] * s[j])
+            a[i], a[j] = a[i] - coupling * w[j], a[j] + coupling * w[i]
             L[i][j] = A[i][j] * (c[i] * c[j] + s[i] * s[j])
     per_diagonal: list[Any] = [None] * n  # 1 / L_ii
     for i in range(n):
@@ -209,7 +211,10 @@ def chain(f: Functions, p: Mapping[str, Any], y: Numbers) -> list[Any]:
 
 
 def chain_constants(p: Mapping[str, Any], n: int) -> tuple[list[list[Any]], list[Any]]:
-    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j (masses from max(i, j) on); weights by arms."""
+    """(A, b) of a chain, for M_ij = A_ij cos(q_i - q_j) and gravity torques -b_i sin(q_i).
+
+    A_ij = l_i l_j times the sum of the masses from max(i, j) on, b_i = g l_i times that from i on.
+    """
     m, rods = p["m"], p["l"]
     carried = [sum(m[j] for j in range(i, n)) for i in range(n)]
     A = [[rods[i] * rods[j] * carried[max(i, j)] for j in range(n)] for i in range(n)]

@@ -1,10 +1,10 @@
-"""Constrained mechanisms to measure stabilisation on, with consistent starts.
+"""Constrained mechanisms with consistent starts, to measure stabilization.
 
-They move without forces other than weight and a spring, so that H is constant: lengths in m,
-masses in kg, angles in rad. Linkages move in a plane, y upward, and start where V is least: the
-kinetic energy there is what H has above its least value. Their motion stays bounded: angles that
-grow with every turn would take the resolution of phi, eps |q|, along. What rolls has rows without
-phi, and quasi-velocities in which they hold by themselves.
+The only forces are weight and a spring, so that H is constant. Lengths are in m, masses in kg,
+angles in rad. Linkages move in a plane, y upward, and start where V is least. So their initial
+kinetic energy is H minus its least value. Their motion stays bounded, because the rounding error
+of phi, eps |q|, would grow with angles that increase with every revolution. Rolling bodies have
+constraint rows without phi, and quasi-velocities that satisfy these rows identically.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ G = 9.81
 
 
 class Mechanism(NamedTuple):
-    """A system with constraints, a consistent start, and the kinetic energy there in J."""
+    """A system with constraints, a consistent start, and its initial kinetic energy in J."""
 
     system: jl.System
     q0: np.ndarray
@@ -43,13 +43,13 @@ def bobs(t: Any, q: Array, v: Array, params: Any) -> Array:
 
 
 def rods(t: Any, q: Array, params: Any) -> Array:
-    """Squares of the distances that the rods span, less those of their lengths."""
+    """Squared distances between the ends of the rods, minus their squared lengths."""
     d = q[2:] - q[:2]
     return jnp.stack([q[:2] @ q[:2] - params["l1"] ** 2, d @ d - params["l2"] ** 2])
 
 
 def double_pendulum() -> Mechanism:
-    """It hangs straight down, the first rod turning fast enough for the second to tumble."""
+    """It hangs straight down; the first rod turns fast enough to make the second one tumble."""
     l1, l2 = BOBS["l1"], BOBS["l2"]
     system = jl.System(
         bobs, ("x1", "y1", "x2", "y2"), constraints=(jl.Holonomic(rods, ("rod1", "rod2")),)
@@ -68,21 +68,21 @@ def links(t: Any, q: Array, v: Array, params: Any) -> Array:
     """L of uniform slender links a, b, c joined head to tail from the origin; mass 1 kg/m."""
     lengths = jnp.stack([params["a"], params["b"], params["c"]])
     rates = jnp.stack([-jnp.sin(q), jnp.cos(q)], -1) * (lengths * v)[:, None]
-    centres = jnp.cumsum(rates, 0) - 0.5 * rates
+    centers = jnp.cumsum(rates, 0) - 0.5 * rates
     rises = lengths * jnp.sin(q)
     heights = jnp.cumsum(rises) - 0.5 * rises
-    T = 0.5 * jnp.sum(lengths * jnp.sum(centres**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
+    T = 0.5 * jnp.sum(lengths * jnp.sum(centers**2, 1)) + jnp.sum(lengths**3 * v**2) / 24
     return T - G * jnp.sum(lengths * heights)
 
 
 def closure(t: Any, q: Array, params: Any) -> Array:
-    """Where the head of the last link is, from the other pivot (d, 0)."""
+    """Position of the head of the last link relative to the other pivot (d, 0)."""
     lengths = jnp.stack([params["a"], params["b"], params["c"]])
     return jnp.stack([lengths @ jnp.cos(q) - params["d"], lengths @ jnp.sin(q)])
 
 
 def four_bar() -> Mechanism:
-    """The open configuration by the law of cosines; the crank swings through 4 rad."""
+    """The open configuration, by the law of cosines; the crank swings through 4 rad."""
     lengths = np.array([FOUR_BAR[name] for name in "abc"])
     a, b, c = lengths
     gap = np.array([FOUR_BAR["d"] - a * np.cos(CRANK), -a * np.sin(CRANK)])
@@ -105,18 +105,18 @@ def _started(
     return Mechanism(system, q0, v0, params, float(T))
 
 
-# ---- What rolls: systems of the catalogue, a spring on the steered wheels ------------------------
+# ---- Rolling bodies of the catalogue, with a spring on the steered wheels ------------------------
 
 BOARD = {"m": 2.0, "r": 0.3, "J": 0.08, "J_r": 0.03, "J_w": 0.005, "k": 0.5}
 
 
 def spring(t: Any, q: Array, params: Any) -> Array:
-    """V of a torsion spring that centres the steering."""
+    """V of a torsion spring that centers the steering."""
     return 0.5 * params["k"] * q[4] ** 2
 
 
 def sprung_snakeboard() -> Mechanism:
-    """The wheels swing about straight ahead, so that the board winds its way."""
+    """The wheels swing about the forward direction, so that the board moves on a winding path."""
     free = snakeboard.system
     system = jl.System(
         coordinates=free.coordinates.shapes,
@@ -133,7 +133,7 @@ DISK = {"m": 1.5, "R": 0.25, "I_d": 0.025, "I_a": 0.045, "g": G}
 
 
 def disk() -> Mechanism:
-    """It leans and wobbles as it rolls about, fast enough not to fall."""
+    """It rolls leaning and wobbling, fast enough not to fall."""
     system, q0 = rolling_disk.system, np.array([0.0, 0.0, 0.0, 1.2, 0.0])
     v0 = np.asarray(system.velocities(q0, {"w1": 0.3, "w2": 1.0, "w3": 12.0}, DISK))
     return _started(system, q0, v0, DISK)

@@ -1,9 +1,9 @@
-"""Motions to solve to a given error: what jaxlag is told of them, and explicit equations.
+"""Motions to solve to a given error: declarations for jaxlag, and explicit equations.
 
-SI units, angles in rad. Errors are those of the coordinates at the end, each over 1 + its size.
-What the start is off by, the chaotic pendulum magnifies up to 7000 times, orbits of e = 0.9 up to
-700 000 times (the others less than 50 times), and rounding on the way with it: no solver in double
-precision gets below about 1e-12 and 1e-10 there.
+SI units, angles in rad. Errors are those of the final coordinates, each divided by 1 + its size.
+The chaotic pendulum amplifies an error of the start up to 7000 times, orbits of e = 0.9 up to
+700 000 times, the other motions less than 50 times. Rounding errors during the motion are amplified
+too. So no solver in double precision reaches errors below about 1e-12 and 1e-10 in these two.
 """
 
 import math
@@ -37,19 +37,19 @@ class Motion(NamedTuple):
     """A start and a span, and the equations in every form that is compared.
 
     Attributes:
-        system: as jaxlag is told.
-        q0: coordinates at the start, or one row for each lane.
+        system: the declaration for jaxlag.
+        q0: coordinates at the start, (n,) or (lanes, n).
         v0: their rates.
         t1: end, s; it starts at 0.
         rates: the explicit equations.
         lagrangian: L(t, q, v, params), for a first prototype by naive autodiff.
-        speeds: what stands behind the coordinates in y, from (q, v); None: v itself.
+        speeds: the part of y after the coordinates, from (q, v); None: v.
         force: generalized force of the prototype.
         rows: left sides of the constraints on velocities, c(q, v, params) = 0, linear in v.
-        field: dy/dt on arrays, where a hand would write that for JAX and not scalars.
-        stiff: whether implicit methods are worth a line.
-        loosest: exponent of the first tolerance, 10^-loosest; looser ones fall into a centre.
-        fewest: steps of equal length to begin with.
+        field: dy/dt on arrays, if one would write arrays and not scalars for JAX by hand.
+        stiff: whether implicit methods have a line.
+        loosest: the first tolerance is 10^-loosest; looser ones make orbits fall into the center.
+        fewest: smallest number of fixed steps.
     """
 
     system: jl.System
@@ -80,7 +80,7 @@ class Motion(NamedTuple):
         return np.concatenate([self.q0, np.asarray(w0)])
 
     def error(self, q: Any, reference: Any) -> float:
-        """Largest deviation of coordinates at the end, over 1 + their size."""
+        """Largest deviation of the final coordinates, each divided by 1 + its size."""
         q = np.asarray(q, float)
         off = np.abs(q - reference) / (1.0 + np.abs(reference))
         return float(np.max(off)) if np.all(np.isfinite(q)) else math.nan
@@ -91,12 +91,12 @@ class Motion(NamedTuple):
 
 
 def orbit(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """A particle about a centre of attraction, in the plane."""
+    """A particle about a center of attraction, in the plane."""
     return 0.5 * (v @ v) + p["mu"] / jnp.sqrt(q @ q)
 
 
 def _kepler(e: float) -> Motion:
-    """From the pericentre, semi-major axis 1, 100 periods."""
+    """From the pericenter, semi-major axis 1, 100 periods."""
     return Motion(
         system=jl.System(orbit, ("x", "y")),
         params={"mu": 1.0},
@@ -196,7 +196,7 @@ def _cartesian() -> Motion:
 
 def _disk() -> Motion:
     q0 = np.array([0.0, 0.0, 0.0, 1.2, 0.0])
-    # It leans and wobbles as it rolls about, fast enough not to fall.
+    # It rolls leaning and wobbling, fast enough not to fall.
     u0 = {"w1": 0.3, "w2": 1.0, "w3": 12.0}
     return Motion(
         system=rolling_disk.system,
@@ -212,7 +212,7 @@ def _disk() -> Motion:
 
 
 def _elastic() -> Motion:
-    """At rest, the spring stretched by the weight along it: it rings by 1e-10 m at 1000 rad/s."""
+    """At rest, the spring stretched by the weight: it vibrates by 1e-10 m at 1000 rad/s."""
     params = {"m": 1.0, "l": 1.0, "k": 1e6, "g": G}
     stretch = params["m"] * G * math.cos(1.0) / params["k"]
     return Motion(

@@ -1,4 +1,4 @@
-"""Systems to measure the lowering on: each as a Lagrangian written the way a user would write it.
+"""Systems for the benchmark of the lowering: each is a Lagrangian as a user would write it.
 
 Angles in rad, lengths in m, masses in kg; params are dicts of numbers or vectors.
 """
@@ -17,7 +17,7 @@ G = 9.81
 
 
 class Scene(NamedTuple):
-    """A Lagrangian with n coordinates and parameters; q0, v0: a state to evaluate it near."""
+    """A Lagrangian with n coordinates and its parameters; it is evaluated near (q0, v0)."""
 
     lagrangian: Callable
     q0: tuple[float, ...]
@@ -84,7 +84,7 @@ def elastic_pendulum(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def kepler(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Motion about a centre of attraction, in polar coordinates from the position."""
+    """Motion about a center of attraction, in polar coordinates from the position."""
     r, dr = along(lambda q: q[0] * jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])]), q, v)
     return 0.5 * p["m"] * dr @ dr + p["k"] / jnp.sqrt(r @ r)
 
@@ -115,20 +115,20 @@ def top(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def rigid_body(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Rigid body in space, q = (x, y, z, yaw, pitch, roll), about its mass centre."""
+    """Rigid body in space, q = (x, y, z, yaw, pitch, roll), about its mass center."""
     _, w = _rates(lambda q: rotation.yaw_pitch_roll.matrix(q[3:]), q, v)
     T = 0.5 * p["m"] * v[:3] @ v[:3] + 0.5 * w @ (p["I"] * w)
     return T - p["m"] * p["g"] * q[2]
 
 
 def aircraft(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Rigid body in space with a full inertia matrix and a mass centre off the origin."""
+    """Rigid body in space with a full inertia matrix and a mass center off the origin."""
     R, w = _rates(lambda q: rotation.yaw_pitch_roll.matrix(q[3:]), q, v)
     J = p["J"]
     J = jnp.stack([J[0], J[3], J[4], J[3], J[1], J[5], J[4], J[5], J[2]]).reshape(3, 3)
-    centre = R @ p["c"]
+    center = R @ p["c"]
     T = 0.5 * p["m"] * v[:3] @ v[:3] + p["m"] * v[:3] @ (R @ jnp.cross(w, p["c"]))
-    return T + 0.5 * w @ (J @ w) - p["m"] * p["g"] * (q[2] + centre[2])
+    return T + 0.5 * w @ (J @ w) - p["m"] * p["g"] * (q[2] + center[2])
 
 
 def chain(t: Any, q: Array, v: Array, p: Any) -> Array:
@@ -152,7 +152,7 @@ def links(n: int) -> Scene:
 _PENDULUM = {"m": 1.0, "l": 0.8, "g": G}
 _DOUBLE = {"m1": 1.0, "m2": 0.8, "l1": 1.0, "l2": 0.9, "g": G}
 _BODY = {"m": 1.2, "I": np.array([0.02, 0.03, 0.05]), "g": G}
-_TURN = (0.3, 0.4, -0.2), (0.5, -0.7, 0.9)
+_ATTITUDE = (0.3, 0.4, -0.2), (0.5, -0.7, 0.9)
 
 SCENES: dict[str, Scene] = {
     "pendulum": Scene(pendulum, (1.0,), (0.3,), _PENDULUM),
@@ -175,9 +175,11 @@ SCENES: dict[str, Scene] = {
         top, (0.3, 0.5, 0.1), (0.4, 0.1, 30.0),
         {"I": np.array([0.02, 0.03, 0.01]), "m": 0.5, "l": 0.1, "g": G},
     ),
-    "rigid_body": Scene(rigid_body, (0.0, 0.0, 1.0, *_TURN[0]), (1.0, 0.5, -0.2, *_TURN[1]), _BODY),
+    "rigid_body": Scene(
+        rigid_body, (0.0, 0.0, 1.0, *_ATTITUDE[0]), (1.0, 0.5, -0.2, *_ATTITUDE[1]), _BODY
+    ),
     "aircraft": Scene(
-        aircraft, (0.0, 0.0, 1.0, *_TURN[0]), (1.0, 0.5, -0.2, *_TURN[1]),
+        aircraft, (0.0, 0.0, 1.0, *_ATTITUDE[0]), (1.0, 0.5, -0.2, *_ATTITUDE[1]),
         {"m": 1.2, "J": np.array([0.2, 0.3, 0.5, 0.01, 0.03, -0.02]),
          "c": np.array([0.1, 0.02, -0.05]), "g": G},
     ),

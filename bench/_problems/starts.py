@@ -1,9 +1,9 @@
-"""Two starts of every system that moves: its example's, and one of more energy.
+"""Two starts of every system that moves: that of its example, and one with more energy.
 
-The second is chaotic where the system can be: `jl.lyapunov` finds an exponent beyond three of
-its errors. Systems that cannot (one freedom, linear, integrable, short) are only livelier. Spans
-are such that errors grow less than a million times. Values are guesses where there are constraints:
-the state nearest to them is taken.
+If the system can be chaotic, the second motion is: `jl.lyapunov` finds an exponent above three of
+its standard errors. Otherwise (one degree of freedom, linear, integrable, short motion) it only has
+more energy. Spans are short enough that errors grow less than a million times. With constraints
+the values are guesses, which are replaced by the nearest consistent state.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from systems.catalogue import ENTRIES, Entry
 
 
 class Start(NamedTuple):
-    """Where a motion begins, q0 in m or rad and v0 per s, and how long it is, s."""
+    """The start of a motion, q0 in m or rad and v0 per s, and its duration, s."""
 
     name: str
     q0: tuple[float, ...]
@@ -20,7 +20,7 @@ class Start(NamedTuple):
     duration: float
 
 
-# Of examples that leave it to be assembled.
+# For examples whose start must be assembled.
 _ASSEMBLED = {
     "four_bar": ((1.0, 0.4, -1.86), (9.0, -1.18, 3.29)),
     "n_link_loop": ((-1.89, -0.2, -0.73, 0.26, 0.76, 1.06), (0.0,) * 6),

@@ -1,15 +1,16 @@
-"""Accuracy: every system to 1e-4 ... 1e-11 against references of 20 digits and more.
+"""Accuracy: every system to 1e-4 ... 1e-11 against references of 20 digits or more.
 
-A row is one motion to one tolerance, rtol = atol, by the method that `jl.simulate` chooses. With
-w = atol + rtol |y|, kappa from `jl.lyapunov` and norms as there:
+A case is one motion to one tolerance, rtol = atol, by the method that `jl.simulate` chooses. With
+w = atol + rtol |y|, kappa from `jl.lyapunov` and norms as there, the requirements are:
 
     |error / w| <= 10 kappa + floor, floor = 10 eps kappa sqrt(steps) |y / w|, at every time;
     |error / w| >= 1e-3 for the largest, from 20 steps on and above the floor;
     errors at save times at most twice those of motions that end there;
-    estimates of the error between a third of it and 100 times it, above round-off.
+    estimates of the error between a third of it and 100 times it, above rounding.
 
-Rows that keep below the floor at every tolerance are called exact. References come from
-`python -m bench._multiprecision.make_references`. A quick run takes a few systems.
+The cases of a motion are called exact if the error is below the floor at every tolerance.
+References come from `python -m bench._multiprecision.make_references`. A quick run takes a few
+systems.
 """
 
 import math
@@ -27,8 +28,8 @@ from systems.catalogue import ENTRIES
 
 MOVING = tuple(name for name, entry in ENTRIES.items() if entry.kind == "trajectory")
 TOLERANCES = tuple(10.0**-k for k in range(4, 12))
-FINE = 1e-12  # tolerance of the motion along which perturbations are followed
-ENDS_EVERY = 4  # every so many save times are made an end, too
+FINE = 1e-12  # tolerance of the motion for which the growth of perturbations is computed
+ENDS_EVERY = 4  # one motion ends at every fourth save time
 QUICK = ("simple_pendulum", "double_pendulum", "chaplygin_sleigh")
 
 
@@ -39,14 +40,14 @@ def run(quick: bool) -> Report:
         params, references = load(name)
         for reference in references:
             rows += safely(name, params, reference, TOLERANCES[::3] if quick else TOLERANCES)
-        jax.clear_caches()  # programs of this system, which take much memory and serve no other
+        jax.clear_caches()  # programs of this system: large and not needed again
     return Report(rows, *conclusions(rows))
 
 
 def safely(
     name: str, params: Any, reference: Reference, tolerances: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """The rows of one motion; beyond all bounds where it breaks off, so that others go on."""
+    """The table rows of one motion; if it raises an error they are beyond all bounds."""
     try:
         return rows_of(name, params, reference, tolerances)
     except Exception as error:
@@ -58,9 +59,9 @@ def safely(
 def rows_of(
     name: str, params: Any, reference: Reference, tolerances: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """The rows of one motion."""
+    """The table rows of one motion."""
     motion = Run(name, params, reference)
-    growth = jl.lyapunov(motion.to(FINE))  # of weights atol = rtol, as in the rows
+    growth = jl.lyapunov(motion.to(FINE))  # with weights atol = rtol, as in the cases
     kappa = np.asarray(growth.kappa)[1:]
     rows = []
     for rtol in tolerances:
@@ -72,7 +73,7 @@ def rows_of(
 
 
 class Run:
-    """A motion of a reference, solved."""
+    """A reference motion, solved to several tolerances."""
 
     def __init__(self, name: str, params: Any, reference: Reference) -> None:
         self.system, self.reference = ENTRIES[name].system, reference
@@ -82,7 +83,10 @@ class Run:
         }
 
     def to(self, tolerance: float, until: int = -1, **options: Any) -> jl.Solution:
-        """To this tolerance, from the start to a row of the reference, at as many times as it."""
+        """Solve to this tolerance, from the start to time `until` of the reference.
+
+        The solution has as many save times as the reference.
+        """
         q0, v0 = np.split(self.reference.y[0], 2)
         times = self.reference.times
         if until != -1:
@@ -100,7 +104,7 @@ class Run:
         )
 
     def errors(self, rtol: float, kappa: np.ndarray) -> Errors:
-        """What is to be judged."""
+        """The errors to be judged."""
         motion = self.to(rtol, estimate_error=True)
         exact = self.reference.y[1:]
         saves = scaled(_state(motion.q, motion.v)[1:] - exact, exact, rtol, rtol)
@@ -109,7 +113,7 @@ class Run:
         return Errors(
             saves=saves,
             ends=np.array(list(self._ends(rtol, chosen))),
-            saves_there=saves[chosen],
+            saves_at_ends=saves[chosen],
             estimates=scaled(_state(*motion.error)[1:], exact, rtol, rtol),
             size=scaled(exact, exact, rtol, rtol),
             kappa=kappa,
@@ -117,11 +121,11 @@ class Run:
         )
 
     def _ends(self, rtol: float, chosen: np.ndarray) -> Iterator[float]:
-        """Scaled errors of motions that end at these rows."""
-        for row in chosen + 1:
-            last = row == len(self.reference.times) - 1
-            motion = self.to(rtol, until=-1 if last else int(row))
-            found, exact = _state(motion.q, motion.v)[-1], self.reference.y[row]
+        """Scaled errors of motions that end at these save times."""
+        for save in chosen + 1:
+            last = save == len(self.reference.times) - 1
+            motion = self.to(rtol, until=-1 if last else int(save))
+            found, exact = _state(motion.q, motion.v)[-1], self.reference.y[save]
             yield float(scaled(found - exact, exact, rtol, rtol))
 
 

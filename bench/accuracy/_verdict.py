@@ -1,4 +1,4 @@
-"""Whether the errors of a motion are what its tolerance promises: formulas and verdicts.
+"""Whether the errors of a motion match its tolerance: formulas and verdicts.
 
 Errors are measured as `jl.lyapunov` measures growth: |e / w|, the Euclidean norm over (q, v) of
 the error in units of w = atol + rtol |y|.
@@ -17,25 +17,25 @@ LOWER = 1e-3
 STEPS = 20  # least number for the lower bound
 AT_SAVES = 2.0  # times the error at step ends
 ESTIMATE = 1 / 3, 100.0  # times the error
-WORST = 5  # rows named for each bound
+WORST = 5  # cases named for each bound
 
 
 class Errors(NamedTuple):
     """Errors of one motion at s times after the start.
 
     Attributes:
-        saves: (s,), scaled, as saved along one motion.
-        ends: (e,), scaled, of motions that end at some of the times, as step ends.
-        saves_there: (e,), those of `saves` at the same times.
-        estimates: (s,), scaled, that the motion gives itself.
+        saves: (s,), scaled errors at the save times of one motion.
+        ends: (e,), scaled errors of motions that end at some of these times, where a step ends.
+        saves_at_ends: (e,), the entries of `saves` at the times of `ends`.
+        estimates: (s,), scaled estimates of the error by `jl.simulate`.
         size: (s,), |y / w|.
-        kappa: (s,).
-        steps: accepted ones.
+        kappa: (s,), growth of perturbations.
+        steps: number of accepted steps.
     """
 
     saves: np.ndarray
     ends: np.ndarray
-    saves_there: np.ndarray
+    saves_at_ends: np.ndarray
     estimates: np.ndarray
     size: np.ndarray
     kappa: np.ndarray
@@ -43,21 +43,21 @@ class Errors(NamedTuple):
 
 
 NOTHING = Errors(*(np.array([np.nan]) for _ in range(6)), steps=0)
-"""Errors of a motion that could not be had."""
+"""Errors of a motion that could not be solved."""
 
 
 def scaled(error: np.ndarray, y: np.ndarray, rtol: float, atol: float) -> np.ndarray:
-    """|error / (atol + rtol |y|)| of every row."""
+    """|error / (atol + rtol |y|)| at every time."""
     return np.linalg.norm(error / (atol + rtol * np.abs(y)), axis=-1)
 
 
 def rounding(errors: Errors) -> np.ndarray:
-    """What round-off may grow to, eps kappa sqrt(steps) |y / w|, (s,)."""
+    """Bound on the accumulated rounding error, eps kappa sqrt(steps) |y / w|, (s,)."""
     return EPS * errors.kappa * errors.steps**0.5 * errors.size
 
 
 def judged(errors: Errors) -> dict[str, Any]:
-    """The columns of a row."""
+    """The columns of a table row."""
     floor = 10 * rounding(errors)
     over = errors.saves / (UPPER * errors.kappa + floor)
     error = _largest(errors.saves)
@@ -79,7 +79,7 @@ def judged(errors: Errors) -> dict[str, Any]:
 
 
 def _largest(x: np.ndarray) -> float:
-    """Infinite where a motion did not get."""
+    """The largest entry; infinite if there is a nan, where the motion ended early."""
     return float(np.max(np.nan_to_num(x, nan=np.inf)))
 
 
@@ -92,32 +92,34 @@ def _lower(error: float, above: bool, steps: int) -> str:
 
 
 def _saves_to_ends(errors: Errors) -> float:
-    return _largest(errors.saves_there) / _largest(errors.ends)
+    return _largest(errors.saves_at_ends) / _largest(errors.ends)
 
 
 def _estimates(errors: Errors) -> np.ndarray:
-    """Estimate over error at every row whose error is above round-off, the largest error last."""
-    seen = np.flatnonzero(~(errors.saves <= rounding(errors)))
-    order = seen[np.argsort(errors.saves[seen], kind="stable")]
+    """Estimate over error at all times with an error above rounding, the largest error last."""
+    above = np.flatnonzero(~(errors.saves <= rounding(errors)))
+    order = above[np.argsort(errors.saves[above], kind="stable")]
     return errors.estimates[order] / errors.saves[order]
 
 
 def name_exact(rows: Sequence[dict[str, Any]]) -> None:
-    """Call the rows of one motion exact where no tolerance leaves an error above the floor."""
+    """Mark the cases of one motion as exact if no tolerance has an error above the floor."""
     if all(row["lower"] == "floor" for row in rows):
         for row in rows:
             row["lower"] = "exact"
 
 
 def conclusions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[Reference]]:
-    """Targets, and by name the rows that miss one or come nearest to it."""
+    """Targets, and the names of the cases that miss one or come nearest to missing it."""
     beyond = [row for row in rows if row["upper"] == "beyond"]
     below = [row for row in rows if row["lower"] == "below"]
     at_saves = [row for row in rows if (row["saves_to_ends"] or 0.0) > AT_SAVES]
     low, high = ESTIMATE
-    told = [row for row in rows if row["estimate_least"] is not None]
-    off = [row for row in told if not low <= row["estimate_least"] <= row["estimate_most"] <= high]
-    largest_off = [row for row in told if not low <= row["estimate_of_largest"] <= high]
+    estimated = [row for row in rows if row["estimate_least"] is not None]
+    off = [
+        row for row in estimated if not low <= row["estimate_least"] <= row["estimate_most"] <= high
+    ]
+    largest_off = [row for row in estimated if not low <= row["estimate_of_largest"] <= high]
     targets = [
         Target("rows beyond 10 kappa + floor", len(beyond), "<=", 0),
         Target("rows below 1e-3 of the tolerance", len(below), "<=", 0),
@@ -133,8 +135,8 @@ def conclusions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[R
 def _counts(rows: Sequence[Mapping[str, Any]]) -> list[Reference]:
     kinds = [row["lower"] for row in rows]
     return [
-        Reference(str(kinds.count(kind)), f"rows of {len(rows)}: {words}")
-        for kind, words in (
+        Reference(str(kinds.count(kind)), f"rows of {len(rows)}: {text}")
+        for kind, text in (
             ("within", "judged by the lower bound, and within it"),
             ("few steps", f"fewer than {STEPS} steps"),
             ("floor", "error within the floor of round-off"),
@@ -158,7 +160,7 @@ def _named(rows: Any, beyond: Any, below: Any, at_saves: Any, off: Any) -> list[
 
 
 def _worst(rows: Any, column: str, sign: int, missed: Any, what: str) -> list[Reference]:
-    """All rows that miss, and some that come near."""
+    """All cases that miss a target, and those nearest to missing it."""
     known = [row for row in rows if row[column] is not None]
     order = sorted(known, key=lambda row: -sign * row[column])
     return [

@@ -1,24 +1,27 @@
-"""Constraint drift over a million steps: residuals, energy, and time per step of stabilisation.
+"""Constraint drift over a million steps: residuals, energy, and time per step of stabilization.
 
-Two linkages (bench/_problems/mechanisms.py), by both formulations with multipliers, with nothing
-against drift ("none"), with Baumgarte's damping and with projection; and two systems that roll, by
-multipliers without and with projection, and in quasi-velocities, in which nothing can drift. Steps
-are fixed: 0.01 s of order 8. Baumgarte's alpha = beta = 0.1 / step damp residuals critically, over
-ten steps.
+The cases are two linkages (bench/_problems/mechanisms.py) and two rolling systems. The linkages
+have both formulations with multipliers, each without stabilization ("none"), with Baumgarte's
+damping and with projection. The rolling systems have multipliers without and with projection, and
+quasi-velocities, in which the constraints cannot drift. Steps are fixed: 0.01 s of order 8.
+Baumgarte's alpha = beta = 0.1 / step damp residuals critically, over ten steps.
 
-A quick run takes 20 000 steps, of the linkages the first by multipliers without Baumgarte's
-damping, of what rolls the first: most of its time goes into compilation.
+A quick run has 20 000 steps. It takes the first linkage by multipliers without Baumgarte's
+damping, and the first rolling system. Most of its time is compilation.
 
-Motions that tumble are chaotic and soon differ between the cases. Compared is what should stay as
-it was at the start, in 1001 rows (quick: 201) evenly over the run; nan where a run failed.
-`position`: the largest |phi_k| / |A_k| of any row k, about the distance from the constraint, in m
-(double pendulum) or rad (four-bar), 0 for what has none; `growth`: that over the largest of the
-first tenth of the run;
-`velocity`: the largest |A v + b|_k / |A_k|, in m/s or rad/s; `energy`: the largest |H - H0| / T0,
-T0 the kinetic energy at the start; `slope`: that of a line through the second half of
-(H - H0) / T0, per million steps. `min_us` and `median_us` are per step; `ratio` is min_us over that
-of "none" with the same mechanism and formulation, of quasi-velocities over that of multipliers with
-projection.
+Tumbling motions are chaotic and soon differ between the cases. So the benchmark compares quantities
+that should be constant, at 1001 save times (quick: 201) evenly over the run. They are nan if a run
+failed. The columns are:
+
+`position`: the largest |phi_k| / |A_k| of any constraint row k. This is about the distance from the
+constraint, in m (double pendulum) or rad (four-bar); 0 without phi.
+`growth`: `position` divided by its value for the first tenth of the run.
+`velocity`: the largest |A v + b|_k / |A_k|, in m/s or rad/s.
+`energy`: the largest |H - H0| / T0, where T0 is the initial kinetic energy.
+`slope`: slope of a line through the second half of (H - H0) / T0, per million steps.
+`min_us`, `median_us`: time per step.
+`ratio`: min_us divided by that of "none" with the same mechanism and formulation, for
+quasi-velocities by that of multipliers with projection.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,17 +44,17 @@ STEP = 0.01  # s
 METHOD = "dopri8"
 GAIN = 0.1 / STEP  # 1/s
 NONE, BAUMGARTE, PROJECTION = "none", "Baumgarte", "projection"
-STABILISATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
+STABILIZATIONS = {NONE: None, BAUMGARTE: jl.Baumgarte(GAIN, GAIN), PROJECTION: "projection"}
 FORMULATIONS = ("multipliers", "null_space")
 QUASI = "quasi"
-STEPS, ROWS = 1_000_000, 1001
-QUICK_STEPS, QUICK_ROWS = 20_000, 201
+STEPS, SAVES = 1_000_000, 1001
+QUICK_STEPS, QUICK_SAVES = 20_000, 201
 
 Row = dict[str, Any]
 
 
 class Case(NamedTuple):
-    """What is compared."""
+    """One case; its fields are columns of the table and of stored runs."""
 
     mechanism: str
     formulation: str
@@ -59,9 +62,9 @@ class Case(NamedTuple):
 
 
 def cases(quick: bool) -> list[Case]:
-    """All that is compared."""
+    """All cases that are compared."""
     linkages, rolling = list(LINKAGES), list(ROLLING)
-    forms, ways = list(FORMULATIONS), list(STABILISATIONS)
+    forms, ways = list(FORMULATIONS), list(STABILIZATIONS)
     if quick:
         linkages, rolling, forms, ways = linkages[:1], rolling[:1], forms[:1], [NONE, PROJECTION]
     found = [Case(*each) for each in product(linkages, forms, ways)]
@@ -72,10 +75,10 @@ def cases(quick: bool) -> list[Case]:
 
 
 class Record(NamedTuple):
-    """One run at its rows: the columns of the same names before the largest is taken.
+    """One run at its save times: the columns of the same names before the largest is taken.
 
     Attributes:
-        steps: steps up to the row.
+        steps: number of steps before each save time.
         position: largest |phi_k| / |A_k|.
         velocity: largest |A v + b|_k / |A_k|.
         energy: (H - H0) / T0.
@@ -88,20 +91,20 @@ class Record(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run reached its end."""
         return all(np.isfinite(each).all() for each in self)
 
 
 def run(quick: bool) -> Report:
     """All cases: recorded one after the other, timed in turn."""
-    steps, rows = (QUICK_STEPS, QUICK_ROWS) if quick else (STEPS, ROWS)
+    steps, saves = (QUICK_STEPS, QUICK_SAVES) if quick else (STEPS, SAVES)
     compared = cases(quick)
     starts = LINKAGES | ROLLING
     mechanisms = {name: starts[name]() for name in dict.fromkeys(c.mechanism for c in compared)}
     calls, programs, records = {}, {}, {}
     for case in compared:
         mechanism = mechanisms[case.mechanism]
-        programs[case] = program = compiled(mechanism, case, steps, rows)
+        programs[case] = program = compiled(mechanism, case, steps, saves)
         calls[", ".join(case)] = call = partial(program.call, mechanism.q0, mechanism.v0)
         q, v = call()
         records[case] = record(mechanism, q, v, steps)
@@ -124,15 +127,15 @@ def run(quick: bool) -> Report:
 
 
 def against(case: Case) -> Case:
-    """What a step of this case is timed against."""
+    """The case whose time per step is the reference for this case."""
     if case.formulation == QUASI:
         return Case(case.mechanism, FORMULATIONS[0], PROJECTION)
     return case._replace(stabilisation=NONE)
 
 
-def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program:
-    """(q0, v0) -> (q, v), evenly over `steps` steps; nan from where the run failed."""
-    ts = np.linspace(0.0, steps * STEP, rows)
+def compiled(mechanism: Mechanism, case: Case, steps: int, saves: int) -> Program:
+    """(q0, v0) -> (q, v) at times evenly over `steps` steps; nan after a failure."""
+    ts = np.linspace(0.0, steps * STEP, saves)
 
     def solve(q0: Array, v0: Array) -> tuple[Array, Array]:
         motion = jl.simulate(
@@ -143,9 +146,9 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
             mechanism.params,
             method=METHOD,
             dt=STEP,
-            max_steps=steps + 1,  # the times of steps are rounded, and may leave a short last one
+            max_steps=steps + 1,  # step times are rounded: a short last step may remain
             formulation=case.formulation,
-            stabilization=STABILISATIONS[case.stabilisation],
+            stabilization=STABILIZATIONS[case.stabilisation],
             throw=False,
         )
         return motion.q, motion.v
@@ -154,9 +157,9 @@ def compiled(mechanism: Mechanism, case: Case, steps: int, rows: int) -> Program
 
 
 def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
-    """Of states (q, v), the first at the start and the last after `steps` steps."""
+    """Record of states (q, v), the first at the start and the last after `steps` steps."""
 
-    def rows(q: Array, v: Array) -> tuple[Array, Array]:
+    def residuals(q: Array, v: Array) -> tuple[Array, Array]:
         position, velocity = mechanism.system.residuals(q, v, mechanism.params)
         rates = jnp.concatenate([jnp.ravel(x) for x in velocity.values()])
         if not position:  # rows without phi
@@ -166,8 +169,10 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
     @jax.jit
     @jax.vmap
     def each(q: Array, v: Array) -> tuple[Array, Array, Array]:
-        A = jax.jacfwd(lambda v: rows(q, v)[1])(v)
-        position, velocity = (jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in rows(q, v))
+        A = jax.jacfwd(lambda v: residuals(q, v)[1])(v)
+        position, velocity = (
+            jnp.max(jnp.abs(x) / jnp.linalg.norm(A, axis=1)) for x in residuals(q, v)
+        )
         return position, velocity, mechanism.system.energy(q, v, mechanism.params)
 
     position, velocity, H = (np.asarray(x) for x in each(q, v))
@@ -177,7 +182,7 @@ def record(mechanism: Mechanism, q: Array, v: Array, steps: int) -> Record:
 
 
 def figures(record: Record) -> dict[str, float]:
-    """The columns on one record."""
+    """The columns computed from one record."""
     count = len(record.steps)
     early, late = slice(1, count // 10 + 1), slice(count // 2, None)
     position = float(np.max(record.position))
@@ -192,7 +197,7 @@ def figures(record: Record) -> dict[str, float]:
 
 
 def times(samples: Sequence[float], record: Record) -> Row:
-    """The columns on time: per step, and nan for a run that failed, since it ended early."""
+    """The columns about time, per step; nan for a failed run, because it ended early."""
     columns = spread(samples, "us", round(record.steps[-1]))
     if record.complete:
         return columns
@@ -200,7 +205,7 @@ def times(samples: Sequence[float], record: Record) -> Row:
 
 
 def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
-    """Targets for each formulation, its worst mechanism named; references for the rest."""
+    """Targets for each formulation, named after the worst mechanism; references for the rest."""
     found = {Case(*(row[name] for name in Case._fields)): row for row in rows}
     targets = []
     for formulation in FORMULATIONS:
@@ -212,13 +217,13 @@ def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
         drifts = {
             case: row["energy"] / found[against(case)]["energy"] for case, row in projected.items()
         }
-        for words, figure, bound in (
+        for label, figure, bound in (
             ("position residual with projection", _of(projected, "position"), 1e-12),
             ("velocity residual with projection", _of(projected, "velocity"), 1e-12),
             ("times the energy drift: projection as none", drifts, 1.0),
             ("times as long: a step with projection as none", _of(projected, "ratio"), 1.5),
         ):
-            targets.append(_worst(f"{words}, {formulation}", figure, bound))
+            targets.append(_worst(f"{label}, {formulation}", figure, bound))
     rolling = {case: row for case, row in found.items() if case.formulation == QUASI}
     if rolling:
         drifts = {
@@ -236,11 +241,11 @@ def judged(rows: Sequence[Row]) -> tuple[list[Target], list[Reference]]:
     return targets, _references(found)
 
 
-def _worst(words: str, figure: Mapping[Case, float], bound: float) -> Target:
-    """The target that no mechanism exceeds the bound, the worst named."""
+def _worst(label: str, figure: Mapping[Case, float], bound: float) -> Target:
+    """The target that no mechanism exceeds the bound, named after the worst one."""
     # nan is worse than any number.
     worst = max(figure, key=lambda case: np.nan_to_num(figure[case], nan=np.inf))
-    return Target(f"{words} ({worst.mechanism})", figure[worst], "<=", bound)
+    return Target(f"{label} ({worst.mechanism})", figure[worst], "<=", bound)
 
 
 def _of(rows: Mapping[Case, Row], column: str) -> dict[Case, float]:
@@ -249,7 +254,7 @@ def _of(rows: Mapping[Case, Row], column: str) -> dict[Case, float]:
 
 def _references(rows: Mapping[Case, Row]) -> list[Reference]:
     references = []
-    for stabilisation, column, words in (
+    for stabilization, column, label in (
         (NONE, "position", "position residual without stabilisation"),
         (NONE, "growth", "times that of the first tenth of the run: the same"),
         (BAUMGARTE, "position", "position residual with Baumgarte's damping"),
@@ -259,10 +264,10 @@ def _references(rows: Mapping[Case, Row]) -> list[Reference]:
         values = [
             row[column]
             for case, row in rows.items()
-            if case[2] == stabilisation and case.mechanism not in ROLLING
+            if case[2] == stabilization and case.mechanism not in ROLLING
         ]
         if not values:
             continue
         ends = [f"{x:.2g}" for x in (np.min(values), np.max(values))]
-        references.append(Reference(" to ".join(dict.fromkeys(ends)), words))
+        references.append(Reference(" to ".join(dict.fromkeys(ends)), label))
     return references

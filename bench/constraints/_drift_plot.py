@@ -11,21 +11,21 @@ PANELS = {
     "velocity": "|A v + b| / |A| [m/s; rad/s]",
     "energy": "|H - H0| / T0",
 }
-COLOURS = {"none": "tab:red", "Baumgarte": "tab:blue", "projection": "tab:green"}
+COLORS = {"none": "tab:red", "Baumgarte": "tab:blue", "projection": "tab:green"}
 LINES = {"multipliers": "-", "null_space": ":", "quasi": "--"}
 FLOOR = 1e-18  # shown for 0
 
 
 def save(records: Mapping[tuple[str, str, str], Any], path: Path) -> str:
-    """Write the figure: a column for each mechanism, curves of the largest value so far.
+    """Write the figure: one column per mechanism, curves of the running maximum.
 
     Args:
-        records: (mechanism, formulation, stabilisation) -> an object with the attributes `steps`
-            and those of `PANELS`, (rows,) each. A curve ends at the first nan.
-        path: the file, whose folder is made.
+        records: (mechanism, formulation, stabilization) -> an object with the attributes `steps`
+            and those of `PANELS`, (saves,) each. A curve ends at the first nan.
+        path: the file, whose folder is created.
 
     Returns:
-        The name of the file, or why there is none.
+        The name of the file, or why it was not written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -36,7 +36,7 @@ def save(records: Mapping[tuple[str, str, str], Any], path: Path) -> str:
     figure = Figure(figsize=(4.5 * len(names) + 2.5, 8), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(PANELS), len(names), sharex=True, sharey="row", squeeze=False)
-    for (name, formulation, stabilisation), record in records.items():
+    for (name, formulation, stabilization), record in records.items():
         column = axes[:, names.index(name)]
         for (panel, label), ax in zip(PANELS.items(), column, strict=True):
             largest = np.maximum.accumulate(np.abs(getattr(record, panel)))
@@ -44,8 +44,8 @@ def save(records: Mapping[tuple[str, str, str], Any], path: Path) -> str:
                 record.steps[1:],
                 np.maximum(largest, FLOOR)[1:],
                 LINES[formulation],
-                color=COLOURS[stabilisation],
-                label=f"{stabilisation}, {formulation}",
+                color=COLORS[stabilization],
+                label=f"{stabilization}, {formulation}",
             )
             ax.set_ylabel(label)
             ax.grid(alpha=0.3)

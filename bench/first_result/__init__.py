@@ -1,10 +1,10 @@
 """Seconds from a declared motion to its first result, in fresh processes.
 
-Nine systems, each with 2 rows, 101 rows, a gradient, 256 lanes and their gradients, at tolerance
-1e-9. "cold" is a process with an empty compile cache, "warm" the next one with the same cache;
-importing jaxlag is apart. Beside it diffrax' Dopri8 on equations written by hand, cold, and heyoka
-(building its Taylor integrator and running it once). Of all rounds the shortest is kept; ends are
-compared with diffrax'.
+Nine systems at tolerance 1e-9, each with 2 save times, 101 save times, a gradient, 256 lanes and
+their gradients. "cold" is a process with an empty compile cache, "warm" the next one with the same
+cache. The time to import jaxlag is given separately. For comparison: diffrax's Dopri8 on equations
+written by hand, cold, and heyoka (building its Taylor integrator and running it once). The table
+has the shortest time of all rounds. Final states are compared with those of diffrax.
 """
 
 import json
@@ -27,10 +27,11 @@ SMALL = ("simple pendulum", "double pendulum", "cart pendulum", "rotating body")
 LARGE = ("chain of 8", "chain of 12", "5 bodies", "network potential")
 SCENES = (*SMALL[:3], "quadcopter", SMALL[3], *LARGE)
 ROUNDS = 2
-ROWS = CASES[:2]
-# By its path: as a module of this package it would import jax before anything is timed.
+SOLVES = CASES[:2]
+# Run by its path: as a module of this package it would import jax before the timing starts.
 ONE_PROCESS = str(Path(__file__).with_name("_one_process.py"))
-APART = 1e-5  # of ends, over 1 + their size: tolerance 1e-9 a step, magnified on the way
+# Of final states, over 1 + their size. The tolerance is 1e-9 per step, and errors are amplified.
+APART = 1e-5
 CACHE = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
@@ -50,7 +51,7 @@ def run(quick: bool) -> Report:
 
 
 def first(side: str, scene: str, case: str, cache: str | None) -> dict[str, Any]:
-    """What one process says of its program."""
+    """The times and the result of one program, measured in its own process."""
     environment = {
         key: value
         for key, value in os.environ.items()
@@ -85,7 +86,7 @@ def _row(
     )
     run_ms = {side: min(r[side]["run_ms"] for r in rounds) for side in ("cold", "diffrax")}
     apart = _apart(cold["end"], diffrax["end"])
-    if case in ROWS and not apart <= APART:
+    if case in SOLVES and not apart <= APART:
         raise RuntimeError(f"{scene}: jaxlag and the equations by hand end {apart:.1e} apart")
     return {
         "scene": scene,
@@ -101,20 +102,20 @@ def _row(
         "run_ms": run_ms["cold"],
         "diffrax_run_ms": run_ms["diffrax"],
         "heyoka_run_ms": heyoka.get("run_ms"),
-        "apart": apart if case in ROWS else None,
+        "apart": apart if case in SOLVES else None,
         "rounds": len(rounds),
     }
 
 
 def _apart(a: Sequence[float], b: Sequence[float]) -> float:
-    if len(a) != len(b):  # y behind the coordinates may be something else by hand
+    if len(a) != len(b):  # by hand, y may have other entries after the coordinates
         return float("nan")
     x, y = np.asarray(a), np.asarray(b)
     return float(np.max(np.abs(x - y) / (1.0 + np.abs(y))))
 
 
 def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[Reference]]:
-    """The worst row of every kind."""
+    """Targets, each for the worst case of its kind, and references."""
     targets = []
     names = {row["scene"] for row in rows}
     for kind, wanted, bounds in (
@@ -122,11 +123,14 @@ def judged(rows: Sequence[Mapping[str, Any]]) -> tuple[list[Target], list[Refere
         ("the quadcopter", ("quadcopter",), (2.5, 4.0)),
         ("chains, bodies, a network", LARGE, (4.0, 8.0)),
     ):
-        for what, cases, bound in (("rows", ROWS, bounds[0]), ("a gradient", ("grad",), bounds[1])):
+        for what, cases, bound in (
+            ("rows", SOLVES, bounds[0]),
+            ("a gradient", ("grad",), bounds[1]),
+        ):
             if names & set(wanted):
                 found = _worst(rows, wanted, cases, lambda row: row["cold_s"])
                 targets.append(Target(f"s to the first result: {what}, {kind}", found, "<=", bound))
-    for what, cases, bound in (("rows", ROWS, 1.2), ("a gradient", ("grad",), 1.0)):
+    for what, cases, bound in (("rows", SOLVES, 1.2), ("a gradient", ("grad",), 1.0)):
         found = _worst(rows, SCENES, cases, lambda row: row["cold_s"] / row["diffrax_s"])
         claim = f"times as long to the first result as diffrax by hand: {what}"
         targets.append(Target(claim, found, "<=", bound))

@@ -1,6 +1,6 @@
-"""One program from nothing to its first result: `python _one_process.py SIDE SCENE CASE`.
+"""One program from the start of a process to its result: `python _one_process.py SIDE SCENE CASE`.
 
-A process of its own, which prints one line of JSON; libraries are imported where they are timed.
+The process prints one line of JSON. Libraries are imported inside functions, where this is timed.
 """
 
 import json
@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def of_jax(side: str, scene: str, case: str) -> dict[str, Any]:
-    """Seconds from a declared motion to its first result, where they went, and what it gave."""
+    """Seconds from a declared motion to its first result, with their parts, and the result."""
     begin = perf_counter()
     import jaxlag  # noqa: F401
 
@@ -40,7 +40,7 @@ def of_jax(side: str, scene: str, case: str) -> dict[str, Any]:
     from jaxlag._lowering import _scalar_program
 
     motion = BEGINNINGS[scene]()
-    jax.block_until_ready(jax.numpy.zeros(3) + 1.0)  # the backend is up
+    jax.block_until_ready(jax.numpy.zeros(3) + 1.0)  # initializes the backend
     spent = {"derive_s": 0.0, "lower_s": 0.0, "compile_s": 0.0}
 
     def listen(event: str, seconds: float, **_: Any) -> None:
@@ -88,7 +88,7 @@ def _numbers(motion: Any) -> dict[str, Any]:
 
 
 def _program(solve: Callable, y0: Any, params: Any, case: str) -> Callable[[], Any]:
-    """Coordinates at the end, or the derivative of their square, from solve(y0, params)."""
+    """Final coordinates, or the gradient of their squared norm, from solve(y0, params)."""
     import jax
     import jax.numpy as jnp
 
@@ -98,8 +98,8 @@ def _program(solve: Callable, y0: Any, params: Any, case: str) -> Callable[[], A
 
     starts = y0 * (1.0 + 1e-3 * jnp.linspace(-1.0, 1.0, LANES)[:, None])
     if case.endswith("rows"):
-        rows = jax.jit(lambda y0, params: solve(y0, params))
-        return lambda: rows(y0, params)[-1]
+        coordinates = jax.jit(lambda y0, params: solve(y0, params))
+        return lambda: coordinates(y0, params)[-1]
     program = jax.jit(
         {
             "grad": gradient,
@@ -157,7 +157,7 @@ def _diffrax(motion: Any, case: str) -> tuple[Callable, Any]:
 
 
 def of_heyoka(scene: str) -> dict[str, Any]:
-    """Its Taylor integrator, made and run; None where the motion has no equations on scalars."""
+    """Build and run heyoka's Taylor integrator; None if there are no equations on scalars."""
     from importlib import import_module
 
     from bench._problems.declared_scenes import BEGINNINGS

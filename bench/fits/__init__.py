@@ -1,16 +1,16 @@
-"""Params from real measurements, beside what others found from the same ones.
+"""Parameters identified from real measurements, compared with published values.
 
-The recordings lie in a folder outside this project, which `--data` names, or the environment
+The recordings are in a folder outside this project, given by `--data` or by the environment
 variable JAXLAG_DATA: multiarm_pendulum/{single,double,triple}.csv.gz (columns seg, t, theta1, ...),
 dfki_double_pendulum/design*.csv.gz (t, q1, q2, tau_meas1, tau_meas2), dfki_simple_pendulum/
 {ddp,ilqr}.csv.gz (t, q, tau_meas), contactnets_cube/tosses.csv.gz (toss, t, x, y, z, qw, qx, qy,
-qz, vx, vy, vz, wx, wy, wz), ibm_double_pendulum/{2,13,17}.csv.gz (six columns of pixels). One that
-is missing is left out and named. The last part is simulated and needs none.
+qz, vx, vy, vz, wx, wy, wz), ibm_double_pendulum/{2,13,17}.csv.gz (six columns of pixels). A missing
+recording is left out and named. One part is simulated and needs no recording.
 
-`value` is what was found, in `unit`; `low` and `high` bound its 95 % interval, which holds for
-noise that is independent from sample to sample (residuals of dry friction are not: intervals are
-too narrow there). `other` is the number to read it by, and `whose` says whose it is. Test data
-give their own starts and nothing else.
+`value` is the estimate, in `unit`. `low` and `high` are the limits of its 95 % interval. The
+interval is valid for noise that is independent between samples. Residuals of dry friction are not
+independent: there the intervals are too narrow. `other` is a value for comparison, `whose` its
+source. On test data only the initial states are fitted.
 
 A quick run takes a few windows of each recording.
 """
@@ -25,7 +25,7 @@ from bench.fits import _actuated_arm, _cube, _multiarm, _network, _synthetic, _v
 from bench.fits._data import folder
 from bench.fits._report import Part
 
-# Folder of the recordings -> what is found from them, by (path, quick).
+# Folder of the recordings, and the function of (path, quick) that evaluates them.
 PARTS: tuple[tuple[str, Callable[..., Part]], ...] = (
     ("multiarm_pendulum", partial(_multiarm.measured, arms=1)),
     ("multiarm_pendulum", partial(_multiarm.measured, arms=2)),

@@ -1,13 +1,13 @@
 """Pendulums whose joints are driven (Wiebe et al., JOSS 7(74) 3884, 2022, and IEEE Robotics &
 Automation Magazine 31(2), 2024): one arm, and two arms of two designs.
 
-Angles are 0 hanging, that of the second arm relative to the first. Torques are those measured, at
-the output shaft. Friction at a joint is b v + cf 2/pi atan(100 v), as in the published models.
+Angles are 0 for hanging arms; the second angle is relative to the first arm. Torques are measured
+at the output shaft. Friction at a joint is b v + cf 2/pi atan(100 v), as in the published models.
 
-One arm: J q'' = -g ml sin q + s tau + u0 - friction. A torque scale s and the numbers J, ml cannot
-be told apart: either s = 1, or J and ml are those of the documented masses.
+One arm: J q'' = -g ml sin q + s tau + u0 - friction. The torque scale s, J and ml cannot all be
+identified: either s = 1, or J and ml are those of the documented masses.
 
-Two arms, of gear ratio 6, the inertia Ir of both rotors before the gear:
+Two arms, of gear ratio 6, with the inertia Ir of each rotor before the gear:
 
     M11 = A + I2 + 2 C cos q2 + 37 Ir,   M12 = I2 + C cos q2 - 6 Ir,   M22 = I2 + 36 Ir
     V   = -g (P1 cos q1 + P2 cos(q1 + q2))
@@ -31,10 +31,10 @@ from bench.fits._report import Part, errors, estimates, missed, timed
 
 G = 9.81  # m/s^2
 GEAR = 6.0
-EVERY = 5  # rows of 2 ms
+EVERY = 5  # samples of 2 ms
 OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-6, "atol": 1e-6, "max_steps": 4096}}
-STEEP = 100.0  # s/rad, how fast dry friction changes its sign
-LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction takes energy
+STEEP = 100.0  # s/rad, steepness of dry friction at zero rate
+LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction dissipates energy
 
 # ---- One arm -------------------------------------------------------------------------------------
 
@@ -50,7 +50,7 @@ def arm_lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def friction(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Moments against rates."""
+    """Friction torques, which oppose the rates."""
     return -p["b"] * v - p["cf"] * (2 / jnp.pi) * jnp.arctan(STEEP * v)
 
 
@@ -87,7 +87,7 @@ def published(design: str) -> dict[str, Any]:
 
 
 def arms_lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """L of the docstring."""
+    """L of the module docstring."""
     c, Ir = p["C"] * jnp.cos(q[1]), p["Ir"]
     m11 = p["A"] + p["I2"] + 2 * c + (GEAR**2 + 1) * Ir
     m12 = p["I2"] + c - GEAR * Ir
@@ -111,10 +111,10 @@ ARMS = jl.System(
 
 
 def recording(path: Path, columns: tuple[str, ...], torques: tuple[str, ...], every: int) -> Any:
-    """One run: angles every so many rows, torques at all of them."""
-    rows = table(path)
-    t = rows["t"]
-    angles, torque = (np.stack([rows[x] for x in names], axis=1) for names in (columns, torques))
+    """One run: angles at every `every`-th sample, torques at all samples."""
+    samples = table(path)
+    t = samples["t"]
+    angles, torque = (np.stack([samples[x] for x in names], axis=1) for names in (columns, torques))
     return jl.Experiment(
         t[::every],
         {"q": angles[::every]},
@@ -124,7 +124,7 @@ def recording(path: Path, columns: tuple[str, ...], torques: tuple[str, ...], ev
 
 
 def arm(path: Path, quick: bool) -> Part:
-    """Trained on the run at 500 Hz, tested on that at 50 Hz: windows of 1 s."""
+    """Fit to the run at 500 Hz, test on the run at 50 Hz, in windows of 1 s."""
     name = "one driven arm"
     folder = path / "dfki_simple_pendulum"
     train = windows([recording(folder / "ddp.csv.gz", ("q",), ("tau_meas",), EVERY)], 1.0)
@@ -148,7 +148,7 @@ def arm(path: Path, quick: bool) -> Part:
 
 
 def arms(path: Path, design: str, quick: bool) -> Part:
-    """Windows of 0.5 s."""
+    """Fit and test in windows of 0.5 s."""
     name = f"two driven arms, design {design}"
     folder = path / "dfki_double_pendulum"
     angles, torques = ("q1", "q2"), ("tau_meas1", "tau_meas2")

@@ -13,17 +13,17 @@ VARIABLE = "JAXLAG_DATA"
 
 
 class DataError(ValueError):
-    """The recordings are not where they were said to be."""
+    """The recordings are not in the given folder."""
 
 
 def folder(given: str | None) -> Path:
-    """Where the recordings lie.
+    """The folder of the recordings.
 
     Args:
-        given: the folder; None for the one that JAXLAG_DATA names.
+        given: the folder; None for that in JAXLAG_DATA.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no such folder.
     """
     path = given or os.environ.get(VARIABLE)
     if not path:
@@ -35,15 +35,15 @@ def folder(given: str | None) -> Path:
 
 
 def table(path: Path) -> dict[str, np.ndarray]:
-    """Columns by name: of a CSV file, gzipped, with comments (#) and a line of names at its top."""
+    """Columns of a gzipped CSV file by name; comments (#), then a line of names are at its top."""
     with gzip.open(path, "rt") as file:
         head = next(line for line in file if not line.startswith("#"))
-        rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    return dict(zip(head.strip().split(","), rows.T, strict=True))
+        samples = np.loadtxt(file, delimiter=",", ndmin=2)
+    return dict(zip(head.strip().split(","), samples.T, strict=True))
 
 
 def pieces(columns: dict[str, np.ndarray], by: str) -> dict[int, dict[str, np.ndarray]]:
-    """The rows of each number in the column `by`."""
+    """The samples for each number in the column `by`."""
     numbers = columns[by].astype(int)
     return {
         int(number): {name: x[numbers == number] for name, x in columns.items()}
@@ -52,7 +52,7 @@ def pieces(columns: dict[str, np.ndarray], by: str) -> dict[int, dict[str, np.nd
 
 
 def windows(recordings: Iterable[jl.Experiment], seconds: float) -> list[jl.Experiment]:
-    """All windows of all recordings that are as long as one."""
+    """All windows of the recordings that are at least as long as one window."""
     return [
         window
         for each in recordings

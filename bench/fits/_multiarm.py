@@ -1,13 +1,13 @@
 """Pendulums of one, two and three arms that swing freely (Kaheman et al., HardwareX 15, 2023).
 
-Angles are absolute, 0 upright. A free swing tells ratios: with c_k the lever arms of mass k about
-the joints, S = sum m_k c_k c_k^T + diag(I) and G = g sum m_k c_k,
+Angles are absolute, 0 upright. A free swing identifies ratios only. Let c_k be the lever arms of
+mass k about the joints, S = sum m_k c_k c_k^T + diag(I) and G = g sum m_k c_k. Then
 
     L = 1/2 sum S_ij w_i w_j cos(theta_i - theta_j) - sum G_i cos(theta_i),   S_11 = 1.
 
-Friction acts at the joints, on relative rates, air drag on the arms themselves. The model of both
-is chosen among candidates by what they predict of a third of the training segments, which are not
-fitted to then; segments whose number is divisible by 3 take no part in anything but the test.
+Friction acts at the joints and depends on relative rates. Air drag acts on the arms. The model of
+both is chosen among candidates: each is fitted to two thirds of the training segments and predicts
+the other third. Segments whose number is divisible by 3 are used for the test only.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,20 +26,20 @@ from bench.fits._data import pieces, table, windows
 from bench.fits._report import Figure, Part, errors, estimates, missed, timed
 
 NAMES = {1: "single", 2: "double", 3: "triple"}
-EVERY = 10  # milliseconds: rows that are fitted to and compared
-EVERY_EARLY = 2  # where a start is fitted to 0.1 s
+EVERY = 10  # ms: samples for fits and comparisons
+EVERY_EARLY = 2  # ms: samples for starts that are fitted to 0.1 s
 SETTLE = 0.1  # s
-PIECES = 4  # of recordings of one arm, joined in the fit
+PIECES = 4  # segments of multiple shooting, for recordings of one arm
 OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-9, "atol": 1e-9}}
-SLIP = 0.05  # rad/s, over which dry friction changes its sign
-ANGLE = 0.05  # rad, likewise the restoring moment
-# Of a fit to all segments, mrad: what is to be beaten (single: whole segments; else 1 s).
+SLIP = 0.05  # rad/s, width of the sign change of dry friction
+ANGLE = 0.05  # rad, width of the sign change of the restoring moment
+# Errors of a fit to all segments, mrad, for comparison (single: whole segments; else 1 s).
 REFITTED = {1: (2.05,), 2: (1.1, 1.5), 3: (1.2, 1.2, 1.1)}
 MARGIN = 1.1
 BOUNDS = {"u": jl.transforms.Bounded(0.3, 30.0)}  # rad/s
-LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction takes energy
-# Published estimates: of the arms a (joint to mass centre), L (joint to joint), I (about the mass
-# centre), m, and k of the joints, SI units.
+LOSS = jl.transforms.Bounded(0.0, np.inf)  # friction dissipates energy
+# Published estimates, SI units: of the arms a (joint to mass center), L (joint to joint), I (about
+# the mass center), m; of the joints k.
 PUBLISHED: Mapping[int, dict[str, float]] = {
     1: {"m1": 0.147585, "a1": 0.147755, "I1": 1.09119e-4, "k1": 2.2394e-4, "g": 9.81},
     2: {"m1": 0.0938440, "a1": 0.108565, "L1": 0.172719, "I1": 4.37529e-4, "k1": 2.37143e-4}
@@ -62,7 +62,7 @@ def matrices(p: Mapping[str, Any], arms: int) -> tuple[Array, Array]:
 
 
 def base(arms: int) -> dict[str, float]:
-    """Published estimates as the numbers that a free swing tells."""
+    """Published estimates as the parameters that a free swing identifies."""
     S, G = matrices(PUBLISHED[arms], arms)
     found = {f"S{i + 1}{j + 1}": float(S[i, j] / S[0, 0]) for i, j in _entries(arms)}
     return found | {f"G{i + 1}": float(G[i] / S[0, 0]) for i in range(arms)}
@@ -79,7 +79,7 @@ def _swing(S: Array, G: Array, angles: Array, rates: Array) -> Array:
 
 
 def lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Of base parameters; `zero` is what encoders show of arms that stand upright."""
+    """L with base parameters; `zero` holds the encoder angles of upright arms."""
     arms = q.shape[0]
     S = jnp.zeros((arms, arms)).at[0, 0].set(1.0)
     for i, j in _entries(arms):
@@ -89,7 +89,7 @@ def lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def published_lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """Of masses, lever arms and inertias."""
+    """L with masses, lever arms and inertias."""
     return _swing(*matrices(p, q.shape[0]), q, v)
 
 
@@ -104,7 +104,7 @@ def _relative(v: Array) -> Array:
 
 
 def _joints(moment: Callable[[Array, Any], Array], name: str) -> jl.GeneralizedForce:
-    """Moments on arms of those that act between them, which oppose relative rates."""
+    """Torques on the arms from joint torques between them, which oppose relative rates."""
 
     def force(t: Any, q: Array, v: Array, p: Any) -> Array:
         each = moment(_relative(v), p)
@@ -150,19 +150,19 @@ def candidates(arms: int) -> dict[str, jl.Candidate]:
 
 
 def recordings(path: Path, arms: int, every: int) -> dict[int, jl.Experiment]:
-    """Segments by number, every so many milliseconds."""
+    """Segments by number, sampled every `every` milliseconds."""
     columns = table(path / "multiarm_pendulum" / f"{NAMES[arms]}.csv.gz")
     found = {}
-    for number, rows in pieces(columns, "seg").items():
-        angles = np.stack([rows[f"theta{i + 1}"] for i in range(arms)], axis=1)
-        t = rows["t"][::every] - rows["t"][0]
+    for number, samples in pieces(columns, "seg").items():
+        angles = np.stack([samples[f"theta{i + 1}"] for i in range(arms)], axis=1)
+        t = samples["t"][::every] - samples["t"][0]
         name = f"segment {number}"
         found[number] = jl.Experiment(t, {"theta": angles[::every]}, name=name)
     return found
 
 
 def measured(path: Path, arms: int, quick: bool) -> Part:
-    """All that is found of one pendulum."""
+    """All results for one pendulum."""
     recording = f"{NAMES[arms]} pendulum"
     segments = recordings(path, arms, EVERY)
     train = [x for number, x in segments.items() if number % 3]
@@ -191,14 +191,14 @@ def measured(path: Path, arms: int, quick: bool) -> Part:
 
 
 def fitted(segments: list[jl.Experiment], arms: int) -> list[jl.Experiment]:
-    """What is fitted to: segments of one arm, which is not chaotic, and windows of several."""
+    """Data for fits: whole segments of one arm, which is not chaotic; windows of several arms."""
     return segments if arms == 1 else windows(segments, 1.0)
 
 
 def _chosen(
     recording: str, arms: int, train: list[jl.Experiment], quick: bool
 ) -> tuple[str, Callable[[], jl.FitResult], list[Figure]]:
-    """(the model of friction that predicts best, its fit to all, how the others do)."""
+    """(friction model with the best predictions, its fit to all segments, errors of all models)."""
     system = jl.System(lagrangian, {"theta": (arms,)})
     params0 = base(arms) | {"zero": np.zeros(arms)}
     models = candidates(arms)
@@ -206,7 +206,7 @@ def _chosen(
         models = dict(list(models.items())[:2])
     held_out = fitted(train[1::3], arms)
     rest = fitted([x for i, x in enumerate(train) if i % 3 != 1], arms)
-    # A search in whole recordings of one arm ends in minima on the way.
+    # Single shooting over whole recordings of one arm ends in local minima.
     options, free = {"segments": PIECES if arms == 1 else 1} | OPTIONS, tuple(params0)
     begun = perf_counter()
     compared = jl.select_model(
@@ -241,7 +241,7 @@ def _published(arms: int) -> jl.System:
 def _ahead(
     path: Path, arms: int, recording: str, chosen: str, found: jl.FitResult, quick: bool
 ) -> list[Figure]:
-    """1 s ahead of starts that are fitted to 0.1 s, beside published params."""
+    """Predictions 1 s ahead of starts fitted to 0.1 s, compared with published params."""
     finer = recordings(path, arms, EVERY_EARLY)
     test = windows([x for n, x in finer.items() if n % 3 == 0][: 2 if quick else None], 1.1)
     own = found.predict(test, settle=SETTLE)
@@ -259,7 +259,7 @@ def _ahead(
 def _unidentifiable(
     train: list[jl.Experiment], arms: int, recording: str, quick: bool
 ) -> list[Reference]:
-    """Null directions of the form with masses, lever arms and inertias."""
+    """Null directions of the model with masses, lever arms and inertias."""
     params = PUBLISHED[arms]
     found = jl.fit(
         _published(arms), train[:2] if quick else train, params, free=tuple(params), **OPTIONS

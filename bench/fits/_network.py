@@ -1,9 +1,9 @@
-"""A network beside physics: a potential of the free single pendulum that nobody wrote down.
+"""A neural network added to a physical model: an unknown potential of the free single pendulum.
 
-To L = 1/2 w^2 - G cos(theta - zero) with viscous and falling dry friction and drag, a network adds
-a potential of the angle. All are trained together by gradients on whole segments; the start is the
-fit of the physics alone. What it adds is a potential, so energy stays consistent: without friction
-it is constant to the solver's tolerance.
+The physical model is L = 1/2 w^2 - G cos(theta - zero) with viscous friction, falling dry friction
+and drag. The network adds a potential of the angle. All parameters are trained together by
+gradients on whole segments, starting from the fit of the physical model alone. The network is a
+potential, so energy is conserved: without friction it is constant to the solver's tolerance.
 """
 
 from pathlib import Path
@@ -22,9 +22,9 @@ from bench.fits import _multiarm as multiarm
 from bench.fits._report import Figure, Part, missed, timed
 
 PHYSICS = multiarm.candidates(1)["viscous, falling, drag"]
-EVERY = 20  # milliseconds
+EVERY = 20  # ms
 WIDTH = 8
-SHARP = 3.0  # of the network's inputs: what is missing may change within a third of a radian
+SHARP = 3.0  # scale of the network's inputs: the potential may change within a third of a radian
 EPOCHS, QUICK_EPOCHS = 300, 5
 MEMORY = 20
 COORDINATES = {"theta": (1,)}
@@ -37,7 +37,7 @@ def learned(t: Any, q: Array, v: Array, p: Any) -> Array:
 
 
 def drift(params: Any) -> float:
-    """Largest change of energy in 10 s without friction, over G."""
+    """Largest change of energy in 10 s without friction, divided by G."""
     system = jl.System(learned, COORDINATES)
     ts = np.linspace(0.0, 10.0, 201)
     motion = jl.simulate(system, [2.0], [0.0], ts, params, rtol=1e-11, atol=1e-11)
@@ -46,7 +46,7 @@ def drift(params: Any) -> float:
 
 
 def measured(path: Path, quick: bool) -> Part:
-    """Both models on segments that neither saw."""
+    """Both models, tested on segments that were not used for training."""
     name, model = "single pendulum", "physics and a network's potential"
     segments = multiarm.recordings(path, 1, EVERY)
     train = [x for number, x in segments.items() if number % 3]
@@ -57,7 +57,7 @@ def measured(path: Path, quick: bool) -> Part:
     free, options = tuple(params0), {"transforms": PHYSICS.transforms} | multiarm.OPTIONS
     plain = jl.System(multiarm.lagrangian, COORDINATES, forces=PHYSICS.forces)
     physics = jl.fit(plain, train, params0, free=free, **options)
-    # Without a constant, which no motion tells.
+    # Without a constant, which no motion determines.
     key = jax.random.key(0)
     network = eqx.nn.MLP(2, "scalar", WIDTH, 1, jnp.tanh, use_final_bias=False, key=key)
     both = jl.System(learned, COORDINATES, forces=PHYSICS.forces)
@@ -68,7 +68,7 @@ def measured(path: Path, quick: bool) -> Part:
         start = physics.params | {"net": network}
         return jl.fit(both, train, start, free=(*free, "net"), optimizer=descent, **options)
 
-    found, figures = timed(name, model, fit, turns=1)
+    found, figures = timed(name, model, fit, repeats=1)
     figures.append(Figure(name, model, "numbers trained", "1", float(len(found.names))))
 
     def compared(what: str, others: list[jl.Experiment]) -> Figure:

@@ -15,15 +15,15 @@ class Figure(NamedTuple):
     """One number of a report.
 
     Attributes:
-        recording: what was measured, or simulated.
-        model: what it was fitted with.
-        quantity: what was found.
-        unit: of the numbers; "SI" where the model says it.
+        recording: the recording, or the simulated system.
+        model: the fitted model.
+        quantity: name of the quantity.
+        unit: of the values; "SI" if the model defines it.
         value: of the quantity.
-        low: of its 95 % interval, where it has one.
-        high: likewise.
-        other: the number to read it by.
-        whose: that number is.
+        low: lower limit of its 95 % interval, if it has one.
+        high: upper limit of this interval.
+        other: a value for comparison.
+        whose: source of `other`.
     """
 
     recording: str
@@ -38,7 +38,7 @@ class Figure(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one recording gives."""
+    """The results for one recording."""
 
     figures: list[Figure]
     targets: list[Target]
@@ -46,11 +46,11 @@ class Part(NamedTuple):
 
 
 def timed(
-    recording: str, model: str, fit: Callable[[], jl.FitResult], turns: int = 2
+    recording: str, model: str, fit: Callable[[], jl.FitResult], repeats: int = 2
 ) -> tuple[jl.FitResult, list[Figure]]:
-    """A fit, and what it cost: the last time, when all programs are compiled, and the first."""
+    """A fit and its cost: run time with all programs compiled, and that of the first run."""
     seconds = []
-    for _ in range(turns):
+    for _ in range(repeats):
         begun = perf_counter()
         found = fit()
         seconds.append(perf_counter() - begun)
@@ -67,17 +67,17 @@ def estimates(
 ) -> list[Figure]:
     """Estimates with their 95 % intervals."""
     intervals = found.interval()
-    rows = []
+    figures = []
     for name, value in zip(found.names, found.values.tolist(), strict=True):
         low, high = intervals[name]
         other = others.get(name)
         own = None if other is None else whose
-        rows.append(Figure(recording, model, name, "SI", value, low, high, other, own))
-    return rows
+        figures.append(Figure(recording, model, name, "SI", value, low, high, other, own))
+    return figures
 
 
 def missed(prediction: jl.Prediction, channel: str) -> Float[np.ndarray, " k"]:
-    """Root mean square of what a prediction misses; inf where a motion failed."""
+    """Root mean square of the errors of a prediction; inf if a motion failed."""
     rms = prediction.rms(channel)
     return np.full_like(rms, np.inf) if prediction.failed else rms
 
@@ -90,11 +90,11 @@ def errors(
     others: Sequence[float] = (),
     whose: str = "",
 ) -> list[Figure]:
-    """Root mean squares of angles, given in rad, as mrad; those of others in mrad."""
-    rows = []
+    """Root mean squares of angles, given in rad, as figures in mrad; `others` are in mrad."""
+    figures = []
     for i, value in enumerate(rms):
         other = others[i] if len(others) else None
         name = f"{quantity}, angle {i + 1}"
         own = None if other is None else whose
-        rows.append(Figure(recording, model, name, "mrad", 1e3 * value, None, None, other, own))
-    return rows
+        figures.append(Figure(recording, model, name, "mrad", 1e3 * value, None, None, other, own))
+    return figures

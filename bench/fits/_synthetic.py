@@ -1,9 +1,9 @@
-"""A chaotic double pendulum whose params are known: how often a fit finds them, and how well it
-knows what it does not.
+"""A chaotic double pendulum with known params: how often a fit finds them, and how often its
+intervals contain them.
 
-Two point masses on massless rods, angles absolute, 0 hanging, measured 100 times a second with
-noise of a stated standard deviation. m1 and g are given; l1, l2 and m2 are found, from starts that
-are wrong by half of their values, up or down by chance, over five Lyapunov times.
+Two point masses on massless rods; angles are absolute, 0 hanging. They are measured 100 times per
+second with noise of a given standard deviation, over five Lyapunov times. m1 and g are known. l1,
+l2 and m2 are fitted. Their initial values are 50 % too large or too small, at random.
 """
 
 from statistics import NormalDist
@@ -52,7 +52,7 @@ PENDULUM = jl.System(lagrangian, {"theta": (2,)})
 
 @jax.jit
 def lyapunov_exponent() -> Array:
-    """The largest, 1/s: mean growth of a small change, second by second."""
+    """The largest Lyapunov exponent, 1/s: mean growth per second of an infinitesimal change."""
 
     def after(y: Array) -> Array:
         motion = jl.simulate(PENDULUM, y[:2], y[2:], [0.0, 1.0], TRUE, rtol=1e-9, atol=1e-9)
@@ -70,7 +70,7 @@ def lyapunov_exponent() -> Array:
 
 
 def times(exponent: float) -> np.ndarray:
-    """s, over five Lyapunov times."""
+    """Sample times over five Lyapunov times, s."""
     return np.arange(int(TIMES / exponent * RATE) + 1) / RATE
 
 
@@ -86,19 +86,19 @@ def measured(ts: np.ndarray, exact: np.ndarray, seed: int) -> jl.Experiment:
 
 
 def wrong(seed: int) -> dict[str, float]:
-    """Params half off."""
+    """Params, those to be fitted wrong by 50 %."""
     signs = np.random.default_rng([seed, 1]).choice([-0.5, 0.5], len(FREE))
     return TRUE | {name: TRUE[name] * (1 + x) for name, x in zip(FREE, signs.tolist(), strict=True)}
 
 
 class Tally(NamedTuple):
-    """Of many fits.
+    """Results of many fits.
 
     Attributes:
-        found: how many have all params within 1 % and inside their 99 % intervals.
-        near: how many have all within 1 %.
-        worst: largest relative error among those near.
-        solves: motions with derivatives, in the middle of all.
+        found: number of fits with all params within 1 % and inside their 99 % intervals.
+        near: number of fits with all params within 1 %.
+        worst: largest relative error of the fits in `near`.
+        solves: median number of motions with derivatives.
     """
 
     found: int
@@ -108,7 +108,7 @@ class Tally(NamedTuple):
 
 
 def recovered(ts: np.ndarray, seeds: int, segments: int) -> Tally:
-    """How often wrong starts lead to the truth."""
+    """How often fits from wrong initial values find the true params."""
     exact = truth(ts)
     found, errors, solves = 0, [], []
     for seed in range(seeds):
@@ -133,7 +133,7 @@ def recovered(ts: np.ndarray, seeds: int, segments: int) -> Tally:
 
 
 def posed(ts: np.ndarray, exact: np.ndarray) -> MultipleShooting:
-    """The least squares, of measurements without noise."""
+    """The least-squares problem, with measurements without noise."""
     data = (jl.Experiment(ts, {"theta": exact}, sigma={"theta": NOISE}),)
     shown = readers_of(PENDULUM, data, {}, TRUE)
     free, where = unknowns(TRUE, FREE, {}), layout(data, SEGMENTS)
@@ -141,7 +141,7 @@ def posed(ts: np.ndarray, exact: np.ndarray) -> MultipleShooting:
 
 
 def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
-    """Share of 95 % intervals that hold the truth, of each param; all fits in one batch."""
+    """Share of 95 % intervals that contain the true value, per param; all fits in one batch."""
     problem = posed(ts, truth(ts))
     segments = problem.segments
     rng = np.random.default_rng(seed)
@@ -165,7 +165,7 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
 
 
 def part(quick: bool) -> Part:
-    """Both questions."""
+    """Recovery of the params, and coverage of the intervals."""
     name = "simulated double pendulum"
     exponent = float(lyapunov_exponent())
     ts = times(exponent)

@@ -5,8 +5,8 @@ inertia of the first arm 1,
 
     L = 1/2 w1^2 + 1/2 B w2^2 + C w1 w2 cos(th1 - th2) + P cos th1 + Q cos th2,
 
-friction viscous at both joints. Time is that of 400 frames a second, which the arms' lengths do not
-agree with: P, Q and friction are in units of that clock.
+with viscous friction at both joints. Time is based on 400 frames per second. This is inconsistent
+with the lengths of the arms, so P, Q and friction are in units of that clock.
 """
 
 import gzip
@@ -26,12 +26,12 @@ WINDOW = 0.3  # s: longer ones are chaotic
 TRAIN, TEST = ("2", "13"), ("17",)
 OPTIONS = {"simulate_options": {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}}
 START = {"B": 0.1, "C": 0.15, "P": 100.0, "Q": 10.0, "k1": 0.02, "k2": 0.02}
-# Middles of the ranges over seven runs, each fitted alone.
+# Centers of the ranges over seven runs, each fitted alone.
 OTHERS = {"B": 0.076, "C": 0.1034, "P": 69.2, "Q": 7.06, "k2": 0.008}
 
 
 def lagrangian(t: Any, q: Array, v: Array, p: Any) -> Array:
-    """L of the docstring."""
+    """L of the module docstring."""
     T = 0.5 * v[0] ** 2 + 0.5 * p["B"] * v[1] ** 2 + p["C"] * v[0] * v[1] * jnp.cos(q[0] - q[1])
     return T + p["P"] * jnp.cos(q[0]) + p["Q"] * jnp.cos(q[1])
 
@@ -45,7 +45,7 @@ PENDULUM = jl.System(lagrangian, {"theta": (2,)}, forces=(jl.Rayleigh(friction, 
 
 
 def angles(path: Path, run: str) -> jl.Experiment:
-    """One run, whole; gravity points along the first of each pair of columns."""
+    """One whole run; gravity points along the first of each pair of columns."""
     with gzip.open(path / "ibm_double_pendulum" / f"{run}.csv.gz", "rt") as file:
         points = np.loadtxt(file, delimiter=",").reshape(-1, 3, 2)
     along, across = np.moveaxis(np.diff(points, axis=1), 2, 0)
@@ -54,7 +54,7 @@ def angles(path: Path, run: str) -> jl.Experiment:
 
 
 def measured(path: Path, quick: bool) -> Part:
-    """Two runs, tested on a third."""
+    """Fit two runs, test on a third."""
     name, model = "double pendulum on video", "viscous"
     train, test = (windows([angles(path, run) for run in runs], WINDOW) for runs in (TRAIN, TEST))
     if quick:

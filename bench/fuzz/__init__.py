@@ -1,24 +1,25 @@
-"""Systems at random: every program of the library against another way to the same numbers.
+"""Random systems: every program of the library is compared with an independent computation.
 
-Lagrangians of 1 to 5 coordinates with every kind of operation, energies of 1e-12 to 1e12 times the
-usual size, coordinates in units of 1e-6 to 1e6, float32 and float64. Of ten systems
+Lagrangians have 1 to 5 coordinates and all kinds of operations. Energies are 1e-12 to 1e12 times
+the usual size, units of coordinates 1e-6 to 1e6. The precision is float32 or float64. Of ten
+systems
 
-- four are free: the scalar program against the array program (`_system_programs.py`);
-- three are constrained, holonomic, rheonomic and Pfaffian rows at random, some of which follow from
-  others, say nothing, or lose rank at the state, residuals in units of 1e-6 to 1e6, coordinates
-  without inertia: accelerations, multipliers and their derivatives by arrays, scalars and null
-  spaces against Gaussian elimination in extended precision (`_mechanism_programs.py`,
-  `_reference_solution.py`);
-- two are in quasi-velocities, by U or by kinematics, L in v or in u, with rows or without,
-  singular at the state by chance: against the same equations solved with multipliers;
-- one is differentiated twice through a loop: against the same unrolled (`_loops.py`).
+- four are free. The scalar program is compared with the array program (`_system_programs.py`).
+- three are constrained by random holonomic, rheonomic and Pfaffian rows. Some rows depend on
+  others, are identically zero, or lose rank at the state. Units of residuals are 1e-6 to 1e6;
+  coordinates may have no inertia. Accelerations, multipliers and their derivatives by arrays,
+  scalars and null spaces are compared with Gaussian elimination in extended precision
+  (`_mechanism_programs.py`, `_reference_solution.py`).
+- two have quasi-velocities, by U or by kinematics, L in v or in u, with rows or without. Some are
+  singular at the state. They are compared with the same equations solved with multipliers.
+- one is differentiated twice through a loop and compared with the unrolled loop (`_loops.py`).
 
-What has no solution must have no number. Of some of the constrained ones, and of those in
-quasi-velocities, short motions by two formulations are compared, and their statuses, and of some
-loops the steps are motions (`_mechanism_motions.py`). Differences are allowed up to what other
-roundings change. What differs more is made smaller and written down as source. All but the motions
-is computed operation by operation: it is the programs that are compared, not what compilers make of
-them.
+If there is no solution, the result must not be finite. For some systems with constraints or
+quasi-velocities, short motions by two formulations and their statuses are compared. For some loops
+the steps are motions (`_mechanism_motions.py`). The allowed difference is that caused by other
+rounding errors. A system that differs more is reduced and reported as source. Everything except
+motions is evaluated operation by operation, because the test is about the programs and not about
+the compilers.
 """
 
 from collections import Counter
@@ -40,21 +41,21 @@ from bench.fuzz import (
 )
 from bench.fuzz._comparison import DIFFERS, EQUAL, Compared
 
-SYSTEMS = 2000  # compared: an hour and a half
+SYSTEMS = 2000  # to be compared: this takes an hour and a half
 QUICK = 20.0  # seconds of a quick run
-TOGETHER = 200  # systems, after which what is compiled is dropped
-SMALLEST = 60  # attempts to make a find smaller
-MOVING = 4.0  # decades of units of what moves: tolerances bound no more
+TOGETHER = 200  # systems, after which compiled programs are dropped
+SMALLEST = 60  # attempts to reduce a system that differs
+MOVING = 4.0  # decades of the units for motions: tolerances do not cover more
 
 
 class Kind(NamedTuple):
-    """What is drawn, and how it is looked at.
+    """A kind of random systems, with the functions that draw and compare them.
 
     Attributes:
-        name: in the rows of the report.
-        draw: from a seed.
-        compared: how it compares.
-        smaller: others with something left out.
+        name: in the table of the report.
+        draw: a system from a seed.
+        compared: the comparison of a system.
+        smaller: reduced systems.
     """
 
     name: str
@@ -95,7 +96,7 @@ KINDS = (
 
 
 def kind_of(seed: int) -> Kind:
-    """What a seed stands for: free, constrained, quasi or loops, in ten 4, 3, 2 and 1."""
+    """The kind of a seed: of ten seeds 4 are free, 3 constrained, 2 quasi and 1 loops."""
     tens, ones = divmod(seed, 10)
     if ones == 5 and tens % 5 == 3:
         return CONSTRAINED_MOTION
@@ -103,12 +104,12 @@ def kind_of(seed: int) -> Kind:
         return QUASI_MOTION
     if ones == 9 and tens % 40 == 6:
         return LOOPED_MOTION
-    turns = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
-    return turns[ones]
+    kinds = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
+    return kinds[ones]
 
 
 def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
-    """Systems one after the other until enough are compared or the time is over."""
+    """Compare systems one after the other until there are enough or the time has expired."""
     if seconds is None:
         seconds = QUICK if quick else float("inf")
     end = perf_counter() + seconds
@@ -139,7 +140,7 @@ def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
 
 
 def _smallest(kind: Kind, drawn: Any, found: Compared) -> tuple[Any, Compared]:
-    """A system in which the programs still differ, with as much left out as the tries allow."""
+    """A reduced system in which the programs still differ, after at most `SMALLEST` attempts."""
     tries, again = 0, True
     while again:
         again = False
@@ -149,7 +150,7 @@ def _smallest(kind: Kind, drawn: Any, found: Compared) -> tuple[Any, Compared]:
                 return drawn, found
             try:
                 now = kind.compared(other)
-            except Exception:  # left too little
+            except Exception:  # reduced too far
                 continue
             if now.kind == DIFFERS:
                 drawn, found, again = other, now, True

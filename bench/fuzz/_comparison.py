@@ -1,17 +1,17 @@
-"""How a program compares, and what it is allowed to differ by."""
+"""The result of a comparison, and the allowed difference."""
 
 from typing import NamedTuple
 
-SLACK = 100.0  # times what other roundings change, or roundings of the result
+SLACK = 100.0  # times the change by other rounding errors, or the rounding error of the result
 
 
 class Compared(NamedTuple):
-    """How one system compares.
+    """The result of comparing one system.
 
     Attributes:
-        kind: "equal", "differs", or why there is nothing to compare.
-        worst: the largest difference over what is allowed.
-        what: which quantity it is in.
+        kind: "equal", "differs", or the reason why nothing was compared.
+        worst: the largest difference divided by the allowed one.
+        what: the quantity with this difference.
     """
 
     kind: str
@@ -24,6 +24,6 @@ DIFFERS = "differs"
 
 
 def worst(found: dict[str, float]) -> Compared:
-    """What differs most, by quantity: differences over what is allowed."""
+    """The quantity that differs most; `found` holds differences divided by the allowed ones."""
     what, most = max(found.items(), key=lambda pair: pair[1], default=("", 0.0))
     return Compared(DIFFERS if not most <= 1.0 else EQUAL, most, what)

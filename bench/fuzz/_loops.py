@@ -1,10 +1,10 @@
-"""Second derivatives through loops at random: beside the same unrolled, forward over forward.
+"""Second derivatives through random loops, compared with the unrolled loop, forward over forward.
 
-A few steps of a random system in `lax.scan`, `fori_loop` or `lax.map`, alone or within
-`checkpoint`, `jit`, `cond` or `vmap`, L with functions that have a rule of their own for their
-derivative. Of two derivatives, each by jvp, grad, jacfwd or jacrev, one number is left. JAX's loops
-take programs apart for reverse derivatives; what is written out step by step leaves nothing to
-take apart.
+A few steps of a random system run in `lax.scan`, `fori_loop` or `lax.map`, alone or within
+`checkpoint`, `jit`, `cond` or `vmap`. L contains functions with custom derivative rules. Two
+derivatives are taken, each by jvp, grad, jacfwd or jacrev, and reduced to one number. JAX splits
+the bodies of loops for reverse derivatives, and could lose the custom rules. The unrolled program
+has no loop to split.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ DERIVATIVES = ("jvp", "grad", "jacfwd", "jacrev")
 
 @jax.custom_jvp
 def ruled(x: Any) -> Any:
-    """tanh(x), of which only the rule knows the derivative."""
+    """tanh(x); only the custom rule has the derivative."""
     return lax.stop_gradient(jnp.tanh(x))
 
 
@@ -42,15 +42,15 @@ def _ruled(primals: Any, tangents: Any) -> Any:
 
 
 class Looped(NamedTuple):
-    """What is computed.
+    """A random computation.
 
     Attributes:
-        drawn: L, and numbers.
-        system: the declared system, in which L has rules of its own.
-        plain: the same without.
+        drawn: L, params and units.
+        system: the declared system, in which L has a custom derivative rule.
+        plain: the same system without the rule.
         q, v, t: a state.
-        loop, within: what the steps stand in.
-        inner, outer: how derivatives are taken.
+        loop, within: the loop of the steps, and the transformation around it.
+        inner, outer: the transformations that take the derivatives.
         simulates: whether a step is a short motion.
     """
 
@@ -68,7 +68,7 @@ class Looped(NamedTuple):
 
     @property
     def written(self) -> str:
-        """In words and as source."""
+        """A description with source code."""
         how = f"{self.outer} of {self.inner} of {self.loop} within {self.within}"
         what = "motions" if self.simulates else "accelerations"
         drawn = self.drawn
@@ -102,7 +102,7 @@ def draw(seed: int, simulates: bool = False) -> Looped:
 
 
 def having(system: jl.System, drawn: Drawn, f: Callable, lowering: str = "auto") -> jl.System:
-    """The system with a potential f(x_0 + b x_0^2) more."""
+    """The system with an additional potential f(x_0 + b x_0^2)."""
     L = _random_systems.function("t, q, v, p", drawn.lagrangian)
     unit, scale = drawn.units[0], drawn.scale
 
@@ -125,7 +125,7 @@ def having(system: jl.System, drawn: Drawn, f: Callable, lowering: str = "auto")
 
 
 def compared(looped: Looped) -> Compared:
-    """The loop beside what is unrolled."""
+    """Compare the loop with the unrolled loop."""
     drawn = looped.drawn
     dtype = jnp.dtype(drawn.dtype)
     eps, rng = float(jnp.finfo(dtype).eps), np.random.default_rng(3)
@@ -156,7 +156,7 @@ def compared(looped: Looped) -> Compared:
 
 
 def _step(looped: Looped, system: jl.System) -> Callable:
-    """(state in units, share of a step, params) -> the next state."""
+    """(state in units, fraction of a step, params) -> the next state."""
     drawn = looped.drawn
     units = jnp.asarray(drawn.units, drawn.dtype)
     n, h = drawn.n, 0.02
@@ -185,7 +185,7 @@ def _ks(looped: Looped, z: Any) -> Any:
 
 
 def _unrolled(looped: Looped) -> Callable:
-    """(z, d, w) -> d^T H w, written out and forward over forward."""
+    """(z, d, w) -> d^T H w, unrolled and forward over forward."""
     step = _step(looped, looped.plain)
 
     def value(z: Any) -> Any:
@@ -206,7 +206,7 @@ def _unrolled(looped: Looped) -> Callable:
 
 
 def _looping(looped: Looped) -> Callable:
-    """(z, d, w) -> d^T H w, in a loop, by the derivatives drawn."""
+    """(z, d, w) -> d^T H w, in a loop, by the drawn derivatives."""
     step = _step(looped, looped.system)
 
     def run(x: Any, p: Any) -> Any:

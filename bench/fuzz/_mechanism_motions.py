@@ -1,7 +1,7 @@
-"""Short motions of random mechanisms: two formulations beside one another, residuals, statuses.
+"""Short motions of random mechanisms: two formulations compared, and their statuses.
 
-What has a solution must move, and by both formulations alike, up to what their tolerance leaves;
-what has none must end in a status that says what is wrong.
+If there is a solution, both formulations must give the same motion within the tolerance. If there
+is none, the motion must end with the status that names the cause.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from bench.fuzz._random_mechanisms import Mechanism, values
 from bench.fuzz._reference_solution import Unclear
 
 DURATION = 0.1
-LOCAL = 1e4  # local errors that a global one may be, and what two motions may differ by
+LOCAL = 1e4  # allowed difference of two motions, in units of the tolerance (local errors)
 NAMED = {
     "contradictory": {"contradictory_rows", "rank_change"},
     "singular": {"mass_singular"},
@@ -25,13 +25,13 @@ NAMED = {
 
 
 def compared(mechanism: Mechanism) -> Compared:
-    """The motions of a mechanism beside one another."""
+    """Compare the motions of a mechanism by two formulations."""
     try:
         prepared = prepare(mechanism, 1)
     except Unclear as unclear:
         return Compared(f"not compared: {unclear}")
     drawn, quasi = mechanism.drawn, mechanism.quasi
-    # Rows beside U are none that quasi-velocities take care of.
+    # Quasi-velocities by U do not satisfy additional rows.
     with_u = quasi is not None and not (quasi.U is not None and mechanism.rows)
     first, second = ("quasi", "multipliers") if with_u else ("multipliers", "null_space")
     tolerance = 1e-9 if drawn.dtype == "float64" else 1e-5
@@ -43,16 +43,16 @@ def compared(mechanism: Mechanism) -> Compared:
         motion = _motion(mechanism, prepared, way, tolerance)
         status = jl.Status(int(motion.status)).name
         singular = quasi is not None and quasi.singular and way == "quasi"
-        due = "kinematics" if singular and outcome == "solution" else outcome
-        if due in NAMED:
-            right = NAMED[due] | (NAMED["kinematics"] if singular else set())
-            if due == "contradictory" and not _holds(mechanism, prepared):
+        expected = "kinematics" if singular and outcome == "solution" else outcome
+        if expected in NAMED:
+            right = NAMED[expected] | (NAMED["kinematics"] if singular else set())
+            if expected == "contradictory" and not _holds(mechanism, prepared):
                 right = right | {"inconsistent_start"}
             wrong = status not in right
-            found[f"{way}: {status} where rows or masses are {due}"] = np.inf if wrong else 0.0
+            found[f"{way}: {status} where rows or masses are {expected}"] = np.inf if wrong else 0.0
         elif status == "ok":
             ends[way] = _end(mechanism, motion)
-        elif _sound_there(mechanism, motion):
+        elif _solvable_at_end(mechanism, motion):
             found[f"{way}: {status} without need"] = np.inf
     if len(ends) == 2:
         one, other = ends.values()
@@ -78,7 +78,7 @@ def _motion(mechanism: Mechanism, prepared: Prepared, way: str, tolerance: float
         v,
         jnp.asarray([mechanism.t, mechanism.t + duration]),
         values(drawn),
-        method="tsit5",  # compiles in a third of the time that the default takes
+        method="tsit5",  # compiles three times as fast as the default
         formulation=way,
         rtol=tolerance,
         atol=min(bound) if way == "quasi" else bound,
@@ -88,7 +88,7 @@ def _motion(mechanism: Mechanism, prepared: Prepared, way: str, tolerance: float
 
 
 def _holds(mechanism: Mechanism, prepared: Prepared) -> bool:
-    """Whether velocities satisfy the rows that say something; where these contradict, none do."""
+    """Whether velocities satisfy all rows except void ones; if rows contradict, none can."""
     A, b, v = prepared.terms.A, prepared.terms.b, prepared.state.v
     void = np.array([row.role == "void" for row in mechanism.all_rows], bool)
     size = np.abs(A) @ np.abs(v) + np.abs(b)
@@ -102,11 +102,11 @@ def _end(mechanism: Mechanism, motion: jl.Solution) -> np.ndarray:
     return np.concatenate([q, v])
 
 
-def _sound_there(mechanism: Mechanism, motion: jl.Solution) -> bool:
-    """Whether there is clearly a solution where the motion ended, too."""
+def _solvable_at_end(mechanism: Mechanism, motion: jl.Solution) -> bool:
+    """Whether the equations at the end of the motion also have a solution for certain."""
     q, v = (tuple(map(float, np.asarray(x))) for x in motion.last_state[:2])
-    there: Any = mechanism._replace(t=float(motion.last_time), q=q, v=v)
+    ended: Any = mechanism._replace(t=float(motion.last_time), q=q, v=v)
     try:
-        return prepare(there, 1).equations.outcome == "solution"
+        return prepare(ended, 1).equations.outcome == "solution"
     except Unclear:
         return False

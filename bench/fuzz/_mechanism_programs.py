@@ -1,8 +1,8 @@
-"""The library's programs for a mechanism beside the reference: accelerations and multipliers.
+"""The library's programs for a mechanism compared with the reference: accelerations, multipliers.
 
-By arrays, by multipliers from scalars, by null spaces, and by both programs in quasi-velocities,
-each with derivatives along one direction in q, v and params that keeps to the constraints. Where
-there is no solution there must be no number.
+The programs are those on arrays, on scalars with multipliers, by null spaces, and both programs in
+quasi-velocities. Derivatives are compared along one direction in q, v and params that is tangent
+to the constraints. If there is no solution, the results must not be finite.
 """
 
 from typing import Any, NamedTuple
@@ -20,13 +20,13 @@ from jaxlag._lowering import ArrayProgram, ArrayTerms, Choices, QuasiState, Scal
 from jaxlag._lowering import State as StateOfProgram
 
 NUDGES = 4
-NEARBY = 2  # to tell a contradiction from roundings
-MORE = 60  # where they differ by those
+NEARBY = 2  # nudged states, to distinguish a contradiction from rounding
+MORE = 60  # nudged states if NUDGES of them show a difference
 OPERATIONS = 3000
 
 
 class State(NamedTuple):
-    """Where things are compared: numbers of the system's precision, and a direction."""
+    """A state and params, or a direction of these, in the system's precision."""
 
     q: np.ndarray
     v: np.ndarray
@@ -39,16 +39,16 @@ class State(NamedTuple):
         return sum(x.size for x in self)
 
     def nudged(self, eps: float, rng: np.random.Generator) -> "State":
-        """Each number by a rounding."""
+        """Each number changed by a rounding error."""
         return State(*(x * (1.0 + eps * rng.uniform(-1.0, 1.0, x.shape)) for x in self))
 
 
 class Prepared(NamedTuple):
-    """A mechanism at its state, and what there is to be found there.
+    """A mechanism at its state, with the reference solution.
 
     Attributes:
-        turning: how large v' is at u' = 0, and its derivative along the direction: accelerations
-            are sums of it and of what u' makes, and either may be larger than they are.
+        turning: size of v' at u' = 0 and of its derivative along the direction. Accelerations are
+            the sum of it and of a part from u'; either part may be larger than the sum.
     """
 
     state: State
@@ -63,7 +63,7 @@ class Prepared(NamedTuple):
 
 
 def compared(mechanism: Mechanism, nudges: int = NUDGES) -> Compared:
-    """All programs of a mechanism beside the reference."""
+    """Compare all programs of a mechanism with the reference."""
     try:
         prepared = prepare(mechanism, nudges)
     except Unclear as unclear:
@@ -75,10 +75,10 @@ def compared(mechanism: Mechanism, nudges: int = NUDGES) -> Compared:
 
 
 def prepare(mechanism: Mechanism, nudges: int) -> Prepared:
-    """The state made consistent, a direction along the constraints, the solution there.
+    """A consistent state, a direction tangent to the constraints, and the solution.
 
     Raises:
-        Unclear: nothing can be said for certain.
+        Unclear: whether there is a solution is uncertain.
     """
     drawn, rng = mechanism.drawn, np.random.default_rng(2)
     eps = float(jnp.finfo(drawn.dtype).eps)
@@ -94,23 +94,23 @@ def prepare(mechanism: Mechanism, nudges: int) -> Prepared:
     given = [np.asarray(x, drawn.dtype).astype(float) for x in (mechanism.q, mechanism.v)]
     given += [np.asarray(values(drawn)[name]).astype(float) for name in ("a", "b")]
     state = State(*given)
-    still = State(*(0.0 * x for x in state))
-    written = jax.make_jaxpr(everything)(*state, *still)
+    zero = State(*(0.0 * x for x in state))
+    written = jax.make_jaxpr(everything)(*state, *zero)
 
     def run(state: State, dots: State, *noise: Any) -> tuple[Terms, Terms]:
         found = [np.asarray(x, float) for x in evaluated(written, [*state, *dots], *noise)]
         return Terms(*found[:5]), Terms(*found[5:])
 
-    here, _ = run(state, still)
+    here, _ = run(state, zero)
     void = np.array([row.role == "void" for row in mechanism.all_rows], bool)
     units = np.array(drawn.units)
     if not np.all(np.isfinite(here.A)) or not np.all(np.isfinite(here.b)):
         raise Unclear("terms that are not finite")
     state = state._replace(v=_consistent(mechanism, here, void, units))
-    here, _ = run(state, still)
-    near = [run(state.nudged(eps, rng), still, eps, rng)[0] for _ in range(NEARBY)]
+    here, _ = run(state, zero)
+    near = [run(state.nudged(eps, rng), zero, eps, rng)[0] for _ in range(NEARBY)]
     equations = Equations(here, void, eps, near)
-    if equations.outcome == "singular" and all(drawn.masses):  # by unlike inertias alone
+    if equations.outcome == "singular" and all(drawn.masses):  # as inertias differ in size
         raise Unclear("inertia that nearly vanishes")
     direction = _along(mechanism, state, here, run, equations, rng)
     here, rates = run(state, direction)
@@ -130,7 +130,7 @@ def prepare(mechanism: Mechanism, nudges: int) -> Prepared:
 
 
 def _turning(mechanism: Mechanism, state: State, direction: State) -> np.ndarray:
-    """(v' at u' = 0, its derivative along the direction), none without quasi-velocities."""
+    """(v' at u' = 0, its derivative along the direction); zeros without quasi-velocities."""
     quasi, drawn = mechanism.quasi, mechanism.drawn
     if quasi is None or quasi.singular:
         return np.zeros((2, len(state.q)))
@@ -154,7 +154,7 @@ def _turning(mechanism: Mechanism, state: State, direction: State) -> np.ndarray
 
 
 def _consistent(mechanism: Mechanism, here: Terms, void: Any, units: Any) -> np.ndarray:
-    """The velocity nearest to what was drawn, in units, in the system's precision."""
+    """The consistent velocity nearest to the drawn one, in units, in the system's precision."""
     A, b = here.A[~void] * units, here.b[~void]
     size = np.linalg.norm(A, axis=1)
     size = np.where(size > 0, size, 1.0)
@@ -174,10 +174,9 @@ def _consistent(mechanism: Mechanism, here: Terms, void: Any, units: Any) -> np.
 def _along(
     mechanism: Mechanism, state: State, here: Terms, run: Any, equations: Equations, rng: Any
 ) -> State:
-    """A direction that keeps A v + b = 0 and phi = 0 of the base.
+    """A direction that preserves A v + b = 0 and phi = 0 of the base rows.
 
-    Rows have length 1 in the units that it is drawn in: least squares leave none of them out for
-    being short beside the others.
+    It is drawn in units in which rows have length 1. So least squares do not drop short rows.
     """
     units, n = np.array(mechanism.drawn.units), len(state.q)
     base = equations.base
@@ -186,7 +185,7 @@ def _along(
     size = np.linalg.norm(A, axis=1)
     A = A / size[:, None]
     da, db = rng.uniform(-1.0, 1.0, 3), np.asarray(rng.uniform(-1.0, 1.0) * state.b)
-    if np.any(holonomic):  # positions hold for these params alone
+    if np.any(holonomic):  # phi = 0 holds for these params only
         da, db = 0.0 * da, 0.0 * db
     x = rng.uniform(-1.0, 1.0, n)
     if np.any(holonomic):
@@ -201,11 +200,11 @@ def _along(
 
 
 def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
-    """By name functions of (t, q, v, params) that return a, or (a, lam)."""
+    """Functions of (t, q, v, params) that return a, or (a, lam), by name."""
     system = mechanism.system
     array = ArrayTerms(system.lagrangian, system.forces, system.constraints)
-    kept = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
-    choice = RowChoice(jnp.asarray(kept), jnp.asarray(~prepared.equations.void))
+    selected = np.isin(np.arange(len(mechanism.all_rows)), prepared.equations.base)
+    choice = RowChoice(jnp.asarray(selected), jnp.asarray(~prepared.equations.void))
 
     def by(program: Any) -> Any:
         def a(t: Any, q: Any, v: Any, params: Any) -> Any:
@@ -217,9 +216,9 @@ def programs(mechanism: Mechanism, prepared: Prepared) -> dict[str, Any]:
     if mechanism.quasi is not None:
         return found | _in_quasi(mechanism, choice)
     if prepared.equations.outcome == "contradictory":
-        return found  # the others solve for the rows that they are given
+        return found  # the others solve with the given rows only
     found["scalars"] = by(ScalarProgram(array, OPERATIONS))
-    if round(1e3 * mechanism.t) % 3 == 0:  # by chance
+    if round(1e3 * mechanism.t) % 3 == 0:  # for a third of the systems
         given = system.lagrangian, system.forces, system.constraints
         found["null space"] = by(ArrayProgram(ArrayTerms(*given, "null_space")))
     return found
@@ -248,7 +247,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
         return tuple(jnp.where(regular, x, jnp.nan) for x in found)
 
     def straight(t: Any, q: Any, v: Any, params: Any) -> Any:
-        """v' = B u' + s from the rates (v, u') of the scalar program."""
+        """v' = B u' + s, from the rates (v, u') of the scalar program."""
         w = speeds(t, q, v, params)
         prepared: Any = scalars.precompute(
             q, params, {}, Choices(kept=choice.kept, reacting=choice)
@@ -262,7 +261,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
         return jax.jvp(velocity, (t, q, w), (jnp.ones_like(t), v, du))[1]
 
     if mechanism.quasi is not None and mechanism.quasi.singular:
-        return {"quasi, arrays": projected}  # a motion by scalars asks before it starts
+        return {"quasi, arrays": projected}  # motions check this before the scalar program runs
     return {"quasi, arrays": projected, "quasi, scalars": straight}
 
 
@@ -303,7 +302,7 @@ def _judged(mechanism: Mechanism, prepared: Prepared) -> Compared:
 
 
 def _evaluated(mechanism: Mechanism, program: Any, prepared: Prepared) -> dict[str, np.ndarray]:
-    """What a program gives, in double precision, by name."""
+    """The results of a program in double precision, by name."""
     drawn = mechanism.drawn
     dtype = jnp.dtype(drawn.dtype)
 
@@ -327,9 +326,9 @@ def _evaluated(mechanism: Mechanism, program: Any, prepared: Prepared) -> dict[s
 def _off(
     results: dict[str, np.ndarray], prepared: Prepared, bent: bool = False
 ) -> dict[str, float]:
-    """Differences over what is allowed, in units of inertias and rows.
+    """Differences divided by the allowed ones, in units of inertias and rows.
 
-    Where the rank drops at this state alone there are no derivatives.
+    If the rank drops at this state alone (`bent`), derivatives do not exist.
     """
     equations, right = prepared.equations, prepared.right
     roles = {"a": "a", "lam": "mu", "da": "da", "dlam": "dmu"}
@@ -341,7 +340,7 @@ def _off(
         if name not in results or (bent and name.startswith("d")):
             continue
         x = results[name]
-        # What is smaller than the smallest numbers of the precision is none.
+        # Values below the smallest numbers of the precision count as zero.
         least = float(jnp.finfo(prepared.dtype).tiny) / equations.eps
         if of.endswith("a"):
             x = x / equations.units

@@ -1,9 +1,9 @@
-"""Constrained systems at random, each at one consistent state: rows of every kind, as source text.
+"""Random constrained systems, each at one consistent state: rows of all kinds, as source text.
 
-Rows that are independent come first; then some that follow from them (copies, combinations, rows
-times a function, rates of positions), some that are 0 = 0 but for rounding, and bent ones, which
-follow from others at this state alone: places where the rank drops. What there is to be found at
-the state is decided in `_reference_solution.py`, from numbers.
+Independent rows are drawn first. Then follow dependent rows (copies, combinations, rows times a
+function, rates of positions), void rows, which are 0 = 0 except for rounding, and bent rows, which
+depend on the others at this state alone: there the rank drops. Whether the equations at the state
+have a solution is determined numerically in `_reference_solution.py`.
 """
 
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ _KINKED_ALSO = ("maximum", "minimum", "jnp.max(")
 
 
 def _smooth(templates: tuple[str, ...]) -> tuple[str, ...]:
-    words = (*_KINKED, *_KINKED_ALSO)
-    return tuple(x for x in templates if not any(word in x for word in words))
+    fragments = (*_KINKED, *_KINKED_ALSO)
+    return tuple(x for x in templates if not any(fragment in x for fragment in fragments))
 
 
 SMOOTH_ONE, SMOOTH_TWO = _smooth(ONE), _smooth(TWO)
@@ -47,7 +47,7 @@ class Row(NamedTuple):
 
     @property
     def arguments(self) -> str:
-        """Of the residual."""
+        """Arguments of the residual."""
         return "t, q, p" if self.kind == "holonomic" else "t, q, v, p"
 
     def declared(self, name: str) -> Any:
@@ -60,11 +60,11 @@ class Quasi(NamedTuple):
     """Quasi-velocities u0, u1, ...
 
     Attributes:
-        U: rows of u as functions of v; None where `kinematics` are given.
-        kinematics: the rows of v, as functions of u.
+        U: components of u as functions of v; None if `kinematics` is given.
+        kinematics: components of v, as functions of u.
         constrained: indices of those that vanish.
-        written_in: what L is a function of, "v" or "u".
-        singular: whether v does not follow from u at the state.
+        written_in: the velocities in L, "v" or "u".
+        singular: whether u does not determine v at the state.
     """
 
     U: tuple[str, ...] | None
@@ -76,7 +76,7 @@ class Quasi(NamedTuple):
 
     @property
     def declared(self) -> jl.QuasiVelocities:
-        """The same as an object."""
+        """The quasi-velocities as an object."""
         names = tuple(f"u{k}" for k in range(self.size))
         if self.U is None:
             f = function("t, q, u, p", self.kinematics or "")
@@ -91,13 +91,13 @@ class Quasi(NamedTuple):
 
 
 class Mechanism(NamedTuple):
-    """A system under constraints, or in quasi-velocities, at a state.
+    """A system with constraints, or in quasi-velocities, at a state.
 
     Attributes:
         drawn: L, forces and params.
-        rows: those that are declared; the constrained quasi-velocities come before them.
-        t, q, v: the state; of velocities what they are before they are made consistent.
-        rest: a coordinate whose velocity is to vanish.
+        rows: the declared rows; in the system, constrained quasi-velocities come before them.
+        t, q, v: the state; v before it is made consistent.
+        rest: a coordinate whose velocity must vanish.
         quasi: quasi-velocities.
     """
 
@@ -111,7 +111,7 @@ class Mechanism(NamedTuple):
 
     @property
     def all_rows(self) -> tuple[Row, ...]:
-        """Rows in the order of the system's."""
+        """All rows in the order of the system."""
         if self.quasi is None or self.quasi.U is None:
             return self.rows
         bound = (self.quasi.U[k] for k in self.quasi.constrained)
@@ -134,7 +134,7 @@ class Mechanism(NamedTuple):
 
     @property
     def written(self) -> str:
-        """All of it as source."""
+        """The mechanism as source code."""
         lines = [self.drawn.written]
         lines += [f"{row.kind} ({row.role}): {row.text}" for row in self.rows]
         if self.quasi is not None:
@@ -144,7 +144,7 @@ class Mechanism(NamedTuple):
 
 
 def values(drawn: Drawn, dtype: Any = None) -> dict[str, Any]:
-    """Params as the Lagrangian takes them."""
+    """Params in the form for the Lagrangian."""
     own = jnp.dtype(drawn.dtype)
     to = own if dtype is None else dtype
     arrays = {name: np.asarray(drawn.params[name], own).astype(to) for name in ("a", "b")}
@@ -157,7 +157,7 @@ def values(drawn: Drawn, dtype: Any = None) -> dict[str, Any]:
 
 
 class _Drawing:
-    """What rows and quasi-velocities of one system are drawn with."""
+    """The generator of rows and quasi-velocities of one system."""
 
     def __init__(self, seed: int, reach: float, smooth: bool) -> None:
         self.rng = rng = np.random.default_rng([seed, 38])
@@ -176,7 +176,7 @@ class _Drawing:
         self.scale, self.smooth = scale, smooth
 
     def lagrangian(self, without: int | None = None, name: str = "v") -> Drawn:
-        """L and forces; one coordinate without inertia."""
+        """L and forces; coordinate `without` has no inertia."""
         rng, n = self.rng, self.n
         plain = Trees(rng, self.units, "0.7" if self.single else "jnp.sin(t)")
         trees = self.trees if self.smooth else plain
@@ -236,7 +236,7 @@ class _Drawing:
         return f"({' + '.join(parts)})"
 
     def void(self, kind: str) -> str:
-        """A row that says nothing."""
+        """A row that is zero except for rounding."""
         i, j, k = (int(x) for x in self.rng.integers(self.n, size=3))
         x, y, z = (self.trees.over("q", m) for m in (i, j, k))
         speed = self.trees.over("v", k)
@@ -244,7 +244,7 @@ class _Drawing:
         return f"{shape} * {z if kind == 'holonomic' else speed}"
 
     def following(self, base: list[Row]) -> Row:
-        """A row that follows from others, everywhere on the constraints."""
+        """A row that depends on others everywhere on the constraints."""
         rng = self.rng
         chosen = base[int(rng.integers(len(base)))]
         alike = [row for row in base if row.kind == chosen.kind]
@@ -260,7 +260,7 @@ class _Drawing:
         return Row("Pfaffian", rate_of(chosen.text), "dependent")
 
     def bent(self, base: list[Row]) -> tuple[Row, int]:
-        """A row that follows at this state alone, and the coordinate that it bends along."""
+        """(row dependent at this state alone, coordinate along which it becomes independent)."""
         i = int(self.rng.integers(self.n))
         off = f"((q[{i}] - {self.q[i]!r}) / {self.units[i]!r}) ** 2"
         alike = [row for row in base if row.kind == "holonomic"]
@@ -273,7 +273,7 @@ class _Drawing:
         return row if factor == 1.0 else row._replace(text=f"{factor!r} * ({row.text})")
 
     def mechanism(self, drawn: Drawn, rows: list[Row], **options: Any) -> Mechanism:
-        """All of it, with random velocities."""
+        """The mechanism, with random velocities."""
         v = np.array(self.units) * self.rng.uniform(-1.5, 1.5, self.n)
         v = tuple(float(x) for x in v.astype(self.dtype))
         return Mechanism(drawn, tuple(map(self.scaled, rows)), self.t, self.q, v, **options)
@@ -288,9 +288,9 @@ def draw(seed: int, reach: float = 12.0, smooth: bool = False) -> Mechanism:
     """The constrained system of a seed.
 
     Args:
-        seed: what it follows from.
+        seed: of the random numbers.
         reach: decades of the units and of the energies.
-        smooth: whether nothing in L may have kinks.
+        smooth: whether L must be smooth.
     """
     by = _Drawing(seed, reach, smooth)
     rng, n = by.rng, by.n
@@ -315,7 +315,7 @@ def draw(seed: int, reach: float = 12.0, smooth: bool = False) -> Mechanism:
 
 
 def smaller(mechanism: Mechanism) -> Iterator[Mechanism]:
-    """Mechanisms with something left out."""
+    """Reduced mechanisms, each without one part."""
     drawn = mechanism.drawn
     for k in range(len(mechanism.rows)):
         if len(mechanism.rows) > 1:

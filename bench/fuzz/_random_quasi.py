@@ -1,8 +1,8 @@
-"""Systems in quasi-velocities at random, each at one consistent state.
+"""Random systems in quasi-velocities, each at one consistent state.
 
-U with a regular dU/dv, by chance singular at the state, with names that vanish and rows that say so
-once more; kinematics v = B u + c, square, or tall where they satisfy rows by themselves. L is
-a function of v, or of u.
+U has a regular dU/dv, which is singular at the state for some systems. Some quasi-velocities vanish
+(constraints), and additional rows may repeat this. Kinematics v = B u + c are square, or they are
+tall and satisfy the rows identically. L is a function of v or of u.
 """
 
 import numpy as np
@@ -12,10 +12,10 @@ from bench.fuzz._random_systems import Trees, text
 
 
 class _Speeds(_Drawing):
-    """What quasi-velocities are drawn with."""
+    """The generator of quasi-velocities."""
 
     def affine(self, name: str, i: int, units: tuple[float, ...]) -> str:
-        """One row of a regular matrix times these velocities in units, and what is left at rest."""
+        """A component affine in these velocities in units, from a regular matrix."""
         rng, trees = self.rng, self.trees
         own = f"(1.6 + 0.4 * jnp.sin({text(trees.grow(1))}))"
         parts = [f"{own} * {name}[{i}] / {units[i]!r}"]
@@ -28,9 +28,9 @@ class _Speeds(_Drawing):
         return " + ".join(parts)
 
     def by_u(self) -> tuple[Quasi, list[Row]]:
-        """U, some of them constrained, and rows that follow from these."""
+        """U with some constrained components, and rows that depend on these."""
         rng, n = self.rng, self.n
-        rows = [self.affine("v", i, self.units) for i in rng.permutation(n)]
+        parts = [self.affine("v", i, self.units) for i in rng.permutation(n)]
         bound = ()
         if n > 1 and rng.random() < 0.5:
             bound = tuple(sorted(rng.choice(n, size=int(rng.integers(1, n)), replace=False)))
@@ -41,27 +41,27 @@ class _Speeds(_Drawing):
             k, i = int(rng.choice(free)), int(rng.integers(n))
             off = f"((q[{i}] - {self.q[i]!r}) / {self.units[i]!r})"
             others = [j for j in range(n) if j != k]
-            like = f" + ({rows[int(rng.choice(others))]})" if others and rng.random() < 0.5 else ""
-            rows[k] = f"jnp.sin({off}) * ({rows[k]}){like}"
-        u = tuple(f"{self.factor()!r} * ({row})" for row in rows)
-        base = [Row("Pfaffian", f"({rows[k]})") for k in bound]
-        again = []
+            like = f" + ({parts[int(rng.choice(others))]})" if others and rng.random() < 0.5 else ""
+            parts[k] = f"jnp.sin({off}) * ({parts[k]}){like}"
+        u = tuple(f"{self.factor()!r} * ({part})" for part in parts)
+        base = [Row("Pfaffian", f"({parts[k]})") for k in bound]
+        dependent = []
         if base and rng.random() < 0.4:
-            again = [self.following(base)]
+            dependent = [self.following(base)]
         if rng.random() < 0.1:
-            again.append(Row("Pfaffian", self.void("Pfaffian"), "void"))
-        return Quasi(u, None, n, bound, "v", singular), again
+            dependent.append(Row("Pfaffian", self.void("Pfaffian"), "void"))
+        return Quasi(u, None, n, bound, "v", singular), dependent
 
     def square(self) -> tuple[Quasi, list[Row]]:
         """Kinematics without rows."""
         n = self.n
         order = self.rng.permutation(n)
-        rows = [f"{self.units[i]!r} * ({self.affine('u', i, self.units)})" for i in order]
-        rows = [rows[k] for k in np.argsort(order)]
-        return Quasi(None, f"jnp.stack([{', '.join(rows)}])", n), []
+        parts = [f"{self.units[i]!r} * ({self.affine('u', i, self.units)})" for i in order]
+        parts = [parts[k] for k in np.argsort(order)]
+        return Quasi(None, f"jnp.stack([{', '.join(parts)}])", n), []
 
     def tall(self) -> tuple[Quasi, list[Row]]:
-        """Kinematics that satisfy rows by themselves."""
+        """Kinematics that satisfy the rows identically."""
         rng, n, units = self.rng, self.n, self.units
         led = sorted(int(k) for k in rng.choice(n, size=int(rng.integers(1, n)), replace=False))
         free = [k for k in range(n) if k not in led]
@@ -108,9 +108,9 @@ def draw(seed: int, reach: float = 12.0, smooth: bool = False) -> Mechanism:
     """The system of a seed.
 
     Args:
-        seed: what it follows from.
+        seed: of the random numbers.
         reach: decades of the units and of the energies.
-        smooth: whether nothing in L may have kinks.
+        smooth: whether L must be smooth.
     """
     by = _Speeds(seed, reach, smooth)
     rng = by.rng

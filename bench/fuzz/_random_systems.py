@@ -1,4 +1,4 @@
-"""Lagrangians at random, as source text: what the fuzzer tries, and what it leaves behind."""
+"""Random Lagrangians as source text, and their reduction."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import jaxlag as jl
 
 Tree = tuple[Any, ...]  # (template, subtree, ...); a leaf is (text,)
 
-# Every template is smooth or at most kinked; denominators and radicands stay positive.
+# Templates may have kinks and jumps; denominators and radicands stay positive.
 ONE = (
     "jnp.sin({0})",
     "jnp.cos({0})",
@@ -83,7 +83,7 @@ TWO = (
 
 @jax.custom_jvp
 def smooth(x: Any) -> Any:
-    """x^2 / sqrt(1 + x^2), with a derivative rule of its own."""
+    """x^2 / sqrt(1 + x^2), with a custom derivative rule."""
     return x * x / jnp.sqrt(1.0 + x * x)
 
 
@@ -99,14 +99,14 @@ class Drawn(NamedTuple):
 
     Attributes:
         n: number of coordinates.
-        kinetic, potential: trees of T (beside a positive definite part) and V.
+        kinetic, potential: trees of T (in addition to a positive definite part) and V.
         force: a tree for each coordinate, or none.
         masses: factors of v_i^2 / 2.
         params: leaves `a` (3,), `b` (), and `k`, a Python number.
-        units: of the coordinates, by which states are multiplied.
+        units: of the coordinates; states are multiplied by them.
         scale: of the energies.
         dtype: of the state.
-        second: whether second derivatives are compared, too: they take long to compile.
+        second: whether second derivatives are compared too; they take long to compile.
     """
 
     n: int
@@ -129,21 +129,21 @@ class Drawn(NamedTuple):
 
     @property
     def written(self) -> str:
-        """All of it as source."""
+        """The system as source code."""
         source = [f"L = {self.lagrangian}", f"Q = [{', '.join(map(text, self.force))}]"]
         source += [f"{name} = {getattr(self, name)!r}" for name in ("params", "units", "dtype")]
         return "; ".join(source)
 
     @property
-    def push(self) -> Callable:
+    def generalized_force(self) -> Callable:
         """The generalized force as a function."""
-        rows = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
-        return function("t, q, v, params", f"jnp.stack([{rows}])".replace("p[", "params["))
+        components = ", ".join(f"{self.scale!r} * ({text(x)})" for x in self.force)
+        return function("t, q, v, params", f"jnp.stack([{components}])".replace("p[", "params["))
 
     @property
     def forces(self) -> tuple[jl.GeneralizedForce, ...]:
-        """The generalized force as it is declared."""
-        return (jl.GeneralizedForce(self.push, "push"),) if self.force else ()
+        """The generalized force as declared."""
+        return (jl.GeneralizedForce(self.generalized_force, "push"),) if self.force else ()
 
     @property
     def system(self) -> jl.System:
@@ -159,21 +159,21 @@ def text(tree: Tree) -> str:
 
 
 def function(arguments: str, body: str) -> Any:
-    """The function of this source."""
+    """The function with this source code."""
     space = {"jnp": jnp, "jax": jax, "lax": lax, "smooth": smooth}
     space["MATRIX"] = np.array([[0.5, -1.0], [2.0, 0.25]])
     return eval(f"lambda {arguments}: {body}", space)
 
 
 class Trees:
-    """Expressions at random, in coordinates over their units.
+    """Random expressions of coordinates divided by their units.
 
     Attributes:
-        rng: where they come from.
+        rng: the random generator.
         units: of the coordinates.
-        time: a leaf that depends on time, or stands for one.
+        time: a leaf that depends on time, or a constant in its place.
         one, two: templates of one and of two operands.
-        among: coordinates that they may depend on; None for all.
+        among: coordinates on which expressions may depend; None for all.
     """
 
     def __init__(
@@ -189,12 +189,12 @@ class Trees:
         self.among = tuple(range(len(units))) if among is None else among
 
     def over(self, name: str, i: int) -> str:
-        """A coordinate or a velocity in its unit."""
+        """A coordinate or a velocity divided by its unit."""
         unit = self.units[i]
         return f"{name}[{i}]" if unit == 1.0 else f"{name}[{i}] / {unit!r}"
 
     def leaf(self, speeds: bool = False) -> Tree:
-        """A coordinate, a velocity where there may be some, a parameter, time, or a number."""
+        """A coordinate, a velocity if `speeds`, a parameter, time, or a number."""
         rng = self.rng
         kind = rng.random()
         i = self.among[int(rng.integers(len(self.among)))]
@@ -211,7 +211,7 @@ class Trees:
         return (repr(float(rng.choice([0.0, 1.0, -1.0, 2.0, 0.5, -0.3, 1e-8, 1e3]))),)
 
     def grow(self, depth: int, speeds: bool = False) -> Tree:
-        """A tree of at most so many operations one above the other."""
+        """A tree of at most `depth` nested operations."""
         rng = self.rng
         if depth == 0 or rng.random() < 0.15:
             return self.leaf(speeds)
@@ -224,11 +224,11 @@ class Trees:
         )
 
     def square(self, name: str = "v", without: int | None = None) -> Tree:
-        """(sum of c_i(q) v_i)^2 with a positive factor: keeps M positive definite.
+        """(sum of c_i(q) v_i)^2 with a positive factor, so that M stays positive definite.
 
         Args:
             name: of the velocities.
-            without: one that must not be among them.
+            without: index of a velocity that must not appear.
         """
         rng, n = self.rng, len(self.units)
         terms = []
@@ -254,7 +254,7 @@ def draw(seed: int) -> Drawn:
     if rng.random() < 0.4:  # gyroscopic
         i = int(rng.integers(n))
         kinetic.append((f"({{0}}) * v[{i}] / {units[i]!r}", grow(2)))
-    if rng.random() < 0.2:  # not quadratic in v, and M a little changed
+    if rng.random() < 0.2:  # not quadratic in v, with a small effect on M
         i = int(rng.integers(n))
         speed = f"(v[{i}] / {units[i]!r})"
         kinetic.append((f"0.1 * jnp.sqrt(1.0 + {speed} ** 2 + jnp.sin({{0}}) ** 2)", grow(1)))
@@ -278,7 +278,7 @@ def draw(seed: int) -> Drawn:
 
 
 def sizes(rng: np.random.Generator, n: int, reach: float) -> tuple[tuple[float, ...], float]:
-    """(Units of the coordinates, scale of the energies), of so many decades, or 1."""
+    """(units of the coordinates, scale of the energies), over `reach` decades, or 1."""
     spread = rng.random() < 0.5
     units = 10.0 ** rng.uniform(-reach / 2, reach / 2, n) if spread else np.ones(n)
     scale = float(10.0 ** rng.uniform(-reach, reach)) if rng.random() < 0.5 else 1.0
@@ -286,7 +286,7 @@ def sizes(rng: np.random.Generator, n: int, reach: float) -> tuple[tuple[float, 
 
 
 def numbers(rng: np.random.Generator) -> dict[str, Any]:
-    """Params."""
+    """Random params."""
     return {
         "a": [float(f"{x:.3g}") for x in rng.uniform(-1.5, 1.5, 3)],
         "b": float(f"{10.0 ** rng.uniform(-2, 2):.3g}"),
@@ -295,7 +295,7 @@ def numbers(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def smaller(drawn: Drawn) -> Iterator[Drawn]:
-    """Systems with something left out."""
+    """Reduced systems, each without one part."""
     for k in range(len(drawn.kinetic)):
         yield drawn._replace(kinetic=drawn.kinetic[:k] + drawn.kinetic[k + 1 :])
     if drawn.force:
@@ -307,7 +307,7 @@ def smaller(drawn: Drawn) -> Iterator[Drawn]:
     for k, whole in enumerate(drawn.kinetic):
         for tree in _pruned(whole):
             parts = (*drawn.kinetic[:k], tree, *drawn.kinetic[k + 1 :])
-            if len(tree) == len(whole) and tree[0] == whole[0]:  # the square remains one
+            if len(tree) == len(whole) and tree[0] == whole[0]:  # the square remains a square
                 yield drawn._replace(kinetic=parts)
     for k, whole in enumerate(drawn.force):
         for tree in _pruned(whole):
@@ -315,7 +315,7 @@ def smaller(drawn: Drawn) -> Iterator[Drawn]:
 
 
 def _pruned(tree: Tree) -> Iterator[Tree]:
-    """The tree with one of its nodes replaced by one below it or by a number."""
+    """The tree with one of its nodes replaced by one of its subtrees or by a number."""
     template, *below = tree
     if not below:
         if template not in ("0.0", "1.0"):

@@ -1,13 +1,12 @@
-"""What M a + h = Q + A^T lam, A a + gamma = 0 has for a solution: a way of its own to it.
+"""Reference solution of M a + h = Q + A^T lam, A a + gamma = 0, independent of the library.
 
-M, h, A, b and gamma come from plain Jacobians of L and of the residuals, in double precision
-whatever the system's. The equations are solved with extended precision by Gaussian elimination,
-in units in which inertias are 1, for rows that are independent; multipliers of least norm follow
-by a factorisation of full rank, derivatives by implicit differentiation. Nothing here is the
-library's.
+M, h, A, b and gamma come from plain Jacobians of L and of the residuals, in double precision for
+all systems. Gaussian elimination in extended precision solves the equations with the independent
+rows, in units in which inertias are 1. A full-rank factorization gives the multipliers of least
+norm, implicit differentiation the derivatives.
 
-What other roundings of the terms change in the solution, and errors of the size of roundings in
-every entry of the equations, as a stable method may leave them, is how well it can be known.
+The attainable accuracy is estimated by two perturbations: other rounding errors of the terms, and
+errors of the size of rounding in every entry of the equations. A stable method may make both.
 """
 
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ LONG = np.longdouble
 
 
 class Unclear(Exception):
-    """Too near to a border between having a solution and having none."""
+    """It is uncertain whether there is a solution."""
 
 
 class Terms(NamedTuple):
@@ -41,10 +40,10 @@ class Solved(NamedTuple):
     """A solution in units of inertias and rows, with its derivatives along a direction.
 
     Attributes:
-        a: accelerations over the units.
-        mu: multipliers times lengths of rows, 0 of rows that say nothing.
-        size: of the forces that make accelerations: they may cancel.
-        dsize: of their derivatives.
+        a: accelerations divided by the units.
+        mu: multipliers times lengths of rows; 0 for void rows.
+        size: of the terms that determine the accelerations; they may cancel.
+        dsize: of the derivatives of these terms.
     """
 
     a: np.ndarray
@@ -92,7 +91,7 @@ def terms_of(mechanism: Mechanism) -> Any:
 
         h = along(momentum) - jax.grad(L, 1)(t, q, v, p)
         if drawn.force:
-            h = h - drawn.push(t, q, v, p)
+            h = h - drawn.generalized_force(t, q, v, p)
         M = jax.jacfwd(momentum, 2)(t, q, v, p)
         A = jax.jacfwd(velocity, 2)(t, q, v, p)
         return Terms(M, h, A, velocity(t, q, 0.0 * v, p), along(velocity))
@@ -101,29 +100,29 @@ def terms_of(mechanism: Mechanism) -> Any:
 
 
 def units_of(M: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """1 / sqrt of inertias; of coordinates without, what their rows say."""
+    """1 / sqrt of inertias; for coordinates without inertia, an estimate from their rows."""
     inertias = np.diagonal(M).copy()
     if np.any(inertias < 0):
         raise Unclear("inertias that are negative")
-    there = inertias > 0
-    if not np.all(there):
-        met = np.sum(np.where(there, A**2 / np.where(there, inertias, 1.0), 0.0), axis=1)
+    nonzero = inertias > 0
+    if not np.all(nonzero):
+        met = np.sum(np.where(nonzero, A**2 / np.where(nonzero, inertias, 1.0), 0.0), axis=1)
         square = np.sum(A**2, axis=1)
         alone = (np.sum(inertias) or 1.0) / np.where(square > 0, square, 1.0)
         weights = np.where(met > 0, 1.0 / np.where(met > 0, met, 1.0), alone)
-        lent = weights @ A**2
-        inertias = np.where(there, inertias, lent)
+        estimated = weights @ A**2
+        inertias = np.where(nonzero, inertias, estimated)
     return 1.0 / np.sqrt(np.where(inertias > 0, inertias, 1.0))
 
 
 class Equations:
-    """The equations at a state, what there is to be found, and how the rows hang together.
+    """The equations at a state, with a set of independent rows and the kind of outcome.
 
     Attributes:
         units: of the coordinates.
         lengths: of the rows, in these units.
         base: a largest set of independent rows.
-        void: rows that say nothing.
+        void: rows that are zero except for rounding.
         outcome: "solution", "singular" (M on the tangent space) or "contradictory".
     """
 
@@ -143,9 +142,9 @@ class Equations:
         self.outcome = self._outcome(terms)
 
     def _independent(self, A: np.ndarray) -> np.ndarray:
-        """Greedily, the row of the largest sine first."""
+        """A greedy choice of independent rows: the row of the largest sine first."""
         rows = A * self.units / self.lengths[:, None]
-        floor = self.eps ** (1 / 3)  # the library's, of sines
+        floor = self.eps ** (1 / 3)  # bound on sines in the library
         left, base, others = rows.copy(), [], [k for k in range(len(A)) if not self.void[k]]
         while others:
             sines = np.linalg.norm(left[others], axis=1)
@@ -186,7 +185,7 @@ class Equations:
         noise = max(
             (np.max(np.abs(self._left_open(x)[0][others] - off)) for x in self._near), default=0.0
         )
-        # Programs may keep other rows, whose solutions are as far apart as what is left open.
+        # Programs may choose other rows; their solutions differ by as much as these residuals.
         if np.max(np.abs(off)) <= SLACK * (self.eps * size + noise):
             return "solution"
         if np.max(np.abs(off)) < 1e-2 * size + 1e6 * noise:
@@ -194,7 +193,7 @@ class Equations:
         return "contradictory"
 
     def _left_open(self, terms: Terms) -> tuple[np.ndarray, float]:
-        """(A a + gamma of all rows, in units, its size) for the a that the base gives."""
+        """(A a + gamma of all rows, in units, its size), with a from the base rows."""
         found = self.solve(terms)
         gamma = terms.gamma / self.lengths
         rows = terms.A * self.units / self.lengths[:, None]
@@ -204,12 +203,12 @@ class Equations:
     def solve(
         self, terms: Terms, rates: Terms | None = None, rng: np.random.Generator | None = None
     ) -> Solved:
-        """The solution, with errors of the size of roundings in every entry if there is an rng.
+        """The solution; with `rng`, every entry has an error of the size of rounding.
 
         Args:
             terms: of the equations.
-            rates: their derivatives along the direction of `Solved`'s; None for none.
-            rng: where errors come from.
+            rates: derivatives of the terms along a direction; None to omit derivatives.
+            rng: the random generator of the errors.
         """
         D, length, base = self.units.astype(LONG), self.lengths.astype(LONG), self.base
 
@@ -223,17 +222,17 @@ class Equations:
             A = np.where(self.void[:, None], 0, A)
         K = _bordered(M, A[base])
         z = _eliminated(K, np.concatenate([-h, -gamma[base]]))
-        if rng is not None:  # right-hand sides, by what meets in them
+        if rng is not None:  # right-hand sides, by the size of their terms
             a, y = abs(z[:n]), abs(z[n:])
             h = self._shaken(h, abs(M) @ a + y @ abs(A[base]), rng)
-            # What forces do to rows is found before reactions undo it.
+            # Forces contribute to the rows before reactions cancel this contribution.
             forces = _largest(h, z[n:])
             gamma = self._shaken(gamma, abs(A) @ (a + forces), rng)
             z = _eliminated(K, np.concatenate([-h, -gamma[base]]))
         a, y = z[:n], z[n:]
 
-        # Rows of true unit length, those in the users' units, are F times those of the base; nu are
-        # multipliers times these lengths: of all nu with F^T nu = known the least.
+        # In the user's units, rows of unit length are F times those of the base. nu are the
+        # multipliers times the lengths: the solution of F^T nu = known with least norm.
         true = np.linalg.norm(terms.A.astype(LONG), axis=1)
         true = np.where(self.void | (true == 0), 1, true)
         ratio = true / length
@@ -257,7 +256,7 @@ class Equations:
         dz = _eliminated(K, np.concatenate([upper, lower]))
         da, dy = dz[:n], dz[n:]
         growth = np.where(self.void, 0, np.sum(terms.A * rates.A, axis=1)) / true**2
-        # Rows go on to hang together so along the constraints.
+        # The dependence of the rows also holds along the constraints.
         dC = _spanned(dA - C @ dA[base], A[base])
         dF = dC * ratio[base] / ratio[:, None] + F * (growth[base] - growth[:, None])
         known = ratio[base] * (dy + growth[base] * y)
@@ -268,14 +267,14 @@ class Equations:
         return Solved(*found, size, max(size, dsize))
 
     def _nudged(self, X: Any, rng: np.random.Generator, size: float | None = None) -> Any:
-        """Each entry by a rounding of the largest one, or of a number."""
+        """Each entry changed by a rounding error of the largest one, or of `size`."""
         size = np.max(np.abs(X), initial=0.0) if size is None else size
         E = rng.uniform(-1.0, 1.0, X.shape)
         E = (E + E.T) / 2 if X.shape[0] == X.shape[1] else E
         return X + self.eps * size * E
 
     def _shaken(self, x: Any, more: Any, rng: np.random.Generator) -> Any:
-        """Each entry by a rounding of its size, and of so much more."""
+        """Each entry changed by a rounding error of its size plus `more`."""
         return x + self.eps * (abs(x) + more) * rng.uniform(-1.0, 1.0, np.shape(x))
 
 
@@ -288,13 +287,13 @@ def _bordered(M: Any, A: Any) -> Any:
 
 
 def _spanned(rows: Any, base: Any) -> Any:
-    """C with rows = C base, nearest."""
+    """C with rows = C base, by least squares."""
     found = [_eliminated(base @ base.T, base @ row) for row in rows]
     return np.array(found, LONG).reshape(len(rows), len(base))
 
 
 def _eliminated(K: Any, right: Any) -> Any:
-    """The x with K x = right, in extended precision, with exchanges of rows."""
+    """The x with K x = right, in extended precision, by elimination with pivoting."""
     K, x = np.array(K, LONG), np.array(right, LONG)
     n = len(K)
     for k in range(n):

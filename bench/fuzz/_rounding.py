@@ -1,10 +1,11 @@
-"""What the roundings inside a computation may do to its results: every one drawn at random.
+"""The effect of rounding errors on the results of a computation, by random rounding.
 
-Random rounding of each operation, repeated, shows how many digits of a result are significant
+Repeated random rounding of each operation shows how many digits of a result are significant
 (Vignes 2004, Discrete stochastic arithmetic for validating results of numerical software).
 
-Common operations are numpy's here, written for this alone: neither what the scalar program is
-derived with nor what it is compared with in use, and nothing to compile. The others are JAX's.
+Common operations use numpy functions written for this module only. They are independent of the
+derivation of the scalar program and of its verification, and need no compilation. Other operations
+use JAX.
 """
 
 from collections.abc import Callable
@@ -15,14 +16,14 @@ import numpy as np
 
 from jaxlag._tracing._dependence import scan_sizes
 
-# Exact in floating point: a number moved, chosen or of another sign.
+# Exact in floating point: numbers are moved, selected or change sign.
 _CHOSEN = ("abs", "neg", "sign", "max", "min", "clamp", "floor", "round", "select_n", "sort")
 _REDUCED = ("reduce_max", "reduce_min", "cummax", "cummin")
 _MOVED = ("slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "stack")
 _MOVED_ALSO = ("unstack", "split", "pad", "rev", "tile", "gather", "scatter", "dynamic_slice")
-_KEPT = ("stop_gradient", "copy", "optimization_barrier", "iota", "convert_element_type")
-EXACT = {*_CHOSEN, *_REDUCED, *_MOVED, *_MOVED_ALSO, *_KEPT, "dynamic_update_slice", "expand_dims"}
-CALLS = {  # primitive: the name of what it calls
+_EQUAL = ("stop_gradient", "copy", "optimization_barrier", "iota", "convert_element_type")
+EXACT = {*_CHOSEN, *_REDUCED, *_MOVED, *_MOVED_ALSO, *_EQUAL, "dynamic_update_slice", "expand_dims"}
+CALLS = {  # primitive: the name of its parameter with the called program
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -99,7 +100,7 @@ def _split(p: Any, x: Any) -> Any:
 
 
 def _floats(function: Callable) -> Callable:
-    """Of floating-point numbers alone: those of whole numbers have rules of JAX's own."""
+    """For floating-point numbers only; integer operations follow JAX's rules."""
     return lambda p, *xs: function(*xs) if all(x.dtype.kind == "f" for x in xs) else None
 
 
@@ -107,7 +108,7 @@ def _always(function: Callable) -> Callable:
     return lambda p, *xs: function(*xs)
 
 
-# By primitive: of its parameters and operands; None: to be left to JAX.
+# By primitive: a function of its parameters and operands; it returns None to use JAX.
 NUMPY: dict[str, Callable] = {
     **{name: _floats(getattr(np, name)) for name in ("sqrt", "exp", "log", "floor")},
     **{name: _floats(getattr(np, name)) for name in ("sin", "cos", "tanh", "log1p", "expm1")},
@@ -163,10 +164,10 @@ def evaluated(
     """The results of a traced function, operation by operation.
 
     Args:
-        closed: what `jax.make_jaxpr` gives.
+        closed: the result of `jax.make_jaxpr`.
         args: its arguments, flat.
         eps: each result of an operation that rounds is multiplied by 1 + eps u, u in -1 to 1.
-        rng: where u comes from; None: no result is changed.
+        rng: the random generator of u; None: no result is changed.
     """
     return _run(getattr(closed, "jaxpr", closed), getattr(closed, "consts", ()), args, eps, rng)
 
@@ -201,10 +202,10 @@ def _run(jaxpr: Any, consts: Any, args: Any, eps: float, rng: Any) -> list[Any]:
 def _scanned(eqn: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
     p = eqn.params
     fixed, carries = scan_sizes(p)
-    consts, carry, rows = given[:fixed], given[fixed : fixed + carries], given[fixed + carries :]
+    consts, carry, slices = given[:fixed], given[fixed : fixed + carries], given[fixed + carries :]
     written = []
     for k in range(p["length"])[:: -1 if p["reverse"] else 1]:
-        found = evaluated(p["jaxpr"], [*consts, *carry, *(x[k] for x in rows)], eps, rng)
+        found = evaluated(p["jaxpr"], [*consts, *carry, *(x[k] for x in slices)], eps, rng)
         carry = found[:carries]
         written.append(found[carries:])
     written = written[:: -1 if p["reverse"] else 1]
@@ -212,7 +213,7 @@ def _scanned(eqn: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
 
 
 def _solved(p: Any, given: list[Any], eps: float, rng: Any) -> list[Any]:
-    """By the program that solves; the others serve derivatives."""
+    """Run the `solve` program; the others are for derivatives."""
     sizes = p["const_lengths"]
     before = sizes.matvec + sizes.vecmat
     consts, right = given[before : before + sizes.solve], given[sum(sizes) :]
@@ -234,12 +235,12 @@ def _operation(eqn: Any, given: list[Any]) -> list[Any]:
 
 
 def _typed(x: Any) -> bool:
-    """Whether it is a random key: of those numpy has none."""
+    """Whether it is a random key, which numpy does not have."""
     return jax.dtypes.issubdtype(getattr(x, "dtype", np.float64), jax.dtypes.extended)
 
 
 def _rounded(x: Any, eps: float, rng: np.random.Generator) -> Any:
-    """The number with another rounding; zeros, whole numbers and truths stay as they are."""
+    """The numbers with another rounding; zeros, integers and Booleans are unchanged."""
     if _typed(x) or x.dtype.kind != "f":
         return x
     factor = 1.0 + eps * rng.uniform(-1.0, 1.0, x.shape)

@@ -1,8 +1,8 @@
-"""The scalar program of a system beside its array program, derivatives included.
+"""The scalar program of a system compared with its array program, with derivatives.
 
 Accelerations, their derivatives in q, v and params, and second derivatives in q are compared at
-random states, near zero and with equal coordinates. The scalar program may differ by what other
-roundings of the arguments and of every operation of the array program change (`_rounding.py`).
+random states, near zero and with equal coordinates. The allowed difference is the change of the
+array program's results by other rounding errors of its arguments and operations (`_rounding.py`).
 """
 
 from typing import Any
@@ -17,13 +17,13 @@ from bench.fuzz._rounding import evaluated
 from jaxlag._lowering import ArrayProgram, ArrayTerms, ScalarProgram, State
 from jaxlag._system._inspection import check_traceable
 
-NUDGES = 4  # runs with other roundings
-MORE = 60  # where they differ by those: a floor may turn at one rounding in ten
+NUDGES = 4  # runs with other rounding errors
+MORE = 60  # runs if these show a difference: a `floor` may jump at one rounding in ten
 STATES = 4
 
 
 def compared(drawn: Drawn) -> Compared:
-    """The scalar program of a system beside the array program."""
+    """Compare the scalar program of a system with its array program."""
     system = drawn.system
     dtype = jnp.dtype(drawn.dtype)
     leaves = {
@@ -46,18 +46,18 @@ def compared(drawn: Drawn) -> Compared:
 
 
 def _number(drawn: Drawn) -> Any:
-    """A number of Python's is double precision in a scalar program."""
+    """The param `k`; in float32 an array, as scalar programs use doubles for Python numbers."""
     k = drawn.params["k"]
     return k if drawn.dtype == "float64" else jnp.asarray(k, drawn.dtype)
 
 
-def _reason(said: str) -> str:
+def _reason(reason: str) -> str:
     for known in ("random states to compare", "operations", "weighted sums"):
-        if known in said:
+        if known in reason:
             return f"not used: {known}"
-    if said.startswith("differs"):
+    if reason.startswith("differs"):
         return "not used: differs where it was compared"
-    return f"not used: {said.split(' at ')[0]}"
+    return f"not used: {reason.split(' at ')[0]}"
 
 
 def _judged(
@@ -71,14 +71,14 @@ def _judged(
 
     def everything(program: Any) -> Any:
         def a(x: Any) -> Any:
-            """The acceleration in units, as a function of state in units and params in one row."""
+            """Acceleration in units, as a function of one vector: state in units, then params."""
             params = {"a": x[2 * n : -1], "b": x[-1], "k": _number(drawn)}
             q, v = units * x[:n], units * x[n : 2 * n]
             return program.acceleration(State(jnp.asarray(0.3), q, v, params, {})) / units
 
         def of(x: Any) -> dict[str, Any]:
-            value, push = jax.linearize(a, x)
-            slopes = jax.vmap(push, out_axes=1)(jnp.eye(x.size, dtype=dtype))
+            value, jvp_fn = jax.linearize(a, x)
+            slopes = jax.vmap(jvp_fn, out_axes=1)(jnp.eye(x.size, dtype=dtype))
             found = {"a": value} | {name: slopes[:, part] for name, part in parts.items()}
             if drawn.second:
                 along = jnp.zeros_like(x).at[:n].set(jnp.linspace(0.5, 1.0, n, dtype=dtype))
@@ -111,22 +111,22 @@ def _judged(
 
 
 def _off(right: np.ndarray, found: np.ndarray, a: np.ndarray, eps: float) -> float:
-    """The largest difference over what is allowed.
+    """The largest difference divided by the allowed one.
 
-    Roundings of the acceleration count in its derivatives, too, which are per unit of a coordinate:
-    of those nothing closer is asked.
+    Derivatives are per unit of a coordinate. They need not be more accurate than the rounding
+    error of the acceleration.
 
     Args:
-        right: from the array program, shape (1 + nudges, STATES, entries): as it is, then nudged.
+        right: from the array program, (1 + nudges, STATES, entries): without nudges, then nudged.
         found: from the scalar program, (STATES, entries).
         a: the acceleration, (STATES, n).
-        eps: of the numbers.
+        eps: machine precision of the numbers.
     """
     worst = 0.0
     for k, y in enumerate(found):
         x = right[:, k]
         if not np.isfinite(x[0]).all() or not np.isfinite(y).all():
-            # Where the array program overflows, or is undefined, the other need not be.
+            # If the array program overflows or is undefined, the scalar program may be finite.
             worst = max(worst, np.inf if np.isfinite(x).all() else 0.0)
             continue
         spread = np.nanmax(np.abs(x[1:] - x[0]), initial=0.0)

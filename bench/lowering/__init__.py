@@ -1,18 +1,22 @@
-"""Accelerations as scalar code: time, operations and compilation, beside code by others.
+"""Accelerations as scalar code: time, operations and compilation, compared with other code.
 
 part "evaluation": one evaluation of the accelerations, as a quarter of a Runge-Kutta step in one
-jitted loop, the same for all (_rk4.py). jaxlag: the scalar program; array: jaxlag's array
-program, its state one vector; by hand: what a good engineer writes (_by_hand.py); sympy: L
-in symbols, differentiated, shared by cse, as derived and with trigsimp (_sympy.py). "called"
-is the same code as a function that every stage calls, as jaxlag compiles its own code of more
-than some lines: shown, not judged. part "chain": the same for chains of n links beside numba,
-MuJoCo and Pinocchio (_chains.py says what each does). part "compile": a whole `jl.simulate`
-from functions never seen before, `trace_s` holding the derivation. part "solve": the double
-pendulum to t = 10 at the loosest tolerance of a list that ends within 1e-9 of the reference, with
-XLA's setting and without.
+jitted loop, the same for all (_rk4.py). The contenders are
 
-`ratio` is to jaxlag's row of the same system, `error` to the array program's accelerations (part
-"solve": of the end state).
+- jaxlag: the scalar program;
+- array: jaxlag's array program, with the state as one vector;
+- by hand: equations as a good engineer writes them (_by_hand.py);
+- sympy: L in symbols, differentiated, with cse, as derived and with trigsimp (_sympy.py);
+- called: the same code as a function that every stage calls, which is how jaxlag compiles long
+  code; shown, not judged.
+
+part "chain": the same for chains of n links, compared with numba, MuJoCo and Pinocchio (see
+_chains.py). part "compile": a whole `jl.simulate` from new functions; `trace_s` includes the
+derivation. part "solve": the double pendulum to t = 10, with XLA's setting and without it. The
+tolerance is the loosest of a list with an end within 1e-9 of the reference.
+
+`ratio` is the time divided by that of jaxlag for the same system. `error` is relative to the array
+program's accelerations (part "solve": the error of the end state).
 """
 
 from collections.abc import Mapping
@@ -81,22 +85,22 @@ def contenders(name: str) -> dict[str, tuple[Equations, bool]]:
 
         if name in _sympy.LAGRANGIANS:
             forms = _sympy.forms(name, scene)
-            peers |= {f"sympy {words}": equations for words, equations in forms.items()}
+            peers |= {f"sympy {label}": equations for label, equations in forms.items()}
     if len(scene.q0) > 2:
-        peers |= {f"{words}, called": _rk4.called(peer) for words, peer in peers.items()}
-    return found | {words: (peer, True) for words, peer in peers.items()}
+        peers |= {f"{label}, called": _rk4.called(peer) for label, peer in peers.items()}
+    return found | {label: (peer, True) for label, peer in peers.items()}
 
 
 def accelerations(name: str, chosen: Mapping[str, tuple[Equations, bool]]) -> dict[str, np.ndarray]:
-    """Of every contender, near the state of the scene with every rate different from zero."""
+    """Accelerations by every contender, near the state of the scene, with all rates nonzero."""
     scene = SCENES[name]
     q, v = np.array(scene.q0) + 0.1, np.array(scene.v0) + 0.1 * np.arange(1, len(scene.q0) + 1)
     params, found = _params(scene), {}
-    for words, (equations, scalar) in chosen.items():
+    for label, (equations, scalar) in chosen.items():
         a = jax.jit(lambda q, v, p, equations=equations: equations(p)(q, v))(
             _rk4.parts(q, scalar), _rk4.parts(v, scalar), params
         )
-        found[words] = np.concatenate([np.atleast_1d(x) for x in a])
+        found[label] = np.concatenate([np.atleast_1d(x) for x in a])
     return found
 
 
@@ -105,9 +109,9 @@ def evaluation(name: str, quick: bool) -> list[Row]:
     scene, chosen = SCENES[name], contenders(name)
     errors = _agreed(name, accelerations(name, chosen), dict.fromkeys(chosen, AGREEMENT))
     calls, rows = {}, {}
-    for words, (equations, scalar) in chosen.items():
-        calls[words], cost = _timed(scene, equations, scalar, STEPS)
-        rows[words] = {"error": errors[words], **cost}
+    for label, (equations, scalar) in chosen.items():
+        calls[label], cost = _timed(scene, equations, scalar, STEPS)
+        rows[label] = {"error": errors[label], **cost}
     rows["jaxlag"]["operations"] = _rk4.operations(scene, "scalar")
     samples = interleaved(calls, 3 if quick else 10, 0.3 if quick else 2.0)
     lanes = dict.fromkeys(calls, _rk4.STAGES * STEPS)
@@ -115,21 +119,21 @@ def evaluation(name: str, quick: bool) -> list[Row]:
 
 
 def chain(n: int, quick: bool) -> list[Row]:
-    """jaxlag as it comes, its array program and the neighbours in turn."""
+    """jaxlag with its defaults, its array program and the other libraries in turn."""
     name, scene, steps = f"chain_{n}", links(n), STEPS // n
     q, v = np.array(scene.q0), np.linspace(0.5, -0.4, n)
     calls, rows, values, lanes = {}, {}, {}, {}
-    for words, lowering in (("jaxlag", "auto"), ("array", "array")):
-        calls[words], cost = _timed(scene, *_rk4.by_jaxlag(scene, lowering), steps)
-        rows[words], lanes[words] = {**cost}, _rk4.STAGES * steps
-        rows[words]["operations"] = _rk4.operations(scene, lowering)
-        values[words] = np.asarray(_rk4.system(scene, lowering).acceleration(q, v, scene.params))
-    for words, peer in _chains.neighbours(scene, steps).items():
-        calls[words], rows[words], lanes[words] = peer.call, {}, peer.evaluations
-        values[words] = peer.acceleration(q, v)
+    for label, lowering in (("jaxlag", "auto"), ("array", "array")):
+        calls[label], cost = _timed(scene, *_rk4.by_jaxlag(scene, lowering), steps)
+        rows[label], lanes[label] = {**cost}, _rk4.STAGES * steps
+        rows[label]["operations"] = _rk4.operations(scene, lowering)
+        values[label] = np.asarray(_rk4.system(scene, lowering).acceleration(q, v, scene.params))
+    for label, peer in _chains.libraries(scene, steps).items():
+        calls[label], rows[label], lanes[label] = peer.call, {}, peer.evaluations
+        values[label] = peer.acceleration(q, v)
     bounds = dict.fromkeys(calls, PEER_AGREEMENT) | {"jaxlag": AGREEMENT}
-    for words, error in _agreed(name, values, bounds).items():
-        rows[words]["error"] = error
+    for label, error in _agreed(name, values, bounds).items():
+        rows[label]["error"] = error
     samples = interleaved(calls, 3 if quick else 6, 0.5 if quick else 3.0)
     return _finished("chain", name, scene, rows, samples, lanes)
 
@@ -147,13 +151,13 @@ def _params(scene: Scene) -> Any:
 def _agreed(
     name: str, values: Mapping[str, np.ndarray], bounds: Mapping[str, float]
 ) -> dict[str, float]:
-    """Relative differences from the array program; an error where one is too large."""
+    """Relative differences from the array program; raises an error if one is too large."""
     expected = values["array"]
     size = np.max(np.abs(expected))
-    errors = {words: float(np.max(np.abs(a - expected)) / size) for words, a in values.items()}
-    for words, error in errors.items():
-        if not error <= bounds[words]:
-            raise RuntimeError(f"{name}: accelerations of '{words}' are off by {error:.1e}")
+    errors = {label: float(np.max(np.abs(a - expected)) / size) for label, a in values.items()}
+    for label, error in errors.items():
+        if not error <= bounds[label]:
+            raise RuntimeError(f"{name}: accelerations of '{label}' are off by {error:.1e}")
     return errors
 
 
@@ -168,16 +172,16 @@ def _finished(
     own = min(samples["jaxlag"]) / lanes["jaxlag"]
     fixed = {"part": part, "system": name, "n": len(scene.q0)}
     return [
-        _row(**fixed, contender=words, ratio=min(taken) / lanes[words] / own, **rows[words],
-             **spread(taken, "us", lanes[words]))
-        for words, taken in samples.items()
+        _row(**fixed, contender=label, ratio=min(taken) / lanes[label] / own, **rows[label],
+             **spread(taken, "us", lanes[label]))
+        for label, taken in samples.items()
     ]  # fmt: skip
 
 
-def compilation(name: str, scene: Scene, turns: int) -> Row:
-    """A solve from functions that nothing knows yet, at best; nothing runs."""
+def compilation(name: str, scene: Scene, repeats: int) -> Row:
+    """The shortest compilation of a solve from new functions; nothing is run."""
     best = None
-    for _ in range(turns):
+    for _ in range(repeats):
         jax.clear_caches()
         fresh = scene._replace(lagrangian=lambda t, q, v, p: scene.lagrangian(t, q, v, p))
         system, ts = _rk4.system(fresh), np.array([0.0, 1.0])
@@ -193,7 +197,7 @@ def compilation(name: str, scene: Scene, turns: int) -> Row:
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
-    """The solve in a process of its own: its call, and the columns known before."""
+    """The solve in its own process: its call, and the columns known before timing."""
     start, params = pendulum.start(), pendulum.params()
     program = build(pendulum.with_jaxlag(pendulum.times(2)), start, params, jnp.asarray(1e-9))
     expected, error = pendulum.reference(pendulum.times(2)), inf
@@ -207,13 +211,13 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
 
 
 def solves(quick: bool) -> list[Row]:
-    """The double pendulum with XLA's setting and without, in turn."""
+    """The double pendulum with XLA's setting and without it, in turn."""
     known, samples = under_both_settings("lowering", quick)
     rows = []
     for setting, all_facts in known.items():
         facts = {key: value for key, value in all_facts.items() if key in COLUMNS}
-        words = f"setting {setting}, tolerance {all_facts['tolerance']:g}"
+        label = f"setting {setting}, tolerance {all_facts['tolerance']:g}"
         times = spread(samples[setting, "solve"], "us")
-        rows.append(_row(part="solve", system="double_pendulum", n=2, contender=words,
+        rows.append(_row(part="solve", system="double_pendulum", n=2, contender=label,
                          **facts, **times))  # fmt: skip
     return rows

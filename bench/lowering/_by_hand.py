@@ -1,8 +1,8 @@
 """Equations of motion as a good engineer writes them on scalars, by the names of the scenes.
 
-Shared subexpressions and reciprocals are computed once, linear systems solved in closed form,
-what depends on params alone is taken out of the loop. Rigid bodies follow Euler's equations in
-body rates (Goldstein, Classical Mechanics, sec. 5.5) instead of Lagrange's in angles.
+Shared subexpressions and reciprocals are computed once. Linear systems are solved in closed form.
+Terms that depend on params alone are computed outside the loop. Rigid bodies use Euler's equations
+in body rates (Goldstein, Classical Mechanics, sec. 5.5) instead of Lagrange's equations in angles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -103,7 +103,7 @@ def top(p: Any) -> Field:
     I1, I2, I3 = (p["I"][i] for i in range(3))
     weight = p["m"] * p["g"] * p["l"]
     k1, k2, k3 = (I2 - I3) / I1, (I3 - I1) / I2, (I1 - I2) / I3
-    pull1, pull2 = weight / I1, weight / I2
+    gravity1, gravity2 = weight / I1, weight / I2
 
     def field(q: Parts, v: Parts) -> Parts:
         s, c = jnp.sin(q[1]), jnp.cos(q[1])
@@ -114,7 +114,7 @@ def top(p: Any) -> Field:
         w2 = level * cP - nutation * sP
         w3 = c_rate + spin
         up = s * sP, s * cP  # the vertical in body axes
-        d1, d2 = k1 * w2 * w3 + pull1 * up[1], k2 * w3 * w1 - pull2 * up[0]
+        d1, d2 = k1 * w2 * w3 + gravity1 * up[1], k2 * w3 * w1 - gravity2 * up[0]
         a = (sP * d1 + cP * d2 + nutation * (spin - c_rate)) / s
         b = cP * d1 - sP * d2 - spin * level
         return [a, b, k3 * w1 * w2 - a * c + level * nutation]
@@ -123,7 +123,7 @@ def top(p: Any) -> Field:
 
 
 def _angles(q: Parts, v: Parts) -> tuple[Any, Any]:
-    """Sines and cosines of (yaw, pitch, roll) but for yaw, and body rates."""
+    """Sines and cosines of pitch and roll, and body rates."""
     sT, cT, sF, cF = jnp.sin(q[4]), jnp.cos(q[4]), jnp.sin(q[5]), jnp.cos(q[5])
     yaw, pitch, roll = v[3:]
     across = cT * yaw
@@ -131,7 +131,7 @@ def _angles(q: Parts, v: Parts) -> tuple[Any, Any]:
     return (sT, cT, sF, cF), rates
 
 
-def _turned(v: Parts, angles: Any, d: Sequence[Array]) -> list[Array]:
+def _angle_accelerations(v: Parts, angles: Any, d: Sequence[Array]) -> list[Array]:
     """Second derivatives of the angles from those of the body rates."""
     sT, cT, sF, cF = angles
     yaw, pitch, roll = v[3:]
@@ -148,7 +148,7 @@ def rigid_body(p: Any) -> Field:
     def field(q: Parts, v: Parts) -> Parts:
         angles, (w1, w2, w3) = _angles(q, v)
         d = k1 * w2 * w3, k2 * w3 * w1, k3 * w1 * w2
-        return [zero, zero, fall, *_turned(v, angles, d)]
+        return [zero, zero, fall, *_angle_accelerations(v, angles, d)]
 
     return field
 
@@ -156,16 +156,16 @@ def rigid_body(p: Any) -> Field:
 def aircraft(p: Any) -> Field:
     m, g, c = p["m"], p["g"], tuple(p["c"][i] for i in range(3))
     xx, yy, zz, xy, xz, yz = (p["J"][i] for i in range(6))
-    # About the mass centre (parallel axes), and its inverse.
+    # Inertia about the mass center (parallel axes), and its inverse.
     xx, yy, zz = (
         J - m * (c[i] ** 2 + c[j] ** 2)
         for J, i, j in zip((xx, yy, zz), (1, 0, 0), (2, 2, 1), strict=True)
     )
     xy, xz, yz = xy + m * c[0] * c[1], xz + m * c[0] * c[2], yz + m * c[1] * c[2]
     J = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-    rows = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
-    per_det = 1.0 / _dot(J[0], rows[0])
-    inverse = [[x * per_det for x in row] for row in rows]
+    adjugate = _cross(J[1], J[2]), _cross(J[2], J[0]), _cross(J[0], J[1])
+    per_det = 1.0 / _dot(J[0], adjugate[0])
+    inverse = [[x * per_det for x in row] for row in adjugate]
 
     def field(q: Parts, v: Parts) -> Parts:
         angles, w = _angles(q, v)
@@ -174,10 +174,10 @@ def aircraft(p: Any) -> Field:
         torque = _cross([_dot(row, w) for row in J], w)
         d = [_dot(row, torque) for row in inverse]
         x, y, z = (a + b for a, b in zip(_cross(d, c), _cross(w, _cross(w, c)), strict=True))
-        # R = Rz Ry Rx, one turn after the other.
+        # R = Rz Ry Rx, one rotation after the other.
         y, z = cF * y - sF * z, sF * y + cF * z
         x, z = cT * x + sT * z, cT * z - sT * x
-        return [sP * y - cP * x, -sP * x - cP * y, -g - z, *_turned(v, angles, d)]
+        return [sP * y - cP * x, -sP * x - cP * y, -g - z, *_angle_accelerations(v, angles, d)]
 
     return field
 

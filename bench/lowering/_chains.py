@@ -1,10 +1,10 @@
-"""Forward dynamics of the chain by its neighbours, each as it is meant to be used.
+"""Forward dynamics of the chain by other libraries, each in its recommended use.
 
-numba: equations written by hand in absolute angles, dense, the loop compiled as well. MuJoCo:
-`mj_step` with RK4 and its loop in C, joint angles relative, contacts and constraints switched off;
-a step holds four evaluations and the integration. Pinocchio: articulated-body algorithm, joint
-angles relative, one call from Python for each evaluation, its overhead (about 1 us) included. A
-neighbour that cannot be imported is left out.
+numba: equations written by hand in absolute angles, with a dense M; the loop is also compiled.
+MuJoCo: `mj_step` with RK4 and its loop in C, relative joint angles, contacts and constraints off;
+a step consists of four evaluations and the integration. Pinocchio: articulated-body algorithm,
+relative joint angles, one call from Python per evaluation, with an overhead of about 1 us. A
+library that cannot be imported is left out.
 """
 
 from collections.abc import Callable
@@ -20,13 +20,13 @@ Vector = np.ndarray
 MODULES = {"numba": "numba", "MuJoCo": "mujoco", "Pinocchio": "pinocchio"}
 
 
-class Neighbour(NamedTuple):
+class Library(NamedTuple):
     """Forward dynamics of one chain.
 
     Attributes:
         acceleration: of the absolute angles, from absolute angles and rates.
-        call: many evaluations.
-        evaluations: how many.
+        call: runs many evaluations.
+        evaluations: their number.
     """
 
     acceleration: Callable[[Vector, Vector], Vector]
@@ -34,14 +34,14 @@ class Neighbour(NamedTuple):
     evaluations: int
 
 
-def neighbours(scene: Scene, steps: int) -> dict[str, Neighbour]:
-    """Those that can be imported, to be timed over so many steps."""
+def libraries(scene: Scene, steps: int) -> dict[str, Library]:
+    """The libraries that can be imported, to be timed over this number of steps."""
     absent = missing()
     return {name: make(scene, steps) for name, make in MAKERS.items() if name not in absent}
 
 
 def missing() -> list[str]:
-    """Those that cannot be imported."""
+    """The libraries that cannot be imported."""
     return [name for name, module in MODULES.items() if not _imports(module)]
 
 
@@ -53,20 +53,20 @@ def _imports(module: str) -> bool:
     return True
 
 
-def by_numba(scene: Scene, steps: int) -> Neighbour:
-    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j sum of the masses from max(i, j) on."""
+def by_numba(scene: Scene, steps: int) -> Library:
+    """M_ij = A_ij cos(q_i - q_j), A_ij = l_i l_j times the sum of the masses from max(i, j) on."""
     m, rods, g, q0, v0 = _numbers(scene)
     carried = np.cumsum(m[::-1])[::-1]
     A = np.outer(rods, rods) * carried[np.maximum.outer(np.arange(rods.size), np.arange(rods.size))]
-    pull = carried * g * rods
+    gravity = carried * g * rods
     evaluate, run = _compiled()
 
     def acceleration(q: Vector, v: Vector) -> Vector:
         a = np.empty_like(q)
-        evaluate(q, v, A, pull, a, *_scratch(q.size))
+        evaluate(q, v, A, gravity, a, *_scratch(q.size))
         return a
 
-    return Neighbour(acceleration, lambda: run(q0, v0, A, pull, STEP, steps), STAGES * steps)
+    return Library(acceleration, lambda: run(q0, v0, A, gravity, STEP, steps), STAGES * steps)
 
 
 def _scratch(n: int) -> tuple[Vector, Vector, Vector, Vector]:
@@ -82,18 +82,18 @@ def _compiled() -> list[Callable]:
     njit = import_module("numba").njit
 
     @njit
-    def evaluate(q, v, A, pull, a, s, c, w, L):
+    def evaluate(q, v, A, gravity, a, s, c, w, L):
         n = q.size
         for i in range(n):
             s[i], c[i], w[i] = np.sin(q[i]), np.cos(q[i]), v[i] * v[i]
-            a[i] = -pull[i] * s[i]
+            a[i] = -gravity[i] * s[i]
         for i in range(n):
             L[i, i] = A[i, i]
             for j in range(i):
                 L[i, j] = A[i, j] * (c[i] * c[j] + s[i] * s[j])
-                turn = A[i, j] * (s[i] * c[j] - c[i] * s[j])
-                a[i] -= turn * w[j]
-                a[j] += turn * w[i]
+                coupling = A[i, j] * (s[i] * c[j] - c[i] * s[j])
+                a[i] -= coupling * w[j]
+                a[j] += coupling * w[i]
         for i in range(n):  # Cholesky, row by row; 1 / L_ii in place of L_ii
             for j in range(i):
                 x = L[i, j]
@@ -114,7 +114,7 @@ def _compiled() -> list[Callable]:
                 a[k] -= L[i, k] * a[i]
 
     @njit
-    def run(q0, v0, A, pull, h, count):
+    def run(q0, v0, A, gravity, h, count):
         n = q0.size
         q, v, x, y = q0.copy(), v0.copy(), np.empty(n), np.empty(n)
         a, dq, dv = np.empty(n), np.empty(n), np.empty(n)
@@ -123,7 +123,7 @@ def _compiled() -> list[Callable]:
             x[:], y[:] = q, v
             dq[:], dv[:] = 0.0, 0.0
             for stage in range(4):
-                evaluate(x, y, A, pull, a, s, c, w, L)
+                evaluate(x, y, A, gravity, a, s, c, w, L)
                 weight = h / 3.0 if 0 < stage < 3 else h / 6.0
                 ahead = h if stage == 2 else h / 2.0
                 for i in range(n):
@@ -139,8 +139,8 @@ def _compiled() -> list[Callable]:
     return _functions
 
 
-def by_mujoco(scene: Scene, steps: int) -> Neighbour:
-    """Hinges about -y, each body a mass at the end of its link, with next to no inertia."""
+def by_mujoco(scene: Scene, steps: int) -> Library:
+    """Hinges about -y; each body is a mass at the end of its link, with negligible inertia."""
     mujoco: Any = import_module("mujoco")
     m, rods, g, q0, v0 = _numbers(scene)
     inner = ""
@@ -170,11 +170,11 @@ def by_mujoco(scene: Scene, steps: int) -> Neighbour:
         put(q0, v0)
         mujoco.mj_step(model, data, nstep=steps)
 
-    return Neighbour(acceleration, call, STAGES * steps)
+    return Library(acceleration, call, STAGES * steps)
 
 
-def by_pinocchio(scene: Scene, steps: int) -> Neighbour:
-    """Joints about y against the sense of the angles, the bodies point masses."""
+def by_pinocchio(scene: Scene, steps: int) -> Library:
+    """Joints about y, so that joint angles have the opposite sign; the bodies are point masses."""
     pin: Any = import_module("pinocchio")
     m, rods, g, q0, v0 = _numbers(scene)
     model = pin.Model()
@@ -196,7 +196,7 @@ def by_pinocchio(scene: Scene, steps: int) -> Neighbour:
         for _ in range(STAGES * steps):
             aba(model, data, q, v, free)
 
-    return Neighbour(acceleration, call, STAGES * steps)
+    return Library(acceleration, call, STAGES * steps)
 
 
 def _numbers(scene: Scene) -> tuple[Vector, Vector, float, Vector, Vector]:
@@ -208,7 +208,7 @@ def _relative(x: Vector) -> Vector:
     return np.diff(x, prepend=0.0)
 
 
-MAKERS: dict[str, Callable[[Scene, int], Neighbour]] = {
+MAKERS: dict[str, Callable[[Scene, int], Library]] = {
     "numba": by_numba,
     "MuJoCo": by_mujoco,
     "Pinocchio": by_pinocchio,

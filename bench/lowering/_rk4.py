@@ -1,4 +1,4 @@
-"""The loop in which all accelerations are timed: Runge-Kutta steps of one length, nothing else.
+"""The loop in which all accelerations are timed: Runge-Kutta steps of fixed length.
 
 A state is a list of arrays: scalars, or one vector for a program on arrays.
 """
@@ -17,11 +17,11 @@ from bench._problems.scenes import Scene
 from jaxlag._lowering import ScalarProgram, State
 
 STEP = 1e-4  # s
-STAGES = 4  # evaluations in a step
+STAGES = 4  # evaluations per step
 
 Parts = Sequence[Array]
 Field = Callable[[Parts, Parts], Parts]  # (q, v) -> a
-Equations = Callable[[Any], Field]  # what depends on params alone is computed here
+Equations = Callable[[Any], Field]  # terms that depend on params alone are computed here
 
 
 def loop(equations: Equations, steps: int) -> Callable[[Parts, Parts, Any], Any]:
@@ -57,19 +57,19 @@ def _mean(*rates: Parts) -> list[Array]:
 
 
 def called(equations: Equations) -> Equations:
-    """The same as a function that every stage calls, as jaxlag compiles code of many lines."""
+    """The same as a function that every stage calls, which is how jaxlag compiles long code."""
 
     def wrapped(params: Any) -> Field:
         field = equations(params)
 
         @jax.jit
-        def row(state: Array) -> Array:
+        def evaluate(state: Array) -> Array:
             q, v = jnp.split(state, 2)
             return jnp.stack(field(_elements(q), _elements(v)))
 
         def call(q: Parts, v: Parts) -> Parts:
             with set_xla_metadata(inlineable="false"):
-                return _elements(row(jnp.stack([*q, *v])))
+                return _elements(evaluate(jnp.stack([*q, *v])))
 
         return call
 
@@ -87,7 +87,7 @@ def system(scene: Scene, lowering: str = "auto") -> jl.System:
 
 
 def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
-    """jaxlag's equations, and whether they are on scalars, as `jl.simulate` takes them."""
+    """jaxlag's equations as `jl.simulate` uses them, and whether they are on scalars."""
     program = system(scene, lowering)._program
     like, t = jnp.asarray(scene.q0), jnp.zeros(())
     scalar = isinstance(program, ScalarProgram) and operations(scene, lowering) is not None
@@ -110,7 +110,7 @@ def by_jaxlag(scene: Scene, lowering: str = "auto") -> tuple[Equations, bool]:
 
 
 def operations(scene: Scene, lowering: str = "auto") -> int | None:
-    """Operations of the scalar program; None where there is none."""
+    """Number of operations of the scalar program; None if there is no scalar program."""
     program = system(scene, lowering)._program
     if not isinstance(program, ScalarProgram):
         return None
@@ -119,5 +119,5 @@ def operations(scene: Scene, lowering: str = "auto") -> int | None:
 
 
 def parts(x: Sequence[float], scalar: bool) -> list[Array]:
-    """A vector as the loop takes it."""
+    """A vector in the form for the loop."""
     return [jnp.asarray(float(number)) for number in x] if scalar else [jnp.asarray(x)]

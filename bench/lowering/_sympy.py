@@ -1,7 +1,7 @@
 """Equations of motion by sympy: L in symbols, Lagrange's equations, cse, printed as JAX code.
 
-M a = -h is solved by straight-line L D L^T (Golub, Van Loan, Matrix Computations, sec. 4.1) on
-the shared entries, two unknowns by Cramer's rule. The rotations are those of `jaxlag.rotation`.
+M a = -h is solved by straight-line L D L^T (Golub, Van Loan, Matrix Computations, sec. 4.1) on the
+entries after cse; for two unknowns Cramer's rule is used. Rotations are as in `jaxlag.rotation`.
 """
 
 import signal
@@ -24,7 +24,7 @@ Lines = list[tuple[sp.Symbol, sp.Expr]]
 
 
 class Model(NamedTuple):
-    """Symbols of a scene; `tidy` simplifies kinematics, where asked for."""
+    """Symbols of a scene; `tidy` simplifies kinematics or is the identity."""
 
     q: list[sp.Symbol]
     v: list[sp.Symbol]
@@ -106,8 +106,8 @@ def symmetric_top(s: Model) -> sp.Expr:
     return T - m * g * rod * sp.cos(s.q[1])
 
 
-def _turn(axis: int, angle: Any) -> sp.Matrix:
-    """By `angle` about an axis, body to space."""
+def _rotation(axis: int, angle: Any) -> sp.Matrix:
+    """Rotation by `angle` about an axis, body to space."""
     s, c = sp.sin(angle), sp.cos(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = sp.eye(3)
@@ -123,14 +123,14 @@ def _rates(s: Model, R: sp.Matrix) -> sp.Matrix:
 
 
 def top(s: Model) -> sp.Expr:
-    R = _turn(2, s.q[0]) * _turn(0, s.q[1]) * _turn(2, s.q[2])
+    R = _rotation(2, s.q[0]) * _rotation(0, s.q[1]) * _rotation(2, s.q[2])
     w = _rates(s, R)
     T = sum(moment * rate**2 for moment, rate in zip(s.p["I"], w, strict=True)) / 2
     return T - s.p["m"] * s.p["g"] * s.p["l"] * R[2, 2]
 
 
 def _yaw_pitch_roll(s: Model) -> sp.Matrix:
-    return _turn(2, s.q[3]) * _turn(1, s.q[4]) * _turn(0, s.q[5])
+    return _rotation(2, s.q[3]) * _rotation(1, s.q[4]) * _rotation(0, s.q[5])
 
 
 def rigid_body(s: Model) -> sp.Expr:
@@ -169,12 +169,12 @@ LAGRANGIANS: Mapping[str, Callable[[Model], sp.Expr]] = {
 
 
 def forms(name: str, scene: Scene) -> dict[str, Equations]:
-    """The equations as derived, and simplified where that takes less than the patience."""
+    """The equations as derived, and simplified versions if sympy takes at most `PATIENCE_S`."""
     found = {"as derived": _equations(name, scene, _same, _same)}
-    for words, tidy, last in (("trigsimp in L", _tidy, _same), ("trigsimp", _tidy, _tidy)):
+    for label, tidy, last in (("trigsimp in L", _tidy, _same), ("trigsimp", _tidy, _tidy)):
         try:
             with _time_limit(PATIENCE_S):
-                found[words] = _equations(name, scene, tidy, last)
+                found[label] = _equations(name, scene, tidy, last)
         except TimeoutError:
             break
     return found
@@ -231,7 +231,7 @@ def _symbols(name: str, value: Any) -> Any:
 
 
 def _solve(M: list[list[sp.Expr]], r: list[sp.Expr], lines: Lines) -> list[sp.Expr]:
-    """The a with M a = r, each step a new line; M is its lower triangle."""
+    """The a with M a = r; each operation is a new line. M is given by its lower triangle."""
     n, names = len(r), sp.numbered_symbols("z")
 
     def line(x: sp.Expr) -> sp.Expr:
@@ -263,7 +263,7 @@ def _solve(M: list[list[sp.Expr]], r: list[sp.Expr], lines: Lines) -> list[sp.Ex
 
 
 class _Printer(PythonCodePrinter):
-    """Whole powers stay powers, halves become roots."""
+    """Integer powers stay powers, half-integer powers become roots."""
 
     def _print_Pow(self, expr: sp.Pow, **_: Any) -> str:
         base, exponent = self._print(expr.base), expr.exp
@@ -277,7 +277,7 @@ class _Printer(PythonCodePrinter):
 def _printed(
     lines: Lines, a: list[sp.Expr], q: list[sp.Symbol], v: list[sp.Symbol], p: dict[str, Any]
 ) -> Equations:
-    """Code with the lines on params alone outside of the function of the state."""
+    """Code; lines that depend on params alone are outside of the function of the state."""
     show = _Printer({"fully_qualified_modules": False}).doprint
     fixed = {x for value in p.values() for x in (value if isinstance(value, tuple) else [value])}
     outer, inner = [], []
@@ -302,7 +302,7 @@ def _printed(
 
 
 def _as_arrays(equations: Equations) -> Equations:
-    """Results that are numbers become arrays, params that are vectors their elements."""
+    """The equations with results as arrays, also where these are constant numbers."""
 
     def wrapped(p: Any) -> Field:
         field = equations(p)

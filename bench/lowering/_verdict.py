@@ -1,4 +1,4 @@
-"""What the rows of the benchmark `lowering` say: figures, targets and references."""
+"""Figures, targets and references from the table rows of the benchmark `lowering`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import exp, log
@@ -6,7 +6,7 @@ from typing import Any
 
 from bench._harness.timing import Reference, Target
 
-NEIGHBOURS = ("numba", "MuJoCo", "Pinocchio")
+LIBRARIES = ("numba", "MuJoCo", "Pinocchio")
 OPERATIONS = {"top": 85, "rigid_body": 85, "aircraft": 410, "chain_8": 720}  # at most
 SOLVE_MS = {"on": 0.13, "off": 0.15}
 
@@ -14,13 +14,13 @@ Row = Mapping[str, Any]
 
 
 class Figures:
-    """Figures of the rows by what they compare; none where no row has them."""
+    """Figures from the table rows, by the kind of comparison; empty if there are no rows."""
 
     def __init__(self, rows: Sequence[Row]) -> None:
         self.rows = rows
 
     def of(self, part: str, **wanted: Any) -> list[Row]:
-        """The rows of one part with these entries."""
+        """The table rows of one part with these entries."""
         return [
             row
             for row in self.rows
@@ -28,7 +28,7 @@ class Figures:
         ]
 
     def ratios(self, admitted: Callable[[str], bool]) -> dict[str, float]:
-        """Times as long: jaxlag as the fastest of the contenders admitted, by system."""
+        """Time of jaxlag divided by that of the fastest admitted contender, by system."""
         found: dict[str, float] = {}
         for row in self.of("evaluation"):
             if admitted(row["contender"]):
@@ -36,21 +36,21 @@ class Figures:
         return found
 
     def gains(self, part: str, sizes: Sequence[int]) -> list[float]:
-        """Times faster: the scalar than the array program, for every system of these sizes."""
+        """Time of the array program over that of the scalar one, for systems of these sizes."""
         return [row["ratio"] for row in self.of(part, contender="array") if row["n"] in sizes]
 
-    def neighbours(self) -> dict[int, tuple[float, str]]:
-        """Times as long: jaxlag as the fastest neighbour, and its name, by the length of chain."""
+    def libraries(self) -> dict[int, tuple[float, str]]:
+        """(time of jaxlag over that of the fastest library, its name), by the length of chain."""
         found: dict[int, tuple[float, str]] = {}
         for row in self.of("chain"):
-            if row["contender"] in NEIGHBOURS:
+            if row["contender"] in LIBRARIES:
                 new = (1.0 / row["ratio"], row["contender"])
                 found[row["n"]] = max(found.get(row["n"], (0.0, "")), new)
         return found
 
 
 def is_peer(contender: str) -> bool:
-    """Whether it is judged against: plain code by hand or by sympy."""
+    """Whether jaxlag is judged against it: plain code by hand or by sympy."""
     return is_any_peer(contender) and not contender.endswith("called")
 
 
@@ -66,14 +66,14 @@ def mean(ratios: Mapping[str, float]) -> float:
 def verdict(
     rows: Sequence[Row], operations: Mapping[str, int | None], missing: Sequence[str]
 ) -> tuple[list[Target], list[Reference]]:
-    """Targets and references of all parts that have rows."""
+    """Targets and references of all parts that have table rows."""
     figures = Figures(rows)
     targets: list[Target] = []
     references = [Reference("left out", f"{name}: cannot be imported") for name in missing]
     for judge in (_evaluation, _chains, _compilation, _solves):
-        more, told = judge(figures)
+        more, found = judge(figures)
         targets += more
-        references += told
+        references += found
     for name, bound in OPERATIONS.items():
         count = operations[name]
         figure = float("nan") if count is None else float(count)
@@ -89,23 +89,23 @@ def _evaluation(figures: Figures) -> tuple[list[Target], list[Reference]]:
         Target(f"times as long: {what}, worst ({_worst(ratios)})", max(ratios.values()), "<=", 1.3),
     ]
     faster = "times faster: the scalar than the array program"
-    for words, part, sizes, bound in (
+    for label, part, sizes, bound in (
         ("n = 1", "evaluation", (1,), 1.0),
         ("least for n = 2 to 4", "evaluation", (2, 3, 4), 20.0),
         ("chain of 8", "chain", (8,), 5.0),
     ):
         gains = figures.gains(part, sizes)
         if gains:
-            targets.append(Target(f"{faster}, {words}", min(gains), ">=", bound))
+            targets.append(Target(f"{faster}, {label}", min(gains), ">=", bound))
     references = []
-    for words, admitted in (
+    for label, admitted in (
         ("hand-written code alone", lambda name: name == "by hand"),
         ("sympy alone", lambda name: name.startswith("sympy") and is_peer(name)),
         ("the best of both, theirs also called", is_any_peer),
     ):
         some = figures.ratios(admitted)
         if some:
-            text = f"times as long: jaxlag as {words}, mean of {len(some)}; worst {_worst(some)}"
+            text = f"times as long: jaxlag as {label}, mean of {len(some)}; worst {_worst(some)}"
             references.append(Reference(f"{mean(some):.3g}; {max(some.values()):.3g}", text))
     return targets, references
 
@@ -115,13 +115,13 @@ def _worst(ratios: Mapping[str, float]) -> str:
 
 
 def _chains(figures: Figures) -> tuple[list[Target], list[Reference]]:
-    found = figures.neighbours()
+    found = figures.libraries()
     near = {n: ratio for n, (ratio, _) in found.items() if n <= 16}
     targets = []
     if near:
         n = max(near, key=lambda n: near[n])
-        words = f"times as long: jaxlag as its best neighbour, worst of n <= 16 (n = {n})"
-        targets.append(Target(words, near[n], "<=", 1.0))
+        label = f"times as long: jaxlag as its best neighbour, worst of n <= 16 (n = {n})"
+        targets.append(Target(label, near[n], "<=", 1.0))
     references = [
         Reference(f"{ratio:.3g}", f"times as long: jaxlag as {name}, chain of {n}")
         for n, (ratio, name) in found.items()
@@ -145,6 +145,6 @@ def _solves(figures: Figures) -> tuple[list[Target], list[Reference]]:
     targets = []
     for row in figures.of("solve"):
         setting = "on" if "setting on" in row["contender"] else "off"
-        words = f"ms: double pendulum to 1e-9, setting {setting}"
-        targets.append(Target(words, row["min_us"] / 1e3, "<=", SOLVE_MS[setting]))
+        label = f"ms: double pendulum to 1e-9, setting {setting}"
+        targets.append(Target(label, row["min_us"] / 1e3, "<=", SOLVE_MS[setting]))
     return targets, []

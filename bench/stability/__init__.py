@@ -1,10 +1,10 @@
-"""Stress: long runs, extremes and singular places, each with a bound and one verdict.
+"""Stress: long runs, extremes and singular states, each with a bound and one verdict.
 
-A row ends in success ("ok") with its figure within a bound written down beforehand, or in a status
-that says what is singular ("named"). "silent" is an answer beyond its bound with the status ok;
-"failed" a status where none was due. Long runs take a million steps from 20 starts, orbits for
-Brouwer's law 100 000 or more from 128. A quick run takes a few of the rows, its long runs 30 000
-steps from 8 starts and 32: most of its time goes into compilation.
+A case must end with the status ok and its figure within a bound written down beforehand ("within"),
+or with the status that names its singularity ("named"). "silent" is a result beyond its bound with
+the status ok. "failed" is a status that is not expected. Long runs take a million steps from 20
+starts, orbits for Brouwer's law 100 000 or more from 128. A quick run takes some of the cases. Its
+long runs have 30 000 steps from 8 and 32 starts. Most of its time is compilation.
 """
 
 import math
@@ -45,7 +45,7 @@ PARTS = (
     _equilibria,
 )
 CASES = [case for part in PARTS for case in part.rows.cases]
-LEAST = 25  # rows that must end in success
+LEAST = 25  # cases that must end within their bounds
 QUICK = {
     "energy over a million steps, splitting4",
     "energy over a million steps, splitting8",
@@ -79,7 +79,7 @@ QUICK = {
 
 
 def run(quick: bool) -> Report:
-    """All rows, one after the other."""
+    """All cases, one after the other."""
     cases = [case for case in CASES if not quick or case.name in QUICK]
     rows = [judged(case, quick) for case in cases]
     successes = sum(not case.statuses for case in cases)
@@ -88,18 +88,18 @@ def run(quick: bool) -> Report:
 
 
 def judged(case: Case, quick: bool) -> dict[str, Any]:
-    """One row."""
+    """Run one case; its table row."""
     case = case.in_quick(quick)
     start = perf_counter()
     try:
         found = case.run(quick)
-    except Exception as error:  # a row that breaks off must not take the others along
+    except Exception as error:  # an error in one case must not stop the others
         found = Found(math.nan, (f"raised {type(error).__name__}: {error}"[:200],))
     return row(case, found) | {"seconds": perf_counter() - start}
 
 
 def row(case: Case, found: Found) -> dict[str, Any]:
-    """What was found, beside what was expected."""
+    """The table row: the result of a case, with its bound and verdict."""
     return {
         "row": case.name,
         "figure": found.figure,
@@ -112,7 +112,7 @@ def row(case: Case, found: Found) -> dict[str, Any]:
 
 
 def conclusions(rows: Sequence[dict[str, Any]], least: int) -> tuple[list[Target], list[Reference]]:
-    """Targets, and the rows that miss them by name."""
+    """Targets, and the names of the cases that miss them."""
     count = Counter(row["verdict"] for row in rows)
     targets = [
         Target("rows within their bounds", count["within"], ">=", least),

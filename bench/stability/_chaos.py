@@ -1,7 +1,8 @@
-"""Chaos: how long motions hold at a tolerance, against the growth of perturbations along them.
+"""Chaos: how long motions stay accurate at a tolerance, compared with the growth of perturbations.
 
-Eight double pendulums let go at rest from high up. Their errors are judged against tolerance times
-growth up to the horizon, the time at which they reach 1e-2 rad; beyond it motions share nothing.
+Eight double pendulums are released at rest from large angles. Their errors are compared with
+tolerance times growth up to the horizon, the time at which the error reaches 1e-2 rad. Beyond the
+horizon motions are independent of each other.
 """
 
 import warnings
@@ -16,7 +17,7 @@ import jaxlag as jl
 from bench.stability._long_runs import ARMS
 from bench.stability._rows import Found, Rows, names
 
-SPAN, ROWS, COUNT = 22.0, 441, 8
+SPAN, SAVES, COUNT = 22.0, 441, 8
 TOLERANCES = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 LOST = 1e-2  # rad
 
@@ -26,7 +27,7 @@ rows = Rows()
 def solved_to(tolerance: float, method: str) -> jl.Solution:
     """The eight motions."""
     q0 = jnp.asarray(np.random.default_rng(5).uniform(1.8, 2.6, (COUNT, 2)))
-    ts = np.linspace(0.0, SPAN, ROWS)
+    ts = np.linspace(0.0, SPAN, SAVES)
     options: dict[str, Any] = {
         "rtol": tolerance,
         "atol": tolerance,
@@ -38,11 +39,11 @@ def solved_to(tolerance: float, method: str) -> jl.Solution:
 
 
 class Exact(NamedTuple):
-    """What motions are judged by.
+    """The accurate motions for comparison.
 
     Attributes:
-        q: (starts, rows, 2), angles.
-        kappa: (starts, rows), growth of perturbations from anywhere before.
+        q: (starts, saves, 2), angles.
+        kappa: (starts, saves), growth of perturbations from any earlier time.
         exponent: (starts,), largest Lyapunov exponents, 1/s.
         error: (starts,), their standard errors.
         statuses: of all motions.
@@ -57,10 +58,10 @@ class Exact(NamedTuple):
 
 @cache
 def exact() -> Exact:
-    """Motions to round-off, which has grown to 1e-3 rad at the end, and their growth."""
+    """Motions with rounding errors only, which grow to 1e-3 rad at the end, and their growth."""
     motions = solved_to(3e-14, "auto")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the horizon
+        warnings.simplefilter("ignore")  # about the horizon
         growth = jl.lyapunov(motions)
     statuses = names(motions.status) + names(growth.status)
     return Exact(
@@ -73,7 +74,7 @@ def exact() -> Exact:
 
 
 class Held(NamedTuple):
-    """How long motions held, and how well: (tolerances, starts) each."""
+    """Horizons of motions, and errors before them: (tolerances, starts) each."""
 
     horizons: np.ndarray
     errors: np.ndarray
@@ -82,17 +83,17 @@ class Held(NamedTuple):
 
 @cache
 def held(method: str) -> Held:
-    """Horizons, s, and largest errors before them, over tolerance and growth."""
+    """Horizons, s, and largest errors before them, divided by tolerance and growth."""
     true = exact()
-    ts, statuses = np.linspace(0.0, SPAN, ROWS), true.statuses
+    ts, statuses = np.linspace(0.0, SPAN, SAVES), true.statuses
     horizons, errors = [], []
     for tolerance in TOLERANCES:
         motions = solved_to(tolerance, method)
         off = np.abs(np.asarray(motions.q) - true.q)
         lost = np.max(off, -1) > LOST
-        first = np.where(np.any(lost, 1), np.argmax(lost, 1), ROWS - 1)
+        first = np.where(np.any(lost, 1), np.argmax(lost, 1), SAVES - 1)
         over = np.max(off / (tolerance * (1.0 + np.abs(true.q))), -1) / true.kappa
-        before = np.arange(ROWS) < first[:, None]
+        before = np.arange(SAVES) < first[:, None]
         horizons.append(ts[first])
         errors.append(np.max(np.where(before, over, 0.0), 1))
         statuses = statuses + names(motions.status)
@@ -106,23 +107,23 @@ def worst(method: str) -> Found:
     return Found(float(np.max(motions.errors)), motions.statuses, f"median {middle:.2g}")
 
 
-# The error of a step is about its estimate, and so about the tolerance at most; those of a Lyapunov
-# time, ten steps or fewer, may have one sign, those of before have grown by the same kappa.
+# The error of a step is about its estimate, so at most about the tolerance. The errors of a
+# Lyapunov time (ten steps or fewer) may have one sign; earlier errors have grown by the same kappa.
 @rows.row("chaos: errors of order 5 up to the horizon", "error over tolerance and growth", 10.0)
 def fifth_order(quick: bool) -> Found:
     return worst("dopri5")
 
 
-# Steps of order 8 are accepted by an estimate of lower order, ten times their error or more.
+# Steps of order 8 are accepted by an estimate of lower order, at least ten times their error.
 @rows.row("chaos: errors of order 8 up to the horizon", "error over tolerance and growth", 1.0)
 def eighth_order(quick: bool) -> Found:
     return worst("auto")
 
 
-# ln(1e4) / exponent is how much longer motions hold at a tolerance 1e4 times tighter. An exponent
-# of 22 s is off by a quarter, and both horizons by an e-fold of the 9: 30 % of each, 10 % of the
-# mean of 8, and three standard errors of that. A tight tolerance that was missed by a factor of 100
-# would shorten what is gained to a half.
+# With a tolerance 1e4 times tighter, horizons are longer by ln(1e4) / exponent, which is 9 e-folds.
+# An exponent from 22 s has an error of a quarter, both horizons one of an e-fold: 30 % for each
+# motion, 10 % for the mean of 8; the bound is three standard errors of that. If a tight tolerance
+# were missed by a factor of 100, the gain would be half as long.
 @rows.row("chaos: horizons against the Lyapunov exponent", "|mean gain over ln(1e4) / l - 1|", 0.3)
 def horizons(quick: bool) -> Found:
     motions, true = held("auto"), exact()
@@ -131,6 +132,6 @@ def horizons(quick: bool) -> Found:
     mean, error = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(COUNT)
     exponents = f"{np.min(true.exponent):.2f} to {np.max(true.exponent):.2f} 1/s"
     details = f"{mean:.3f} +- {error:.3f}, exponents {exponents}, gains {np.mean(gained):.2f} s"
-    # Exponents that are not sure to be positive tell of no horizon.
+    # Without positive exponents beyond their errors there is no horizon.
     sure = bool(np.all(true.exponent > 3.0 * true.error))
     return Found(abs(float(mean) - 1.0) if sure else np.inf, motions.statuses, details)

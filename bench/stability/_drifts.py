@@ -1,13 +1,12 @@
-"""Energy over a million steps: the drift of methods that keep a structure, with its error.
+"""Energy over a million steps: the drift of structure-preserving methods, with its error.
 
-On a motion that is quasi-periodic, H oscillates about a mean with the frequencies of the motion.
-Its means over the first and the second half of the run are taken with weights that are smooth to
-all orders and vanish with all derivatives at the ends of a half: they converge faster than any
-power of its length, so that of an oscillation of 10^12 roundings less than a ten-thousandth of one
-is left per step. Their difference is drift or round-off. Motions from 20 starts have differences
-of their own, whose spread is the error of their mean. The figure is what the drift may be at most,
-|mean| + 4 standard errors: it is beyond its bound where there is a drift, and where the error is
-too large to tell.
+Along a quasi-periodic motion, H oscillates about a mean with the frequencies of the motion. Its
+means over the first and the second half of the run use smooth weights, which vanish with all
+derivatives at the ends of each half. These means converge faster than any power of the length. An
+oscillation of 10^12 eps therefore changes the drift by less than 1e-4 eps per step. The difference
+of the two means is drift or rounding. The 20 starts have different values; their spread gives the
+standard error of the mean. The figure is an upper limit of the drift, |mean| + 4 standard errors.
+It exceeds its bound if there is a drift, or if the error is too large to exclude one.
 
 Source: Das, Saiki, Sander, Yorke, Nonlinearity 30 (2017) 4111; Hairer, Lubich, Wanner, Geometric
 Numerical Integration, sec. VIII.5, VIII.6.
@@ -28,13 +27,13 @@ rows = Rows()
 
 
 def uneven(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """Henon and Heiles, with frequencies whose ratio is the root of 2 in place of 1."""
+    """Henon and Heiles, with a frequency ratio of sqrt(2) instead of 1."""
     V = 0.5 * q[0] ** 2 + q[1] ** 2 + q[0] ** 2 * q[1] - q[1] ** 3 / 3
     return 0.5 * (v @ v) - V
 
 
 def wire(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """A bead on a parabola: the mass depends on the position, so that L does not separate."""
+    """A bead on a parabola: the mass depends on the position, so that L is not separable."""
     return 0.5 * (1.0 + q[0] ** 2) * v[0] ** 2 - 0.5 * q[0] ** 2
 
 
@@ -54,7 +53,7 @@ BOB = jl.System(bob, ("x", "y", "z"), constraints=(jl.Holonomic(rod, "rod"),))
 
 
 def uneven_starts(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """At 0.02 of the energy of the rim at most, where all is regular."""
+    """Starts with at most 0.02 of the energy of the rim, where all motions are regular."""
     random = np.random.default_rng(1)
     return random.uniform(-0.1, 0.1, (count, 2)), random.uniform(-0.1, 0.1, (count, 2))
 
@@ -67,18 +66,18 @@ def bob_starts(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Thrown sideways."""
     random = np.random.default_rng(3)
     angle, rate = random.uniform(0.6, 1.0, count), random.uniform(0.5, 1.0, count)
-    still = np.zeros(count)
-    q = np.stack([np.sin(angle), still, -np.cos(angle)], 1)
-    return q, np.stack([still, np.sin(angle) * rate, still], 1)
+    zero = np.zeros(count)
+    q = np.stack([np.sin(angle), zero, -np.cos(angle)], 1)
+    return q, np.stack([zero, np.sin(angle) * rate, zero], 1)
 
 
 class Long(NamedTuple):
-    """What is kept of a long run.
+    """The saved quantities of a long run.
 
     Attributes:
-        energy: (starts, rows), change of H over the largest kinetic energy.
-        spin: (starts, rows), change of x v_y - y v_x over its size; of spherical pendulums.
-        every: steps from row to row.
+        energy: (starts, saves), change of H divided by the largest kinetic energy.
+        spin: (starts, saves), relative change of x v_y - y v_x; for spherical pendulums.
+        every: steps between save times.
         statuses: of all motions.
     """
 
@@ -89,7 +88,7 @@ class Long(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What a method is run on."""
+    """The problem that a method solves."""
 
     system: jl.System
     starts: Callable[[int], tuple[np.ndarray, np.ndarray]]
@@ -109,10 +108,10 @@ SETTINGS = {
 
 
 class Length(NamedTuple):
-    """How long runs are, and how many starts there are."""
+    """The length of runs, and the number of starts."""
 
     steps: int
-    half: int  # rows of one half: a second or two apart, a third of a period
+    half: int  # save times of one half: a second or two apart, a third of a period
     starts: int
 
 
@@ -121,7 +120,7 @@ FULL, BRIEF = Length(1_000_000, 25_000, 20), Length(30_000, 1_500, 8)
 
 @cache
 def long_run(method: str, length: Length, dtype: Any = np.float64) -> Long:
-    """Motions whose rows are ends of steps."""
+    """Motions saved at ends of steps."""
     system, starts, dt = SETTINGS[method]
     every = length.steps // (2 * length.half)
     ts = np.arange(2 * length.half + 1) * (every * dt)
@@ -146,7 +145,7 @@ def smooth_mean(values: np.ndarray) -> np.ndarray:
 
 
 def drifts(values: np.ndarray, every: int) -> np.ndarray:
-    """Change per step of each line of `values`, whose rows are `every` steps apart."""
+    """Drift per step of each motion; `values` (starts, saves) are `every` steps apart."""
     half = values.shape[-1] // 2
     first, second = smooth_mean(values[:, :half]), smooth_mean(values[:, half : 2 * half])
     return (second - first) / (half * every)
@@ -155,7 +154,7 @@ def drifts(values: np.ndarray, every: int) -> np.ndarray:
 def drift(
     values: np.ndarray, every: int, statuses: tuple[str, ...], rounding: float = EPS
 ) -> Found:
-    """|mean| + 4 standard errors of the drift, in roundings per step."""
+    """|mean| + 4 standard errors of the drift, in units of `rounding` per step."""
     per_step = drifts(values, every) / rounding
     mean, error = np.mean(per_step), np.std(per_step, ddof=1) / np.sqrt(len(per_step))
     details = f"mean {mean:.2e} +- {error:.1e} eps per step"
@@ -163,30 +162,32 @@ def drift(
 
 
 def walked(roundings: int, length: Length) -> float:
-    """What |mean| + 4 standard errors are at most where there is no drift, eps per step.
+    """Bound on |mean| + 4 standard errors if there is no drift, eps per step.
 
-    A rounding moves one number by half an eps of it at most, 0.29 eps in the mean square, and H by
-    0.6 eps of the largest kinetic energy; `roundings` of them a step add in squares, and steps make
-    a walk. Between the centres of its halves a walk of N steps changes by sigma sqrt(N / 2) at
-    most, per step sigma sqrt(2 / N); the mean of the starts is within 4 standard errors of 0.
+    A rounding error changes a number by at most half an eps of it, 0.29 eps rms, and H by 0.6 eps
+    of the largest kinetic energy. The squares of `roundings` such errors per step add up, and the
+    steps form a random walk. Between the centers of its halves a walk of N steps changes by at
+    most sigma sqrt(N / 2), per step sigma sqrt(2 / N). The mean of the starts is within 4 standard
+    errors of 0.
     """
     return 8.0 * 0.6 * float(np.sqrt(roundings * 2.0 / (length.steps * length.starts)))
 
 
-# Roundings of a step. Splitting: s kicks, s + 1 drifts. Gauss: those of q, p and v at its end and
-# of p at its start, each twice for what is left of the stages. Under constraints three coordinates,
-# and the impulse.
+# Rounding errors per step. Splitting: s kicks, s + 1 drifts. Gauss: those of q, p and v at the end
+# and of p at the start, doubled for the residuals of the stages. With constraints: three
+# coordinates, and the constraint impulse.
 ROUNDINGS = {
     **{f"splitting{order}": 2 * kicks + 1 for order, kicks in ((2, 1), (4, 6), (6, 11), (8, 17))},
     **dict.fromkeys(("gauss2", "gauss4", "gauss6", "gauss8"), 8),
     **dict.fromkeys(("variational2", "variational4"), 24),
 }
 
-# What may be systematic. Coefficients are rounded: b_i a_ij + b_j a_ji - b_i b_j, which should
-# vanish, adds up to 0.9 eps (4 stages) and changes H by (h w)^2 of that over v^2 / 2: 0.02 eps.
-# The end of a step misses the rod by a rounding of |q|^2, whose mean may be eps / 8, as numbers
-# below 1 are twice as dense as those above: eps / 16 of the length. The next step makes up for it
-# along the rod as it was, and leaves w times that in v, at most eps / 8 in v^2 / 2.
+# Systematic errors. Coefficients are rounded: b_i a_ij + b_j a_ji - b_i b_j, which should vanish,
+# adds up to 0.9 eps (4 stages). It changes H by (h w)^2 of that relative to v^2 / 2: 0.02 eps.
+# The end of a step violates the constraint of the rod by a rounding error of |q|^2. Its mean may be
+# eps / 8, because numbers below 1 are twice as dense as those above: eps / 16 of the length. The
+# next step corrects it along the previous direction of the rod. This leaves w times the error in v,
+# at most eps / 8 in v^2 / 2.
 SYSTEMATIC = {"splitting": 0.0, "gauss": 0.02, "variational": 0.125}
 
 
@@ -211,8 +212,8 @@ for _method in SETTINGS:
     _add_drift(_method)
 
 
-# As with the energy: gravity and the rod have no moment about the vertical, so that what is left
-# are the same roundings, of x v_y and y v_x, and the same leak along the rod.
+# As for the energy: gravity and the rod have no moment about the vertical. So there are only the
+# same rounding errors, of x v_y and y v_x, and the same systematic error along the rod.
 def _add_spin(method: str) -> None:
     name = f"angular momentum of spherical pendulums, {method}"
 

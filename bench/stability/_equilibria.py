@@ -1,8 +1,9 @@
-"""Random closed linkages at rest: what `equilibrium` finds from any place on their constraints.
+"""Random closed linkages at rest: `equilibrium` from random configurations on their constraints.
 
-Link lengths that close, masses over two decades, springs or none, from a random configuration:
-every one of them has a stable rest. One is wrong where the status is ok and its forces do not
-balance along the constraints, or these are open; both are computed anew from V and phi alone.
+The linkages have lengths that can be closed, masses over two decades, and springs or none. Each of
+them has a stable state of rest. A result counts as wrong if the status is ok but the forces are not
+balanced along the constraints, or the constraints are violated. Both are computed independently
+from V and phi.
 """
 
 from collections.abc import Callable
@@ -17,14 +18,14 @@ import jaxlag as jl
 from bench.stability._rows import Found, Rows, names
 
 COUNT, QUICK_COUNT = 200, 20
-ROUNDING = 1e-9  # of the largest force, and of lengths in m; the worst that was found is 3e-11
+ROUNDING = 1e-9  # of the largest force, and of lengths in m; the worst observed is 3e-11
 GRAVITY = 9.81
 
 rows = Rows()
 
 
 class Linkage(NamedTuple):
-    """Params and the start, of one linkage or of many with a first axis."""
+    """Params and the start of one linkage, or of many along a first axis."""
 
     params: dict[str, Any]
     q0: Any
@@ -36,7 +37,7 @@ Draw = Callable[[np.random.Generator], Linkage]
 
 
 def row(name: str, size: int, potential: Potential, residual: Residual, draw: Draw) -> None:
-    """A row of linkages with this many coordinates."""
+    """Add a case of linkages with `size` coordinates."""
     system = jl.System(
         coordinates=tuple(f"q{i}" for i in range(size)),
         kinetic=lambda t, q, v, params: 0.5 * v @ v,
@@ -45,7 +46,7 @@ def row(name: str, size: int, potential: Potential, residual: Residual, draw: Dr
     )
 
     def one(linkage: Linkage) -> tuple[Array, Array]:
-        """(status, what is left of forces along the constraints and of these)."""
+        """(status, larger of the force residual along the constraints and the constraint error)."""
         params, q0 = linkage
         rest = jl.equilibrium(system, q0, params, throw=False)
         F = jax.grad(potential, argnums=1)(0.0, rest.q, params)
@@ -80,7 +81,7 @@ def tips(q: Array, params: Any) -> Array:
 
 
 def chain_potential(t: Any, q: Array, params: Any) -> Array:
-    """Weights at fractions f of the links, springs from their tips to fixed points."""
+    """Weights at fractions f of the links, springs from their tips to fixed points: V."""
     ends = tips(q, params)
     links = params["l"][:, None] * direction(q)
     y = (ends - (1.0 - params["f"][:, None]) * links)[:, 1]
@@ -94,13 +95,13 @@ def chain_open(t: Any, q: Array, params: Any) -> Array:
 
 
 def chain_doubled(t: Any, q: Array, params: Any) -> Array:
-    """The same, and again in other words: of rank 2 where it holds, of more beside that."""
+    """The same rows and two dependent ones: rank 2 on the constraints, higher rank elsewhere."""
     x, y = chain_open(t, q, params)
     return jnp.stack([x, y, 2.0 * x + y, x * (1.0 + q[0] ** 2)])
 
 
 def dyad(rng: np.random.Generator, to: Any, l1: float, l2: float) -> tuple[float, float] | None:
-    """Angles of two links that reach there, one of two choices; None where they do not."""
+    """Angles of two links that reach `to`, one of two solutions; None if they cannot."""
     d = np.hypot(*to)
     if not abs(l1 - l2) < d < l1 + l2:
         return None
@@ -135,7 +136,7 @@ row("five-bars with springs", 4, chain_potential, chain_open, chain(4))
 row("hanging chains of 8 links", 8, chain_potential, chain_open, chain(8, springs=False))
 
 
-# ---- The same by the points between the links --------------------------------------------------
+# ---- The same by the Cartesian coordinates of the points between the links ---------------------
 
 
 def points_potential(t: Any, q: Array, params: Any) -> Array:
@@ -202,7 +203,7 @@ row("slider-cranks", 3, slider_potential, slider_open, slider)
 def joints(q: Array, params: Any) -> tuple[Array, Array, Array]:
     """Joints of the four-bar, the point on its coupler, joints of the dyad."""
     loop = tips(q[:3], params | {"l": params["l"][:3]})
-    at = loop[0] + params["arm"] * direction(q[1] + params["turn"])
+    at = loop[0] + params["arm"] * direction(q[1] + params["bend"])
     return loop, at, at + tips(q[3:], params | {"l": params["l"][3:]})
 
 
@@ -221,11 +222,11 @@ def six_potential(t: Any, q: Array, params: Any) -> Array:
 def six(rng: np.random.Generator) -> Linkage:
     four, q = chain(3)(rng)
     lengths = np.append(four["l"], rng.uniform(0.3, 1.5, 2))
-    arm, (turn, d, e) = rng.uniform(0.2, 1.0), rng.uniform(-np.pi, np.pi, 3)
-    at = lengths[0] * direction(q[0], np) + arm * direction(q[1] + turn, np)
+    arm, (bend, d, e) = rng.uniform(0.2, 1.0), rng.uniform(-np.pi, np.pi, 3)
+    at = lengths[0] * direction(q[0], np) + arm * direction(q[1] + bend, np)
     h = at + lengths[3:] @ direction(np.array([d, e]), np)
     k = rng.uniform(0, 1) * rng.choice([0, 10.0, 100.0])
-    params = {"l": lengths, "arm": arm, "turn": turn, "g": four["g"], "h": h, "k": k}
+    params = {"l": lengths, "arm": arm, "bend": bend, "g": four["g"], "h": h, "k": k}
     params |= {"m": 10 ** rng.uniform(-1, 1, 4), "anchor": rng.uniform(-2, 2, 2)}
     return Linkage(params, np.array([*q, d, e]))
 

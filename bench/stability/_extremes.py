@@ -1,4 +1,4 @@
-"""Extremes of time, tolerance and numbers, and what cannot be integrated."""
+"""Extremes of time, tolerance and numbers, and problems that cannot be integrated."""
 
 from typing import Any
 
@@ -21,9 +21,9 @@ rows = Rows()
 
 
 def driven(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """An oscillator pushed by cos(w (t - t0))."""
-    push = jnp.cos(params["w"] * (t - params["t0"]))
-    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2 + push * q[0]
+    """An oscillator driven by the force cos(w (t - t0))."""
+    force = jnp.cos(params["w"] * (t - params["t0"]))
+    return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2 + force * q[0]
 
 
 DRIVEN = jl.System(driven, ("x",))
@@ -34,9 +34,9 @@ def response(w: Any, t: Any) -> Any:
     return jnp.cos(t) + (jnp.cos(w * t) - jnp.cos(t)) / (1.0 - w**2)
 
 
-# Times are multiples of 1.2e-7 s, so that the push is rounded by up to 8e-8 of it. What a step of h
-# sees of that, 8e-8 h, is held to 1e-9: steps of 1/80 s. 400 of them add in squares to 2e-8, and
-# as much again for 1e-9 a step by itself.
+# Times are multiples of 1.2e-7 s, so the force has rounding errors of up to 8e-8 of its size. Its
+# effect on a step of length h, 8e-8 h, is limited to 1e-9: steps of 1/80 s. The squares of 400
+# steps add up to 2e-8, and the same again for the tolerance of 1e-9 per step.
 @rows.row("t0 = 1e9 s, pushed", "error of x, m", 4e-8)
 def late(quick: bool) -> Found:
     t0, w, span = 1e9, 1.3, np.array([0.0, 5.0])
@@ -50,7 +50,7 @@ def short(quick: bool) -> Found:
     return difference(motion, [1.0 + 0.3e-12, 0.5 - 0.2e-12])
 
 
-# Round-off of some thousand steps instead of the tolerance.
+# Rounding errors of some thousand steps instead of the tolerance.
 @rows.row("tolerance 1e-14", "error of q", 1e-11)
 def finest(quick: bool) -> Found:
     q0, v0, t = np.array([0.9, 0.0]), np.array([0.0, np.sqrt(1.1 / 0.9)]), np.array([0.0, 20.0])
@@ -82,11 +82,11 @@ def jumps(quick: bool) -> Found:
 
 
 def tied(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """On a spring of no natural length."""
+    """A mass on a spring of zero natural length."""
     return 0.5 * (v @ v) - jl.energy.spring(params["k"], q)
 
 
-# 1e-9 a step over some dozen steps.
+# 1e-9 per step over some dozen steps.
 @rows.row("a start at zero length", "error of q, m", 1e-7)
 def zero_length(quick: bool) -> Found:
     motion = run(jl.System(tied, ("x", "y")), [0.0, 0.0], [0.3, 0.4], [0.0, 5.0], {"k": 1.0})
@@ -120,7 +120,7 @@ def hardest(quick: bool) -> Found:
     return difference(motion, [np.cos(5.0)])
 
 
-# ---- What cannot be integrated -----------------------------------------------------------------
+# ---- Problems that cannot be integrated --------------------------------------------------------
 
 
 @rows.row("a force that becomes nan", "-", 0.0, ("nonfinite", "step_below_resolution"))
@@ -142,7 +142,7 @@ def unsolved(quick: bool) -> Found:
 
 @rows.row("steps far too long for a stiff spring", "-", 0.0, ("nonfinite", "max_steps"))
 def unstable(quick: bool) -> Found:
-    """An explicit method with fixed steps of 10 times its limit of stability."""
+    """An explicit method with fixed steps of 10 times its stability limit."""
     options: dict[str, Any] = {"method": diffrax.Tsit5(), "dt": 0.03, "max_steps": 10_000}
     return must_end(run(SPRING, [1.0], [0.0], [0.0, 100.0], {"m": 1.0, "k": 1e6}, **options))
 

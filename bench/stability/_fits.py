@@ -1,4 +1,4 @@
-"""Fits that determine little, or numbers far apart, by `jl.fit` and by a solver of optimistix."""
+"""Fits with little information or params of different size, by `jl.fit` and by optimistix."""
 
 import warnings
 from typing import Any
@@ -27,23 +27,23 @@ def measured(x: Any, sigma: float) -> jl.Experiment:
 
 
 def searched(system: jl.System, data: jl.Experiment, guess: dict[str, float]) -> jl.FitResult:
-    """All params free."""
+    """A fit with all params free."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a search that stopped short: the row says so
+        warnings.simplefilter("ignore")  # about a search that stopped early: the status shows it
         return jl.fit(
             system, data, guess, free=tuple(guess), simulate_options={"rtol": 1e-12, "atol": 1e-12}
         )
 
 
 def ending(found: jl.FitResult) -> tuple[str, ...]:
-    """As a status."""
+    """The end of a fit as a status."""
     if found.failed:
         return ("segments failed",)
     return ("ok" if found.converged and found.distance < 0.3 else "not converged",)
 
 
 def ratio(scale: float) -> Found:
-    """k / m of a spring, whose motion determines no more, and whether the result says that."""
+    """k / m of a spring, the only quantity that the motion determines; the result must name it."""
     guess = {"m": 0.7 * scale, "k": 1.3 * scale}
     found = searched(SPRING, measured(np.cos(TIMES), 1e-6), guess)
     named = found.determined in (("k/m",), ("m/k",)) and np.all(np.isinf(list(found.std.values())))
@@ -52,7 +52,7 @@ def ratio(scale: float) -> Found:
     return Found(abs(value - 1.0), statuses, f"determined {found.determined}")
 
 
-# Positions are exact to some 1e-12, and so is the frequency that they determine.
+# Positions are exact to some 1e-12, and so is the frequency determined from them.
 @rows.row("jl.fit: k / m alone", "error of k / m", 1e-11)
 def fit_ratio(quick: bool) -> Found:
     return ratio(1.0)
@@ -75,15 +75,15 @@ def soft_motion() -> np.ndarray:
     return np.asarray(run(SOFT, [1.0], [0.0], TIMES, {"k": 1.0, "c": 1.0}, **TIGHT)["x"])
 
 
-# The frequency changes by 3/8e-6 of c, apart from what k does by 1e-6 / 16: 1e-12 of the positions
-# are 1e-5 of c.
+# c changes the frequency by 3/8e-6. Its effect differs from that of k by 1e-6 / 16 only. So errors
+# of 1e-12 in the positions are errors of 1e-5 in c.
 @rows.row("jl.fit: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
 def fit_weak(quick: bool) -> Found:
     found = searched(SOFT, measured(soft_motion(), 1e-9), {"k": 0.8, "c": 3.0})
     return Found(abs(float(found.params["c"]) - 1.0), ending(found), f"std {found.std['c']:.2g}")
 
 
-# A normal distribution: beyond 4 once in 16 000 times.
+# A normal distribution exceeds 4 standard deviations once in 16 000 times.
 @rows.row("jl.fit: the same with noise of 1e-8", "error over its standard deviation", 4.0)
 def fit_noisy(quick: bool) -> Found:
     noise = 1e-8 * np.random.default_rng(4).normal(size=len(TIMES))
@@ -93,11 +93,11 @@ def fit_noisy(quick: bool) -> Found:
 
 
 def heavy(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """1e9 kg on a spring, with a pull of that weight."""
+    """1e9 kg on a spring, under gravity g."""
     return 0.5e9 * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2 + 1e9 * params["g"] * q[0]
 
 
-# Positions are exact to some 1e-12; both params change them by their own size.
+# Positions are exact to some 1e-12; relative changes of both params change them by as much.
 @rows.row("jl.fit: parameters 1e9 apart in size", "largest relative error", 1e-11)
 def fit_apart(quick: bool) -> Found:
     system, true = jl.System(heavy, ("x",)), {"k": 2e9, "g": 0.5}
@@ -111,9 +111,9 @@ def fit_apart(quick: bool) -> Found:
 
 
 def fitted(scale: Array, least: float) -> tuple[Array, bool]:
-    """(m, k) of a spring from 40 exact positions, by Levenberg and Marquardt from half as much.
+    """(m, k) of a spring from 40 exact positions, by Levenberg-Marquardt from wrong values.
 
-    The motion determines k / m alone: the normal equations are singular in every turn.
+    The motion determines k / m only: the normal equations are singular in every iteration.
     """
     ts = jnp.asarray(TIMES)
 
@@ -127,7 +127,7 @@ def fitted(scale: Array, least: float) -> tuple[Array, bool]:
     return jnp.exp(found.value) * scale, bool(found.result == optimistix.RESULTS.successful)
 
 
-# Positions are exact to some 1e-12, and so is the frequency that they determine.
+# Positions are exact to some 1e-12, and so is the frequency determined from them.
 @rows.row("optimistix: k / m alone", "error of k / m", 1e-11)
 def ratio_alone(quick: bool) -> Found:
     (m, k), ended = fitted(jnp.ones(2), 1e-12)
@@ -143,7 +143,7 @@ def heavy_ratio(quick: bool) -> Found:
 # As with jl.fit.
 @rows.row("optimistix: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
 def weak_parameter(quick: bool) -> Found:
-    """Stiffness and cubic stiffness 1e-6 of a soft oscillation."""
+    """Stiffness and cubic stiffness, which is 1e-6 times as large."""
 
     def positions(p: Any) -> Array:
         return run(SOFT, [1.0], [0.0], TIMES, {"k": p[0], "c": p[1]}, **TIGHT).q[1:, 0]

@@ -1,6 +1,6 @@
-"""Gradients of the rows of `stability`, with the statuses of the motions that they go through.
+"""Gradients for the cases of `stability`, with the statuses of their motions.
 
-Expected derivatives are closed forms, or the imaginary part of a motion written by hand.
+Expected derivatives are closed forms, or complex-step derivatives of equations written by hand.
 """
 
 from collections.abc import Callable
@@ -39,14 +39,14 @@ def forward(last: Motion, x: Any, along: Any) -> tuple[np.ndarray, tuple[str, ..
 
 
 def off(slope: Any, expected: Any, statuses: tuple[str, ...]) -> Found:
-    """The largest difference, over 1 or the largest number expected."""
+    """The largest difference, divided by 1 + the largest expected number."""
     slope, expected = np.asarray(slope), np.asarray(expected)
     size = 1.0 + float(np.max(np.abs(expected)))
     return Found(float(np.max(np.abs(slope - expected))) / size, statuses, f"size {size:.3g}")
 
 
 def against_differences(last: Motion, x: float, h: float) -> Found:
-    """A reverse derivative against an extrapolated central difference."""
+    """A reverse derivative compared with an extrapolated central difference."""
 
     def central(h: float) -> float:
         return float(last(x + h)[0] - last(x - h)[0]) / (2 * h)
@@ -58,8 +58,9 @@ def against_differences(last: Motion, x: float, h: float) -> Found:
 # ---- Unstable, unequal, stiff ------------------------------------------------------------------
 
 
-# At a pericentre v is 14, its derivative by e 700: a tenth of 1e-12 of it a step moves that of the
-# energy, v dv, by 1e-9, and that of the phase by 3/2 t = 100 times that, ten times in squares.
+# At a pericenter v is 14 and its derivative by e is 700. An error of a tenth of 1e-12 of it per
+# step changes the derivative of the energy, v dv, by 1e-9, and that of the phase by 3/2 t = 100
+# times as much. The squares of ten such errors add up.
 @rows.row("gradient of Kepler, e = 0.99", "relative error", 5e-7)
 def eccentric(quick: bool) -> Found:
     e0, t = 0.99, (2 if quick else 10) * 2 * np.pi + 2.0
@@ -81,7 +82,7 @@ def eccentric(quick: bool) -> Found:
 
 
 def unequal(t: float, mass: float, **options: Any) -> Found:
-    """By the start of the lower bob."""
+    """Derivative by the initial angle of the lower bob."""
 
     def last(q0: Any) -> tuple[Array, jl.Solution]:
         motion = run(UNEQUAL, q0, [0.0, 0.0], [0.0, t], {"m": mass}, **options)
@@ -92,29 +93,30 @@ def unequal(t: float, mass: float, **options: Any) -> Found:
     return off(slope, double_pendulum(start, t, mass, along)[1], statuses)
 
 
-# A tenth of 1e-12 a step, 100 steps in squares, grown by 110: the state is off by 1e-10, and its
-# derivative by about as much of its size.
+# A tenth of 1e-12 per step, squares of 100 steps added, growth 110: the error of the state is
+# 1e-10, and the relative error of its derivative is about the same.
 @rows.row("gradient of masses 1 : 1e-8", "relative error", 2e-10)
 def light_end(quick: bool) -> Found:
     return unequal(5.0, 1e-8, **TIGHT)
 
 
-# A tenth of 1e-9 a step, 20 steps in squares, grown by 5: 2e-9. Rates double within 1e-2 rad of
-# where the rods are straight, and so do derivatives: a hundred times that.
+# A tenth of 1e-9 per step, squares of 20 steps added, growth 5: 2e-9. Within 1e-2 rad of the
+# straight position rates double, and so do derivatives: a hundred times that.
 @rows.row("gradient of masses 1 : 1e8, rods not yet straight", "relative error", 2e-7)
 def heavy_end(quick: bool) -> Found:
     return unequal(0.13, 1e8)
 
 
-# The light bob is thrown through the straight line in 1e-4 s. A tenth of 1e-9 is what q is off by,
-# its first derivative by 1e4, its second by 1e8 times that.
+# The light bob passes the straight line in 1e-4 s. The error of q is a tenth of 1e-9, that of its
+# first derivative 1e4 times that, that of its second 1e8 times that.
 @rows.row("gradient of masses 1 : 1e8, past the straight line", "relative error", 1e-2)
 def thrown(quick: bool) -> Found:
     return unequal(0.14, 1e8)
 
 
-# Of cos(w t) by ln k: -w t / 2 sin(w t), 3000 for the stiff one. What the phase is off by in a
-# thousand turns, 1e-5, and its derivative by ln k, half of that times w t.
+# The derivative of cos(w t) by ln k is -w t / 2 sin(w t), 3000 for the stiff spring. The error of
+# the phase after a thousand periods is 1e-5, that of its derivative by ln k is half of that times w
+# t.
 @rows.row("gradient of springs over 12 decades", "relative error", 1e-5)
 def decades(quick: bool) -> Found:
     k, t = np.array([1e-6, 1.0, 1e6]), 6.0
@@ -131,11 +133,11 @@ def decades(quick: bool) -> Found:
     return off(slope / (1.0 + np.abs(expected)), expected / (1.0 + np.abs(expected)), statuses)
 
 
-# ---- Places where coordinates say nothing ------------------------------------------------------
+# ---- Singular coordinates ----------------------------------------------------------------------
 
 
 def turning(system: jl.System, start: Any, rates: Any, map_: Any) -> Found:
-    """Of the attitude of a ball by its second rate: derivative of the matrix exponential."""
+    """Derivative of a ball's attitude by its second rate: that of the matrix exponential."""
     t = 2.0
 
     def last(w: Any) -> tuple[Array, jl.Solution]:
@@ -154,21 +156,21 @@ def turning(system: jl.System, start: Any, rates: Any, map_: Any) -> Found:
     return off(slope, expected, statuses)
 
 
-# The angles turn by pi within 1e-3 s: rates of 1e3 rad/s, their derivatives 1e6, errors a tenth of
-# 1e-11.
+# The angles change by pi within 1e-3 s: rates of 1e3 rad/s, derivatives of the rates 1e6, errors a
+# tenth of 1e-11.
 @rows.row("gradient past gimbal lock by 1e-3 rad, angles", "error of dR", 1e-6)
 def past_lock(quick: bool) -> Found:
     return turning(ANGLES, [0.0] * 3, np.array([1e-3, 1.0, 1e-3]), jl.rotation.yaw_pitch_roll)
 
 
-# 1e-11 a step over some dozen steps.
+# 1e-11 per step over some dozen steps.
 @rows.row("gradient through gimbal lock, quaternions", "error of dR", 1e-9)
 def quaternions(quick: bool) -> Found:
-    still = [1.0, 0.0, 0.0, 0.0]
-    return turning(QUATERNION, still, np.array([0.0, 1.0, 0.0]), jl.rotation.quaternion)
+    identity = [1.0, 0.0, 0.0, 0.0]
+    return turning(QUATERNION, identity, np.array([0.0, 1.0, 0.0]), jl.rotation.quaternion)
 
 
-# h^4 and 1e-12 / h: 1e-8 each.
+# Errors of the difference, h^4 and 1e-12 / h: 1e-8 each.
 @rows.row("gradient through the pole, Cartesian", "relative error", 1e-6)
 def pole(quick: bool) -> Found:
     entry = spherical_pendulum_cartesian.entry
@@ -185,10 +187,10 @@ def pole(quick: bool) -> Found:
 # ---- Constraints -------------------------------------------------------------------------------
 
 
-# 1e-9 a step over some dozen steps that grow by 5, and their derivatives as much again.
+# 1e-9 per step over some dozen steps, growth 5, and the same again for the derivatives.
 @rows.row("gradient of a straight chain, Cartesian", "relative error", 1e-6)
 def taut(quick: bool) -> Found:
-    """The lower bob of a horizontal chain by the angle that both links are let go from."""
+    """Derivative of the lower bob of a horizontal chain by the initial angle of both links."""
     t = 1.0
 
     def last(angle: Any) -> tuple[Array, jl.Solution]:
@@ -220,7 +222,8 @@ def twice(quick: bool) -> Found:
 # ---- Time, numbers, rest -----------------------------------------------------------------------
 
 
-# Of the push by w: rounded by 6e-8 (1 + w t) in place of the push's 8e-8, 6 times as much.
+# The derivative of the force by w has rounding errors of 6e-8 (1 + w t) instead of the force's
+# 8e-8: 6 times as much.
 @rows.row("gradient at t0 = 1e9 s", "relative error", 2.4e-7)
 def late(quick: bool) -> Found:
     t0, w0, t = 1e9, 1.3, 5.0
@@ -236,7 +239,7 @@ def late(quick: bool) -> Found:
 # Parabolas between knots: every step is exact.
 @rows.row("gradient of a force that jumps", "relative error", 100 * EPS)
 def jumps(quick: bool) -> Found:
-    """x(1) by when it jumps, and by its values."""
+    """Derivative of x(1) by the times of the jumps, and by the values of the force."""
     knots, f = np.array([0.0, 0.3, 0.7, 1.0]), np.array([1.0, -2.0, 3.0, 0.0])
 
     def last(table: Any) -> tuple[Array, jl.Solution]:
@@ -252,7 +255,7 @@ def jumps(quick: bool) -> Found:
     return off(slope, np.concatenate([when, what]), statuses)
 
 
-# By k: -(x t^2 / 2 + v t^3 / 6); by m: 0. Polynomials of the third degree: every step is exact.
+# By k: -(x t^2 / 2 + v t^3 / 6); by m: 0. Polynomials of degree 3: every step is exact.
 @rows.row("gradient at stiffness 0", "relative error", 100 * EPS)
 def no_spring(quick: bool) -> Found:
     def last(params: Any) -> tuple[Array, jl.Solution]:
@@ -263,7 +266,7 @@ def no_spring(quick: bool) -> Found:
     return off([slope["k"], slope["m"]], [-13.5, 0.0], statuses)
 
 
-# 1e-9 a step over some dozen steps, times t / 2.
+# 1e-9 per step over some dozen steps, times t / 2.
 @rows.row("gradient at mass and stiffness 1e12", "relative error", 1e-7)
 def huge(quick: bool) -> Found:
     t = 5.0
@@ -279,7 +282,7 @@ def huge(quick: bool) -> Found:
     return off([slope["m"], slope["k"]], [expected, -expected], statuses)
 
 
-# The linear motion about the lowest position, where nothing moves: 1e-9 a step, dozens of steps.
+# The linearized motion about the lowest position, at rest: 1e-9 per step, dozens of steps.
 @rows.row("gradient of a double pendulum at rest", "relative error", 1e-7)
 def hanging(quick: bool) -> Found:
     t = 5.0
@@ -324,8 +327,8 @@ def zero_length(quick: bool) -> Found:
 # ---- Chaos -------------------------------------------------------------------------------------
 
 
-# A tenth of 1e-12 a step, 700 steps in squares, grown by 7000: the state is off by 2e-8, and its
-# derivative by about as much of its size.
+# A tenth of 1e-12 per step, squares of 700 steps added, growth 7000: the error of the state is
+# 2e-8, and the relative error of its derivative is about the same.
 @rows.row("gradient of chaos", "relative error", 2e-8)
 def chaos(quick: bool) -> Found:
     t, along = 10.0, (1.0, 0.0)

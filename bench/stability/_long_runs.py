@@ -1,7 +1,7 @@
-"""Round-off of the methods that keep a structure: how it wanders, momenta, reversal.
+"""Rounding errors of structure-preserving methods: random walks, momenta, reversal.
 
-Round-off that is not systematic walks: energy with the square root of time, the phase of an orbit
-with the power 3/2 (Brouwer's law).
+Rounding errors that are not systematic make a random walk. The error of the energy grows with the
+square root of time, that of the phase of an orbit with the power 3/2 (Brouwer's law).
 
 Source: Hairer, Lubich, Wanner, Geometric Numerical Integration, sec. VIII.5, IX.3.
 """
@@ -38,7 +38,7 @@ def arms(t: Any, q: Array, v: Array, params: Any) -> Array:
 
 
 def bobs(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """The same as free points."""
+    """The same bobs as free points."""
     return 0.5 * (v @ v) - 9.81 * (q[1] + q[3])
 
 
@@ -59,29 +59,29 @@ BOBS = jl.System(
 )
 
 
-def well_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Inside the well, whose rim is at 1/6."""
+def well_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Starts inside the well; its rim has the energy 1/6."""
     random = np.random.default_rng(1)
-    q = random.uniform(-0.25, 0.25, (count, 2)) + apart
+    q = random.uniform(-0.25, 0.25, (count, 2)) + offset
     return q, random.uniform(-0.2, 0.2, (count, 2))
 
 
-def small_arm_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Regular motions about the lowest position."""
+def small_arm_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Starts of regular motions about the lowest position."""
     random = np.random.default_rng(2)
-    return random.uniform(-0.3, 0.3, (count, 2)) + apart, np.zeros((count, 2))
+    return random.uniform(-0.3, 0.3, (count, 2)) + offset, np.zeros((count, 2))
 
 
-def bob_starts(count: int, apart: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """The same of free points."""
-    q, _ = small_arm_starts(count, apart)
+def bob_starts(count: int, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """The same starts of free points."""
+    q, _ = small_arm_starts(count, offset)
     first = np.stack([np.sin(q[:, 0]), -np.cos(q[:, 0])], 1)
     second = np.stack([np.sin(q[:, 1]), -np.cos(q[:, 1])], 1)
     return np.concatenate([first, first + second], 1), np.zeros((count, 4))
 
 
 def solved(system: jl.System, starts: Any, ts: np.ndarray, method: str, dt: float) -> jl.Solution:
-    """All motions at once."""
+    """All motions in one batch."""
     most = int(abs(ts[-1] - ts[0]) / dt) + 8 * len(ts)
     solve = jax.jit(
         jax.vmap(
@@ -94,11 +94,11 @@ def solved(system: jl.System, starts: Any, ts: np.ndarray, method: str, dt: floa
 
 
 def kepler_starts(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(q0, v0, eccentricities) at the pericentre, semi-major axis 1, turned by chance."""
+    """(q0, v0, eccentricities) at the pericenter, semi-major axis 1, in random directions."""
     random = np.random.default_rng(3)
-    e, turn = random.uniform(0.05, 0.15, count), random.uniform(0, 2 * np.pi, count)
-    along = np.stack([np.cos(turn), np.sin(turn)], 1)
-    across = np.stack([-np.sin(turn), np.cos(turn)], 1)
+    e, angle = random.uniform(0.05, 0.15, count), random.uniform(0, 2 * np.pi, count)
+    along = np.stack([np.cos(angle), np.sin(angle)], 1)
+    across = np.stack([-np.sin(angle), np.cos(angle)], 1)
     return (1 - e)[:, None] * along, np.sqrt((1 + e) / (1 - e))[:, None] * across, e
 
 
@@ -115,12 +115,12 @@ def kepler(q0: np.ndarray, v0: np.ndarray, e: np.ndarray, t: np.ndarray) -> np.n
 
 
 class Wandering(NamedTuple):
-    """Errors of orbits at numbers of steps that grow by equal factors: (starts, numbers) each.
+    """Errors of orbits after numbers of steps in geometric progression: (starts, numbers) each.
 
     Attributes:
-        steps: their numbers.
+        steps: the numbers of steps.
         energy: change of H.
-        phase: how far q is behind along v, s.
+        phase: time error of q along the orbit, s.
         spin: change of the angular momentum.
         statuses: of all motions.
     """
@@ -132,10 +132,11 @@ class Wandering(NamedTuple):
     statuses: tuple[str, ...]
 
 
-# (steps of a turn, steps, rows at whole turns). Truncation is below round-off: with 17 stages of
-# order 8 from 400 steps a turn on, with Gauss's 4 stages, whose constant is 1e-9, from 100 on. That
-# of order 4 would be with 10^5 steps a turn; the energy comes back to what it was at whole turns,
-# the phase does not: its exponent is the 1 of a period that is wrong.
+# (steps per revolution, steps, whether to save at whole revolutions only). The truncation error is
+# below rounding: with 17 stages of order 8 from 400 steps per revolution on, with Gauss's 4 stages,
+# whose error constant is 1e-9, from 100 on. Order 4 would need 10^5 steps per revolution. Its
+# energy error vanishes at whole revolutions. Its phase error does not: it grows with the exponent 1
+# of a wrong period.
 ORBITS = {
     "splitting8": (400, LONG, False),
     "gauss8": (120, 150_000, False),
@@ -146,24 +147,24 @@ QUICK_ORBITS = 30_000
 
 @cache
 def wandering(method: str, quick: bool) -> Wandering:
-    """Orbits with steps too short to see."""
-    turn, steps, whole = ORBITS[method]
+    """Orbits with steps so short that only rounding errors remain."""
+    per_revolution, steps, whole = ORBITS[method]
     steps, count = (QUICK_ORBITS, 32) if quick else (steps, 128)
-    part = turn if whole else 1
-    rows = np.unique((np.geomspace(steps / 100, steps, 15) / part).round()).astype(int) * part
+    part = per_revolution if whole else 1
+    saves = np.unique((np.geomspace(steps / 100, steps, 15) / part).round()).astype(int) * part
     q0, v0, e = kepler_starts(count)
-    dt = 2 * np.pi / turn
-    ts = np.concatenate([[0.0], rows * dt])
+    dt = 2 * np.pi / per_revolution
+    ts = np.concatenate([[0.0], saves * dt])
     motions = solved(ORBIT, (q0, v0), ts, method, dt)
     energy, q, v = (np.asarray(x) for x in (motions.energy, motions.q, motions.v))
     behind = np.sum((q - kepler(q0, v0, e, ts)) * v, -1) / np.sum(v**2, -1)
     spin = q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0]
     energy, behind, spin = ((x - x[:, :1])[:, 1:] for x in (energy, behind, spin))
-    return Wandering(rows, energy, behind, spin, names(motions.status))
+    return Wandering(saves, energy, behind, spin, names(motions.status))
 
 
 def power(method: str, quick: bool, what: str, expected: float) -> Found:
-    """How far the power of time, with which the mean square of an error wanders, is off."""
+    """Difference from the expected power of time with which the rms of an error grows."""
     motions = wandering(method, quick)
     size = np.sqrt(np.mean(getattr(motions, what) ** 2, axis=0))
     exponent = float(np.polyfit(np.log(motions.steps), np.log(size), 1)[0])
@@ -171,8 +172,8 @@ def power(method: str, quick: bool, what: str, expected: float) -> Found:
     return Found(abs(exponent - expected), motions.statuses, details)
 
 
-# The size of 128 walks is known to 1 / sqrt(256), 6 %, at each of 15 numbers of steps over two
-# decades that share most of their past: the exponent to some 0.03.
+# The rms of 128 walks is known to 1 / sqrt(256), 6 %, at each of 15 numbers of steps over two
+# decades. These share most of their steps, so the exponent is known to some 0.03.
 def _add_power(method: str, what: str, expected: float) -> None:
     @rows.row(f"Brouwer's law: {what}, {method}", f"|exponent - {expected}|", 0.1)
     def run(quick: bool) -> Found:
@@ -190,17 +191,18 @@ for _method, _what, _expected in (
 
 
 def spin_walk(method: str, quick: bool) -> Found:
-    """Change of the angular momentum of orbits over a walk of one rounding a step."""
+    """Change of the angular momentum of orbits, divided by a random walk of eps per step."""
     motions = wandering(method, quick)
     change = float(np.sqrt(np.mean(motions.spin[:, -1] ** 2)) / EPS)
     details = f"{change:.0f} eps after {motions.steps[-1]} steps"
     return Found(change / float(np.sqrt(motions.steps[-1])), motions.statuses, details)
 
 
-# Forces are central, and q x v is quadratic: what changes it are roundings alone, by 0.3 eps of |q|
-# |v| in the mean square each. Splitting of order 8: 35 drifts and kicks, of two coordinates each:
-# 0.3 sqrt(70) = 2.5. The others: q, v and p at the end and p at the start, twice for what is left
-# of the stages: 0.3 sqrt(16) = 1.2. Orbits of e = 0.15 have |q| |v| up to 1.2; 1.3 for the spread.
+# Forces are central and q x v is quadratic, so only rounding errors change it, each by 0.3 eps of
+# |q| |v| rms. Splitting of order 8: 35 drifts and kicks, of two coordinates each: 0.3 sqrt(70) =
+# 2.5. The others: q, v and p at the end and p at the start, doubled for the residuals of the
+# stages: 0.3 sqrt(16) = 1.2. Orbits of e = 0.15 have |q| |v| up to 1.2; a factor 1.3 is for the
+# spread.
 def _add_spin(method: str, bound: float) -> None:
     @rows.row(f"angular momentum of orbits, {method}", "rms change, eps per root of a step", bound)
     def run(quick: bool) -> Found:
@@ -212,21 +214,24 @@ for _method, _bound in (("splitting8", 4.0), ("gauss8", 2.0), ("variational4", 2
 
 
 def reversal(system: jl.System, starts: Callable, method: str, dt: float, steps: int) -> Found:
-    """There and back, over the growth of the perturbations on the way (two motions 1e-8 apart)."""
+    """Error after forward and backward motion, divided by the growth of perturbations.
+
+    The growth is that of the difference of two motions, which is 1e-8 at the start.
+    """
     q0, v0 = starts(8)
     span = np.array([0.0, steps * dt])
-    there = solved(system, (q0, v0), span, method, dt)
-    beside = solved(system, starts(8, 1e-8), span, method, dt)
-    growth = 1.0 + np.max(np.abs(np.asarray(beside.q - there.q)[:, -1]), 1) / 1e-8
-    back = solved(system, (there.q[:, -1], there.v[:, -1]), span[::-1], method, dt)
+    forward = solved(system, (q0, v0), span, method, dt)
+    perturbed = solved(system, starts(8, 1e-8), span, method, dt)
+    growth = 1.0 + np.max(np.abs(np.asarray(perturbed.q - forward.q)[:, -1]), 1) / 1e-8
+    back = solved(system, (forward.q[:, -1], forward.v[:, -1]), span[::-1], method, dt)
     error = np.max(np.abs(np.asarray(back.q)[:, -1] - q0), 1) / growth
     details = f"growth {np.min(growth):.3g} to {np.max(growth):.3g}"
-    return Found(float(np.max(error) / EPS), names(there.status) + names(back.status), details)
+    return Found(float(np.max(error) / EPS), names(forward.status) + names(back.status), details)
 
 
-# A walk there and back: 0.3 eps of the largest coordinate, by the root of the roundings of a step
-# and of the number of steps; 3 for the largest of 8 motions.
-# |q| up to 0.5, 13 and 35 drifts and kicks, 2000 steps: 3 * 0.3 * 0.5 * sqrt(13 or 35 * 2000).
+# A random walk forward and backward: 0.3 eps of the largest coordinate, times the square root of
+# the number of rounding errors per step and of the number of steps; 3 for the largest of 8 motions.
+# |q| up to 0.5, 13 or 35 drifts and kicks, 2000 steps: 3 * 0.3 * 0.5 * sqrt(13 or 35 * 2000).
 @rows.row("there and back, splitting4", "error, eps of the growth", 75.0)
 def reverse_fourth(quick: bool) -> Found:
     return reversal(WELLS, well_starts, "splitting4", 0.1, 1000)
@@ -237,13 +242,13 @@ def reverse_eighth(quick: bool) -> Found:
     return reversal(WELLS, well_starts, "splitting8", 0.1, 1000)
 
 
-# |v| up to 1.5, 8 roundings, 1000 steps: 3 * 0.3 * 1.5 * sqrt(8000).
+# |v| up to 1.5, 8 rounding errors, 1000 steps: 3 * 0.3 * 1.5 * sqrt(8000).
 @rows.row("there and back, gauss6", "error, eps of the growth", 120.0)
 def reverse_gauss(quick: bool) -> Found:
     return reversal(ARMS, small_arm_starts, "gauss6", 0.01, 500)
 
 
-# |q| up to 2, 12 roundings, 1000 steps: 3 * 0.3 * 2 * sqrt(12000).
+# |q| up to 2, 12 rounding errors, 1000 steps: 3 * 0.3 * 2 * sqrt(12000).
 @rows.row("there and back, variational2", "error, eps of the growth", 200.0)
 def reverse_held(quick: bool) -> Found:
     return reversal(BOBS, bob_starts, "variational2", 0.01, 500)

@@ -1,9 +1,9 @@
-"""Motions that pass places where their quasi-velocities are singular, and others that stay clear.
+"""Motions through states with singular quasi-velocities, and motions that stay away from them.
 
-Where dU/dv loses rank v does not follow from u. The motions are known exactly, or by other
-quasi-velocities. One counts where it ends well with an error of q or v of more than a thousand
-tolerances, or of more than 1e-3 with fixed steps of 0.05 s; one that stays clear of such a place
-counts where it is refused, too.
+If dU/dv loses rank, u does not determine v. The motions are known in closed form, or are computed
+with other quasi-velocities. A motion counts as wrong if its status is ok and its error of q or v is
+above a thousand tolerances, or above 1e-3 with fixed steps of 0.05 s. A motion that stays away from
+singular states also counts if it is refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ rows = Rows()
 
 
 class Starts(NamedTuple):
-    """Starts and spans, all with a first axis of motions."""
+    """Starts and spans; the first axis is that of the motions."""
 
     q0: Any
     v0: Any
@@ -55,7 +55,7 @@ def counted(
     clear: bool,
     ways: Sequence[dict[str, Any]],
 ) -> Found:
-    """How many motions are wrong without a word, and, where all stay clear, how many refused."""
+    """Number of motions that are wrong with the status ok, plus, if `clear`, of refused ones."""
     wrong, statuses, details = 0, set[str](), []
     right = [np.asarray(x) for x in exact(*map(np.asarray, starts))]
     for way in ways:
@@ -86,7 +86,7 @@ def counted(
 def row(
     name: str, system: jl.System, draw: Draw, clear: bool = False, params: Any = None
 ) -> Callable[[Exact], Exact]:
-    """A decorator: the function gives (q, v) at the ends of the motions of this row."""
+    """A decorator that adds a case; the function returns the exact final (q, v) of its motions."""
 
     def added(exact: Exact) -> Exact:
         def run(quick: bool) -> Found:
@@ -135,7 +135,7 @@ row("cos(y) x', crossed", weighted(1), past)(dragged)
 row("cos(y)^2 x', touched", weighted(2), past)(dragged)
 
 
-# ---- The same, y swinging past 90 degrees and back, or not quite so far ------------------------
+# ---- The same, y swinging beyond 90 degrees and back, or just below ----------------------------
 
 
 def swinging(t: Any, q: Array, v: Array, params: Any) -> Array:
@@ -158,10 +158,10 @@ def swings(low: float, high: float, beyond: int) -> Draw:
 
     def draw(rng: np.random.Generator, count: int) -> Starts:
         size = np.pi / 2 + beyond * 10 ** rng.uniform(low, high, count)
-        turn = rng.uniform(-1.2, 1.2, count)
+        phase = rng.uniform(-1.2, 1.2, count)
         vx = rng.choice([-1, 1], count) * rng.uniform(0.5, 2, count)
-        q0 = np.stack([np.zeros(count), size * np.sin(turn)], axis=1)
-        v0 = np.stack([vx, size * np.cos(turn)], axis=1)
+        q0 = np.stack([np.zeros(count), size * np.sin(phase)], axis=1)
+        v0 = np.stack([vx, size * np.cos(phase)], axis=1)
         return Starts(q0, v0, rng.uniform(np.pi, 8, count))
 
     return draw
@@ -179,7 +179,7 @@ WHEELS = ("x", "y", "yaw", "steer")
 
 
 def wheeled(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """Mass centre at b ahead of the rear axle."""
+    """L of a two-wheeler with its mass center at b ahead of the rear axle."""
     x = v[0] - params["b"] * jnp.sin(q[2]) * v[2]
     y = v[1] + params["b"] * jnp.cos(q[2]) * v[2]
     turning = params["J"] * v[2] ** 2 + params["K"] * (v[2] + v[3]) ** 2
@@ -231,9 +231,9 @@ def steered(rng: np.random.Generator, count: int) -> Starts:
     front = rng.choice([-1, 1], count) * rng.uniform(0.3, 1.5, count)
     zero, rear = np.zeros(count), front * np.cos(steer)
     along = [rear * np.cos(yaw), rear * np.sin(yaw), front * np.sin(steer) / PARAMS["l"]]
-    turn = rng.choice([-1, 1], count) * rng.uniform(1, 4, count)
+    steer_rate = rng.choice([-1, 1], count) * rng.uniform(1, 4, count)
     q0 = np.stack([zero, zero, yaw, steer], axis=1)
-    return Starts(q0, np.stack([*along, turn], axis=1), rng.uniform(1, 4, count))
+    return Starts(q0, np.stack([*along, steer_rate], axis=1), rng.uniform(1, 4, count))
 
 
 def by_front_speed(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
@@ -307,7 +307,7 @@ point = jl.System(
 )
 
 
-def seen(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
+def spherical_state(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
     """(q, v) of a point at (x, y, z) that moves along x; y >= 0, and x < 0 beyond the pole."""
     aside = np.where(y > 0, np.hypot(x, y), x)
     r, along = np.hypot(aside, z), speed * x / aside
@@ -317,26 +317,26 @@ def seen(x: Any, y: Any, z: Any, speed: Any) -> tuple[Any, Any]:
 
 
 def lines(low: float | None = None, high: float = 0.0) -> Draw:
-    """Straight lines past the pole, or 10^low to 10^high of their height beside it."""
+    """Straight lines over the pole, or with an offset of 10^low to 10^high of their height."""
 
     def draw(rng: np.random.Generator, count: int) -> Starts:
         x, z = rng.uniform(0.3, 2, count), rng.uniform(0.5, 2, count)
         side = np.zeros(count) if low is None else z * 10 ** rng.uniform(low, high, count)
         speed = -rng.uniform(0.5, 2, count)
         span = -x / speed * rng.uniform(0.7, 2.5, count)
-        return Starts(*seen(x, side, z, speed), span)
+        return Starts(*spherical_state(x, side, z, speed), span)
 
     return draw
 
 
-def onwards(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
+def after_straight_line(q0: Any, v0: Any, span: Any) -> tuple[Any, Any]:
     (r, theta, phi), (out, south, east) = q0.T, v0.T
     aside, z = r * np.sin(theta), r * np.cos(theta)
     along = out * np.sin(theta) + r * south * np.cos(theta)
     x, y = aside * np.cos(phi), aside * np.sin(phi)
     speed = along * np.cos(phi) - aside * east * np.sin(phi)
-    return seen(x + speed * span, y, z, speed)
+    return spherical_state(x + speed * span, y, z, speed)
 
 
-row("past the pole", point, lines())(onwards)
-row("beside the pole", point, lines(-2, 0), clear=True)(onwards)
+row("past the pole", point, lines())(after_straight_line)
+row("beside the pole", point, lines(-2, 0), clear=True)(after_straight_line)

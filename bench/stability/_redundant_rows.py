@@ -1,8 +1,9 @@
-"""Redundant constraint rows and rows that say nothing: what they must not change.
+"""Redundant constraint rows and void rows: they must not change the results.
 
-Rollers of radius r on a rail, whose rows are alike but for levers of r metres, declared once and
-again in other words. And rows that are 0 = 0 but for rounding, in every kind of declaration, by
-every formulation: beside them the motion is what it is without; with a gap added they are told.
+Redundant rows: rollers of radius r on a rail, whose rows differ by levers of r meters only,
+declared with additional dependent rows. Void rows: rows that are 0 = 0 except for rounding, in
+every kind of declaration and formulation. They must not change the motion. With a gap added to
+such a row, the contradiction must be reported.
 """
 
 from itertools import product
@@ -25,7 +26,7 @@ def rolling(t: Any, q: Array, params: Any) -> Array:
     return jnp.stack([q[0] - params * q[1], q[0] - params * q[2]])
 
 
-AGAIN = {
+DEPENDENT = {
     "none": None,
     "doubled": lambda t, q, r: 2.0 * rolling(t, q, r)[:1],
     "sum": lambda t, q, r: jnp.sum(rolling(t, q, r))[None],
@@ -34,12 +35,12 @@ AGAIN = {
 
 
 def imbalance(dtype: Any) -> Found:
-    """The largest |M a + h - A^T lam| over the sum of its terms, in roundings."""
+    """The largest |M a + h - A^T lam| divided by the sum of its terms, in units of eps."""
     worst, where = 0.0, ""
-    for name, again in AGAIN.items():
+    for name, dependent in DEPENDENT.items():
         constraints = (jl.Holonomic(rolling, "rollers"),)
-        if again is not None:
-            constraints += (jl.Holonomic(again, "again"),)
+        if dependent is not None:
+            constraints += (jl.Holonomic(dependent, "again"),)
         system = jl.System(
             coordinates=("x", "a", "b"),
             kinetic=lambda t, q, v, r: 0.5 * (v[0] ** 2 + r**2 * (v[1] ** 2 + 2 * v[2] ** 2)),
@@ -68,7 +69,7 @@ def single(quick: bool) -> Found:
     return imbalance(jnp.float32)
 
 
-# ---- Rows that say nothing -----------------------------------------------------------------------
+# ---- Void rows -----------------------------------------------------------------------------------
 
 
 def identity(x: Array) -> Array:
@@ -98,8 +99,8 @@ def moved(constraints: Any, lowering: str, gap: float, ways: Any) -> jl.Solution
     return jl.simulate(system, [0.6, -0.8], [0.24, 0.18], [0.0, 0.5], gap, throw=False, **ways)
 
 
-def beside(gap: float, quick: bool) -> Found:
-    """How many motions are not what they must be."""
+def wrong_motions(gap: float, quick: bool) -> Found:
+    """Number of motions that differ from the expected result."""
     wrong, count, found = 0, 0, set[str]()
     alone = [()] if quick else [(), (ROD,)]
     for others, lowering in product(alone, ["auto"] if quick else ["auto", "array"]):
@@ -118,9 +119,9 @@ def beside(gap: float, quick: bool) -> Found:
 
 @rows.row("rows that are 0 = 0 but for rounding", "motions refused or changed", 0.0)
 def empty(quick: bool) -> Found:
-    return beside(0.0, quick)
+    return wrong_motions(0.0, quick)
 
 
 @rows.row("the same with a gap of 1 nm", "contradictions not told", 0.0)
 def contradictory(quick: bool) -> Found:
-    return beside(1e-9, quick)
+    return wrong_motions(1e-9, quick)

@@ -1,4 +1,4 @@
-"""Rows of the benchmark `stability`: what is expected, what was found, and the verdict."""
+"""Cases of the benchmark `stability`: the expected result, the computed one, and the verdict."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,10 +12,10 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 class Found(NamedTuple):
-    """How a row ended: its figure, and the statuses of its motions in their order.
+    """The result of a case: its figure, and the statuses of its motions in order.
 
     Attributes:
-        details: what the figure was made of, in words and numbers.
+        details: the numbers behind the figure, as text.
     """
 
     figure: float
@@ -24,15 +24,15 @@ class Found(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One row, with its bound written down before it was run.
+    """One case, with a bound written down before it was run.
 
     Attributes:
-        name: what is stressed.
-        figure: what the figure is, with its unit.
-        bound: the figure must not exceed it where the status is ok.
-        statuses: statuses other than ok that say what is singular; () where none is due.
-        run: from `quick`.
-        quick_bound: of a quick run, where fewer steps tell less.
+        name: of the case.
+        figure: name of the figure, with its unit.
+        bound: the figure must not exceed it if the status is ok.
+        statuses: expected statuses that name the singularity; () if ok is expected.
+        run: function of `quick` that runs the case.
+        quick_bound: bound for a quick run, which is less accurate with fewer steps.
     """
 
     name: str
@@ -43,13 +43,13 @@ class Case(NamedTuple):
     quick_bound: float | None = None
 
     def in_quick(self, quick: bool) -> "Case":
-        """The row with the bound that holds for this run."""
+        """The case with the bound for this run."""
         loose = quick and self.quick_bound is not None
         return self._replace(bound=self.quick_bound) if loose else self
 
 
 class Rows:
-    """A list of cases that functions add themselves to."""
+    """A list of cases, filled by a decorator."""
 
     def __init__(self) -> None:
         self.cases: list[Case] = []
@@ -62,7 +62,7 @@ class Rows:
         statuses: Sequence[str] = (),
         quick_bound: float | None = None,
     ) -> Callable[[Callable[[bool], Found]], Callable[[bool], Found]]:
-        """A decorator: the function runs this row."""
+        """A decorator that adds a case; the function runs it."""
 
         def added(run: Callable[[bool], Found]) -> Callable[[bool], Found]:
             self.cases.append(Case(name, figure, bound, tuple(statuses), run, quick_bound))
@@ -77,14 +77,14 @@ def names(status: Any) -> tuple[str, ...]:
 
 
 def verdict(case: Case, found: Found) -> str:
-    """What is to be said of a row.
+    """The verdict on a case.
 
-    "within" and "named" are what was expected; "failed" ends in a status where none was due, or
-    in another one; "silent" is a wrong answer with the status ok.
+    "within" and "named" are expected results. "failed" is a status other than ok that is not among
+    the expected ones. "silent" is a wrong result with the status ok.
     """
-    bad = sorted(set(found.statuses) - {OK})
-    if bad:
-        return "named" if set(bad) <= set(case.statuses) else "failed"
+    failures = sorted(set(found.statuses) - {OK})
+    if failures:
+        return "named" if set(failures) <= set(case.statuses) else "failed"
     if not found.figure <= case.bound:
         return "silent"
     return "within"
@@ -95,17 +95,17 @@ def run(system: jl.System, q0: Any, v0: Any, ts: Any, params: Any, **options: An
 
 
 def energy_change(motion: jl.Solution, scale: float) -> Found:
-    """The largest change of H, over `scale`."""
+    """The largest change of H, divided by `scale`."""
     change = np.max(np.abs(np.asarray(motion.energy) - float(motion.energy[0])))
     return Found(float(change) / scale, names(motion.status))
 
 
 def difference(motion: jl.Solution, expected: Any, scale: float = 1.0) -> Found:
-    """The largest error of q at the end, over `scale`."""
+    """The largest error of the final q, divided by `scale`."""
     error = np.max(np.abs(np.asarray(motion.q[-1]) - np.asarray(expected)))
     return Found(float(error) / scale, names(motion.status))
 
 
 def must_end(motion: jl.Solution) -> Found:
-    """There is no answer: ending well would be wrong."""
+    """For a problem without solution: the status ok would be wrong."""
     return Found(np.inf, names(motion.status))

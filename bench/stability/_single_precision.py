@@ -1,4 +1,4 @@
-"""Rows in float32, whose roundings are 1.2e-7 and whose tolerances are 1e-5 and 1e-6 by default."""
+"""Cases in float32, with eps = 1.2e-7 and default tolerances of 1e-5 and 1e-6."""
 
 from typing import Any
 
@@ -23,11 +23,11 @@ rows = Rows()
 
 
 def single(motion: jl.Solution, found: Found) -> Found:
-    """The same, if the motion was one of float32."""
+    """`found` if the motion is in float32, otherwise a failed case."""
     return found if motion.q.dtype == jnp.float32 else found._replace(figure=np.inf)
 
 
-# 1e-5 a step in float32 of an energy of some 10 J, over some hundred steps.
+# 1e-5 per step in float32, with an energy of some 10 J, over some hundred steps.
 @rows.row("float32: energy of two pendulums", "change of H over g", 1e-3)
 def energy(quick: bool) -> Found:
     pair = jl.System(
@@ -37,7 +37,8 @@ def energy(quick: bool) -> Found:
     return single(motion, energy_change(motion, G))
 
 
-# A tenth of 1.1e-5 a step, 30 steps in squares, growth 1.4: 8e-6. Roundings are a tenth of that.
+# A tenth of 1.1e-5 per step, squares of 30 steps added, growth 1.4: 8e-6. Rounding errors are a
+# tenth of that.
 @rows.row("float32: double pendulum", "error of q, rad", 1e-5)
 def double(quick: bool) -> Found:
     motion = run(ARMS, START, AT_REST, TIME, {})
@@ -50,7 +51,7 @@ def points(angles: Any) -> Any:
     return np.array([x[0], y[0], x[0] + x[1], y[0] + y[1]])
 
 
-# The same with both angles in the lower bob.
+# The same; the position of the lower bob depends on both angles.
 @rows.row("float32: bobs on rods", "error of q, m", 2e-5)
 def bobs(quick: bool) -> Found:
     expected = points(double_pendulum(START.astype(float), TIME[-1])[0])
@@ -58,7 +59,7 @@ def bobs(quick: bool) -> Found:
     return single(motion, difference(motion, expected))
 
 
-# Roundings of |q|^2 = 4, whatever the number of steps.
+# Rounding errors of |q|^2 = 4, independent of the number of steps.
 @rows.row("float32: constraints after many steps", "residual over |q|^2", 16 * EPS)
 def residual(quick: bool) -> Found:
     start, steps = np.array([0.6, -0.8, 1.6, -0.8], np.float32), 5_000
@@ -68,7 +69,7 @@ def residual(quick: bool) -> Found:
     return single(motion, Found(float(jnp.max(jnp.abs(phi)) / 4.0), names(motion.status)))
 
 
-# The bounds of the runs in float64, in roundings of float32.
+# The bounds of the runs in float64, in units of float32's eps.
 def _add_drift(method: str) -> None:
     name = f"float32: energy over {LENGTH.steps} steps, {method}"
 
@@ -82,7 +83,7 @@ for _method in ("splitting4", "gauss4", "variational2"):
     _add_drift(_method)
 
 
-# An error of q changes the derivative by it times w t = 20 or less: 1e-5 * 20.
+# An error of q, 1e-5, changes the derivative by this error times w t, at most 20.
 @rows.row("float32: gradient by the start", "relative error", 2e-4)
 def gradient(quick: bool) -> Found:
     def last(angle: Array) -> tuple[Array, jl.Solution]:

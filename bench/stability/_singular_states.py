@@ -1,4 +1,4 @@
-"""Unequal masses, gimbal lock, poles, folded linkages: places that are hard, with known answers."""
+"""Unequal masses, gimbal lock, poles, folded linkages: difficult states with known solutions."""
 
 from typing import Any
 
@@ -31,17 +31,18 @@ rows = Rows()
 # ---- Unstable, unequal, stiff ------------------------------------------------------------------
 
 
-# Errors of 1e-12 a step grow as t and, through the period, as (1 - e)^-2: 1e-12 * 60 * 1e4.
+# Errors of 1e-12 per step grow with t and, by the period, with (1 - e)^-2: 1e-12 * 60 * 1e4.
 @rows.row("Kepler, e = 0.99", "error of q", 1e-6)
 def eccentric(quick: bool) -> Found:
-    e, turns = 0.99, 2 if quick else 10
+    e, revolutions = 0.99, 2 if quick else 10
     q0, v0 = np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
-    t = np.array([0.0, turns * 2 * np.pi + 2.0])
+    t = np.array([0.0, revolutions * 2 * np.pi + 2.0])
     exact = kepler(q0[None], v0[None], np.array([e]), t)[0, -1]
     return difference(run(ORBIT, q0, v0, t, {}, **TIGHT), exact)
 
 
-# The linear solution; the cubic terms are of 1e-9, pi is rounded by 1e-16 of 1e-9.
+# The linearized solution. The cubic terms are of 1e-9; the rounding error of pi is 1e-16, that is
+# 1e-7 of the deviation.
 @rows.row("falling from upright, 1e-9 rad", "error over the deviation", 1e-5)
 def upright(quick: bool) -> Found:
     M, K = np.array([[2.0, 1.0], [1.0, 1.0]]), -G * np.array([[2.0, 0.0], [0.0, 1.0]])
@@ -53,7 +54,7 @@ def upright(quick: bool) -> Found:
 
 
 def unequal(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """Double pendulum, second mass m."""
+    """Double pendulum with the second mass m."""
     m, c = params["m"], jnp.cos(q[0] - q[1])
     T = 0.5 * (1 + m) * v[0] ** 2 + 0.5 * m * v[1] ** 2 + m * v[0] * v[1] * c
     return T + G * ((1 + m) * jnp.cos(q[0]) + m * jnp.cos(q[1]))
@@ -62,10 +63,10 @@ def unequal(t: Any, q: Array, v: Array, params: Any) -> Array:
 UNEQUAL = jl.System(unequal, ("a", "b"))
 
 
-# An order-8 step is wrong by a tenth of the 1e-9 it is estimated at, or less; errors of the steps
-# add in squares and grow as the motion by its start does. Light bob: 70 steps, growth 110, 1e-10 *
-# sqrt(70) * 110. Heavy one, which pulls the rods taut at 1e8 times the weight of the upper bob: 950
-# steps, growth 5, 1e-10 * sqrt(950) * 5.
+# The error of a step of order 8 is at most a tenth of its estimate, 1e-9. The squares of these
+# errors add up, and the errors grow as perturbations of the start do. Light bob: 70 steps, growth
+# 110, 1e-10 * sqrt(70) * 110. Heavy bob, with a tension of 1e8 times the weight of the upper bob:
+# 950 steps, growth 5, 1e-10 * sqrt(950) * 5.
 @rows.row("masses 1 : 1e-8, both bobs", "error of q, rad", 1e-7)
 def light_end(quick: bool) -> Found:
     start, t, m = [1.0, 0.5], 5.0, 1e-8
@@ -82,7 +83,7 @@ def heavy_end(quick: bool) -> Found:
     )
 
 
-# 1e-9 a step of 1e8 g, over 2000 steps.
+# 1e-9 of 1e8 g per step, over 2000 steps.
 @rows.row("masses 1 : 1e8, energy", "change of H over that of the large mass", 2e-6)
 def heavy_energy(quick: bool) -> Found:
     ts = np.linspace(0.0, 2.0, 21)
@@ -90,11 +91,11 @@ def heavy_energy(quick: bool) -> Found:
 
 
 def springs(t: Any, q: Array, v: Array, params: Any) -> Array:
-    """Masses of 1 kg."""
+    """Masses of 1 kg on springs."""
     return 0.5 * (v @ v) - 0.5 * (params["k"] @ q**2)
 
 
-# A thousand turns of the stiff one, ten steps each with 1e-9.
+# A thousand periods of the stiff spring, ten steps each with 1e-9.
 @rows.row("springs over 12 decades", "error of q", 1e-5)
 def decades(quick: bool) -> Found:
     k, t = np.array([1e-6, 1.0, 1e6]), 2 * np.pi
@@ -109,7 +110,7 @@ def elastic(t: Any, q: Array, v: Array, params: Any) -> Array:
     return 0.5 * (v @ v) - 9.81 * q[1] - 0.5 * params["k"] * stretch**2
 
 
-# Explicit steps follow the spring; implicit ones of order 5 at 1e-8 a step.
+# Explicit steps resolve the spring's vibration; implicit steps of order 5 have 1e-8 per step.
 @rows.row("stiff spring, implicit steps", "difference from explicit steps, m", 1e-4)
 def stiff(quick: bool) -> Found:
     system, start = jl.System(elastic, ("x", "y")), ([1.0, 0.0], [0.0, 0.0])
@@ -119,7 +120,7 @@ def stiff(quick: bool) -> Found:
     return difference(run(system, *start, t, params, **options), explicit.q[-1])
 
 
-# ---- Places where coordinates say nothing ------------------------------------------------------
+# ---- Singular coordinates ----------------------------------------------------------------------
 
 
 @rows.row("gimbal lock at the start", "-", 0.0, LOCK)
@@ -133,7 +134,7 @@ def spinning(t: Any, q: Array, u: Array, params: Any) -> Array:
     return 0.5 * params["I"] @ u**2
 
 
-def still(t: Any, q: Array, params: Any) -> Array:
+def zero_potential(t: Any, q: Array, params: Any) -> Array:
     return jnp.zeros_like(q[0])
 
 
@@ -171,28 +172,28 @@ def attitude(map_: Any, motion: jl.Solution) -> np.ndarray:
     return np.asarray(map_.matrix(motion.q[-1]))
 
 
-# A steady turn about the pitch axis; steps may land on the lock or on either side of it. Its angle
-# is t: every method is exact, whatever its steps.
+# A uniform rotation about the pitch axis. Steps may end at gimbal lock or on either side of it. The
+# angle is t, so every method is exact with any steps.
 @rows.row("through gimbal lock, angles", "error of R", 1e-6, LOCK)
 def through_lock(quick: bool) -> Found:
-    return turned(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0))
+    return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0))
 
 
-# The tenth step ends at the lock, where rates of the angles have no value.
+# The tenth step ends at gimbal lock, where the rates of the angles are undefined.
 @rows.row("a step that ends in gimbal lock, angles", "error of R", 1e-6, LOCK)
 def into_lock(quick: bool) -> Found:
     options = {"method": "dopri8", "dt": np.pi / 20}
-    return turned(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0, **options))
+    return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0, **options))
 
 
-def turned(motion: jl.Solution) -> Found:
-    """Against 2 rad of pitch."""
+def pitch_error(motion: jl.Solution) -> Found:
+    """Compare the attitude with a pitch of 2 rad."""
     exact = np.asarray(jl.rotation.about_y(2.0))
     error = np.max(np.abs(attitude(jl.rotation.yaw_pitch_roll, motion) - exact))
     return Found(float(error), names(motion.status))
 
 
-# The angles turn by pi within 1e-3 s: rates of 1e3 rad/s, errors of 1e-11 times that.
+# The angles change by pi within 1e-3 s: rates of 1e3 rad/s, errors of 1e-11 times that.
 @rows.row("past gimbal lock by 1e-3 rad, angles", "difference from quaternions", 1e-7)
 def past_lock(quick: bool) -> Found:
     w = [1e-3, 1.0, 1e-3]
@@ -213,7 +214,7 @@ def quaternions(quick: bool) -> Found:
 
 @rows.row("spherical pendulum through its pole, angles", "error of q, rad", 1e-6, LOCK)
 def pole(quick: bool) -> Found:
-    """In a plane, as a plane pendulum: from 1 rad to the other side."""
+    """Motion in a plane, as of a plane pendulum: from 1 rad to the other side."""
     entry = spherical_pendulum_fixed.entry
     params = entry.example.params
     plane = jl.System(
@@ -224,7 +225,7 @@ def pole(quick: bool) -> Found:
     return difference(motion, jnp.concatenate([jnp.array([0.3]), expected]))
 
 
-# 1e-9 a step; the azimuth turns by pi within 1e-6 s past the pole.
+# 1e-9 per step; the azimuth changes by pi within 1e-6 s near the pole.
 @rows.row("spherical pendulum past its pole, angles", "change of H, J", 1e-5)
 def past_pole(quick: bool) -> Found:
     entry = spherical_pendulum_fixed.entry
@@ -234,7 +235,7 @@ def past_pole(quick: bool) -> Found:
 
 @rows.row("spherical pendulum through its pole, Cartesian", "error of x, m", 1e-6)
 def pole_cartesian(quick: bool) -> Found:
-    """Released at (0.96, 0, -0.28): a quarter of the period later below the pivot."""
+    """Released at (0.96, 0, -0.28), it is below the pivot after a quarter of the period."""
     entry = spherical_pendulum_cartesian.entry
     params = entry.example.params
     angle = np.arctan2(0.96, 0.28)
@@ -251,7 +252,7 @@ def pole_cartesian(quick: bool) -> Found:
 
 @rows.row("straight chain let go, Cartesian", "difference from angles, m", 1e-6)
 def taut(quick: bool) -> Found:
-    """Both bobs on one horizontal line with the pivot: the rows are parallel in part."""
+    """Both bobs on a horizontal line with the pivot: the constraint rows are partly parallel."""
     angles = run(ARMS, [np.pi / 2] * 2, [0.0, 0.0], [0.0, 1.0], {}, **TIGHT).q[-1]
     x, y = np.sin(angles), -np.cos(angles)
     motion = run(BOBS, [1.0, 0.0, 2.0, 0.0], [0.0] * 4, [0.0, 1.0], {})
@@ -284,7 +285,7 @@ def twice(quick: bool) -> Found:
 
 @rows.row("rows that contradict each other", "-", 0.0, ("contradictory_rows", "rank_change"))
 def contradictory(quick: bool) -> Found:
-    """x = 0 and x = t^2 / 2 agree in position and velocity at t = 0, in acceleration never."""
+    """x = 0 and x = t^2 / 2 agree in position and velocity at t = 0, but not in acceleration."""
     held = jl.Holonomic(lambda t, q, p: q[0], "held")
     drawn = jl.Holonomic(lambda t, q, p: q[0] - 0.5 * t**2, "drawn")
     system = jl.System(particle, ("x", "y"), constraints=(held, drawn))
@@ -293,7 +294,7 @@ def contradictory(quick: bool) -> Found:
 
 @rows.row("parallelogram through its folded position", "change of H, J", 1e-6)
 def folded(quick: bool) -> Found:
-    """All links on one line, where the mechanism may go on in two ways, and a state is saved."""
+    """All links on one line, a bifurcation of the mechanism, with a save time near it."""
     entry = four_bar.entry
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
     crank = 2.0
@@ -302,7 +303,7 @@ def folded(quick: bool) -> Found:
     return energy_change(motion, 1.0)
 
 
-# Roundings of |q|^2 = 4 in a step, whatever their number.
+# Rounding errors of |q|^2 = 4 in one step, independent of the number of steps.
 @rows.row("constraints after many steps", "residual over |q|^2", 16 * EPS)
 def residual(quick: bool) -> Found:
     steps = 5_000 if quick else 100_000

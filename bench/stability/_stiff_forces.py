@@ -1,9 +1,9 @@
-"""Short, stiff forces: walls, contacts, cords and barriers that a step could pass through.
+"""Short, stiff forces: walls, contacts, cords and barriers that a step could miss.
 
-Twelve potentials, 1,000 starts each, three tolerances, by the default method. A motion counts where
-it ends well and its energy is off by more than 1 % of itself and by more than three times the worst
-that `tsit5` leaves in this potential at this tolerance: all stages of that method have a part in
-its error estimate, so that what it leaves is what the tolerance allows.
+Twelve potentials, 1,000 starts each, three tolerances, by the default method. A motion counts as
+wrong if its status is ok and its energy error is above two limits: 1 %, and three times the largest
+error of `tsit5` for this potential and tolerance. In `tsit5` all stages contribute to the error
+estimate, so its error is the one that the tolerance allows.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ rows = Rows()
 
 
 class Starts(NamedTuple):
-    """Starts and parameters of a potential, all with a first axis of motions."""
+    """Starts and parameters of a potential; the first axis is that of the motions."""
 
     q0: Any
     v0: Any
@@ -37,7 +37,7 @@ Draw = Callable[[np.random.Generator, int], Starts]
 
 
 def silent(potential: Callable[[Array, Any], Array], starts: Starts) -> Found:
-    """How many motions end well with an energy that no tolerance excuses."""
+    """Number of motions with the status ok and an energy error above the limits."""
     size = starts.q0.shape[1]
 
     def lagrangian(t: Any, q: Array, v: Array, params: Any) -> Array:
@@ -81,7 +81,7 @@ def silent(potential: Callable[[Array, Any], Array], starts: Starts) -> Found:
 
 
 def row(name: str, draw: Draw) -> Callable[[Callable], Callable]:
-    """A decorator: the function is the potential of this row."""
+    """A decorator that adds a case; the function is its potential."""
 
     def added(potential: Callable[[Array, Any], Array]) -> Callable:
         def run(quick: bool) -> Found:
@@ -95,7 +95,7 @@ def row(name: str, draw: Draw) -> Callable[[Callable], Callable]:
 
 
 def decades(rng: np.random.Generator, low: float, high: float, count: int) -> Any:
-    """Numbers spread evenly over powers of ten."""
+    """Random numbers, uniform in their logarithm."""
     return 10.0 ** rng.uniform(low, high, count)
 
 
@@ -183,9 +183,9 @@ def around(radius: Any, angle: Any) -> Any:
 
 
 def in_ring(rng: np.random.Generator, count: int) -> Starts:
-    turn, heading = rng.uniform(0, 2 * np.pi, (2, count))
+    angle, heading = rng.uniform(0, 2 * np.pi, (2, count))
     speed, k = decades(rng, -0.5, 1, count), decades(rng, 4, 8, count)
-    q0 = around(rng.uniform(0, 0.8, count), turn)
+    q0 = around(rng.uniform(0, 0.8, count), angle)
     return Starts(q0, around(speed, heading), 10 / speed, {"k": k})
 
 

@@ -1,13 +1,14 @@
 """Time over achieved error: jaxlag, diffrax, heyoka, numba, SUNDIALS, CasADi, scipy, MuJoCo.
 
-Each line of a system is one way to solve it at many tolerances (or steps). Errors are against ends
-to 20 digits (`bench/references`): the largest of the coordinates at the end, over one plus its
-size. Times at an error are interpolated between neighbours on a line, never beyond its ends.
+Each line of a system is one way to solve it, at many tolerances (or steps). The error is the
+largest deviation of a final coordinate from a reference to 20 digits (`bench/references`), divided
+by one plus its size. Times at an error are interpolated between adjacent points of a line, never
+extrapolated.
 
-The processes take turns, all on one core: jax with XLA's loop setting, jax without it, another jax
-(`--python PATH` of an interpreter that has jax, diffrax and optimistix), and all that is not JAX.
-Compilation is apart, in `compile_s`. Runs of more than 40 ms are timed twice, where the line is
-made, and do not take turns. Of 16 pendulums at once times are those of one.
+The processes run in turn, all on one core: jax with XLA's loop setting, jax without it, another jax
+(`--python PATH` of an interpreter that has jax, diffrax and optimistix), and all libraries other
+than JAX. Compilation is given separately, in `compile_s`. Runs of more than 40 ms are timed only
+twice, when the line is built, and not in turn. For a batch of 16 pendulums, times are per pendulum.
 """
 
 import os
@@ -30,8 +31,8 @@ from jaxlag._core import _xla
 
 KIND, SYSTEM = "BENCH_KIND", "BENCH_SYSTEM"  # environment of a worker
 ROUNDS, QUICK_ROUNDS = 4, 2
-TURNS_S = 40e-3  # runs up to this length take turns
-BUDGET_S = 100e-3  # after which a point sits out
+IN_TURN_S = 40e-3  # runs up to this length are timed in turn
+BUDGET_S = 100e-3  # after which a point is not timed again
 PATIENCE_S = 0.5
 QUICK_SYSTEMS = ("double pendulum, regular",)
 QUICK_LINES = {"jaxlag dopri8", "diffrax Dopri8, by hand", "heyoka", "numba DOP853", "scipy DOP853"}
@@ -42,7 +43,7 @@ SETTINGS = {"on": "1", "off": "0", "newest": "1", "peers": "1"}
 
 
 def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
-    """Sweep every line of this process: what to time, and its points."""
+    """Sweep every line of this process: the calls to time, and the points of the lines."""
     name, kind = os.environ[SYSTEM], os.environ[KIND]
     motion = MOTIONS[name]()
     exact = exact_end(name)
@@ -50,48 +51,48 @@ def prepare(quick: bool) -> tuple[dict[str, Call], dict[str, Any]]:
     calls: dict[str, Call] = {}
     facts: dict[str, Any] = {"missing": missing, "jax": jax.__version__, "points": {}, "none": {}}
     facts["versions"] = _peers.versions() if kind == "peers" else {}
-    for words, make in lines.items():
-        if quick and words not in QUICK_LINES:
+    for label, make in lines.items():
+        if quick and label not in QUICK_LINES:
             continue
         try:
             line = built(make)
             found, points = swept(line, lambda q: motion.error(q, exact), PATIENCE_S)
-        except Exception as error:  # what a method says of a system not for it, a broken library
-            facts["none"][words] = f"{type(error).__name__}: {error}".splitlines()[0]
+        except Exception as error:  # the method does not apply, or a library is broken
+            facts["none"][label] = f"{type(error).__name__}: {error}".splitlines()[0]
             continue
         if not points:
-            facts["none"][words] = line.why_none(PATIENCE_S)
-        facts["points"][words] = points
-        calls |= {f"{words}|{value}": call for value, call in found.items()}
+            facts["none"][label] = line.why_none(PATIENCE_S)
+        facts["points"][label] = points
+        calls |= {f"{label}|{value}": call for value, call in found.items()}
         for value, point in zip(found, points, strict=True):
-            point["case"] = f"{words}|{value}"
+            point["case"] = f"{label}|{value}"
     return calls, facts
 
 
 def _lines(motion: Motion, kind: str) -> tuple[Mapping[str, Callable[[], Line]], dict[str, str]]:
-    """Lines of one kind of process, and the error text of what cannot be imported."""
+    """Lines of one kind of process, and the error texts of libraries that cannot be imported."""
     if kind != "peers":
         ours = {"on": None, "off": (), "newest": ("tsit5", "dopri8")}[kind]
-        # A prototype runs as jax is found: without the setting.
+        # A prototype runs with jax's default: without the setting.
         return _jax.lines(motion, ours, prototype=kind == "off"), {}
     _silence()
     missing = _peers.missing()
     chosen = _peers.lines(motion)
     return {
-        words: partial(make, motion)
-        for words, (library, make) in chosen.items()
+        label: partial(make, motion)
+        for label, (library, make) in chosen.items()
         if library not in missing
     }, missing
 
 
 def _silence() -> None:
-    """What libraries write of steps too short fills a terminal."""
+    """Discard output: warnings of libraries about short steps would fill a terminal."""
     nothing = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(nothing, stream)
 
 
-# ---- Where it is put together --------------------------------------------------------------------
+# ---- The main process ----------------------------------------------------------------------------
 
 
 def run(quick: bool, system: list[str] | None = None, python: str | None = None) -> Report:
@@ -99,36 +100,36 @@ def run(quick: bool, system: list[str] | None = None, python: str | None = None)
 
     Args:
         quick: one system and a few lines.
-        system: names of the systems, all where left out.
-        python: interpreter with another version of jax; without it that is left out.
+        system: names of the systems; all by default.
+        python: interpreter with another version of jax; by default that version is left out.
     """
     chosen = system or (QUICK_SYSTEMS if quick else tuple(MOTIONS))
     unknown = [name for name in chosen if name not in MOTIONS]
     if unknown:
         raise ValueError(f"--system must be one of {list(MOTIONS)}, but it was {unknown[0]!r}.")
     rows: list[dict[str, Any]] = []
-    said: list[Reference] = []
+    remarks: list[Reference] = []
     folder = results.FOLDER / "quick" if quick or system else results.FOLDER
     for name in chosen:
         try:
             found, notes = contest(name, quick, python)
-        except RuntimeError as error:  # a process that dies must not take the other systems along
-            said.append(Reference("failed", f"{name}: {error}"))
+        except RuntimeError as error:  # a crashed process must not stop the other systems
+            remarks.append(Reference("failed", f"{name}: {error}"))
             continue
         rows += found
-        said += notes
-        said.append(Reference(_plot.save(name, found, folder), f"{name}: the diagram"))
+        remarks += notes
+        remarks.append(Reference(_plot.save(name, found, folder), f"{name}: the diagram"))
     if python is None:
-        said.append(Reference("left out", "another jax: no interpreter given by --python"))
+        remarks.append(Reference("left out", "another jax: no interpreter given by --python"))
     targets, profiles = _ranking.judged(rows, chosen)
-    references = _ranking.told(rows) + profiles + list(dict.fromkeys(said))
+    references = _ranking.fastest_references(rows) + profiles + list(dict.fromkeys(remarks))
     return Report(rows, targets, references, _ranking.fastest(rows))
 
 
 def contest(
     name: str, quick: bool, python: str | None
 ) -> tuple[list[dict[str, Any]], list[Reference]]:
-    """Rows of one system, and what is missing and why."""
+    """Table rows of one system, and notes about missing lines and versions."""
     kinds = ("on", "peers") if quick else tuple(SETTINGS)
     samples: dict[tuple[str, str], list[float]] = defaultdict(list)
     notes: list[Reference] = []
@@ -150,7 +151,7 @@ def contest(
             for point in found
         }
         for key, point in points.items():
-            point["in_turn"] = min(point["swept_s"]) <= TURNS_S
+            point["in_turn"] = min(point["swept_s"]) <= IN_TURN_S
             if not point["in_turn"]:
                 samples[key] = point["swept_s"]
         for _ in range(QUICK_ROUNDS if quick else ROUNDS):
@@ -166,13 +167,13 @@ def contest(
         rows = [
             {
                 "system": name,
-                "line": _words(words, kind, worker.facts["jax"]),
+                "line": _label(label, kind, worker.facts["jax"]),
                 **{key: point[key] for key in ("knob", "value", "error", "steps")},
                 **spread(samples[kind, point["case"]], "us", lanes),
                 "compile_s": point["compile_s"],
             }
             for kind, worker in workers.items()
-            for words, found in worker.facts["points"].items()
+            for label, found in worker.facts["points"].items()
             for point in found
         ]
         for kind, worker in workers.items():
@@ -188,14 +189,14 @@ def _worker(name: str, kind: str, quick: bool, python: str | None) -> Worker:
     return Worker("work_precision", quick, settings, **options)
 
 
-def _words(line: str, kind: str, version: str) -> str:
+def _label(line: str, kind: str, version: str) -> str:
     return line + {"off": ", no setting", "newest": f", jax {version}"}.get(kind, "")
 
 
 def _notes(name: str, kind: str, facts: Mapping[str, Any]) -> list[Reference]:
     missing = [Reference("left out", f"{who}: {text}") for who, text in facts["missing"].items()]
     none = [
-        Reference("no line", f"{name}, {_words(line, kind, facts['jax'])}: {text}")
+        Reference("no line", f"{name}, {_label(line, kind, facts['jax'])}: {text}")
         for line, text in facts["none"].items()
     ]
     used = [Reference(number, f"version of {who}") for who, number in facts["versions"].items()]

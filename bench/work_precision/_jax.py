@@ -1,9 +1,9 @@
 """The motions solved in JAX: every solver of jaxlag, and diffrax alone.
 
-diffrax gets the explicit equations by hand and, as a first prototype would have it, naive
-autodiff: `jax.hessian` of L, Jacobians of the rows, `jnp.linalg.solve`. All are functions of start,
-parameters and tolerance (or step), compiled once and called again and again, as in a fit. What they
-return is what is read: coordinates at the end, whether it was reached, and the number of steps.
+diffrax has the explicit equations by hand and, as in a first prototype, naive autodiff:
+`jax.hessian` of L, Jacobians of the constraint rows, `jnp.linalg.solve`. All are functions of
+start, parameters and tolerance (or step), compiled once and called repeatedly, as in a fit. They
+return only the needed results: final coordinates, whether the end was reached, number of steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,21 +23,21 @@ from bench.work_precision._sweep import Line, Solved, steps, tolerances
 from jaxlag._simulation._methods import METHODS
 from jaxlag.solvers import AbstractFixedStep
 
-ORDER = 5  # of diffrax's own methods from which on they get a line
+ORDER = 5  # lowest order of diffrax's own methods that have a line
 MOST_STEPS = 1 << 22
 JNP = functions(jnp)
 DIFFRAX = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
 
 
 def methods(motion: Motion) -> list[str]:
-    """Names of our own solvers and of diffrax's from order 5 on, implicit ones if it is stiff."""
+    """Names of jaxlag's solvers and of diffrax's from order 5; implicit ones if it is stiff."""
     found = []
     for name, make in METHODS.items():
         solver = make()
         ours = type(solver).__module__.startswith("jaxlag")
         implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
         high = (solver.order(diffrax.ODETerm(lambda t, y, args: y)) or 0) >= ORDER
-        # Lanes are a matter of methods that choose their steps.
+        # Lanes are compared for adaptive methods only.
         single = motion.lanes == 1 or not isinstance(solver, AbstractFixedStep)
         if (ours or high) and (motion.stiff or ours or not implicit) and single:
             found.append(name)
@@ -48,10 +48,10 @@ def with_jaxlag(motion: Motion, method: str) -> Line:
     """By `jl.simulate`, jitted.
 
     Raises:
-        ValueError: the method is not for such systems.
+        ValueError: the method does not apply to such systems.
     """
     fixed = isinstance(METHODS[method](), AbstractFixedStep)
-    # Methods that keep a structure have velocities in their state, not quasi-velocities.
+    # The state of structure-preserving methods has velocities, not quasi-velocities.
     formulation = "multipliers" if fixed and motion.system.quasi is not None else "auto"
 
     def solve(q0: Array, v0: Array, params: Any, knob: Array) -> tuple[Array, Array, Array]:
@@ -98,7 +98,7 @@ def with_diffrax(motion: Motion, field: Callable, method: str, y0: Array) -> Lin
 
 def _line(motion: Motion, solve: Callable, args: tuple, knobs: list[float], fixed: bool) -> Line:
     if motion.lanes > 1:
-        moving = len(args) - 1  # all but the parameters and the knob
+        moving = len(args) - 1  # all except the parameters and the knob
         solve = jax.vmap(solve, (0,) * moving + (None, None))
     program = build(solve, *args, jnp.asarray(knobs[0]))
 
@@ -127,7 +127,7 @@ def by_hand(motion: Motion) -> Callable[[Any, Array, Any], Array]:
 
 
 def naive(motion: Motion) -> Callable[[Any, Array, Any], Array]:
-    """d(q, v)/dt by autodiff on arrays and library solves, multipliers among the unknowns."""
+    """d(q, v)/dt by autodiff on arrays and a library solve for accelerations and multipliers."""
 
     def field(t: Any, y: Array, params: Any) -> Array:
         q, v = jnp.split(y, 2)
@@ -139,12 +139,10 @@ def naive(motion: Motion) -> Callable[[Any, Array, Any], Array]:
         if motion.rows is None:
             return jnp.concatenate([v, jnp.linalg.solve(M, right)])
         A = jax.jacfwd(motion.rows, 1)(q, v, params)
-        turned = jax.jvp(lambda q: motion.rows(q, v, params), (q,), (v,))[1]
+        gamma = jax.jvp(lambda q: motion.rows(q, v, params), (q,), (v,))[1]
         zero = jnp.zeros((len(A), len(A)))
         K = jnp.block([[M, A.T], [A, zero]])
-        return jnp.concatenate(
-            [v, jnp.linalg.solve(K, jnp.concatenate([right, -turned]))[: len(q)]]
-        )
+        return jnp.concatenate([v, jnp.linalg.solve(K, jnp.concatenate([right, -gamma]))[: len(q)]])
 
     return field
 
@@ -152,11 +150,11 @@ def naive(motion: Motion) -> Callable[[Any, Array, Any], Array]:
 def lines(
     motion: Motion, ours: Sequence[str] | None, prototype: bool
 ) -> dict[str, Callable[[], Line]]:
-    """Lines of one process: jaxlag's methods, those named or all, and diffrax's.
+    """Lines of one process: jaxlag's methods and diffrax's.
 
     Args:
-        motion: what is solved.
-        ours: names of methods; None for all.
+        motion: the motion to solve.
+        ours: names of jaxlag's methods; None for all.
         prototype: whether naive autodiff has lines.
     """
     chosen = [name for name in methods(motion) if ours is None or name in ours]
@@ -167,8 +165,8 @@ def lines(
     if prototype:
         qv = jnp.concatenate([jnp.asarray(motion.q0), jnp.asarray(motion.v0)], axis=-1)
         forms["naive"] = naive(motion), qv
-    for words, (field, start) in forms.items():
+    for label, (field, start) in forms.items():
         for name in DIFFRAX:
             make = partial(with_diffrax, motion, field, name, start)
-            found[f"diffrax {name}, {words}"] = make
+            found[f"diffrax {name}, {label}"] = make
     return found

@@ -1,7 +1,7 @@
-"""Models of the motions for MuJoCo, as far as it can express them.
+"""Models of the motions for MuJoCo, if it can represent them.
 
 Hinges turn about -y, x to the right and z upward, so that angles are those of the motions. Joint
-angles are relative to the link before; bodies are point masses with next to no inertia.
+angles are relative to the previous link. Bodies are point masses with negligible inertia.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import numpy as np
 from bench._problems.exact_ends import exact_end
 from bench._problems.motions import Motion
 
-POINT = 1e-12  # kg m^2, what MuJoCo wants of a point
+POINT = 1e-12  # kg m^2, inertia of a point mass, which MuJoCo requires to be positive
 Model = tuple[Any, Callable[[Any], None], Callable[[Any], np.ndarray]]  # model, put, read
 
 
@@ -47,7 +47,7 @@ def links(library: Any, motion: Motion) -> Model:
 
 
 def elastic(library: Any, motion: Motion) -> Model:
-    """A hinge and, on it, a slide with a spring."""
+    """A hinge that carries a slide with a spring."""
     p = motion.params
     body = (
         '<body><joint type="hinge" axis="0 -1 0"/>'
@@ -69,9 +69,9 @@ def elastic(library: Any, motion: Motion) -> Model:
 
 
 def top(library: Any, motion: Motion) -> Model:
-    """A body on a ball joint; angles from its attitude, the whole turns from the exact end."""
+    """A body on a ball joint; angles from its attitude, multiples of 2 pi from the exact end."""
     p, near = motion.params, exact_end("heavy top")
-    across = p["I1"] - p["m"] * p["l"] ** 2  # about the mass centre
+    across = p["I1"] - p["m"] * p["l"] ** 2  # about the mass center
     body = (
         '<body><joint type="ball"/>'
         f'<inertial pos="0 0 {p["l"]!r}" mass="{p["m"]!r}" '
@@ -100,9 +100,9 @@ def top(library: Any, motion: Motion) -> Model:
 
     def read(data: Any) -> np.ndarray:
         w, x, y, z = data.qpos
-        total, apart = np.arctan2(z, w), np.arctan2(y, x)
+        total, difference = np.arctan2(z, w), np.arctan2(y, x)
         tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
-        angles = np.array([total + apart, tilt, total - apart])
+        angles = np.array([total + difference, tilt, total - difference])
         return angles + 2.0 * np.pi * np.round((near - angles) / (2.0 * np.pi))
 
     return _model(library, p["g"], body), put, read

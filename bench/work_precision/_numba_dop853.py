@@ -1,6 +1,6 @@
-"""Dormand and Prince's method of order 8(5,3) in numba, the loop and the equations compiled as one.
+"""Dormand and Prince's method of order 8(5,3) in numba, loop and equations compiled together.
 
-Coefficients are those of scipy; step control and first step as in Hairer, Norsett, Wanner,
+Coefficients are those of scipy. Step control and first step are as in Hairer, Norsett, Wanner,
 Solving Ordinary Differential Equations I, ch. II.4 and II.10 (their DOP853, and scipy's). The sums
 over stages are written out, without the terms that are zero.
 """
@@ -16,13 +16,13 @@ from bench.work_precision._straight_line import source
 
 
 class Solve(NamedTuple):
-    """`run(y0, t1, rtol, atol)`: the state at t1, accepted and all steps (0 where it failed)."""
+    """`run(y0, t1, rtol, atol)`: (state at t1, accepted steps, all steps); 0 steps if it failed."""
 
     run: Callable[[np.ndarray, float, float, float], tuple[np.ndarray, int, int]]
 
 
 def build(motion: Motion) -> Solve:
-    """Compile for one motion, its parameters constants."""
+    """Compile for one motion, with its parameters as constants."""
     njit = import_module("numba").njit
     space: dict[str, Any] = {"sin": np.sin, "cos": np.cos, "sqrt": np.sqrt, "np": np}
     size = motion.start().shape[-1]
@@ -88,8 +88,8 @@ def _step_source(size: int) -> str:
     """`step(y, h, k, z, y_new, rtol, atol)`: new state and k[12], the norm of the error."""
     from scipy.integrate._ivp import dop853_coefficients as table
 
-    def total(row: np.ndarray) -> str:
-        return " + ".join(f"{float(a)!r} * k[{j}, i]" for j, a in enumerate(row) if a)
+    def total(coefficients: np.ndarray) -> str:
+        return " + ".join(f"{float(a)!r} * k[{j}, i]" for j, a in enumerate(coefficients) if a)
 
     lines = ["def step(y, h, k, z, y_new, rtol, atol):"]
     for s in range(1, table.N_STAGES):

@@ -1,11 +1,11 @@
-"""The motions solved by libraries other than JAX, each as its manual has it used.
+"""The motions solved by libraries other than JAX, each used as its manual recommends.
 
-All get the same explicit equations with their parameters as constants, but for MuJoCo, which has
-models of its own. heyoka: a Taylor series of the order that the tolerance asks for, compiled for
-every tolerance. numba: `_numba_dop853`. CasADi: CVODES, the equations on its scalars.
-SUNDIALS: CVODE, the equations compiled by numba where that is there and called through Python.
-Both by Adams' methods and, where a motion is stiff, by backward differences. scipy: equations in
-plain Python, the fastest form for so few numbers.
+All have the same explicit equations with parameters as constants, except MuJoCo, which has its own
+models. heyoka: a Taylor series of the order required by the tolerance, compiled for every
+tolerance. numba: `_numba_dop853`. CasADi: CVODES, with the equations on its scalars. SUNDIALS:
+CVODE, with the equations compiled by numba if installed, and called through Python. Both use Adams
+methods and, if a motion is stiff, backward differences. scipy: equations in plain Python, which is
+the fastest form for so few numbers.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ MODULES = {
     "scipy": "scipy",
 }
 MOST_STEPS = 1_000_000
-PACKAGES = {"sksundae": "scikit-sundae"}  # where the module has another name
+PACKAGES = {"sksundae": "scikit-sundae"}  # module: package, if the names differ
 
 
 def missing() -> dict[str, str]:
@@ -42,13 +42,13 @@ def missing() -> dict[str, str]:
     for name, module in MODULES.items():
         try:
             import_module(module)
-        except Exception as error:  # a broken library is named like an absent one
+        except Exception as error:  # a broken library is reported like a missing one
             found[name] = f"{type(error).__name__}: {error}"
     return found
 
 
 def versions() -> dict[str, str]:
-    """Of those that are installed."""
+    """Versions of the installed libraries."""
     found = {}
     for name, module in MODULES.items():
         with suppress(PackageNotFoundError):
@@ -80,7 +80,7 @@ def heyoka(motion: Motion) -> Line:
 
 
 def heyoka_batch(motion: Motion) -> Line:
-    """Its SIMD mode, in as many batches as it takes."""
+    """heyoka's SIMD mode, in as many batches as needed."""
     hy = import_module("heyoka")
     width = hy.recommended_simd_size()
     starts = motion.start().T  # (size, lanes)
@@ -145,7 +145,7 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
         y, start, n = ca.SX.sym("y", motion.start().size), motion.start(), len(motion.q0)
         rates = motion.rates(of_expressions(ca), motion.params, ca.vertsplit(y))
         problem = {"x": y, "ode": ca.vertcat(*rates)}
-        said: list[str] = []
+        messages: list[str] = []
 
         def make(tolerance: float) -> Callable[[], Any]:
             options = {
@@ -159,8 +159,8 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
             def call() -> Any:
                 try:
                     return solve(x0=start)["xf"]
-                except RuntimeError as error:  # CVODES gives up
-                    said.append(str(error).strip().splitlines()[-1])
+                except RuntimeError as error:  # CVODES failed
+                    messages.append(str(error).strip().splitlines()[-1])
                     return np.full(start.size, np.nan)
 
             return call
@@ -168,7 +168,7 @@ def _casadi(method: str) -> Callable[[Motion], Line]:
         def read(end: Any) -> Solved:
             return Solved(np.asarray(end).ravel()[:n])
 
-        return Line("tolerance", tolerances(motion.loosest, 14.0), make, read, 0.0, said)
+        return Line("tolerance", tolerances(motion.loosest, 14.0), make, read, 0.0, messages)
 
     return line
 
@@ -194,7 +194,7 @@ def _sundials(method: str) -> Callable[[Motion], Line]:
 
 
 def compiled(motion: Motion) -> Callable[..., Any]:
-    """`rates(t, y, out)` by numba; plain Python where it cannot be imported."""
+    """`rates(t, y, out)` by numba; plain Python if numba cannot be imported."""
     function = plain(motion)
     try:
         njit = import_module("numba").njit
@@ -211,7 +211,7 @@ def compiled(motion: Motion) -> Callable[..., Any]:
 
 
 def plain(motion: Motion) -> Callable[..., Any]:
-    """`rates(t, y, out)` on Python's numbers."""
+    """`rates(t, y, out)` on Python numbers."""
     import math
 
     space: dict[str, Any] = {"sin": math.sin, "cos": math.cos, "sqrt": math.sqrt}
@@ -229,7 +229,7 @@ def _scipy(method: str) -> Callable[[Motion], Line]:
             return rates(t, y.tolist(), out).copy()
 
         def make(tolerance: float) -> Callable[[], Any]:
-            tolerance = max(tolerance, 2.3e-14)  # scipy's least
+            tolerance = max(tolerance, 2.3e-14)  # smallest tolerance of scipy
             return lambda: integrate.solve_ivp(
                 field, (0.0, motion.t1), start, method, rtol=tolerance, atol=tolerance
             )
@@ -248,7 +248,7 @@ def mujoco(motion: Motion) -> Line:
     model_of = MODELS[motion.rates.__name__]
     model, put, read = model_of(library, motion)
     data = library.MjData(model)
-    library.set_mju_user_warning(lambda text: None)  # of steps too long, into a file
+    library.set_mju_user_warning(lambda text: None)  # about long steps, to a file
 
     def make(step: float) -> Callable[[], Any]:
         count = round(motion.t1 / step)
@@ -268,7 +268,7 @@ def mujoco(motion: Motion) -> Line:
 
 
 def lines(motion: Motion) -> dict[str, tuple[str, Callable[[Motion], Line]]]:
-    """(library, how) by the names of the lines."""
+    """(library, function that makes the line), by the names of the lines."""
     if motion.lanes > 1:
         return {
             "heyoka, SIMD": ("heyoka", heyoka_batch),

@@ -1,7 +1,7 @@
 """The diagrams of `work-precision`: time over achieved error, one for each system.
 
-Every jaxlag solver has its line, thick where it is our fastest at some error; of diffrax and of
-libraries with several methods the best at each error is drawn.
+Every jaxlag solver has its own line. It is thick if this solver is jaxlag's fastest at some error.
+For diffrax and libraries with several methods, the best method at each error is drawn.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from bench.work_precision._ranking import is_ours
 from bench.work_precision._sweep import time_at
 
 ERRORS = 10.0 ** -np.arange(1.0, 14.01, 0.25)
-COLOURS = {
+COLORS = {
     "jaxlag": "tab:red",
     "heyoka": "black",
     "numba": "tab:green",
@@ -32,15 +32,15 @@ Curve = tuple[np.ndarray, np.ndarray]  # errors, us
 
 
 def name_of(system: str) -> str:
-    """The file of a system."""
-    words = "".join(x if x.isalnum() or x == "." else " " for x in system).split()
-    return f"work-precision-{'-'.join(words)}.png".lower()
+    """The file name of a system's diagram."""
+    parts = "".join(x if x.isalnum() or x == "." else " " for x in system).split()
+    return f"work-precision-{'-'.join(parts)}.png".lower()
 
 
 def group_of(line: str) -> str:
-    """What a line is drawn as: jaxlag's methods alone, the others with their kind."""
+    """The group in which a line is drawn: jaxlag's methods separately, the others by library."""
     library = line.split()[0].rstrip(",")
-    ending = next((line[line.index(words) :] for words in STYLES if words in line), "")
+    ending = next((line[line.index(label) :] for label in STYLES if label in line), "")
     if library == "jaxlag":
         return line
     if library == "diffrax":
@@ -49,7 +49,7 @@ def group_of(line: str) -> str:
 
 
 def curves(rows: Sequence[dict[str, Any]]) -> dict[str, Curve]:
-    """By group the least time at each error, as far as it goes."""
+    """The least time at each error by group, for the errors that the group reaches."""
     lines: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         lines.setdefault(group_of(row["line"]), {}).setdefault(row["line"], []).append(row)
@@ -57,7 +57,7 @@ def curves(rows: Sequence[dict[str, Any]]) -> dict[str, Curve]:
     for group, members in lines.items():
         pairs = []
         for error in ERRORS:
-            # Inside the line alone: a loosest point that is better already is no curve.
+            # Only within the line: errors above that of its loosest point are not drawn.
             times = [
                 time_at(points, error, "min_us")
                 for points in members.values()
@@ -72,7 +72,7 @@ def curves(rows: Sequence[dict[str, Any]]) -> dict[str, Curve]:
 
 
 def leaders(found: dict[str, Curve]) -> set[str]:
-    """Those of our lines that are our fastest at some error."""
+    """The lines of jaxlag that are its fastest at some error."""
     ours = {name: curve for name, curve in found.items() if is_ours(name)}
     best = set()
     for error in ERRORS:
@@ -85,7 +85,7 @@ def leaders(found: dict[str, Curve]) -> set[str]:
 
 
 def save(system: str, rows: Sequence[dict[str, Any]], folder: Path) -> str:
-    """Write the diagram of one system; its name, or why there is none."""
+    """Write the diagram of one system; return its name, or why it was not written."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -99,15 +99,15 @@ def save(system: str, rows: Sequence[dict[str, Any]], folder: Path) -> str:
     first, marks = leaders(found), iter(MARKS * 3)
     for name in sorted(found, key=lambda name: _rank(name, first)):
         errors, us = found[name]
-        colour = next(c for words, c in COLOURS.items() if name.startswith(words))
-        style = next((style for words, style in STYLES.items() if words in name), "-")
+        color = next(c for label, c in COLORS.items() if name.startswith(label))
+        style = next((style for label, style in STYLES.items() if label in name), "-")
         thick = name in first or name == "heyoka"
         ours = name.startswith("jaxlag")
         ax.loglog(
             errors,
             us,
             style,
-            color=colour,
+            color=color,
             marker=next(marks) if ours else None,
             markevery=4,
             markersize=5 if thick else 4,
@@ -131,5 +131,5 @@ def save(system: str, rows: Sequence[dict[str, Any]], folder: Path) -> str:
 
 
 def _rank(name: str, first: set[str]) -> tuple[int, bool, str]:
-    library = next(i for i, words in enumerate(COLOURS) if name.startswith(words))
+    library = next(i for i, label in enumerate(COLORS) if name.startswith(label))
     return library, name not in first, name

@@ -1,4 +1,4 @@
-"""What the rows of `work-precision` say: who is fastest at equal error, and whether that is us."""
+"""The ranking from the table rows of `work-precision`: the fastest line at equal error, targets."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ Belongs = Callable[[str], bool]
 
 
 def is_ours(line: str) -> bool:
-    """Solvers of jaxlag with XLA's setting, on the jax that runs the benchmark."""
+    """Whether a line is jaxlag's, with XLA's setting, on the jax that runs the benchmark."""
     return line.startswith("jaxlag") and ", jax " not in line
 
 
@@ -28,18 +28,18 @@ def is_peer(line: str) -> bool:
     return line.startswith(PEERS)
 
 
-def starts(*words: str) -> Belongs:
-    return lambda line: line.startswith(words)
+def starts(*prefixes: str) -> Belongs:
+    return lambda line: line.startswith(prefixes)
 
 
-def diffrax(words: str, setting: bool) -> Belongs:
+def diffrax(form: str, setting: bool) -> Belongs:
     """diffrax on equations "by hand" or "naive", with the setting or without."""
-    ending = words if setting else f"{words}, no setting"
+    ending = form if setting else f"{form}, no setting"
     return lambda line: line.startswith("diffrax") and line.endswith(ending)
 
 
 def best(rows: Iterable[Row], system: str, error: float, belongs: Belongs) -> tuple[float, str]:
-    """Least time of all such lines at an error, us, and whose; (inf, "") where none reaches it."""
+    """(least time at an error, us, its line) over these lines; (inf, "") if none reaches it."""
     lines: dict[str, list[Row]] = {}
     for row in rows:
         if row["system"] == system and belongs(row["line"]):
@@ -53,10 +53,10 @@ def best(rows: Iterable[Row], system: str, error: float, belongs: Belongs) -> tu
 
 
 def ratio(rows: Sequence[Row], system: str, error: float, others: Belongs) -> float:
-    """Our time over that of the best of others: nan where we never get there, 0 where only we do.
+    """jaxlag's time divided by that of the best of others, at an error.
 
-    nan, too, where the others have no rows, as libraries that are not installed: nothing was
-    compared.
+    It is nan if jaxlag does not reach the error, and 0 if only jaxlag reaches it. It is also nan if
+    the others have no table rows, for example if the libraries are not installed.
     """
     if not any(row["system"] == system and others(row["line"]) for row in rows):
         return math.nan
@@ -66,7 +66,7 @@ def ratio(rows: Sequence[Row], system: str, error: float, others: Belongs) -> fl
 
 
 def fastest(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """For every system and error the best of ours, of the peers and of diffrax by hand, us."""
+    """For every system and error the best time of jaxlag, of the peers and of diffrax, us."""
     groups = {
         "jaxlag": is_ours,
         "peer": is_peer,
@@ -77,17 +77,17 @@ def fastest(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for system in dict.fromkeys(row["system"] for row in rows):
         for error in ERRORS:
             cells: dict[str, Any] = {"system": system, "error": f"{error:.0e}"}
-            for words, belongs in groups.items():
+            for label, belongs in groups.items():
                 us, line = best(rows, system, error, belongs)
-                cells[f"{words}_us"] = us if us < math.inf else None
-                if words in ("jaxlag", "peer"):
-                    cells[words] = line
+                cells[f"{label}_us"] = us if us < math.inf else None
+                if label in ("jaxlag", "peer"):
+                    cells[label] = line
             table.append(cells)
     return table
 
 
-def told(rows: Sequence[Row]) -> list[Reference]:
-    """The table "fastest at 1e-6, 1e-9, 1e-12" in words."""
+def fastest_references(rows: Sequence[Row]) -> list[Reference]:
+    """References that name the fastest line at 1e-6, 1e-9 and 1e-12."""
     found = []
     for system in dict.fromkeys(row["system"] for row in rows):
         for error in ERRORS:
@@ -100,11 +100,11 @@ def told(rows: Sequence[Row]) -> list[Reference]:
 
 
 def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], list[Reference]]:
-    """Targets of these systems, and for every one missed the steps and times of both sides."""
+    """Targets of these systems, and the steps and times of both sides for every missed target."""
     plans: list[tuple[str, str, float, float, Belongs]] = []  # claim, system, error, bound, others
 
-    def at_most(bound: float, system: str, errors: Sequence[float], words: str, who: Belongs):
-        plans.extend((words, system, error, bound, who) for error in errors)
+    def at_most(bound: float, system: str, errors: Sequence[float], label: str, who: Belongs):
+        plans.extend((label, system, error, bound, who) for error in errors)
 
     at_most(1.0, REGULAR, (1e-6, 1e-9), "the best of heyoka and numba", starts(*COMPILED))
     at_most(1.3, REGULAR, (1e-12,), "the best of heyoka and numba", starts(*COMPILED))
@@ -116,15 +116,15 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
     at_most(1.25, LANES, (1e-9,), "heyoka's SIMD mode", starts("heyoka"))
     at_most(1.0, LANES, (1e-7,), "heyoka's SIMD mode", starts("heyoka"))
     targets, profiles = [], []
-    for words, system, error, bound, who in plans:
+    for label, system, error, bound, who in plans:
         if system not in systems:
             continue
         what = f"{system} at {error:.0e}"
-        claim = f"times as long: jaxlag as {words}, {what}"
+        claim = f"times as long: jaxlag as {label}, {what}"
         targets.append(Target(claim, ratio(rows, system, error, who), "<=", bound))
         if not targets[-1].met:
             profiles.append(
-                Reference(profile(rows, system, error, who), f"missed: as {words}, {what}")
+                Reference(profile(rows, system, error, who), f"missed: as {label}, {what}")
             )
     targets += overall(rows, systems)
     for system in systems:
@@ -137,18 +137,18 @@ def judged(rows: Sequence[Row], systems: Sequence[str]) -> tuple[list[Target], l
             figure = ratio(rows, system, error, others)
             if figure > 1.0:
                 text = profile(rows, system, error, others)
-                words = f"diffrax by hand with the setting: {system} at {error:.0e}"
-                profiles.append(Reference(text, f"{figure:.3g} times {words}"))
+                label = f"diffrax by hand with the setting: {system} at {error:.0e}"
+                profiles.append(Reference(text, f"{figure:.3g} times {label}"))
     return targets, profiles
 
 
 def overall(rows: Sequence[Row], systems: Sequence[str]) -> list[Target]:
-    """What is claimed of all systems: the worst of them, nan for one without rows."""
+    """Targets for the worst of all systems; nan if a system has no table rows."""
     gains = {}
     for system in systems:
         for error in ERRORS:
             share = ratio(rows, system, error, diffrax("naive", False))
-            # Where the prototype is not there or never gets there, nothing can be said.
+            # If the prototype is missing or does not reach the error, there is no comparison.
             if (
                 not ours_exist(rows, system)
                 or best(rows, system, error, diffrax("naive", False))[1]
@@ -176,7 +176,7 @@ def ours_exist(rows: Sequence[Row], system: str) -> bool:
 
 
 def worst(figures: Mapping[str, float], smallest: bool) -> tuple[str, float]:
-    """nan is worse than anything."""
+    """The worst figure and its name; nan is worse than any number."""
     for name, figure in figures.items():
         if math.isnan(figure):
             return name, figure
@@ -184,7 +184,7 @@ def worst(figures: Mapping[str, float], smallest: bool) -> tuple[str, float]:
 
 
 def profile(rows: Sequence[Row], system: str, error: float, others: Belongs) -> str:
-    """Steps and time per step of both sides at an error, and what ours takes besides steps."""
+    """Steps and time per step of both sides at an error, and jaxlag's time besides the steps."""
     parts = []
     for belongs in (is_ours, others):
         us, line = best(rows, system, error, belongs)
@@ -203,7 +203,7 @@ def profile(rows: Sequence[Row], system: str, error: float, others: Belongs) -> 
 
 
 def fixed_and_each(points: Sequence[Row]) -> tuple[float, float]:
-    """Time of a solve without steps and time per accepted step, us, by least relative squares."""
+    """(time independent of the steps, time per accepted step), us, by least relative squares."""
     us = np.array([point["min_us"] for point in points], float)
     steps = np.array([point["steps"] for point in points], float)
     if len(set(steps)) < 2:

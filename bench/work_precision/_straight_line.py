@@ -1,6 +1,6 @@
-"""Source code of equations: one line for each operation, none of them twice.
+"""Source code of equations: one line for each operation, without repetitions.
 
-Numba and Python's own numbers get the equations of `_problems.explicit_equations` in this form.
+Numba and plain Python use the equations of `_problems.explicit_equations` in this form.
 """
 
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from bench._problems.explicit_equations import Functions, Rates
 
 
 class _Line:
-    """A number that has been given a name."""
+    """A number with a name in the code."""
 
     def __init__(self, code: "_Code", name: str) -> None:
         self.code, self.name = code, name
@@ -56,25 +56,25 @@ class _Code:
         return self.known[expression]
 
     def line(self, operator: str, a: Any, b: Any) -> _Line:
-        return self.named(f"{_word(a)} {operator} {_word(b)}")
+        return self.named(f"{_operand(a)} {operator} {_operand(b)}")
 
     def function(self, name: str) -> Any:
-        return lambda x: self.named(f"{name}({_word(x)})")
+        return lambda x: self.named(f"{name}({_operand(x)})")
 
 
-def _word(x: Any) -> str:
+def _operand(x: Any) -> str:
     return x.name if isinstance(x, _Line) else f"({float(x)!r})"
 
 
 def source(rates: Rates, params: Mapping[str, Any], size: int, name: str = "rates") -> str:
     """A function `name(t, y, out)` that writes the rates into `out` and returns it.
 
-    It calls sin, cos and sqrt, which are to be in its namespace.
+    It calls sin, cos and sqrt, which must be in its namespace.
     """
     code = _Code()
-    sin, cos, sqrt = (code.function(word) for word in ("sin", "cos", "sqrt"))
+    sin, cos, sqrt = (code.function(function_name) for function_name in ("sin", "cos", "sqrt"))
     functions = Functions(sin, cos, sqrt, lambda x: 1.0 / (x * sqrt(x)))
     ends = rates(functions, params, [_Line(code, f"y{i}") for i in range(size)])
     body = [f"y{i} = y[{i}]" for i in range(size)]
-    body += code.lines + [f"out[{i}] = {_word(x)}" for i, x in enumerate(ends)] + ["return out"]
+    body += code.lines + [f"out[{i}] = {_operand(x)}" for i, x in enumerate(ends)] + ["return out"]
     return f"def {name}(t, y, out):\n" + "".join(f"    {line}\n" for line in body)

@@ -1,4 +1,4 @@
-"""Lines of a diagram of work over error: one way to solve at many tolerances or steps."""
+"""Lines of a work-precision diagram: one method at many tolerances or steps."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,19 +10,19 @@ import jax
 
 from bench._harness.timing import Call, seconds
 
-CLOSE = 3e-14  # an error no tighter tolerance needs to go below
-WRONG = 0.1  # errors that no line needs
-ROUNDED = 1e-8  # from here on
-PATIENCE = 3  # values in a row without progress mean that rounding has the last word
-FACTOR = 4  # by which a first run may exceed the patience, for what it compiles
+CLOSE = 3e-14  # an error below which the sweep ends
+WRONG = 0.1  # larger errors are not recorded
+ROUNDED = 1e-8  # errors below this may be limited by rounding
+PATIENCE = 3  # successive values without progress, after which rounding limits the error
+FACTOR = 4  # by which a first run may exceed the patience, because it may compile
 
 
 class Solved(NamedTuple):
-    """What one run ended with.
+    """The result of one run.
 
     Attributes:
-        q: coordinates at the end; nan where it was not reached.
-        steps: accepted steps; None where the program does not tell.
+        q: final coordinates; nan if the end was not reached.
+        steps: accepted steps; None if unknown.
     """
 
     q: Any
@@ -35,10 +35,10 @@ class Line(NamedTuple):
     Attributes:
         knob: "tolerance" or "step" (in s).
         knobs: its values, from loose to tight.
-        make: a call that returns finished work for one value.
-        read: what it returned.
-        build_s: what it took to get here, compilation in it; `make` may add to that.
-        said: what runs that failed said, added to as they do.
+        make: function of one value that returns a call for one solve.
+        read: function of the call's return value that gives the result.
+        build_s: seconds to build the line, including compilation; `make` may take more.
+        messages: of failed runs; each failure adds one.
     """
 
     knob: str
@@ -46,12 +46,12 @@ class Line(NamedTuple):
     make: Callable[[float], Call]
     read: Callable[[Any], Solved]
     build_s: float
-    said: Sequence[str] = ()
+    messages: Sequence[str] = ()
 
     def why_none(self, patience_s: float) -> str:
-        """Of a line without a point."""
-        if self.said:
-            return self.said[-1]
+        """The reason why a line has no points."""
+        if self.messages:
+            return self.messages[-1]
         return f"no run of at most {FACTOR * patience_s:g} s ended with an error below {WRONG:g}"
 
 
@@ -62,13 +62,13 @@ def tolerances(loosest: float = 2.5, tightest: float = 14.0, each: float = 0.5) 
 
 
 def steps(t1: float, fewest: int, most: int) -> list[float]:
-    """Steps that go into the span a whole number of times, from `fewest` on."""
+    """Step lengths that divide the span into a whole number of steps, `fewest` or more."""
     counts = [fewest * 2**i for i in range(32)]
     return [t1 / count for count in counts if count <= most]
 
 
 def built(make: Callable[[], Line]) -> Line:
-    """The line, with what making it took."""
+    """The line, with the time to build it."""
     start = perf_counter()
     line = make()
     return line._replace(build_s=line.build_s + perf_counter() - start)
@@ -77,10 +77,10 @@ def built(make: Callable[[], Line]) -> Line:
 def swept(
     line: Line, error: Callable[[Any], float], patience_s: float
 ) -> tuple[dict[str, Call], list[dict[str, Any]]]:
-    """Calls by the values of the knob, and what is known of them before they are timed.
+    """Calls by the values of the knob, and their points before timing.
 
-    It ends where rounding takes over and with the first run longer than `patience_s`. Points have
-    the two runs made here: `swept_s`.
+    The sweep ends when rounding limits the error, or after the first run longer than `patience_s`.
+    Points contain the times of the two runs made here: `swept_s`.
     """
     calls: dict[str, Call] = {}
     points: list[dict[str, Any]] = []
@@ -96,7 +96,7 @@ def swept(
             break
         again = seconds(call)
         found = error(solved.q)
-        if found < WRONG:  # nan is not
+        if found < WRONG:  # False for nan
             calls[f"{value:.3g}"] = call
             points.append(
                 {
@@ -118,10 +118,10 @@ def swept(
 
 
 def time_at(points: Iterable[Mapping[str, Any]], error: float, column: str) -> float | None:
-    """Least time in which the line reaches an error, None where it never does.
+    """Least time in which the line reaches an error; None if it does not.
 
-    Between two neighbours on the line that enclose it, times are interpolated in logarithms. Where
-    the loosest point is better already, its own time is one that suffices.
+    Between two adjacent points of the line that enclose the error, times are interpolated in
+    logarithms. If the error of the loosest point is smaller, its time is used.
     """
     line = [(point["error"], point[column]) for point in points]
     found = [line[0][1]] if line and line[0][0] <= error else []

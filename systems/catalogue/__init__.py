@@ -39,11 +39,11 @@ class _Entries(Mapping[str, AbstractEntry]):
 
 
 ENTRIES: Mapping[str, AbstractEntry] = _Entries()
-"""Name -> entry, in the order of the book; what is not in it last."""
+"""Name -> entry, in the order of the book; systems that are not in the book come last."""
 
 
 class UnknownSystem(LookupError):
-    """A name that no system of this package bears."""
+    """No system of this package has this name."""
 
 
 def find(name: str) -> AbstractEntry:

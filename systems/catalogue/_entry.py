@@ -1,4 +1,4 @@
-"""One system of the book: its declaration and what is known about it."""
+"""One system of the book: its declaration and known results."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,16 +18,16 @@ StateFunction = Callable[..., ArrayLike]
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """A start and parameters worth looking at.
+    """Parameters and a start for an example run.
 
     Attributes:
         params: parameter name -> value, a number or an array, in the units of `parameter_units`.
         q0: coordinates at t = 0, in the order of the system's coordinates.
         v0: generalized velocities at t = 0.
         duration: length of the run [s].
-        hold: what stays as it is where q0 and v0 are a guess, to be assembled under the
-            constraints: names of coordinates and, with a prime, of velocities. None where q0 and
-            v0 satisfy the constraints themselves.
+        hold: given if q0 and v0 are a guess that must be assembled with the constraints: names of
+            the coordinates and, with a prime, of the velocities to be held. None if q0 and v0
+            satisfy the constraints.
     """
 
     params: Mapping[str, Any]
@@ -46,7 +46,7 @@ class StaticExample:
 
 @dataclass(frozen=True, kw_only=True)
 class PrescribedExample:
-    """Parameters of a prescribed motion, and for how long to follow it [s]."""
+    """Parameters of a prescribed motion, and its duration [s]."""
 
     params: Mapping[str, float]
     duration: float
@@ -54,7 +54,7 @@ class PrescribedExample:
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """Independent coordinates from which all of a constrained system's follow.
+    """Independent coordinates that determine all coordinates of a constrained system.
 
     Attributes:
         coordinates: their names, among those of the system and in its order.
@@ -77,7 +77,7 @@ class Chart:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AbstractEntry:
-    """What every system of the book has; compared and hashed by identity.
+    """Data of every system of the book; entries are compared and hashed by identity.
 
     Attributes:
         name: the name of its module.
@@ -86,12 +86,12 @@ class AbstractEntry:
         coordinate_units: one unit per coordinate.
         quasi_units: one unit per quasi-velocity.
         multiplier_units: name of a constraint -> unit of its multiplier, in the order of the
-            constraints; every row has a name of its own.
+            constraints; every row has its own name.
         parameter_units: parameter name -> unit; names every parameter.
-        example: parameters, and a start where there is one, to run.
-        chart: the independent coordinates that reference files are written in, which say nothing
-            of constraints then; None where they are written in all coordinates.
-        kind: what is asked of it: "trajectory", "static" or "prescribed".
+        example: parameters and, if there is one, a start.
+        chart: the independent coordinates of reference files, which then do not contain
+            constraints; None if reference files have all coordinates.
+        kind: the kind of problem: "trajectory", "static" or "prescribed".
     """
 
     kind: ClassVar[str]
@@ -107,7 +107,7 @@ class AbstractEntry:
     chart: Chart | None = None
 
     def __post_init__(self) -> None:
-        """Check that the entry speaks of one system throughout."""
+        """Check that all data of the entry belong to its system."""
         self._check_length("coordinate_units", self.coordinate_units)
         if len(self.quasi_units) != len(self.quasi_velocities):
             names = ", ".join(self.quasi_velocities) or "no quasi-velocities"
@@ -126,8 +126,8 @@ class AbstractEntry:
                 f"{self.name}: multiplier_units must name the constraints {declared}, in this "
                 f"order, but it named {self.constraints}."
             )
-        kept = tuple(name for name in self.coordinates if name in self.file_coordinates)
-        if self.file_coordinates != kept:
+        ordered = tuple(name for name in self.coordinates if name in self.file_coordinates)
+        if self.file_coordinates != ordered:
             raise ValueError(
                 f"{self.name}: chart.coordinates must be among {', '.join(self.coordinates)}, in "
                 f"this order, but they were {', '.join(self.file_coordinates)}."
@@ -156,17 +156,17 @@ class AbstractEntry:
 
     @property
     def file_coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates that reference files are written in."""
+        """Names of the coordinates in reference files."""
         return self.coordinates if self.chart is None else self.chart.coordinates
 
     @property
     def file_constraints(self) -> tuple[str, ...]:
-        """Names of the constraint rows that reference files speak of."""
+        """Names of the constraint rows in reference files."""
         return self.constraints if self.chart is None else ()
 
     @property
     def file_columns(self) -> np.ndarray:
-        """Where the coordinates of reference files stand among all of them."""
+        """Indices of the coordinates of reference files among all coordinates."""
         return np.array([self.coordinates.index(name) for name in self.file_coordinates])
 
     def _check_length(self, argument: str, values: Sequence | Array) -> None:
@@ -183,10 +183,10 @@ class Entry(AbstractEntry):
 
     Attributes:
         extras: name -> function of the state, beyond the H, p and dp/dt of every system.
-        invariants: name -> function of the state that the motion keeps constant, as long as no
+        invariants: name -> function of the state that is constant along the motion, as long as no
             force is applied.
         exact: `exact(t, q0, v0, params)`, (q, v) at t of the motion from (q0, v0) at t = 0, each
-            (n,), in closed form; None where none is known. Its derivatives by JAX are exact, too.
+            (n,), in closed form; None if none is known. Its derivatives by JAX are also exact.
     """
 
     kind: ClassVar[str] = "trajectory"
@@ -197,13 +197,13 @@ class Entry(AbstractEntry):
     exact: Callable[..., tuple[Array, Array]] | None = None
 
     def __post_init__(self) -> None:
-        """Check the start, too."""
+        """Check also the start."""
         super().__post_init__()
         self._check_length("example.q0", self.example.q0)
         self._check_length("example.v0", self.example.v0)
 
     def start(self) -> tuple[Array, Array]:
-        """(q, v) of the example at t = 0, each (n,), assembled where it is a guess."""
+        """(q, v) of the example at t = 0, each (n,), assembled if it is a guess."""
         q0, v0 = jnp.asarray(self.example.q0), jnp.asarray(self.example.v0)
         if self.example.hold is None:
             return q0, v0
@@ -213,7 +213,7 @@ class Entry(AbstractEntry):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StaticEntry(AbstractEntry):
-    """A system whose state of rest is asked.
+    """A system with a state of rest to be found.
 
     Attributes:
         guess: `guess(params)`, coordinates from which the search for the state of rest starts.
@@ -227,7 +227,7 @@ class StaticEntry(AbstractEntry):
     values: Mapping[str, Callable[..., ArrayLike]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the guess, too."""
+        """Check also the guess."""
         super().__post_init__()
         self._check_length("guess", self.guess(self.example.params))
 
@@ -239,7 +239,7 @@ class StaticEntry(AbstractEntry):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PrescribedEntry(AbstractEntry):
-    """A system led along a given motion, whose forces are asked.
+    """A system with a prescribed motion and forces to be found.
 
     Attributes:
         motion: `motion(t, params)`, the coordinates, shape (n,), at a time t [s].

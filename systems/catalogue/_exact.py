@@ -1,6 +1,6 @@
 """Motions in closed form that several systems share: (q, v) at t from (q0, v0) at t = 0.
 
-JAX differentiates them to rounding.
+Their derivatives by JAX are exact to rounding.
 """
 
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from jax.scipy.linalg import block_diag, expm
 from jax.typing import ArrayLike
 
 _LANDEN = 7
-"""Landen's transformations: the modulus falls below 1e-16 for m up to 0.9999."""
+"""Number of Landen's transformations: they reduce the modulus below 1e-16 for m up to 0.9999."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _PIECES = 8
 
 
 def accelerated(t: Array, q0: Array, v0: Array, a: Array) -> tuple[Array, Array]:
-    """Under a constant acceleration a, shape (n,)."""
+    """Motion with a constant acceleration a, shape (n,)."""
     return q0 + v0 * t + 0.5 * a * t**2, v0 + a * t
 
 
@@ -34,25 +34,25 @@ def oscillating(
     F: Array,
     w: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Of M q'' + C q' + K q = f + F cos(w t): one exponential of (q, v, 1, cos(w t), sin(w t)).
+    """Motion of M q'' + C q' + K q = f + F cos(w t), by one matrix exponential.
 
-    M, C and K are (n, n), f and F are (n,).
+    It acts on (q, v, 1, cos(w t), sin(w t)). M, C and K are (n, n), f and F are (n,).
     """
     n = len(f)
     rates = jnp.linalg.solve(M, jnp.column_stack([-K, -C, f, F, 0.0 * F]))
     forms = jnp.concatenate([jnp.eye(n, 2 * n + 3, n), rates])
-    turn = w * jnp.array([[0.0, -1.0], [1.0, 0.0]])
-    forcing = block_diag(jnp.zeros((1, 1)), turn)
+    rotation = w * jnp.array([[0.0, -1.0], [1.0, 0.0]])
+    forcing = block_diag(jnp.zeros((1, 1)), rotation)
     whole = jnp.concatenate([forms, jnp.pad(forcing, ((0, 0), (2 * n, 0)))])
     y = expm(t * whole) @ jnp.concatenate([q0, v0, jnp.array([1.0, 1.0, 0.0])])
     return y[:n], y[n : 2 * n]
 
 
 def swinging(t: Array, q0: Array, v0: Array, rate: Array) -> tuple[Array, Array]:
-    """Of theta'' = -rate^2 sin(theta), while it does not turn over.
+    """Motion of theta'' = -rate^2 sin(theta) without full turns.
 
-    sin(theta/2) = k sn(rate t + s), cos(theta/2) = dn and theta' = 2 rate k cn, the start s taken
-    in by the addition theorem, so that neither k nor s is needed, only k^2.
+    sin(theta/2) = k sn(rate t + s), cos(theta/2) = dn and theta' = 2 rate k cn. The addition
+    theorem accounts for the start s, so that only k^2 is needed, not k and s.
     """
     theta, p = q0[0], v0[0] / (2 * rate)
     s0, c0 = jnp.sin(theta / 2), jnp.cos(theta / 2)
@@ -65,7 +65,9 @@ def swinging(t: Array, q0: Array, v0: Array, rate: Array) -> tuple[Array, Array]
 
 
 def integral(function: Callable[[Array], Array], t: Array) -> Array:
-    """Of function(t) from 0 to t, by Gauss-Legendre of 20 points in 8 pieces: to rounding here.
+    """Integral of function(t) from 0 to t, by Gauss-Legendre with 20 points in each of 8 pieces.
+
+    It is exact to rounding for the functions here.
 
     `function` maps times of any shape to values of the same shape.
     """

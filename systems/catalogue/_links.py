@@ -22,7 +22,7 @@ def centers(lengths: Array, angles: Array) -> Array:
 
 
 def kinetic(masses: Array, lengths: Array, angles: Array, rates: Array) -> Array:
-    """T of the mass centers and of the turns about them, m l^2/12 each [J]."""
+    """T of the mass centers and of the rotations about them, with inertias m l^2/12 [J]."""
 
     def position(t: Array, q: Array, params: None) -> Array:
         return centers(lengths, q)

@@ -1,4 +1,4 @@
-"""Velocities at the point of contact of what rolls on a plane, along its X, Y [m/s]."""
+"""Velocities of rolling bodies at the point of contact, along X, Y of the plane [m/s]."""
 
 import jax.numpy as jnp
 from jax import Array

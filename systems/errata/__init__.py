@@ -1,9 +1,9 @@
-"""Errata of chapters 1 to 4 of Pila's book, each shown by numbers: `python -m systems errata`.
+"""Errata of chapters 1 to 4 of Pila's book, each shown numerically: `python -m systems errata`.
 
-Every printed formula that is wrong is evaluated with its correction at a few random states, and
-both are compared with what `jaxlag` finds there by differentiation from positions, energies and
-points of application. The error of a formula is its largest deviation over these states and all
-its components, in units of the largest value of the engine.
+Every wrong printed formula and its correction are evaluated at a few random states. Both are
+compared with the values that `jaxlag` computes there by differentiation, from positions, energies
+and points of application. The error of a formula is its largest deviation over these states and
+all its components, in units of the largest value of the engine.
 """
 
 from argparse import ArgumentParser
@@ -25,10 +25,10 @@ from systems.errata._erratum import Erratum as Erratum
 from systems.errata._erratum import Errors, examine
 
 TOLERANCE = 64 * float(np.finfo(float).eps)
-"""Largest error of a right formula: roundings in some ten terms, each some times their sum."""
+"""Largest error of a right formula: rounding in about ten terms, each larger than their sum."""
 
 WRONG = 1e-6
-"""An error above this is no rounding."""
+"""An error above this is not a rounding error."""
 
 ERRATA: tuple[Erratum, ...] = (
     *_chapter1.ERRATA,
@@ -52,7 +52,7 @@ TEXT_ONLY: tuple[tuple[str, str], ...] = (
     *_chapter4_body_axes.TEXT_ONLY,
     *_chapter4_flight.TEXT_ONLY,
 )
-"""(place, remark) of those in words and signs, where no two formulas differ in value."""
+"""(place, remark) of misprints in words and symbols that do not change a value."""
 
 
 def confirmed(errors: Errors) -> bool:

@@ -1,6 +1,6 @@
-"""What the errata of chapters 1 and 4 need of a body with the angles (phi, theta, psi).
+"""Functions of a body with the angles (phi, theta, psi), for the errata of chapters 1 and 4.
 
-First the engine's side, from `jaxlag.rotation` and particles; then the formulas', written out.
+First those of the engine, from `jaxlag.rotation` and particles; then the formulas, written out.
 """
 
 import jax.numpy as jnp
@@ -9,21 +9,21 @@ from numpy import array, cos, cross, sin
 from jaxlag.rotation import yaw_pitch_roll
 from systems.errata._erratum import State, motion
 
-# The engine's side.
+# By the engine.
 
 
-def turned(angles):
-    """T_I/B, which takes body components to inertial ones."""
+def rotation_matrix(angles):
+    """T_I/B, which transforms body components to inertial ones."""
     return yaw_pitch_roll.matrix(angles[::-1])
 
 
 def pose(t, q, params):
     """(T_I/B, r_O) of a body with q = (X, Y, Z, phi, theta, psi)."""
-    return turned(q[3:]), q[:3]
+    return rotation_matrix(q[3:]), q[:3]
 
 
 def body_torque(angles, Q):
-    """Torque, body components, that does the work of the generalized force Q on the angles."""
+    """Torque, body components, equivalent to the generalized force Q on the angles."""
     W = yaw_pitch_roll.body_rate_matrix(angles[::-1])[:, ::-1]
     return jnp.linalg.solve(W.T, Q)
 
@@ -31,20 +31,20 @@ def body_torque(angles, Q):
 def spinning(t, q, params):
     """Six particles of mass m/6 at -+a, -+b, -+c on the body axes, turned by q = angles."""
     arms = jnp.diag(jnp.stack([params["a"], params["b"], params["c"]]))
-    return jnp.concatenate([arms, -arms]) @ turned(q).T
+    return jnp.concatenate([arms, -arms]) @ rotation_matrix(q).T
 
 
 def needed_torque(s: State):
-    """Torque, body components, that a motion of `spinning` needs."""
+    """Torque, body components, required for a motion of `spinning`."""
     r, _, acceleration = motion(spinning, s, s.a)
     moment = s.params["m"] / 6 * jnp.sum(jnp.cross(r, acceleration), axis=0)
-    return turned(s.q).T @ moment
+    return rotation_matrix(s.q).T @ moment
 
 
 SPINNING = {"m": 3.0, "a": 0.5, "b": 0.8, "c": 0.3}
 """Parameters of `spinning`."""
 
-# The formulas' side.
+# By the formulas.
 
 
 def moments(s: State):
@@ -72,7 +72,7 @@ def rates_matrix(angles):
 
 
 def rates_matrix_rate(angles, rates):
-    """M' where the angles change at these rates."""
+    """M' for these rates of the angles."""
     (cF, cT, _), (sF, sT, _) = cos(angles), sin(angles)
     by_phi = array([[0.0, 0.0, 0.0], [0.0, -sF, cF * cT], [0.0, -cF, -sF * cT]])
     by_theta = array([[0.0, 0.0, -cT], [0.0, 0.0, -sF * sT], [0.0, 0.0, -cF * sT]])
@@ -80,7 +80,7 @@ def rates_matrix_rate(angles, rates):
 
 
 def body_rates(s: State):
-    """(w, w'): body rates and their rates, where q ends with the angles."""
+    """(w, w'): body rates and their rates; the last entries of q are the angles."""
     angles, rates = s.q[-3:], s.v[-3:]
     M = rates_matrix(angles)
     return M @ rates, M @ s.a[-3:] + rates_matrix_rate(angles, rates) @ rates

@@ -6,8 +6,8 @@ from systems.errata._erratum import Erratum, State, around
 
 
 def _left_to_complete(s: State):
-    """What a right angle between the first two columns of T_B/I leaves to their last term."""
-    A = direction_cosines(attitude.turned(s.q))
+    """Last term of the scalar product of the first two columns of T_B/I, which is zero."""
+    A = direction_cosines(attitude.rotation_matrix(s.q))
     return -(A[0, 0] * A[0, 1] + A[1, 0] * A[1, 1])
 
 

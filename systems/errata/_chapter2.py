@@ -143,7 +143,7 @@ def _transverse(s: State):
 
 
 def _centripetal(s: State):
-    """In units of g, from the force that holds the rider."""
+    """Centripetal acceleration in units of g, from the force on the rider."""
     force = jl.inverse_dynamics(carnival_ride.system, s.q, s.v, s.a, s.params, t=s.t)
     return -force[0] / (s.params["m"] * FREE_FALL)
 

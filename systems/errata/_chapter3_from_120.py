@@ -129,7 +129,7 @@ _STICK = jl.System(
     potential=falling_stick_multiplier.potential,
     forces=(jl.PointForce(_contact, _ground_force, "ground"),),
 )
-"""The stick with no ground but its force (mu N, N) at the lower end."""
+"""The stick without ground, with the ground's force (mu N, N) at its lower end."""
 
 _sliding = around({"m": 0.5, "L": 1.0, "g": 9.81, "mu": 0.3, "N": 4.0}, (0.0, 1.0))
 
@@ -140,7 +140,7 @@ def _stick(t, q, params):
 
 
 def _friction_moment(s: State):
-    """What the friction adds to the generalized force on theta."""
+    """Generalized force of the friction on theta."""
     q = _stick(s.t, s.q, s.params)
     rough, smooth = s.params, {**s.params, "mu": 0.0 * s.params["mu"]}
     Q, Q_smooth = (_STICK.generalized_force(q, jnp.zeros(3), p) for p in (rough, smooth))
@@ -148,7 +148,7 @@ def _friction_moment(s: State):
 
 
 def _sliding_acceleration(s: State):
-    """(x_c'', theta'') at which the ground's force (mu N, N) is all that the motion needs."""
+    """(x_c'', theta'') for which the ground's force (mu N, N) is the only applied force."""
 
     def missing(unknown):
         a, N = unknown[:2], unknown[2]
@@ -164,9 +164,9 @@ def _sliding_formula(s: State, mu: float):
     c, sine, w = cos(s.q[1]), sin(s.q[1]), s.v[1]
     lever = c - mu * sine
     inertia = m * L**2 / 12 + 0.25 * m * L**2 * c * lever
-    turn = -0.5 * L * lever * (m * g - 0.5 * m * L * w**2 * sine) / inertia
-    N = m * g + 0.5 * m * L * (turn * c - w**2 * sine)
-    return [s.params["mu"] * N / m, turn]
+    theta_acceleration = -0.5 * L * lever * (m * g - 0.5 * m * L * w**2 * sine) / inertia
+    N = m * g + 0.5 * m * L * (theta_acceleration * c - w**2 * sine)
+    return [s.params["mu"] * N / m, theta_acceleration]
 
 
 # Spherical pendulum on a string of given length L(t), driven and damped.

@@ -1,6 +1,6 @@
 """Errata of chapter 3 up to eq. 3.119, in the order of the book.
 
-Those of Example 5 have a module of their own.
+Those of Example 5 are in `_quadcopter.py`.
 """
 
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ _BOBS = jl.System(
     kinetic=double_pendulum_cartesian.kinetic,
     potential=double_pendulum_cartesian.potential,
 )
-"""The two bobs with no strings."""
+"""The two bobs without strings."""
 
 
 def _displacement(s: State, factor):
@@ -82,7 +82,7 @@ def _bob_energy(s: State, power: int):
 
 
 def _second_equation(s: State, power: int):
-    """Left-hand side of the second equation of motion, with m2 h2^power theta2''."""
+    """Left side of the second equation of motion, with m2 h2^power theta2''."""
     m2, h1, h2, g = s.values("m2", "h1", "h2", "g")
     theta1, theta2 = s.q
     c, sine = cos(theta1 - theta2), sin(theta1 - theta2)
@@ -105,7 +105,7 @@ def _multiplier_forces(s: State, sign: int):
     (theta1, theta2), (w1, w2) = s.q, s.v
     u1, u2 = array([sin(theta1), -cos(theta1)]), array([sin(theta2), -cos(theta2)])
     c = cos(theta1 - theta2)
-    # Along the strings: m1 h1 w1^2 = t1 - t2 c - m1 g cos(theta1), and for the second bob less
+    # Along the strings: m1 h1 w1^2 = t1 - t2 c - m1 g cos(theta1), and for the second bob minus
     # the first m1 m2 h2 w2^2 = (m1 + m2) t2 - m2 t1 c.
     right = array([m1 * (h1 * w1**2 + g * cos(theta1)), m1 * m2 * h2 * w2**2])
     determinant = m1 + m2 - m2 * c**2
@@ -128,7 +128,7 @@ _BOB = jl.System(
     kinetic=lambda t, q, v, params: 0.5 * params["m1"] * v @ v,
     potential=lambda t, q, params: params["m1"] * params["g"] * q[1],
 )
-"""The bob of the simple pendulum with no string."""
+"""The bob of the simple pendulum without its string."""
 
 
 def _string_force(s: State):

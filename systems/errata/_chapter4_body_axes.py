@@ -33,7 +33,7 @@ def particles(t, q, params):
 
 
 def needed(s: State):
-    """(force, torque about O), body components, that a motion of the body needs."""
+    """(force, torque about O), body components, required for a motion of the body."""
     r, _, acceleration = motion(particles, s, s.a)
     pulls = masses(s.params)[:, None] * acceleration
     R, origin = attitude.pose(s.t, s.q, s.params)
@@ -60,7 +60,7 @@ def rotational_rate(s: State):
         r, speeds = particles(t, q, s.params), energy.velocity(particles, t, q, v, s.params)
         return jnp.sum(masses(s.params)[:, None] * jnp.cross(r - q[:3], speeds), 0)
 
-    return attitude.turned(s.q[3:]).T @ rate(total, s, s.a)
+    return attitude.rotation_matrix(s.q[3:]).T @ rate(total, s, s.a)
 
 
 def mass_properties(s: State):
@@ -78,7 +78,7 @@ _STEP = 0.01
 def _increment(s: State):
     """(dR of R^T dR)_32, for increments of the angles."""
     angles, steps = jnp.asarray(s.q), _STEP * jnp.asarray(s.v)
-    return rotation.body_rates(*jax.jvp(attitude.turned, (angles,), (steps,)))[0]
+    return rotation.body_rates(*jax.jvp(attitude.rotation_matrix, (angles,), (steps,)))[0]
 
 
 def _increment_formula(s: State, psi: float):
@@ -91,12 +91,12 @@ def _third_row_by_vI(s: State):
 
 
 def _turning_of_velocity(s: State):
-    """Body components of dV/dt less the rates of the body components of V."""
+    """Body components of dV/dt minus the rates of the body components of V."""
 
     def components(t, q, v):
         return energy.body_velocity(attitude.pose, t, q, v, s.params)[0]
 
-    return attitude.turned(s.q[3:]).T @ s.a[:3] - rate(components, s, s.a)
+    return attitude.rotation_matrix(s.q[3:]).T @ s.a[:3] - rate(components, s, s.a)
 
 
 def _omega_cross_V(s: State):
@@ -122,13 +122,13 @@ def _arm_rate(s: State):
         return center(t, q, params) - q[:3]
 
     velocity = energy.velocity(arm, s.t, s.q, s.v, s.params)
-    return attitude.turned(s.q[3:]).T @ velocity
+    return attitude.rotation_matrix(s.q[3:]).T @ velocity
 
 
 def _momentum(s: State):
     """dT/dV at fixed body rates."""
     by_velocity = jax.grad(kinetic, argnums=2)(s.t, s.q, jnp.asarray(s.v), s.params)[:3]
-    return attitude.turned(s.q[3:]).T @ by_velocity
+    return attitude.rotation_matrix(s.q[3:]).T @ by_velocity
 
 
 def _center_velocity(s: State):

@@ -12,7 +12,7 @@ from systems.errata import _attitude as attitude
 from systems.errata import _chapter4_body_axes as body
 from systems.errata._erratum import Erratum, State, around, rate
 
-# Aircraft, the engine's side: four particles, a force and a torque fixed in the body axes.
+# Aircraft by the engine: four particles, a force and a torque fixed in the body axes.
 
 
 def _weight_energy(s: State):
@@ -26,7 +26,7 @@ def _body_rates(t, q, v, params):
 
 
 def _force(t, q, v, params):
-    return attitude.turned(q[3:]) @ jnp.stack([params["Fx"], params["Fy"], params["Fz"]])
+    return attitude.rotation_matrix(q[3:]) @ jnp.stack([params["Fx"], params["Fy"], params["Fz"]])
 
 
 def _torque(t, q, v, params):
@@ -68,7 +68,7 @@ def _power(s: State):
     return rate(lambda t, q, v: body.kinetic(t, q, v, s.params), s, s.a)
 
 
-# Aircraft, the formulas' side.
+# Aircraft by the formulas.
 
 
 def _kinetic_formula(s: State, sign: int):
@@ -123,7 +123,7 @@ def _torque_formula(s: State):
     return array(s.values("Mx", "My", "Mz"))
 
 
-# Quadcopter, the engine's side: rotors in front, left, rear, right; y is to the right.
+# Quadcopter by the engine: rotors in front, left, rear, right; y is to the right.
 
 
 def _hubs(t, q, params):
@@ -157,7 +157,9 @@ _LIFTED = jl.System(
     forces=(
         jl.PointForce(
             _hubs,
-            lambda t, q, v, params: -jnp.outer(_thrusts(params), attitude.turned(q[3:])[:, 2]),
+            lambda t, q, v, params: (
+                -jnp.outer(_thrusts(params), attitude.rotation_matrix(q[3:])[:, 2])
+            ),
             "thrust",
         ),
     ),
@@ -185,17 +187,17 @@ _ROTORS = jl.System(
     kinetic=_spin_kinetic,
     potential=lambda t, q, params: jnp.zeros_like(q[0]),
 )
-"""Four rotors with given rates relative to a frame without mass."""
+"""Four rotors with given rates relative to a massless frame."""
 
 
 def _gyroscopic_torque(s: State):
     """Torque of the spinning rotors on the frame, body components."""
-    still = {**s.params, **{f"w{i}": 0.0 * s.params[f"w{i}"] for i in range(1, 5)}}
-    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, still))
+    stopped = {**s.params, **{f"w{i}": 0.0 * s.params[f"w{i}"] for i in range(1, 5)}}
+    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, stopped))
     return attitude.body_torque(s.q[3:], (without - needed)[3:])
 
 
-# Quadcopter, the formulas' side.
+# Quadcopter by the formulas.
 
 
 def _thrust_formula(s: State, sign: int):

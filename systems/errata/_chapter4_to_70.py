@@ -47,7 +47,7 @@ def _with_a22(s: State):
 
 def _quasi_velocities(q, v):
     def pose(t, q, params):
-        return attitude.turned(q), jnp.zeros(3)
+        return attitude.rotation_matrix(q), jnp.zeros(3)
 
     return energy.body_velocity(pose, 0.0, q, v, None)[1]
 
@@ -89,7 +89,7 @@ def _entry_23(s: State, first: int, second: int):
     return -s.v[0] * cos(s.q[0]) + s.v[2] * sin(s.q[first]) * cos(s.q[second])
 
 
-# Euler's equations: torque less what the angles' generalized forces of inertia add.
+# Euler's equations: torque minus the generalized inertia forces of the angles.
 
 
 def _euler(s: State):

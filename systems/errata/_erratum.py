@@ -1,4 +1,4 @@
-"""An erratum of the book: the printed formula and the right one, held against the engine."""
+"""An erratum of the book: the printed and the right formula, compared with the engine."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _SEED = 0
 
 
 class State(NamedTuple):
-    """Where a formula is evaluated.
+    """A state at which a formula is evaluated.
 
     Attributes:
         t: time [s].
@@ -52,13 +52,13 @@ Numbers = float | Sequence[float] | np.ndarray
 
 @dataclass(frozen=True, kw_only=True)
 class Erratum:
-    """A place where the book is wrong.
+    """An error in the book.
 
     Attributes:
-        place: number of the equation, and what it is about.
-        wrong: what is wrong there.
+        place: number of the equation, and its subject.
+        wrong: the error.
         draw: random states at which to compare.
-        engine: what `jaxlag` finds from positions, energies and forces alone.
+        engine: the value that `jaxlag` computes from positions, energies and forces alone.
         printed: the book's formula for it.
         right: the corrected formula for it.
         singular: whether the printed formula is not finite at these states.
@@ -93,13 +93,13 @@ def examine(erratum: Erratum) -> Errors:
 
     def error(formula: Formula) -> float:
         with np.errstate(divide="ignore"):
-            rows = np.array([formula(state) for state in states])
-        if rows.shape != values.shape:
+            found = np.array([formula(state) for state in states])
+        if found.shape != values.shape:
             raise ValueError(
                 f"{erratum.place}: a formula must return what the engine does, shape "
-                f"{values.shape[1:]}, but it returned {rows.shape[1:]}."
+                f"{values.shape[1:]}, but it returned {found.shape[1:]}."
             )
-        return float(np.max(np.abs(rows - values)) / np.max(np.abs(values)))
+        return float(np.max(np.abs(found - values)) / np.max(np.abs(values)))
 
     return Errors(error(erratum.printed), error(erratum.right))
 
@@ -119,9 +119,9 @@ def around(
         params: parameter name -> value.
         q: coordinates, shape (n,).
         v: generalized velocities.
-        dq: largest departure from q.
-        dv: the same of v.
-        da: the same of a from 0.
+        dq: largest deviation from q.
+        dv: largest deviation from v.
+        da: largest deviation of a from 0.
     """
 
     def draw(generator: np.random.Generator) -> State:

@@ -8,7 +8,7 @@ from jaxlag.rotation import yaw_pitch_roll
 from systems.catalogue.chapter3 import quadcopter
 from systems.errata._erratum import Erratum, State, around, around_example
 
-# The engine's side: the body by its pose, each rotor by a force at its hub.
+# By the engine: the body by its pose, each rotor by a force at its hub.
 
 
 def _pose(t, q, params):
@@ -49,8 +49,8 @@ _BODY = jl.System(
 def _rotor_kinetic(t, q, v, params):
     """T of the rotors about their shafts: 1, 3 clockwise, 2, 4 counterclockwise from above."""
     relative = jnp.array([-1.0, 1.0, -1.0, 1.0]) * _speeds(params)
-    turn = quadcopter.angular_velocity(t, q, v, params)[2]
-    return 0.5 * params["Im"] * jnp.sum((turn + relative) ** 2)
+    frame_rate = quadcopter.angular_velocity(t, q, v, params)[2]
+    return 0.5 * params["Im"] * jnp.sum((frame_rate + relative) ** 2)
 
 
 _ROTORS = jl.System(
@@ -58,7 +58,7 @@ _ROTORS = jl.System(
     kinetic=_rotor_kinetic,
     potential=lambda t, q, params: jnp.zeros_like(q[0]),
 )
-"""Four rotors that spin at given speeds relative to a frame without mass."""
+"""Four rotors that spin at given speeds relative to a massless frame."""
 
 
 def _turning_energy(s: State):
@@ -68,7 +68,7 @@ def _turning_energy(s: State):
 
 
 def _force_of_translation(s: State):
-    """What a motion needs along X, Y, Z beyond lift and weight."""
+    """Force along X, Y, Z that a motion requires in addition to lift and weight."""
     return jl.inverse_dynamics(_BODY, s.q, s.v, s.a, s.params, t=s.t)[:3]
 
 
@@ -79,17 +79,17 @@ def _rotational_force(s: State):
 
 def _gyroscopic_torque(s: State):
     """Torque of the spinning rotors on the frame, body components; all angles are 0."""
-    still = {**s.params, **{name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}}
-    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, still))
+    stopped = {**s.params, **{name: 0.0 * s.params[name] for name in ("w1", "w2", "w3", "w4")}}
+    needed, without = (jl.inverse_dynamics(_ROTORS, s.q, s.v, s.a, p) for p in (s.params, stopped))
     return (without - needed)[:2:-1]
 
 
 def _velocity_terms(s: State):
-    """J' eta' less half the gradient of eta'.J eta', for the angles eta."""
+    """J' eta' minus half the gradient of eta'.J eta', for the angles eta."""
     return _BODY.bias(s.q, s.v, s.params, t=s.t)[3:]
 
 
-# The formulas' side.
+# By the formulas.
 
 
 def _rotor_forces(s: State):
@@ -150,7 +150,7 @@ def _rotation_energy(s: State, omega):
 
 
 def _translation(s: State, sign: int):
-    """m X'' + sign (0, 0, m g) less the thrust."""
+    """m X'' + sign (0, 0, m g) minus the thrust."""
     (cP, cT, cF), (sP, sT, sF) = cos(s.q[3:]), sin(s.q[3:])
     body_z = array([cF * sT * cP + sF * sP, cF * sT * sP - sF * cP, cF * cT])
     up = array([0.0, 0.0, sign * s.params["g"]])

@@ -9,7 +9,7 @@ import jaxlag as jl
 from jaxlag import energy
 from systems.errata._erratum import Erratum, State, around, rate
 
-# The engine's side: the two contacts, seen along and across their wheels.
+# By the engine: the two contacts, along and across their wheels.
 
 
 def _front(t, q, params):
@@ -17,7 +17,7 @@ def _front(t, q, params):
 
 
 def _wheel(angle):
-    """(along, across) a wheel at this angle, rows."""
+    """Unit vectors (along, across) of a wheel at this angle, as rows of a matrix."""
     return jl.rotation.about_z(angle)[:2, :2].T
 
 
@@ -137,7 +137,7 @@ def _book_derivatives(s: State):
     return jnp.stack([by_u[0], by_u[2], _gradient(s, 0)[3]])
 
 
-# The formulas' side.
+# By the formulas.
 
 
 def _v(s: State):

@@ -2,12 +2,12 @@
 
     J q'' = -m g l sin(q - zero) - c q' - f sign(q') - k q'|q'| + torque
 
-The motion is cut in windows of 1 s, each with a free start (q, q') of its own; the parameters are
-common to all. Models differ in friction: none, viscous (c), + Coulomb (f), + quadratic (k).
-Measured velocities are not used: rigs filter them. Parameters come from the training windows alone;
-on the test windows only the starts are fitted anew (`jl.fit`, `FitResult.predict`).
+The motion is cut into windows of 1 s, each with its own free start (q, q'). The parameters are
+common to all windows. Models differ in friction: none, viscous (c), + Coulomb (f), + quadratic (k).
+Measured velocities are not used, because they are filtered. Parameters are fitted to the training
+windows alone. On the test windows only the starts are fitted (`jl.fit`, `FitResult.predict`).
 
-A free swing tells m g l, c, f and k over J only; a measured torque tells J too.
+A free swing identifies only m g l, c, f and k divided by J. A measured torque identifies J too.
 """
 
 import sys
@@ -30,13 +30,13 @@ from systems.fit_pendulum._models import fit_segments as fit_segments
 from systems.fit_pendulum._models import guess as guess
 from systems.fit_pendulum._models import try_models as try_models
 
-# Without a recording: per J, as in a free swing.
+# For a synthetic recording: divided by J, as in a free swing.
 TRUTH = {"J": 1.0, "mgl": 60.0, "c": 0.05, "f": 0.2, "zero": 0.01}
 NOISE = 2e-3  # rad
 
 
 def main(argv: Sequence[str]) -> int:
-    """Fit a recording, or a synthetic one, and print what was found; 0 if all went well."""
+    """Fit a recording, or a synthetic one, and print the results; 0 if successful."""
     arguments = _parser().parse_args(argv)
     try:
         _run(arguments.recording, arguments.test, arguments.window, arguments.plot)
@@ -106,11 +106,12 @@ def synthetic(
 ) -> Recording:
     """A simulated pendulum with Gaussian noise on its angle.
 
-    Each segment lasts 5 s at 100 Hz and starts at rest, closer to hanging than the one before.
+    Each segment lasts 5 s at 100 Hz and starts at rest, each closer to hanging than the previous
+    one.
 
     Args:
         values: parameters by name; those left out are 0.
-        torque: whether two sines drive the shaft, and are recorded.
+        torque: whether a torque of two sines drives the shaft and is recorded.
         noise: its rms, rad.
         segments: their number.
         seed: of the noise.

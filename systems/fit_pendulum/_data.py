@@ -1,7 +1,7 @@
-"""Recordings of a swinging pendulum: read from a file, cut in windows.
+"""Recordings of a swinging pendulum: read from a file, cut into windows.
 
 Angles are in rad from the hanging position, positive counterclockwise, not wrapped. A recording
-is one or more segments sampled evenly, each with a number of its own; where the shaft is driven,
+consists of one or more evenly sampled segments, each with its own number. If the shaft is driven,
 the motor's torque (N m) is recorded with the angle.
 """
 
@@ -14,20 +14,20 @@ from jaxtyping import Float
 
 import jaxlag as jl
 
-# Columns of an angle, and what each shows where the pendulum hangs (rad).
+# Columns of an angle, and the value of each for the hanging pendulum (rad).
 ANGLES = {"q": 0.0, "theta1": np.pi}
-# Columns that may be there but are not used: recorded velocities are filtered, angles are not.
+# Columns that may exist but are not used: recorded velocities are filtered, angles are not.
 UNUSED = ("v", "omega1")
 LONGEST_GAP = 1.5  # between samples, over their median spacing
 FEWEST_SAMPLES = 10  # in a window
 SHORTEST = 0.2  # s, of a window
-# Hz, of the angles that are used: all samples of a free swing at 1 kHz moved its parameters by 0.2
-# of the standard errors found at 100 Hz. Torques are used as they were recorded.
+# Hz, of the angles that are used. All samples of a free swing at 1 kHz changed its parameters by
+# 0.2 of the standard errors at 100 Hz. Torques are used as recorded.
 RATE = 100.0
 
 
 class DataError(ValueError):
-    """A recording that cannot be used: which argument, what it must be, what it was."""
+    """A recording cannot be used; the message names the argument, the requirement and the value."""
 
 
 class Recording(NamedTuple):
@@ -35,8 +35,8 @@ class Recording(NamedTuple):
 
     Attributes:
         name: of the file.
-        segments: evenly sampled motion by number: channel "q" (rad, 0 hanging) and, where the
-            shaft is driven, input "torque" (N m).
+        segments: evenly sampled motion by number: channel "q" (rad, 0 hanging) and, if the shaft
+            is driven, input "torque" (N m).
     """
 
     name: str
@@ -53,19 +53,19 @@ class Recording(NamedTuple):
         return float(np.median(np.diff(next(iter(self.segments.values())).ts)))
 
     def thinned(self) -> "Recording":
-        """The same at RATE, or as it is where that is higher."""
+        """The recording thinned to RATE; unchanged if its own rate is not higher."""
         every = slice(None, None, max(1, round(1 / (RATE * self.spacing))))
         return Recording(self.name, {n: each.part(every) for n, each in self.segments.items()})
 
 
 class Split(NamedTuple):
-    """Windows to find parameters from, and windows to try them on."""
+    """Windows for the fit of the parameters, and windows for their test."""
 
     train: list[jl.Experiment]
     test: list[jl.Experiment]
 
 
-def bad(argument: str, must: str, was: str, fix: str) -> DataError:
+def data_error(argument: str, must: str, was: str, fix: str) -> DataError:
     """`<argument> must <must>, but <was>. <fix>`."""
     return DataError(f"{argument} must {must}, but {was}. {fix}")
 
@@ -78,9 +78,9 @@ def segment(
 ) -> jl.Experiment:
     """One piece of evenly sampled motion.
 
-    The torque is interpolated linearly between its samples: they are those of a motor current,
-    which is continuous, and not commands, which would be held. (Held instead, they made the rms
-    larger by 1 % in a recording at 500 Hz, by 4 % in one at 50 Hz.)
+    The torque is interpolated linearly between its samples. These come from a motor current, which
+    is continuous; commands would be held between samples. (A zero-order hold increased the rms by
+    1 % in a recording at 500 Hz, by 4 % in one at 50 Hz.)
 
     Args:
         name: of the piece.
@@ -93,23 +93,23 @@ def segment(
 
 
 def cut(recording: Recording, seconds: float) -> dict[int, list[jl.Experiment]]:
-    """Windows of `seconds`, side by side from each segment's start, by the segment's number.
+    """Adjacent windows of `seconds` from each segment's start, by the segment's number.
 
     A remainder shorter than a window is left out.
 
     Raises:
-        DataError: a window would be too short, no segment is as long as one, or angle or torque
-            never change.
+        DataError: a window would be too short, all segments are shorter than a window, or angle or
+            torque never change.
     """
     spacing = recording.spacing
     least = max(SHORTEST, FEWEST_SAMPLES * spacing)
     if not seconds >= 0.999 * least or not np.isfinite(seconds):
         must = f"last {least:.3g} s or more"
-        raise bad("--window", must, f"it was {seconds:g} s", "Make it longer.")
+        raise data_error("--window", must, f"it was {seconds:g} s", "Make it longer.")
     pieces = list(recording.segments.values())
     lengths = {n: _length(each, spacing) for n, each in recording.segments.items()}
     if max(lengths.values()) < 0.999 * seconds:
-        raise bad(
+        raise data_error(
             recording.name,
             f"last one window of {seconds:.3g} s or more",
             f"its longest segment lasts {max(lengths.values()):.3g} s",
@@ -117,10 +117,12 @@ def cut(recording: Recording, seconds: float) -> dict[int, list[jl.Experiment]]:
         )
     q = np.concatenate([each.channels["q"] for each in pieces])
     if np.ptp(q) == 0:
-        raise bad(recording.name, "move", f"its angle was always {q[0, 0]:g}", "Let it swing.")
+        raise data_error(
+            recording.name, "move", f"its angle was always {q[0, 0]:g}", "Let it swing."
+        )
     torques = [np.asarray(each.inputs["torque"].values) for each in pieces if each.inputs]
     if torques and np.ptp(np.concatenate(torques)) == 0:
-        raise bad(
+        raise data_error(
             f"tau_meas of {recording.name}",
             "vary",
             f"it was always {torques[0][0]:g}",
@@ -134,15 +136,15 @@ def cut(recording: Recording, seconds: float) -> dict[int, list[jl.Experiment]]:
 
 
 def _length(piece: jl.Experiment, spacing: float) -> float:
-    """Seconds, with the one that its last sample stands for."""
+    """Duration in seconds, including the interval after the last sample."""
     return float(piece.ts[-1] - piece.ts[0]) + spacing
 
 
 def split(recording: Recording, other: Recording | None, seconds: float) -> Split:
     """Windows of `recording` to train on, and of `other`, or a third of `recording`, to test on.
 
-    That third is the segments whose number is divisible by 3; every third window where there is
-    one segment only.
+    That third consists of the segments whose number is divisible by 3, or of every third window if
+    there is only one segment.
 
     Raises:
         DataError: the recordings are too short, or only one of them has a torque.
@@ -151,7 +153,7 @@ def split(recording: Recording, other: Recording | None, seconds: float) -> Spli
     own = [window for each in pieces.values() for window in each]
     if other is not None:
         if other.driven != recording.driven:
-            raise bad(
+            raise data_error(
                 "--test",
                 f"name a recording {'with' if recording.driven else 'without'} tau_meas, "
                 f"like {recording.name}",
@@ -164,7 +166,7 @@ def split(recording: Recording, other: Recording | None, seconds: float) -> Spli
     else:
         held = [i % 3 == 0 for i in range(len(own))]
     if all(held) or not any(held):
-        raise bad(
+        raise data_error(
             recording.name,
             "have windows to train on and windows to test on",
             f"it has {len(held)}, in segments {sorted(pieces)}",
@@ -179,27 +181,27 @@ def read(path: Path) -> Recording:
 
     Lines that start with # are skipped; the next line names the columns: `t` (s), the angle as
     `q` (rad, 0 hanging) or `theta1` (rad, 0 upright), and optionally `seg` (integer segment
-    numbers) and `tau_meas` (N m). Columns `v` and `omega1` are passed over.
+    numbers) and `tau_meas` (N m). Columns `v` and `omega1` are ignored.
 
     Raises:
         DataError: no such file, or its content is not such a table.
     """
-    names, rows = _table(path)
+    names, samples = _table(path)
     angles = [name for name in names if name in ANGLES]
     unknown = set(names) - {"t", "seg", "tau_meas", *ANGLES, *UNUSED}
     if len(angles) != 1 or "t" not in names or unknown or len(set(names)) < len(names):
-        raise bad(
+        raise data_error(
             f"the header of {path.name}",
             "name t, one angle (q, 0 hanging, or theta1, 0 upright) and at most "
             "seg, tau_meas, v, omega1 besides",
             f"it names {', '.join(names)}",
             "Rename or drop columns.",
         )
-    columns = dict(zip(names, rows.T, strict=True))
-    numbers = columns.get("seg", np.zeros(len(rows)))
+    columns = dict(zip(names, samples.T, strict=True))
+    numbers = columns.get("seg", np.zeros(len(samples)))
     if np.any(numbers != np.round(numbers)):
         was = f"one was {numbers[numbers != np.round(numbers)][0]:g}"
-        raise bad(f"seg of {path.name}", "hold integers", was, "Number the segments.")
+        raise data_error(f"seg of {path.name}", "hold integers", was, "Number the segments.")
     q = columns[angles[0]] - ANGLES[angles[0]]
     torque = columns.get("tau_meas")
     segments = {}
@@ -217,41 +219,43 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
             lines = [line for line in file if line.strip() and not line.startswith("#")]
     except (OSError, EOFError, UnicodeDecodeError) as error:
-        raise bad(
+        raise data_error(
             "the recording",
             "be a CSV file that can be read, gzipped if its name ends in .gz",
             f"{path}: {getattr(error, 'strerror', None) or error}",
             "Check the path.",
         ) from error
     if len(lines) < 3:
-        raise bad(path.name, "have a header and rows", f"it has {len(lines)} lines", "Fill it.")
+        raise data_error(
+            path.name, "have a header and rows", f"it has {len(lines)} lines", "Fill it."
+        )
     try:
-        rows = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+        samples = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
     except ValueError as error:
         was = str(error).rstrip(".")
-        raise bad(path.name, "be a table of numbers", was, "Mend that row.") from error
+        raise data_error(path.name, "be a table of numbers", was, "Mend that row.") from error
     names = [name.strip() for name in lines[0].split(",")]
-    if rows.shape[1] != len(names):
-        raise bad(
+    if samples.shape[1] != len(names):
+        raise data_error(
             path.name,
             f"have as many columns as its header names, {len(names)}",
-            f"its rows have {rows.shape[1]}",
+            f"its rows have {samples.shape[1]}",
             "Mend the header.",
         )
-    if not np.all(np.isfinite(rows)):
-        row, column = np.argwhere(~np.isfinite(rows))[0]
-        raise bad(
+    if not np.all(np.isfinite(samples)):
+        index, column = np.argwhere(~np.isfinite(samples))[0]
+        raise data_error(
             path.name,
             "hold finite numbers",
-            f"{names[column]} was {rows[row, column]} in row {row + 1}",
+            f"{names[column]} was {samples[index, column]} in row {index + 1}",
             "Drop such rows, and number the pieces between them in a column seg.",
         )
-    return names, rows
+    return names, samples
 
 
 def _check_times(name: str, number: int, t: np.ndarray) -> None:
     if len(t) < 2:
-        raise bad(
+        raise data_error(
             name,
             "have 2 rows or more in every segment",
             f"segment {number} has {len(t)}",
@@ -260,7 +264,7 @@ def _check_times(name: str, number: int, t: np.ndarray) -> None:
     steps = np.diff(t)
     if np.min(steps) <= 0:
         i = int(np.argmax(steps <= 0))
-        raise bad(
+        raise data_error(
             f"t of {name}",
             "increase strictly within a segment",
             f"{t[i]} s is followed by {t[i + 1]} s",
@@ -268,7 +272,7 @@ def _check_times(name: str, number: int, t: np.ndarray) -> None:
         )
     if np.max(steps) > LONGEST_GAP * np.median(steps):
         i = int(np.argmax(steps))
-        raise bad(
+        raise data_error(
             f"t of {name}",
             f"be sampled evenly, no step longer than {LONGEST_GAP} times the median",
             f"{t[i]} s is followed by {t[i + 1]} s",

@@ -1,4 +1,4 @@
-r"""The pendulum, models of its friction, and which of them a measured motion shows.
+r"""The pendulum, models of its friction, and the choice of a model from a measured motion.
 
 A rigid body on a fixed horizontal axis, swinging freely or driven by a motor:
 
@@ -9,16 +9,16 @@ A rigid body on a fixed horizontal axis, swinging freely or driven by a motor:
             O m
 
 Coordinate
-    q      angle of the sensor [rad], 0 where it says hanging, positive counterclockwise
+    q      angle of the sensor [rad], nominally 0 when hanging, positive counterclockwise
 
-Parameters (of a free swing, which cannot tell a scale of torque: J = 1, the others are over J)
+Parameters (a free swing does not identify a scale of torque: J = 1, the others are divided by J)
     J      moment of inertia about the axis [kg m^2]
     mgl    mass times gravity times distance of the center of mass from the axis [N m]
     c      viscous friction [N m s]
     f      Coulomb friction [N m], made smooth below |q'| = V_S
     k      quadratic drag [N m s^2]
     u0     torque missing from the measured one, u [N m]
-    zero   what the sensor shows where the pendulum really hangs [rad]
+    zero   angle of the sensor when the pendulum hangs [rad]
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ import jaxlag as jl
 from systems.fit_pendulum._data import Recording, split
 
 NAMES: tuple[str, ...] = ("J", "mgl", "c", "f", "k", "u0", "zero")
-V_S = 0.1  # rad/s; any from 0.01 to 0.5 moves the friction of a free swing by 2 % at most
+V_S = 0.1  # rad/s; 0.01 to 0.5 change the friction of a free swing by at most 2 %
 EARLY = 0.1  # s: the first motion in a window
 OPTIONS = {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}
 
@@ -80,18 +80,18 @@ free = jl.System(
 driven = free.with_forces(jl.GeneralizedForce(motor, "motor"))
 MODELS = {"none": "", "viscous": "c", "+ Coulomb": "cf", "+ quadratic": "cfk"}
 FRICTION = "cfk"
-# A friction that a model lacks is one that is known to be 0. So all models are one program, which
-# is compiled once; compiling takes longer than all their fits.
+# A friction term that a model lacks is known to be 0. So all models use one program, which is
+# compiled once. Compilation takes longer than all their fits.
 ABSENT, PRESENT = jl.Prior(0.0, 1e-6), jl.Prior(0.0, 1e6)
 
 
 class Trial(NamedTuple):
-    """One model of friction, fitted to the training windows and tried on the test windows.
+    """One model of friction, fitted to the training windows and tested on the test windows.
 
     Attributes:
-        fit: to the training windows.
-        test: of the test windows, their starts fitted to all of them.
-        ahead: of the test windows, their starts fitted to the first 0.1 s.
+        fit: fit to the training windows.
+        test: prediction of the test windows, with starts fitted to the whole windows.
+        ahead: prediction of the test windows, with starts fitted to the first 0.1 s.
     """
 
     fit: jl.FitResult
@@ -102,7 +102,7 @@ class Trial(NamedTuple):
 def try_models(
     recording: Recording, other: Recording | None = None, seconds: float = 1.0
 ) -> dict[str, Trial]:
-    """Every model, fitted to `recording` and tried on `other`, or on a third of `recording`.
+    """Every model, fitted to `recording` and tested on `other`, or on a third of `recording`.
 
     Raises:
         DataError: the recordings are too short, or only one of them has a torque.
@@ -117,7 +117,7 @@ def try_models(
 
 
 def fit_segments(recording: Recording, trials: Mapping[str, Trial]) -> dict[str, jl.FitResult]:
-    """Every model, fitted to all segments whole; the search begins where that of windows ended."""
+    """Every model, fitted to all whole segments, starting from the fit to windows."""
     whole = list(recording.thinned().segments.values())
     return {model: fit(whole, trial.fit.params, model) for model, trial in trials.items()}
 
@@ -127,9 +127,9 @@ def fit(
 ) -> jl.FitResult:
     """One model of friction, fitted to windows or whole segments."""
     system = driven if experiments[0].inputs else free
-    told = [name for name in params0 if system is driven or name != "J"]
+    names = [name for name in params0 if system is driven or name != "J"]
     priors = {name: PRESENT if name in MODELS[model] else ABSENT for name in FRICTION}
-    return jl.fit(system, experiments, params0, free=told, priors=priors, simulate_options=OPTIONS)
+    return jl.fit(system, experiments, params0, free=names, priors=priors, simulate_options=OPTIONS)
 
 
 def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:
@@ -138,18 +138,18 @@ def estimated(fitted: jl.FitResult, model: str) -> tuple[str, ...]:
 
 
 def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
-    """Params, without friction, by linear regression of q'' on sin q, and on u and 1 where driven.
+    """Params, without friction, by linear regression of q'' on sin q and, if driven, on u and 1.
 
-    Rates are differences of neighboring samples: rough, but their errors are in q'' alone.
+    Rates are differences of neighboring samples. They are rough, but their errors are in q'' alone.
     """
-    rows, q2 = [], []
+    regressors, q2 = [], []
     for each in windows:
         q = each.channels["q"][:, 0]
         torque = each.inputs.get("torque")
         u = () if torque is None else (np.interp(each.ts, torque.times, torque.values),)
-        rows.append(np.stack([-np.sin(q), *u, *(np.ones_like(x) for x in u)], axis=1)[2:-2])
+        regressors.append(np.stack([-np.sin(q), *u, *(np.ones_like(x) for x in u)], axis=1)[2:-2])
         q2.append(np.gradient(np.gradient(q, each.ts), each.ts)[2:-2])
-    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(q2))[0].tolist()
+    found = np.linalg.lstsq(np.concatenate(regressors), np.concatenate(q2))[0].tolist()
     if len(found) == 1:
         return {"J": 1.0, "mgl": found[0], "zero": 0.0} | dict.fromkeys(FRICTION, 0.0)
     mgl, per_J, u0 = found
@@ -157,18 +157,18 @@ def guess(windows: Sequence[jl.Experiment]) -> dict[str, float]:
     return params | dict.fromkeys(FRICTION, 0.0)
 
 
-# What residuals tell.
+# Statistics of the residuals.
 
 
 def correlation(found: jl.FitResult) -> float:
-    """Of residuals one sample apart."""
-    rows = [each["q"][:, 0] for each in found.residuals]
-    products = sum(float(np.nansum(r[1:] * r[:-1])) for r in rows)
-    return products / sum(float(np.nansum(r**2)) for r in rows)
+    """Correlation of residuals one sample apart."""
+    residuals = [each["q"][:, 0] for each in found.residuals]
+    products = sum(float(np.nansum(r[1:] * r[:-1])) for r in residuals)
+    return products / sum(float(np.nansum(r**2)) for r in residuals)
 
 
 def samples_each(found: jl.FitResult) -> float:
-    """Number of samples that tell as much as one independent one."""
+    """Number of samples with as much information as one independent sample."""
     r = correlation(found)
     return max(1.0, (1 + r) / (1 - r))
 
@@ -179,10 +179,10 @@ def count(found: jl.FitResult) -> int:
 
 
 def choose(fits: Mapping[str, jl.FitResult]) -> str:
-    """The model of least Bayesian information criterion, n log(r.r) + p log n.
+    """The model with the least Bayesian information criterion, n log(r.r) + p log n.
 
-    A real recording's residuals are correlated: n counts independent ones, by the correlation
-    under the last and richest model.
+    Residuals of a real recording are correlated. So n is the number of independent ones, from the
+    correlation with the last model, which has the most parameters.
     """
     richest = list(fits.values())[-1]
     n = count(richest) / samples_each(richest)

@@ -1,4 +1,4 @@
-"""What the fits of a pendulum say: tables and a figure."""
+"""Tables and a figure for the fits of a pendulum."""
 
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxlag as jl
-from systems.fit_pendulum._data import RATE, Recording, bad
+from systems.fit_pendulum._data import RATE, Recording, data_error
 from systems.fit_pendulum._models import (
     EARLY,
     FRICTION,
@@ -19,7 +19,7 @@ from systems.fit_pendulum._models import (
     samples_each,
 )
 
-# Symbol and unit of each parameter where the torque is known, and in a free swing.
+# Symbol and unit of each parameter if the torque is known, and in a free swing.
 DRIVEN = {
     "J": ("J", "kg m^2"),
     "mgl": ("mgl", "N m"),
@@ -36,8 +36,8 @@ FREE = {
     "k": ("k/J", "1"),
     "zero": ("zero", "rad"),
 }
-# Figures to beat, mrad rms: quick fits by multiple shooting, made when these recordings were
-# chosen; in whole segments of the first, in windows of 1 s of the other two.
+# Reference errors, mrad rms: from quick fits by multiple shooting, made when these recordings were
+# selected. They are for whole segments of the first, for windows of 1 s of the other two.
 TO_BEAT = {
     "single.csv.gz": {"viscous": 7.8, "+ Coulomb": 6.7, "+ quadratic": 2.05},
     "ddp.csv.gz": {"+ Coulomb": 3.3},
@@ -50,13 +50,13 @@ SUFFIXES = (".png", ".pdf", ".svg")
 def describe(recording: Recording) -> str:
     """A recording in one line."""
     segments = list(recording.segments.values())
-    rows = sum(len(segment.ts) for segment in segments)
+    sample_count = sum(len(segment.ts) for segment in segments)
     reach = max(float(np.max(np.abs(segment.channels["q"]))) for segment in segments)
     rate = 1 / recording.spacing
     used = f" (angles used at {RATE:.0f} Hz)" if rate > 1.5 * RATE else ""
     return (
         f"{recording.name}: {'driven' if recording.driven else 'free swing'}, "
-        f"{len(segments)} segment{'s' * (len(segments) > 1)}, {rows} samples at "
+        f"{len(segments)} segment{'s' * (len(segments) > 1)}, {sample_count} samples at "
         f"{rate:.0f} Hz{used}, up to {reach:.2f} rad from hanging"
     )
 
@@ -67,7 +67,7 @@ def trials(
     trials: Mapping[str, Trial],
     truth: Mapping[str, float] | None = None,
 ) -> Iterator[str]:
-    """Lines of the table of models fitted to windows, and what it means."""
+    """Lines of the table of models fitted to windows, and its interpretation."""
     symbols = DRIVEN if recording.driven else FREE
     beat_train = TO_BEAT.get(recording.name, {}) if other else {}
     beat_test = TO_BEAT.get(other.name, {}) if other else {}
@@ -120,16 +120,16 @@ def segments(recording: Recording, fits: Mapping[str, jl.FitResult]) -> Iterator
 
 
 def mrad(found: jl.FitResult | jl.Prediction) -> float:
-    """Root mean square of the angle over all samples, of a prediction those predicted, mrad."""
+    """Root mean square of the angle's residuals over all, or all predicted, samples, mrad."""
     return 1e3 * float(found.rms("q")[0])
 
 
 def mean_mrad(found: jl.FitResult | jl.Prediction) -> float:
     """Mean over the experiments of each one's own rms, mrad."""
-    rows = [each["q"][:, 0] for each in found.residuals]
+    residuals = [each["q"][:, 0] for each in found.residuals]
     if isinstance(found, jl.Prediction):
-        rows = [x[own] for x, own in zip(rows, found.predicted, strict=True)]
-    return 1e3 * float(np.mean([np.sqrt(np.mean(x**2)) for x in rows]))
+        residuals = [x[own] for x, own in zip(residuals, found.predicted, strict=True)]
+    return 1e3 * float(np.mean([np.sqrt(np.mean(x**2)) for x in residuals]))
 
 
 def _head(symbols: Mapping[str, tuple[str, str]], rms_of: list[str]) -> Iterator[list[str]]:
@@ -144,7 +144,7 @@ def _name(model: str, fitted: jl.FitResult) -> str:
 def _numbers(
     fitted: jl.FitResult, model: str, symbols: Mapping[str, object]
 ) -> tuple[list[str], list[str]]:
-    """Estimates and standard errors, to two figures of the error; blank where held."""
+    """Estimates and standard errors, to two digits of the error; blank if fixed."""
     values, errors = [], []
     for name in symbols:
         if name not in estimated(fitted, model):
@@ -199,20 +199,22 @@ def can_plot() -> bool:
 
 
 def require_figure(path: Path) -> None:
-    """Complain before the work begins.
+    """Check that a figure can be written, before the fits run.
 
     Raises:
         DataError: matplotlib is missing, or the folder, or the name ends in another way.
     """
     if not can_plot():
-        raise bad("--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB)
+        raise data_error(
+            "--plot", "be left out without matplotlib", "it was given", NEEDS_MATPLOTLIB
+        )
     if path.suffix not in SUFFIXES or not path.parent.is_dir():
         must = f"name a {', '.join(SUFFIXES)} in a folder that exists"
-        raise bad("--plot", must, f"it was {path}", "Rename it, or make the folder.")
+        raise data_error("--plot", must, f"it was {path}", "Rename it, or make the folder.")
 
 
 def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
-    """Measured against simulated angles in some test windows, residuals beneath.
+    """Measured and simulated angles in some test windows, with the residuals below.
 
     Raises:
         DataError: the file cannot be written.
@@ -228,4 +230,4 @@ def figure(name: str, trials: Mapping[str, Trial], path: Path) -> None:
         figure.savefig(path)
     except OSError as error:
         must = "name a file that can be written"
-        raise bad("--plot", must, str(error), "Choose another folder.") from error
+        raise data_error("--plot", must, str(error), "Choose another folder.") from error

@@ -1,1 +1,1 @@
-"""Reference files: motions and states of rest, read strictly and held against the engine."""
+"""Reference files: motions and states of rest, read strictly and compared with the engine."""

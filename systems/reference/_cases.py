@@ -1,4 +1,4 @@
-"""The cases of a reference file, read strictly; what a case holds goes by the kind of system."""
+"""The cases of a reference file, read strictly; their contents depend on the kind of system."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -37,9 +37,9 @@ class Case:
     Attributes:
         name: its name in the file.
         params: parameter name -> value.
-        times: shape (S,), s; of a state of rest a single 0.
-        fields: name of a quantity -> its rows, shape (S, ...). Of a motion the first rows of `q`
-            and `v` are its start; of a prescribed one `q`, `v` and `a` are the motion.
+        times: shape (S,), s; for a state of rest a single 0.
+        fields: name of a quantity -> its values, shape (S, ...). For a motion the first values of
+            `q` and `v` are the start; for a prescribed one `q`, `v` and `a` are the motion.
     """
 
     name: str
@@ -60,7 +60,7 @@ def _(entry: Entry, index: int, raw: Any) -> Case:
     if not entry.file_constraints:
         things = "constraints in its files" if entry.constraints else "constraints"
         absent |= dict.fromkeys(_REACTIONS, things)
-    rows = tuple(field for field in (*_MOTION, "u", *_REACTIONS) if field not in absent)
+    fields = tuple(field for field in (*_MOTION, "u", *_REACTIONS) if field not in absent)
     required = ("name", "params", "times", *_MOTION, "u", *_REACTIONS, "energy", "invariants")
     where = _begin(index, raw, required, (*_OPTIONAL, "extras", "controls"))
     _check_controls(f"{where}: controls", raw.get("controls"))
@@ -69,7 +69,7 @@ def _(entry: Entry, index: int, raw: Any) -> Case:
             must = f"be null, for {entry.name} has no {things}"
             fail(f"{where}: {field}", must, f"it was {shown(raw[field])}")
     groups = {"energy": ("T", "V", "E"), "extras": (), "invariants": ()}
-    given = {field: raw[field] for field in rows} | _grouped(where, entry, raw, groups)
+    given = {field: raw[field] for field in fields} | _grouped(where, entry, raw, groups)
     return _case(where, entry, raw, _read_times(where, raw["times"]), given)
 
 
@@ -96,7 +96,7 @@ def members(entry: AbstractEntry, group: str) -> tuple[str, ...]:
 
 
 def _begin(index: int, raw: Any, required: tuple[str, ...], optional: tuple[str, ...]) -> str:
-    """Check names and texts of a case; returns what to call it in messages."""
+    """Check names and texts of a case; return its name for messages."""
     where = f"case {index}"
     check_fields(where, raw, required, optional)
     if not isinstance(raw["name"], str):
@@ -114,7 +114,7 @@ def _case(
         name=raw["name"],
         params=_read_params(where, entry, raw["params"]),
         times=times,
-        fields=_read_rows(where, entry, given, len(times)),
+        fields=_read_values(where, entry, given, len(times)),
     )
 
 
@@ -142,7 +142,7 @@ def _read_params(where: str, entry: AbstractEntry, raw: Any) -> dict[str, np.nda
 def _grouped(
     where: str, entry: AbstractEntry, raw: Any, groups: Mapping[str, tuple[str, ...]]
 ) -> dict[str, Any]:
-    """`group.name` -> value of every quantity that stands in one of the groups."""
+    """`group.name` -> value of every quantity in one of the groups."""
     given = {}
     for group, required in groups.items():
         values = raw.get(group, {})
@@ -151,25 +151,25 @@ def _grouped(
     return given
 
 
-def _read_rows(
+def _read_values(
     where: str, entry: AbstractEntry, given: Mapping[str, Any], count: int
 ) -> dict[str, np.ndarray]:
-    """Every quantity that the case holds, each with `count` rows of the system's own shape."""
+    """Every quantity of the case, with `count` values of the shape that the system defines."""
     fields = {}
     for field, value in given.items():
-        rows = numbers(f"{where}: {field}", value)
+        values = numbers(f"{where}: {field}", value)
         shape = (count, *shapes(entry)[field])
-        if rows.shape == (count,) and shape == (count, 1):
-            rows = rows.reshape(shape)  # a vector of one component may stand as a plain number
-        if rows.shape != shape:
+        if values.shape == (count,) and shape == (count, 1):
+            values = values.reshape(shape)  # a vector of one component may be a plain number
+        if values.shape != shape:
             must = f"have shape {shape}, one row for each of {count} times"
-            fail(f"{where}: {field}", must, f"it had {rows.shape}")
-        fields[field] = rows
+            fail(f"{where}: {field}", must, f"it had {values.shape}")
+        fields[field] = values
     return fields
 
 
 def _check_controls(where: str, raw: Any) -> None:
-    """What the applied forces are, in words: their numbers are in `params`."""
+    """Check the texts that describe the applied forces; their values are in `params`."""
     if isinstance(raw, dict):
         check_texts(where, raw, raw)
     else:

@@ -1,4 +1,4 @@
-"""Replay of reference files: from what a case starts with to every number that it holds."""
+"""Replay of reference files: all values of a case are computed from its initial data."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,22 +25,22 @@ STATE_TOLERANCE = 1e-10
 """Largest |x - reference| / (1 + |reference|) of q, v, u, energies, invariants, states of rest."""
 
 DERIVED_TOLERANCE = 1e-9
-"""The same for accelerations, reactions, extras and all else found from the state of a motion."""
+"""The same for accelerations, reactions, extras and other values computed from the states."""
 
 
 class Motion(NamedTuple):
-    """What a case was replayed to: name -> rows, shape (S, ...), and how that ended."""
+    """The replay of a case: name -> values, shape (S, ...), and the status at its end."""
 
-    rows: Mapping[str, Array]
+    values: Mapping[str, Array]
     status: Array
     last_time: Array
 
 
 class Deviation(NamedTuple):
-    """Worst row of one field: |x - reference| / (1 + |reference|), the largest component."""
+    """The worst time of one field: |x - reference| / (1 + |reference|), largest component."""
 
     field: str
-    row: int
+    time_index: int
     size: float
     tolerance: float
 
@@ -56,7 +56,7 @@ class Deviation(NamedTuple):
 
     def __str__(self) -> str:
         """E.g. `2.1e-14 of 1e-10 in energy.T, row 3`."""
-        return f"{self.size:.1e} of {self.tolerance:.0e} in {self.field}, row {self.row}"
+        return f"{self.size:.1e} of {self.tolerance:.0e} in {self.field}, row {self.time_index}"
 
 
 def replay(entry: Entry, params: Mapping[str, Any], times: Any, q0: Any, v0: Any) -> Motion:
@@ -72,13 +72,13 @@ def replay(entry: Entry, params: Mapping[str, Any], times: Any, q0: Any, v0: Any
     if entry.chart is not None:
         q0, v0 = entry.chart.state(times[0], q0, v0, params)
     if len(times) == 1:
-        rows = _quantities(entry, params, times, q0[None], v0[None])
-        return Motion(rows, jnp.int32(jl.Status.ok), times[0])
+        values = _quantities(entry, params, times, q0[None], v0[None])
+        return Motion(values, jnp.int32(jl.Status.ok), times[0])
     motion = jl.simulate(
         entry.system, q0, v0, times, params, rtol=LOCAL_ERROR, atol=LOCAL_ERROR, throw=False
     )
-    rows = _quantities(entry, params, times, motion.q, motion.v)
-    return Motion(rows, motion.status, motion.last_time)
+    values = _quantities(entry, params, times, motion.q, motion.v)
+    return Motion(values, motion.status, motion.last_time)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -90,32 +90,32 @@ def _quantities(
 
 @partial(jax.jit, static_argnums=0)
 def replay_rest(entry: StaticEntry, params: Mapping[str, Array]) -> Motion:
-    """Find the state of rest, a single row."""
+    """Find the state of rest; the values have one entry."""
     rest = entry.rest(params)
-    rows = static_quantities(entry, params, rest)
-    return Motion({name: x[None] for name, x in rows.items()}, rest.status, jnp.zeros(()))
+    values = static_quantities(entry, params, rest)
+    return Motion({name: x[None] for name, x in values.items()}, rest.status, jnp.zeros(()))
 
 
 @partial(jax.jit, static_argnums=0)
 def replay_prescribed(
     entry: PrescribedEntry, params: Mapping[str, Array], times: Array, q: Array, v: Array, a: Array
 ) -> Motion:
-    """The forces that the motion (q, v, a), each (S, n), needs at `times`.
+    """The forces required for the motion (q, v, a), each (S, n), at `times`.
 
-    The rows of q, v and a in the result are those of the entry's own motion law.
+    q, v and a in the result are computed from the entry's own motion.
     """
-    rows = jax.vmap(partial(prescribed_quantities, entry, params))(times, q, v, a)
+    values = jax.vmap(partial(prescribed_quantities, entry, params))(times, q, v, a)
     law = jl.prescribed_motion(lambda t: entry.motion(t, params), times)
-    rows |= dict(zip(("q", "v", "a"), law, strict=True))
-    return Motion(rows, jnp.int32(jl.Status.ok), times[-1])
+    values |= dict(zip(("q", "v", "a"), law, strict=True))
+    return Motion(values, jnp.int32(jl.Status.ok), times[-1])
 
 
 @singledispatch
 def replay_case(entry: AbstractEntry, case: Case) -> Motion:
-    """Replay a case from what such a case starts with.
+    """Replay a case from its initial data.
 
-    A motion from its parameters, times and first row of q and v alone, a state of rest from its
-    parameters alone, a prescribed motion from all its q, v and a.
+    These are, for a motion, the parameters, the times and the first q and v; for a state of rest
+    the parameters; for a prescribed motion all of q, v and a.
     """
     raise NotImplementedError(f"cases of {entry.kind} systems cannot be replayed")
 
@@ -136,15 +136,15 @@ def _(entry: PrescribedEntry, case: Case) -> Motion:
     return replay_prescribed(entry, case.params, case.times, *motion)
 
 
-def compare(case: Case, rows: Mapping[str, Array]) -> list[Deviation]:
-    """The worst deviation of every field of the case from the replayed rows."""
+def compare(case: Case, values: Mapping[str, Array]) -> list[Deviation]:
+    """The worst deviation of every field of the case from the replayed values."""
     deviations = []
     for field, reference in case.fields.items():
         tolerance = DERIVED_TOLERANCE if _is_derived(field) else STATE_TOLERANCE
-        relative = np.abs(np.asarray(rows[field]) - reference) / (1 + np.abs(reference))
-        by_row = relative.reshape(len(case.times), -1).max(axis=1)
-        row = int(np.argmax(by_row))  # the first NaN, if there is one
-        deviations.append(Deviation(field, row, float(by_row[row]), tolerance))
+        relative = np.abs(np.asarray(values[field]) - reference) / (1 + np.abs(reference))
+        by_time = relative.reshape(len(case.times), -1).max(axis=1)
+        index = int(np.argmax(by_time))  # the first NaN, if there is one
+        deviations.append(Deviation(field, index, float(by_time[index]), tolerance))
     return deviations
 
 
@@ -160,7 +160,7 @@ def main(paths: Sequence[Path]) -> int:
             continue
         cases += len(reference.cases)
         failed += sum(not _report(path, reference.entry, case) for case in reference.cases)
-        jax.clear_caches()  # no file needs another's programs, and all of them take gigabytes
+        jax.clear_caches()  # programs are not shared by files, and all of them take gigabytes
     verdicts = [f"{failed} out of tolerance" if failed else "all within tolerance"] * bool(cases)
     verdicts += [f"{refused} refused"] * bool(refused)
     print(f"files {len(paths)}, cases {cases}: {', '.join(verdicts)}")
@@ -169,7 +169,7 @@ def main(paths: Sequence[Path]) -> int:
 
 def _report(path: Path, entry: AbstractEntry, case: Case) -> bool:
     motion = replay_case(entry, case)
-    deviations = compare(case, motion.rows)
+    deviations = compare(case, motion.values)
     status = jl.Status(int(motion.status))
     outside = [deviation.field for deviation in deviations if not deviation.ok]
     ok = status == jl.Status.ok and not outside

@@ -1,8 +1,8 @@
 """Reference files: motions and states of rest of known systems, read strictly.
 
-A file is one JSON object about one system, with a list of cases; a case holds parameters and
-everything known about what they lead to. Nothing in a file is passed over: a field that is not
-known here is an error, and so is one whose form is not as expected.
+A file is one JSON object about one system, with a list of cases. A case holds parameters and all
+known results for them. Nothing in a file is ignored: an unknown field is an error, and so is a
+field with an unexpected form.
 """
 
 import json
@@ -41,7 +41,7 @@ class Reference:
 
 
 def load(path: Path) -> Reference:
-    """Read the file at `path`; raises `InvalidReference` saying what is wrong with it."""
+    """Read the file at `path`; raises `InvalidReference` with the error found."""
     try:
         raw = json.loads(
             path.read_text(encoding="utf-8"), parse_int=float, object_pairs_hook=distinct
@@ -54,7 +54,7 @@ def load(path: Path) -> Reference:
 
 
 def read(raw: Any) -> Reference:
-    """Read a parsed file; raises `InvalidReference` saying what is wrong with it."""
+    """Read a parsed file; raises `InvalidReference` with the error found."""
     check_fields("the file", raw, _REQUIRED, _OPTIONAL)
     if raw["schema"] != SCHEMA:
         fail("schema", f"be {SCHEMA!r}", f"it was {raw['schema']!r}")
@@ -84,7 +84,7 @@ def read(raw: Any) -> Reference:
 
 
 def _numbered(cases: tuple[Case, ...]) -> Iterator[Case]:
-    """The cases, each with a name of its own: names that occur again are numbered."""
+    """The cases with unique names: repeated names are numbered."""
     seen = Counter[str]()
     for case in cases:
         seen[case.name] += 1
@@ -93,7 +93,7 @@ def _numbered(cases: tuple[Case, ...]) -> Iterator[Case]:
 
 
 def _check_coordinates(raw: Any, entry: AbstractEntry) -> None:
-    """Those that the file is written in, and all of the system's where these are more."""
+    """Check the coordinates of the file, and those of the system if it has more."""
     own, every = list(entry.file_coordinates), list(entry.coordinates)
     if raw["coordinates"] != own:
         fail("coordinates", f"be {own}", f"it was {raw['coordinates']!r}")
@@ -106,7 +106,7 @@ def _check_coordinates(raw: Any, entry: AbstractEntry) -> None:
 
 
 def _check_constraints(raw: Any, entry: AbstractEntry) -> None:
-    """What each constraint row is, in words: one text for each, in order."""
+    """Check the texts that describe the constraint rows: one for each, in order."""
     rows = entry.file_constraints
     texts = isinstance(raw, list) and all(isinstance(text, str) for text in raw)
     if texts and len(raw) == len(rows):

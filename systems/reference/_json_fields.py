@@ -8,7 +8,7 @@ import numpy as np
 
 
 class InvalidReference(ValueError):
-    """A reference file that cannot be read, naming the field and what it must be."""
+    """A reference file cannot be read; the message names the field and the requirement."""
 
 
 def numbers(where: str, raw: Any) -> np.ndarray:
@@ -60,7 +60,7 @@ def check_texts(where: str, raw: Any, known: Iterable[str]) -> None:
 
 
 def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of the file, whose names must differ."""
+    """An object of the file; its names must be distinct."""
     result: dict[str, Any] = {}
     for name, value in pairs:
         if name in result:
@@ -70,11 +70,11 @@ def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def shown(raw: Any) -> str:
-    """`raw` as it stands in a message."""
+    """`raw` as text for a message."""
     text = repr(raw)
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def fail(where: str, must: str, was: str) -> NoReturn:
-    """Raise, naming the field, what it must be and what it was."""
+    """Raise an error that names the field, the requirement and the value."""
     raise InvalidReference(f"{where} must {must}, but {was}.")

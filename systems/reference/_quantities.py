@@ -1,4 +1,4 @@
-"""What is known of a system at one state: every quantity by name."""
+"""Quantities of a system at one state, by name."""
 
 from collections.abc import Mapping
 from functools import cache, partial, singledispatch
@@ -15,7 +15,7 @@ from systems.catalogue._entry import AbstractEntry, Entry, PrescribedEntry, Stat
 def quantities(
     entry: Entry, params: Mapping[str, ArrayLike], t: Array, q: Array, v: Array
 ) -> dict[str, Array]:
-    """Every quantity of the state (t, q, v), the entry's own included.
+    """Every quantity of the state (t, q, v), including those of the entry.
 
     Args:
         entry: the system, n coordinates.
@@ -25,9 +25,9 @@ def quantities(
         v: generalized velocities, shape (n,).
 
     Returns:
-        `q`, `v`, `a`; `u`, where there are quasi-velocities; under constraints `lambda` and
+        `q`, `v`, `a`; `u`, if there are quasi-velocities; with constraints `lambda` and
         `constraint_force`, A^T lambda; `energy.T`, `energy.V`, `energy.E`; `extras.H`, `extras.p`
-        and `extras.p_dot`, which is dp/dt along the motion; the entry's further `extras.*` and
+        and `extras.p_dot`, which is dp/dt along the motion; the entry's other `extras.*` and
         `invariants.*`.
     """
     system = entry.system
@@ -55,10 +55,10 @@ def quantities(
 def file_quantities(
     entry: Entry, params: Mapping[str, ArrayLike], t: Array, q: Array, v: Array
 ) -> dict[str, Array]:
-    """What a reference file may hold of the state (t, q, v), which is that of the system.
+    """The quantities that a reference file may hold for the state (t, q, v) of the system.
 
-    All of `quantities`, but where the file is written in coordinates of its own: then `q`, `v`, `a`
-    of these, and nothing that belongs to the others or to the constraints.
+    These are all of `quantities`. If the entry has a chart, `q`, `v` and `a` are those of its
+    coordinates, without quantities of the other coordinates or of the constraints.
     """
     found = quantities(entry, params, t, q, v)
     if entry.chart is None:
@@ -73,7 +73,7 @@ _OF_ALL_COORDINATES = ("lambda", "constraint_force", "extras.H", "extras.p", "ex
 def static_quantities(
     entry: StaticEntry, params: Mapping[str, ArrayLike], rest: jl.Equilibrium
 ) -> dict[str, Array]:
-    """The entry's values of the state of rest; and `q`, unless these name the coordinates."""
+    """The entry's values of the state of rest, and `q` if the entry has no chart."""
     values = {name: jnp.asarray(f(rest, params)) for name, f in entry.values.items()}
     return values if entry.chart is not None else {"q": rest.q} | values
 
@@ -86,7 +86,7 @@ def prescribed_quantities(
     v: Array,
     a: Array,
 ) -> dict[str, Array]:
-    """`q`, `v`, `a`, the `generalized_force` that they need, and the entry's `extras.*`."""
+    """`q`, `v`, `a`, the `generalized_force` that they require, and the entry's `extras.*`."""
     force = jl.inverse_dynamics(entry.system, q, v, a, params, t=t)
     extras = {name: f(t, q, v, a, params) for name, f in entry.extras.items()}
     return {"q": q, "v": v, "a": a, "generalized_force": force} | _named({"extras": extras})
@@ -94,7 +94,7 @@ def prescribed_quantities(
 
 @cache
 def shapes(entry: AbstractEntry) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of every quantity in reference files, found without computing any."""
+    """Name -> shape of every quantity in reference files, without computing them."""
     abstract = jax.eval_shape(partial(_at_zero, entry), entry.example.params)
     return {name: value.shape for name, value in abstract.items()}
 

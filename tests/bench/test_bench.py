@@ -12,7 +12,7 @@ from _kept_runs import check_fields
 
 from bench import __main__ as command
 from bench._harness import results, timing, workers
-from bench._harness.timing import BENCHMARKS, RUNS_PER_TURN, Reference, Report, Target
+from bench._harness.timing import BENCHMARKS, RUNS_PER_ROUND, Reference, Report, Target
 from bench._problems import double_pendulum as pendulum
 from systems.catalogue.chapter3.double_pendulum import system
 
@@ -81,8 +81,8 @@ def test_calls_take_turns_after_one_to_warm_up(clock):
 def test_a_call_over_its_budget_sits_out(clock):
     calls = {"slow": lambda: clock.pending(9.0), "fast": lambda: clock.pending(0.1)}
     samples = timing.interleaved(calls, rounds=6, budget_s=2.0)
-    assert len(samples["slow"]) == RUNS_PER_TURN
-    assert len(samples["fast"]) == 6 * RUNS_PER_TURN
+    assert len(samples["slow"]) == RUNS_PER_ROUND
+    assert len(samples["fast"]) == 6 * RUNS_PER_ROUND
 
 
 def test_times_are_per_lane_in_the_unit_named():

@@ -24,7 +24,7 @@ def errors(saves, *, kappa=100.0, steps=100, size=1e4, ends=None, estimates=None
     return Errors(
         saves=saves,
         ends=saves if ends is None else np.array(ends, float),
-        saves_there=saves,
+        saves_at_ends=saves,
         estimates=1.5 * saves if estimates is None else np.array(estimates, float),
         size=np.full(saves.shape, size),
         kappa=np.full(saves.shape, kappa),

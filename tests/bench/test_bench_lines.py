@@ -98,7 +98,7 @@ def test_a_line_without_a_point_says_why():
     line = made_up_line({1e-1: math.nan})
     assert swept(line, float, patience_s=0.5)[1] == []
     assert line.why_none(0.5) == "no run of at most 2 s ended with an error below 0.1"
-    assert line._replace(said=["first", "too much work"]).why_none(0.5) == "too much work"
+    assert line._replace(messages=["first", "too much work"]).why_none(0.5) == "too much work"
 
 
 def points(*pairs):

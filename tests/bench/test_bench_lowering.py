@@ -15,7 +15,7 @@ from bench._harness.timing import Report
 from bench._problems.scenes import SCENES, links
 from bench.lowering import _chains, _rk4
 from bench.lowering._by_hand import BY_HAND
-from bench.lowering._verdict import NEIGHBOURS, OPERATIONS, verdict
+from bench.lowering._verdict import LIBRARIES, OPERATIONS, verdict
 
 
 def off(name, contenders):
@@ -74,18 +74,18 @@ def test_the_loop_of_evaluations_integrates():
     assert abs(v[0][()] + 20.0 * math.sin(phase)) < 2e-11
 
 
-@pytest.mark.parametrize("name", NEIGHBOURS)
+@pytest.mark.parametrize("name", LIBRARIES)
 @pytest.mark.parametrize("n", [2, 5])
-def test_neighbours_compute_the_accelerations_of_the_chain(name, n):
+def test_libraries_compute_the_accelerations_of_the_chain(name, n):
     pytest.importorskip(_chains.MODULES[name])
     scene = links(n)
     q, v = np.array(scene.q0), np.linspace(0.5, -0.4, n)
     expected = _rk4.system(scene).acceleration(q, v, scene.params)
-    neighbour = _chains.MAKERS[name](scene, 3)
-    found = neighbour.acceleration(q, v)
+    library = _chains.MAKERS[name](scene, 3)
+    found = library.acceleration(q, v)
     assert np.max(np.abs(found - expected)) < lowering.PEER_AGREEMENT * np.max(np.abs(expected))
-    neighbour.call()
-    assert neighbour.evaluations == 12
+    library.call()
+    assert library.evaluations == 12
 
 
 def test_the_loop_of_numba_is_the_same():
@@ -98,10 +98,10 @@ def test_the_loop_of_numba_is_the_same():
     assert np.max(np.abs(found - expected)) < 1e-13
 
 
-def test_neighbours_that_cannot_be_imported_are_left_out(monkeypatch):
-    monkeypatch.setattr(_chains, "MODULES", dict.fromkeys(NEIGHBOURS, "no_such_module"))
-    assert _chains.missing() == list(NEIGHBOURS)
-    assert _chains.neighbours(links(2), 3) == {}
+def test_libraries_that_cannot_be_imported_are_left_out(monkeypatch):
+    monkeypatch.setattr(_chains, "MODULES", dict.fromkeys(LIBRARIES, "no_such_module"))
+    assert _chains.missing() == list(LIBRARIES)
+    assert _chains.libraries(links(2), 3) == {}
 
 
 def test_contenders_that_disagree_are_not_timed(monkeypatch):

@@ -49,7 +49,10 @@ def test_the_fastest_are_told_at_equal_error():
     regular = at[_ranking.REGULAR, "1e-06"]
     assert (regular["jaxlag_us"], regular["peer_us"]) == (100.0, 80.0)
     assert (regular["peer"], regular["naive_us"]) == ("heyoka", 3000.0)
-    told = {reference.what: reference.figure for reference in _ranking.told(made_up_rows())}
+    told = {
+        reference.what: reference.figure
+        for reference in _ranking.fastest_references(made_up_rows())
+    }
     words = f"{_ranking.REGULAR}: fastest at 1e-09; jaxlag dopri8 100 us"
     assert told[words] == "jaxlag dopri8, jax 0.12.0 1 us"
 

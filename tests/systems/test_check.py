@@ -74,7 +74,7 @@ def test_the_reference_file_is_reproduced(name):
     for case in reference.cases:
         motion = replay_case(reference.entry, case)
         assert motion.status == jl.Status.ok
-        for deviation in compare(case, motion.rows):
+        for deviation in compare(case, motion.values):
             assert deviation.ok, f"{case.name}: {deviation}"
 
 
@@ -97,19 +97,19 @@ def test_every_wrong_number_is_found(name):
     motion = replayed(entry, times)
     raw = json.loads(json.dumps(recorded(entry, times, motion)), parse_int=float)
     (case,) = read(raw).cases
-    assert all(deviation.size == 0 for deviation in compare(case, motion.rows))
+    assert all(deviation.size == 0 for deviation in compare(case, motion.values))
 
     compared = [
         path for path in places(raw) if path[2] not in ("params", "times", "error_estimate")
     ]
-    assert len(compared) == sum(rows.size for rows in motion.rows.values())
+    assert len(compared) == sum(rows.size for rows in motion.values.values())
     for path in compared:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
         row = next((key for key in path[2:] if isinstance(key, int)), 0)
         row = 0 if entry.kind == "static" else row
         (case,) = read(nudged(raw, path)).cases
-        outside = [deviation for deviation in compare(case, motion.rows) if not deviation.ok]
-        assert [(deviation.field, deviation.row) for deviation in outside] == [(field, row)]
+        outside = [deviation for deviation in compare(case, motion.values) if not deviation.ok]
+        assert [(deviation.field, deviation.time_index) for deviation in outside] == [(field, row)]
 
 
 def test_a_prescribed_motion_is_the_input():
@@ -119,13 +119,13 @@ def test_a_prescribed_motion_is_the_input():
     raw = json.loads(json.dumps(recorded(entry, times, replayed(entry, times))), parse_int=float)
     raw["cases"][0]["a"][2][1] += 0.5
     (case,) = read(raw).cases
-    found = {d.field: d for d in compare(case, replay_case(entry, case).rows) if not d.ok}
+    found = {d.field: d for d in compare(case, replay_case(entry, case).values) if not d.ok}
     assert set(found) == {"a", "generalized_force", "extras.torque"}
-    assert {d.row for d in found.values()} == {2}
+    assert {d.time_index for d in found.values()} == {2}
     # 100 kg at r(0.8 s) = 5.32 m, 0.5 rad/s^2 more: m r^2 theta'' grows by 1415.12 N m.
     torque = 100 * (2 * 5.32 * 0.4 * 3.0 + 5.32**2 * 0.5)
     np.testing.assert_allclose(
-        replay_case(entry, case).rows["generalized_force"][2, 1], torque, rtol=1e-12
+        replay_case(entry, case).values["generalized_force"][2, 1], torque, rtol=1e-12
     )
 
 

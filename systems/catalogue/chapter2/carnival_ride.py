@@ -1,4 +1,4 @@
-r"""Carnival ride: a rider led outwards on a turning arm, the motion prescribed.
+r"""Carnival ride: a rider moved outward on a turning arm, with a prescribed motion.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 2, sec. 2.8, Example 7 (Fig. 2.13,
 eqs. 2.43-2.47).
@@ -22,7 +22,7 @@ Parameters
 
     T = 1/2 m (r'^2 + r^2 theta'^2)      V = 0
 
-The force on the rider along r and the torque about the axis that the motion needs:
+The motion requires this force on the rider along r and this torque about the axis:
 
     radial force = m (r'' - r theta'^2)
     torque       = 2 m r r' theta' + m r^2 theta'' = dh/dt,   h = m r^2 theta'
@@ -55,12 +55,12 @@ def potential(t, q, params):
 
 
 def radial_force(t, q, v, a, params):
-    """Force along r that the motion needs [N], m (r'' - r theta'^2)."""
+    """Force along r required for the motion [N], m (r'' - r theta'^2)."""
     return jl.inverse_dynamics(system, q, v, a, params, t=t)[0]
 
 
 def torque(t, q, v, a, params):
-    """Torque about the axis that the motion needs [N m]."""
+    """Torque about the axis required for the motion [N m]."""
     return jl.inverse_dynamics(system, q, v, a, params, t=t)[1]
 
 

@@ -85,7 +85,7 @@ def applied_force(t, q, v, a, params):
 
 
 def spin_less_impulse(t, q, v, a, params):
-    """Angular momentum about the mass center less the torque about it times t [N m s]."""
+    """Angular momentum about the mass center minus the torque about it times t [N m s]."""
     xb, yb = params["xb"], params["yb"]
     first = (params["x1"] - xb) * params["f1y"] - (params["y1"] - yb) * params["f1x"]
     second = (params["x2"] - xb) * params["f2y"] - (params["y2"] - yb) * params["f2x"]

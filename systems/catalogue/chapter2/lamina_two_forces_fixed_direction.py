@@ -58,7 +58,7 @@ def applied_force(t, q, v, a, params):
 
 
 def momentum_less_impulse(t, q, v, a, params):
-    """(p_x, p_y) less the resultant times t [N s]."""
+    """(p_x, p_y) minus the resultant times t [N s]."""
     impulse = jnp.sum(fixed_forces(t, q, v, params), axis=0) * t
     return system.momentum(q, v, params, t=t)[:2] - impulse[:2]
 

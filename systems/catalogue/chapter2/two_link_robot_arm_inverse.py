@@ -1,4 +1,4 @@
-r"""Robot arm of two links led along a given motion: the torques its motors must supply.
+r"""Robot arm of two links with a prescribed motion: the torques of its motors.
 
 Pila, "Introduction to Lagrangian Dynamics", ch. 2, sec. 2.7 (Fig. 2.12, eqs. 2.34-2.41). The
 motion is an addition.
@@ -25,9 +25,9 @@ Parameters
     a0, a1, wa   theta1: mean and amplitude [rad], angular frequency [rad/s]
     b0, b1, wb   theta2: the same
 
-T and V are those of the driven arm. What they need is (tauO - tauA, tauA): the torque tauA of
-link 1 on link 2, and tauO of the ground on link 1. Without gravity tauA is the moment
-tau_B/A = r_BA x m a_B of the load, else tauA = tau_B/A + m g l2 cos(theta2).
+T and V are those of the driven arm. The required generalized force is (tauO - tauA, tauA), with
+the torque tauA of link 1 on link 2, and tauO of the ground on link 1. Without gravity tauA is the
+moment tau_B/A = r_BA x m a_B of the load; with gravity tauA = tau_B/A + m g l2 cos(theta2).
 """
 
 import jax.numpy as jnp
@@ -45,7 +45,7 @@ def motion(t, params):
 
 
 def motor_torque_O(t, q, v, a, params):
-    """tauO [N m]: both components together, for they are tauO - tauA and tauA."""
+    """tauO [N m]: the sum of both components, which are tauO - tauA and tauA."""
     return jnp.sum(jl.inverse_dynamics(system, q, v, a, params, t=t))
 
 

@@ -51,7 +51,7 @@ def potential(t, q, params):
 
 
 def slip(t, q, params):
-    """(y1 - R theta, y2 + R theta), what the masses descend beyond the cord [m]."""
+    """(y1 - R theta, y2 + R theta), descents of the masses minus those of the cord [m]."""
     y1, y2, theta = q
     return jnp.stack([y1 - params["R"] * theta, y2 + params["R"] * theta])
 

@@ -101,8 +101,8 @@ def exact(t, q0, v0, params):
     M = jnp.array([[params["m0"] + m, m * along], [m * along, 1.5 * m]])
     C = jnp.diag(jnp.array([params["b"], 0.0]))
     K = jnp.diag(jnp.stack([params["K2"], params["K1"]]))
-    push = params["F1"] * jnp.array([1.0, along])
-    return _exact.oscillating(t, q0, v0, M, C, K, jnp.zeros(2), push, params["Omega"])
+    force = params["F1"] * jnp.array([1.0, along])
+    return _exact.oscillating(t, q0, v0, M, C, K, jnp.zeros(2), force, params["Omega"])
 
 
 entry = Entry(

@@ -46,7 +46,7 @@ def potential(t, q, params):
 
 
 def squared_length_excesses(t, q, params):
-    """Squares of the distances that the strings span, less those of their lengths [m^2]."""
+    """Squared distances between the ends of the strings, minus their squared lengths [m^2]."""
     first, second = q[:2], q[2:] - q[:2]
     return jnp.stack([first @ first - params["h1"] ** 2, second @ second - params["h2"] ** 2])
 

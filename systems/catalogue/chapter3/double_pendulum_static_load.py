@@ -26,11 +26,11 @@ Parameters
     Fx, Fy   force on the end [N]
 
 V and the points are those of the moving pendulum; a state of rest needs no T. Each link hangs
-along the resultant of what pulls at its lower end:
+along the resultant of the forces at its lower end:
 
     theta1 = atan2(Fx + Bx, (m1 + m2) g - Fy - By),   theta2 = atan2(Fx, m2 g - Fy)
 
-which is the stable one of four states of rest; the others have one link or both turned by pi.
+This is the stable one of four states of rest; the others have one link or both turned by pi.
 """
 
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ def end_force(t, q, v, params):
 
 
 def guess(params):
-    """Half a radian off the resultant of what pulls at each lower end: near the stable state.
+    """Half a radian from the resultant of the forces at each lower end: near the stable state.
 
     From angles of zero, large loads lead to other states, in which a link is upside down.
     """

@@ -34,7 +34,7 @@ Parameters
 The model holds while the contact point slides towards -x, x_c' + (L/2) theta' sin(theta) < 0, and
 while N > 0. Its states are those of (x_c, theta).
 
-Misprint: 3.175-3.176 leave the moment mu N (L/2) sin(theta) of the friction out.
+Misprint: 3.175-3.176 omit the moment mu N (L/2) sin(theta) of the friction.
 """
 
 import math

@@ -27,8 +27,9 @@ Parameters
     Q = (F1 R, F1 cos(gamma), F1 sin(gamma))
 
 All accelerations are constant: theta'' = F1 R/(M kappa^2), x'' = F1 cos(gamma)/M,
-y'' = F1 sin(gamma)/M. The pull acts on the cord's end, whose way includes what unwinds; the point
-where the cord leaves the puck stands still relative to G and would give no moment.
+y'' = F1 sin(gamma)/M. The pull acts on the cord's end, whose displacement includes the length that
+unwinds. The point where the cord leaves the puck is at rest relative to G; as the point of
+application it would give no moment.
 """
 
 import jax.numpy as jnp
@@ -63,8 +64,8 @@ system = jl.System(
 def exact(t, q0, v0, params):
     """The slide and the spin under constant accelerations."""
     spin = params["F1"] * params["R"] / (params["M"] * params["kappa"] ** 2)
-    push = pull(t, q0, v0, params) / params["M"]
-    return _exact.accelerated(t, q0, v0, jnp.append(spin, push))
+    acceleration = pull(t, q0, v0, params) / params["M"]
+    return _exact.accelerated(t, q0, v0, jnp.append(spin, acceleration))
 
 
 entry = Entry(

@@ -32,7 +32,7 @@ Parameters
     torque  ((f2 - f4) l, (f3 - f1) l, b (w1^2 - w2^2 + w3^2 - w4^2)) - omega x (0, 0, h)
             in body axes, with the spin h = Im (-w1 + w2 - w3 + w4) of the rotors
 
-Yaw and roll cannot be told apart at theta = +-pi/2, where the mass matrix is singular.
+Yaw and roll cannot be distinguished at theta = +-pi/2, where the mass matrix is singular.
 
 Errors in the book: 3.76 is no kinetic energy, for the angle rates are not components of omega
 (3.79 is right). 3.82 swaps the arms of pitch (rotors 1, 3) and roll (2, 4), and uses body torques

@@ -46,9 +46,9 @@ from systems.catalogue._entry import Entry, Example
 
 def kinetic(t, q, v, params):
     """T of the mass center, of the roll and of the turn [J]."""
-    x_rate, y_rate, turn, roll = v
+    x_rate, y_rate, heading_rate, roll = v
     moving = 0.5 * params["m"] * (x_rate**2 + y_rate**2)
-    return moving + 0.5 * params["Iw"] * roll**2 + 0.5 * params["Id"] * turn**2
+    return moving + 0.5 * params["Iw"] * roll**2 + 0.5 * params["Id"] * heading_rate**2
 
 
 def potential(t, q, params):

@@ -63,7 +63,7 @@ def rod(params):
 
 
 def disk(params):
-    """The disk by its inertia about O; axes that do not spin with it serve as well."""
+    """The disk by its inertia about O; its axes need not spin with it, because it is symmetric."""
     m2, end = params["m2"], params["l"] * ALONG
     central = jnp.stack([params["Iz"], params["Iy"], params["Iz"]])
     return energy.RigidBody(m2, energy.parallel_axis(central, m2, end), end)
@@ -71,9 +71,9 @@ def disk(params):
 
 def kinetic(t, q, v, params):
     """T of rod and disk [J]."""
-    still, omega = energy.body_velocity(pose, t, q, v, params)
-    spin = disk(params).kinetic_from_rates(still, omega + v[2] * ALONG)
-    return rod(params).kinetic_from_rates(still, omega) + spin
+    at_rest, omega = energy.body_velocity(pose, t, q, v, params)
+    spin = disk(params).kinetic_from_rates(at_rest, omega + v[2] * ALONG)
+    return rod(params).kinetic_from_rates(at_rest, omega) + spin
 
 
 def potential(t, q, params):

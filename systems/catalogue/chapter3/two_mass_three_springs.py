@@ -49,8 +49,8 @@ def exact(t, q0, v0, params):
     k1, k2, k3 = params["k1"], params["k2"], params["k3"]
     M = jnp.diag(jnp.stack([params["m1"], params["m2"]]))
     K = jnp.array([[k1 + k2, -k2], [-k2, k2 + k3]])
-    still = jnp.zeros(2)
-    return _exact.oscillating(t, q0, v0, M, jnp.zeros((2, 2)), K, still, still, 0.0)
+    zero = jnp.zeros(2)
+    return _exact.oscillating(t, q0, v0, M, jnp.zeros((2, 2)), K, zero, zero, 0.0)
 
 
 entry = Entry(

@@ -47,11 +47,11 @@ from systems.catalogue._entry import Entry, Example
 
 def velocities(t, q, v, params):
     """(v, v_Y, v_R, phidot) of 4.74 (m/s, m/s, m/s, rad/s)."""
-    x_rate, y_rate, turn, steer = v
+    x_rate, y_rate, theta_rate, steer = v
     c, s = jnp.cos(q[2]), jnp.sin(q[2])
     along = (x_rate * c + y_rate * s) / jnp.cos(q[3])
     sideways = -x_rate * s + y_rate * c
-    front = params["l"] * turn * c * jnp.cos(q[3]) - x_rate * jnp.sin(q[3])
+    front = params["l"] * theta_rate * c * jnp.cos(q[3]) - x_rate * jnp.sin(q[3])
     return jnp.stack([along, sideways, front, steer])
 
 

@@ -86,13 +86,13 @@ def exact(t, q0, v0, params):
     C = jnp.sqrt(forward**2 + (size * turning) ** 2)
     s0, rate = jnp.arctanh(forward / C), m * a * C / J
 
-    def turned(s):
+    def angle(s):
         return sense * size / a * 2 * jnp.arctan(jnp.tanh(s / 2))
 
     def moved(t):
         """(theta, v) at t."""
         s = s0 + rate * t
-        return q0[2] + turned(s) - turned(s0), C * jnp.tanh(s)
+        return q0[2] + angle(s) - angle(s0), C * jnp.tanh(s)
 
     def path(direction):
         def rate(t):

@@ -27,9 +27,9 @@ Parameters
     pivot_y:  a sin(theta1) + b sin(theta2) + c sin(theta3) = 0
     lambda = force of the pivot D on the rocker along x and y in N
 
-With the shortest link and the longest one together shorter than the other two the shortest turns
-all the way round (Grashof). Coupler and rocker of the example are given 20 % wrong, as if read off
-a sketch; they are assembled, the crank held.
+If the shortest and the longest link together are shorter than the other two, the shortest makes
+full turns (Grashof). The example has angles of coupler and rocker with errors of 20 %, as if read
+from a sketch. They are assembled with the crank held.
 """
 
 import jax.numpy as jnp

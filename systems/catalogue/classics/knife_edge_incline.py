@@ -69,12 +69,12 @@ system = jl.System(
 def exact(t, q0, v0, params):
     """An edge that turns, at the constant rate w, from the velocity v along itself."""
     (_, _, start), (v, _, w) = q0, velocities(0.0, q0, v0, params)
-    pull, phi = params["g"] * jnp.sin(params["alpha"]), start + w * t
+    downhill, phi = params["g"] * jnp.sin(params["alpha"]), start + w * t
     s, s0, c, c0 = jnp.sin(phi), jnp.sin(start), jnp.cos(phi), jnp.cos(start)
-    rest = v - pull / w * s0
-    x = rest / w * (s - s0) + pull / (2 * w**2) * (s**2 - s0**2)
-    y = -rest / w * (c - c0) + pull / (2 * w**2) * (phi - start - s * c + s0 * c0)
-    along = rest + pull / w * s
+    rest = v - downhill / w * s0
+    x = rest / w * (s - s0) + downhill / (2 * w**2) * (s**2 - s0**2)
+    y = -rest / w * (c - c0) + downhill / (2 * w**2) * (phi - start - s * c + s0 * c0)
+    along = rest + downhill / w * s
     return q0 + jnp.stack([x, y, w * t]), jnp.stack([along * c, along * s, w])
 
 

@@ -1,4 +1,4 @@
-r"""Free particle whose velocity is held to z' = y x'.
+r"""Free particle with the constraint z' = y x' on its velocity.
 
 Not in the book; Rosenberg, Analytical Dynamics of Discrete Systems (1977). The quasi-velocities
 are declared as in

@@ -1,4 +1,4 @@
-r"""Thin disk that rolls on a level plane without slipping and leans as it likes.
+r"""Thin disk that rolls on a level plane without slipping and leans freely.
 
 Not in the book; Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), and, low and without
 friction losses, Euler's disk. The quasi-velocities are declared as in
@@ -50,8 +50,8 @@ from systems.catalogue._entry import Entry, Example
 
 def angular_velocity(t, q, v, params):
     """(w1, w2, w3) along e1, e2, e3 [rad/s]."""
-    theta, (turn, lean, spin) = q[3], v[2:]
-    return jnp.stack([lean, turn * jnp.sin(theta), spin + turn * jnp.cos(theta)])
+    theta, (heading_rate, lean, spin) = q[3], v[2:]
+    return jnp.stack([lean, heading_rate * jnp.sin(theta), spin + heading_rate * jnp.cos(theta)])
 
 
 def kinetic(t, q, v, params):

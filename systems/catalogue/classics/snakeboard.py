@@ -16,7 +16,7 @@ Coordinates
     x, y         center of the board [m]
     theta        direction of the board from x [rad]
     psi          angle of the rotor from the board [rad]
-    phi          front wheels from the board [rad]; the back ones stand at -phi
+    phi          front wheels from the board [rad]; the back ones are at -phi
 
 Quasi-velocities
     xi           rate of the motion that the wheels allow [rad/s]
@@ -60,10 +60,10 @@ from systems.catalogue._entry import Entry, Example
 
 def kinetic(t, q, v, params):
     """T of board, rotor and wheels [J]."""
-    x_rate, y_rate, turn, rotor, steer = v
-    moving = 0.5 * params["m"] * (x_rate**2 + y_rate**2) + 0.5 * params["J"] * turn**2
-    wheels = 0.5 * params["J_w"] * ((turn + steer) ** 2 + (turn - steer) ** 2)
-    return moving + 0.5 * params["J_r"] * (turn + rotor) ** 2 + wheels
+    x_rate, y_rate, theta_rate, rotor, steer = v
+    moving = 0.5 * params["m"] * (x_rate**2 + y_rate**2) + 0.5 * params["J"] * theta_rate**2
+    wheels = 0.5 * params["J_w"] * ((theta_rate + steer) ** 2 + (theta_rate - steer) ** 2)
+    return moving + 0.5 * params["J_r"] * (theta_rate + rotor) ** 2 + wheels
 
 
 def potential(t, q, params):
@@ -80,10 +80,10 @@ def torques(t, q, v, params):
 
 def velocities(t, q, v, params):
     """(xi, psidot, phidot, n_front, n_back) (rad/s, m/s)."""
-    theta, phi, r, turn = q[2], q[4], params["r"], v[2]
+    theta, phi, r, theta_rate = q[2], q[4], params["r"], v[2]
     along = v[0] * jnp.cos(theta) + v[1] * jnp.sin(theta)
-    xi = jnp.cos(phi) / r * along + turn * jnp.sin(phi)
-    lever = r * turn * jnp.cos(phi)
+    xi = jnp.cos(phi) / r * along + theta_rate * jnp.sin(phi)
+    lever = r * theta_rate * jnp.cos(phi)
     front = -v[0] * jnp.sin(theta + phi) + v[1] * jnp.cos(theta + phi) + lever
     back = -v[0] * jnp.sin(theta - phi) + v[1] * jnp.cos(theta - phi) - lever
     return jnp.stack([xi, v[3], v[4], front, back])

@@ -91,9 +91,9 @@ def exact(t, q0, v0, params):
 
     x = _exact.integral(lambda t: speed(t) * jnp.cos(heading(t)), t)
     y = _exact.integral(lambda t: speed(t) * jnp.sin(heading(t)), t)
-    turns, rates = _exact.accelerated(t, q0[2:], v0[2:], a)
-    forward = jnp.stack([jnp.cos(turns[1]), jnp.sin(turns[1])])
-    q = jnp.concatenate([q0[:2] + jnp.stack([x, y]), turns])
+    angles, rates = _exact.accelerated(t, q0[2:], v0[2:], a)
+    forward = jnp.stack([jnp.cos(angles[1]), jnp.sin(angles[1])])
+    q = jnp.concatenate([q0[:2] + jnp.stack([x, y]), angles])
     return q, jnp.concatenate([speed(t) * forward, rates])
 
 
