@@ -327,6 +327,7 @@ def _weighted(mass: Any, values: Array) -> Array:
         raise invalid(
             "mass",
             "be a number, or one for each of the positions",
-            f"its shape was {mass.shape}, the positions' (..., d) with {values.shape} in front",
+            f"its shape was {mass.shape}, and that of the positions was {values.shape} without the "
+            "last axis",
         )
     return jnp.sum(mass.astype(values.dtype) * values)

@@ -54,7 +54,7 @@ def renamed(**words: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
             for old in words.keys() & kwargs.keys():
-                must, was = "be called by its present keywords", f"it got {old}="
+                must, was = "be called with its current keywords", f"it got {old}="
                 raise invalid(function.__name__, must, was, f"Write {words[old]}.")
             return function(*args, **kwargs)
 

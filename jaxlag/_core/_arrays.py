@@ -69,7 +69,7 @@ def of_state(argument: str, *arrays: Array) -> list[Array]:
     state = common(*arrays)
     dtype = state[0].dtype
     if jnp.finfo(dtype).bits < 32:
-        was = f"in {dtype.name} equations keep {jnp.finfo(dtype).precision} digits at most"
+        was = f"{dtype.name} has {jnp.finfo(dtype).precision} digits at most"
         fix = f"Write {argument.replace(',', ' ').split()[0]}.astype(float)."
         raise invalid(argument, "be float32 or float64", was, fix)
     return state

@@ -23,10 +23,10 @@ Leaves = Sequence[Any]
 
 
 _TWICE = (
-    "Reverse derivatives of reverse derivatives must be taken through explicit methods or those of "
-    "jaxlag.solvers: JAX does not transpose the loops in which others solve their equations. Take "
-    "second derivatives forward over reverse, jax.hessian(f) or jax.jacfwd(jax.grad(f)), which all "
-    "methods have."
+    "Reverse derivatives of reverse derivatives must use an explicit method or a method of "
+    "jaxlag.solvers: JAX cannot transpose the loops in which other methods solve their equations. "
+    "Take second derivatives forward over reverse, by jax.hessian(f) or jax.jacfwd(jax.grad(f)): "
+    "all methods support these."
 )
 
 

@@ -21,9 +21,9 @@ def refuse(name: str) -> NoReturn:
         ImportError: always.
     """
     raise ImportError(
-        f"{name} must be a module or a name of this version of jaxlag, but it was of an older one, "
-        "as those in older pickles are. Make the pickle anew; of motions keep `to_dict()`: arrays "
-        "by name, which every version reads.",
+        f"{name} must be a module or a name of this version of jaxlag, but it belongs to an older "
+        "version, as in an old pickle. Create the pickle again. To store a motion, keep "
+        "`motion.to_dict()`: every version reads these named arrays.",
         name=name,
     )
 

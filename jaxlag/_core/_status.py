@@ -39,13 +39,13 @@ CONCERNS_ROW = {
 
 ADVICE = {
     Status.max_steps: (
-        "Raise max_steps, loosen rtol and atol, or shorten ts. What held the steps short is in "
-        "motion.explain()."
+        "Raise max_steps, loosen rtol and atol, or shorten ts. motion.explain() shows what limited "
+        "the steps."
     ),
     Status.step_below_resolution: (
-        "The step shrank below the resolution of time: a singularity, a discontinuity that no "
-        "input knot announces, atol = 0 where a component is 0, or a tolerance tighter than the "
-        "dtype gives."
+        "The step shrank below the resolution of time: a singularity, a discontinuity without an "
+        "input knot at its time, atol = 0 where a component is 0, or a tolerance below the "
+        "rounding of the dtype."
     ),
     Status.nonfinite: "The Lagrangian or a force is not finite there: check its domain.",
     Status.mass_singular: (
@@ -53,28 +53,28 @@ ADVICE = {
         "or drop it."
     ),
     Status.kinematics_singular: (
-        "There dU/dv is singular: this quasi-velocity follows from the others or vanishes, and v "
-        "does not follow from u (pitch at 90 degrees, a steered wheel across the way). Use other "
-        "coordinates or quasi-velocities near it, or formulation='multipliers', which passes "
-        "where the motion itself does."
+        "There dU/dv is singular: this quasi-velocity depends on the others or vanishes, and u "
+        "does not determine v (pitch at 90 degrees, a wheel steered by 90 degrees). Near this "
+        "state use other coordinates or quasi-velocities, or formulation='multipliers', which "
+        "passes this state if the motion continues through it."
     ),
     Status.rank_change: (
-        "There this constraint row came to depend on the others, or no longer follows from them: "
-        "a dead point or a change point, where the motion may go on in more than one way. It is "
-        "passed, but with change_points='stop', where ways of moving cross, states are projected "
-        "and forces read no multipliers. Else start beyond it, or add the row that "
-        "decides. Of redundant rows those that are solved with are chosen at the start: there, go "
-        "on from last_state."
+        "There this constraint row became dependent on the others, or independent of them: a dead "
+        "point or a change point, where the motion may have more than one continuation. Unless "
+        "change_points='stop', it is passed if branches cross, states are projected and forces "
+        "read no multipliers. Otherwise start beyond it, or add a row that selects one branch. "
+        "If rows are redundant, the rows to solve with are chosen at the start: then start again "
+        "from motion.last_state."
     ),
     Status.no_reaction_solution: (
-        "No reaction goes with the forces that depend on it: the contact lifts off, its sliding "
-        "stops or reverses, or friction is so strong that there is no solution (Painleve)."
+        "No reaction is consistent with the forces that depend on it: the contact lifts off, its "
+        "sliding stops or reverses, or friction is so strong that there is no solution (Painleve)."
     ),
     Status.contradictory_rows: (
         "No motion satisfies this constraint row together with the others: drop or correct one."
     ),
     Status.projection_failed: (
-        "The state was too far from this constraint to be moved back: reduce rtol and atol."
+        "The state was too far from this constraint to be projected: reduce rtol and atol."
     ),
     Status.inconsistent_start: (
         "q0 and v0 do not satisfy this constraint: pass assemble=True, or q0, v0 from jl.assemble."
@@ -92,10 +92,10 @@ ADVICE_FIXED = {
     Status.max_steps: "Raise max_steps, lengthen dt, or shorten ts.",
     Status.nonfinite: (
         "The Lagrangian or a force is not finite there: check its domain, and whether dt is short "
-        "against the fastest motion; steps that are too long grow without bound."
+        "compared with the fastest motion. If dt is too long, the solution grows without bound."
     ),
     Status.projection_failed: (
-        "The state was too far from this constraint to be moved back: reduce dt."
+        "The state was too far from this constraint to be projected: reduce dt."
     ),
     Status.implicit_solve_failed: ("The implicit solver's equations did not converge: reduce dt."),
 }
@@ -103,7 +103,7 @@ ADVICE_FIXED = {
 
 ADVICE_SHARP = {
     Status.max_steps: (
-        "Raise max_steps, or shorten ts. What held the steps short is in motion.explain()."
+        "Raise max_steps, or shorten ts. motion.explain() shows what limited the steps."
     ),
 }
 """Advice if forces change over a short distance, which a looser tolerance would miss."""

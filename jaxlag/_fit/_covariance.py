@@ -160,7 +160,9 @@ def _together(names: tuple[str, ...], row: np.ndarray) -> str:
     moved = [(n, x) for n, x in zip(names, row, strict=True) if abs(x) > 1e-3]
     if len(moved) == 1:
         return f"{moved[0][0]} is not determined at all"
-    return "change together without a trace: " + ", ".join(f"{n} by {x:+.3g} %" for n, x in moved)
+    return "change together without effect on the channels: " + ", ".join(
+        f"{n} by {x:+.3g} %" for n, x in moved
+    )
 
 
 # ---- The linear problem at the end of a search, states eliminated --------------------------------

@@ -81,7 +81,7 @@ class Experiment(eqx.Module):
         count = len(self.ts)
         if not isinstance(channels, Mapping) or not channels:
             raise invalid(
-                f"{name}: channels", "be a dict with one channel or more", f"was {channels}"
+                f"{name}: channels", "be a dict with one channel or more", f"it was {channels}"
             )
         self.channels = {key: _channel(name, key, x, count) for key, x in channels.items()}
         if callable(inputs):
@@ -100,10 +100,10 @@ class Experiment(eqx.Module):
             try:
                 x = np.broadcast_to(x[:, None] if x.ndim == 1 else x, shape)
             except ValueError:
-                must = f"be a number, {shape[0]} of them, or of shape {shape}"
+                must = f"be a number, {shape[0]} numbers, or an array of shape {shape}"
                 raise invalid(f"{name}: sigma[{key!r}]", must, f"its shape was {given}") from None
             if not np.all((x > 0) & (x < np.inf)):
-                fix = "Write NaN into the channel where it does not count."
+                fix = "To exclude a sample, write NaN into the channel instead."
                 was = f"its least was {np.min(x):g}, its largest {np.max(x):g}"
                 raise invalid(f"{name}: sigma[{key!r}]", "be positive and finite", was, fix)
             self.sigma[key] = x
@@ -111,8 +111,8 @@ class Experiment(eqx.Module):
         self.start_sigma = None if start_sigma is None else np.asarray(start_sigma, float)
         if self.start_sigma is not None:
             if self.q0 is None or self.v0 is None:
-                was = "q0 and v0 were not both given"
-                raise invalid(f"{name}: start_sigma", "come with the start it is about", was)
+                was = "they were not both given"
+                raise invalid(f"{name}: start_sigma", "be given together with q0 and v0", was)
             if not np.all(self.start_sigma >= 0):
                 was = f"it was {start_sigma}"
                 raise invalid(f"{name}: start_sigma", "be zero or positive, or None", was)
@@ -168,7 +168,7 @@ class Experiment(eqx.Module):
         edges = self.ts[0] + seconds * np.arange(count + 1) - 0.5 * per_sample
         samples = np.searchsorted(self.ts, edges)
         if seconds < 2 * per_sample:
-            raise invalid("seconds", "be two samples or more", f"it was {seconds:g}")
+            raise invalid("seconds", "cover two samples or more", f"it was {seconds:g}")
         return tuple(
             self.part(slice(a, b), f"{self.name}[{self.ts[a]:g} s]")
             for a, b in pairwise(samples)

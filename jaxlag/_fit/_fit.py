@@ -327,8 +327,8 @@ def _downhill(
     before = _starts(problem, z, jnp.zeros(problem.segments.guess.shape), join, max_steps)
     guess, costs, unsound = descend(problem, FitVariables(z, before.guess.x), descent)
     if int(unsound):
-        text = f"{int(unsound)} steps of the descent met derivatives that are not finite"
-        warnings.warn(f"{text}: they moved nothing by those.", stacklevel=4)
+        text = f"{int(unsound)} steps of the descent had derivatives that are not finite"
+        warnings.warn(f"{text}: these were replaced by 0.", stacklevel=4)
     after = _starts(problem, guess.z, guess.x, join, max_steps)
     count = len(guess.x)
     solves = (int(before.steps) + int(after.steps)) * count + descent.solves(count)
@@ -363,41 +363,40 @@ def _judged(
 def _warn_after(result: FitResult) -> None:
     if not result.converged:
         text = f"The search did not converge in {result.iterations} iterations: raise "
-        text += "max_steps, take more segments, or start closer."
+        text += "max_steps, take more segments, or choose params0 closer to the solution."
         if not result.freedom:
-            text = "No segment has a solution at the estimates: start closer."
+            text = "No segment has a solution at the estimates: choose a better params0."
         elif result.costs.size:
-            text = f"The descent ended no lower than it began, from {result.costs[0]:.3g} to "
-            text += f"{result.costs[-1]:.3g}: take a lower learning rate."
+            text = f"The descent did not reduce the cost: {result.costs[0]:.3g} at first, "
+            text += f"{result.costs[-1]:.3g} at the end. Take a lower learning rate."
         warnings.warn(text, stacklevel=3)
     if result.converged and result.distance > MAX_NEWTON_DISTANCE:
-        text = (
-            f"The search stopped {result.distance:.2g} standard deviations from where derivatives"
-        )
+        text = f"At the estimates the Newton step is {result.distance:.2g} standard deviations long"
         fix = "lower rtol and atol, or take fixed steps (dt)"
         if result.costs.size:
             fix = "take more epochs"
-        warnings.warn(f"{text} lead: {fix}.", stacklevel=3)
+        warnings.warn(f"{text}: {fix}.", stacklevel=3)
     few = len(result.names) <= LARGEST_COVARIANCE
     if few and np.isnan(result.singular_values).any():
         text = (
-            "Derivatives at the estimates are not finite: there is no covariance, and they may be"
+            "Derivatives at the estimates are not finite: there is no covariance, and the "
+            "estimates may be"
         )
         warnings.warn(f"{text} wrong. Look for a square root or a norm at zero.", stacklevel=3)
     for name in result.unused:
         warnings.warn(f"nothing measured depends on {name}: it keeps its value.", stacklevel=3)
     for name, line in result.jumps.items():
-        text = f"{name} is compared at {line}, and moves nothing but where the equations jump: no "
-        text += "derivative shows it, it keeps its value, and other estimates may be wrong by it. "
+        text = f"{name} is compared at {line}, and affects only where the equations jump. No "
+        text += "derivative shows this: it keeps its value, and other estimates may be wrong. "
         text += "Make the time of the jump a knot of a table, inputs=function of the params, or "
         warnings.warn(f"{text}smooth the jump.", stacklevel=3)
     for force, names in result.feeding.items():
-        text = f"At the estimates {force!r} gives energy where it should take some: it depends on "
+        text = f"At the estimates {force!r} adds energy instead of dissipating it. It depends on "
         text += f"{', '.join(names)}. Bound these (transforms=), or look for a force that is "
-        warnings.warn(f"{text}missing, or measurements that are not what they seem.", stacklevel=3)
+        warnings.warn(f"{text}missing, or for wrong measurements.", stacklevel=3)
     for name in result.on_bound:
         at = result.values[result.names.index(name)]
         text = f"{name} ended on its bound, {at:g}: widen the bound, or leave the parameter out."
         warnings.warn(text, stacklevel=3)
     for text in result.failed:
-        warnings.warn(f"{text}: it does not count.", stacklevel=3)
+        warnings.warn(f"{text}: it is ignored.", stacklevel=3)

@@ -180,7 +180,7 @@ class FitResult(eqx.Module):
         lines += [f"and {len(self.names) - SHOWN} more"] * (len(self.names) > SHOWN)
         lines += [f"unknown: {text}" for text in self.unidentifiable]
         lines += [f"known: {text}" for text in self.determined]
-        lines += [f"gives energy: {name}" for name in self.feeding]
+        lines += [f"adds energy: {name}" for name in self.feeding]
         for name in self.channels:
             lines.append(f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name)))
         lines += list(self.failed)

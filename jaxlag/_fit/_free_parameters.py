@@ -216,7 +216,7 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
             raise invalid("free", f"name parameters among {names}", f"one was {name!r}")
         real = [i for i in below if _is_real(values[i])]
         if not real:
-            must, was = "hold real numbers to be found", f"it was {values[below[0]]!r}"
+            must, was = "hold floating-point numbers if it is free", f"it was {values[below[0]]!r}"
             raise invalid(f"params0[{name!r}]", must, was, "Write 1.0 for 1.")
         chosen |= dict.fromkeys(real)
     for name, transform in transforms.items():

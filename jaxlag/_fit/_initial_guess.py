@@ -80,7 +80,7 @@ def _check(system: System, experiment: Experiment) -> None:
             raise invalid(f"{name}: {kind}", must, f"its shape was {given.shape}")
     sigma, size = experiment.start_sigma, start_size(system)
     if sigma is not None and sigma.ndim and sigma.shape != (size,):
-        must = f"be one number or {size}, of all coordinates and {what} that are free"
+        must = f"be one number or {size}, one for each coordinate and each of the free {what}"
         raise invalid(f"{name}: start_sigma", must, f"its shape was {sigma.shape}")
 
 
@@ -142,14 +142,14 @@ def _simulated(
     q0, v0 = (x if x.ndim == 1 else x[0] for x in (q0, v0))
     missing = np.isnan(q0)
     if missing.any():
-        fix = f"Pass {experiment.name} a q0 and v0: where the search for them starts."
+        fix = f"Pass q0= and v0= to {experiment.name}: the search starts from these."
         must = "be among the channels or in q0"
         raise invalid("coordinates", must, f"{labels[missing].tolist()} were not", fix)
     start: dict[str, Any] = {"v0": v0}
     if system.quasi is not None and given is not None:
         start = {"v0": None, "u0": v0}
     elif np.isnan(v0).any():
-        fix = f"Pass {experiment.name} a v0."
+        fix = f"Pass v0= to {experiment.name}."
         raise invalid("velocities", "follow from the channels or v0", "some did not", fix)
     ts, inputs = experiment.ts, experiment.inputs_at(params)
     return simulate(

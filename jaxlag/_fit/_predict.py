@@ -153,8 +153,8 @@ def predict(
     nowhere = FitVariables(jnp.zeros(0), jnp.zeros(whole.segments.guess.shape))
     found = search(whole, nowhere, jnp.asarray(1.0), jnp.asarray((rtol, atol)), max_steps)
     if not found.converged:
-        text = f"The search for starts did not converge in {int(found.steps)} iterations: raise "
-        warnings.warn(text + "max_steps, or make settle longer.", stacklevel=2)
+        text = f"The search for initial states did not converge in {int(found.steps)} iterations: "
+        warnings.warn(text + "raise max_steps or settle.", stacklevel=2)
     seen = found.seen
     if settle is not None:
         whole, where = posed(experiments)
@@ -166,7 +166,7 @@ def predict(
         for k in map(int, np.flatnonzero(status != Status.ok))
     )
     for text in failed:
-        warnings.warn(f"{text}: it does not count.", stacklevel=2)
+        warnings.warn(f"{text}: it is ignored.", stacklevel=2)
     samples = tuple(
         np.ones(len(each.ts), bool) if settle is None else np.arange(len(each.ts)) >= len(first.ts)
         for each, first in zip(experiments, early, strict=True)
@@ -194,8 +194,11 @@ def _first(fewest: int, experiment: Experiment, settle: float | int | None) -> E
     known = experiment.start_sigma is not None
     numbers = sum(int(np.isfinite(x[:samples]).sum()) for x in experiment.channels.values())
     if samples < 2 or (not known and numbers < fewest):
-        must = f"hold {fewest} numbers or more of {experiment.name}, as many as a start"
-        raise invalid("settle", must, f"its first {settle:g} s hold {numbers}", "Make it longer.")
+        must = (
+            f"contain {fewest} measurements or more of {experiment.name}, to determine the initial "
+            "state"
+        )
+        raise invalid("settle", must, f"the first {settle:g} s contain {numbers}", "Raise settle.")
     return experiment.part(slice(0, samples))
 
 

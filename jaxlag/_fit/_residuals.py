@@ -97,7 +97,7 @@ def read(
         x = x[:, None] if x.ndim == 1 else x
         if x.shape != (count, width):
             must = f"have as many columns as were measured, {width}, at each of {count} times"
-            raise invalid(f"channels[{name!r}]", must, f"the motion shows {x.shape}")
+            raise invalid(f"channels[{name!r}]", must, f"its shape was {x.shape}")
         shown.append(x)
     return jnp.concatenate(shown, axis=1)
 

@@ -67,7 +67,7 @@ def layout(experiments: Sequence[Experiment], segments: int) -> SegmentLayout:
         samples = len(experiment.ts)
         if segments > samples // 2:
             was = f"it was {segments}, and {experiment.name} has {samples} samples"
-            raise invalid("segments", "leave two samples or more to each", was)
+            raise invalid("segments", "leave two samples or more in each segment", was)
         edges = np.round(np.linspace(0, samples, segments + 1)).astype(int)
         owner += [i] * segments
         first += edges[:-1].tolist()

@@ -202,8 +202,8 @@ def select_model(
             models.append(Ranked(" + ".join(names) or "none", error, found, predicted))
     ranked = tuple(sorted(models, key=lambda model: model.error))
     if np.isinf(ranked[0].error):
-        text = "No model predicts all that was held out: motions or searches for starts failed."
-        warnings.warn(f"{text} See `prediction.failed` of each.", stacklevel=2)
+        text = "No model predicts all of held_out: motions or searches for initial states failed."
+        warnings.warn(f"{text} See `prediction.failed` of each model.", stacklevel=2)
     return ModelSelection(ranked)
 
 
@@ -278,8 +278,8 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> 
             raise invalid(f"candidates[{name!r}]", "be a jl.Candidate", f"it was {candidate!r}")
         for key in candidate.params0:
             if key in taken:
-                must = "bring params under names of its own"
-                raise invalid(f"candidates[{name!r}]", must, f"{taken[key]} has {key!r}, too")
+                must = "have params with other names"
+                raise invalid(f"candidates[{name!r}]", must, f"{taken[key]} also has {key!r}")
             if most != 1:  # else candidates never meet
                 taken[key] = f"candidate {name!r}"
     if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= len(candidates):

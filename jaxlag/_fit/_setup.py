@@ -89,7 +89,7 @@ def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:
             names = [key for key in known if key not in (*OURS, "system")]
             raise invalid("simulate_options", f"be among {names}", f"one was {name!r}")
         if name in OURS:
-            raise invalid(name, f"be left to {by}", "it was given")
+            raise invalid(name, f"be left out, since {by} sets it", "it was given")
         if eqx.is_array(value) or isinstance(value, np.ndarray | np.generic):
             if np.ndim(value):
                 must, was = "be one number, a name or an object without arrays", f"it was {value!r}"

@@ -138,10 +138,10 @@ def _check_closures(inputs: dict[str, Any]) -> None:
         for function in functions_of(signal):
             cells = getattr(function.function, "__closure__", None) or ()
             if not concrete([cell.cell_contents for cell in cells]):
-                must = "take params where experiments have functions of their own"
+                must = "take params as an argument if experiments have different functions"
                 fix = "Write jl.TimeFunction(f(t, params)) or jl.Feedback(f(t, q, v, params))."
                 raise invalid(
-                    f"inputs[{name!r}]", must, "it closes over those of inputs(params)", fix
+                    f"inputs[{name!r}]", must, "it closes over the params of inputs(params)", fix
                 )
 
 
@@ -206,8 +206,8 @@ def _alike(name: str, signals: list[Any], ends: Sequence[float]) -> list[Any]:
     knots = [signal.knots() if isinstance(signal, TimeFunction) else None for signal in signals]
     most = max(0 if times is None else len(times) for times in knots)
     if of_state and most:
-        must = "be without knots where another experiment has a Feedback in its place"
-        raise invalid(f"inputs[{name!r}]", must, f"one had {most}")
+        must = "have no knots if another experiment has a Feedback of this name"
+        raise invalid(f"inputs[{name!r}]", must, f"one had {most} knots")
     plain = [TimeFunction(x.f) if isinstance(x, TimeFunction) else x for x in signals]
     if not _equal(plain):
         among = _different(plain)

@@ -115,7 +115,9 @@ class Bounded(AbstractTransform):
             was = f"they were {lower} and {upper}"
             raise invalid("Bounded: lower and upper", "be in increasing order", was)
         if math.isinf(self.lower) and math.isinf(self.upper):
-            raise invalid("Bounded: lower and upper", "be finite, one at least", "neither was")
+            raise invalid(
+                "Bounded: lower and upper", "include a finite bound", "both were infinite"
+            )
 
     def value(self, u: Float[Array, " k"], shape: tuple[int, ...]) -> Array:
         """U clipped to the bounds, with the derivative of u: a search can return from there."""

@@ -50,7 +50,7 @@ def capacity_for(
         return min(ROOM, rooms["recorded"]) if mode == "auto" else rooms[mode]
     if not isinstance(saves, int):
         was = f"it was {memory} for {saves} times"
-        raise invalid("gradient_memory", "be left out where the number of times is a symbol", was)
+        raise invalid("gradient_memory", "be left out if the number of times is symbolic", was)
     turns = max_steps + saves - 2  # upper bound, for all lanes
     needs = {
         name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)

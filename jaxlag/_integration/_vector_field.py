@@ -192,8 +192,8 @@ class VectorField(eqx.Module):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise invalid(
                 "stabilization",
-                "be 'projection' where forces read multipliers of Pfaffian rows beside holonomic "
-                "ones, whose phi would not be damped if they follow from these",
+                "be 'projection' if forces read multipliers of Pfaffian rows and there are also "
+                "holonomic rows (phi of a dependent holonomic row would not be damped)",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
         reacting = independent_rows(M, A, unread, there=there, mobile_first=True)

@@ -127,7 +127,7 @@ def _examine(
         raise invalid(
             f"constraint {_listed(bent)}: residual",
             "be affine in v",
-            "its slope depends on v, as far as its program tells",
+            "its derivative with respect to v contains v in the traced program",
             f"Write A(t, q) v + b(t, q): {_AFFINE.format('v')}",
         )
     empty = [label for label, row in zip(labels, rows, strict=True) if row.empty and not row.zero]
@@ -135,14 +135,14 @@ def _examine(
         raise invalid(
             f"constraint {_listed(empty)}",
             "contain a coordinate",
-            "none enters it: its row of A is zero",
+            "it contains none: its row of A is zero",
             "Drop the row, or check which entry of q it reads.",
         )
     return rows
 
 
 _AFFINE = (
-    "drop powers and products of speeds, and choices and loops that read {}, even where they "
+    "drop powers and products of velocities, and branches and loops that read {}, even if they "
     "cancel."
 )
 
@@ -174,7 +174,8 @@ def _checked(
             raise invalid(
                 "QuasiVelocities: kinematics",
                 "be affine in u",
-                f"the slope of v[{bent[0]}] depends on u, as far as its program tells",
+                f"the derivative of v[{bent[0]}] with respect to u contains u in the traced "
+                "program",
                 f"Write B(t, q) u + c(t, q): {_AFFINE.format('u')}",
             )
         return
@@ -184,12 +185,12 @@ def _checked(
         raise invalid(
             f"quasi-velocity {_listed(bent)}: U",
             "be affine in v",
-            "its slope depends on v, as far as its program tells",
+            "its derivative with respect to v contains v in the traced program",
             f"Write Theta^T v + theta_0: {_AFFINE.format('v')}",
         )
     empty = [name for name, row in zip(quasi.names, rows, strict=True) if row.empty]
     if empty:
-        raise invalid(f"quasi-velocity {_listed(empty)}: U", "contain a velocity", "none enters it")
+        raise invalid(f"quasi-velocity {_listed(empty)}: U", "contain a velocity", "it has none")
 
 
 def _listed(labels: list[str]) -> str:
@@ -274,7 +275,7 @@ def _scalars(closed: ClosedJaxpr) -> tuple[Graph, list[Node], list[np.ndarray]]:
         Unsupported: it has no scalar form, or a long one.
     """
     if any(jnp.issubdtype(aval.dtype, jnp.integer) for aval in closed.in_avals):
-        raise Unsupported("integers among the params, which divide in a way of their own")
+        raise Unsupported("integers among the params, whose division differs from that of floats")
     if sum(map(_effort, closed.jaxpr.eqns)) > LIMIT:
         raise Unsupported(f"more than {LIMIT} scalar operations")
     graph = Graph()

@@ -162,7 +162,7 @@ def _names(kind: str, names: Any) -> str | tuple[str, ...]:
         if not isinstance(name, str) or not name:
             raise invalid(f"{kind}: names", "be non-empty strings", f"one was {name!r}", fix)
         if name == EXPLICIT_TIME:
-            must = "not contain that of the power of explicit time"
+            must = "not contain the name of the power of explicit time"
             raise invalid(f"{kind}: names", must, f"one was {name!r}", "Choose another name.")
     return names if isinstance(names, str) else tuple(given)
 
@@ -222,12 +222,16 @@ def check_reactions(
     taken = {force.name for force in forces}
     for name in names:
         if name in taken:
-            was = f"{name!r} is the name of a force, too"
-            raise invalid("constraints", "have names that no force bears", was)
+            was = f"{name!r} is also the name of a force"
+            raise invalid("constraints", "have names that no force has", was)
     for force in filter(reads_lam, forces):
         if not constraints:
             was = "the system has none"
-            raise invalid(f"force {force.name!r}", "have constraints whose lam it reads", was)
+            raise invalid(
+                f"force {force.name!r}",
+                "belong to a system with constraints if it reads lam",
+                was,
+            )
         if force.contact is not None and force.contact not in names:
             was = f"it was {force.contact!r}"
             raise invalid(f"force {force.name!r}: contact", f"be among {names}", was)

@@ -25,7 +25,7 @@ def _require_name(kind: str, name: object) -> None:
         raise invalid(f"{kind}: name", "be a non-empty string", f"it was {name!r}")
     if name == EXPLICIT_TIME:
         raise invalid(
-            f"{kind}: name", "not be that of the power of explicit time", f"it was {name!r}"
+            f"{kind}: name", "not be the name of the power of explicit time", f"it was {name!r}"
         )
 
 
@@ -119,7 +119,12 @@ class GeneralizedForce(AbstractForce):
             for other, value in (("contact", contact), ("sliding", sliding)):
                 if value is not None:
                     fix = "Write reaction=True and let Q take lam as its last argument."
-                    raise invalid(f"{argument}: {other}", "be left out", "reaction was False", fix)
+                    raise invalid(
+                        f"{argument}: {other}",
+                        "be given with reaction=True only",
+                        "reaction was False",
+                        fix,
+                    )
         if contact is not None and (not isinstance(contact, str) or not contact):
             raise invalid(
                 f"{argument}: contact", "be the name of a constraint", f"it was {contact!r}"
@@ -265,9 +270,9 @@ class Torque(AbstractForce):
             raise invalid(
                 argument,
                 "be affine in v",
-                "its derivative dw/dv depends on v, as far as its program tells",
-                "An angular velocity is W(t, q) v + w0(t, q): drop powers and products of speeds, "
-                "and choices and loops that read v, even where they cancel.",
+                "its derivative dw/dv contains v in the traced program",
+                "An angular velocity is W(t, q) v + w0(t, q): drop powers and products of "
+                "velocities, and branches and loops that read v, even if they cancel.",
             )
         state = (t, q, v, params, inputs) if self.takes_inputs else (t, q, v, params)
         torque = _like(f"torque {self.name!r}: torque", self.torque(*state), w)

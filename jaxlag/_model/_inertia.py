@@ -128,10 +128,10 @@ def check_about_origin(argument: str, inertia: Array, mass: Array, center: Array
     axis[turning] = axes[:, 0]
     raise invalid(
         argument,
-        "be at least that of the mass at its center, m (|c|^2 E - c c^T)",
-        f"what is left, the inertia about the mass center, has the eigenvalue {moments[0]:.6g} "
+        "be at least that of a point mass at the center, m (|c|^2 E - c c^T)",
+        f"the difference, the inertia about the mass center, has the eigenvalue {moments[0]:.6g} "
         f"kg m^2 about the axis {_axis(axis)}",
-        "The inertia is about the body's origin: use energy.parallel_axis.",
+        "Give the inertia about the body's origin: use energy.parallel_axis.",
     )
 
 

@@ -67,4 +67,4 @@ class _Named:
         zeros = parts(jnp.zeros_like(q))
         whole = {name: value.get(name, zero) for name, zero in zeros.items()}
         unknown = {name: x for name, x in value.items() if name not in zeros}
-        return self.coordinates.flatten(whole | unknown, "what a function returns")
+        return self.coordinates.flatten(whole | unknown, "the returned dict")

@@ -95,7 +95,9 @@ class QuasiVelocities(eqx.Module):
                 must, was = f"be among the names {list(self.names)}", f"one was {name!r}"
                 raise invalid("QuasiVelocities: constrained", must, was)
         if len(self.constrained) == len(self.names):
-            raise invalid("QuasiVelocities: constrained", "leave something that moves", "all were")
+            raise invalid(
+                "QuasiVelocities: constrained", "leave out at least one name", "it had all"
+            )
 
     @property
     def size(self) -> int:
@@ -350,7 +352,7 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
     for name in quasi.names:
         if name in taken:
             raise invalid(
-                "quasi: names", "be names of their own", f"{name!r} is {taken[name]}, too"
+                "quasi: names", "differ from other names", f"{name!r} is also {taken[name]}"
             )
     k = quasi.size
     if quasi.kinematics is None and k != n:
@@ -358,8 +360,8 @@ def check_quasi(quasi: Any, n: int, taken: dict[str, str]) -> None:
             "quasi: names",
             f"be as many as there are coordinates, {n}, so that v follows from u",
             f"there were {k}",
-            "Name the combinations that constraints set to zero, too, in constrained=; or say how "
-            "v follows from u by kinematics=.",
+            "Also name the combinations that constraints set to zero, in constrained=; or give v "
+            "as a function of u by kinematics=.",
         )
     if k > n:
         raise invalid("quasi: names", f"be no more than the {n} coordinates", f"there were {k}")

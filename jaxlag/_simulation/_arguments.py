@@ -60,7 +60,7 @@ def check_options(
             fix = "Write 'multipliers'." if name == "lam" else ""
             raise invalid("save", f"name quantities among {known}", f"one was {name!r}", fix)
         if name == "u" and system.quasi is None:
-            must, was = "name what the system has", "one was 'u' without quasi-velocities"
+            must, was = "name quantities of the system", "one was 'u' without quasi-velocities"
             raise invalid("save", must, was, "Declare the system with quasi=.")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise invalid(
@@ -95,11 +95,11 @@ def check_formulation(
             why = "Forces that depend on multipliers need formulation='multipliers'."
         elif left:
             why = (
-                f"Quasi-velocities do not take care of the rows {left}: name the quasi-velocities "
-                "that vanish in constrained=, or use formulation='multipliers'."
+                f"Quasi-velocities do not satisfy the rows {left}: pass the names of those that "
+                "are zero as constrained=, or use formulation='multipliers'."
             )
         elif isinstance(stabilization, Baumgarte):
-            why = "Baumgarte's terms belong to formulation='multipliers'."
+            why = "Baumgarte's terms need formulation='multipliers'."
         else:
             known.append("quasi")
     if formulation not in known:
@@ -121,7 +121,7 @@ def check_start(
     if (v0 is None) == (u0 is None):
         was = "neither was given" if v0 is None else "both were given"
         raise invalid(
-            "v0 and u0", "be given one at a time", was, "Pass v0=, the velocities at ts[0]."
+            "exactly one of `v0` and `u0`", "be given", was, "Pass v0=, the velocities at ts[0]."
         )
     quasi = system.quasi
     if u0 is not None and quasi is None:
@@ -153,7 +153,7 @@ def _number(argument: str, must: str, x: Any, dtype: Any) -> Any:
             return given.astype(dtype)
     except (TypeError, ValueError) as error:
         raise invalid(argument, must, f"it was {x!r}") from error
-    raise invalid(argument, must, f"it was {x!r}", "Only real numbers will do.")
+    raise invalid(argument, must, f"it was {x!r}", "Give real numbers.")
 
 
 def check_times(ts: Any) -> tuple[Any, int | None]:
@@ -191,15 +191,15 @@ def check_method(method: Any, rtol: Any, atol: Any, dt: Any) -> None:
         return
     if tolerances:
         raise invalid(
-            "rtol and atol", "be left out when method brings a controller", "both were given"
+            "rtol and atol", "be left out when method has a controller", "both were given"
         )
     for name in ("step_ts", "jump_ts"):
         if getattr(method[-1], name, None) is not None:
             raise invalid(
                 "method[1]",
-                "leave times to the inputs",
+                "have no times",
                 f"it had {name}",
-                "Steps end on the knots of ZeroOrderHold and LinearInterpolation inputs.",
+                "Make them knots of ZeroOrderHold or LinearInterpolation inputs: steps end there.",
             )
 
 
@@ -253,7 +253,7 @@ def check_longest(dt: Any, dt_max: Any) -> Any:
 def check_step(dt: Any, dt0: Any) -> Any:
     """The fixed step, or the first one; None if neither is given."""
     if dt is not None and dt0 is not None:
-        raise invalid("dt and dt0", "be given one at a time", "both were given")
+        raise invalid("dt and dt0", "not both be given", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
     return None if step is None else _positive(name, step)
 
@@ -263,5 +263,5 @@ def _positive(name: str, step: Any) -> Any:
     if step.ndim != 0:
         raise invalid(name, "be a number", f"its shape was {step.shape}")
     if concrete(step) and not (np.isfinite(step) and step > 0):
-        raise invalid(name, "be positive, whichever way time runs", f"it was {step}")
+        raise invalid(name, "be positive, even if ts decreases", f"it was {step}")
     return step

@@ -45,10 +45,10 @@ def timed(
 def _words(system: System, seconds: float) -> str:
     names = system.coordinates.labels
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    advice = "JAX_COMPILATION_CACHE_DIR keeps what is compiled for the next process"
+    advice = "Set JAX_COMPILATION_CACHE_DIR to keep compiled programs for the next process"
     if system.lowering != "array":
-        advice += "; lowering='array' compiles long equations in less time, and runs slower"
+        advice += "; lowering='array' compiles long equations in less time, but runs slower"
     return (
         f"Compiling the motion of {len(names)} coordinates ({shown}) took {seconds:.0f} s, once "
-        f"for this program. {advice}. System.explain says what was found in the equations."
+        f"for this program. {advice}. System.explain(params) shows the structure of the equations."
     )

@@ -90,7 +90,7 @@ class Jumps:
         moving = [_TIME, _STATE, _STATE, *[_TIME] * len(jax.tree.leaves(values))]
         names = [frozenset({name}) for name in (*moving, *names_of(*self._traced))]
         self._found: list[_Found] = []
-        self._line = "a place that is not known"
+        self._line = "an unknown line"
         self._program = jax.make_jaxpr(self._declared)(*self._moving, self._traced)
         outputs_depend_on(self._program.jaxpr, names, self._look, continuous=True)
 
@@ -226,10 +226,11 @@ def warn(jumps: Iterable[Jump]) -> None:
     """Warn of numbers whose derivatives are wrong, with the remedy."""
     for leaf, line in jumps:
         warnings.warn(
-            f"Derivatives by {leaf} leave out how the time moves at which the equations jump, as "
-            f"it is compared with t at {line}. Make that time a knot: pass inputs={{name: "
-            "jl.ZeroOrderHold(times, values)}, where the times depend on the params, or "
-            "jl.TimeFunction(f, knots=times), and read it in the force.",
+            f"Derivatives with respect to {leaf} are incomplete. It is compared with t at {line}, "
+            "so it sets a time at which the equations jump, and the derivative of this time is "
+            "missing. Make that time a knot: pass inputs={name: jl.ZeroOrderHold(times, values)}, "
+            "where the times depend on the params, or jl.TimeFunction(f, knots=times), and read "
+            "this input in the force.",
             UserWarning,
             stacklevel=1,
         )

@@ -165,7 +165,7 @@ def _not_differentiated(x: Any) -> Any:
 def _refused(primals: tuple, tangents: tuple) -> Any:
     if jax.tree.leaves(tangents):
         fix = "Pass jax.lax.stop_gradient of the motion's start and params."
-        raise unsupported("A derivative of `lyapunov`", "its results have none", fix)
+        raise unsupported("A derivative of `lyapunov`", "its results are not differentiable", fix)
     return primals[0], None
 
 
@@ -176,8 +176,8 @@ def _warn_beyond(growth: PerturbationGrowth) -> None:
     if beyond.ndim == 0 and beyond:
         warnings.warn(growth.message(), stacklevel=3)
     elif beyond.any():
-        text = f"{np.sum(beyond)} of {beyond.size} motions go on beyond the horizon of their growth"
-        warnings.warn(f"{text}: gradients at their ends say nothing.", stacklevel=3)
+        text = f"{np.sum(beyond)} of {beyond.size} motions end beyond the horizon of their growth"
+        warnings.warn(f"{text}: gradients at their ends are meaningless.", stacklevel=3)
 
 
 def _not_negative(name: str, x: Any, default: float, dtype: Any, zero: bool = True) -> Array:

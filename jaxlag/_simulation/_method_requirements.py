@@ -75,7 +75,7 @@ def _separable(
     fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
     if system.constraints:
         was = f"it has constraints ({', '.join(map(repr, system._rows(params, dtype).labels))})"
-        fix = "Choose 'variational2' or 'variational4', which hold holonomic constraints."
+        fix = "Choose 'variational2' or 'variational4', which satisfy holonomic constraints."
         raise invalid(name, "split a system without constraints", was, fix)
     traced, static = _params.split(params)
     structure = system._structure(params, dtype)

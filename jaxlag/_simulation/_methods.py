@@ -101,9 +101,7 @@ def choose(
                 "method[1]", "be a diffrax step-size controller", f"it was {controller!r}"
             )
         if not adaptive:
-            raise invalid(
-                "dt", "be left out when method brings its own controller", "both were given"
-            )
+            raise invalid("dt", "be left out when method has a controller", "both were given")
         if isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
             raise invalid(
                 "method[1]",
@@ -204,7 +202,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
         raise invalid(
             "method",
             "integrate an ordinary differential equation y' = f(t, y)",
-            f"{type(method).__name__} wants terms {method.term_structure}",
+            f"{type(method).__name__} requires terms {method.term_structure}",
         )
     return with_stages(method, "lax")
 

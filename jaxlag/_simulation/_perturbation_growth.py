@@ -66,32 +66,34 @@ class PerturbationGrowth(eqx.Module):
             )
         status = Status(int(self.status))
         if status is not Status.ok:
-            return f"{status.name}: the motion, or a segment of it, could not be followed."
+            return f"{status.name}: the motion, or a segment of it, could not be computed."
         rate, error = float(self.exponent), float(self.exponent_error)
         exponent = f"largest Lyapunov exponent {rate:.4g} +- {error:.2g} 1/s"
         if self.exponential:
-            kind = f"exponential: {exponent}"
+            kind = f"The growth is exponential: {exponent}"
         elif rate < -SURE * error:
-            kind = f"that of an error that dies out: {exponent}"
+            kind = f"The error decays: {exponent}"
         elif abs(rate) <= error:
-            kind = f"like a power of time at most: {exponent}, not significantly other than 0"
+            kind = (
+                f"The error grows at most like a power of time: {exponent}, not significantly "
+                "different from 0"
+            )
         else:
-            kind = f"not decided by a motion as short as this: {exponent}"
+            kind = f"The motion is too short to determine the growth: {exponent}"
         span, decades = abs(float(self.ts[-1] - self.ts[0])), float(self.log_kappa[-1]) / np.log(10)
         grown = f"{10**decades:.3g}" if decades < 300 else f"10^{decades:.0f}"
         text = (
             f"In {span:.6g} s an error of the state becomes at most {grown} times as large, "
-            f"measured by atol + rtol |y|. The growth is {kind}."
+            f"measured by atol + rtol |y|. {kind}."
         )
         horizon, tolerance = float(self.horizon), float(effective_rtol(self.rtol))
         if horizon == np.inf:
-            return f"{text} Up to its end one gradient along the motion means what it says."
+            return f"{text} A gradient along the whole motion is meaningful."
         beyond = ", beyond its end (extrapolated)," if horizon > span else ""
         return (
             f"{text} From {horizon:.4g} s after its start{beyond} an error of {tolerance:.1g} is "
-            "as large as the state: neither the motion nor a gradient along it means anything "
-            "there. Use segments well shorter than that (multiple shooting), or a loss that ends "
-            "earlier."
+            "as large as the state: there the motion and gradients along it are meaningless. Use "
+            "segments well shorter than that (multiple shooting), or a loss that ends earlier."
         )
 
     def __str__(self) -> str:

@@ -12,7 +12,7 @@ from jaxlag._core._arrays import concrete, real
 from jaxlag._core._errors import invalid, unsupported
 from jaxlag._simulation._abstract_solution import AbstractSolution
 
-_ASK = "Ask for it as a save time: ts=jnp.linspace(0, 10, 501)."
+_ASK = "Make it a save time: ts=jnp.linspace(0, 10, 501)."
 
 
 def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
@@ -30,11 +30,13 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
             "Take one of them, as batch[3].",
         )
     if not concrete(motion.ts, motion.q, t):
-        raise unsupported("`at` inside jit, vmap or a derivative", "it looks at numbers", _ASK)
+        raise unsupported("`at` inside jit, vmap or a derivative", "it needs concrete values", _ASK)
     if motion.tolerances is None:
-        raise unsupported("`at` of a motion with fixed steps", "they end elsewhere", _ASK)
+        raise unsupported("`at` of a motion with fixed steps", "the steps do not end at t", _ASK)
     if motion._solver:
-        raise unsupported(f"`at` of a motion by {motion._solver}", "its method has no name", _ASK)
+        raise unsupported(
+            f"`at` of a motion by {motion._solver}", "its method was not given by name", _ASK
+        )
     asked = np.atleast_1d(np.asarray(real("at: t", t)))
     if asked.ndim != 1:
         raise invalid(

@@ -60,7 +60,7 @@ _MAY_BE_SINGULAR = (
 
 
 @renamed(project="stabilization='projection', None or a jl.Baumgarte")
-@required(v0="Pass v0=None beside u0=.", ts="Pass ts=jnp.linspace(0, 10, 501).")
+@required(v0="With u0= pass v0=None.", ts="Pass ts=jnp.linspace(0, 10, 501).")
 def simulate(
     system: System,
     q0: Any,
@@ -236,7 +236,7 @@ def simulate(
     formulation = check_formulation(system, formulation, stabilization, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":
         must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
-        raise invalid("atol", must, was, "Or pass formulation='multipliers'.")
+        raise invalid("atol", must, was, "Give one number, or pass formulation='multipliers'.")
     params = lift_closure_tracers(system, params, q0, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
@@ -245,11 +245,11 @@ def simulate(
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     stepper = choose(method, dt is None, rtol, atol)
     if isinstance(stepper[0], AbstractPartitioned) and isinstance(stabilization, Baumgarte):
-        must = f"be left out for {type(stepper[0]).__name__}, whose steps hold the constraints"
+        must = f"be left out for {type(stepper[0]).__name__}, whose steps satisfy the constraints"
         raise invalid("stabilization", must, f"it was {stabilization!r}")
     if gradient_memory is not None and remembers(stepper[0]):
         must = (
-            f"be left out for {type(stepper[0]).__name__}, which keeps every step for derivatives"
+            f"be left out for {type(stepper[0]).__name__}, which stores every step for derivatives"
         )
         raise invalid(
             "gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method."

@@ -283,7 +283,7 @@ class Solution(AbstractSolution):
             assert self.system.quasi is not None
             labels = self.system.quasi.names
             if index < 0:
-                more = " The quasi-velocities are fewer than the freedoms that constraints leave."
+                more = " There are fewer quasi-velocities than degrees of freedom."
             else:
                 more = f" {self._fallen(index)}"
         if status in CONCERNS_ROW:
@@ -321,7 +321,7 @@ class Solution(AbstractSolution):
         )
         if not (begin > 0 and end > 0) or begin == end:
             return ""
-        what = "its part that does not follow from those before it"
+        what = "its part that is independent of the quasi-velocities before it"
         return f"Since the start {what} has changed by a factor of {end / begin:.2g}."
 
     def explain(self) -> str:

@@ -93,8 +93,8 @@ def advice(motion: AbstractSolution, status: Status) -> str:
         said = f"{said} {_about_time(motion)}".strip()
     if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
         return (
-            f"The motion is stiff: something in it decays at {rates.fastest:.3g} 1/s, and explicit "
-            f"steps must be about as short as that. Take method='kvaerno5'. {said}"
+            f"The motion is stiff: a component decays at {rates.fastest:.3g} 1/s, and explicit "
+            f"steps must be about as short as its time constant. Take method='kvaerno5'. {said}"
         )
     assert motion.tolerances is not None
     if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
@@ -105,8 +105,8 @@ def advice(motion: AbstractSolution, status: Status) -> str:
         resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
         if resting:
             return (
-                f"With atol = 0 no error is small enough where a component is 0, as "
-                f"{', '.join(resting)} here: give atol > 0, or start elsewhere."
+                f"With atol = 0 no error is small enough where a component is 0, here "
+                f"{', '.join(resting)}: give atol > 0, or start elsewhere."
             )
     return said
 
@@ -125,7 +125,7 @@ def explain(motion: AbstractSolution) -> str:
         )
     if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
         raise unsupported(
-            "`explain` inside jit or vmap", "it looks at numbers, and the motion is traced"
+            "`explain` inside jit or vmap", "it needs concrete values, and the motion is traced"
         )
     accepted, rejected = _counts(motion)
     how = "fixed steps"
@@ -152,14 +152,14 @@ def explain(motion: AbstractSolution) -> str:
         elapsed = abs(float(motion.last_time - motion.ts[0]))
         span = abs(float(motion.ts[-1] - motion.ts[0]))
         advice.append(
-            f"It got through {elapsed / span:.1%} of ts: about {attempts * span / elapsed:.2g} "
-            "steps would do at this pace."
+            f"The solve reached {elapsed / span:.1%} of ts: the whole of ts takes about "
+            f"{attempts * span / elapsed:.2g} steps at this rate."
         )
     if attempts >= 20 and rejected > REJECTED * attempts:
         advice.append(
-            "Many steps were rejected: forces that jump, bend or rise within a short way make the "
-            "step shrink each time. Where that is at known times, let them read an input with "
-            "knots, where steps end. Where it depends on the position, these steps are needed."
+            "Many steps were rejected: the step shrinks at every jump, kink or steep rise of a "
+            "force. If its times are known, let the force read an input with knots at these times: "
+            "steps end there. If it depends on the position, these steps are needed."
         )
     fixed = motion.tolerances is None
     if coarse := _about_time(motion):
@@ -172,13 +172,15 @@ def explain(motion: AbstractSolution) -> str:
         lines += _about_projection(motion, looks, advice)
     if not advice and fixed:
         advice.append(
-            "dt alone sets the number of steps, and nothing stands out. Whether a longer one would "
-            "do is told by estimate_error=True."
+            "dt alone sets the number of steps, and no other cause was found. "
+            "estimate_error=True shows whether a longer dt is accurate enough."
         )
     elif not advice and rejected > UNEVEN * attempts:
-        advice.append("Accuracy sets the step, where forces change fast most of all.")
+        advice.append("Accuracy limits the step, most of all where forces change fast.")
     elif not advice:
-        advice.append("Accuracy sets the step, and nothing stands out: a looser tolerance is all.")
+        advice.append(
+            "Accuracy limits the step, and no other cause was found: loosen rtol and atol."
+        )
     heads = ["advice        ", *["              "] * (len(advice) - 1)]
     return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
 
@@ -204,8 +206,8 @@ def _about_time(motion: AbstractSolution) -> str:
     if digit <= 10 * float(np.max(np.asarray(motion.tolerances[0]))) * h:
         return ""
     return (
-        f"Times near {farthest:.3g} s are {digit:.2g} s apart: steps this short see jumps of what "
-        "depends on time. Measure time from the start, and make the start a parameter."
+        f"Times near {farthest:.3g} s are {digit:.2g} s apart: in steps this short, functions of "
+        "time change in jumps. Measure time from the start, and make the start a parameter."
     )
 
 
@@ -224,16 +226,16 @@ def _about_rates(
     if rates.kind == "decays":
         if _within(product, STIFF) and not motion.scene.implicit:
             advice.append(
-                f"It is stiff: what decays in {time:.3g} s is over, but keeps explicit steps about "
-                "as short. Steps of method='kvaerno5' need not follow."
+                f"It is stiff: a component decays in {time:.3g} s, and explicit steps must stay "
+                "about as short after its decay. Steps of method='kvaerno5' may be longer."
             )
         return [f"rates         fastest decay 1/e in {time:.3g} s, {1 / product:.2g} steps"]
     period = 2 * np.pi * time
     turns = abs(float(motion.ts[-1] - motion.ts[0])) / period
     if _within(period / h, FOLLOWED) and turns > OFTEN and not motion.scene.implicit:
         advice.append(
-            f"The steps follow an oscillation of period {period:.3g} s, {turns:.2g} of them in "
-            "ts: if it does not matter, put a constraint in the place of the stiff part."
+            f"The steps follow an oscillation of period {period:.3g} s, {turns:.2g} periods in "
+            "ts: if it does not matter, replace the stiff part with a constraint."
         )
     return [
         f"rates         fastest oscillation of period {period:.3g} s, {period / h:.3g} steps each"
@@ -252,7 +254,7 @@ def _about_errors(motion: AbstractSolution, looks: Look) -> list[str]:
         names = labels + [f"d({label})/dt" for label in labels]
     (index, often), *_ = Counter(np.argmax(error[sound], axis=1).tolist()).most_common(1)
     share = f"in {often} of {int(sound.sum())} states"
-    return [f"error         largest, beside its tolerance, in {names[index]} ({share})"]
+    return [f"error         largest, relative to its tolerance, in {names[index]} ({share})"]
 
 
 def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
@@ -275,7 +277,7 @@ def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> lis
         return [f"mass matrix   singular by itself, as along {label!r}"]
     if worst > 1 / np.sqrt(eps):
         advice.append(
-            f"M is nearly singular, as along {label!r}: accelerations keep about "
+            f"M is nearly singular, as along {label!r}: accelerations are accurate to about "
             f"{-np.log10(worst * eps):.0f} digits. Choose coordinates with inertias of their own."
         )
     return [f"mass matrix   cond(M) up to {worst:.2g} with its diagonal scaled to 1"]
@@ -287,10 +289,10 @@ def _about_projection(motion: AbstractSolution, looks: Look, advice: list[str]) 
         return []
     if most > TURNS:
         advice.append(
-            f"Each step is moved back onto the constraints in up to {most} turns: steps are long "
-            "for how much the constraints bend. A tighter tolerance may be faster."
+            f"The projection of a step onto the constraints takes up to {most} iterations: steps "
+            "are long for the curvature of the constraints. A tighter tolerance may be faster."
         )
-    return [f"projection    up to {most} turn{'s' if most > 1 else ''} per step"]
+    return [f"projection    up to {most} iteration{'s' if most > 1 else ''} per step"]
 
 
 def _rates(looks: Look) -> Rates | None:

@@ -361,7 +361,7 @@ def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]
         plain = name[:-1] if rate else name
         if plain not in index:
             known = list(coordinates.names)
-            must = f"name coordinates among {known}, or with a prime their velocities"
+            must = f'name coordinates among {known}, or their velocities with a prime ("x\'")'
             raise invalid("assemble: hold", must, f"one was {name!r}")
         held[int(rate), index[plain]] = True
     return tuple(held[0].tolist()), tuple(held[1].tolist())
@@ -374,7 +374,7 @@ def _what_to_release(
     labels = system.coordinates.labels
     free = (False,) * system.size
     if int(_run((system, free, free), params, None, *state).status) != int(Status.ok):
-        return " It cannot be satisfied with nothing held, either."
+        return " Without hold= it cannot be satisfied either."
     culprits = []
     for rate in (0, 1):
         for i in np.flatnonzero(held[rate]):

@@ -155,10 +155,11 @@ class Equilibrium(eqx.Module):
         on = " on the constraints" if self.rows.shape[-2] else ""
         return shortened(
             f"{status.name}: no equilibrium was found. After {int(self.iterations)} steps the "
-            f"nearest point was q = {self.q}; the force on {labels[worst]!r} left there is "
+            f"nearest point was q = {self.q}; the remaining force on {labels[worst]!r} is "
             f"{self.residual[worst]:.6g}, {relative[worst]:.1e} of its scale "
-            f"{self.scale[worst]:.3g}. Damped motion{on} from q0 and places around it "
-            "did not end in one either. Start nearer to it, or see whether the forces can balance."
+            f"{self.scale[worst]:.3g}. Damped motion{on} from q0 and points around it did not "
+            "reach an equilibrium either. Choose a closer q0, or check whether the forces can "
+            "balance."
         )
 
 
@@ -240,9 +241,9 @@ def equilibrium(
     if not all(c.holonomic for c in system.constraints) or any(map(reads_lam, system.forces)):
         raise invalid(
             "system",
-            "have holonomic constraints alone, and no forces that depend on multipliers",
+            "have holonomic constraints only, and no forces that depend on multipliers",
             "it has others",
-            "Under these it may be at rest in more than isolated states: declare it without them.",
+            "With these its states of rest may not be isolated: declare it without them.",
         )
     (q0,) = of_state("q0", vector(system.coordinates, "q0", q0))
     if concrete(q0) and not np.all(np.isfinite(q0)):

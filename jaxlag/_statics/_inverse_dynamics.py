@@ -77,7 +77,7 @@ def inverse_dynamics(
     if any(map(reads_lam, system.forces)):
         was = "it has some"
         must = "be a system without forces that depend on multipliers"
-        raise invalid("inverse_dynamics: system", must, was, "A motion does not say what lam is.")
+        raise invalid("inverse_dynamics: system", must, was, "A motion does not determine lam.")
     q, v, a, t = _motion(system, q, v, a, t)
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
@@ -117,7 +117,7 @@ def prescribed_motion(
                 f"it returned {was}",
                 "Use jnp.stack([q1, q2]).",
             )
-        return real("prescribed_motion: what motion returns", q)
+        return real("prescribed_motion: `motion(t)`", q)
 
     def rate(f: Callable, t: Array) -> Array:
         return jax.jvp(f, (t,), (jnp.ones_like(t),))[1]

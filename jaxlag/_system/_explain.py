@@ -55,7 +55,7 @@ def _quasi(system: AbstractQuantities) -> list[str]:
         return []
     free = [name for name in quasi.names if name not in quasi.constrained]
     zero = f", {', '.join(quasi.constrained)} being 0" if quasi.constrained else ""
-    return [f"quasi         {', '.join(free)} make the state with q{zero}"]
+    return [f"quasi         {', '.join(free)} and q form the state{zero}"]
 
 
 def _constraints(rows: ConstraintRows, quasi: bool) -> list[str]:
@@ -168,7 +168,7 @@ def _factorization(n: int) -> str:
     if n <= UNROLL_UP_TO:
         return "unrolled"
     if n <= LOOP_UP_TO:
-        return f"in a loop over rows (n > {UNROLL_UP_TO})"
+        return f"in a loop over pivots (n > {UNROLL_UP_TO})"
     return f"by library Cholesky (n > {LOOP_UP_TO})"
 
 

@@ -31,14 +31,14 @@ def advice_on_rows(system: Any, params: Any, t: Any, q: Any, dependent: bool = T
     if vanishing:
         return (
             f"The gradient of {', '.join(map(repr, vanishing))} vanishes wherever the row holds, "
-            "as of y**2, of a length, or of 1 - cos(y): such a row allows no velocity and has no "
-            "reaction that were defined. Write the quantity itself, y; of a length, each component."
+            "as for y**2, a length, or 1 - cos(y): such a row defines neither velocities nor a "
+            "reaction. Write the quantity itself, y; for a length, each component."
         )
     if dependent and is_singular(system, params, t, q):
         return (
-            "Rows are all but dependent there: a dead point or a change point, where no tolerance "
-            "helps and the motion may go on in more than one way. Start beyond it, or add the row "
-            "that decides."
+            "Rows are nearly dependent there: a dead point or a change point, where no tolerance "
+            "helps and the motion may have more than one continuation. Start beyond it, or add a "
+            "row that selects one branch."
         )
     return ""
 

@@ -264,7 +264,7 @@ class AbstractQuantities(eqx.Module):
         if function is None:
             raise unsupported(
                 f"`System.{name}` of a Lagrangian alone",
-                "only a system declared by kinetic= and potential= knows them apart",
+                "it is known only if the system is declared by kinetic= and potential=",
             )
         return function
 

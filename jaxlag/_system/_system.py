@@ -138,18 +138,18 @@ class System(AbstractReactions):
         if written_in not in ("v", "u"):
             raise invalid("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
         if written_in == "u" and quasi is None:
-            was = "this one has none"
-            raise invalid("written_in='u'", "go with a system that has quasi-velocities", was)
+            was = "the system has none"
+            raise invalid("written_in='u'", "be used with quasi-velocities", was)
         if written_in == "u" and quasi is not None and quasi.size < self.coordinates.size:
             speeds = [c.all_names[0] for c in self.constraints if not c.holonomic]
             if speeds:
                 raise invalid(
                     "written_in",
-                    "be 'v' where kinematics= leave out velocities that Pfaffian rows forbid, "
+                    "be 'v' if kinematics= leaves out velocities that Pfaffian rows set to zero, "
                     "since their momenta enter the equations",
-                    f"it was 'u' beside the row {speeds[0]!r}",
+                    f"it was 'u', and there is the Pfaffian row {speeds[0]!r}",
                     "Give L as a function of v; or name as many quasi-velocities as coordinates, "
-                    "those that vanish in constrained=.",
+                    "and those that are zero also in constrained=.",
                 )
         self.written_in = written_in
         form = ("t", "q", written_in, "params")
@@ -184,7 +184,7 @@ class System(AbstractReactions):
         """Names that quasi-velocities must not have -> their owners."""
         taken = dict.fromkeys(self.coordinates.names, "a coordinate")
         taken |= {force.name: "a force" for force in self.forces}
-        fix = "a constraint (the row of a constrained name is declared by that name alone)"
+        fix = "a constraint (a name in constrained= already declares its row)"
         return taken | {name: fix for row in rows for name in row.all_names}
 
     def __hash__(self) -> int:
@@ -238,10 +238,11 @@ class System(AbstractReactions):
         if self.quasi is not None and len(self.quasi.free) + rows.size < self.size:
             raise invalid(
                 "quasi: names",
-                f"leave at least {self.size - rows.size} that are not constrained, as many as "
-                f"{self.size} coordinates have freedoms under {rows.size} rows",
+                f"leave at least {self.size - rows.size} that are not constrained, the degrees of "
+                f"freedom of {self.size} coordinates with {rows.size} rows",
                 f"there were {len(self.quasi.free)}",
-                "Add quasi-velocities for the freedoms that are missing, or the constraints.",
+                "Add quasi-velocities for the missing degrees of freedom, or add the missing "
+                "constraints.",
             )
         return rows
 
@@ -279,9 +280,9 @@ class System(AbstractReactions):
             M, _ = augmented(M, self._terms.rows(t, q, v, params)[0])
         vanishing = vanishing_rows(self, params, t, q)
         if vanishing:
-            must = "have a gradient where it holds"
-            was = "it was 0 there and the same on both sides, as y**2 or a length is"
-            fix = "Write the quantity itself, y; of a length, each component."
+            must = "have a nonzero gradient where it holds"
+            was = "it was 0 there, with an extremum of the residual, as for y**2 or a length"
+            fix = "Write the quantity itself, y; for a length, each component."
             raise invalid(f"constraint {vanishing[0]!r}", must, was, fix)
         index = int(first_unhealthy(M))
         if index >= 0:

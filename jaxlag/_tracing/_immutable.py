@@ -39,8 +39,8 @@ _UNCHANGED = {
 }
 _CHANGING = (list, dict, set, bytearray, ModuleType, Context, np.void)
 _FUNCTIONS = (FunctionType, BuiltinFunctionType, MethodType, partial)
-_MUST = "be a number, an array, or an object that cannot change and that hashes"
-_LIVE = "its numbers are read at every call then."
+_MUST = "be a number, an array, or an immutable and hashable object"
+_LIVE = "then its numbers are read at every call."
 _CHANGES = "can change in place"
 _shown = Repr()
 _shown.maxother = _shown.maxstring = 60
@@ -119,7 +119,7 @@ def _found(search: "_Search", place: _Place | None, x: Any, hashed: bool) -> _Fa
         thing = f"{where}, {what}," if where else what
         return _Fault(f"{thing} {place.why}", _fix(x, place))
     if hashed and not _hashes(x):
-        return _Fault("it does not hash", _fix(x, None))
+        return _Fault("it is not hashable", _fix(x, None))
     search.keep()
     change = _changed(search.readers)
     if change is None:
@@ -226,7 +226,7 @@ class _Search:
     def _record(self, x: Any, path: tuple[str, ...]) -> _Place | None:
         names, uncompared, _ = _form(type(x))
         if uncompared is not None:
-            why = "does not count where objects are compared"
+            why = "is excluded from comparisons"
             return _Place((*path, f"its field {uncompared!r}"), getattr(x, uncompared), why)
         parts = [(f"its field {name!r}", getattr(x, name, None)) for name in names]
         if not getattr(x, "__dict__", {}).keys() <= names.keys():
@@ -239,7 +239,7 @@ class _Search:
     ) -> _Place | None:
         """The same for an object with methods."""
         if _form(type(x)).compares:
-            return _Place(path, x, "is compared by a method of its own, __eq__")
+            return _Place(path, x, "has an __eq__ method of its own")
         return self._parts(parts, path) or self.kind(type(x), path)
 
     def _other(self, x: Any, path: tuple[str, ...]) -> _Place | None:
@@ -250,7 +250,7 @@ class _Search:
         if package in _UNCHANGED or isinstance(x, np.ufunc | np.generic) or kind is object:
             return None
         builtin = package == "builtins"
-        return _Place(path, x, "is no value that hashes" if builtin else _CHANGES)
+        return _Place(path, x, "is not hashable" if builtin else _CHANGES)
 
     def _parts(self, parts: Iterable[tuple[str, Any]], path: tuple[str, ...]) -> _Place | None:
         return _first(self.place(y, (*path, name)) for name, y in parts)
@@ -362,8 +362,13 @@ def _words(x: Any) -> str:
     return f"a {type(x).__name__}" if "Traced" in text or "Tracer" in text else text
 
 
-_OF_FUNCTION = "Hand over in params what it reads; numbers and arrays of jax.numpy may stay."
-_OF_CLASS = "Make it a field, or hand it over in params; numbers and arrays of jax.numpy may stay."
+_OF_FUNCTION = (
+    "Pass in params what it reads; numbers and arrays of jax.numpy may be read from outside."
+)
+_OF_CLASS = (
+    "Make it a field, or pass it in params; numbers and arrays of jax.numpy may be read from "
+    "outside."
+)
 
 
 def _fix(x: Any, place: _Place | None) -> str:
@@ -373,7 +378,9 @@ def _fix(x: Any, place: _Place | None) -> str:
     if _is_function(x) or (place is not None and "it reads" in " ".join(place.path)):
         return _OF_FUNCTION
     if place is not None and place.why.startswith("is no plain"):
-        return f"Write {place.why.split()[-1]}(...) of it, and what its methods read into params."
+        return (
+            f"Write {place.why.split()[-1]}(...) of it, and pass in params what its methods read."
+        )
     if place is not None and isinstance(x, tuple | frozenset | list | dict) and of_library(x):
         x = place.thing  # the keys of a dict and the like
     if isinstance(x, Enum | type | ModuleType):
@@ -383,13 +390,13 @@ def _fix(x: Any, place: _Place | None) -> str:
     if isinstance(x, slice):
         return "Write a tuple of its bounds, and the slice where it is used."
     if isinstance(x, list | dict):
-        return "Make its field no static one: what is in it is read at every call then."
+        return "Make its field not static: then its contents are read at every call."
     if isinstance(x, SimpleNamespace):
-        return f"Write a dict, as by vars: {_LIVE}"
+        return f"Write a dict, for example by vars(): {_LIVE}"
     if isinstance(x, Mapping):
         return f"Write a dict: {_LIVE}"
     if isinstance(x, np.ndarray):
-        return "Make its field no static one: arrays are read at every call then."
+        return "Make its field not static: then arrays are read at every call."
     if is_dataclass(x):
         kind = type(x).__name__
         return (
@@ -397,7 +404,7 @@ def _fix(x: Any, place: _Place | None) -> str:
             f"eqx.Module: {_LIVE}"
         )
     if hasattr(type(x), "__array__") or hasattr(type(x), "to_dict"):
-        return f"Write a dict, as by to_dict(), or an array, as by to_numpy(): {_LIVE}"
+        return f"Write a dict, for example by to_dict(), or an array, by to_numpy(): {_LIVE}"
     if type(x).__module__ == "builtins":
         return "Write a tuple or an array of the numbers that are read from it."
     return f"Make its class an eqx.Module or a registered dataclass, or write a dict: {_LIVE}"

@@ -99,6 +99,6 @@ def _check(eqn: Any, name: str, indices: list[Any], of: str) -> None:
                 of,
                 f"take indices from {-size} to {size - 1} of {name}, which has {size} entries",
                 f"{name}[{taken}] was taken" + (f" at {where}" if where else ""),
-                "JAX would read the nearest entry; jnp.take(..., mode='clip') asks for that.",
+                "JAX would read the nearest entry. For that, write jnp.take(..., mode='clip').",
             )
         )

@@ -20,7 +20,7 @@ def real_scalar(argument: str, function: Callable) -> Callable:
         value = function(*arguments)
         must, fix = (
             "return a real scalar",
-            "Sum with jnp.sum, of one coordinate take v[0]; use real energies.",
+            "Sum with jnp.sum; for one coordinate write v[0]; use real energies.",
         )
         if not eqx.is_array_like(value):
             raise invalid(argument, "return an array", f"it returned {value!r}", fix)
@@ -50,10 +50,10 @@ def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) 
             line = line_of(jax.make_jaxpr(lambda *state: scalar(*state, params))(*state), "while")
             raise invalid(
                 argument,
-                "have reverse derivatives, from which momenta and forces follow",
-                f"a loop in it has no fixed number of turns: {line}",
-                "Write it by jax.lax.scan, or fori_loop between numbers; or give its derivative "
-                "by jax.custom_jvp, by jax.lax.custom_root where it solves an equation.",
+                "have reverse derivatives, since these give momenta and forces",
+                f"a loop in it has no fixed number of iterations: {line}",
+                "Use jax.lax.scan, or fori_loop between constant bounds; or define the derivative "
+                "by jax.custom_jvp, or by jax.lax.custom_root if the loop solves an equation.",
             ) from error
 
     return of
@@ -109,7 +109,7 @@ def require_arity(argument: str, function: Callable, names: tuple[str, ...]) -> 
                 argument,
                 f"take {form} in this order",
                 f"its signature was {signature(function)}",
-                f"{other!r} stands where {name!r} is handed over.",
+                f"{other!r} is in the place of {name!r}.",
             )
 
 

@@ -188,9 +188,9 @@ class TracedFunction:
                 continue
             self._told.add(name)
             warnings.warn(
-                f"{name} of {_named(self.function)} is the Python int {leaf}, the "
-                f"{len(values)}th value that it has: ints count as part of the program, which "
-                f"compiles anew for each of them. Write {float(leaf)} where it is a number.",
+                f"{name} of {_named(self.function)} is the Python int {leaf}, its "
+                f"{len(values)}th value so far: an int is part of the program, which is compiled "
+                f"again for each value. Write {float(leaf)} if it is a physical parameter.",
                 UserWarning,
                 stacklevel=1,
             )
@@ -204,9 +204,9 @@ class TracedFunction:
         """Warn of outside values that have changed since the function read them."""
         for name, before, now in changes(self._outside or {}):
             message = (
-                f"{name}, which {_named(self.function)} reads from outside, was {before} when it "
-                f"was first traced, which still holds, and is {now} now. Hand it over in params, "
-                "or define the function anew."
+                f"{name}, which {_named(self.function)} reads from outside, was {before} at the "
+                f"first trace and is {now} now. The function still uses the old value. Pass it in "
+                "params, or define the function again."
             )
             warnings.warn(message, UserWarning, stacklevel=1)
 
@@ -234,8 +234,8 @@ def _count(function: Callable) -> None:
     if _MADE[code] == MANY_FUNCTIONS:
         _logger.warning(
             "%s (line %d of %s) was traced as a new function for the %dth time: systems made of "
-            "new functions compile anew. Define it once, outside of loops, and hand over what "
-            "changes in params.",
+            "new functions are compiled again. Define it once, outside of loops, and pass in "
+            "params what changes.",
             *(_named(function), code.co_firstlineno, code.co_filename, MANY_FUNCTIONS),
         )
 
@@ -265,7 +265,7 @@ def traced_function(function: Callable) -> TracedFunction:
         module = getattr(function, "__self__", function)
         raise invalid(
             f"function {_named(function)}",
-            "hash, as functions do that programs are compiled for",
+            "be hashable, since compiled programs are stored by function",
             f"the {type(module).__name__} that it belongs to holds arrays",
             "Put the module into params and call it from a function: "
             'def lagrangian(t, q, v, params): return params["model"](t, q, v).',

@@ -18,26 +18,26 @@ _CONVERTED = (
     (
         jax.errors.TracerArrayConversionError,
         "compute with jax.numpy",
-        "hands a traced array to numpy",
-        "Write jnp.cos(q[0]) where it says np.cos(q[0]).",
+        "passes a traced array to numpy",
+        "Write jnp.cos(q[0]) instead of np.cos(q[0]).",
     ),
     (
         jax.errors.TracerIntegerConversionError,
         "index with numbers that are known while it is traced",
-        "turns a traced number into an index of Python's",
+        "converts a traced number to a Python index",
         "Keep indices and counts as Python ints in params, or use jnp.take.",
     ),
     (
         jax.errors.TracerBoolConversionError,
         "choose without `if`, `and`, `or` and `while` on traced numbers",
-        "asks whether a traced number is true",
+        "converts a traced number to a Python bool",
         "Write jnp.where(condition, a, b), jnp.minimum, jnp.maximum or jax.lax.cond.",
     ),
     (
         jax.errors.ConcretizationTypeError,
         "keep traced numbers as they are",
-        "turns a traced number into one of Python's",
-        "Leave out float(), int() and .item(); what stays the same goes into params as a number.",
+        "converts a traced number to a Python number",
+        "Leave out float(), int() and .item(); pass constants as numbers in params.",
     ),
 )
 

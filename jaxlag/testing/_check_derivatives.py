@@ -29,21 +29,21 @@ _MASKED = (
     "derivative by zero. Give it an argument that is safe: where(ok, f(where(ok, x, 1.0)), ...)."
 )
 _BATCHED = (
-    "Under vmap alone, where both branches of a choice are computed, and the batching rules of "
-    "custom_vmap are used: make what is not chosen, or those rules, safe as well."
+    "Under vmap only: it computes both branches of a choice, and uses the batching rules of "
+    "custom_vmap. Make the branch that is not chosen, or those rules, finite as well."
 )
 _HINTS = {
-    "sqrt": "Use jaxlag.math.norm for a length, jaxlag.math.sqrt otherwise; or x @ x where a "
-    "square will do.",
+    "sqrt": "Use jaxlag.math.norm for a length, jaxlag.math.sqrt otherwise; or x @ x if the "
+    "square is enough.",
     "rsqrt": "Use jaxlag.math.unit for a direction, jaxlag.math.norm for a length.",
     "cbrt": "Its derivatives are infinite at 0: keep the argument away from it.",
     "atan2": "Use jaxlag.math.atan2.",
     "acos": "Use jaxlag.math.acos, or jaxlag.math.angle_between for two vectors.",
     "asin": "Use jaxlag.math.asin.",
     "div": "Use jaxlag.math.sinc or cosc for sin(x)/x and (1 - cos(x))/x^2 (sinc_sqrt or "
-    "cosc_sqrt of a square), jaxlag.math.unit for x/|x|; or keep the divisor from 0.",
-    "pow": "At x = 0 a power x**p has finite derivatives to order p alone, unless p is whole: use "
-    "jaxlag.math.norm for a length; or round it off, as in (x**2 + e**2)**(p/2).",
+    "cosc_sqrt of a square), jaxlag.math.unit for x/|x|; or keep the divisor away from 0.",
+    "pow": "At x = 0 a power x**p has finite derivatives only up to order p, unless p is an "
+    "integer: use jaxlag.math.norm for a length; or smooth it, as in (x**2 + e**2)**(p/2).",
     "log": "Its derivatives are infinite at 0: keep the argument away from it.",
     "custom_jvp_call": "Its derivative rule must be finite there, too.",
     "custom_vjp_call": "Its derivative rule must be finite there, too.",
@@ -252,7 +252,7 @@ def check_derivatives(
 
 def _require_numbers(name: str, values: Any) -> None:
     if not concrete(values):
-        must = "have values, since the check looks at numbers"
+        must = "have concrete values, which the check needs"
         fix = "Call check_derivatives outside jit, vmap and grad."
         raise invalid(f"check_derivatives: {name}", must, "it was traced", fix)
     for x in jax.tree.leaves(values):

@@ -48,7 +48,7 @@ ROLLING = jl.System(
 )
 def test_states_of_16_bits_are_refused(ask, message, dtype):
     q, v = jnp.asarray(Q0, dtype), jnp.asarray(V0, dtype)
-    fix = rf"but in {dtype.dtype.name} equations keep \d digits .* Write q0?\.astype\(float\)"
+    fix = rf"but {dtype.dtype.name} has \d digits .* Write q0?\.astype\(float\)"
     with pytest.raises(ValueError, match=f"^{message} be float32 or float64, {fix}"):
         ask(q, v)
 

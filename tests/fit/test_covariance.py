@@ -17,7 +17,9 @@ def spectrum(names, values, *known):
 def test_only_a_ratio_is_known():
     found = spectrum(("g", "l", "c"), (9.81, 0.5, 0.1), (1, -1, 0), (0, 0, 1))
     assert found.determined == ("l/g",)
-    assert found.unidentifiable == ("change together without a trace: g by +1 %, l by +1 %",)
+    assert found.unidentifiable == (
+        "change together without effect on the channels: g by +1 %, l by +1 %",
+    )
     covariance = found.covariance()
     assert np.isinf(np.diag(covariance)[:2]).all()
     np.testing.assert_allclose(covariance[2, 2], (0.1 / 1e3) ** 2)

@@ -125,7 +125,7 @@ def test_derivatives_that_are_not_finite_are_counted():
     descent = jl.Descent(optax.adam(1e-2), epochs=3)
     no_covariance = r"Derivatives at the estimates are not finite: there is no covariance"
     with (
-        pytest.warns(UserWarning, match=r"3 steps of the descent met derivatives that are not"),
+        pytest.warns(UserWarning, match=r"3 steps of the descent had derivatives that are not"),
         pytest.warns(UserWarning, match=no_covariance),
     ):
         found = jl.fit(spring, data, {"k": 0.0}, free=("k",), optimizer=descent, **OPTIONS)

@@ -27,7 +27,7 @@ def test_windows_and_parts():
         (np.nan, r"`seconds` must be a positive number, but it was nan"),
         (-1, r"`seconds` must be a positive number, but it was -1"),
         (4.0, r"at most the 3\.02 s of experiment, but it was 4"),
-        (0.03, r"`seconds` must be two samples or more, but it was 0\.03"),
+        (0.03, r"`seconds` must cover two samples or more, but it was 0\.03"),
     ],
 )
 def test_bad_windows_are_named(seconds, message):
@@ -48,16 +48,16 @@ NAN = np.full(len(TS), np.nan)
         (TS, {}, {}, r"one channel or more"),
         (TS, {"x": np.where(TS > 1, np.inf, TS)}, {}, r"finite, or NaN where nothing was measured"),
         (TS, {"x": TS}, {"sigma": {"x": 0.0}}, r"`sigma\['x'\]` must be positive"),
-        (TS, {"x": TS}, {"sigma": {"x": np.inf}}, r"positive and finite, .* Write NaN into the"),
+        (TS, {"x": TS}, {"sigma": {"x": np.inf}}, r"positive and finite, .* write NaN into the"),
         (
             TS,
             {"x": TS},
             {"sigma": {"x": np.ones(3)}},
-            r"a number, 151 of them, or of shape \(151, 1",
+            r"a number, 151 numbers, or an array of shape \(151, 1",
         ),
         (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
         (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"`q0` must be \(n,\) numbers at ts\[0\]"),
-        (TS, {"x": TS}, {"start_sigma": 0.0}, r"come with the start it is about"),
+        (TS, {"x": TS}, {"start_sigma": 0.0}, r"be given together with q0 and v0"),
     ],
 )
 def test_a_bad_experiment_is_named(ts, channels, options, message):

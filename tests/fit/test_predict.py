@@ -59,7 +59,7 @@ def test_a_fit_predicts_as_its_params_do():
 
 def test_a_search_that_did_not_converge_is_said():
     with pytest.warns(
-        UserWarning, match=r"search for starts did not converge in 1 iterations: raise"
+        UserWarning, match=r"search for initial states did not converge in 1 iterations: raise"
     ):
         found = predict(experiment(), settle=0.5, max_steps=1)
     assert not found.converged
@@ -74,7 +74,7 @@ def test_a_motion_that_fails_is_said():
 
     system = pendulum.with_forces(jl.GeneralizedForce(stop, "stop"))
     wide = jl.Experiment(TS, {"x": angles(q0=1.5)}, name="wide")
-    with pytest.warns(UserWarning, match=r"motion of wide ended with nonfinite: it does not count"):
+    with pytest.warns(UserWarning, match=r"motion of wide ended with nonfinite: it is ignored"):
         found = jl.predict(system, (experiment(), wide), TRUE, **OPTIONS)
     assert found.failed == ("the motion of wide ended with nonfinite",)
     assert 0.8 * NOISE < found.rms("x")[0] < 1.2 * NOISE
@@ -98,8 +98,14 @@ def test_figures_show_what_was_measured(tmp_path):
     [
         ({"settle": 0.0}, r"`settle` must be a positive number of seconds, or None, but it was 0"),
         ({"settle": 5.0}, r"`settle` must leave samples of experiment to be predicted.*5 s of 3 s"),
-        ({"settle": 1e-3}, r"`settle` must hold 2 numbers or more.*hold 1.*Make it longer"),
-        ({"simulate_options": {"save": ("a",)}}, r"`save` must be left to jl\.predict"),
+        (
+            {"settle": 1e-3},
+            r"`settle` must contain 2 measurements or more.*contain 1.*Raise settle",
+        ),
+        (
+            {"simulate_options": {"save": ("a",)}},
+            r"`save` must be left out, since jl\.predict sets",
+        ),
     ],
 )
 def test_bad_arguments_are_named(options, message):

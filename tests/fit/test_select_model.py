@@ -136,7 +136,7 @@ def test_forces_are_added_to_a_system():
         (
             {"a": viscous, "b": viscous},
             {"most": 2},
-            r"names of its own, but candidate 'a' has 'c', too",
+            r"other names, but candidate 'a' also has 'c'",
         ),
         ({"a": viscous}, {"free": "l"}, r"`free` must be a sequence of names.*Write free=\('l',\)"),
         ({"a": viscous}, {"most": 2}, r"`most` must be an integer from 1 to the 1 candidates"),

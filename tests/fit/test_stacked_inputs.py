@@ -94,7 +94,7 @@ def test_knots_that_an_experiment_lacks_lie_beyond_its_end():
             [{"u": TABLES[0]}, {"u": jl.ZeroOrderHold(TS, TS)}],
             r"LinearInterpolation and ZeroOrderHold",
         ),
-        ([{"u": JUMPS[0]}, {"u": jl.Feedback(held_back)}], r"\['u'\]` must be without knots"),
+        ([{"u": JUMPS[0]}, {"u": jl.Feedback(held_back)}], r"\['u'\]` must have no knots"),
         ([{"u": TABLES[0]}, {}], r"names of the inputs must be the same .* \['u'\] or \[\]"),
     ],
 )

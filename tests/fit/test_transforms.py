@@ -83,7 +83,7 @@ def test_an_invalid_start_is_named(transform, value, message):
     ("lower", "upper", "message"),
     [
         (1.0, 0.0, r"in increasing order, but they were 1\.0 and 0\.0"),
-        (-np.inf, np.inf, r"finite, one at least"),
+        (-np.inf, np.inf, r"include a finite bound"),
     ],
 )
 def test_crossed_bounds_are_named(lower, upper, message):

@@ -272,7 +272,7 @@ def test_memory_decides():
         ),
         (
             {"gradient_memory": 1e9, "method": diffrax.LeapfrogMidpoint(), "dt": 0.1},
-            "`gradient_memory` must be left out for LeapfrogMidpoint, which keeps every step",
+            "`gradient_memory` must be left out for LeapfrogMidpoint, which stores every step",
         ),
     ],
 )

@@ -363,7 +363,7 @@ def test_explain_says_what_is_not_there():
 def test_explain_says_how_the_mass_matrix_is_solved():
     for n, said in (
         (8, "unrolled"),
-        (9, "in a loop over rows (n > 8)"),
+        (9, "in a loop over pivots (n > 8)"),
         (17, "by library Cholesky (n > 16)"),
     ):
         explained = chain(n, lowering="array").explain(GENERAL["chain"].params)

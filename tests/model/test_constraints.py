@@ -134,11 +134,11 @@ def declared(*constraints, forces=()):
         (lambda: jl.Holonomic(rods, (1, 2)), "Holonomic: `names` must be non-empty strings"),
         (
             lambda: jl.Holonomic(rods, ("rod1", "explicit time")),
-            "Holonomic: `names` must not contain that of the power of explicit time, but one was",
+            "Holonomic: `names` must not contain the name of the power of explicit time, but one",
         ),
         (
             lambda: jl.Pfaffian(lambda t, q, v, params: v, "explicit time"),
-            "Pfaffian: `names` must not contain that of the power of explicit time, but one was",
+            "Pfaffian: `names` must not contain the name of the power of explicit time, but one",
         ),
         (
             lambda: jl.Baumgarte(-1.0, 1.0),
@@ -158,17 +158,17 @@ def declared(*constraints, forces=()):
                 jl.Holonomic(rods, ("a", "b")),
                 forces=(jl.GeneralizedForce(lambda t, q, v, params: q, "a"),),
             ),
-            "`constraints` must have names that no force bears, but 'a'",
+            "`constraints` must have names that no force has, but 'a'",
         ),
         (
             lambda: declared(
                 forces=(jl.GeneralizedForce(lambda t, q, v, params, lam: q, "f", reaction=True),)
             ),
-            "force 'f' must have constraints whose lam it reads",
+            "force 'f' must belong to a system with constraints if it reads lam",
         ),
         (
             lambda: jl.GeneralizedForce(lambda t, q, v, params: q, "f", contact="floor"),
-            "force 'f': `contact` must be left out, but reaction was False",
+            "force 'f': `contact` must be given with reaction=True only, but reaction was False",
         ),
         (
             lambda: declared(
@@ -251,7 +251,7 @@ def test_a_row_of_the_number_0_says_nothing():
         ),
         (
             jl.Pfaffian(lambda t, q, v, params: solved(q, v)[:2] * v[0], ("a", "b")),
-            "constraint 'a', 'b': `residual` must be affine in v, .* as far as its program tells",
+            "constraint 'a', 'b': `residual` must be affine in v, .* contains v in the traced",
         ),
         (
             jl.Holonomic(lambda t, q, params: jnp.stack([q[0], params["l1"]]), ("a", "b")),

@@ -79,17 +79,17 @@ def test_an_inertia_about_the_mass_center_is_refused(dtype):
     """I_G given for I_O: T = -0.45 J for a motion of 1 m/s and 1 rad/s, were it taken."""
     central, c = np.full(3, 0.1, dtype), np.array([1.0, 0.0, 0.0], dtype)
     message = (
-        "RigidBody: `inertia` must be at least that of the mass at its center, m (|c|^2 E - c c^T)"
-        ", but what is left, the inertia about the mass center, has the eigenvalue -0.9 kg m^2 "
-        "about the axis (0, "
+        "RigidBody: `inertia` must be at least that of a point mass at the center, m (|c|^2 E - c "
+        "c^T), but the difference, the inertia about the mass center, has the eigenvalue -0.9 kg "
+        "m^2 about the axis (0, "
     )
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         energy.RigidBody(1.0, central, c)
-    advice = "The inertia is about the body's origin: use energy.parallel_axis."
+    advice = "Give the inertia about the body's origin: use energy.parallel_axis."
     assert str(caught.value).endswith(advice)
     body = energy.RigidBody(1.0, energy.parallel_axis(central, 1.0, c), c)
     assert body.kinetic_from_rates([0, -1, 0], [0, 0, 1]) > 0
-    with pytest.raises(ValueError, match=r"about the axis \(0, 0, 1\)\. The inertia is about"):
+    with pytest.raises(ValueError, match=r"about the axis \(0, 0, 1\)\. Give the inertia about"):
         energy.RigidBody(2.0, (0.0, 0.0, 0.1), (0.3, 0.2, 0.0))
 
 

@@ -76,7 +76,7 @@ def test_it_is_one_function_however_often_it_is_named():
 def test_a_dict_of_other_names_is_refused():
     force = jl.GeneralizedForce(jl.named(NAMES)(lambda t, q, v, p: {"phi": 1.0}), "push")
     system = jl.System(lagrangian, NAMES, forces=(force,))
-    with pytest.raises(ValueError, match=r"what a function returns must name exactly .*'phi'"):
+    with pytest.raises(ValueError, match=r"the returned dict must name exactly .*'phi'"):
         system.acceleration([0.0] * 3, [0.0] * 3, PARAMS)
     with pytest.raises(ValueError, match="`coordinates` must name at least one"):
         jl.named({})

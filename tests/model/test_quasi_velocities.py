@@ -167,19 +167,19 @@ def run(quasi, **options):
         (lambda: one(names=("a", "a", "b")), "distinct, but 'a' occurs 2 times"),
         (lambda: one(names=("a", "", "b")), "non-empty strings"),
         (lambda: one(constrained=("d",)), r"among the names \['a', 'b', 'c'\], but one was 'd'"),
-        (lambda: one(constrained=NAMES), "leave something that moves"),
+        (lambda: one(constrained=NAMES), "leave out at least one name"),
         (lambda: system_of(one(("a", "b"))), "as many as there are coordinates, 3.*there were 2"),
         (lambda: system_of(one(("a", "b", "c", "d"))), "as there are coordinates, 3.*were 4"),
-        (lambda: system_of(one(("x", "b", "c"))), "'x' is a coordinate, too"),
+        (lambda: system_of(one(("x", "b", "c"))), "'x' is also a coordinate"),
         (
             lambda: system_of(one(constrained=("b",)), constraints=(jl.Pfaffian(sideways, "b"),)),
-            "'b' is a constraint",
+            "'b' is also a constraint",
         ),
         (
             lambda: system_of(one(), forces=(jl.GeneralizedForce(push, "a"),)),
-            "'a' is a force, too",
+            "'a' is also a force",
         ),
-        (lambda: jl.System(in_v, ("x", "y", "z"), written_in="u"), "has quasi-velocities"),
+        (lambda: jl.System(in_v, ("x", "y", "z"), written_in="u"), "be used with quasi-velocities"),
         (lambda: system_of(one(), written_in="w"), "`written_in` must be 'v' or 'u'"),
         (lambda: run(one(U=bent)), "'a': `U` must be affine in v"),
         (lambda: run(one(U=lambda t, q, v, p: v[:2])), r"`U` must return 3 numbers.*shape \(2,\)"),
@@ -193,7 +193,7 @@ def run(quasi, **options):
         ),
         (
             lambda: run(jl.QuasiVelocities(kinematics=bent_kinematics, names=NAMES)),
-            r"`kinematics` must be affine in u, but the slope of v\[1\]",
+            r"`kinematics` must be affine in u, but the derivative of v\[1\]",
         ),
         (
             lambda: run(one(), u0=[0.0, 1.0]),
@@ -201,16 +201,16 @@ def run(quasi, **options):
         ),
         (lambda: run(one(), u0={"a": 0.0}), r"`u0` must name \['a', 'b', 'c'\].*named \['a'\]"),
         (lambda: run(one(), u0=[0.0, np.nan, 1.0]), r"u0\[1\] \('b'\) was nan"),
-        (lambda: run(one(), v0=np.zeros(3)), "`v0` and `u0` must be given one at a time"),
+        (lambda: run(one(), v0=np.zeros(3)), "^exactly one of `v0` and `u0` must be given"),
         (
             lambda: run(one(), formulation="quasi", constraints=(BLADE,)),
-            r"`formulation` must be among .*take care of the rows \['v_n'\]",
+            r"`formulation` must be among .*do not satisfy the rows \['v_n'\]",
         ),
         (
             lambda: run(
                 one(constrained=("b",)), formulation="quasi", stabilization=jl.Baumgarte(1.0, 1.0)
             ),
-            "Baumgarte's terms belong to",
+            "Baumgarte's terms need",
         ),
         (
             lambda: jl.simulate(PLAIN, [0.0] * 3, None, u0=[0.0] * 3, ts=[0.0, 1.0], params=PARAMS),
@@ -218,7 +218,7 @@ def run(quasi, **options):
         ),
         (
             lambda: jl.simulate(PLAIN, [0.0] * 3, [0.0] * 3, [0.0, 1.0], PARAMS, save=("u",)),
-            "`save` must name what the system has, but one was 'u'",
+            "`save` must name quantities of the system, but one was 'u'",
         ),
         (
             lambda: PLAIN.quasi_velocities([0.0] * 3, [0.0] * 3, PARAMS),
@@ -289,5 +289,5 @@ def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
 def test_what_is_found_is_said():
     system = declared(of_u, "u", ("b",))
     text = system.explain(PARAMS)
-    assert "a, c make the state with q, b being 0" in text
+    assert "a, c and q form the state, b being 0" in text
     assert "v and u'" in text or "array program" in text

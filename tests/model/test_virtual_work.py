@@ -222,7 +222,7 @@ def test_an_angular_velocity_that_is_not_affine_is_refused(rates):
         forces=(jl.Torque(rates, torque, "motor"),),
     )
     message = (
-        r"torque 'motor': `angular_velocity` must be affine in v, but its derivative dw/dv depe"
+        r"torque 'motor': `angular_velocity` must be affine in v, but its derivative dw/dv cont"
     )
     with pytest.raises(ValueError, match=message):
         system.acceleration(Q, V, PARAMS)

@@ -95,7 +95,7 @@ def test_a_former_keyword_says_the_present_one(call, former, present):
 def test_what_became_required_is_asked_for():
     with pytest.raises(ValueError, match=r"^`ts` must be given, .* Pass ts=jnp\.linspace"):
         jl.simulate(SYSTEM, Q, V)
-    with pytest.raises(ValueError, match=r"^`v0` must be given, .* Pass v0=None beside u0="):
+    with pytest.raises(ValueError, match=r"^`v0` must be given, .* With u0= pass v0=None"):
         jl.simulate(SYSTEM, Q, u0=V, ts=TS)
     with pytest.raises(ValueError, match=r"^`name` must be given, .* Write jl\.Rayleigh\(R, "):
         jl.Rayleigh(lambda t, q, v, params: v @ v)
@@ -105,7 +105,7 @@ def test_what_became_required_is_asked_for():
 def test_options_of_a_simulation_are_those_that_it_has():
     for wrong, message in (
         ({"rtoll": 1e-6}, r"^`simulate_options` must be among .*'rtol'.* but one was 'rtoll'"),
-        ({"ts": TS}, "^`ts` must be left to jl.fit"),
+        ({"ts": TS}, "^`ts` must be left out, since jl.fit sets it"),
         (1e-6, "^`simulate_options` must be a dict of options of jl.simulate, but it was 1e-06"),
     ):
         with pytest.raises(ValueError, match=message):

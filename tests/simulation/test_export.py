@@ -73,7 +73,7 @@ def test_what_is_not_known_of_a_symbol_is_said():
     (k,) = export.symbolic_shape("k")
     for count, options, message in (
         (k, {}, r'at least 2 times, .* was \(k,\)\. Write jax\.export.*constraints=\["k >= 2"\]'),
-        (k + 1, {"gradient_memory": 1e6}, r"`gradient_memory` must be left out .* is a symbol"),
+        (k + 1, {"gradient_memory": 1e6}, r"`gradient_memory` must be left out .* is symbolic"),
     ):
         ended = jax.jit(lambda ts, options=options: end(PENDULUM, **options)(1.0, ts))
         with pytest.raises(ValueError, match=message):

@@ -77,7 +77,7 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
         ),
         (
             {"method": (diffrax.Tsit5(), STEPS), "dt": 0.1},
-            "`dt` must be left out when method brings its own controller, but both were given.",
+            "`dt` must be left out when method has a controller, but both were given.",
         ),
     ],
 )
@@ -112,7 +112,9 @@ def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
 
 def test_arguments_in_another_order_are_told():
     """Where the names say so: q, v, t, p."""
-    message = r"^`lagrangian` must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
+    message = (
+        r"^`lagrangian` must take \(t, q, v, params\) in this order.* 'q' is in the place of 't'"
+    )
     with pytest.raises(ValueError, match=message):
         jl.System(lambda q, v, t, p: 0.5 * v @ v, ("x",))
     with pytest.raises(ValueError, match=r"`phi` must take \(t, q, params\) in this order"):

@@ -200,13 +200,13 @@ def test_where_nothing_balances_it_says_how_near_it_came():
     pushed = jl.System(lambda t, q, v, params: 0.5 * v @ v + q[1], ("x", "y"))
     message = (
         r"status implicit_solve_failed: no equilibrium was found\. After \d+ steps the nearest "
-        r"point was q = \[0\. 0\.\]; the force on 'y' left there is 1, 1\.0e\+00 of its scale 1\."
+        r"point was q = \[0\. 0\.\]; the remaining force on 'y' is 1, 1\.0e\+00 of its scale 1\."
     )
     with pytest.raises(jl.EquilibriumError, match=message):
         jl.equilibrium(pushed, [0.0, 0.0])
 
     twisted = jl.System(lambda t, q, v, params: 0.5 * v @ v + jnp.cos(q[0]) + 2 * q[0], ("theta",))
-    with pytest.raises(jl.EquilibriumError, match="the force on 'theta' left there is 1,") as info:
+    with pytest.raises(jl.EquilibriumError, match="remaining force on 'theta' is 1,") as info:
         jl.equilibrium(twisted, [0.5])
     near = info.value.equilibrium
     np.testing.assert_allclose(near.q, [np.pi / 2], atol=1e-6)
@@ -224,7 +224,9 @@ def test_a_search_cut_short_is_not_a_success():
 
 def test_what_is_not_finite_is_named():
     broken = jl.System(lambda t, q, v, params: 0.5 * v @ v + jnp.log(q[0]), ("x",))
-    with pytest.raises(jl.EquilibriumError, match=r"status nonfinite: .* the force on 'x'"):
+    with pytest.raises(
+        jl.EquilibriumError, match=r"status nonfinite: .* the remaining force on 'x'"
+    ):
         jl.equilibrium(broken, [0.0])
 
 

@@ -249,7 +249,7 @@ def test_what_is_no_system_is_refused():
         (
             lambda t: jax.lax.complex(t, t)[None],
             0.0,
-            "what motion returns must be real, but its dtype",
+            "`motion(t)` must be real, but its dtype",
         ),
         (lambda t: t * jnp.ones(2), "now", "`t` must be real numbers, but it was 'now'"),
         (lambda t: t * jnp.ones(2), None, "`t` must be real numbers, but it was None"),

@@ -136,11 +136,11 @@ def test_what_was_tried_is_said_where_nothing_balances():
         forces=(jl.GeneralizedForce(lambda t, q, v, p: jnp.stack([-q[1], q[0]]), "push"),),
         constraints=(jl.Holonomic(lambda t, q, p: q @ q - 1.0, "hoop"),),
     )
-    message = "Damped motion on the constraints from q0 and places around it did not end in one"
+    message = "Damped motion on the constraints from q0 and points around it did not"
     with pytest.raises(jl.EquilibriumError, match=message):
         jl.equilibrium(hoop, [1.0, 0.0])
     falling = jl.System(lambda t, q, v, params: 0.5 * v @ v + q[0], ("x",))
-    with pytest.raises(jl.EquilibriumError, match="Damped motion from q0 and places around it did"):
+    with pytest.raises(jl.EquilibriumError, match="Damped motion from q0 and points around it did"):
         jl.equilibrium(falling, [0.3])
 
 

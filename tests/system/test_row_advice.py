@@ -61,7 +61,7 @@ def test_dead_points_are_singular_and_redundant_rows_are_not():
     assert advice_on_rows(twice, None, 0.0, [0.3, 0.0]) == ""
 
 
-SAID = r"'rod' vanishes wherever the row holds, as of y\*\*2.* Write the quantity itself, y"
+SAID = r"'rod' vanishes wherever the row holds, as for y\*\*2.* Write the quantity itself, y"
 
 
 def test_whoever_meets_such_a_row_says_so():
@@ -71,7 +71,9 @@ def test_whoever_meets_such_a_row_says_so():
         jl.simulate(given, q, [0.0, 0.0], [0.0, 1.0], dt=0.5, method="bosh3")
     with pytest.raises(jl.EquilibriumError, match=SAID):
         jl.equilibrium(given, q)
-    with pytest.raises(ValueError, match=r"constraint 'rod' must have a gradient .* Write the qu"):
+    with pytest.raises(
+        ValueError, match=r"constraint 'rod' must have a nonzero gradient .* Write the qu"
+    ):
         given.check(q, [0.0, 0.0])
     rooted, q = VANISHING["root of a square"]
     with pytest.raises(jl.AssemblyError, match=SAID):

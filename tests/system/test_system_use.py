@@ -156,7 +156,7 @@ def test_kinetic_and_potential_exist_where_declared():
     assert float(whole.energy([0.5], [3.0], params)) == 10.0
     for name in ("kinetic", "potential"):
         with pytest.raises(
-            ValueError, match=rf"^`System\.{name}` of a Lagrangian alone is not supported: only a"
+            ValueError, match=rf"^`System\.{name}` of a Lagrangian alone is not supported: it is"
         ):
             getattr(whole, name)([0.5], [3.0], params)
 

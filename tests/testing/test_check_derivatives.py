@@ -275,7 +275,7 @@ def test_what_is_refused():
         with pytest.raises(ValueError, match=message):
             testing.check_derivatives(system, **{**fine, **change})
     with pytest.raises(
-        ValueError, match=r"`q` must have values.*Call check_derivatives outside jit"
+        ValueError, match=r"`q` must have concrete values.*Call check_derivatives outside jit"
     ):
         jax.jit(lambda q: testing.check_derivatives(system, q, V, PARAMS))(jnp.array(Q))
 

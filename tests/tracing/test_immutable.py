@@ -117,14 +117,20 @@ REFUSED = {
     "frozen with a list": (Frozen([1.0]), "its field 'k', a list, can change"),
     "frozen with an object": (Frozen((Plain(1.0),)), "its element 0 of its field 'k', a Plain,"),
     "frozen by identity": (FrozenByIdentity([1.0]), "its field 'k', a list,"),
-    "frozen with an array": (Frozen(jnp.ones(2)), "it does not hash. Register its class"),
-    "namespace": (types.SimpleNamespace(k=1.0), "SimpleNamespace can .* Write a dict, as by vars"),
+    "frozen with an array": (Frozen(jnp.ones(2)), "it is not hashable. Register its class"),
+    "namespace": (
+        types.SimpleNamespace(k=1.0),
+        "SimpleNamespace can .* Write a dict, for example by vars",
+    ),
     "class": (Plain, "a class can change in place. Write a dict of the numbers"),
     "module": (types.ModuleType("settings"), "a module can change in place. Write a dict of"),
     "generator": (np.random.default_rng(0), "a Generator can change"),
     "set": ({1, 2}, "a set can change in place. Write a tuple for a set"),
     "enum": (Law.TABLE, "its value, a list,"),
-    "function of a dict": (of_table, "'TABLE', which it reads from outside, a dict, .* Hand over"),
+    "function of a dict": (
+        of_table,
+        "'TABLE', which it reads from outside, a dict, .* Pass in params",
+    ),
     "function of such a function": (through_helper, "'TABLE', which it reads from outside, a dict"),
     "default": (of_default, "'k', which it reads from outside, a list,"),
     "closure": (closing_over([1.0]), "'k', which it reads from outside, a list,"),
@@ -169,7 +175,7 @@ FIXED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_can_change_is_refused_by_its_path(name):
     leaf, message = REFUSED[name]
-    must = r"^`params\['a'\]\[0\]` must be a number, an array, or an object that cannot change"
+    must = r"^`params\['a'\]\[0\]` must be a number, an array, or an immutable and hashable object"
     with pytest.raises(ValueError, match=f"{must}.*{message}"):
         check_keys({"a": [leaf]})
 

@@ -345,7 +345,7 @@ class Static(eqx.Module):
 
 
 METHODS = "'TABLE', which its methods read from outside, a dict, can change in place. Make it a"
-READS = "which it reads from outside, a dict, can change in place. Hand over in params"
+READS = "which it reads from outside, a dict, can change in place. Pass in params"
 REFUSED = {
     "named tuple": (PairOfTable(), METHODS),
     "data of a dict": (Registered({"x": 1.0}, Plain()), "its element 1, a Plain, can .*eqx.Module"),
@@ -379,13 +379,13 @@ REFUSED = {
     "any attribute": (ByName(), METHODS),
     "descriptor": (Described(), "'Described.law', which its methods .* a Descriptor, can change"),
     "frozen": (FrozenOfTable(), METHODS),
-    "uncompared": (Uncompared(), "its field 'k', a float, does not count where .* compared"),
-    "equal to all": (Equal(), "an Equal is compared by a method of its own, __eq__"),
+    "uncompared": (Uncompared(), "its field 'k', a float, is excluded from comparisons"),
+    "equal to all": (Equal(), "an Equal has an __eq__ method of its own"),
     "jitted by equinox": (eqx.filter_jit(of_table), f"'TABLE', {READS}"),
     "method of frozen": (PairOfTable().k, "'TABLE', which its methods read"),
-    "slice": (slice(0, 2), "it does not hash. Write a tuple of its bounds"),
-    "view": (types.MappingProxyType(TABLE), "a mappingproxy is no value that hashes. Write a dict"),
-    "iterator": (iter((1,)), "a tuple_iterator is no value that hashes. Write a tuple"),
+    "slice": (slice(0, 2), "it is not hashable. Write a tuple of its bounds"),
+    "view": (types.MappingProxyType(TABLE), "a mappingproxy is not hashable. Write a dict"),
+    "iterator": (iter((1,)), "a tuple_iterator is not hashable. Write a tuple"),
 }
 if sys.version_info >= (3, 12):  # slices hash
     del REFUSED["slice"]
@@ -429,7 +429,7 @@ CHANGED = {
     "own attribute": (
         of_own_attribute,
         (of_own_attribute, "k"),
-        "of_own_attribute.k, which it reads from outside, was 1.0 before and is 5.0 now. Hand",
+        "of_own_attribute.k, which it reads from outside, was 1.0 before and is 5.0 now. Pass",
     ),
     "attribute of a partial": (PARTIAL, (PARTIAL, "k"), "partial.k, which it reads .* 2.0 before"),
     "attribute of custom_jvp": (with_rule, (with_rule, "k"), "with_rule.k, which it reads .* 2.0"),

@@ -272,7 +272,7 @@ def run(params):
         ),
         (
             {"m": 1.0, "k": [1.0], "s": {1, 2}},
-            r"^`params\['s'\]` must be .* that hashes, .*\{1, 2\}",
+            r"^`params\['s'\]` must be .* immutable and hashable .*\{1, 2\}",
         ),
     ],
 )

@@ -225,7 +225,7 @@ def test_the_third_int_of_one_leaf_is_warned_about():
     message = r"^params\['m'\] of .*stiff.* is the Python int 3"
     with pytest.warns(UserWarning, match=message) as said:
         of(3)
-    assert "Write 3.0 where it is a number" in str(said[0].message)
+    assert "Write 3.0 if it is a physical parameter" in str(said[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         of(4)  # once is enough
@@ -240,4 +240,4 @@ def test_a_function_made_in_a_loop_is_told_once(caplog):
             made(float(k))(jnp.array(1.0))
     (record,) = caplog.records
     assert "was traced as a new function for the 20th time" in record.getMessage()
-    assert "hand over what changes in params" in record.getMessage()
+    assert "pass in params what changes" in record.getMessage()

@@ -187,7 +187,7 @@ def _check_kinds(eqn: Any, operands: list) -> None:
     name = eqn.primitive.name
     kinds = [v.aval.dtype for v, x in zip(eqn.invars, operands, strict=True) if x.dtype == object]
     if name not in _OF_TRUTHS and any(kind == np.bool_ for kind in kinds):
-        raise Missing(f"{name} of truth values")
+        raise Missing(f"{name} of booleans")
     whole = [kind for kind in kinds if np.issubdtype(kind, np.integer)]
     if whole and (name not in _OF_INTEGERS or any(kind.itemsize < 4 for kind in whole)):
         raise Missing(f"{name} of integers")
@@ -206,7 +206,7 @@ _OF_INTEGERS |= {"stop_gradient", "cumsum", "clamp", "argmax", "argmin", *MOVES}
 def _custom_jvp(graph: Graph, eqn: Any, operands: list) -> list:
     rule = Rule(eqn)
     if not all(jax.numpy.issubdtype(aval.dtype, np.floating) for aval in rule.avals):
-        raise Missing("custom_jvp of what is no real number")
+        raise Missing("custom_jvp of values that are not real numbers")
     args = rule.flat([nodes(graph, array) for array in operands])
     results, index = [], 0
     for shape in rule.shapes:
@@ -256,12 +256,12 @@ def _while(graph: Graph, eqn: Any, operands: list) -> list:
         (going,) = _read(graph, params["cond_jaxpr"], *condition_consts, *carry)
         if going.dtype == object:
             if going.item().op != "const":
-                raise Missing("while with a condition on values")
+                raise Missing("while with a condition that depends on values")
             going = np.asarray(going.item().data)
         if not going:
             return carry
         carry = _read(graph, params["body_jaxpr"], *body_consts, *carry)
-    raise Missing(f"while of more than {TURNS} turns")
+    raise Missing(f"while of more than {TURNS} iterations")
 
 
 def _cond(graph: Graph, eqn: Any, operands: list) -> list:

@@ -66,7 +66,7 @@ def rows(
     A = [[column[k] for column in columns] for k in range(len(c.velocity))]
     reached = dependencies(x for row in A for x in row)
     if any(name == "v" for found in reached.values() for name, _ in found):
-        raise Unsupported("constraint rows whose slopes in v contain v")
+        raise Unsupported("constraint rows whose derivatives with respect to v contain v")
     gamma = tangents(graph, c.velocity, dict(zip(q, v, strict=True)) | {t: graph.one})
     if c.damping is not None:
         twice_alpha, beta_squared = c.damping

@@ -30,7 +30,9 @@ def read_scene(key: Key) -> SymbolicSystem:
     for name, like in (("params", key.params), ("inputs", key.inputs)):
         kinds = {leaf.dtype for leaf in jax.tree.leaves(like.tree)}
         if any(jnp.issubdtype(kind, jnp.integer) for kind in kinds):
-            raise Unsupported(f"integers among the {name}, which divide in a way of their own")
+            raise Unsupported(
+                f"integers among the {name}, whose division differs from that of floats"
+            )
     graph, n = Graph(), key.size
     t = graph.input("t", 0)
     # The velocities of a state (q, u) are not inputs of its equations.

@@ -43,10 +43,10 @@ class Verification(NamedTuple):
         """The result as text."""
         if not self.difference <= 1.0:
             if np.isinf(self.difference):
-                return "differs from the array program: one of them has no value"
+                return "differs from the array program: only one of them is finite"
             return f"differs from the array program by {SLACK * self.difference:.1e} roundings"
         if self.states < LEAST:
-            return f"only {self.states} of {DRAWS} random states to compare the array program at"
+            return f"only {self.states} of {DRAWS} random states to compare with the array program"
         return f"equal to the array program at {self.states} random states"
 
     @property
