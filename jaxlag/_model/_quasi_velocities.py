@@ -18,7 +18,6 @@ from jaxlag._linalg._refined_qr import (
     factored,
     inverse_of,
     least_sine,
-    lengths,
     nearest,
     refined,
     sines,
@@ -126,8 +125,6 @@ class QuasiVelocities(eqx.Module):
     ) -> Float[Array, " k"]:
         """u = U(t, q, v), shape (k,), in m/s or rad/s; without U the u with B u + c nearest to v.
 
-        The distance to v is measured over the lengths of the rows of B.
-
         Args:
             t: time, s.
             q: coordinates, shape (n,).
@@ -140,9 +137,7 @@ class QuasiVelocities(eqx.Module):
         if self.U is not None:
             return self._checked("U", self.U(t, q, v, params), self.size, v.dtype)
         B, c = self._affine(t, q, v.dtype, params)
-        # Otherwise rows of large units would reduce those of small units to rounding.
-        size = lengths(B)
-        return nearest(B / size[:, None], (v - c) / size)
+        return nearest(B, v - c)
 
     def velocities(
         self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " k"], params: Any

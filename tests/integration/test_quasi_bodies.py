@@ -52,6 +52,16 @@ def tumbling(**options):
     )
 
 
+def test_the_norm_of_a_quaternion_has_no_reaction():
+    """T in body rates does not change if q and q' are scaled: to the rounding of |I| |w|^2."""
+    system, rng = tumbling(), np.random.default_rng(2)
+    for _ in range(5):
+        q, w = rng.standard_normal(4), rng.uniform(-2, 2, 3)
+        v = system.velocities(q / norm(q), w, {})
+        lam = system.multipliers(q / norm(q), v, {})["unit"]
+        assert abs(lam) <= 100 * EPS * np.max(I) * norm(w) ** 2
+
+
 @pytest.mark.full
 def test_a_free_top_in_quaternions_goes_through_gimbal_lock():
     """Against R' = R [w]x by scipy; its pitch passes within 1e-3 of 90 degrees, at large roll."""
