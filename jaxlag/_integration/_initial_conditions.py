@@ -9,15 +9,16 @@ from jaxtyping import Array, Bool, Int
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._integration._step_arguments import Arguments
 from jaxlag._integration._vector_field import VectorField
-from jaxlag._linalg._independent_rows import (
+from jaxlag._linalg._independent_rows import independent_rows
+from jaxlag._linalg._mass_solve import closed_to, dependence_floor
+from jaxlag._linalg._rounding_bounds import with_rounding
+from jaxlag._linalg._row_residuals import (
     ROUNDINGS,
     Sizes,
-    independent_rows,
+    relative_residual,
     row_sizes,
     without_rounding,
 )
-from jaxlag._linalg._mass_solve import closed_to, dependence_floor
-from jaxlag._linalg._rounding_bounds import with_rounding
 
 
 class Start(NamedTuple):
@@ -130,7 +131,7 @@ def _rows_consistent(
     if dynamics.quasi is not None:
         off = jnp.zeros_like(unit)
         for c, x in ((phi, q), (rate, v)):
-            off = jnp.maximum(off, jnp.abs(c) / unit / (floor * (1.0 + jnp.max(jnp.abs(x)))))
+            off = jnp.maximum(off, relative_residual(c, unit, x) / floor)
         near = jnp.all(off <= 1.0)
         bad, complete = _fitting(dynamics, t, q, v, params, A, void, unit)
         bad = jnp.where(near, bad / floor, 0.0)
@@ -143,7 +144,7 @@ def _rows_consistent(
 
     off, bad = jnp.zeros_like(unit), jnp.zeros_like(unit)
     for c, x in ((phi, q), (rate, v)):
-        size = jnp.abs(c) / unit / (1.0 + jnp.max(jnp.abs(x)))
+        size = relative_residual(c, unit, x)
         off = jnp.maximum(off, size / floor)
         # A residual of the linearized rows alone is no contradiction.
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
@@ -211,8 +212,7 @@ def rows_hold_after(
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
     first = _sizes(dynamics, ts[0], q[0], v[0], params).size
     unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
-    speed = 1.0 + jnp.max(jnp.abs(v), axis=1)[:, None]
-    off = jnp.abs(rates) / unit / speed / dependence_floor(q.dtype)
+    off = jax.vmap(relative_residual)(rates, unit, v) / dependence_floor(q.dtype)
     off = jnp.max(jnp.where(jnp.isfinite(off), off, 0.0), axis=0)
     return jnp.all(off <= 1.0), jnp.argmax(off).astype(jnp.int32)
 

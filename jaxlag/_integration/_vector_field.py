@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._core._errors import invalid
 from jaxlag._integration._step_arguments import Arguments, KnotIntervals, RowSelection
-from jaxlag._linalg._independent_rows import RowChoice, independent_rows, row_sizes
+from jaxlag._linalg._independent_rows import RowChoice, independent_rows
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering import AccelerationProgram, ArrayTerms, Choices, ScalarProgram, State
 from jaxlag._model._constraints import NO_ROWS, Baumgarte, ConstraintRows
 from jaxlag._model._forces import sliding

@@ -1,7 +1,6 @@
 """A largest independent set of constraint rows, and the multipliers of dependent rows."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,10 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._linalg._kkt import augmented
 from jaxlag._linalg._mass_solve import eliminate, factor_mass, rank_floor
-from jaxlag._linalg._rounding_bounds import with_rounding, with_scatter
-
-ROUNDINGS = 16
-"""Multiple of the rounding of a row up to which the row counts as zero."""
+from jaxlag._linalg._row_residuals import ROUNDINGS, row_lengths
 
 ALIKE = 0.01
 """Part of the largest pivot from which on pivots count as equally good."""
@@ -31,128 +27,6 @@ class RowChoice(NamedTuple):
 
     kept: Bool[Array, " m"]
     there: Bool[Array, " m"]
-
-
-class Sizes(NamedTuple):
-    """Sizes of the constraint rows.
-
-    Attributes:
-        there: rows that are more than rounding.
-        void: rows that are rounding here and nearby: 0 = 0 for every motion.
-        size: their lengths. For rows that are rounding, their rate of change, or the size of their
-            terms if that is larger.
-    """
-
-    there: Bool[Array, " m"]
-    void: Bool[Array, " m"]
-    size: Float[Array, " m"]
-
-
-def row_sizes(
-    rows: Callable[[Array], Array],
-    q: Float[Array, " n"],
-    A: Float[Array, "m n"],
-    sure: bool = False,
-) -> Sizes:
-    """The rows that are more than rounding, and the sizes of all rows.
-
-    At a dead point, where rows vanish, sin(pi) leaves a meaningless 1e-16. Such a value changes
-    with a few roundings of the coordinates, and of all intermediate results.
-
-    Args:
-        rows: A as a function of q.
-        q: coordinates.
-        A: rows(q).
-        sure: whether no row is void, so that roundings of the coordinates are sufficient.
-    """
-    eps, at = float(jnp.finfo(q.dtype).eps), np.arange(q.shape[0])
-    small = eps**0.25
-    signs = jnp.asarray([(-1.0) ** at, (-1.0) ** (at // 2)], q.dtype)
-    places = jax.lax.stop_gradient(jnp.concatenate([q[None], q[None] + small * signs]))
-    if sure:
-        places = jnp.concatenate([places, q[None] + ROUNDINGS * eps * signs * jnp.abs(places[:1])])
-        changes = _lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A)[None])
-        growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
-        norms = _lengths(A)
-        there = (norms != 0) & ~(norms <= rounding)
-        size = jnp.where(there, norms, growth)
-        return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
-    found, rounding = jax.vmap(partial(with_rounding, rows))(places)
-    rounding, norms = _lengths(rounding), _lengths(A)
-    growth = _lengths(found[1:] - jax.lax.stop_gradient(A)[None])
-    # Unknown rounding, as of derivatives beside the end of a domain, does not exclude the row.
-    there = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
-    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
-    made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
-    size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
-    return Sizes(there, void, jnp.where(size > 0, size, 1.0))
-
-
-def without_rounding(
-    residuals: Callable[..., tuple[Array, ...]],
-    void: Bool[Array, " m"],
-    size: Float[Array, " m"],
-    *args: Array,
-) -> tuple[Array, ...]:
-    """Residuals of rows; 0 for void rows if they are no more than rounding.
-
-    The residual of such a row does not depend on the state: its changes nearby are rounding.
-
-    Args:
-        residuals: of all rows, as functions of `args`.
-        void: rows, see `row_sizes`.
-        size: of the rows.
-        args: coordinates, velocities.
-    """
-    found, scatter = with_scatter(residuals, *args)
-    least = float(jnp.finfo(size.dtype).eps) * size
-    return tuple(
-        jnp.where(void & (jnp.abs(c) <= ROUNDINGS * jnp.maximum(less, least)), 0.0, c)
-        for c, less in zip(found, scatter, strict=True)
-    )
-
-
-def _lengths(A: Float[Array, "*k m n"]) -> Float[Array, "*k m"]:
-    """Lengths of rows; derivatives of rows that vanish are 0. NaN stays NaN."""
-    square = jnp.sum(A**2, axis=-1)
-    return jnp.where(square == 0, 0.0, jnp.sqrt(jnp.where(square == 0, 1.0, square)))
-
-
-def redundant_rows_hold(
-    A: Float[Array, "m n"],
-    x: Float[Array, " n"],
-    gamma: Callable[..., Array],
-    state: tuple[Array, Array, Array],
-    sizes: Sizes,
-    force: Float[Array, " n"],
-    units: Float[Array, " n"],
-) -> Bool[Array, ""]:
-    """Whether A x + gamma = 0 for all rows, including those left out as dependent.
-
-    The tolerance is the angle below which a row counts as dependent, in units of the coordinates,
-    plus the rounding of gamma, of any row, and of the accelerations by forces that
-    reactions cancel.
-
-    Args:
-        A: rows.
-        x: an acceleration that satisfies some of them.
-        gamma: of (t, q, v).
-        state: (t, q, v).
-        sizes: of the rows, see `row_sizes`.
-        force: Q - h.
-        units: of the coordinates, in which their inertias are 1.
-    """
-    eps = float(jnp.finfo(A.dtype).eps)
-    c, rounding = with_rounding(gamma, *state)
-    lengths = _lengths(A * units[None])
-    size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
-    scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
-    allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
-    # The rounding of x from the solved rows appears in the others.
-    rounding = jnp.nan_to_num(rounding)
-    allowed += ROUNDINGS * jnp.max(jnp.where(sizes.there, rounding / size, 0.0))
-    allowed = allowed * size + ROUNDINGS * rounding
-    return jnp.all(jnp.abs(A @ x + c) <= allowed)
 
 
 def independent_rows(
@@ -246,7 +120,7 @@ def least_norm(
     if kept is None:
         metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
         kept = independent_rows(metric, fixed, there=there, mobile_first=True)
-    norms, sizes = _lengths(A), _lengths(A * units[None])
+    norms, sizes = row_lengths(A), row_lengths(A * units[None])
     norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
     unit = A * units[None] / sizes[:, None]
     C = _least_squares(unit.T, unit.T, kept).T
@@ -261,7 +135,7 @@ def least_norm(
     # Normal equations, in units in which their diagonal is 1: weights may differ as much as forces
     # and moments of short levers. Rows of small weights are kept, so that accuracy is not lost.
     moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
-    lengths = _lengths(moved.T)
+    lengths = row_lengths(moved.T)
     lengths = jnp.where(lengths > 0, lengths, 1.0)
     square = (moved.T @ moved) / jnp.outer(lengths, lengths)
     square = square + jnp.diag((~follows).astype(A.dtype))

@@ -10,15 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._linalg._independent_rows import (
-    RowChoice,
-    independent_rows,
-    redundant_rows_hold,
-    row_sizes,
-    shared,
-)
+from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
 from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
+from jaxlag._linalg._row_residuals import redundant_rows_hold, row_sizes
 from jaxlag._lowering._row_layout import layout
 from jaxlag._lowering._structure import Structure, find_structure
 from jaxlag._model._constraints import (

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._linalg._independent_rows import independent_rows, least_norm, row_sizes
+from jaxlag._linalg._independent_rows import independent_rows, least_norm
 from jaxlag._linalg._kkt import masked, units_of
 from jaxlag._linalg._mass_solve import factor_mass, solve_mass
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._tracing._signature import gradient
 

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import real
 from jaxlag._core._errors import invalid
-from jaxlag._linalg._independent_rows import row_sizes
 from jaxlag._linalg._refined_qr import (
     factored,
     inverse_of,
@@ -22,6 +21,7 @@ from jaxlag._linalg._refined_qr import (
     refined,
     sines,
 )
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._model._constraints import Pfaffian
 from jaxlag._tracing._dependence import outputs_depend_on
 from jaxlag._tracing._signature import require_arity

@@ -16,10 +16,10 @@ from jaxlag._integration._record import Outcome, Times
 from jaxlag._integration._step_arguments import Arguments
 from jaxlag._integration._step_end import StepEnd
 from jaxlag._integration._vector_field import VectorField
-from jaxlag._linalg._independent_rows import row_sizes
 from jaxlag._linalg._kkt import FORMULATIONS, Multipliers, augmented, factor_kkt, masked
 from jaxlag._linalg._mass_solve import factor_mass, first_unhealthy, solve_mass
 from jaxlag._linalg._refined_qr import SINE
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._model._forces import reads_lam
 from jaxlag._tracing import _params
 

@@ -14,9 +14,10 @@ from jaxlag._core._arrays import concrete, number, real, stop_gradient
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import AssemblyError, invalid
 from jaxlag._core._status import Status
-from jaxlag._linalg._independent_rows import independent_rows, row_sizes, without_rounding
+from jaxlag._linalg._independent_rows import independent_rows
 from jaxlag._linalg._kkt import augmented, solve_kkt
 from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
+from jaxlag._linalg._row_residuals import relative_residual, row_sizes, without_rounding
 from jaxlag._lowering import ArrayTerms
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._statics._assembly import Assembly
@@ -196,7 +197,7 @@ def _assembled(
 
     off = jnp.zeros_like(size)
     for c, x in zip(without_rounding(residuals, void, size, q, v), (q, v), strict=True):
-        off = jnp.maximum(off, jnp.abs(c) / size / (1.0 + jnp.max(jnp.abs(x))))
+        off = jnp.maximum(off, relative_residual(c, size, x))
     ok = jnp.all(off <= floor)
     finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v))
     failure = jnp.where(finite, int(Status.contradictory_rows), int(Status.nonfinite))

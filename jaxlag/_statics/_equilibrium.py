@@ -16,7 +16,8 @@ from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import EquilibriumError, invalid, shortened, unsupported
 from jaxlag._core._status import Status
-from jaxlag._linalg._independent_rows import least_norm, row_sizes, without_rounding
+from jaxlag._linalg._independent_rows import least_norm
+from jaxlag._linalg._row_residuals import row_sizes, without_rounding
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import vector
 from jaxlag._model._forces import reads_lam

@@ -10,7 +10,7 @@ from bench.fuzz._mechanism_programs import compared, prepare
 from bench.fuzz._random_mechanisms import Mechanism, Quasi, Row, smaller
 from bench.fuzz._random_systems import Drawn
 from bench.fuzz._reference_solution import Unclear
-from jaxlag._linalg import _independent_rows
+from jaxlag._linalg import _row_residuals
 from jaxlag._lowering import ArrayTerms, _array_terms
 from jaxlag._lowering import QuasiState as Rates
 from jaxlag._lowering._jaxpr import _from_jaxpr
@@ -216,7 +216,7 @@ def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
 
     def all_there(rows, q, A, sure=False):
         whole = jnp.ones(A.shape[0], bool)
-        return _independent_rows.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
+        return _row_residuals.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
 
     monkeypatch.setattr(_array_terms, "row_sizes", all_there)
     found_in(DOUBLED)

@@ -6,8 +6,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlag._linalg._independent_rows import independent_rows, least_norm, row_sizes
+from jaxlag._linalg._independent_rows import independent_rows, least_norm
 from jaxlag._linalg._kkt import units_of
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering._graph._expression import Graph
 from jaxlag._lowering._symbolic._evaluate import evaluate
 from jaxlag._lowering._symbolic._shared_reactions import Sharing, shared

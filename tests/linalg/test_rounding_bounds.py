@@ -7,8 +7,8 @@ import pytest
 from _families import mostly_full
 
 import jaxlag as jl
-from jaxlag._linalg._independent_rows import row_sizes
 from jaxlag._linalg._rounding_bounds import with_rounding
+from jaxlag._linalg._row_residuals import row_sizes
 
 TILT = np.asarray(jl.rotation.about_x(0.5)) @ np.asarray(jl.rotation.about_y(0.35))
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from jaxlag._linalg._independent_rows import ROUNDINGS
 from jaxlag._linalg._kkt import orthonormal_rows
+from jaxlag._linalg._row_residuals import ROUNDINGS
 from jaxlag._lowering._graph._eliminate import GREATER, bordered
 from jaxlag._lowering._graph._expression import Graph, Node
 from jaxlag._lowering._graph._vectors import backward, dot, without
