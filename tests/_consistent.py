@@ -1,11 +1,11 @@
-"""Random states moved onto constraints, by a way of its own."""
+"""Random states projected onto constraints, independently of jaxlag."""
 
 import jax
 import jax.numpy as jnp
 
 
 def onto_constraints(system, params, t, q, v):
-    """(q, v) by steps of least norm: Newton's for the positions, then one for the velocities."""
+    """(q, v) by steps of least norm: Newton's method for positions, one step for velocities."""
 
     def position(q):
         return jnp.hstack([*system.residuals(q, v, params, t=t)[0].values(), jnp.zeros(0)])

@@ -1,10 +1,10 @@
-"""Families of tests: a few members always, the others with -m full."""
+"""Families of tests: a few members always run, the others with -m full."""
 
 import pytest
 
 
 def mostly_full(values, *plain):
-    """Values to parametrize by; those that are not among `plain` are left to -m full."""
+    """Values to parametrize by; those that are not among `plain` are marked full."""
 
     def left(x):
         return pytest.param(*(x if isinstance(x, tuple) else (x,)), marks=pytest.mark.full)

@@ -1,4 +1,4 @@
-"""Programs read as jaxprs: which operations they do, how often, and on arrays of which size."""
+"""Programs as jaxprs: their operations, how often these are executed, and sizes of arrays."""
 
 import math
 from typing import NamedTuple
@@ -19,9 +19,9 @@ class Operation(NamedTuple):
 
 
 def operations(function, *args, turns=None):
-    """Every operation that one call of `function` executes, those of nested programs included.
+    """Every operation that one call of `function` executes, including those of nested programs.
 
-    A while loop has no number of turns to count: `turns` says how many to assume.
+    A while loop has no known number of iterations: `turns` is assumed.
     """
     return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), turns))
 
@@ -63,11 +63,11 @@ def _walk(jaxpr, times, inside, turns):
 
 def _executed(name, eqn):
     params = eqn.params
-    if name == "linear_map":  # holds its programs as functions
+    if name == "linear_map":  # its programs are functions
         form, count = params["form"], params["count"]
         like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
         return [jax.make_jaxpr(form.forward)(like[:count], like[count:]).jaxpr]
-    if name == "custom_linear_solve":  # its products and its transpose serve derivatives only
+    if name == "custom_linear_solve":  # its product and its transpose are for derivatives only
         return [params["jaxprs"].solve.jaxpr]
     found = [leaf for value in params.values() for leaf in _leaves(value)]
     return [leaf.jaxpr if isinstance(leaf, ClosedJaxpr) else leaf for leaf in found]

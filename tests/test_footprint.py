@@ -1,4 +1,4 @@
-"""The bounds on memory maps and memory: a run beyond them fails and says where, others do not."""
+"""Runs beyond the bounds on memory maps and memory fail and name the test; others pass."""
 
 import os
 import re

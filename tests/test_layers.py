@@ -1,6 +1,6 @@
-"""Which package may import which, by the syntax tree: late imports and those for types count, too.
+"""Which package may import which, by the syntax tree: includes late imports and those for types.
 
-One way: model -> lowering -> system -> integration -> gradient -> simulation -> fit.
+The order is model -> lowering -> system -> integration -> gradient -> simulation -> fit.
 """
 
 import ast
@@ -15,10 +15,10 @@ ROOT = Path(jaxlag.__file__).parent
 REPO = Path(__file__).parents[1]
 FILES = sorted(ROOT.rglob("*.py"))
 MOST = 20
-"""Source files in a folder."""
+"""Largest number of source files in a folder."""
 FOLDERS = sorted(
     {path.parent for top in ("jaxlag", "bench", "systems") for path in (REPO / top).rglob("*.py")}
-    - {REPO / "systems" / "catalogue" / "chapter3"}  # 35 systems, each to be read by itself
+    - {REPO / "systems" / "catalogue" / "chapter3"}  # 35 independent systems
 )
 
 _BASE = ("_core", "_linalg", "_tracing", "_model")
@@ -56,7 +56,7 @@ WITHIN_LOWERING = {
 
 
 def name(path: Path) -> str:
-    """As it is imported."""
+    """The module name in imports."""
     parts = ("jaxlag", *path.relative_to(ROOT).with_suffix("").parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -96,7 +96,7 @@ def test_a_module_imports_only_what_lies_below(module):
 
 
 def test_no_two_modules_need_one_another():
-    """A facade stands above what it gathers, and what it gathers does not import it."""
+    """A facade imports its modules; they do not import it."""
     needs = {module: {other for _, other in imported(path)} for module, path in MODULES.items()}
     assert len(list(TopologicalSorter(needs).static_order())) == len(MODULES)
 

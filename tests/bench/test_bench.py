@@ -1,4 +1,4 @@
-"""The benchmarks measure finished work, keep what they found, and judge it."""
+"""The benchmarks measure finished work, store their results and judge them."""
 
 import io
 import json
@@ -18,7 +18,7 @@ from systems.catalogue.chapter3.double_pendulum import system
 
 
 class Clock:
-    """A clock that stands still but for the work that is waited for."""
+    """A clock that only waiting for work advances."""
 
     def __init__(self, monkeypatch):
         self.now = 0.0
@@ -29,7 +29,7 @@ class Clock:
 
 
 class Pending:
-    """An output that takes time, but only of those who wait for it."""
+    """An output that takes time only if it is waited for."""
 
     def __init__(self, clock, seconds):
         self.clock, self.seconds = clock, seconds
@@ -65,7 +65,7 @@ def test_a_program_known_to_be_slow_takes_long():
         return jax.pure_callback(sleep, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
     program = timing.build(slow, jnp.zeros(()))
-    assert not runs  # compilation is measured apart
+    assert not runs  # compilation is measured separately
     assert timing.seconds(lambda: program.call(jnp.zeros(()))) >= 0.2
     assert len(runs) == 1
 
@@ -196,7 +196,7 @@ def test_all_equations_compared_are_those_of_the_system(field):
     y = jnp.array([0.7, -1.1, 0.4, 1.3])
     params = {name: value * (1.0 + 0.1 * i) for i, (name, value) in enumerate(params_of_bench())}
     expected = jnp.concatenate([y[2:], system.acceleration(y[:2], y[2:], params)])
-    # Round-off of an acceleration of about 10 rad/s^2 through a 2 x 2 solve.
+    # Rounding of an acceleration of about 10 rad/s^2 by a 2 x 2 solve.
     assert jnp.max(jnp.abs(field(0.0, y, params) - expected)) < 1e-13
 
 

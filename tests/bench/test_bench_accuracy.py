@@ -19,7 +19,7 @@ FILES = accuracy.MOVING
 
 
 def errors(saves, *, kappa=100.0, steps=100, size=1e4, ends=None, estimates=None):
-    """Errors at made-up rows; the floor is 10 eps kappa sqrt(steps) size, 2.2e-8 by default."""
+    """Errors at made-up saves; the floor is 10 eps kappa sqrt(steps) size, 2.2e-8 by default."""
     saves = np.array(saves, float)
     return Errors(
         saves=saves,
@@ -87,7 +87,7 @@ def test_motions_that_never_leave_the_floor_are_exact():
 
 def test_errors_at_saves_are_compared_with_those_at_step_ends():
     assert judged(errors([2.0, 6.0], ends=[4.0, 1.0]))["saves_to_ends"] == 1.5
-    assert judged(errors([1e-9], ends=[1e-10]))["saves_to_ends"] is None  # round-off alone
+    assert judged(errors([1e-9], ends=[1e-10]))["saves_to_ends"] is None  # only rounding
 
 
 def test_estimates_are_compared_at_every_row_above_round_off():
@@ -203,7 +203,7 @@ class TestManyDigits:
             assert abs(y[0] - x) < 1e-24
 
     def test_an_orbit(self, gmpy2):
-        """Kepler's, e = 1/2, a = 1, from the nearest point."""
+        """A Kepler orbit, e = 1/2, a = 1, from the pericenter."""
 
         def lagrangian(t, q, v, params):
             return 0.5 * v @ v + 1 / jnp.linalg.norm(q)
@@ -261,7 +261,7 @@ class TestManyDigits:
             self.follow(system, [1.0, 0.0], [0.0, 1.0], [0.0, 1.0])
 
     def test_what_a_heavy_top_keeps(self, gmpy2):
-        """The momenta of psi and phi and the energy along the rows of its file."""
+        """The momenta of psi and phi and the energy at the saves of its file."""
         from bench._multiprecision.equations import precise
 
         precise()

@@ -1,4 +1,4 @@
-"""The benchmark of first results: equations by hand, judging, one process."""
+"""The benchmark of first results: equations by hand, verdicts, one process."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def test_equations_by_hand_are_those_of_the_system(name):
     motion = BEGINNINGS[name]()
     y = motion.start()
     right = np.asarray(expected(motion, y))
-    # Some hundred roundings, through a solve of up to 12 unknowns with a condition of some 1e3.
+    # Some hundred roundings, through a solve of up to 12 unknowns with a condition of about 1e3.
     allowed = 1e5 * EPS * np.max(np.abs(right))
     np.testing.assert_allclose(motion.by_hand()(0.0, y, motion.params), right, rtol=0, atol=allowed)
     if motion.rates is not None:

@@ -1,4 +1,4 @@
-"""Fits of real recordings: their models by a second route, their reading, and reduced sets."""
+"""Fits of real recordings: models derived independently, reading of files, reduced sets."""
 
 import gzip
 import math
@@ -88,7 +88,7 @@ def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):
 
 
 def test_angles_of_a_video_are_from_where_gravity_points(tmp_path):
-    """Hanging, and the second arm level; both go on beyond half a turn."""
+    """Hanging, and the second arm level; both move beyond half a turn."""
     turns = np.linspace(0.0, 5.0, 60)
     joint = 1000 + 500 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     tip = joint + 400 * np.stack([np.cos(turns + 1.5), np.sin(turns + 1.5)], axis=1)
@@ -101,7 +101,7 @@ def test_angles_of_a_video_are_from_where_gravity_points(tmp_path):
 
 
 def test_a_flight_ends_where_a_corner_comes_near():
-    """A cube on its edge, sinking: its lowest corner is sqrt(2) half edges below the centre."""
+    """A sinking cube on its edge: its lowest corner is sqrt(2) half edges below the center."""
     half = np.sqrt(0.5)
     e = np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0
     z = np.linspace(0.3, 0.05, 26)
@@ -115,12 +115,12 @@ def test_a_flight_ends_where_a_corner_comes_near():
     np.testing.assert_allclose(below, -2 * half * cube.HALF, rtol=10 * EPS)
 
 
-# ---- Models by a second route --------------------------------------------------------------------
+# ---- Models derived independently ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arms", [1, 2, 3])
 def test_base_params_say_what_masses_and_lengths_do(arms):
-    """The published form by positions of mass centres, and per its first moment of inertia."""
+    """The published form by positions of mass centers, and over its first moment of inertia."""
     p = multiarm.PUBLISHED[arms]
 
     def by_positions(q, v):
@@ -161,7 +161,7 @@ def test_friction_acts_between_arms():
 
 @pytest.mark.parametrize("design", ["A", "C.1"])
 def test_arms_by_energies_of_links_and_rotors(design):
-    """Links with inertia about their joints, rotors that turn six times as fast as the joints."""
+    """Links with inertia about their joints; rotors rotate six times as fast as the joints."""
     m1, m2, l1, r1, r2, I1, I2, Ir = actuated.DESIGNS[design]["published"]
     p, g = actuated.published(design), actuated.G
     q, v = jnp.array([0.4, -1.1]), jnp.array([1.3, -0.7])
@@ -188,7 +188,7 @@ def test_wrong_starts_are_wrong_by_half():
 
 
 def fewest(count, share, chance=1e-4):
-    """The least number of successes among so many that chance explains, each of this share."""
+    """The least number of successes that chance explains, of `count` with this share each."""
     total = 0.0
     for k in range(count + 1):
         total += math.comb(count, k) * share**k * (1 - share) ** (count - k)
@@ -199,7 +199,7 @@ def fewest(count, share, chance=1e-4):
 
 @pytest.mark.full
 def test_a_chaotic_motion_gives_its_params():
-    """Of all three params inside their 99 % intervals the least likely is 0.97 = 1 - 3 * 0.01."""
+    """That all three params are in their 99 % intervals has a probability of 0.97 or more."""
     ts = synthetic.times(float(synthetic.lyapunov_exponent()))
     tally = synthetic.recovered(ts, 8, synthetic.SEGMENTS)
     assert tally.near == 8

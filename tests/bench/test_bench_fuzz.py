@@ -1,4 +1,4 @@
-"""The fuzzer: what it draws, that it finds what is wrong, and what it leaves behind."""
+"""The fuzzer: systems that it draws, errors that it detects, reports that it writes."""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ def test_what_is_drawn_is_a_system_of_its_own_for_every_seed():
     assert {x.dtype for x in drawn} == {"float32", "float64"}
     assert {x.n for x in drawn} == {1, 2, 3, 4, 5}
     used = " ".join(x.lagrangian for x in map(draw, range(300)))
-    for template in (*ONE, *TWO):  # by the longest piece that every use of it has
+    for template in (*ONE, *TWO):  # by the longest piece that every use contains
         assert max(template.replace("{1}", "{0}").split("{0}"), key=len) in used
 
 
@@ -75,14 +75,14 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
     find = report.rows[-1]
     assert find["kind"].startswith("seed 7: ")
     assert find["systems"] > 1.0
-    # Made smaller as far as it differs: of the force nothing is left.
+    # Reduced as long as it differs: no force remains.
     assert find["declared"].startswith("L = 1.0 * (0.5 * (2.0 * v[0] ** 2) - (")
     assert "; Q = []; params = {'a': [0.1, " in find["declared"]
     assert [target.met for target in report.targets] == [False, True]
 
 
 def test_a_run_draws_every_kind():
-    """Of ten systems four are free, three constrained, two quasi, one a loop; some of them move."""
+    """Of ten systems four are free, three constrained, two quasi, one a loop; some move."""
     names = [fuzz.kind_of(seed).name for seed in range(400)]
     assert set(names) == {kind.name for kind in fuzz.KINDS}
     of = {word: sum(word in name for name in names) for word in ("free", "constrained", "quasi")}
@@ -91,7 +91,7 @@ def test_a_run_draws_every_kind():
 
 
 def test_a_run_counts_what_it_compared(monkeypatch):
-    """Until enough are equal; what cannot be compared counts for nothing."""
+    """Until enough are equal; systems that cannot be compared do not count."""
     kind = fuzz.QUASI._replace(
         draw=lambda seed: seed,
         compared=lambda seed: Compared("equal" if seed % 2 else "not compared: odd", 0.25),
@@ -116,12 +116,12 @@ def test_differences_are_measured_by_what_roundings_change(off, least, most):
     right = np.array([[[1.0, 2.0]], [[1.0 + 1e-15, 2.0]]])
     found = right[0] + off
     assert least <= _system_programs._off(right, found, right[0], 2.0**-52) <= most
-    # Where the array program has no value, anything is right.
+    # If the array program has no value, any result is right.
     assert _system_programs._off(np.full_like(right, np.nan), found, right[0], 2.0**-52) == 0.0
 
 
 def test_roundings_show_the_digits_that_a_result_has():
-    """(1 + x) - 1 has the digits that 1 + x has; what is only moved has all."""
+    """(1 + x) - 1 has the digits of 1 + x; a result that is only moved has all digits."""
 
     def cancels(x):
         return jax.jit(lambda x: (1.0 + x) - 1.0)(x), -jnp.stack([x, x])[::-1]
@@ -219,7 +219,7 @@ def test_operations_are_those_of_jax(case):
 
 def test_every_operation_is_tried():
     tried = {name for f, *args in CALLED for name in _primitives(jax.make_jaxpr(f)(*args).jaxpr)}
-    tried |= {"add_any"}  # of sums that derivatives make
+    tried |= {"add_any"}  # from sums in derivatives
     assert set(NUMPY) <= tried
 
 

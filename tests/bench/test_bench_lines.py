@@ -1,4 +1,4 @@
-"""Lines of work over error: swept, timed and interpolated; everybody gets to the end."""
+"""Lines of work over error: swept, timed and interpolated; every library reaches the end."""
 
 import math
 from functools import cache
@@ -22,7 +22,7 @@ motion_of = cache(lambda name: MOTIONS[name]())
 
 
 class Result:
-    """An answer that is there only after it has been waited for."""
+    """A result that exists only after it has been waited for."""
 
     def __init__(self, q):
         self.q, self.waited = q, False
@@ -33,7 +33,7 @@ class Result:
 
 
 def made_up_line(errors, results=None):
-    """One that ends off by what is given, knob by knob."""
+    """A line with the given errors, knob by knob."""
 
     def make(knob):
         def call():
@@ -55,7 +55,7 @@ def test_sweeps_wait_for_every_result():
     results = []
     line = made_up_line({1e-2: 1e-3, 1e-3: 1e-4}, results)
     calls, points = swept(line, float, patience_s=10.0)
-    assert len(results) == 4  # one to warm up and one to time, for each
+    assert len(results) == 4  # one to warm up and one to time, for each knob
     assert all(result.waited for result in results)
     assert list(calls) == ["0.01", "0.001"]
     assert [point["error"] for point in points] == [1e-3, 1e-4]
@@ -83,9 +83,9 @@ def test_sweeps_end_where_rounding_takes_over_and_where_patience_does():
     assert len(points) == 8 + _sweep.PATIENCE
     plateau = {10.0**-k: 1e-6 if k < 10 else 1e-14 for k in range(2, 16)}
     _, points = swept(made_up_line(plateau), float, patience_s=10.0)
-    assert points[-1]["error"] == 1e-14  # stability, not rounding, held the error up
+    assert points[-1]["error"] == 1e-14  # stability, not rounding, limited the error
     _, points = swept(made_up_line(errors), float, patience_s=-1.0)
-    assert points == []  # its first run was longer than any patience
+    assert points == []  # its first run exceeded any patience
 
 
 def test_failed_runs_are_no_points():
@@ -111,7 +111,7 @@ def test_times_at_equal_error_are_interpolated_and_never_beyond_the_line():
     assert math.isclose(time_at(line, 1e-6, "min_us"), 40.0)
     assert math.isclose(time_at(line, 1e-7, "min_us"), 80.0)
     assert time_at(line, 1e-9, "min_us") is None
-    assert time_at(line, 1e-2, "min_us") == 10.0  # its loosest suffices
+    assert time_at(line, 1e-2, "min_us") == 10.0  # its loosest one suffices
     assert time_at([], 1e-2, "min_us") is None
 
 
@@ -233,5 +233,5 @@ def test_dop853_in_numba_takes_the_steps_of_scipy():
     other = integrate.solve_ivp(rates, (0, 10), motion.start(), "DOP853", rtol=1e-8, atol=1e-8)
     assert abs(accepted - (len(other.t) - 1)) <= 2
     assert attempts > accepted
-    # Steps that differ by a rounding of the controller end within the error of either.
+    # Steps that differ by rounding of the controller end within the error of either.
     assert np.max(np.abs(y - other.y[:, -1])) < 1e-7

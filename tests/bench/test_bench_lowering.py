@@ -1,4 +1,4 @@
-"""Accelerations compared with code by others: right, timed alike, judged."""
+"""Accelerations compared with other code: they are right, timed alike and judged."""
 
 import math
 import time

@@ -42,7 +42,7 @@ def acceleration(motion, y):
 
 @pytest.mark.parametrize("name", mostly_full(SINGLE, "heavy top"))
 def test_explicit_equations_are_those_of_the_system(name):
-    """And so are all forms they are given to solvers in."""
+    """So are all forms in which solvers get them."""
     motion = motion_of(name)
     y = state_near_the_start(motion, 1)
     n = len(motion.q0)
@@ -53,7 +53,7 @@ def test_explicit_equations_are_those_of_the_system(name):
         along = lambda q, v: motion.speeds(0.0, q, v, motion.params)  # noqa: E731
         speeds, rates = jax.jvp(along, (q, v), (v, a))
     assert np.allclose(speeds, y[n:], rtol=1e-13, atol=1e-13)
-    # Rounding of the terms that cancel: k r of the spring, M of the chain (condition about 1e3).
+    # Rounding of terms that cancel: k r of the spring, M of the chain (condition about 1e3).
     cancelling = motion.params.get("k", 1e2 if n == 8 else 1.0)
     bound = 300 * EPS * max(float(jnp.max(jnp.abs(rates))), cancelling)
     expected = np.array(motion.evaluate(y))
@@ -67,7 +67,7 @@ def test_explicit_equations_are_those_of_the_system(name):
     naive = jax.jit(_jax.naive(motion))(0.0, jnp.concatenate([q, v]), params)
     assert (
         np.max(np.abs(naive - jnp.concatenate([v, a]))) < 10 * bound
-    )  # its solve knows no structure
+    )  # its solve uses no structure
 
 
 def test_no_operation_is_written_twice():
@@ -91,10 +91,10 @@ def test_ends_are_kept_for_every_motion_to_20_digits():
 
 @pytest.mark.parametrize(("name", "e"), [("Kepler, e = 0.6", 0.6), ("Kepler, e = 0.9", 0.9)])
 def test_orbits_close(name, e):
-    """After 100 periods: where they began, but for the rounding of the span and of the start."""
+    """After 100 periods they are at their start, up to rounding of the span and of the start."""
     motion = motion_of(name)
     off = np.abs(exact_ends.exact_end(name) - motion.q0)
-    # Starts to one rounding: the period is off by as much, times its growth with 1 / (1 - e).
+    # The start has an error of one rounding, the period as much, times its growth with 1 / (1 - e).
     late = motion.t1 * EPS * 4.0 / (1.0 - e)
     assert off[0] < EPS
     assert off[1] < motion.v0[1] * late

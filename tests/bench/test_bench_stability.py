@@ -1,4 +1,4 @@
-"""Stress rows: verdicts, names, exact orbits."""
+"""Stress cases: verdicts, names, exact orbits."""
 
 import math
 
@@ -30,7 +30,7 @@ def stressed(bound=1.0, statuses=(), figure=0.5, found=("ok",)):
     ],
 )
 def test_verdicts_on_stress(case, verdict):
-    """A wrong answer that looks right is the worst; a status counts only where one is due."""
+    """The worst is a wrong answer that looks right; a status counts only where one is expected."""
     row = stability.judged(case, quick=True)
     assert row["verdict"] == verdict
     targets, named = stability.conclusions([row], 1)
@@ -65,7 +65,7 @@ def test_a_quick_run_is_judged_by_its_own_bound():
 
 
 def oscillating(drift, noise):
-    """Two incommensurate oscillations of 1e12, in 20 motions of 200 000 steps, rows 20 apart."""
+    """Two incommensurate oscillations of 1e12, in 20 motions of 200 000 steps, a save every 20."""
     steps = np.arange(1, 10_001) * 20
     random = np.random.default_rng(0)
     phases = random.uniform(0, 2 * np.pi, (2, 20, 1))
@@ -76,23 +76,23 @@ def oscillating(drift, noise):
 
 @pytest.mark.parametrize("drift", [0.0, 0.03, -0.03])
 def test_a_drift_shows_below_oscillations_and_walks(drift):
-    """Without one the figure is within what a walk of its size explains, with one it is beyond."""
+    """Without one the figure is within that of a random walk of its size, with one it is beyond."""
     length = _drifts.Length(200_000, 5_000, 20)
     found = _drifts.drift(oscillating(drift, 1.0), 20, ("ok",))
-    bound = _drifts.walked(3, length)  # of a walk of 1.04 eps a step
+    bound = _drifts.walked(3, length)  # of a random walk of 1.04 eps per step
     assert (found.figure <= bound) == (drift == 0.0)
     mean = float(found.details.split()[1])
     assert abs(mean - drift) < 4e-3
 
 
 def test_a_drift_that_cannot_be_told_is_beyond_its_bound():
-    """An error bar that is too wide fails the row as a drift does."""
+    """A wide error bar fails the case as a drift does."""
     found = _drifts.drift(oscillating(0.0, 30.0), 20, ("ok",))
     assert found.figure > _drifts.walked(3, _drifts.Length(200_000, 5_000, 20))
 
 
 def test_a_derivative_by_the_imaginary_part_is_that_of_the_motion():
-    """Of motions written by hand, against a difference."""
+    """Of motions written by hand, compared with a difference."""
     along = np.array([0.3, -1.0])
     ends = [
         _reference_motions.double_pendulum([1.0, 0.5] + h * along, 1.0, 2.0)[0]

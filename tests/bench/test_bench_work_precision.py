@@ -1,4 +1,4 @@
-"""Work over error: who is fastest is told and judged right, a run is measured and told."""
+"""Work over error: the fastest lines are reported and judged correctly, and a run is measured."""
 
 import json
 import math
@@ -40,7 +40,7 @@ def made_up_rows(ours=1.0):
     return rows
 
 
-# ---- What is said of the rows --------------------------------------------------------------------
+# ---- Reports of the rows -------------------------------------------------------------------------
 
 
 def test_the_fastest_are_told_at_equal_error():
@@ -100,7 +100,7 @@ def test_the_time_besides_the_steps_is_not_negative():
 def test_a_system_that_failed_misses_its_targets():
     targets, _ = _ranking.judged(made_up_rows(), [*SYSTEMS, _ranking.LANES])
     lost = [target for target in targets if _ranking.LANES in target.claim]
-    assert len(lost) == 4  # two of its own, and it is the worst of all twice
+    assert len(lost) == 4  # two of its own, and twice it is the worst of all
     assert not any(target.met for target in lost)
 
 
@@ -188,7 +188,7 @@ def test_an_unknown_system_is_refused():
 
 
 class FakeWorker:
-    """A process that knows one fast and one slow point."""
+    """A process with one fast and one slow point."""
 
     def __init__(self, benchmark, quick, settings, **options):
         self.kind = settings[work_precision.KIND]
@@ -227,7 +227,7 @@ def test_processes_take_turns_and_long_runs_sit_out(monkeypatch):
     }
     assert all(set(row) == COLUMNS for row in rows)
     fast, slow = rows[:2]
-    assert fast["repeats"] == 6  # three turns, then its time is up
+    assert fast["repeats"] == 6  # three rounds, then its time is up
     assert math.isclose(fast["min_us"], 10e3)
     assert (slow["repeats"], slow["min_us"]) == (2, 0.3e6)
     assert notes == [("7.0", "version of heyoka")]
@@ -236,7 +236,7 @@ def test_processes_take_turns_and_long_runs_sit_out(monkeypatch):
 
 
 class AbsentWorker(FakeWorker):
-    """One whose other interpreter has no jax."""
+    """A worker whose other interpreter has no jax."""
 
     def __init__(self, benchmark, quick, settings, **options):
         if "interpreter" in options:

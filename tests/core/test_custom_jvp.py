@@ -1,7 +1,7 @@
-"""Rules of their own stay with functions: through every transform, to second derivatives.
+"""Custom derivative rules survive every transform, up to second derivatives.
 
-The rule of `sine` is unlike the derivative of its body: f' = 2 f, so that f'' = 4 f. What drops it
-gives -f.
+The rule of `sine` differs from the derivative of its body: f' = 2 f, so that f'' = 4 f. A transform
+that drops the rule gives -f.
 """
 
 import itertools
@@ -60,14 +60,14 @@ def _(primals, tangents):
 
 
 def of_pairs(fs, pairs):
-    """All second derivatives at X, in one program."""
+    """All second derivatives at X, by one compiled program."""
     found = jax.jit(lambda x: [twice(pair, f)(x) for f in fs for pair in pairs])(jnp.asarray(X))
     return dict(zip(itertools.product(range(len(fs)), pairs), map(float, found), strict=True))
 
 
 @pytest.mark.parametrize("loop", LOOPS)
 def test_rules_survive_loops(loop):
-    """Ours, and one by `jax.custom_jvp` in a program in which they are kept."""
+    """Rules of `CustomJVP`, and of `jax.custom_jvp` under `keeping_rules`."""
     found = of_pairs([LOOPS[loop](f) for f in (sine, keeping_rules(users))], PAIRS)
     wanted = 4 * np.sin(X)
     assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
@@ -88,7 +88,7 @@ def quotient(x, y):
 
 @quotient.defjvp
 def _(primals, tangents):
-    """Calls the function itself on tangents, which it is linear in."""
+    """Calls the function itself on tangents, in which it is linear."""
     (_, y), (dx, dy) = primals, tangents
     z = quotient(*primals)
     return z, quotient(dx - z * dy, y)
@@ -97,7 +97,7 @@ def _(primals, tangents):
 @pytest.mark.parametrize("loop", ["fori_loop", "jit", "checkpoint", "vmap"])
 @pytest.mark.parametrize("mode", ["grad", "jacrev"])
 def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
-    """Reverse derivatives turn such a call round: of 1 / (1 + x^2), once and twice."""
+    """Reverse derivatives transpose such a call: of 1 / (1 + x^2), first and second order."""
 
     def f(x):
         return quotient(jnp.ones_like(x), 1.0 + x * x)
@@ -111,7 +111,7 @@ def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
 
 
 def test_reverse_derivatives_of_single_precision_in_loops():
-    """Where the equations divide; as in double precision."""
+    """Equations with a division, compared with double precision."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 * (1 + q[0] ** 2) + jnp.cos(p * q[0]), ("x",)
     )
@@ -129,14 +129,14 @@ def test_reverse_derivatives_of_single_precision_in_loops():
 
 
 def test_rules_by_jax_are_dropped_by_the_loops_of_jax():
-    """Why the rule is a primitive's. Once this fails, on all supported versions, it need not be."""
+    """The reason for a primitive, until all supported versions of JAX keep such rules."""
     found = jax.jvp(jax.grad(LOOPS["scan"](users)), (X,), (1.0,))[1]
     assert np.isclose(found, 4 * np.sin(X)) or np.isclose(found, 2 * np.cos(X))
 
 
 @CustomJVP
 def scaled(tree, count, factor):
-    """Of a dict, an integer and a number."""
+    """A function of a dict, an integer and a number."""
     return {"sum": jnp.sum(tree["x"]) * factor, "count": count + 1}, tree["x"] * factor
 
 
@@ -201,7 +201,7 @@ def test_rows_of_some_arguments(axes):
 
 
 def test_a_number_without_a_transform_is_computed_at_once():
-    """Nothing is traced where there is nothing to differentiate."""
+    """Nothing is traced if nothing is differentiated."""
     calls = []
 
     @CustomJVP
@@ -218,7 +218,7 @@ def test_a_number_without_a_transform_is_computed_at_once():
 
 
 def test_rules_within_rules_are_kept():
-    """The rule of the outer function calls one by `jax.custom_jvp` itself."""
+    """The rule of the outer function calls a function with a rule by `jax.custom_jvp`."""
 
     @jax.custom_jvp
     def outer(x):
@@ -235,7 +235,7 @@ def test_rules_within_rules_are_kept():
     np.testing.assert_allclose([first, second, third], np.array([1, 2, 4]) * np.sin(X), rtol=1e-15)
 
 
-# ---- What jaxlag makes of it --------------------------------------------------------------------
+# ---- Derivatives of jaxlag's functions in loops --------------------------------------------------
 
 
 def pendulum(function, lowering="auto"):
@@ -327,7 +327,7 @@ AROUND = {
 
 
 def matrix(derivative):
-    """From a function of params to the row, or the matrix, of its derivatives."""
+    """Maps a function of params to the function that returns its gradient or Jacobian."""
     if derivative == "jvp":
         return lambda f: lambda w: jnp.stack([jax.jvp(f, (w,), (e,))[1] for e in jnp.eye(2)], -1)
     if derivative == "grad":
@@ -345,7 +345,7 @@ def matrix(derivative):
 
 
 def hessian_of(function):
-    """In no loop, where no rule is dropped."""
+    """Second derivatives without a loop, where no rule is dropped."""
 
     def total(w):
         return function(STARTS[0], w) + function(STARTS[1], w)
@@ -354,7 +354,7 @@ def hessian_of(function):
 
 
 def check(function, loops, pairs, rtol):
-    """Everything in one program; forward derivatives alone, and no loop, say what is right."""
+    """All in one program; the reference is forward over forward without a loop."""
     chosen = list(itertools.product(loops, pairs))
     ways = [
         matrix(outer)(matrix(inner)(eqx.Partial(AROUND[loop], function)))
@@ -374,7 +374,7 @@ def test_second_derivatives_of_values_in_loops(name):
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 def test_second_derivatives_of_motions_in_loops(lowering):
-    """And without a loop of the user's: that of the steps drops no rule either."""
+    """Also without a loop by the user: the loop over steps drops no rule either."""
     angle = end(pendulum(users, lowering), method="bosh3", dt=0.25)
 
     def alone(w):

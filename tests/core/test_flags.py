@@ -1,4 +1,4 @@
-"""JAX's switches for strict programs and for debugging: none of them meets a fault of ours."""
+"""JAX's flags for strict promotion and for debugging raise no error in jaxlag."""
 
 import contextlib
 import subprocess
@@ -87,7 +87,7 @@ PLAIN = {
     "infs": ["eager"],
     "nans": ["eager"],
 }
-LEFT_OUT = {("infs", "growth"), ("infs", "fit")}  # infinite where they mean "never", "unknown"
+LEFT_OUT = {("infs", "growth"), ("infs", "fit")}  # their results contain inf: "never", "unknown"
 
 
 def check(flag, job):
@@ -126,5 +126,5 @@ with jax.disable_jit():
 
 @pytest.mark.full
 def test_without_jit():
-    """In a process in which types are not checked: counters of loops are Python's there."""
+    """In a process without type checks: without jit, loop counters are Python integers."""
     subprocess.run([sys.executable, "-c", WITHOUT_JIT], check=True)

@@ -1,4 +1,4 @@
-"""What was pickled when all modules lay in one folder is refused, with what to do."""
+"""Pickles of the former layout, with all modules in one folder, are refused with advice."""
 
 import pickle
 import sys

@@ -1,4 +1,4 @@
-"""Least squares in a box, against scipy's."""
+"""Least squares with bounds, compared with scipy."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ SOLVE = jax.jit(box_least_squares)
 
 
 def problem(seed, p=6):
-    """Limits on some sides, of a problem whose free minimum lies beyond many of them."""
+    """Bounds on some sides of a problem whose free minimum lies beyond many of them."""
     rng = np.random.default_rng(seed)
     R, c = np.linalg.qr(rng.normal(size=(2 * p, p)))[1], 3.0 * rng.normal(size=p)
     low = np.where(rng.random(p) < 0.3, -np.inf, rng.uniform(-1.0, 0.0, p))
@@ -39,7 +39,7 @@ def test_without_limits_it_is_the_triangular_solve():
 
 
 def test_one_beyond_its_limit_does_not_hold_another():
-    """The free minimum is beyond both limits, that in the box at one of them alone."""
+    """The free minimum is beyond both bounds, the bounded one is on one of them only."""
     R = np.linalg.cholesky([[1.0, -0.9], [-0.9, 1.0]]).T
     z = SOLVE(R, R @ np.array([-1.0, -0.1]), np.zeros(2), np.full(2, np.inf))
     # (z + (1, 0.1)) R^T R (z + (1, 0.1)) at z = (0, x) is least at x = 0.9 - 0.1.

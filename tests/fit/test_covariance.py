@@ -1,4 +1,4 @@
-"""Null directions in the params' names, from factors whose null space is known."""
+"""Null directions in terms of params, from factors with a known null space."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from jaxlag._fit._covariance import Spectrum, combination, saturated
 
 
 def spectrum(names, values, *known):
-    """Of measurements of products of powers, each 1e3 times as precise as 1."""
+    """Of measurements of products of powers, each with an accuracy of 1e-3."""
     values = np.asarray(values, float)
     rows = 1e3 * np.asarray(known, float) / values
     factor = np.zeros((len(values), len(values)))
@@ -43,7 +43,7 @@ def test_combinations_in_words():
 
 
 def test_numbers_whose_unknowns_have_run_off_are_on_a_bound():
-    """b moves no longer; c moves little, but what it moves was measured."""
+    """b no longer moves; c moves little, but its effect was measured."""
     by_z, factor = np.diag([1.0, 1e-9, 1e-5]), np.diag([50.0, 1e-6, 3.0])
     assert saturated(factor, by_z, np.eye(3)).tolist() == [False, True, False]
 
@@ -53,8 +53,10 @@ def test_a_number_that_nothing_depends_on_is_on_no_bound():
 
 
 def test_all_of_a_matrix_is_on_the_bound_that_one_of_its_unknowns_is_on():
-    """C C^T, C = ((e^u0, 0), (u2, e^u1)): its numbers (0, 0), (1, 0), (1, 1) by u at u0 = -30, and
-    a fourth number that is another leaf's."""
+    """C C^T with C = ((e^u0, 0), (u2, e^u1)) at u0 = -30: its entries (0, 0), (1, 0), (1, 1).
+
+    A fourth parameter belongs to another leaf.
+    """
     a, b, c = np.exp(-30.0), 1.0, 0.5
     by_z = np.zeros((4, 4))
     by_z[:3, :3] = [[2 * a * a, 0.0, 0.0], [a * c, 0.0, a], [0.0, 2 * b * b, 2 * c]]

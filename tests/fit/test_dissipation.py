@@ -1,4 +1,4 @@
-"""Friction that a fit finds to give energy is named."""
+"""Fitted friction that adds energy is named."""
 
 import warnings
 
@@ -13,7 +13,7 @@ NOISE = 1e-3 * np.random.default_rng(0).normal(size=61)
 
 
 def fitted(force, growth, c0=0.1):
-    """A swing that grows as exp(growth t), fitted with a force that depends on c."""
+    """An oscillation that grows as exp(growth t), fitted with a force that depends on c."""
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 2 * q[0] ** 2, ("x",), forces=(force,))
     x = 0.3 * np.exp(growth * TS) * np.cos(2 * TS) + NOISE
     with warnings.catch_warnings(record=True) as told:
@@ -43,7 +43,7 @@ def test_friction_and_what_is_meant_to_drive_are_not():
 
 
 def test_friction_that_may_be_none_and_forces_without_power_are_not():
-    """Zero within two standard deviations; across the velocity, whose power is rounding."""
+    """Zero within two standard deviations; normal to the velocity, with a power of rounding."""
     still, texts = fitted(DRAG, 0.0)
     assert abs(still.params["c"]) < 2 * still.std["c"]
     assert still.feeding == {}

@@ -1,4 +1,4 @@
-"""What noise leaves of a fit: its estimate, degrees of freedom, outliers, intervals."""
+"""Noise in fits: its estimate, degrees of freedom, outliers, intervals."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_outliers_count_for_less(loss):
 @pytest.mark.full
 @pytest.mark.parametrize("noise", [1e-4, 1e-7])
 def test_segments_are_one_motion_however_precise_measurements_are(noise):
-    """A spring; to a hundredth of the standard deviation."""
+    """A spring; agreement to a hundredth of the standard deviation."""
     spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
     ts = np.linspace(0.0, 10.0, 101)
     x = 0.3 * np.cos(2.0 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
@@ -37,7 +37,7 @@ def test_segments_are_one_motion_however_precise_measurements_are(noise):
 
 @pytest.mark.full
 def test_a_number_that_is_zero_is_known_as_well_as_any():
-    """An offset whose truth is 0: its relative changes move nothing, it does."""
+    """An offset with true value 0: relative changes of it have no effect, absolute ones have."""
     spring = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * (q[0] - p["x0"]) ** 2, ("x",)
     )
@@ -52,7 +52,7 @@ def test_a_number_that_is_zero_is_known_as_well_as_any():
     noise = 1e-4
     x = 0.3 * np.cos(2 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
     found = jl.fit(spring, jl.Experiment(ts, {"x": x}), start, **options)
-    # Of the mean of independent measurements: k and the start swing, and share little of it.
+    # As for the mean of independent measurements: k and the start oscillate, with little overlap.
     np.testing.assert_allclose(found.std["x0"], noise / np.sqrt(len(ts)), rtol=0.1)
     assert abs(found.params["x0"]) < 3.5 * found.std["x0"]
 
@@ -94,12 +94,12 @@ def test_starts_on_a_rod_are_two_numbers_each():
         data.append(jl.Experiment(ts, {"r": r + 5e-3 * rng.normal(size=r.shape)}))
     found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), simulate_options=tight(1e-7))
     np.testing.assert_allclose(found.freedom, 80 - 21, atol=1e-4)
-    # 59 numbers tell it to 9 %.
+    # 59 numbers determine it to 9 %.
     np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
 
 
 def test_a_prior_takes_part_of_what_it_tells():
-    """One that is as good as exact leaves nothing to be told."""
+    """A nearly exact prior leaves nothing to estimate."""
     data = experiment(sigma={"x": NOISE})
     free, known = (fit(data, ("l",), priors={"l": jl.Prior(0.7, s)}) for s in (1e3, 1e-9))
     np.testing.assert_allclose(free.freedom, 151 - 3, atol=1e-3)

@@ -1,4 +1,4 @@
-"""fit-pendulum: what it finds is true, its errors are honest, bad input is named."""
+"""fit-pendulum: estimates are right, their errors are realistic, invalid input is named."""
 
 import gzip
 import os
@@ -50,7 +50,7 @@ def test_accelerations_are_the_equation_of_motion():
 
 @pytest.mark.parametrize(("truth", "torque"), [(FREE, False), (DRIVEN, True)])
 def test_regression_tells_where_to_begin(truth, torque):
-    # Noise is in q'' alone. Measured: within 0.5 %, of J and u0 within 4 % and 0.05 N m.
+    # Only q'' has noise. Measured: within 0.5 %; J and u0 within 4 % and 0.05 N m.
     found = guess(list(synthetic(truth, torque, NOISE, seed=4).segments.values()))
     assert found["mgl"] == pytest.approx(truth["mgl"], rel=0.1)
     assert found["J"] == pytest.approx(truth["J"], rel=0.1)
@@ -73,7 +73,7 @@ def test_free_swing_finds_the_truth_and_its_friction(model, friction):
         assert abs(trial.fit.params[name] - truth[name]) < 4 * trial.fit.std[name], name
     for name in "cfk":
         assert name in pendulum.MODELS[model] or abs(trial.fit.params[name]) < 1e-8, name
-    # Only noise is left. 1000 test samples: its rms is known to 2 %, less what starts take.
+    # Only noise remains. 1000 test samples: its rms is known to 2 %, less the part of the starts.
     assert mrad(trial.fit) == pytest.approx(1e3 * NOISE, rel=0.05)
     assert mrad(trial.test) == pytest.approx(1e3 * NOISE, rel=0.08)
     assert mrad(trial.ahead) > mrad(trial.test)
@@ -95,8 +95,8 @@ def test_driven_pendulum_finds_its_inertia():
 
 @pytest.mark.full
 def test_standard_errors_are_honest():
-    # Deviations over standard errors, squared: mean 1 if these are right. 60 recordings of 4
-    # parameters: the mean scatters by about 0.1.
+    # The squares of deviations over standard errors have mean 1 if the errors are right. For 60
+    # recordings of 4 parameters the mean scatters by about 0.1.
     truth = dict.fromkeys(NAMES, 0.0) | FREE | {"f": 0.2}
     clean = [w for each in cut(synthetic(truth, False, 0.0), 1.0).values() for w in each]
     noise = np.random.default_rng(3)
@@ -264,7 +264,7 @@ def test_without_a_file_it_fits_a_synthetic_pendulum(tmp_path, monkeypatch, caps
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split("  ")[0]: line.split() for line in lines}
     assert rows["truth"][1:] == ["60", "0.05", "0.2", "0", "0.01"]
-    # mgl/J, c/J, f/J, zero of the model that is true, within 4 of the errors printed beneath.
+    # mgl/J, c/J, f/J, zero of the true model, within 4 of the errors in the next line.
     estimates = np.array(rows["+ Coulomb"][2:6], float)
     errors = np.array(lines[lines.index(next(x for x in lines if "+ Coulomb  " in x)) + 1].split())
     assert np.all(np.abs(estimates - [60, 0.05, 0.2, 0.01]) < 4 * errors[1:5].astype(float))
@@ -286,7 +286,7 @@ def test_without_matplotlib_the_figure_is_left_out(tmp_path, monkeypatch, capsys
     assert "--plot must be left out without matplotlib" in capsys.readouterr().err
 
 
-# Measured pendulums, where the recordings are at hand.
+# Measured pendulums, if the recordings are available.
 
 
 @pytest.mark.full

@@ -1,4 +1,4 @@
-"""Where a search for states begins: what was measured, and what was said of it."""
+"""Initial guesses of states, by measurements and given starts."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +22,7 @@ def states(data, rows=(0, 40), system=turned, params=None):
 
 
 def test_values_and_slopes_of_what_was_measured():
-    """Parabolas of 5 rows: slopes to h^2 of the third derivative, 4e-4."""
+    """Parabolas of 5 samples: slopes to h^2 times the third derivative, 4e-4."""
     found = states(jl.Experiment(TS, {"q": MOVED}))
     rates = np.outer(-np.sin(TS), [0.3, 0.1]) + np.outer(np.cos(TS), [0.2, -0.4])
     np.testing.assert_allclose(found[:, :2], MOVED[[0, 40]], atol=1e-5)
@@ -30,7 +30,7 @@ def test_values_and_slopes_of_what_was_measured():
 
 
 def test_v0_is_that_of_the_quasi_velocities():
-    """One row of them where it is given, all of them where there are as many as times."""
+    """The first state for one vector, all states for one vector per time."""
     found = states(jl.Experiment(TS, {"q": MOVED}, v0=[1.0, 2.0]))
     np.testing.assert_array_equal(found[0, 2:], [1.0, 2.0])
     assert np.all(np.abs(found[1, 2:]) < 0.6)

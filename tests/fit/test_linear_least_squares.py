@@ -1,4 +1,4 @@
-"""Elimination of states, against dense least squares."""
+"""Elimination of states, compared with dense least squares."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +47,7 @@ def problem(chained):
 
 
 def close(found, matrix, right):
-    """Whether these are the least squares of a dense problem, to the rounding of its condition."""
+    """These are the least-squares solution of a dense problem, to rounding times its condition."""
     expected = np.linalg.lstsq(matrix, np.append(right, np.zeros(len(matrix) - len(right))))[0]
     bound = 10 * EPS * np.linalg.cond(matrix) * np.linalg.norm(expected)
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)

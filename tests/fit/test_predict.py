@@ -1,4 +1,4 @@
-"""Predictions of recordings that were not fitted, from starts that were."""
+"""Predictions of recordings that were not fitted, from fitted starts."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +13,10 @@ def predict(data, params=TRUE, **options):
 
 
 def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
-    """Starts fitted to the first half second of two recordings of unequal length."""
+    """Starts are fitted to the first half second of two recordings of unequal length."""
     short = jl.Experiment(TS[:100], {"x": angles(TS[:100], seed=1)}, name="short")
     found = predict((experiment(), short), settle=0.5)
-    # 26 samples tell the start to about NOISE/2, which the motion keeps.
+    # 26 samples determine the start to about NOISE/2, which the motion preserves.
     assert 0.8 * NOISE < found.rms("x")[0] < 1.6 * NOISE
     np.testing.assert_allclose(found.starts[0], [1.0, 0.0], atol=8e-3)
     assert [rows.sum() for rows in found.predicted] == [151 - 26, 100 - 26]
@@ -31,7 +31,7 @@ def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
 
 @pytest.mark.full
 def test_a_start_fitted_to_all_rows():
-    """It is that of least squares: as small as any of the starts nearby."""
+    """It is the start of least squares: no start nearby has a smaller error."""
     found = predict(experiment())
     assert found.predicted[0].all()
 
@@ -67,7 +67,7 @@ def test_a_search_that_did_not_converge_is_said():
 
 @pytest.mark.full
 def test_a_motion_that_fails_is_said():
-    """A stop of the clock at x = 1.2, which one of the two passes."""
+    """A force that is NaN beyond x = 1.2, which one of the two motions passes."""
 
     def stop(t, q, v, p):
         return jnp.where(jnp.abs(q) > 1.2, jnp.nan, 0.0) * v

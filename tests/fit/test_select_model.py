@@ -1,4 +1,4 @@
-"""Candidate forces ranked by what they predict."""
+"""Candidate forces ranked by their predictions."""
 
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ def test_the_term_that_acts_ranks_first():
 
 @pytest.mark.full
 def test_combinations_and_what_is_useless():
-    """Both terms predict no better than the one that acts, within the noise."""
+    """Both terms predict no better than the active one, within the noise."""
     found = compare({"cubic": cubic, "viscous": viscous}, most=2)
     both = found["cubic + viscous"]
     assert len(found.models) == 4
@@ -67,7 +67,7 @@ def test_combinations_and_what_is_useless():
 
 @pytest.mark.full
 def test_candidates_that_never_meet_may_share_params():
-    """The second begins at the estimates of the first, and ends where it does from elsewhere."""
+    """The second search starts at the estimates of the first, and ends as from elsewhere."""
     both = jl.Candidate(*viscous.forces, *cubic.forces, params0=viscous.params0 | cubic.params0)
     found = compare({"viscous": viscous, "viscous, cubic": both})["viscous, cubic"].fit
     alone = compare({"viscous, cubic": both})["viscous, cubic"].fit
@@ -77,7 +77,7 @@ def test_candidates_that_never_meet_may_share_params():
 
 
 def test_where_the_search_of_a_model_begins():
-    """At the estimates of the best that shares most of its params; not on a bound."""
+    """At the estimates of the best model that shares most of its params; not on a bound."""
 
     def ranked(error, params, on_bound=(), converged=True, fitted=None):
         data = jl.Experiment([0.0, 1.0], {"x": [0.0, 2.0]})  # ranges over 1
@@ -104,10 +104,10 @@ def test_where_the_search_of_a_model_begins():
     assert start() == start(none) == start(none, bad, far) == {}
     assert start(none, bad, worse, far, better) == {"l": 3.0, "c": 4.0}
     assert start(none, bound) == {"l": 7.0}
-    # What was held out has no say.
+    # Held-out data have no effect.
     fits = ranked(9.0, {"l": 6.5, "c": 6.6}, fitted=1.0)
     assert start(better, fits) == {"l": 6.5, "c": 6.6}
-    # Neither do params of another form, or that a transform does not allow.
+    # Nor have params of another form, or those that a transform excludes.
     other = ranked(1.0, {"l": 3.0, "c": 4.0, "k": np.ones(3)})
     assert start(other) == {"l": 3.0, "c": 4.0}
     bounds = {"c": jl.transforms.Bounded(0.0, 2.0), "l": jl.transforms.Positive()}

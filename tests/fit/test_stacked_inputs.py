@@ -1,4 +1,4 @@
-"""Inputs of experiments as those of one batch: each row is the signal of its own experiment."""
+"""Inputs of experiments in one batch: each lane is the signal of its experiment."""
 
 import equinox as eqx
 import jax

@@ -31,7 +31,7 @@ def test_the_start_gives_the_value_back(name):
     assert len(u) == len(transform.entries(value.shape))
     found = transform.value(jnp.asarray(u), value.shape)
     np.testing.assert_allclose(found, value, rtol=0, atol=1e-14 * np.max(np.abs(value)))
-    # As many independent directions as there are numbers.
+    # As many independent directions as variables.
     by_u = jax.jacfwd(lambda u: jnp.ravel(transform.value(u, value.shape)))(jnp.asarray(u))
     assert np.linalg.matrix_rank(by_u) == len(u)
 

@@ -1,4 +1,4 @@
-"""Derivatives of rows that a motion does not reach are NaN; what masks them keeps its own."""
+"""Derivatives of saves that a motion does not reach are NaN; a loss may mask them."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import pytest
 import jaxlag as jl
 from jaxlag._gradient._unreached_saves import unreached
 
-# V = p/x: repelled for p > 0, drawn into the center for p < 0, which no motion survives.
+# V = p/x: repulsion for p > 0; for p < 0 attraction into the center, where motions fail.
 central = jl.System(lambda t, q, v, p: 0.5 * v @ v - p / q[0], ("x",))
 TS = jnp.array([0.0, 0.1, 2.0])
 P = 3.0
@@ -28,7 +28,7 @@ def energy(p):
 
 
 def masked(p):
-    """Of one motion that arrives, and one that does not."""
+    """Of one motion that reaches the end, and one that does not."""
     found, ok = jax.vmap(rows)(jnp.stack([p, -p]))
     return jnp.sum(jnp.where(ok, found[:, -1], 0.0))
 

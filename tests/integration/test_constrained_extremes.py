@@ -1,4 +1,4 @@
-"""Constraints where numbers are extreme: far away, unequal masses, singular states, no inertia."""
+"""Extreme constraints: far from the origin, unequal masses, singular states, no inertia."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def free(t, q, v, params):
 
 
 def parting(t, q, params):
-    """Two rows that are one at y = 0 and part where y grows."""
+    """Two rows that are equal at y = 0 and differ as y grows."""
     return jnp.stack([q[0], q[0] + q[1] ** 3])
 
 
@@ -46,7 +46,7 @@ def test_rows_that_part_are_told(stabilization):
 
 @pytest.mark.parametrize("gap", mostly_full([1e-6, 1e-9, 1e-11, 1e-13], 1e-9, 1e-13))
 def test_a_small_contradiction_is_one(gap):
-    """Two lengths of one rod; what is below rounding is none."""
+    """Two lengths of one rod; differences below rounding do not count."""
     rods = (jl.Holonomic(rod, "rod"), jl.Holonomic(lambda t, q, p: rod(t, q, p) - p, "other"))
     system = jl.System(pendulum, ("x", "y"), constraints=rods)
     motion = jl.simulate(
@@ -59,7 +59,7 @@ def test_a_small_contradiction_is_one(gap):
         assert "('other')" in motion.message()
 
 
-# ---- Time backwards ------------------------------------------------------------------------------
+# ---- Backward in time ----------------------------------------------------------------------------
 
 
 def pendulum(t, q, v, params):
@@ -73,7 +73,7 @@ def rod(t, q, params):
 @pytest.mark.full
 @pytest.mark.parametrize("traced", [False, True])
 def test_baumgarte_damps_backwards(traced):
-    """There and back: alpha has the sense of time."""
+    """Forward and backward: alpha has the direction of time."""
     system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
 
     def end(ts):
@@ -130,7 +130,7 @@ def hanging(t, q, params):
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
 def test_masses_may_be_as_unequal_as_they_like(formulation):
-    """Against one coordinate, params traced: M = 1e12 m."""
+    """Compared with one coordinate; params traced: M = 1e12 m."""
     system = jl.System(cart, ("X", "x", "y"), constraints=(jl.Holonomic(hanging, "rod"),))
     angle, heavy, light = 1.0, 1e11, 0.1
     start = [0.0, sin(angle), -cos(angle)], [0.0, 0.0, 0.0]
@@ -157,7 +157,7 @@ def almost(t, q, angle):
 
 @pytest.mark.parametrize("angle", [1e-2, 2e-4, 5e-5])
 def test_almost_dependent_rows_have_their_reactions(angle):
-    """Both hold x and y; digits are lost as sin(angle)^2 says."""
+    """Both rows hold x and y; sin(angle)^2 gives the lost digits."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - G * q[1] + q[0] - 3.0 * q[2],
         ("x", "y", "z"),
@@ -192,7 +192,7 @@ def test_a_start_where_a_coordinate_has_no_inertia(traced):
 
 
 def test_whether_a_coordinate_has_inertia_is_asked_of_traced_states_too():
-    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the center as well."""
+    """A slot that rotates at rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, also from the center."""
     turn = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
     system = jl.System(
         lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2),
@@ -227,7 +227,7 @@ def geared():
 
 @pytest.mark.parametrize("formulation", mostly_full(["multipliers", "null_space"], "multipliers"))
 def test_wheels_without_inertia(formulation):
-    """Held by a row of velocities beside one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
+    """Held by one row of velocities and one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
     motion = jl.simulate(
         geared(),
         [0.3, 0.0, 0.0],
@@ -248,7 +248,7 @@ def test_a_guess_for_wheels_without_inertia():
 
 
 def test_all_of_a_heavy_state_may_be_held():
-    """Nothing is left to move, and nothing needs to."""
+    """Nothing is free to move, and nothing needs to move."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * p * v @ v, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),)
     )
@@ -257,7 +257,7 @@ def test_all_of_a_heavy_state_may_be_held():
     np.testing.assert_array_equal(state.q, [0.6, -0.8])
 
 
-# ---- Loops that lie flat, where a row is sin(pi) -----------------------------------------------
+# ---- Flat loops, where a row is sin(pi) --------------------------------------------------------
 
 
 PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
@@ -265,7 +265,7 @@ PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
 
 @pytest.mark.parametrize("crank", [0.0, np.pi])
 def test_what_rounding_leaves_of_a_row_is_no_row(crank):
-    """Of the pin only y holds; forces along x are not found in 1e-16 of a row."""
+    """Only y of the pin holds; no forces along x are computed from a row of 1e-16."""
     params, q, v = PARALLELOGRAM, [crank, 0.0, crank + np.pi], [0.3, 0.2, -0.7]
     found = jl.assemble(four_bar, q, v, params)
     assert int(found.rank) == 1
@@ -280,20 +280,20 @@ def test_what_rounding_leaves_of_a_row_is_no_row(crank):
 
 
 def test_no_acceleration_satisfies_rows_that_contradict():
-    """Turning through the flat place the links would have to leave the pin."""
+    """To rotate through the flat configuration the links would have to leave the pin."""
     a = four_bar.acceleration([0.0, 0.0, np.pi], [1.0, -0.5, 0.0], PARALLELOGRAM)
     assert np.all(np.isnan(a))
 
 
 def once_more(t, q, v, params):
-    """A row twice, once by a factor that turns with x."""
+    """One row twice, once times a factor that depends on x."""
     row = 0.7 * v[1] + 0.3 * params
     return jnp.stack([(1.5 + jnp.sin(q[0])) * row, row])
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dtype):
-    """The factor's rate times what rounding leaves of the row: the row itself asks for 0."""
+    """The factor's rate times the rounding of the row: the row itself requires 0."""
     system = jl.System(free, ("x", "y"), constraints=(jl.Pfaffian(once_more, "rows"),))
     params = jnp.arange(0.1, 1.2, 0.1, dtype=dtype)
     q, speed = jnp.asarray([0.3, 0.1], dtype), dtype(2.0)
@@ -307,11 +307,11 @@ def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dt
     np.testing.assert_allclose(found, np.zeros((11, 2)), atol=16 * np.finfo(dtype).eps)
 
 
-# ---- Starts that cannot be solved with -----------------------------------------------------------
+# ---- Starts that cannot be solved ----------------------------------------------------------------
 
 
 def test_a_row_that_vanishes_at_the_start_is_named():
-    """The user's state is kept, finite as it is."""
+    """The user's state is returned; it is finite."""
     system = jl.System(
         free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, params: q[0] ** 2, "flat"),)
     )
@@ -330,7 +330,7 @@ def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
 
 
 def test_a_lane_without_a_start_spoils_no_derivative():
-    """Neither one that is not a number nor one off the constraint, in what all lanes share."""
+    """Neither a NaN lane nor one off the constraint affects derivatives by shared params."""
     system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
 
     def height(angle, length, g):

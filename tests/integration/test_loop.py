@@ -1,4 +1,4 @@
-"""The loop: order, rows as accurate as steps, landing on knots, fixed grids, lanes, direction."""
+"""The loop: order, accuracy of saves, steps that end on knots, fixed grids, lanes, direction."""
 
 import itertools
 
@@ -16,7 +16,7 @@ PENDULUM = MOTIONS["double_pendulum"]
 
 @pytest.fixture(scope="module")
 def reference(lowering):
-    """The double pendulum over 4 s, at rtol = atol = 1e-13, on 501 rows."""
+    """The double pendulum over 4 s, at rtol = atol = 1e-13, with 501 saves."""
     return run(np.linspace(0.0, 4.0, 501), rtol=1e-13, atol=1e-13)
 
 
@@ -34,10 +34,10 @@ def error(motion, reference):
     ("method", "order", "h"), [("midpoint", 2, 2e-3), ("bosh3", 3, 1e-2), ("tsit5", 5, 5e-2)]
 )
 def test_order_by_slope(method, order, h):
-    """Error at t = 12 of a central motion over two halvings of a fixed step.
+    """Error at t = 12 of a central motion for a fixed step that is halved twice.
 
-    Order 8 has no such window in float64: its leading coefficient is so small that the error is
-    round-off (1e-14) before it stops falling like h^9.
+    Order 8 has no such range in float64: its leading coefficient is so small that the error is
+    rounding (1e-14) before it stops falling like h^9.
     """
     motion, ts = MOTIONS["central_motion"], np.array([0.0, 12.0])
 
@@ -59,9 +59,9 @@ def test_order_by_slope(method, order, h):
     ["dopri8", "tsit5", "bosh3", "kvaerno5"],
 )
 def test_rows_are_as_accurate_as_step_ends(reference, method):
-    """501 rows: the worst error at most twice the worst at the ends of the same steps.
+    """501 saves: the largest error is at most twice the largest at the ends of the same steps.
 
-    The ends of the steps are the rows of a solve whose save times they are.
+    The ends of the steps are the saves of a solve with these save times.
     """
     tolerance = 1e-5 if method in ("bosh3", "kvaerno5") else 1e-8
     options = {"rtol": tolerance, "atol": tolerance, "method": method}
@@ -95,7 +95,8 @@ def step_ends(options):
         return _solve._recorded(problem).record
 
     kept = record(values)
-    # A turn that was not accepted ends where the last one did; a negative one at the stop.
+    # An iteration that was not accepted ends where the last one did; the stop has a negative
+    # offset.
     ends = np.asarray(kept.offsets)[: int(kept.turns)]
     return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
 
@@ -110,7 +111,7 @@ def test_rows_cost_no_steps(reference):
     assert many.stats["accepted"] == few.stats["accepted"]
     assert many.stats["rejected"] == few.stats["rejected"]
     np.testing.assert_array_equal(many.last_state[0], many.q[-1])
-    # Two programs, which round in two ways: 1.2e-14, below what the motion makes of roundings.
+    # Two programs round differently: 1.2e-14, below the growth of rounding in this motion.
     growth, steps = jl.lyapunov(many), int(many.stats["accepted"])
     floor = np.finfo(float).eps * float(growth.kappa[-1]) * np.sqrt(steps)
     np.testing.assert_allclose(many.q[-1], few.q[-1], rtol=floor)
@@ -132,7 +133,7 @@ def test_backwards_retraces_forwards(reference):
 
 
 def torque_motion(table, ts, **options):
-    """theta(t) under a torque, free otherwise: closed form for piecewise constant torque."""
+    """theta(t) under a torque alone: closed form for piecewise constant torque."""
     rotor = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2,
         ("theta",),
@@ -218,7 +219,7 @@ def test_linear_input_is_exact():
 
 
 def test_steps_end_on_knots():
-    """Nine knots inside: at least ten steps, and no rejected ones for a quadratic arc."""
+    """Eight knots inside: nine steps, none of them rejected for a quadratic arc."""
     motion = torque_motion(steps(), np.array([0.0, 1.6]), method="tsit5", dt0=1.0)
     assert motion.stats["accepted"] == 9
     assert motion.stats["rejected"] == 0
@@ -254,7 +255,7 @@ def test_float32_state_float64_time(reference):
 
 
 def test_far_from_time_zero(reference):
-    """t0 = 1e6: times resolve to 1e-10 s, which costs no more than that in the rows."""
+    """t0 = 1e6: times have a resolution of 1e-10 s; saves lose no more than that."""
     motion = run(1e6 + np.asarray(reference.ts), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(motion.q, reference.q, rtol=0, atol=1e-7)
 
@@ -281,7 +282,7 @@ def test_solver_with_memory_keeps_it_in_its_derivative():
 
 
 def test_driven_system_matches_scipy():
-    """Another integrator, another derivation: theta'' written out, knots by restarting."""
+    """Another integrator and derivation: explicit theta'', restarts at knots."""
     from scipy.integrate import solve_ivp
 
     table, params = steps(), {"J": 0.15, "mgl": 3.0, "c": 0.02, "F": 0.1}
@@ -301,7 +302,7 @@ def test_driven_system_matches_scipy():
 
 
 class Spy(diffrax.PIDController):
-    """A controller that looks at the state, and says that the field jumps after every step."""
+    """A controller that reads the state and reports a jump of the field after every step."""
 
     def adapt_step_size(self, t0, t1, y0, y1, *rest):
         assert y0.shape == y1.shape == (4,)
@@ -310,7 +311,7 @@ class Spy(diffrax.PIDController):
 
 
 class Heard(jl.solvers.Dopri8):
-    """Notes what it is told of jumps."""
+    """Records the jumps that are reported to it."""
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         told.append(made_jump)
@@ -322,7 +323,7 @@ told: list = []
 
 @pytest.mark.full
 def test_a_controller_of_the_user_is_given_arrays_and_heard():
-    """A variant of diffrax's control: the state as one array, its jumps passed on."""
+    """A variant of diffrax's controller gets the state as one array; its jumps are passed on."""
     method = (Heard(), Spy(rtol=1e-9, atol=1e-9))
     motion = run([0.0, 0.5, 1.0], method=method)
     assert len(told) > 0

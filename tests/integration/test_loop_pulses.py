@@ -1,4 +1,4 @@
-"""Pulses and forces that begin, end or jump between steps: met, moved with, named."""
+"""Pulses and forces that begin, end or jump between steps: resolved, differentiated, reported."""
 
 import diffrax
 import jax
@@ -30,7 +30,7 @@ def pulse(t):
 @pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize("options", [{}, {"dt": 0.4, "method": "tsit5"}], ids=["adaptive", "fixed"])
 def test_a_pulse_that_is_named_is_met(options, sense):
-    """x' = 1 after a pulse of 1 ms, to rounding: no stage reads the wrong side of its edges."""
+    """x' = 1 after a pulse of 1 ms, to rounding: no stage reads across its edges."""
     ts = np.array([0.0, 10.0])[:: int(sense)]
     motion = kicked(jl.TimeFunction(pulse, knots=[START, END]), ts, **options)
     np.testing.assert_allclose(motion.v[-1, 0], sense, rtol=1e-12)
@@ -39,7 +39,7 @@ def test_a_pulse_that_is_named_is_met(options, sense):
 
 
 def test_a_pulse_moves_with_its_knots():
-    """d x/d start of a pulse of given length: minus its impulse, whatever the steps."""
+    """d x/d start of a pulse of given length: minus its impulse, for any steps."""
 
     @jax.jit
     def end(start):
@@ -56,13 +56,13 @@ def test_a_pulse_moves_with_its_knots():
 
 
 @pytest.mark.parametrize(
-    # At 1e-7, worst of solution and derivatives: 4.3e-8 and 1.1e-7. Where f stood still beyond its
-    # knot, and time beyond its end, derivatives were wrong by 1e-4.
+    # At 1e-7, largest errors of solution and derivatives: 4.3e-8 and 1.1e-7. With f constant beyond
+    # its knot, and time constant beyond its end, derivatives were wrong by 1e-4.
     "method",
     ["kvaerno4", pytest.param("kvaerno5", marks=pytest.mark.full)],
 )
 def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
-    """x'' = sin 5t to a knot, cos 3t from it on: d v/d knot and d v/d end are forces there."""
+    """x'' = sin 5t up to a knot, cos 3t after it: d v/d knot and d v/d end are forces there."""
 
     @jax.jit
     def end(knot, stop):
@@ -93,7 +93,7 @@ def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
 
 @pytest.mark.parametrize("derivatives", [False, True])
 def test_a_row_where_the_force_is_singular_is_none(derivatives):
-    """A spike that steps pass by and the step to a row meets: nothing is made up there."""
+    """A spike that steps miss and the step to a save meets: the save is NaN."""
     spike = jl.TimeFunction(lambda t: jnp.where(jnp.abs(t - 0.5) < 1e-9, 1e6, 0.0))
     ts = np.array([0.0, 0.5, 1.0])
 
@@ -111,7 +111,7 @@ def test_a_row_where_the_force_is_singular_is_none(derivatives):
 
 
 def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
-    """Stepped over without a word of it; met by steps no longer than itself."""
+    """Skipped without a warning; resolved by steps no longer than the pulse."""
     wide = jl.TimeFunction(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
     ts = np.array([0.0, 10.0])
     assert kicked(wide, ts, dt0=5.0, method="tsit5").v[-1, 0] < 0.5
@@ -123,7 +123,7 @@ def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
 
 
 def test_a_force_that_ends_is_not_waited_for():
-    """NaN beyond x = 1 under a least step: its status is that, after a few attempts."""
+    """NaN beyond x = 1 with a least step: status nonfinite after a few attempts."""
     wall = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),

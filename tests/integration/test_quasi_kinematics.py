@@ -1,4 +1,4 @@
-"""Kinematics taller than wide, that satisfy Pfaffian rows by themselves."""
+"""Tall kinematics, which satisfy Pfaffian rows by themselves."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +34,7 @@ def test_tall_kinematics_are_a_square_choice_with_a_row_dropped():
 
 
 def test_no_heading_is_special():
-    """Turned by 90 degrees the motion is the same: a fixed pivot cos(theta) would be 0 there."""
+    """Rotated by 90 degrees the motion is the same; a fixed pivot cos(theta) would be 0 there."""
     _, square = sleighs()
     start = {"v0": None, "u0": {"v": 1.0, "omega": 0.4}, "ts": np.linspace(0, 1, 3)}
     ahead, aside = (
@@ -54,7 +54,7 @@ def offset(t, q, v, params):
 
 @pytest.mark.full
 def test_momenta_across_the_rows_are_not_lost():
-    """L with the rows put in gives other equations, the same for one special value of params."""
+    """L with the rows inserted gives other equations, except for one value of params."""
     system = jl.System(offset, ("x", "y", "theta"), quasi=TALL, constraints=(BLADE,))
     for ahead in (0.0, 0.4):
         q = np.array([0.2, -0.1, 0.3])
@@ -78,7 +78,7 @@ def along_x(t, q, u, params):
 
 
 def test_kinematics_that_break_a_row_on_the_way_are_told():
-    """At theta = 0 the x axis lies along the blade; as it turns it no longer does."""
+    """At theta = 0 the x axis is along the blade; as the sleigh rotates it no longer is."""
     astray = jl.QuasiVelocities(kinematics=along_x, names=("v", "omega"))
     system = jl.System(sleigh, ("x", "y", "theta"), quasi=astray, constraints=(BLADE,))
     with pytest.raises(SimulationError, match=r"contradictory_rows.*v_n.*kinematics.*do not"):
@@ -86,7 +86,7 @@ def test_kinematics_that_break_a_row_on_the_way_are_told():
 
 
 def test_quasi_velocities_that_leave_out_a_freedom_are_told():
-    """Two rows that say the same leave two freedoms, of which one has no quasi-velocity."""
+    """Two equivalent rows leave two freedoms, one of which has no quasi-velocity."""
 
     def twice(t, q, v, params):
         return jnp.stack([v[2], 2.0 * v[2]])

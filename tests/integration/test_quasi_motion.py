@@ -22,7 +22,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
     ids=["v", "same", "u"],
 )
 def test_equations_are_those_of_lagrange(lagrangian, written_in):
-    """a from u' and v = B u + c is a from M a + h = Q, at random states."""
+    """a from u' and v = B u + c equals a from M a + h = Q, at random states."""
     system = declared(lagrangian, written_in)
     found = jax.jit(lambda q, v, t: system._quasi_reactions(q, v, PARAMS, t=t)["a"])
     expected = jax.jit(lambda q, v, t: system.acceleration(q, v, PARAMS, t=t))
@@ -31,7 +31,7 @@ def test_equations_are_those_of_lagrange(lagrangian, written_in):
     for t, q, v in random_states():
         kappa = cond(theta(t, q)) ** 2 * cond(mass(q, v, t))
         a, right = found(q, v, t), expected(q, v, t)
-        # Measured worst 2026-11-22: 4 eps kappa (1 + |a|).
+        # Measured 2026-11-22: at most 4 eps kappa (1 + |a|).
         assert norm(a - right) <= 64 * EPS * kappa * (1.0 + norm(right))
 
 
@@ -40,7 +40,7 @@ def test_equations_are_those_of_lagrange(lagrangian, written_in):
 )
 @pytest.mark.parametrize("constrained", mostly_full([["b"], ["a", "c"]], ["b"]))
 def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
-    """a and lam of the quasi-velocity and of the multiplier equations, on the constraints."""
+    """a and lam of the quasi-velocity equations equal those of the multiplier equations."""
     written_in = "v" if lagrangian is in_v else "u"
     system = declared(lagrangian, written_in, tuple(constrained))
     bound = [NAMES.index(name) for name in constrained]
@@ -51,7 +51,7 @@ def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
         found = system._quasi_reactions(q, v, PARAMS, t=t)
         a, lam = system.acceleration(q, v, PARAMS, t=t), system.multipliers(q, v, PARAMS, t=t)
         scale = 1.0 + norm(a) + max(abs(x) for x in lam.values())
-        # Measured worst 2026-11-22: 2e-14 of the scale.
+        # Measured 2026-11-22: at most 2e-14 of the scale.
         assert norm(found["a"] - a) <= 1e-12 * scale
         assert set(found["multipliers"]) == set(lam) == set(constrained)
         for name, value in lam.items():
@@ -77,7 +77,7 @@ def test_one_motion_by_both_formulations(lagrangian, backwards):
     np.testing.assert_allclose(one.lam["b"], other.lam["b"], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(one.a, other.a, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(one["b"], one.u[:, 1])
-    # The row holds to rounding by itself.
+    # The row holds to rounding without projection.
     assert np.max(np.abs(one["b"])) <= 64 * EPS
 
 
@@ -85,14 +85,14 @@ def test_one_motion_by_both_formulations(lagrangian, backwards):
 
 
 def blown(t, q, v, params):
-    """A blade on ice that drifts and shakes: speeds along and across, with time, and the turn."""
+    """A blade on drifting, oscillating ice: speeds along and across, with time, and rotation."""
     c, s = jnp.cos(q[2]), jnp.sin(q[2])
     along = c * v[0] + s * v[1] + 0.2 * t
     return jnp.stack([along, -s * v[0] + c * v[1] - params["w"] * jnp.sin(t), v[2]])
 
 
 def sprung(t, q, v, params):
-    """A sleigh on springs, its mass center ahead of the blade."""
+    """A sleigh on springs; its mass center is ahead of the blade."""
     m, J, a = params["m"]
     x, y = v[0] - a * jnp.sin(q[2]) * v[2], v[1] + a * jnp.cos(q[2]) * v[2]
     return 0.5 * m * (x * x + y * y) + 0.5 * J * v[2] ** 2 - 0.5 * (1.0 + 0.1 * t) * (q @ q)
@@ -150,7 +150,7 @@ X = {
 
 @pytest.mark.full
 def test_derivatives_forward_reverse_and_by_differences():
-    """Fixed steps make the map smooth: central differences of it, and of the multiplier form."""
+    """Fixed steps make the map smooth, so that central differences apply."""
     system = on_springs()
     end = end_of(system, dt=0.05)
     rng = np.random.default_rng(0)
@@ -244,7 +244,7 @@ def test_save_equals_on_demand_and_the_books_close():
 
 @pytest.mark.full
 def test_a_lagrangian_with_a_loop():
-    """What has no scalar form runs on arrays, and gives the same."""
+    """An L without scalar form uses arrays, and gives the same motion."""
 
     def looped(t, q, v, params):
         def add(k, total):

@@ -1,4 +1,4 @@
-"""Motions that come to places where their quasi-velocities are singular."""
+"""Motions that reach a singularity of their quasi-velocities."""
 
 from functools import partial
 
@@ -32,7 +32,7 @@ def drag(t, q, v, params):
 
 
 def weighted(U=cosine, lagrangian=free, **options):
-    """By default y runs freely past 90 degrees, where the first quasi-velocity vanishes."""
+    """By default y moves freely past 90 degrees, where the first quasi-velocity vanishes."""
     quasi = jl.QuasiVelocities(U, ("a", "b"))
     forces = (jl.Rayleigh(drag, "drag"),)
     return jl.System(lagrangian, ("x", "y"), quasi=quasi, forces=forces, **options)
@@ -47,7 +47,7 @@ def dragged(q0, v0, t):
 
 
 def singular_at(y0, vy):
-    """When y gets to 90 degrees."""
+    """Time at which y reaches 90 degrees."""
     return -np.log(1 - (np.pi / 2 - y0) * DRAG / vy) / DRAG
 
 
@@ -60,7 +60,7 @@ def accepted(determinant, count=20_000):
 
 
 def test_no_zero_within_a_step_is_missed():
-    """Crossed once, twice, touched, and as poles; whatever else the determinant does besides."""
+    """Crossed once, twice, touched, and as poles, for any growth of the determinant."""
     rng = np.random.default_rng(0)
     s, r = rng.uniform(0, 1, (2, 20_000))
     grows, fast = rng.uniform(-1, 1, 20_000), rng.uniform(0.1, 1.5, 20_000)
@@ -76,7 +76,7 @@ def test_no_zero_within_a_step_is_missed():
 
 
 def test_what_stays_clear_is_left_alone():
-    """Zeros a quarter of a step away along the motion, 0.6 beside it; growth by a factor of 7."""
+    """Zeros a quarter step away in time, or 0.6 off the real axis; growth by a factor of 7."""
     rng = np.random.default_rng(1)
     s = rng.uniform(0, 1, 20_000)
     for sound in (
@@ -94,7 +94,7 @@ def test_what_stays_clear_is_left_alone():
 
 
 def test_a_motion_ends_just_before_a_singular_place():
-    """In lanes, which know nothing of multipliers: where it stays clear it is left alone."""
+    """In lanes, which cannot continue with multipliers; other lanes are unaffected."""
 
     @jax.jit
     @jax.vmap
@@ -105,7 +105,7 @@ def test_a_motion_ends_just_before_a_singular_place():
 
     y0 = np.array([0.1, -0.5, 0.1, 0.1])
     at = singular_at(y0, V0[1])
-    ends = np.array([3.0, 3.0, at[2] - 1e-3, -1.0])  # the last one runs backwards
+    ends = np.array([3.0, 3.0, at[2] - 1e-3, -1.0])  # the last one goes backward in time
     ts = np.stack([0 * ends, 0.3 * ends, ends], axis=1)
     status, where, time, (q, v), rows = solve(y0, ts)
     assert status.tolist() == [SINGULAR, SINGULAR, 0, 0]
@@ -119,7 +119,7 @@ def test_a_motion_ends_just_before_a_singular_place():
 
 
 def test_auto_goes_on_with_multipliers_and_says_so():
-    """From u0 as well, what is saved being quasi-velocities; named quasi-velocities fail."""
+    """Also from u0 and with saved quasi-velocities; formulation="quasi" fails instead."""
     ts, steps = np.array([0.0, 1.0, 3.0]), {"method": "dopri5", "dt": 0.05}
     at = singular_at(Q0[1], V0[1])
     u0 = {"a": np.cos(Q0[1]) * V0[0], "b": V0[1]}
@@ -141,7 +141,7 @@ def squared(t, q, v, params):
 
 
 def mixed(t, q, v, params):
-    """Rows that come to lie in line at y = 90 degrees."""
+    """Rows that become parallel at y = 90 degrees."""
     return jnp.stack([v[0] + v[1], jnp.sin(q[1]) * v[0] + v[1]])
 
 
@@ -154,7 +154,7 @@ def given(t, q, u, params):
 
 
 def vanishing(t, q, u, params):
-    """Here v follows from u, and u not from v."""
+    """Here v follows from u, but u not from v."""
     return jnp.stack([u[0] * jnp.cos(q[1]), u[1]])
 
 
@@ -192,12 +192,12 @@ WAYS = (
 @pytest.mark.parametrize("kind", SYSTEMS)
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: way.get("method", "default"))
 def test_no_motion_crosses_without_a_word(kind, way):
-    """From random starts, forwards; rows before are those of the free motion."""
+    """From random starts, forward; saves before are those of the free motion."""
     rng = np.random.default_rng(2)
     y0, vy = rng.uniform(-1, 1, 50), rng.uniform(0.9, 2, 50)
     start = np.stack([0 * y0, y0], axis=1), np.stack([rng.uniform(0.5, 2, 50), vy], axis=1)
     at = np.full(50, 1.4) if kind == "by time" else singular_at(y0, vy)
-    part = rng.uniform(0.3, 2.0, 50)  # of the way to the singular place
+    part = rng.uniform(0.3, 2.0, 50)  # of the time to the singularity
     part = np.where(np.abs(part - 1) < 0.2, 1.3, part)
     ts = np.stack([0 * at, part * at], axis=1)
 
@@ -209,8 +209,8 @@ def test_no_motion_crosses_without_a_word(kind, way):
 
     ok, status, q = solve(*start, ts)
     np.testing.assert_array_equal(ok, part < 1)
-    # Where u grows beyond all numbers, or implicit equations are hard to solve beside a zero of
-    # second order, steps shrink first.
+    # If u grows without bound, or if implicit equations are hard to solve near a zero of second
+    # order, steps shrink first.
     hard = "vanish" in kind or (kind, way.get("method")) == ("in line", "kvaerno5")
     shrunk = {int(Status.step_below_resolution), int(Status.max_steps)} if hard else {}
     assert set(np.asarray(status)[part > 1].tolist()) <= {SINGULAR, *shrunk}
@@ -220,7 +220,7 @@ def test_no_motion_crosses_without_a_word(kind, way):
 
 
 def skew(t, q, v, params):
-    """Nearly dependent everywhere, and as much as that at all times."""
+    """Nearly dependent everywhere, and equally so at all times."""
     return jnp.stack([v[0] + 1e-5 * (2.0 + jnp.sin(q[1])) * v[1], v[0]])
 
 
@@ -234,7 +234,7 @@ def test_nearly_dependent_quasi_velocities_are_no_fault():
 
 @pytest.mark.full
 def test_a_place_is_passed_nearby():
-    """y swings to within 1e-3 of 90 degrees: every motion is right, and none refused."""
+    """y oscillates to within 1e-3 of 90 degrees: every motion is right, and none is refused."""
 
     def spring(t, q, v, params):
         return 0.5 * (v @ v) - 0.5 * q[1] ** 2
@@ -251,7 +251,7 @@ def test_a_place_is_passed_nearby():
     status, q = solve(y0)
     assert not np.any(status)
     np.testing.assert_allclose(q, np.stack([0 * y0 + 4.9, y0 * np.cos(7.0)], axis=1), atol=1e-6)
-    status, _ = solve(2 * np.pi - 3 * np.pi / 2 + np.logspace(-3, -0.3, 20))  # beyond, both ways
+    status, _ = solve(2 * np.pi - 3 * np.pi / 2 + np.logspace(-3, -0.3, 20))  # beyond, either way
     assert set(np.asarray(status).tolist()) == {SINGULAR}
 
 
@@ -269,7 +269,7 @@ def test_in_single_precision():
 
 @pytest.mark.full
 def test_derivatives_are_those_of_a_failed_motion():
-    """Inside transforms there is no going on: NaN at the end, derivatives of the rows before."""
+    """Under transforms there is no continuation: NaN at the end, derivatives of saves before."""
 
     def x(vx, row):
         v0 = jnp.stack([vx, V0[1]])
@@ -289,11 +289,11 @@ def test_l_in_u_keeps_its_status():
     assert motion.formulation == "quasi"
 
 
-# ---- Where nothing changes nothing is computed -------------------------------------------------
+# ---- Constant determinants ---------------------------------------------------------------------
 
 
 def turned(t, q, v, params):
-    """dU/dv turns, its determinant does not change."""
+    """dU/dv rotates; its determinant is constant."""
     c, s = jnp.cos(q[1]), jnp.sin(q[1])
     return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
 
@@ -317,10 +317,10 @@ def constant(t, q, v, params):
     ),
 )
 def test_determinants_that_never_change_are_not_computed(U, lowering, looked_at, monkeypatch):
-    """The program of the steps is the same as where nobody asks."""
+    """The program of the steps equals that without the check."""
 
     def steps():
-        system = weighted(partial(U), lowering=lowering)  # of its own, so that nothing is kept
+        system = weighted(partial(U), lowering=lowering)  # a new system, so that no cache is used
         solve = partial(jl.simulate, system, Q0, V0, [0.0, 1.0], method="tsit5")
         program = operations(lambda k: solve({"k": k}, dt=0.1).q, 0.3, turns=1)
         return [(o.name, o.shapes) for o in loop(program)]

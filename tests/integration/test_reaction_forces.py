@@ -1,4 +1,4 @@
-"""Motions under forces that depend on multipliers, against closed forms."""
+"""Motions under forces that depend on multipliers, compared with closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ def test_a_block_slides_as_coulomb_says():
 
 @pytest.mark.full
 def test_the_way_depends_on_friction_as_it_should():
-    """d way/d mu = -g cos(slope) t^2/2."""
+    """d distance/d mu = -g cos(slope) t^2/2."""
     ts = np.array([0.0, 0.5 * STOP])
 
     def height(mu):
@@ -76,16 +76,16 @@ def test_the_way_depends_on_friction_as_it_should():
 
 
 def test_a_motion_ends_where_sliding_does():
-    """Friction would push on: beyond, it is another system."""
+    """Friction would go on pushing: beyond, it is another system."""
     motion = slid(MU, np.array([0.0, 2 * STOP]), throw=False)
     assert motion.status == Status.no_reaction_solution
-    np.testing.assert_allclose(motion.last_time, STOP, rtol=1e-9)  # rejected steps close in on it
+    np.testing.assert_allclose(motion.last_time, STOP, rtol=1e-9)  # rejected steps approach it
     with pytest.raises(jl.SimulationError, match=r"(?s)plane.*contact lifts off, its sliding"):
         slid(MU, np.array([0.0, 2 * STOP]))
 
 
 def test_a_start_that_slides_not():
-    """No sense of the friction is known."""
+    """The direction of friction is unknown."""
     with pytest.raises(jl.SimulationError, match="contact lifts off, its sliding"):
         slid(MU, np.array([0.0, 0.1]), speed=0.0)
 
@@ -103,7 +103,7 @@ def nothing(t, q, v, params, lam):
 
 @pytest.mark.full
 def test_a_particle_leaves_a_cylinder():
-    """From rest near the top, where cos(angle from there) = 2/3 cos(the one at the start)."""
+    """From rest near the top, where the cosine of the angle is 2/3 of that at the start."""
     contact = jl.GeneralizedForce(nothing, "none", reaction=True, contact="cylinder")
     system = jl.System(
         particle, ("x", "y"), forces=(contact,), constraints=(jl.Holonomic(cylinder, "cylinder"),)
@@ -170,10 +170,10 @@ def test_a_sledge_tips_over():
 
 
 def test_painleve():
-    """A stick that is pushed ahead by its lower end: (1/3 + cos^2)/(sin cos) <= mu has none."""
+    """A stick pushed ahead by its lower end: no solution for mu >= (1/3 + cos^2)/(sin cos)."""
     entry = falling_stick_friction.entry
     params = dict(entry.example.params)
-    theta = np.arctan(2.0)  # where that is least, 4/3
+    theta = np.arctan(2.0)  # the minimum, 4/3
     q0 = [0.0, 0.5 * params["L"] * sin(theta), theta]
     for mu in (1.33, 1.34):
         v0, ts = [-1.0, 0.0, 0.0], [0.0, 1e-4]
@@ -183,7 +183,7 @@ def test_painleve():
         assert np.all(np.isfinite(a)) == (mu < 4 / 3)
 
 
-# ---- Rows that depend on one another ------------------------------------------------------------
+# ---- Dependent rows -----------------------------------------------------------------------------
 
 
 def doubled(t, q, params):
@@ -195,7 +195,7 @@ def rate(t, q, v, params):
 
 
 def sliding_on(rows, read, lowering="auto"):
-    """The block on contacts of these names, with friction on those that are read."""
+    """The block on these contacts, with friction on those in `read`."""
 
     def drag(t, q, v, params, lam):
         along = jnp.array([cos(SLOPE), sin(SLOPE)])
@@ -232,7 +232,7 @@ CONTACTS = {
 @pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
 @pytest.mark.parametrize("kind", mostly_full(list(CONTACTS), "both", "rate"))
 def test_a_contact_that_is_declared_twice_drags_once(kind, lowering):
-    """Whichever row the friction reads; what it reads is what is told, and the books are kept."""
+    """Whichever row friction reads: it reads the reported multipliers; work is consistent."""
     rows, read, shares = CONTACTS[kind]
     system = sliding_on(rows, read, lowering)
     ts, along = np.linspace(0.0, 0.9 * STOP, 3), np.array([cos(SLOPE), sin(SLOPE)])
@@ -254,7 +254,7 @@ def test_a_contact_that_is_declared_twice_drags_once(kind, lowering):
 @pytest.mark.full
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
 def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
-    """d way/d mu, as of one contact."""
+    """d distance/d mu, as of one contact."""
     system = sliding_on(*CONTACTS["both"][:2], lowering)
     ts, along = np.array([0.0, 0.5 * STOP]), np.array([cos(SLOPE), sin(SLOPE)])
 
@@ -267,7 +267,7 @@ def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
 
 
 def turned(t, q, params):
-    """A contact, and a row that psi takes away: sin(psi) is 0, or what rounding leaves at pi."""
+    """A contact, and a row that psi removes: sin(psi) is 0, or its rounding at pi."""
     return jnp.stack([q[1], jnp.sin(q[2]) * (q[1] + 0.5 * q[0])])
 
 
@@ -282,7 +282,7 @@ def turned_drag(t, q, v, params, lam):
     ),
 )
 def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
-    """Deceleration 0.1 g, and the derivative of its way in every start."""
+    """Deceleration 0.1 g, and the derivative of the distance by the start."""
     lock = jl.Holonomic(lambda t, q, params: q[2] - params, "lock")
     system = jl.System(
         lambda t, q, v, params: 0.5 * v @ v - G * q[1],
@@ -308,7 +308,7 @@ def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
 
 
 def test_damped_rows_are_those_that_are_solved_with():
-    """A holonomic row that a read Pfaffian one would replace is not damped: refused."""
+    """A Pfaffian row that a force reads would replace the damped holonomic row: refused."""
     system = sliding_on((PLANE, RATE), {"rate": 1.0})
     with pytest.raises(
         ValueError, match=r"^`stabilization` must be 'projection' .* and a force reads 'rate'"
@@ -319,7 +319,7 @@ def test_damped_rows_are_those_that_are_solved_with():
 
 
 def test_known_contacts_are_not_looked_at_again():
-    """Apart where values are known: then nothing is shared, in either lowering; else it may be."""
+    """Independent rows are known only from values; for traced values multipliers may be shared."""
     apart = sliding_on((PLANE, jl.Holonomic(lambda t, q, p: q[0], "wall")), {"plane": 1, "wall": 1})
     same = sliding_on((PLANE, AGAIN), {"plane": 1.0, "again": 1.0})
     given = MU, jnp.array(0.0), jnp.zeros(2), jnp.zeros(2), {}
@@ -341,7 +341,7 @@ FEET = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 def feet(t, q, params):
-    """Heights of the feet, for small angles; params: (friction, where the mass center is)."""
+    """Heights of the feet, for small angles; params: (friction, position of the mass center)."""
     arms = FEET - params[1]
     return q[2] + arms[:, 1] * q[3] - arms[:, 0] * q[4]
 
@@ -353,7 +353,7 @@ def feet_drag(t, q, v, params, lam):
 @pytest.mark.full
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
 def test_four_feet_share_as_equals(lowering):
-    """Of three alone one might have to pull; of least norm all four press."""
+    """With three of them alone one might pull; with least norm all four push."""
     force = jl.GeneralizedForce(feet_drag, "drag", reaction=True, contact="feet")
     system = jl.System(
         table,
@@ -394,7 +394,7 @@ def test_forces_that_are_not_affine_take_the_array_program():
 
 
 def test_two_sticks_do_not_excuse_one_another():
-    """Two uncoupled ones, pushed too hard each: the determinant of both is positive."""
+    """Two uncoupled sticks, each without solution: the determinant of both is positive."""
     one = falling_stick_friction.entry.system
 
     def both(t, q, v, params):

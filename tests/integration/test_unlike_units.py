@@ -1,4 +1,4 @@
-"""Coordinates in units a million times one another: what holds in like ones holds in these."""
+"""Coordinates in units of ratio 1e6: results are the same as in equal units."""
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,13 @@ def falling(t, q, v, params):
 
 
 def bending(t, q, params):
-    """The second row is the first at y = 1e-5, but asks for another acceleration there."""
+    """The second row equals the first at y = 1e-5, but requires another acceleration there."""
     r = q[0] - 1e5 * q[1]
     return jnp.stack([r, r + params * (1e5 * q[1] - 1.0) ** 2])
 
 
 def test_a_contradiction_is_told_beside_large_numbers():
-    """The accelerations that two rows ask of y are 2e-5 apart, that of z is 1000."""
+    """The accelerations of y by two rows differ by 2e-5, that of z is 1000."""
     system = jl.System(falling, ("x", "y", "z"), constraints=(jl.Holonomic(bending, "rows"),))
     state = [1.0, 1e-5, 0.0], [1.0, 1e-5, 0.0]
     assert np.all(np.isnan(system.acceleration(*state, 1.0)))
@@ -35,14 +35,14 @@ def pressed(t, q, v, params):
 
 
 def led(t, q, params):
-    """As many rows as coordinates: nothing moves, whatever the forces."""
+    """As many rows as coordinates: nothing moves, for any forces."""
     return jnp.stack(
         [q[0] - 1e-5 * q[2] + 9e3 * q[1], 0.7 * q[0] + 1e-5 * q[2], q[1] + 1e-9 * q[2]]
     )
 
 
 def test_what_rows_hold_still_has_an_acceleration():
-    """Forces of 1e4 in units of inertia leave accelerations their rounding, no contradiction."""
+    """Forces of 1e4 in units of inertia leave only rounding in accelerations."""
     system = jl.System(pressed, ("x", "y", "z"), constraints=(jl.Holonomic(led, "rows"),))
     at_rest = np.zeros(3), np.zeros(3)
     units = np.array([1.0, 1e9, 1e-9]) ** -0.5
@@ -75,7 +75,7 @@ def plainly(q, u):
     theta = np.linalg.inv(b)  # u = theta v, p = mass u
     p = mass @ u
     rate = -theta @ turning @ theta
-    # The slopes of theta v in x, at a fixed v: x alone turns B.
+    # The slopes of theta v by x, at constant v: B depends on x alone.
     bent = -theta @ np.array([[0.0, -0.3 * np.sin(q[0])], [0.0, 0.0]]) @ theta @ v
     bending = np.array([p @ bent, 0.0])
     effort = pull - rate.T @ p + bending
@@ -84,7 +84,7 @@ def plainly(q, u):
 
 
 def test_kinematics_of_unlike_units():
-    """u from v, and L written in u: by every program what it is in units of 1."""
+    """u from v, and L written in u: every program gives the result in units of 1."""
     quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))
     system = jl.System(swinging, ("x", "y"), quasi=quasi, written_in="u")
     units, speeds = np.array([1e5, 1e-6]), np.array([1.0, 1e-6])
@@ -138,7 +138,7 @@ def slanted(t, q, v, params):
 
 @pytest.mark.parametrize("derivative", [False, True])
 def test_velocities_from_quasi_velocities_of_unlike_units(derivative):
-    """There and back to rounding, though rows of dU/dv are 1e-9 from parallel."""
+    """The round trip is exact to rounding, although rows of dU/dv are 1e-9 from parallel."""
     quasi = jl.QuasiVelocities(slanted, ("a", "b"))
     q, v = jnp.array([0.4, 0.1]), jnp.array([1.3e5, 0.7e-4])
 
@@ -157,7 +157,7 @@ SCALES = np.array([1.0, 1e-6, 1e6])
 
 
 def turned(x):
-    """In no row as in the others are the units of what enters it."""
+    """The units of the inputs differ from row to row."""
     c, s = jnp.cos(x), jnp.sin(x)
     return jnp.array([[1.6, 0.3 * s, 0.0], [0.0, 1.6, 0.3 * c], [0.3, 0.0, 1.6 + 0.4 * s]])
 
@@ -167,7 +167,7 @@ def round_about(t, q, u, params):
 
 
 def led_along(t, q, u, params):
-    """A fourth coordinate that the others lead."""
+    """A fourth coordinate that depends on the others."""
     w = u / SCALES
     more = 1e3 * (w[0] - jnp.sin(q[0]) * w[2])
     return jnp.append(SCALES * (turned(q[0]) @ w), more)
@@ -175,7 +175,7 @@ def led_along(t, q, u, params):
 
 @pytest.mark.parametrize(("kinematics", "n"), [(round_about, 3), (led_along, 4)])
 def test_quasi_velocities_by_kinematics_of_unlike_units(kinematics, n):
-    """There and back is the identity, its first and second derivatives too, in both modes."""
+    """The round trip is the identity; so are its first and second derivatives, in both modes."""
     quasi = jl.QuasiVelocities(kinematics=kinematics, names=("a", "b", "c"))
     q, x, dx = jnp.full(n, 0.4), jnp.array([0.7, -0.3, 0.5]), jnp.array([0.1, 0.2, -0.4])
 
@@ -186,7 +186,7 @@ def test_quasi_velocities_by_kinematics_of_unlike_units(kinematics, n):
     def along(q, x):
         return jax.jvp(there_and_back, (q, x), (jnp.ones(n), dx))[1]
 
-    # Measured 2026-11-27: 6e-16. By derivatives of the factors 1e-5.
+    # Measured 2026-11-27: 6e-16. With derivatives of the factors: 1e-5.
     off = 1e-13
     np.testing.assert_allclose(there_and_back(q, x), x, atol=off)
     np.testing.assert_allclose(along(q, x), dx, atol=off)
@@ -197,12 +197,12 @@ def test_quasi_velocities_by_kinematics_of_unlike_units(kinematics, n):
 
 
 def off_the_way(t, q, u, params):
-    """In single precision; the second coordinate is led at twice the speed of the first."""
+    """In single precision; the second coordinate moves at twice the speed of the first."""
     return jnp.stack([u[0], 2.0 * u[0], 1e3 * (u[1] + 0.3 * u[0])])
 
 
 def test_velocities_that_kinematics_do_not_reach():
-    """Of tall kinematics the nearest, over the lengths of rows; its derivatives as well."""
+    """Tall kinematics take the nearest, relative to the lengths of rows; derivatives, too."""
     quasi = jl.QuasiVelocities(kinematics=off_the_way, names=("a", "b"))
     v = jnp.array([1.0, 1.0, 1e3], jnp.float32)
 
@@ -223,14 +223,14 @@ def uneven(t, q, v, params):
 
 
 def test_velocities_are_refined_until_they_are_right():
-    """Measured 2026-11-27: 8e-16; with a single step of refinement 1e-10."""
+    """Measured 2026-11-27: 8e-16; with one step of refinement 1e-10."""
     quasi = jl.QuasiVelocities(uneven, ("a", "b", "c"))
     t, v = jnp.zeros(()), jnp.array([0.7e6, -0.3e-6, 0.5e-4])
     np.testing.assert_allclose(quasi.velocities(t, v, quasi.of(t, v, v, None), None), v, rtol=1e-13)
 
 
 def test_quasi_velocities_may_read_arrays_from_outside():
-    """As every other function may, those beside constrained names as well."""
+    """Like every other function, also with constrained names."""
     matrix = np.array([[0.5, -1.0], [2.0, 0.25]])
 
     def U(t, q, v, params):

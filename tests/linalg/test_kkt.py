@@ -1,4 +1,4 @@
-"""M bordered by constraint rows: both ways to solve, singular M, dependent rows, reactions."""
+"""M bordered by constraint rows: both formulations, singular M, dependent rows, reactions."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def scene(n, m, singular=False, seed=0):
 
 
 def dense(M, A, r, c):
-    """(x, lam) by one library solve of the whole, and the condition of that."""
+    """(x, lam) by one dense solve of the whole matrix, and its condition number."""
     n, m = len(M), len(A)
     K = np.block([[M, -A.T], [-A, np.zeros((m, m))]])
     z = np.linalg.solve(K, np.concatenate([r, c]))
@@ -39,7 +39,7 @@ def dense(M, A, r, c):
 @pytest.mark.parametrize("singular", [False, True])
 @pytest.mark.parametrize(("n", "m"), mostly_full(SIZES, *SIZES[::2]))
 def test_solves_as_the_whole_matrix_does(n, m, singular, formulation):
-    """Also where M is singular, but positive on A x = 0."""
+    """Also for a singular M that is positive on A x = 0."""
     M, A, r, c = scene(n, m, singular)
     x, lam, condition = dense(M, A, r, c)
     found = jax.jit(lambda *a: solve_kkt(*a, formulation=formulation))(M, A, r, c)
@@ -50,7 +50,7 @@ def test_solves_as_the_whole_matrix_does(n, m, singular, formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_dependent_rows_are_left_out(formulation):
-    """Copies, multiples and sums of rows change x and A^T lam by rounding alone."""
+    """Copies, multiples and sums of rows change x and A^T lam only by rounding."""
     M, A, r, c = scene(6, 3, singular=True)
     x, lam, condition = dense(M, A, r, c)
     M, r = jnp.array(M), jnp.array(r)
@@ -64,7 +64,7 @@ def test_dependent_rows_are_left_out(formulation):
     np.testing.assert_allclose(more.T @ reduced, A.T @ lam, atol=allowed)
     assert (np.asarray(reduced)[~np.asarray(kept)] == 0).all()
 
-    # Least norm: no other multipliers of the same force are shorter, in the norm stated.
+    # Least norm: no other multipliers of the same force are smaller in this norm.
     shortest = np.asarray(least_norm(jnp.array(more), reduced))
     np.testing.assert_allclose(more.T @ shortest, A.T @ lam, atol=allowed)
     sizes = norm(more, axis=1)
@@ -75,7 +75,7 @@ def test_dependent_rows_are_left_out(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_derivatives_agree_with_differences(formulation):
-    """Forward, reverse and central, with a row left out, in all arguments."""
+    """Forward, reverse and central differences in all arguments, with one row left out."""
     M, A, r, c = scene(4, 2, singular=True, seed=1)
     A, c = np.vstack([A, 2.0 * A[0]]), np.append(c, 2.0 * c[0])
     kept = jnp.array([True, True, False])
@@ -102,7 +102,7 @@ def test_derivatives_agree_with_differences(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_rows_that_became_dependent_are_told(formulation):
-    """Every component is NaN, and the health says which row."""
+    """Every component is NaN, and `healthy` is False for the dependent row."""
     M, A, r, c = scene(4, 1)
     A = jnp.array(np.vstack([A, A + 1e-8]))
     c = jnp.array([c[0], c[0]])
@@ -137,7 +137,7 @@ def test_forces_linear_in_the_multipliers_are_solved_for_at_once():
 
 
 def test_forces_by_the_size_of_a_multiplier_are_found_by_newton():
-    """Friction mu |lam| against either sign of lam, and its derivative."""
+    """Friction mu |lam| for either sign of lam, and its derivative."""
     M, A, r, c = map(jnp.asarray, scene(3, 1))
     g = jnp.array([0.3, -0.2, 0.1])
 

@@ -1,4 +1,4 @@
-"""The solve with the mass matrix: unrolled up to n = 8, by rows up to n = 16, by library above.
+"""The solve with the mass matrix: unrolled up to n = 8, a loop up to n = 16, a library above.
 
 Elimination without pivoting is backward stable on symmetric positive definite matrices: the
 computed x solves a system whose M and r differ by some n EPS of their norms.
@@ -20,7 +20,7 @@ from jaxlag._linalg._mass_solve import (
 
 EPS = np.finfo(float).eps
 SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 16, 17, 18)
-WAYS = (3, UNROLL_UP_TO + 2, LOOP_UP_TO + 2)  # one size for each way of solving
+WAYS = (3, UNROLL_UP_TO + 2, LOOP_UP_TO + 2)  # one size for each algorithm
 
 
 @jax.jit
@@ -38,7 +38,7 @@ def unhealthy(M):
 
 
 def definite(rng, n, condition):
-    """Symmetric, eigenvalues from 1 down to 1/condition along random axes."""
+    """Symmetric matrix with eigenvalues from 1 down to 1/condition along random axes."""
     axes, _ = np.linalg.qr(rng.normal(size=(n, n)))
     M = (axes * np.geomspace(1.0, 1.0 / condition, n)) @ axes.T
     return (M + M.T) / 2
@@ -85,7 +85,7 @@ def test_a_given_factor_serves_any_right_hand_side(n):
 
 
 def with_pivot(rng, n, bad, pivot):
-    """Symmetric with elimination pivots 1, but `pivot` at `bad`: L D L^T in whole numbers."""
+    """Symmetric with elimination pivots 1 except `pivot` at `bad`: L D L^T of integers."""
     L = np.tril(rng.integers(-2, 3, (n, n)), -1) + np.eye(n)
     D = np.where(np.arange(n) == bad, pivot, 1.0)
     return (L * D) @ L.T
@@ -114,7 +114,7 @@ def test_the_coordinate_without_inertia_is_named(n):
 
 
 def of_rank_less_one(rng, n):
-    """The last row is a combination of the others, which are well conditioned."""
+    """The last row is a linear combination of the others, which are well conditioned."""
     M = np.zeros((n, n))
     M[:-1, :-1] = definite(rng, n - 1, 4.0)
     combination = rng.uniform(-1.0, 1.0, n - 1)
@@ -125,7 +125,7 @@ def of_rank_less_one(rng, n):
 
 @pytest.mark.parametrize("n", SIZES[1:])
 def test_a_singular_matrix_is_found_through_its_rounding(n):
-    """Of rank n - 1, the rest well conditioned: the last pivot is rounding, of either sign."""
+    """Rank n - 1, otherwise well conditioned: the last pivot is rounding, of either sign."""
     for seed in range(10):
         assert unhealthy(of_rank_less_one(np.random.default_rng([n, seed]), n)) == n - 1
 
@@ -146,7 +146,7 @@ def test_a_bad_matrix_in_a_batch_harms_no_other(n):
 
 @pytest.mark.parametrize("n", WAYS)
 def test_units_of_the_coordinates_change_nothing(n):
-    """M -> D M D, r -> D r gives x -> x/D: exactly, where D are powers of two, 1e-6 to 1e6."""
+    """M -> D M D, r -> D r gives x -> x/D: exactly for powers of two D from 1e-6 to 1e6."""
     rng = np.random.default_rng(n)
     M, r = definite(rng, n, 100.0), rng.normal(size=n)
     D = 2.0 ** np.round(np.linspace(-20, 20, n))[rng.permutation(n)]
@@ -223,7 +223,7 @@ def test_second_derivatives_agree_with_differences(n):
     second, third, low, high = jax.jit(
         lambda: (jax.grad(first)(0.0), jax.grad(jax.jacfwd(first))(0.0), first(-h), first(h))
     )()
-    # Truncation is h^2/6 of the derivative after next, some kappa times the next one.
+    # The truncation error is h^2/6 times the fourth derivative, about kappa times the third.
     condition = np.linalg.cond(M[0])
     atol = h**2 * condition * abs(third) + 10 * n * EPS * condition * max(abs(low), abs(high)) / h
     np.testing.assert_allclose(second, (high - low) / (2 * h), rtol=0, atol=atol)

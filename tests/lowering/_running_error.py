@@ -1,8 +1,8 @@
 """Running error bounds of a graph, and its exact values to 50 digits.
 
-Every node carries its value in double precision, its value in 50 digits, and a first-order bound
-on the difference: what the errors of its operands become, and its own rounding (Higham, Accuracy
-and Stability of Numerical Algorithms, sec. 3.3).
+Every node has its value in double precision, its value in 50 digits, and a first-order bound on the
+difference: the propagated errors of its operands and its own rounding (Higham, Accuracy and
+Stability of Numerical Algorithms, sec. 3.3).
 """
 
 import operator
@@ -15,7 +15,7 @@ from jaxlag._lowering._graph._expression import order
 
 U = 2.0**-53
 DIGITS = 50
-ULPS = 2.0  # of a function of numpy's or XLA's
+ULPS = 2.0  # of a function of numpy or XLA
 
 _TRUTHS = {name: getattr(operator, name) for name in ("gt", "ge", "lt", "le", "eq", "ne", "and_")}
 _TRUTHS["and"] = _TRUTHS.pop("and_")
@@ -102,7 +102,7 @@ _OPS |= {"let": _same, "stop": _same}
 
 
 def rounded(roots, inputs, dtype):
-    """The roots in the arithmetic of a dtype, overflow and all."""
+    """The roots in the arithmetic of a dtype, including overflow."""
     known = {}
     with np.errstate(all="ignore"):
         for node in order(roots):
@@ -123,7 +123,7 @@ def _round(node, args, inputs, dtype):
     if node.op == "product":
         over, under = dtype(1), dtype(1)
         for x, (_, e) in zip(args, node.data, strict=True):
-            for _ in range(abs(e)):  # as the program does it, one factor after the other
+            for _ in range(abs(e)):  # as the program does it, factor by factor
                 over, under = (over * x, under) if e > 0 else (over, under * x)
         return over / under
     if node.op == "select":

@@ -1,4 +1,4 @@
-"""The repetition of tests under both lowerings does switch programs, compiled ones included."""
+"""Tests repeated under both lowerings use both programs, compiled ones included."""
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +15,18 @@ PARAMS = dict(DOUBLE.example.params)
 
 @jax.jit
 def acceleration(q, v):
-    """Compiled at module level, as a test may have it."""
+    """Compiled at module level, as other tests may do."""
     return DOUBLE.system.acceleration(q, v, PARAMS)
 
 
 @pytest.mark.parametrize("turn", [1, 2])
 def test_accelerations_are_compiled_from_the_lowering_in_use(lowering, turn):
-    """Read from what jit keeps: a program left over from the other lowering would show."""
+    """Read from the cache of jit: a program left over from the other lowering would show."""
     q, v = jnp.array([1.0, 0.5]), jnp.array([0.2, -0.3])
     acceleration(q, v)
     on_arrays = lowering == "array"
     assert ("custom_linear_solve" in names(operations(acceleration, q, v))) == on_arrays
-    assert ("tensor<2x2xf64>" in acceleration.lower(q, v).as_text()) == on_arrays  # M as a whole
+    assert ("tensor<2x2xf64>" in acceleration.lower(q, v).as_text()) == on_arrays  # the whole M
 
 
 def test_solves_are_compiled_from_the_lowering_in_use(lowering):

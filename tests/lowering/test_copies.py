@@ -1,4 +1,4 @@
-"""How often a compiled motion and its gradient hold the equations."""
+"""Number of copies of the equations in a compiled motion and its gradient."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ def _odd(t, q, v, params):
 
 
 def copies(lowering, function_of, size=2):
-    """How often the program of `function_of(system)` contains the force."""
+    """Number of occurrences of the force in the program of `function_of(system)`."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v + 0.1 * jnp.sum(jnp.cos(q[:, None] - q)) * v[0] ** 2
@@ -50,19 +50,22 @@ def gradient_of(system):
 
 
 def test_a_program_holds_the_equations_once_in_its_loop_and_once_before():
-    """On arrays: the loop over stages; the first stage and the estimate of the first step."""
+    """On arrays: in the loop over stages, and for the first stage and first step size."""
     assert copies("array", motion_of) == 2
     assert copies("array", partial(motion_of, save=("a", "energy"))) == 3
 
 
 def test_a_gradient_holds_them_once_in_each_of_its_loops():
-    """The recorded motion, states found again between points, the transposed step; before them
-    the first step, and how fast perturbations turn.
+    """One copy for each loop, and two before the loops.
+
+    The loops are those of the recorded motion, of the states between checkpoints and of the
+    transposed step. The other copies are for the first step size and for the rates of
+    perturbations.
     """
     assert copies("array", gradient_of) == 5
 
 
 @pytest.mark.full
 def test_a_long_scalar_program_is_looped_over_as_well():
-    """Nine elements of the force, all in one copy of the acceleration."""
+    """Nine components of the force: one copy of the acceleration in the loop, one before it."""
     assert copies("scalar", motion_of, size=9) == 9 * 2

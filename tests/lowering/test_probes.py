@@ -1,4 +1,4 @@
-"""Programs as scalars: value and gradient of everything a user may write, or a named reason."""
+"""Programs as scalars: value and gradient of any user expression, or a named reason."""
 
 import re
 
@@ -37,7 +37,7 @@ def at(roots, point):
 
 @pytest.mark.parametrize("name", mostly_full(PROBES, *list(PROBES)[::4]))
 def test_values_and_derivatives_are_those_of_jax(name):
-    """Values, both modes of the gradient, and a row of the Hessian; and all of it simplified."""
+    """Values, both modes of the gradient and a column of the Hessian, also simplified."""
     graph, x, node = scalars(PROBES[name])
     (short,) = Expansion(graph).simplified([node])
     value = jax.jit(jax.value_and_grad(PROBES[name]))

@@ -1,4 +1,4 @@
-"""The scalar program against the array program: values, derivatives, structure, what is skipped."""
+"""The scalar program against the array program: values, derivatives, structure, omissions."""
 
 import re
 from functools import cache, partial
@@ -77,7 +77,7 @@ def test_accelerations_are_those_of_the_array_program(name):
 
 @pytest.mark.parametrize("name", mostly_full(MOVING, *QUICK[:2]))
 def test_derivatives_are_those_of_the_array_program(name):
-    """jvp and vjp in the state and params, batched; k = 2e3 roundings. Of some the Hessian, 2e5."""
+    """jvp and vjp by state and params, batched, to 2e3 eps; for some the Hessian, to 2e5 eps."""
     system, params, q0, v0 = case(name)
     t, q, v = states(q0, v0)
     params = jax.tree.map(jnp.asarray, params)
@@ -111,7 +111,7 @@ def test_derivatives_are_those_of_the_array_program(name):
 
 @pytest.mark.full
 def test_a_rule_of_its_own_keeps_its_derivatives_of_any_order():
-    """A spring through zero length: k times the identity, and what JAX makes of it beyond."""
+    """A spring of length zero has the Jacobian -k times the identity; then JAX's derivatives."""
 
     def lagrangian(t, q, v, params):
         r = q - jnp.array([1.0, 0.0])
@@ -134,7 +134,7 @@ def test_a_rule_of_its_own_keeps_its_derivatives_of_any_order():
 
 
 def test_canceled_terms_stay_canceled():
-    """0 x = 0 and x / x = 1 for every x, where the array program gives NaN; sqrt(x^2) is no |x|."""
+    """0 x = 0 and x / x = 1 for every x, unlike the array program (NaN); sqrt(x^2) is not |x|."""
 
     def lagrangian(t, q, v, params):
         x = q[0]
@@ -156,7 +156,7 @@ def test_canceled_terms_stay_canceled():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_a_mass_matrix_that_is_not_positive_definite_gives_nan(n):
-    """Singular, indefinite and negative, wherever in the elimination it shows."""
+    """Singular, indefinite and negative matrices, with the wrong sign at any pivot."""
     rng = np.random.default_rng(n)
     B = rng.normal(size=(n, n))
 
@@ -177,7 +177,7 @@ def test_a_mass_matrix_that_is_not_positive_definite_gives_nan(n):
 
 @pytest.mark.parametrize("bend", ["maximum", "where", "abs"])
 def test_a_branch_that_no_random_state_enters(bend):
-    """L linear in v below v = 3 and bent there: right beyond, where no comparison looks."""
+    """L is linear in v up to v = 3, with a kink there, which no state of the comparison reaches."""
 
     def lagrangian(t, q, v, params):
         extra = {
@@ -197,7 +197,7 @@ def test_a_branch_that_no_random_state_enters(bend):
 @pytest.mark.full
 @pytest.mark.parametrize("largest", ["maximum", "max", "minimum", "hypot"])
 def test_the_larger_of_two_rounded_results(largest):
-    """The derivative of max asks for equality, which a fused multiply-add may spoil."""
+    """The derivative of max tests for equality, which a fused multiply-add may spoil."""
 
     def size(x):
         a, b = -0.4 * jnp.sin(x), 1 - 0.4 * jnp.cos(x)
@@ -231,7 +231,7 @@ def test_the_larger_of_two_rounded_results(largest):
 
 @pytest.mark.full
 def test_integers_that_are_traced_go_to_the_array_program():
-    """Among the params and among the inputs."""
+    """Among params and among inputs."""
 
     def lagrangian(t, q, v, params):
         n, half = (jnp.asarray(x).astype(float) for x in (params["n"], params["n"] // 2))
@@ -274,7 +274,7 @@ CEILINGS = {  # operations, sines and cosines, divisions
     "name", mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"}))
 )
 def test_operations_of_one_evaluation(name):
-    """Counted in the code itself and, as equations, in the jaxpr of the acceleration."""
+    """Counted in the code itself, which has no custom call, product of arrays or factorization."""
     program = lowered(name).equations.program
     operations, functions, divisions = CEILINGS[name]
     assert program.operations <= operations
@@ -285,7 +285,7 @@ def test_operations_of_one_evaluation(name):
 
 
 def test_structure_is_found():
-    """Through rotation matrices and positions, for whatever values of the params."""
+    """Through rotation matrices and positions, for any values of params."""
 
     def found(name):
         return find(lowered(name).scene, lowered(name).equations)
@@ -301,7 +301,7 @@ def test_structure_is_found():
     assert body.mass_blocks == body.subsystems == ((0,), (1,), (2,), (3, 4, 5))
     assert body.mass_depends == {("q", 4), ("q", 5)}
     aircraft = found("aircraft")
-    assert aircraft.cyclic == (0, 1)  # not yaw: only with x and y turned along
+    assert aircraft.cyclic == (0, 1)  # not yaw: cyclic only together with a rotation of x and y
     mass = lowered("aircraft").equations.mass
     zero = lowered("aircraft").scene.graph.zero
     assert all((mass[i][j] is zero) == (i != j) for i in range(3) for j in range(3))
@@ -325,7 +325,7 @@ def test_values_of_params_never_decide(name):
 
 
 def test_a_constant_mass_matrix_is_factored_before_the_loop():
-    """No division is left in the body; forces that are not declared leave nothing either."""
+    """No division is in the body; undeclared forces add no inputs."""
     program = lowered("two_mass_three_springs").equations.program
     assert program.count("div", "gt", "select") == 0
     assert any(line.op == "div" for line in program.prelude)
@@ -351,7 +351,7 @@ def inertia_by_products(t, q, v, p):
     ids=["long products", "mass"],
 )
 def test_what_would_take_long_to_derive_is_a_named_fallback(lagrangian, n, reason):
-    """Of 90 factors in each of 90 products all pairs were counted again and again: 88 s."""
+    """All pairs of 90 factors in each of 90 products were counted repeatedly: 88 s."""
     system = jl.System(lagrangian, tuple(f"q{i}" for i in range(n)))
     found = derived(system)
     assert found.equations is None
@@ -359,6 +359,6 @@ def test_what_would_take_long_to_derive_is_a_named_fallback(lagrangian, n, reaso
 
 
 def test_factors_of_products_are_shared():
-    """Of 20 factors, each product lacks one: 18 multiplications for each by itself, 4 together."""
+    """Each product lacks one of 20 factors: 18 multiplications separately, 4 with sharing."""
     system = jl.System(sines_of_differences, ("a", "b", "c", "d", "e"))
     assert derived(system).equations.program.operations == 185

@@ -1,6 +1,6 @@
-"""Declarations made to trip the scalar program: it agrees with JAX, or steps aside and says why.
+"""Difficult declarations: the scalar program agrees with JAX or falls back with a reason.
 
-Checked on the graph, which nothing has to be compiled for; the emitted code in the full run.
+The graph is checked without compilation; the full run checks the emitted code.
 """
 
 import jax
@@ -23,14 +23,14 @@ STATES = np.random.default_rng(3).uniform(-1.5, 1.5, (4, 2, 3))
 
 @pytest.fixture(autouse=True)
 def _lenient():
-    """As for a user: whole numbers and real ones mix."""
+    """As for users: integers and real numbers may be mixed."""
     with jax.numpy_dtype_promotion("standard"):
         yield
 
 
 @jax.custom_jvp
 def scaled(x, k):
-    """Its rule is given for x and k alike."""
+    """A function with one rule for x and k together."""
     return x * k
 
 
@@ -49,11 +49,11 @@ def plain(potential):
 
 
 def halves(q):
-    """Integers that Python and C round in different ways: -1 // 2."""
+    """Integers that Python and C round differently: -1 // 2."""
     return ((jnp.arange(3) - 1) // 2)[: q.size] @ q
 
 
-# name: (L, coordinates, what `explain` says of an array program; None for a scalar one)
+# name: (L, number of coordinates); ARRAY has no scalar program, SCALAR has one
 ARRAY = {
     "truths in a product": (plain(lambda q: jnp.dot(q > 0, jnp.array([True, True])) * q[0]), 2),
     "a rule for integers": (plain(lambda q: scaled(q[0], 3) ** 2), 2),
@@ -155,7 +155,7 @@ def declared(name, lowering="auto"):
 
 
 def by_array_program(system, q, v):
-    """M a + h = 0 with M and h by JAX, interpreted."""
+    """M a + h = 0 with M and h by JAX, interpreted in numpy."""
     array = system._terms
     at = np.array(0.3), q, v
     M, h = (
@@ -182,7 +182,7 @@ def test_the_graph_agrees_with_jax(name):
 def test_what_has_no_scalar_program_says_why(name):
     found = lowered(declared(name))
     assert found.equations is None
-    # Nothing came to an end by an accident: each reason is one of those that are looked for.
+    # No reason is an internal error: each is one of the expected ones.
     assert "no scalar program" not in found.reason
     assert found.reason
 
@@ -196,7 +196,7 @@ def test_the_code_agrees_with_jax(name):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-# ---- Premises ------------------------------------------------------------------------------------
+# ---- Conditions of the forms ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_the_code_agrees_with_jax(name):
     ["a stopped velocity", "a clipped velocity", "a choice by velocity", "|v|", "speed as a root"],
 )
 def test_forms_for_quadratic_ones_are_for_those_alone(name):
-    """M is free of v in most of these, and L still no polynomial."""
+    """In most of these M does not depend on v, although L is not a polynomial."""
     system = declared(name)
     equations = lowered(system).equations
     assert equations.form.startswith("derivative of the momentum")
@@ -299,7 +299,7 @@ MOVED = {
 
 
 def test_the_interpreter_does_what_jax_does():
-    """It checks the programs, so it is checked itself; one program of all for one compilation."""
+    """It checks the programs, so it is checked itself; all in one compiled program."""
     x = np.random.default_rng(0).uniform(0.1, 2.0, (2, 3))
     programs = {name: jax.make_jaxpr(f)(x) for name, f in MOVED.items()}
     expected = jax.jit(lambda x: {name: f(x) for name, f in MOVED.items()})(x)
@@ -314,7 +314,7 @@ def test_the_interpreter_does_what_jax_does():
 
 
 def test_one_singular_block_leaves_no_acceleration():
-    """Whichever coordinate it is, as in the array program; the motion fails at its start."""
+    """For any coordinate, as in the array program; the motion fails at its start."""
     lagrangian = lambda t, q, v, p: 0.5 * p @ v**2 - q @ q  # noqa: E731
     system = jl.System(lagrangian, ("x", "y"))
     for masses in ([1.0, 0.0], [0.0, 1.0], [1.0, -1.0]):

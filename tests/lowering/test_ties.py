@@ -1,4 +1,4 @@
-"""Where several numbers are the largest, their derivatives are shared as JAX shares them."""
+"""At ties of max and min, derivatives are divided as in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ PLAIN = {"max", "axis 0", "nested", "the same twice", "constants", "cummin", "sc
     [name if name in PLAIN else pytest.param(name, marks=pytest.mark.full) for name in REDUCED],
 )
 def test_ties_are_shared_to_second_derivatives(name):
-    """Forces, which the graph derives, and stiffness, which JAX derives from its program."""
+    """Forces are derived on the graph, stiffness is derived by JAX from the program."""
     reduced = REDUCED[name]
     force = accelerations(reduced, "auto")
     both = jax.jit(jax.vmap(lambda q: (force(q), jax.jacfwd(force)(q))))
@@ -72,7 +72,7 @@ def test_reverse_derivatives_and_arrays_share_them_too(name):
 
 @pytest.mark.parametrize(("primitive", "whole"), [(largest_p, jnp.max), (smallest_p, jnp.min)])
 def test_the_primitive_is_the_reduction(primitive, whole):
-    """Through transforms, in a loop whose derivatives JAX takes apart, and of a batch in part."""
+    """Under transforms, in a loop whose derivatives JAX splits, and with a partly batched input."""
 
     def of_row(q):
         return primitive.bind(*q)

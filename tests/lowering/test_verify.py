@@ -1,4 +1,4 @@
-"""The scalar program beside the array program: what is compared, and what is found by it."""
+"""The check of the scalar program against the array program: states compared, errors found."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ EPS = np.finfo(float).eps
 
 @pytest.mark.parametrize("bad", [np.nan, 0.0])
 def test_bad_params_at_first_use_decide_nothing(bad):
-    """A program is made for all params of these shapes, whichever came first."""
+    """A program is made for all params of these shapes, whichever come first."""
     system = jl.System(lambda t, q, v, p: 0.5 * p["m"] * v @ v + jnp.cos(q[0]), ("x",))
     found = lowered(system, {"m": bad})
     assert found.equations is not None
@@ -28,7 +28,7 @@ def test_bad_params_at_first_use_decide_nothing(bad):
 
 
 def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
-    """Wrong where k is not 1: the random params tell."""
+    """Wrong for k other than 1: random params show it."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -53,7 +53,7 @@ def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
 
 
 def test_too_few_states_to_compare_at_decide_for_the_array_program():
-    """L has no value but near a state that random ones miss."""
+    """L is finite only near a state that random ones miss."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
     assert "only 0 of 32 random states" in lowered(system).reason
     a = system.acceleration([11.0], [0.0])
@@ -68,7 +68,7 @@ def test_too_few_states_to_compare_at_decide_for_the_array_program():
     ],
 )
 def test_a_coordinate_without_inertia_leaves_no_acceleration(lagrangian, n):
-    """M is singular everywhere: M and h are compared in place of the acceleration."""
+    """M is singular everywhere: M and h are compared instead of the acceleration."""
     system = jl.System(lagrangian, {"x": (n,)})
     assert lowered(system).reason == "equal to the array program at 8 random states"
     assert np.all(np.isnan(system.acceleration(np.ones(n), np.zeros(n))))
@@ -94,7 +94,7 @@ def _wrong(equations, part, graph):
             return [*others, off(last)]
         return [*others, graph.scale(last, 1.0 + 1e-9)]
 
-    if part == "accelerations":  # the velocities are the first of them
+    if part == "accelerations":  # the velocities come first
         v, others = equations.accelerations[:2], equations.accelerations[2:]
         return equations._replace(accelerations=[*off(v), *others])
     if part == "rows":
@@ -111,7 +111,7 @@ def _wrong(equations, part, graph):
     ],
 )
 def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
-    """Params that make it so at every state; an entry of any part off by 1e-9 is found."""
+    """M is indefinite at every state for these params; an error of 1e-9 in any part is found."""
 
     def lagrangian(t, q, v, p):
         return 0.5 * (v[0] ** 2 - p["m"] * (1.0 + q[0] ** 2) * v[1] ** 2) - q @ q
@@ -128,7 +128,7 @@ def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
 
 @pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
 def test_params_that_are_traced_need_not_be_known(module):
-    """Random numbers are no inertia of a body: in a jit over params there is a scalar program."""
+    """Random params are not inertias of a body; under jit over params a scalar program is used."""
     found = []
     params = jax.tree.map(jnp.asarray, dict(module.entry.example.params))
     jax.eval_shape(lambda params: found.append(lowered(module.system, params)), params)
@@ -139,7 +139,7 @@ def test_params_that_are_traced_need_not_be_known(module):
 
 
 def test_a_program_that_differs_is_not_used(monkeypatch):
-    """One sign flipped in h: the reason says so and the array program answers."""
+    """One sign of h is flipped: the reason states the difference, and the array program is used."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -155,7 +155,7 @@ def test_a_program_that_differs_is_not_used(monkeypatch):
 
 
 def test_a_program_that_gives_nan_is_not_used(monkeypatch):
-    """Where the array program is finite; nan compares as smaller than nothing."""
+    """Where the array program is finite; comparisons with nan are False."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -168,7 +168,7 @@ def test_a_program_that_gives_nan_is_not_used(monkeypatch):
 
 
 def test_constrained_states_of_indefinite_mass_are_not_compared_at():
-    """Known params beside random ones, which may make M indefinite on what rows leave free."""
+    """Known params besides random ones, for which M may be indefinite on the constraints."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * ((params["I"] - params["m"]) * v[0] ** 2 + v[1] ** 2) - q[0] * q[1]
@@ -179,7 +179,7 @@ def test_constrained_states_of_indefinite_mass_are_not_compared_at():
 
 
 def test_params_at_hand_are_compared_with():
-    """An inertia that random numbers would make indefinite."""
+    """An inertia that random params would make indefinite."""
     declared, params, q0, _ = case("lamina_two_forces_fixed_direction")
 
     def fresh():

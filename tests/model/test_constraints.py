@@ -1,4 +1,4 @@
-"""Declared constraints: their rows, names and derivatives, and declarations that are refused."""
+"""Declared constraints: rows, names and derivatives, and declarations that are refused."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def test_rows_of_a_velocity_residual():
 
 
 def test_accelerations_keep_the_rows():
-    """A a + gamma = 0 and M a + h = Q + A^T lam, at states off the constraints, too."""
+    """A a + gamma = 0 and M a + h = Q + A^T lam, also at states off the constraints."""
     q, v = random_state(4, 1)
     t = jnp.array(0.0)
     a = cartesian.acceleration(q, v, BOBS)
@@ -79,7 +79,7 @@ def test_reaction_vectors():
     lam = led_pendulum.multipliers(q, v, LED)
     assert list(lam) == ["pin"]
     a = led_pendulum.acceleration(q, v, LED)
-    # Newton: the pin carries m (a - g) of the mass center.
+    # Newton: the force at the pin is m (a - g) of the mass center.
     expected = LED["m"] * (a[:2] - jnp.array([0.0, -9.81]))
     np.testing.assert_allclose(lam["pin"], expected, rtol=1e-14)
 
@@ -110,7 +110,7 @@ def test_names_and_residuals():
 
 @pytest.mark.full
 def test_four_bar_multipliers_by_virtual_work():
-    """Under a torque on the crank alone lam does no work: power balance through the loop."""
+    """Constraint forces do no work: power balance through the loop."""
     q = jl.assemble(four_bar, [1.0, 0.4, -1.8], [0.5, 0, 0], FOUR_BAR, hold=("crank", "crank'"))
     force = four_bar.constraint_force(q.q, q.v, FOUR_BAR)
     assert abs(force @ q.v) <= 50 * EPS * np.linalg.norm(force) * np.linalg.norm(q.v)
@@ -190,7 +190,7 @@ def test_bad_declarations(make, message):
 
 
 def solved(q, v):
-    """(1 + q q^T)^-1 v, by a factorization that has no form on scalars."""
+    """(1 + q q^T)^-1 v, by a factorization without a scalar form."""
     return jnp.linalg.solve(jnp.eye(q.shape[0]) + jnp.outer(q, q), v)
 
 
@@ -210,12 +210,12 @@ def solved(q, v):
     ],
 )
 def test_which_rows_are_known_to_be_no_rounding(phi, sure):
-    """From the program alone; of the others their numbers tell."""
+    """From the program alone; the other rows are decided by their values."""
     assert layout((jl.Holonomic(phi, "a"),), jnp.zeros(()), 3, jnp.float64).sure == (sure,)
 
 
 def test_a_row_of_the_number_0_says_nothing():
-    """It is accepted, and leaves the motion free; another number is refused, see above."""
+    """It is accepted and has no effect; another constant is refused, see above."""
     row = jl.Holonomic(lambda t, q, params: jnp.stack([q[0] - q[1], 0.0 * q[0]]), ("a", "zero"))
     system = declared(row)
     q, v = jnp.zeros(4), jnp.array([1.0, 1.0, 0.5, -0.5])
@@ -335,7 +335,7 @@ def late(t):
             ),
             [False, True, False],
         ),
-        # Without a form on scalars time tells, and what is not known to be zero may differ from it.
+        # Without a scalar form: b counts as zero only if it certainly does not depend on time.
         (jl.Holonomic(lambda t, q, p: solved(q, q)[:2], "pin"), [False, False]),
         (jl.Holonomic(lambda t, q, p: solved(q, q)[0] - late(t), "led"), [True]),
         (jl.Pfaffian(lambda t, q, v, p: solved(q, v)[0] - late(t), "led"), [True]),
@@ -343,7 +343,7 @@ def late(t):
     ],
 )
 def test_rows_that_may_do_work(constraint, driven):
-    """Wherever b differs from zero, be it far from all states one would try."""
+    """Wherever b differs from zero, even far from usual states."""
     n = 150 if constraint.names == "wide" else 4
     params = {**BOBS, "W": jnp.ones((n, n))}
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v, {"x": (n,)}, constraints=(constraint,))
@@ -384,7 +384,7 @@ def test_rows_may_close_over_traced_values():
 
 
 def test_special_values_of_params_decide_nothing():
-    """A row whose amplitude is zero here is still a row with time in it."""
+    """A row whose amplitude is zero here still depends on time."""
     system = jl.System(
         bobs,
         ("x1", "y1", "x2", "y2"),
@@ -395,7 +395,7 @@ def test_special_values_of_params_decide_nothing():
 
 
 def test_closure_is_traced_once_per_shape():
-    """Other values of params do not trace the declaration again."""
+    """New values of params do not trace the declaration again."""
     count = []
 
     def counted(t, q, params):

@@ -1,4 +1,4 @@
-"""Names and shapes of coordinates, and the flat vector behind them."""
+"""Names and shapes of coordinates, and their flat vector."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Applied forces: their two signatures, Rayleigh functions, names, and what is refused."""
+"""Applied forces: signatures, Rayleigh functions, names, and declarations that are refused."""
 
 import re
 from functools import partial
@@ -52,7 +52,7 @@ def test_a_force_takes_inputs_or_leaves_them_out():
 
 
 def test_a_rayleigh_force_is_the_gradient_of_its_function():
-    """Also where it is not quadratic: R = c (1 + t)(1 + x^2) sum |v|^3/3."""
+    """Also for a function that is not quadratic: R = c (1 + t)(1 + x^2) sum |v|^3/3."""
     np.testing.assert_allclose(DRAG(T, Q, V, PARAMS, {}), PARTS["drag"], rtol=8 * EPS)
     assert jl.Rayleigh(dissipation, "rayleigh").name == "rayleigh"
 
@@ -88,7 +88,7 @@ def test_forces_of_the_same_function_and_name_are_one():
 
 
 class Law:
-    """A force with a method for its law, and one given by `partial`."""
+    """A force law as a method."""
 
     def law(self, t, q, v, params, inputs):
         return inputs["gain"] * q
@@ -181,7 +181,7 @@ def test_a_bad_type_is_refused(make, message):
 
 
 def pushed_by(force):
-    """A system of two coordinates under a force, and what checks it."""
+    """A system of two coordinates under a force."""
     return jl.System(free, ("x", "y"), forces=(jl.GeneralizedForce(force, "push"),))
 
 

@@ -1,4 +1,4 @@
-"""Inputs: tables, functions of time, feedback and constants; what is read, and what is refused."""
+"""Inputs: tables, functions of time, feedback and constants; reading, and invalid inputs."""
 
 import re
 from functools import partial
@@ -33,7 +33,7 @@ def read(signal, t):
 
 
 def at(signal, times):
-    """The signal at many times; numpy arrays, each time on its own."""
+    """The signal at many times as a numpy array, each time separately."""
     return np.array([read(signal, jnp.array(t)) for t in times])
 
 
@@ -41,7 +41,7 @@ def at(signal, times):
 
 
 def test_a_hold_keeps_each_value_up_to_the_next_time():
-    np.testing.assert_array_equal(at(HOLD, TIMES), VALUES)  # from the right, the last one too
+    np.testing.assert_array_equal(at(HOLD, TIMES), VALUES)  # from the right, the last value, too
     before = np.nextafter(TIMES[1:], -np.inf)
     np.testing.assert_array_equal(at(HOLD, before), VALUES[:-1])
     np.testing.assert_array_equal(at(HOLD, [0.1, 0.7, 1.9, 2.1]), [3.0, -1.0, -1.0, 4.0])
@@ -55,7 +55,7 @@ def test_a_linear_table_meets_its_values_and_runs_straight_between():
 
 
 def test_a_linear_table_has_the_slope_of_its_interval_on_either_side():
-    """At a knot itself, the slope to the right, but to the left at the last."""
+    """At a knot the slope to the right; at the last knot the slope to the left."""
     slope = jax.jit(jax.vmap(jax.grad(partial(read, LINE))))
     slopes = np.diff(VALUES) / np.diff(TIMES)
     before, after = np.nextafter(TIMES, -np.inf), np.nextafter(TIMES, np.inf)
@@ -78,7 +78,7 @@ def test_tables_differentiate_with_respect_to_their_values_and_times():
 
 
 def test_a_step_reads_the_interval_it_is_told():
-    """Whatever the time: no stage of a step reads the other side of a jump."""
+    """For any time: no stage of a step reads across a jump."""
     for t in (0.4, 0.5, 0.6):
         for i, value in enumerate(VALUES):
             found = evaluate({"u": HOLD}, jnp.array(t), Q, V, PARAMS, {"u": jnp.array(i)})
@@ -144,13 +144,13 @@ def test_a_function_takes_time_or_time_and_params():
 
 
 def test_a_default_of_a_function_is_no_place_for_params():
-    """The usual way to bind a value early."""
+    """The usual way to bind a value at definition."""
     signals = [jl.TimeFunction(lambda t, w=w: w * t) for w in (2.0, 3.0)]
     assert [float(read(signal, jnp.array(0.5))) for signal in signals] == [1.0, 1.5]
 
 
 def test_a_hold_may_have_one_value_for_each_interval():
-    """As controls between edges are kept; the last one holds at the end, too."""
+    """As controls between grid edges; the last value also holds at the end."""
     hold = jl.ZeroOrderHold([0.0, 1.0, 3.0], [2.0, 5.0])
     np.testing.assert_array_equal(hold.values, [2.0, 5.0, 5.0])
     pairs = jl.ZeroOrderHold([0, 1, 3], [[1, 2], [3, 4]])
@@ -159,12 +159,12 @@ def test_a_hold_may_have_one_value_for_each_interval():
 
 
 def around(signal, t):
-    """The signal as a step from t reads it."""
+    """The signal as read by a step from t."""
     return at_interval({"u": signal}, jnp.array(t))[0]["u"]
 
 
 def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
-    """Up to the knot, and from it on; its derivative in time is that of the function."""
+    """Up to the knot, and from it on; the time derivative is that of the function."""
     step = jl.TimeFunction(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
     np.testing.assert_array_equal(step.knots(), [1.0, 2.0])
     before, after = around(step, 0.3), around(step, 1.0)
@@ -172,7 +172,7 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     np.testing.assert_allclose(read(before, knot), 2.0, rtol=1e-15)
     assert read(after, knot) == read(step, knot) == 5.0
     assert jax.grad(lambda t: read(before, t))(knot) == 2.0
-    late, early = knot + 2 * EPS, knot - EPS  # rounding of a step's ends is none of them
+    late, early = knot + 2 * EPS, knot - EPS  # rounding of a step's ends does not cross the knot
     np.testing.assert_allclose([read(before, late), read(after, early)], [2.0, 5.0], rtol=4 * EPS)
     assert jax.grad(lambda t: read(before, t))(late) == 2.0
     assert jax.grad(lambda t: read(after, t))(early) == 5.0
@@ -223,7 +223,7 @@ def test_arrays_and_numbers_are_constants():
 
 
 def pushed(reading):
-    """Two coordinates of unit mass, pushed by `reading(inputs)`."""
+    """Two coordinates of unit mass under the force `reading(inputs)`."""
 
     def push(t, q, v, params, inputs):
         return jnp.stack([reading(inputs), 0.0 * t])
@@ -357,7 +357,7 @@ def test_a_bad_table_is_refused(kind, times, values, message):
 @pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.LinearInterpolation])
 @pytest.mark.parametrize("array", [list, np.array, jnp.array])
 def test_known_tables_are_as_good_under_a_transform(kind, array):
-    """Built of arrays from outside while JAX traces what is around them."""
+    """Built of constant arrays while JAX traces the function around them."""
     times, values, worse = array(TIMES), array(VALUES), array([3.0, np.nan, 4.0, 10.0])
     found = jax.jit(lambda t: read(kind(times, values), t))(1.25)
     assert found == read(kind(TIMES, VALUES), jnp.array(1.25))

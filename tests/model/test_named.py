@@ -1,4 +1,4 @@
-"""Functions of coordinates by name: the same as those of flat vectors."""
+"""Functions of named coordinates equal those of flat vectors."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +67,7 @@ def test_every_declared_function_may_be_of_names():
 
 
 def test_it_is_one_function_however_often_it_is_named():
-    """So that systems made of it compile once."""
+    """Systems of equal functions compile once."""
     assert jl.named(NAMES)(flat) == jl.named(NAMES)(flat)
     assert hash(jl.named(NAMES)(flat)) == hash(jl.named(NAMES)(flat))
     assert jl.named(("x", "y", "z"))(flat) != jl.named(NAMES)(flat)

@@ -1,4 +1,4 @@
-"""Quasi-velocities that are refused, and motions that their kinematics end."""
+"""Invalid quasi-velocities are refused, and singular kinematics end a motion."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 @pytest.mark.full
 def test_singular_kinematics_are_named():
-    """Pitch at 90 degrees: the third rate follows from the second; traced as well."""
+    """At a pitch of 90 degrees the third rate follows from the second; also under jit."""
     system = angles()
 
     def status(pitch):
@@ -70,7 +70,7 @@ def swinging(t, q, v, params):
     "pitch", mostly_full([0.5 * np.pi, -0.5 * np.pi, 1.5 * np.pi], 0.5 * np.pi)
 )
 def test_a_rate_that_rounding_leaves_is_none(pitch):
-    """Without roll the third rate is 6e-17 yaw' and nothing else."""
+    """Without roll the third rate is 6e-17 yaw', which is rounding."""
     system, q, v = angles(), [0.0, pitch, 0.0], [0.1, 0.2, 0.3]
     for start in ({"v0": None, "u0": v}, {"v0": v}):
         motion = jl.simulate(system, q, ts=[0.0, 0.1], throw=False, **start)
@@ -116,7 +116,7 @@ def test_a_lane_with_singular_kinematics_spoils_no_derivative():
 
 @pytest.mark.full
 def test_a_failure_that_kinematics_have_no_part_in_keeps_its_name():
-    """A force that ends, where dU/dv is singular: with multipliers U is not asked."""
+    """A force ends where dU/dv is singular: with multipliers U is not evaluated."""
 
     def ending(t, q, v, params):
         return jnp.stack([0.0 * t, jnp.sqrt(0.1 - t), 0.0 * t])
@@ -241,7 +241,7 @@ def test_something_else_than_quasi_velocities_is_refused(unchecked):  # noqa: F8
 
 @pytest.mark.full
 def test_rows_beside_them_are_solved_for_with_multipliers():
-    """Where quasi-velocities do not take care of a row, "auto" means multipliers."""
+    """If quasi-velocities do not satisfy a row, "auto" means multipliers."""
     motion = run(one(), constraints=(BLADE,), u0=np.zeros(3))
     assert motion.formulation == "multipliers"
     np.testing.assert_allclose(motion.u[0], 0.0, atol=8 * EPS)
@@ -252,7 +252,7 @@ def braked(t, q, v, params, lam):
 
 
 def test_a_force_may_read_what_holds_a_quasi_velocity():
-    """Solved for with multipliers then; the quasi-velocity formulation knows none."""
+    """Such systems are solved with multipliers; the quasi-velocity formulation has none."""
     force = jl.GeneralizedForce(braked, "brake", reaction=True)
     quasi = one(constrained=("b",))
     system = system_of(quasi, forces=(force,))
@@ -269,7 +269,7 @@ def test_a_force_may_read_what_holds_a_quasi_velocity():
 
 
 def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
-    """Three speeds for three coordinates, one of which the blade's row forbids."""
+    """Three speeds for three coordinates; the blade's row excludes one of them."""
 
     def rates(t, q, u, params):
         c, s = jnp.cos(q[2]), jnp.sin(q[2])

@@ -56,7 +56,7 @@ def bent(t, q, params):
 
 
 def test_a_point_force_does_the_work_of_its_displacement():
-    """Q = (dr/dq)^T F, against the Jacobian formed; two points at once."""
+    """Q = (dr/dq)^T F, compared with the explicit Jacobian; two points at once."""
 
     def pull(t, q, v, params):
         return jnp.stack([params["F"], -0.5 * params["F"]]) * (1 + v[0])
@@ -68,7 +68,7 @@ def test_a_point_force_does_the_work_of_its_displacement():
 
 
 def test_the_jacobian_is_never_formed():
-    """A force at the tip of a chain of 50 links: no array of 2 x 50 numbers, in any order."""
+    """A force at the tip of a chain of 50 links: no array has 2 x 50 entries, in any order."""
     n = 50
 
     def tip(t, q, params):
@@ -85,7 +85,7 @@ def test_the_jacobian_is_never_formed():
 
 
 def test_power_of_a_point_force_is_that_of_its_point():
-    """v . Q = F . dr/dt where the point moves with the coordinates alone."""
+    """v . Q = F . dr/dt if the point moves only with the coordinates."""
     found = V @ force_of(jl.PointForce(corner, constant, "pull"))
     rate = jax.jvp(lambda q: corner(T, q, PARAMS), (Q,), (V,))[1]
     np.testing.assert_allclose(found, PARAMS["F"] @ rate, rtol=64 * EPS)
@@ -118,7 +118,7 @@ def test_forces_and_torques_read_inputs():
 
 
 def test_body_torques_act_on_euler_angles_by_the_transposed_rate_matrix():
-    """Q = W^T tau with w = W (psi', theta', phi'), nothing on the position."""
+    """Q = W^T tau with w = W (psi', theta', phi'); zero for the position."""
     found = force_of(jl.Torque(body_rates, constant, "motor"))
     W = np.asarray(rotation.yaw_pitch_roll.body_rate_matrix(Q[3:]))
     np.testing.assert_array_equal(found[:3], 0)
@@ -126,7 +126,7 @@ def test_body_torques_act_on_euler_angles_by_the_transposed_rate_matrix():
 
 
 def test_a_torque_may_be_given_in_body_or_inertial_components():
-    """The same torque, its components and those of the angular velocity in either axes."""
+    """One torque: components of torque and angular velocity in body or inertial axes."""
 
     def turned(t, q, v, params):
         return orientation(q) @ params["F"]
@@ -167,7 +167,7 @@ def test_a_moving_frame_adds_nothing_to_the_torque():
 
 
 def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
-    """w by [w]x = R^T dR/dt, the derivative by JAX: affine in v, found to be so."""
+    """w by [w]x = R^T dR/dt, differentiated by JAX: detected as affine in v."""
 
     def rates(t, q, v, params):
         R, R_rate = jax.jvp(orientation, (q,), (v,))
@@ -192,7 +192,7 @@ def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
     ids=["fori_loop", "scan", "cond on q", "real power"],
 )
 def test_an_angular_velocity_may_come_from_loops_and_choices(rates):
-    """Affine in v however it is written: dw/dv at one v is that at another."""
+    """Affine in v in any form: dw/dv is the same at two values of v."""
     tau = jnp.ones_like(rates(T, Q, V, PARAMS))
     found = force_of(jl.Torque(rates, lambda t, q, v, params: tau, "motor"))
     expected = jnp.tensordot(tau, jax.jacfwd(lambda v: rates(T, Q, v, PARAMS))(0 * V + 1), tau.ndim)

@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md, followed; names and tables of both documents hold."""
+"""The worked examples of CONTRIBUTING.md run; names and tables of both documents are right."""
 
 import importlib
 import re
@@ -36,7 +36,7 @@ def example(heading):
 
 
 def follow(found, namespace=None):
-    """The names that blocks bind; what they print is compared with the text blocks."""
+    """The names that blocks define; their output is compared with the text blocks."""
     namespace = {} if namespace is None else namespace
     run("CONTRIBUTING.md", found, namespace)
     return namespace
@@ -87,7 +87,7 @@ def test_a_system_is_found_by_its_name(added, monkeypatch, capsys):
 
 
 def assert_equal_to_hand_equations(entry, by_hand):
-    """To 32 roundings of the terms: those of a few operations, and of sines on both sides."""
+    """To 32 roundings of the terms: of a few operations, and of sines on both sides."""
     for t, angle, rate in np.random.default_rng(0).uniform(-1.0, 1.0, (8, 3)):
         q, v, params = np.array([angle]), np.array([rate]), entry.example.params
         M, terms = by_hand(t, q, v, **params)
@@ -103,7 +103,7 @@ def test_a_force_law_has_the_power_it_says(monkeypatch):
     namespace = follow([use, said, tests])
     assert run_tests(namespace) == 2
     motion = namespace["motion"]
-    # 1e-9 a step for the energy and for the work, over some dozen steps.
+    # 1e-9 per step for the energy and for the work, over some dozen steps.
     change = motion.energy[-1] - motion.energy[0]
     np.testing.assert_allclose(motion.work["damper"][-1], change, rtol=0, atol=1e-7)
     assert change < -0.1
@@ -137,16 +137,16 @@ def test_modules_of_the_examples_import_what_they_may(tmp_path):
     assert packages <= {"solvers", *test_layers.ALLOWED["solvers"]}
 
 
-# ---- What both documents name ------------------------------------------------------------------
+# ---- Names in both documents -------------------------------------------------------------------
 
 
 def quoted(path):
-    """What stands in back-ticks, outside of code blocks."""
+    """Text in back-ticks, outside of code blocks."""
     return re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL))
 
 
 NEW = {"bead_on_hoop.py", "_sofroniou4.py", "_name.py"}
-"""Files that the examples make, and the pattern of names."""
+"""Files that the examples create, and the pattern of names."""
 
 
 @BOTH

@@ -1,4 +1,4 @@
-"""Every documented line runs: the README's code and its printed numbers, doctests, set-up lines."""
+"""Every documented line runs: code and output of the README, doctests, set-up lines."""
 
 import doctest
 import importlib
@@ -22,7 +22,7 @@ def numbers(text):
 
 
 FIRST = 4
-"""Blocks of the README's opening example: a program and what it prints, twice."""
+"""Blocks of the README's opening example: a program and its output, twice."""
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_readme_runs_and_prints_what_it_says(count, outputs):
 
 
 def test_readme_shows_the_same_numbers_twice():
-    """The simulated and the closed form, to the digits shown."""
+    """The simulated and the closed-form values, to the digits shown."""
     shown = [numbers(text) for _, language, text in blocks(README) if language == "text"]
     assert len(shown[0]) == 2
     assert shown[0] == pytest.approx(shown[1], abs=2e-6)

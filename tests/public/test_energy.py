@@ -14,7 +14,7 @@ EPS = np.finfo(float).eps
 T = jnp.array(0.4)
 RNG = np.random.default_rng(7)
 
-# A body made of six particles: masses and places along the body axes from its origin.
+# A body of six particles: masses and positions along the body axes from its origin.
 MASSES = jnp.asarray(RNG.uniform(0.2, 1.0, 6))
 PLACES = jnp.asarray(RNG.uniform(-0.5, 0.5, (6, 3)))
 MASS = jnp.sum(MASSES)
@@ -39,7 +39,7 @@ PARAMETRIZATIONS = {
 
 def pose_of(parametrization):
     def pose(t, q, params):
-        """Turned by the coordinates on a table that turns and rises by itself."""
+        """Rotated by the coordinates, on a table that rotates and rises with time."""
         table = rotation.about_z(0.7 * t)
         return table @ parametrization.matrix(q[3:]), table @ q[:3] + jnp.stack(
             [0 * t, 0 * t, t**2]
@@ -162,7 +162,7 @@ def test_particles_may_be_one_or_many_in_any_dimension():
 
 
 def test_gravity_points_where_it_is_told():
-    """V = m g y with y upwards."""
+    """V = m g y with y upward."""
     V = energy.gravity(2.0, jnp.array([5.0, 3.0]), jnp.array([0.0, -9.81]))
     np.testing.assert_allclose(V, 2 * 9.81 * 3, rtol=4 * EPS)
 
@@ -189,7 +189,7 @@ def test_a_spring_is_right_at_zero_length():
 
 
 def test_a_declared_system_uses_them():
-    """A spherical pendulum from one position: the motion of T and V written by hand."""
+    """A spherical pendulum by its position: the motion equals that of T and V by hand."""
 
     def position(t, q, params):
         theta, phi = q
@@ -218,7 +218,7 @@ def test_a_declared_system_uses_them():
 
 
 def test_bodies_may_be_params_and_fitted():
-    """A body in the params: its leaves are traced, and T's derivatives in them are right."""
+    """A body in params: its leaves are traced, and derivatives of T by them are right."""
 
     def kinetic(body, V, w):
         return body.kinetic_from_rates(V, w)
@@ -232,7 +232,7 @@ def test_bodies_may_be_params_and_fitted():
 
 
 def test_coordinates_and_velocities_are_brought_to_one_precision():
-    """Integers and mixed precisions, whatever promotion JAX is set to."""
+    """Integers and mixed precisions, for any promotion of dtypes in JAX."""
 
     def point(t, q, params):
         return q**2

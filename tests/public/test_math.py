@@ -1,7 +1,7 @@
 """Values and derivatives to third order at, near and far from singular points.
 
 Smooth functions are compared with their power series in exact rational arithmetic, the others with
-closed forms. Tolerances are in units of EPS, about twice the worst error measured.
+closed forms. Tolerances are in units of EPS, about twice the largest error measured.
 """
 
 import math as stdlib
@@ -73,7 +73,7 @@ def test_functions_of_jax_fail_where_these_do_not():
     assert jax.grad(jnp.arctan2)(1e200, 1e200) == 0  # 5e-201
     assert jnp.linalg.norm(jnp.array([1e-200, 0.0])) == 0
     assert np.isnan(jax.grad(lambda x: jnp.sin(x) / x)(0.0))
-    assert abs((1 - jnp.cos(1e-7)) / math.one_minus_cos(1e-7) - 1) > 1e-4  # it cancels
+    assert abs((1 - jnp.cos(1e-7)) / math.one_minus_cos(1e-7) - 1) > 1e-4  # cancellation
 
 
 # ---- Smooth functions --------------------------------------------------------------------------
@@ -88,7 +88,7 @@ def series(coefficient, x, order):
 
 
 def even(coefficient):
-    """Of x where `coefficient` belongs to z = x^2."""
+    """Coefficients in x if `coefficient` is that in z = x^2."""
     return lambda k: Fraction(0) if k % 2 else coefficient(k // 2)
 
 
@@ -109,8 +109,8 @@ def around(threshold):
     return [1e-300, 1e-160, 1e-8, 1e-3, 0.1, 0.5, 1.0, 1.5, 0.99 * threshold, inside, threshold]
 
 
-# Name, coefficients, end of the series, tolerance of each order in EPS: twice the worst measured.
-# Where it is large, the derivative has a zero near one of the points.
+# Name, coefficients, end of the series, tolerance of each order in EPS: twice the largest error
+# measured. A large tolerance belongs to a derivative with a zero near one of the points.
 SMOOTH = [
     ("sinc", even(of_sinc), 2.0, (2, 2, 32, 6)),
     ("cosc", even(of_cosc), 4.0, (3, 3, 10, 20)),
@@ -124,7 +124,7 @@ SMOOTH = [
     ("name", "coefficient", "threshold", "worst"), mostly_full(SMOOTH, SMOOTH[0], SMOOTH[3])
 )
 def test_smooth_functions_to_third_order(name, coefficient, threshold, worst):
-    """Relative errors: series, quotient, and both sides of the threshold alike."""
+    """Relative errors of series and quotient, on both sides of the threshold."""
     x = np.array([*around(threshold), 1.01 * threshold, 1.1 * threshold, 5.0])
     if not name.endswith("sqrt"):
         x = np.concatenate([x, -x])
@@ -158,7 +158,7 @@ def test_rotation_by_a_vector_is_smooth_at_zero():
 
 
 def test_conventions_do_not_carry_over_to_composed_functions():
-    """As documented: of |x|^2 and sinc(|x|), whose Hessians at 0 are 2 and -1/3 times 1."""
+    """As documented, for |x|^2 and sinc(|x|), whose Hessians at 0 are 2 and -1/3 times 1."""
     zero = jnp.zeros(2)
     assert_array_equal(jax.hessian(lambda x: math.norm(x) ** 2)(zero), 0.0)
     assert_array_equal(jax.hessian(lambda x: x @ x)(zero), 2 * np.eye(2))
@@ -171,7 +171,7 @@ def test_conventions_do_not_carry_over_to_composed_functions():
 
 
 def test_sqrt_far_and_near():
-    """Worst error 0.5, 0.6, 1.6 and 2.1 EPS; the third derivative is some x^(-5/2)."""
+    """Largest errors 0.5, 0.6, 1.6 and 2.1 EPS; the third derivative is of order x^(-5/2)."""
     x = np.array([1e-120, 1e-100, 1e-8, 0.1, 1.0, 2.0, 3e8, 1e120])
     root = np.sqrt(x)
     expected = root, 0.5 / root, -0.25 / root / x, 0.375 / root / x / x
@@ -188,7 +188,7 @@ def inverse_cosine(x):
 
 
 def test_acos_and_asin_to_the_ends():
-    """Worst relative error 0.8, 1.2, 2.8 and 5 EPS; absolute near x = 0, where they have zeros."""
+    """Largest relative errors 0.8, 1.2, 2.8 and 5 EPS; absolute near x = 0, a zero of both."""
     d = np.array([2.0**-53, 1e-15, 1e-12, 1e-8, 1e-4, 0.1, 0.5])
     x = np.concatenate([1 - d, d - 1, [0.3, 1e-3, 1e-160, 0.0]])
     expected = inverse_cosine(x)
@@ -218,7 +218,7 @@ def derivatives_of_length(x):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_length_to_third_order(n):
-    """Worst error 3 EPS |x|^(1 - k)."""
+    """Largest error 3 EPS |x|^(1 - k)."""
     rng = np.random.default_rng(n)
     derivatives = ladder(math.norm)
     for size in (1e-150, 1e-100, 1e-8, 1e-3, 1.0, 1e8, 1e150, 1e200, 1e300):
@@ -275,7 +275,7 @@ def test_length_of_no_components_and_of_what_is_not_finite():
     ids=["norm", "unit", "sqrt", "atan2", "angle_between"],
 )
 def test_second_derivatives_within_a_loop(function, x):
-    """There JAX may pass a derivative rule over, and differentiate what the rule stands for."""
+    """There JAX may skip a derivative rule and differentiate the body of the function."""
     x = jnp.array(x)
 
     def loop(v):
@@ -289,7 +289,7 @@ def test_second_derivatives_within_a_loop(function, x):
 
 
 def test_spring_of_no_length():
-    """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| drops out."""
+    """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| has no effect."""
 
     def energy(r, rest):
         return 7.0 / 2 * (r @ r - 2 * rest * math.norm(r) + rest**2)
@@ -330,7 +330,7 @@ def of_one_argument(name):
 
 @cache
 def together(function):
-    """One derivative of each order of a batch: the orders' first axis has one entry."""
+    """One derivative of each order of a batch: the first axis of each order has length one."""
     return jax.jit(jax.vmap(ladder(function, ONE_EACH), out_axes=1))
 
 
@@ -342,7 +342,7 @@ def test_batches_hold_every_function():
 
 @pytest.mark.parametrize("name", mostly_full(BATCHES, "angle_between", "norm", "sinc"))
 def test_a_singular_point_in_a_batch_harms_no_other(name):
-    """Nor a large argument: each as by itself."""
+    """Nor does a large argument: each value equals the single one."""
     x, function = np.array(BATCHES[name]), of_one_argument(name)
     batch = [values[0] for values in together(function)(x)]
     for i, point in enumerate(x):
@@ -369,7 +369,7 @@ def test_numbers_and_integers(name):
     for one in (1, 1.0, np.arange(1, 2), jnp.array(1)):
         assert function(one).dtype == jnp.float64
         assert_array_equal(np.ravel(function(one)), function(jnp.array(1.0)))
-    for number in (1, 1.0):  # takes the dtype of what it meets, as in jnp
+    for number in (1, 1.0):  # takes the dtype of the other operand, as in jnp
         assert (function(number) * jnp.float32(2)).dtype == jnp.float32
     with jax.enable_x64(False):
         assert function(np.arange(1, 2)).dtype == jnp.float32
@@ -403,6 +403,6 @@ def test_wrong_vectors_are_refused():
 
 
 def test_the_name_hides_nothing():
-    """Siblings that import math get the standard library's."""
+    """Modules that import math get the standard library's."""
     assert jaxlag._model._coordinates.math is stdlib
     assert stdlib is not math

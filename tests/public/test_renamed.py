@@ -1,4 +1,4 @@
-"""Former names, keywords and orders of arguments: each is refused with the present one."""
+"""Former names, keywords and orders of arguments are refused with the present ones."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,7 @@
 """Rotations: matrices, rates and parametrizations, against the book's tables, scipy and jvp.
 
-Entries of R are at most 1 and take some three roundings, so identities of one or two products of
-them hold to some 10 EPS; the worst found over the samples is written beside each bound.
+Entries of R are at most 1 and take some three roundings, so that identities of one or two of their
+products hold to some 10 EPS. A comment at each bound gives the worst error of the samples.
 """
 
 import re
@@ -33,7 +33,7 @@ from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
 
 
 def test_elementary_rotations_turn_the_axes_the_right_way():
-    """Right-hand rule: about x it is y to z, about y it is z to x, about z it is x to y."""
+    """Right-hand rule: about x from y to z, about y from z to x, about z from x to y."""
     x, y, z = np.eye(3)
     for turn, axis, start, end in (
         (rotation.about_x, x, y, z),
@@ -67,7 +67,7 @@ def test_yaw_pitch_roll_is_the_matrix_of_the_book():
 
 
 def test_angles_are_successive_elementary_rotations():
-    """Intrinsic, so left to right; the order matters."""
+    """Intrinsic rotations multiply from left to right; the order matters."""
 
     def differences(x):
         a, b, c = x
@@ -102,13 +102,13 @@ def test_matrices_agree_with_scipy(kind):
         "zxz": lambda: Rotation.from_euler("ZXZ", x),
         "quaternion": lambda: Rotation.from_quat(x[:, [1, 2, 3, 0]]),
     }[kind]()
-    # Angles of 10 rad are halved and composed by scipy: some EPS more than ours.
+    # scipy halves and composes angles of 10 rad: its rounding is some EPS larger.
     assert worst(batch(ALL[kind].matrix, x), theirs.as_matrix()) <= 8 * EPS  # worst 2.5
 
 
 @every
 def test_each_direction_cosine_is_its_cofactor(kind):
-    """The book's nine identities, and with them T T^T = E and det T = 1."""
+    """The book's nine identities, which imply T T^T = E and det T = 1."""
     x = anywhere(kind, np.random.default_rng(4))
     T = batch(lambda x: rotation.direction_cosines(ALL[kind].matrix(x)), x)
     a = {f"{i + 1}{j + 1}": T[:, i, j] for i in range(3) for j in range(3)}
@@ -158,7 +158,7 @@ def test_the_matrix_moves_with_the_rates(kind):
     rng = np.random.default_rng(7)
     x, p = anywhere(kind, rng), ALL[kind]
     size = np.linalg.norm(x, axis=1)[:, None] if kind == "quaternion" else 1.0
-    x_dot = rng.normal(size=x.shape) * size  # so that w is some 1 to 10 rad/s
+    x_dot = rng.normal(size=x.shape) * size  # so that w is about 1 to 10 rad/s
 
     def all_rates(x, x_dot):
         R, R_dot = jax.jvp(p.matrix, (x,), (x_dot,))
@@ -177,7 +177,7 @@ def test_the_matrix_moves_with_the_rates(kind):
 
 
 def test_rates_of_yaw_pitch_roll_are_those_of_the_book():
-    """M, its inverse and det M = cos(theta), printed for (phi, theta, psi): our order reversed."""
+    """M, its inverse and det M = cos(theta), printed for (phi, theta, psi): the reverse order."""
     for x in principal("yaw_pitch_roll", np.random.default_rng(8), 20):
         sT, sF, cT, cF = np.sin(x[1]), np.sin(x[2]), np.cos(x[1]), np.cos(x[2])
         M = np.array([[1, 0, -sT], [0, cF, sF * cT], [0, -sF, cF * cT]])
@@ -204,7 +204,7 @@ def test_determinants_of_the_rate_matrices():
 @every
 @pytest.mark.parametrize("frame", ["body", "space"])
 def test_rates_can_be_undone(kind, frame):
-    """Of a quaternion's x_dot the part along x is no rotation, and is left out."""
+    """The part of a quaternion's x_dot along x is no rotation, and is omitted."""
     rng = np.random.default_rng(10)
     p, x = ALL[kind], principal(kind, rng)
     x_dot, w = rng.normal(size=x.shape), rng.normal(size=(COUNT, 3))
@@ -232,7 +232,7 @@ def test_a_scaled_quaternion_is_the_same_rotation():
             }
             for name, function in same.items():
                 np.testing.assert_array_equal(function(scale), function(1.0), name)
-        # A change of norm alone turns nothing: cancellation of terms |e||e_dot|/(e.e) = 1.
+        # A change of norm alone is no rotation: terms of |e||e_dot|/(e.e) = 1 cancel.
         assert worst(quaternion.body_rates(e, e), 0) <= 2 * EPS  # worst 0.5
 
 
@@ -259,7 +259,7 @@ def test_quaternion_products_are_matrix_products():
 def test_from_matrix_undoes_matrix_in_the_principal_ranges(kind):
     x = principal(kind, np.random.default_rng(13))
     found = batch(lambda x: ALL[kind].from_matrix(ALL[kind].matrix(x)), x)
-    # Angles are ratios of entries of size sin(0.2) or more, and at most pi themselves.
+    # Angles are ratios of entries of at least sin(0.2), and are at most pi.
     assert worst(found, x) <= 5 * EPS  # worst 1
     if kind == "quaternion":  # every component was the largest one for some
         assert set(np.argmax(np.abs(x), axis=1)) == {0, 1, 2, 3}
@@ -267,7 +267,7 @@ def test_from_matrix_undoes_matrix_in_the_principal_ranges(kind):
 
 @every
 def test_from_matrix_reproduces_any_rotation(kind):
-    """Several turns away, and the 24 turns of a cube, where angles are locked and e0 may be 0."""
+    """Several revolutions, and the 24 rotations of a cube: with gimbal lock, or with e0 = 0."""
     p, any_R = ALL[kind], batch(zxz.matrix, anywhere("zxz", np.random.default_rng(14)))
     R = np.concatenate([any_R, np.stack(list(cube()))])
     x, again = batch(lambda R: (p.from_matrix(R), p.matrix(p.from_matrix(R))), R)
@@ -311,7 +311,7 @@ def test_at_exact_gimbal_lock_the_first_angle_is_zero():
 
 
 def test_quaternions_of_half_turns():
-    """All four branches by value; at 1e-9 rad from a half turn nothing is lost to cancellation."""
+    """All four branches by value; at 1e-9 rad from a half turn no digits cancel."""
     for i, e in enumerate(np.eye(4)):
         R = -np.eye(3) if i else np.eye(3)
         R[max(i - 1, 0), max(i - 1, 0)] = 1.0

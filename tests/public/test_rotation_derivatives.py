@@ -12,7 +12,7 @@ from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
 
 
 def functions(p):
-    """Of x alone; x_dot and w are fixed, coordinates from matrices go along rotations."""
+    """Functions of x alone; x_dot and w are fixed, coordinates of matrices vary along rotations."""
 
     def x_dot(x):
         return jnp.array([0.3, -0.8, 0.5, 1.1], x.dtype)[: len(p.names)]
@@ -43,7 +43,7 @@ def test_derivatives_agree_with_central_differences(kind, name):
     differences = np.moveaxis(ahead - behind, 0, -1) / (2 * h)
     scale = np.max(np.abs(forward))
     assert worst(forward, reverse) <= 8 * EPS * scale  # worst 3
-    # h^2/6 of the third derivative, at most 6/0.2^2 of the first, and EPS/h of the values.
+    # h^2/6 of the third derivative, at most 6/0.2^2 times the first one, and EPS/h of the values.
     atol = (h**2 / 0.2**2 + 10 * EPS / h) * scale
     assert worst(forward, differences) <= atol
     assert scale > 0.1
@@ -100,7 +100,7 @@ def test_single_precision_stays_single(kind, function):
     eps = float(np.finfo(np.float32).eps)
     for found, expected in zip(jax.tree.leaves(single), jax.tree.leaves(double), strict=True):
         assert (found.dtype, expected.dtype) == (np.float32, np.float64)
-        # As in double: |a|, |b| <= 5 and 1/|det W| <= 5.
+        # As in double precision: |a|, |b| <= 5 and 1/|det W| <= 5.
         assert worst(found, expected) <= 25 * eps  # worst 5.5
 
 

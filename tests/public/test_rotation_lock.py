@@ -1,4 +1,4 @@
-"""At gimbal lock and near it, and quaternions of extreme norms."""
+"""Rotations at gimbal lock and near it, and quaternions of extreme norms."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxlag.rotation import quaternion, zxz
 @pytest.mark.parametrize("frame", ["body", "space"])
 @every_angles
 def test_at_gimbal_lock_two_rates_are_not_finite(kind, frame, dtype):
-    """Also at the representable angles nearest to it, and for the w of some finite x_dot."""
+    """Also at the nearest representable angles, and for w of a finite x_dot."""
     p, rng = ANGLES[kind], np.random.default_rng(16)
     lock = np.pi * np.arange(-4, 5) + (np.pi / 2 if kind == "yaw_pitch_roll" else 0.0)
     x = rng.uniform(-np.pi, np.pi, (len(lock), 3)).astype(dtype)
@@ -54,7 +54,7 @@ def test_near_gimbal_lock_the_error_grows_as_its_inverse_distance(kind):
 
 
 def test_the_smallest_nutation_is_not_taken_for_lock():
-    """sin(theta) = theta is exact there, whatever its size."""
+    """sin(theta) = theta is exact there, for any size."""
     found = zxz.from_body_rates([0.0, 1e-200, 0.0], [0.5, 3e-200, 0.0])
     np.testing.assert_allclose(found, [3.0, 0.5, -3.0], rtol=4 * EPS)
 
@@ -88,7 +88,7 @@ def test_quaternions_of_extreme_norms_are_rotations(dtype, powers):
 
 
 def test_the_scale_of_a_quaternion_has_no_part_in_its_derivatives():
-    """To second order, forward and reverse, against R written out with sums of squares."""
+    """To second order, forward and reverse, against R written with sums of squares."""
 
     def plain(x):
         a, b, c, d = x

@@ -1,6 +1,6 @@
-"""Bad input to `simulate` and `System`: each is refused by name, with what it must be and was.
+"""Invalid input of `simulate` and `System`: refused by name, with the condition and the value.
 
-Where values are traced nothing can be raised: a status says it instead.
+Traced values cannot raise errors: a status reports them.
 """
 
 import re
@@ -131,7 +131,7 @@ def logarithmic(t, q, v, params):
 
 
 def massless(t, q, v, params):
-    """Inertia for the given coordinates only, couplings none."""
+    """Inertia for the given coordinates only, without couplings."""
     return 0.5 * jnp.sum(jnp.asarray(params["m"]) * v**2) - 0.5 * q @ q
 
 
@@ -291,7 +291,7 @@ def test_a_bad_value_is_refused(changes, message):
 
 
 def test_the_bounds_themselves_are_good():
-    """Traced, not run: what lies on the right side of a bound is let through."""
+    """Traced, not run: values just inside a bound are accepted."""
     for changes in (
         {"rtol": 10 * EPS},
         {"rtol": 0.0, "atol": 1e-9},
@@ -336,7 +336,7 @@ TRACED = {
 
 
 def test_traced_bad_values_end_in_a_status():
-    """All in one batch, so that none of them harms a good one either."""
+    """All in one batch, so that they must not affect a valid one."""
     system = jl.System(logarithmic, ("x", "y"))
     good = {
         "q0": Q0,

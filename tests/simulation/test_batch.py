@@ -1,4 +1,4 @@
-"""Batches by vmap: 256 lanes over everything traced, one of them failing on purpose."""
+"""Batches by vmap: 256 lanes with all values traced; one of them fails intentionally."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ BAD = 77
 
 @pytest.fixture(scope="module")
 def lanes():
-    """params, q0, v0 and the values of a torque table, a draw each; lane BAD has no inertia."""
+    """Random params, q0, v0 and values of a torque table; lane `BAD` has no inertia."""
     rng = np.random.default_rng(3)
     draw = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (LANES, *shape)))  # noqa: E731
     params = {
@@ -34,7 +34,7 @@ def one(params, q0, v0, torques):
 
 
 def test_lanes_equal_single_runs(lanes):
-    """Fixed steps: every lane to round-off of its own run, whatever its neighbors do."""
+    """Fixed steps: every lane equals its single run to rounding, independently of others."""
     batch = jax.jit(jax.vmap(one))(*lanes)
     single = jax.jit(one)
     for i in [*range(0, LANES, 17), BAD - 1, BAD, BAD + 1]:
@@ -49,7 +49,7 @@ def test_lanes_equal_single_runs(lanes):
 
 @pytest.mark.full
 def test_a_failing_lane_changes_no_other(lanes):
-    """Bit for bit: the same program with that lane mended."""
+    """Bit for bit: the same program with that lane corrected."""
     run = jax.jit(jax.vmap(one))
     broken = run(*lanes)
     params, *rest = lanes

@@ -1,4 +1,4 @@
-"""What is said where compiling takes long."""
+"""Messages about long compilations."""
 
 import itertools
 import logging
@@ -15,7 +15,7 @@ PAIR = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * q @ q, ("x", "y"))
 
 
 def called(patch, seconds, system=PAIR, **options):
-    """A simulation whose every look at the clock is so many seconds after the last."""
+    """A simulation in which each reading of the clock is so many seconds after the last."""
     clock = partial(next, itertools.count(0.0, seconds))
     patch.setattr(_simulate, "timed", partial(_compile_log.timed, clock=clock))
     return jl.simulate(system, [0.1, 0.2], [0.0, 0.0], [0.0, 1.0], {"k": 2.0}, **options)
@@ -31,7 +31,7 @@ def test_a_long_compilation_is_said_once(monkeypatch, caplog):
     assert text.startswith("Compiling the motion of 2 coordinates (x, y) took 12 s")
     assert "JAX_COMPILATION_CACHE_DIR" in text
     assert "lowering='array'" in text
-    called(monkeypatch, 12.0, dt=0.25, method="heun")  # compiled already, however long it takes
+    called(monkeypatch, 12.0, dt=0.25, method="heun")  # compiled already: no message
     assert len(caplog.records) == 1
 
 

@@ -1,4 +1,4 @@
-"""Exported programs whose numbers of motions and of times are symbols."""
+"""Exported programs with symbolic numbers of motions and of times."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def row(count):
 
 
 def agree(function, sizes, rtol=0.0):
-    """An exported function of (b,) params and (k,) times, at other sizes, as the function itself.
+    """An exported function of (b,) params and (k,) times equals the function at other sizes.
 
     Chunks of lanes may have other sizes than without symbols: then rounding differs.
     """
@@ -58,7 +58,7 @@ def test_batches_and_times_of_any_number():
 @pytest.mark.parametrize("system", [PENDULUM, ROD, LINES], ids=["scalars", "rod", "arrays"])
 @pytest.mark.parametrize("method", ["auto", "kvaerno5"])
 def test_adaptive_motions(system, method):
-    # The tolerance of a step: steps of one lane are those of no other, but round otherwise.
+    # The tolerance of a step: steps of a lane do not depend on other lanes, but round differently.
     agree(end(system, method=method), [(1, 2), (16, 3), (17, 4)], rtol=1e-9)
 
 

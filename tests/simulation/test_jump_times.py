@@ -1,6 +1,6 @@
-"""Jumps at times that params tell: named where derivatives would miss them, and knots that do not.
+"""Jumps at times given by params: derivatives miss them, which is reported, except at knots.
 
-Bends are not named: of interpolated tables and ramps derivatives are right.
+Kinks are not reported: derivatives by interpolated tables and ramps are right.
 """
 
 import warnings
@@ -76,7 +76,7 @@ def leaves(system, params, inputs=None, names=("params['b']",), ts=TS):
 
 
 def unknown(system, params):
-    """The same where no number is known, as under jit."""
+    """The same without known values, as under jit."""
     found = []
 
     def look(params):
@@ -106,9 +106,9 @@ def test_a_jump_after_the_last_time_is_none_yet():
 
 
 def test_jumps_of_energies_and_rows_and_kinematics():
-    """Whatever the equations are made of: a moving frame whose rate jumps has a momentum that does.
+    """In all parts of the equations: a moving frame with a jump in its rate has one in momentum.
 
-    A row whose second derivative bends moves nothing by a jump.
+    A row whose second derivative has a kink causes no jump.
     """
 
     def carried(power):
@@ -129,7 +129,7 @@ def test_jumps_of_energies_and_rows_and_kinematics():
 
 
 def test_jumps_within_inputs():
-    """Functions and constants are read; what has knots jumps where steps end."""
+    """Functions and constants are searched; signals with knots jump where steps end."""
 
     def force(t, q, v, params, inputs):
         return inputs["u"] * jnp.ones(1)
@@ -158,7 +158,7 @@ def test_jumps_within_inputs():
 
 
 def test_what_refuses_other_numbers_is_no_error():
-    """What cannot be told counts as a jump; tables, keys and truth values are made up in order."""
+    """Undecided comparisons count as jumps; made-up tables are ordered, keys and flags valid."""
 
     def guarded(t, q, v, params):
         bent = jnp.interp(t - params["b"], TIMES, VALUES) * q
@@ -222,7 +222,7 @@ DRIVEN = jl.System(
 
 
 def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
-    """Within its standard deviations, in segments, the first guess on the end of one of them."""
+    """Within its standard deviations, in segments; the first guess is the end of a segment."""
     ts, true = np.linspace(0.0, 3.0, 61), {"b": 1.2, "k": 4.0}
     x = jl.simulate(DRIVEN, Q0, [0.1], ts, true, inputs=inputs(true)).q
     noise = 1e-3 * np.random.default_rng(0).normal(size=(61, 1))
@@ -230,7 +230,7 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     found = jl.fit(DRIVEN, data, {"b": 1.0, "k": 3.5}, free=("b", "k"), segments=3)
     for name, value in true.items():
         assert abs(found.params[name] - value) < 3 * found.std[name]
-    # 20 measurements of a position of 0.3 m to 1 mm each tell a time to some milliseconds.
+    # 20 measurements of a position of 0.3 m to 1 mm each determine a time to some milliseconds.
     assert found.std["b"] < 5e-3
     assert found.jumps == {}
     hidden = pushed(JUMPING["where"])

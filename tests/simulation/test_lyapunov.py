@@ -1,4 +1,4 @@
-"""Growth of perturbations: closed forms, two routes to one number, and what is said about it."""
+"""Growth of perturbations: closed forms, independent computations, and messages."""
 
 import jax
 import jax.numpy as jnp
@@ -69,12 +69,12 @@ def test_kappa_is_what_it_says(params, start, span):
     norms = np.zeros((len(ts), len(ts)))
     Phi = expm(f * (ts[j] - ts[i])[:, None, None])
     norms[i, j] = np.linalg.norm(Phi * w[i][:, None, :] / w[j][:, :, None], 2, axis=(1, 2))
-    # Steps of 1e-10; measured worst 2026-11-22: 2e-10 of kappa and log_norm, 7e-12 of a part.
+    # Steps of 1e-10; measured 2026-11-22: at most 2e-10 of kappa and log_norm, 7e-12 of a part.
     np.testing.assert_allclose(growth.kappa, norms.max(axis=0), rtol=2e-9)
     np.testing.assert_allclose(growth.log_norm, np.log(norms[0]), rtol=0, atol=2e-9)
     exact = expm(f * np.diff(ts)[:, None, None])
     np.testing.assert_allclose(growth.transition, exact, rtol=0, atol=1e-10 * np.abs(exact).max())
-    # At s = t nothing has grown yet.
+    # At s = t nothing has grown.
     assert (growth.kappa >= 1.0).all()
     ratio = jl.lyapunov(motion, rtol=10 * rtol, atol=10 * atol)
     np.testing.assert_allclose(ratio.kappa, growth.kappa, rtol=1e-12)
@@ -104,11 +104,11 @@ def test_growth_as_a_power_of_time_is_not_exponential():
 
 
 def test_inverted_pendulum_has_its_exponent_and_horizon():
-    """Phi at the unstable equilibrium, where the motion itself needs no steps at all."""
+    """Phi at the unstable equilibrium, where the motion alone needs no steps."""
     ts = np.linspace(0.0, 10.0, 41)
     growth = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], ts))
     np.testing.assert_allclose(growth.kappa, norm_of_exponential(ts), rtol=1e-7)
-    # The rest of the other exponential after a quarter of the motion: exp(-2 RATE 2.5) = 2e-7.
+    # The other exponential after a quarter of the motion: exp(-2 RATE 2.5) = 2e-7.
     np.testing.assert_allclose(growth.exponent, RATE, rtol=1e-6)
     assert growth.exponential
     horizon = np.log(2e9 / (RATE + 1 / RATE)) / RATE
@@ -126,7 +126,7 @@ def test_inverted_pendulum_has_its_exponent_and_horizon():
 
 
 def test_a_motion_beyond_its_horizon_warns():
-    """exp(RATE t) takes 6.4 s to 1e9."""
+    """exp(RATE t) reaches 1e9 after 6.4 s."""
     beyond = linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 10.0, 41))
     with pytest.warns(UserWarning, match=r"From 6\.\d+ s after its start an error of 1e-09"):
         growth = jl.lyapunov(beyond)
@@ -179,7 +179,7 @@ def hand_written(t, y):
 
 @pytest.mark.full
 def test_exponent_of_chaos_by_two_nearby_trajectories():
-    """Benettin's way by scipy: the distance is set back to 1e-6 after each second."""
+    """Benettin's method with scipy: the distance is reset to 1e-6 after each second."""
     start, span, distance = np.array([2.0, 2.0, 0.0, 0.0]), 160.0, 1e-6
     motion = jl.simulate(minimal, start[:2], start[2:], np.linspace(0.0, span, 201), BOBS)
     growth = jl.lyapunov(motion)
@@ -196,7 +196,7 @@ def test_exponent_of_chaos_by_two_nearby_trajectories():
         far = near + (far - near) * distance / apart
     blocks = np.mean(np.reshape(rates[40:], (8, 15)), axis=1)
     error = np.std(blocks, ddof=1) / np.sqrt(8)
-    # Two samples of one chaotic sea: they differ by the errors of both, by three of them at most.
+    # Two samples of one chaotic region: they differ by at most three times the combined error.
     assert abs(growth.exponent - np.mean(blocks)) < 3 * np.hypot(growth.exponent_error, error)
     assert growth.exponential
     assert growth.exponent_error < 0.2 * growth.exponent
@@ -237,7 +237,7 @@ def test_conservative_growth_is_symplectic():
     chart = jnp.concatenate(parts, -1)
     growth = jl.lyapunov(motion)
     Phi = chart[1:] @ growth.transition @ jnp.linalg.inv(chart[:-1])
-    # Measured worst 2026-11-22: 5e-14.
+    # Measured 2026-11-22: at most 5e-14.
     J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
     np.testing.assert_allclose(
         jnp.swapaxes(Phi, 1, 2) @ J @ Phi, np.tile(J, (200, 1, 1)), atol=1e-9
@@ -264,12 +264,12 @@ def test_a_table_is_read_on_both_sides_of_its_knots():
         np.testing.assert_allclose(product(jl.lyapunov(motion)), expected, rtol=0, atol=1e-8)
 
 
-# ---- Batches, and what cannot be done ------------------------------------------------------------
+# ---- Batches, and unsupported arguments ----------------------------------------------------------
 
 
 @pytest.mark.full
 def test_batches_have_lanes_of_their_own():
-    """As single motions; under vmap and jit; a lane that failed is NaN and says why."""
+    """Equal to single motions, under vmap and jit; a failed lane is NaN with its status."""
     ts = np.linspace(0.0, 10.0, 41)
     k = jnp.array([4.0, -G, jnp.nan])
 
@@ -295,7 +295,7 @@ def test_batches_have_lanes_of_their_own():
 
 @pytest.mark.full
 def test_float32_has_tolerances_of_its_own():
-    """A state of float32 in time of float64."""
+    """A state in float32, time in float64."""
     params = {"k": np.float32(-G), "c": np.float32(0.0)}
     start = np.float32([0.0]), np.float32([0.0])
     motion = jl.simulate(linear, *start, np.linspace(0.0, 2.5, 41), params)
@@ -340,7 +340,7 @@ def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
 
 @pytest.mark.full
 def test_many_coordinates_at_many_times():
-    """12 coordinates and 32 segments: more at once is more than XLA compiles in one loop."""
+    """12 coordinates and 32 segments: more at once exceeds what XLA compiles in one loop."""
     motion = jl.simulate(
         quadcopter.system, *quadcopter.start(), np.linspace(0, 2, 33), quadcopter.example.params
     )

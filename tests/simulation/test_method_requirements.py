@@ -1,4 +1,4 @@
-"""What structure-preserving methods refuse, and why."""
+"""Systems and options that structure-preserving methods refuse, with the reason."""
 
 import diffrax
 import jax.numpy as jnp

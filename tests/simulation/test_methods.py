@@ -1,4 +1,4 @@
-"""method="auto": by tolerance, structure and stiffness; what a solution says of it."""
+"""method="auto" by tolerance, structure and stiffness, and how a solution reports it."""
 
 import diffrax
 import jax
@@ -71,7 +71,7 @@ def test_a_tolerance_that_is_traced_decides_nothing():
     ("system", "options", "name"),
     [
         (PLAIN, {}, "splitting8"),
-        (PLAIN, {"save": ("work",)}, "dopri8"),  # splitting8 takes work along with order 4
+        (PLAIN, {"save": ("work",)}, "dopri8"),  # splitting8 integrates work with order 4 only
         (WARPED, {}, "dopri8"),
         (PLAIN, {"method": "dopri8"}, "dopri8"),
         (PLAIN, {"method": diffrax.Dopri8()}, "dopri8"),
@@ -102,7 +102,7 @@ def test_motions_by_different_methods_are_of_one_form():
 
 @pytest.mark.full
 def test_tolerances_in_large_units():
-    """An orbit in meters for a day, to 0.1 mm: as order 8 has it."""
+    """An orbit in meters for a day, to 0.1 mm, by a method of high order."""
 
     def earth(t, q, v, params):
         return 0.5 * (v @ v) + 3.986004418e14 / jnp.sqrt(q @ q)
@@ -113,7 +113,7 @@ def test_tolerances_in_large_units():
     assert motion.method == "prince9"
     assert int(motion.stats["accepted"]) < 1000  # order 5 would need more than 3000
     turned = speed / r * 86400.0
-    # 15 turns of tolerances of 1e-4 m and 1e-4 m/s a step; phase errors grow with time.
+    # 15 revolutions with tolerances of 1e-4 m and 1e-4 m/s a step; phase errors grow with time.
     expected = r * np.array([np.cos(turned), np.sin(turned)])
     np.testing.assert_allclose(motion.q[-1], expected, atol=10.0)
 
@@ -124,7 +124,7 @@ def test_every_method_knows_its_name(name):
 
 
 def run_out(**options):
-    """The fast coordinate decays within 1e-5 s, then slowly: 30 s are 5e5 explicit steps."""
+    """The fast coordinate decays within 1e-5 s, then slowly: 30 s need 5e5 explicit steps."""
     return jl.simulate(
         OILED,
         [1.0, 0.1],
@@ -183,7 +183,7 @@ def elastic(t, q, v, params):
 
 
 def test_implicit_steps_are_as_long_as_accuracy_allows():
-    """Measured 299 and 27; with the chord iteration of diffrax's default 5659 and 7900."""
+    """Measured 299 and 27 steps; with the chord iteration of diffrax's default 5659 and 7900."""
     motion = jl.simulate(
         jl.System(elastic, ("x", "y")),
         [np.sin(1.0), -np.cos(1.0) - 1e-5],
@@ -230,7 +230,7 @@ def test_implicit_methods_solve_every_kind_of_system(name):
 
 
 def test_every_coordinate_may_have_a_tolerance_of_its_own():
-    """Of two springs apart only the one that is watched closely sets the step."""
+    """Of two uncoupled springs only the one with a tight tolerance limits the step."""
 
     def apart(t, q, v, params):
         return 0.5 * v @ v - 0.5 * (q[0] ** 2 + 100.0 * q[1] ** 2)

@@ -1,4 +1,4 @@
-"""Bad options of `simulate`: each is refused by name, with what it must be and was."""
+"""Invalid options of `simulate`: refused by name, with the condition and the value."""
 
 import re
 
@@ -111,7 +111,7 @@ def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
 
 
 def test_arguments_in_another_order_are_told():
-    """Where the names say so: q, v, t, p."""
+    """If the names show it: q, v, t, p."""
     message = r"^`lagrangian` must take \(t, q, v, params\) in this order.* 'q' stands where 't'"
     with pytest.raises(ValueError, match=message):
         jl.System(lambda q, v, t, p: 0.5 * v @ v, ("x",))

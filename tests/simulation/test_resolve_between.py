@@ -1,4 +1,4 @@
-"""States between the rows of a motion, as accurate as the rows."""
+"""States between the saves of a motion, as accurate as the saves."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ SYSTEM = jl.System(spring, ("x",))
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_states_between_rows_are_as_accurate_as_rows(sense):
-    """cos(2 t), in any order, rows and repeated times among them."""
+    """cos(2 t), in any order, including saves and repeated times."""
     ts = sense * np.array([0.0, 1.0, 4.0])
     motion = jl.simulate(SYSTEM, [1.0], [0.0], ts, 4.0, rtol=1e-10, atol=1e-10, method="tsit5")
     times = sense * np.array([3.3, 1.0, 2.5, 3.3, 4.0])
@@ -41,7 +41,7 @@ def test_constrained_motions_stay_on_their_constraints():
 
 
 def test_what_was_saved_is_there_between_rows():
-    """Work counts from the start of the motion: all that the damper took, as the energy tells."""
+    """Work counts from the start of the motion: all that of the damper, as the energy shows."""
     damper = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "damper")
     system = SYSTEM.with_forces(damper)
     motion = jl.simulate(system, [1.0], [0.0], [0.0, 1.0, 4.0], 4.0, save=("work", "energy"))

@@ -1,4 +1,4 @@
-"""Motions over several devices: in a process of its own, where the CPU counts as two of them."""
+"""Motions on several devices: in a separate process, where the CPU counts as two devices."""
 
 import json
 import os

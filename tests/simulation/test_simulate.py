@@ -1,4 +1,4 @@
-"""simulate and Solution as a user meets them: statuses, shapes, caching, saved quantities."""
+"""simulate and Solution in use: statuses, shapes, caching, saved quantities."""
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +45,7 @@ def test_save_equals_on_demand():
 
 
 def test_unrequested_quantities_are_not_computed():
-    """The marker in V is evaluated by save=("potential",) on rows; without it there are fewer."""
+    """save=("potential",) evaluates the marker in V at saves; without it there are fewer."""
 
     def count(save):
         jaxpr = jax.make_jaxpr(lambda q0: run(q0=q0, save=save, throw=False).q)(PENDULUM.q0)
@@ -55,7 +55,7 @@ def test_unrequested_quantities_are_not_computed():
 
 
 def test_array_coordinates():
-    """Two masses in the plane on springs to the origin: names give shapes back."""
+    """Two masses in the plane on springs to the origin: names return arrays of their shapes."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 0.5 * p * jnp.sum(q**2),
         {"x": (2, 2), "theta": ()},
@@ -84,7 +84,7 @@ def test_new_values_never_recompile():
     first = compiled()
     for changes in ({"m": 2.0}, {"q": 0.7}, {"v": 1.0}, {"t0": 0.1}, {"t1": 3.0}):
         go(rtol=1e-6, **changes)
-    go(rtol=1e-8, atol=9e-5)  # from 1e-4 on "auto" is another method
+    go(rtol=1e-8, atol=9e-5)  # from 1e-4 on "auto" chooses another method
     assert compiled() == first
     go(dt=0.1)
     fixed = compiled()
@@ -118,7 +118,7 @@ def test_max_steps_says_how_far():
 
 
 def test_force_that_becomes_nan_in_flight():
-    """The last good time is just short of where the force ends, and the coordinate is named."""
+    """The last good time is just before the force ends, and the coordinate is named."""
     force = jl.GeneralizedForce(lambda t, q, v, p: jnp.stack([0.0 * t, jnp.sqrt(p - t)]), "burn")
     system = jl.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), ("x", "y"), forces=(force,))
     with pytest.raises(
@@ -155,7 +155,7 @@ def ends(t, q, v):
     ],
 )
 def test_a_force_that_fails_inside_a_step_is_found_there(law, options):
-    """Of velocity, time or position: neither end of the step needs to be where it fails.
+    """A force of velocity, time or position may fail between the ends of a step.
 
     Another coordinate has the larger acceleration.
     """
@@ -173,7 +173,7 @@ def test_a_force_that_fails_inside_a_step_is_found_there(law, options):
 
 
 def test_what_grows_beyond_all_numbers_names_no_innocent():
-    """The coordinate whose steps are unstable, or none: all that depends on it is lost too."""
+    """The coordinate whose steps are unstable, or none: all that depends on it overflows, too."""
     system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) - 5e5 * q[0] ** 2 - q[0] * q[1], ("x", "y"))
     motion = jl.simulate(
         system, [1.0, 0.0], [0.0, 0.0], [0.0, 9.0], {}, method="tsit5", dt=0.05, throw=False
@@ -338,11 +338,11 @@ def test_explicit_controller():
 
 @pytest.mark.full
 def test_tolerance_is_kept_across_solvers():
-    """Five solvers agree within ten times the tolerance over a second."""
+    """Five solvers agree within a hundred times the tolerance over a second."""
     truth = run(rtol=1e-13, atol=1e-13)
     for method in ("bosh3", "tsit5", "dopri5", "dopri8", "kvaerno4"):
         motion = run(method=method, rtol=1e-6, atol=1e-6)
-        # Measured worst 2026-11-21: 2e-5, bosh3.
+        # Measured 2026-11-21: at most 2e-5, bosh3.
         np.testing.assert_allclose(motion.q, truth.q, rtol=0, atol=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Solution.explain: what held the steps short."""
+"""Solution.explain: what limits the steps."""
 
 import re
 
@@ -34,7 +34,7 @@ def line(text: str, head: str) -> str:
 
 
 def test_a_motion_that_goes_well():
-    """At rest below, the rate is sqrt g: its period 2 pi / 3 and the steps in it are told."""
+    """At the bottom the rate is sqrt g: its period 2 pi / 3 and steps per period are stated."""
     motion = jl.simulate(ANGLE, [1e-3], [0.0], TS, {"g": 9.0})
     text = motion.explain()
     h = 2.0 / int(motion.stats["accepted"])
@@ -56,7 +56,7 @@ def test_the_projection_is_told():
     far = jl.simulate(
         BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, method="tsit5", dt=0.6, throw=False
     )
-    text = far.explain()  # a step of half the way round
+    text = far.explain()  # a step of half a revolution
     turns = int(line(text, "projection").split()[2])
     assert turns > 3
     assert f"moved back onto the constraints in up to {turns} turns" in line(text, "advice")
@@ -73,7 +73,7 @@ def test_a_force_that_jumps_is_advised_a_table():
 
 @pytest.mark.full
 def test_a_mass_matrix_near_singular_names_a_coordinate():
-    """Masses of 1e-10 in units of their own cost no digits; velocities that are nearly one do."""
+    """Masses of 1e-10 in their own units cost no digits; nearly equal velocities do."""
 
     def light(t, q, v, params):
         return 0.5 * v[0] ** 2 + 0.5e-10 * v[1] ** 2 - 0.5 * q[0] ** 2 - 0.5e-10 * q[1] ** 2
@@ -145,7 +145,7 @@ def test_a_motion_without_a_step():
 
 @pytest.mark.parametrize("method", ["gauss4", "tsit5"])
 def test_fixed_steps_have_no_tolerance_to_loosen(method):
-    """What decays 3 times in a step keeps explicit steps short, implicit ones not."""
+    """A decay of 3 per step limits explicit steps, not implicit ones."""
     slow = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),
@@ -189,7 +189,7 @@ def test_fixed_steps_are_advised_no_tolerances():
 
 
 def test_a_stiff_motion_is_told_so():
-    """Its decay rate, and a method for it: not where steps are many for another reason."""
+    """Its decay rate and a method are stated, but not if steps are many for another reason."""
 
     def sticky(t, q, v, params):
         return 0.5 * params * v[0] ** 2

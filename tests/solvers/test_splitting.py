@@ -1,6 +1,6 @@
-"""Splitting methods: orders, the structure they keep, time, work, derivatives and what they refuse.
+"""Splitting methods: orders, conserved structure, time, work, derivatives, refused systems.
 
-Henon and Heiles's potential, plain or pushed by a force that depends on place and time.
+The Henon-Heiles potential, alone or with a force that depends on position and time.
 """
 
 import diffrax
@@ -22,7 +22,7 @@ def lagrangian(t, q, v, params):
 
 
 def swirl(t, q, v, params, inputs):
-    """A force without potential, in time as well."""
+    """A force without potential that depends on time."""
     return params["c"] * jnp.cos(3.0 * t) * jnp.stack([-q[1], q[0]]) + inputs["pull"]
 
 
@@ -36,7 +36,7 @@ pushed = jl.System(lagrangian, ("x", "y"), forces=(force,))
 
 @pytest.mark.parametrize("order", mostly_full(ORDERS, 4))
 def test_order_with_time_and_forces(order):
-    """Forwards and backwards in time; steps long enough for errors above 1e-12."""
+    """Forward and backward in time; steps are long enough for errors above 1e-12."""
     method, steps = f"splitting{order}", {2: 40, 4: 10, 6: 5, 8: 5}[order]
     counts = (steps, 2 * steps) if order > 4 else (steps, 2 * steps, 4 * steps)
     for span in ([0.2, 1.7], [0.2, -1.3]):
@@ -47,7 +47,7 @@ def test_order_with_time_and_forces(order):
 @pytest.mark.full
 @pytest.mark.parametrize("order", ORDERS)
 def test_map_is_symplectic(order):
-    """To 200 roundings of products of |S| over 20 steps; order 8 of Dormand and Prince is not."""
+    """To 200 roundings of products of |S| over 20 steps; the map of dopri8 is not symplectic."""
     defect, size = symplectic_defect(plain, Q0, V0, PARAMS, f"splitting{order}", 0.3, 20)
     assert defect <= 200 * EPS * size
     if order == 2:
@@ -57,7 +57,7 @@ def test_map_is_symplectic(order):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_a_motion_reverses(order):
-    """50 steps there and back: a few roundings a step, of numbers below 1."""
+    """50 steps forward and backward: a few roundings per step, of numbers below 1."""
     method = f"splitting{order}"
     there = end(pushed, Q0, V0, [0.0, 5.0], PARAMS, inputs=PULL, method=method, dt=0.1)
     back = end(pushed, *jnp.split(there, 2), [5.0, 0.0], PARAMS, inputs=PULL, method=method, dt=0.1)
@@ -65,7 +65,7 @@ def test_a_motion_reverses(order):
 
 
 def test_energy_stays_and_angular_momentum_is_kept():
-    """Kepler, e = 0.5, 50 periods: no drift of the energy beyond its oscillation; L to rounding."""
+    """Kepler, e = 0.5, 50 periods: the energy only oscillates; L is constant to rounding."""
     kepler = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 1.0 / jnp.sqrt(q @ q), ("x", "y"))
     e, period = 0.5, 2 * np.pi
     q0, v0 = [1 - e, 0.0], [0.0, np.sqrt((1 + e) / (1 - e))]
@@ -78,7 +78,7 @@ def test_energy_stays_and_angular_momentum_is_kept():
 
 
 def test_work_is_that_of_the_kicks():
-    """What the swirl and the pull do is what the energy gains, with the order of the method."""
+    """The work of swirl and pull is the change of energy, to the order of the method."""
     method = "splitting4"
 
     def gap(count):
@@ -110,7 +110,7 @@ def test_arrays_take_the_same_steps():
 
 @pytest.mark.full
 def test_derivatives_are_those_of_the_steps():
-    """Forward, reverse and differences, in the start and in params, single and in lanes."""
+    """Forward, reverse and differences, by the start and by params, single and in lanes."""
 
     def last(x):
         params = PARAMS | {"k": x[2]}
@@ -138,7 +138,7 @@ def test_a_step_that_does_not_divide_the_span_lands_on_its_end():
 
 
 def test_as_a_solver_of_diffrax():
-    """y = (q, v) of any form; the same numbers as by `simulate`."""
+    """y = (q, v) of any form; the same results as by `simulate`."""
 
     def field(t, y, args):
         (x, z), v = y

@@ -1,4 +1,4 @@
-"""Assembly: the nearest consistent state, what may be held, and what cannot be had."""
+"""Assembly: the nearest consistent state, held coordinates, and impossible requests."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ GUESS = (jnp.array([0.5, -0.7, 1.1, -1.0]), jnp.array([0.3, 0.0, 0.0, 0.1]))
 
 @pytest.mark.parametrize("weights", [None, [1.0, 2.0, 3.0, 4.0]])
 def test_nearest_state(weights):
-    """W (q* - q) is a combination of rows, and so is W (v* - v): conditions of a minimum."""
+    """W (q* - q) and W (v* - v) are combinations of rows: the conditions of a minimum."""
     state = jl.assemble(cartesian, *GUESS, BOBS, weights=weights)
     position, velocity = cartesian.residuals(state.q, state.v, BOBS)
     for residual in (*position.values(), *velocity.values()):
@@ -56,7 +56,7 @@ def test_consistent_states_stay():
 
 @pytest.mark.parametrize("wrong", [(1.0, 1.2, 0.8), (1.0, 0.8, 1.2), (1.0, 1.2, 1.2)])
 def test_four_bar_from_a_wrong_guess(wrong):
-    """20 % off in two angles, the crank held: the law of cosines."""
+    """20 % off in two angles, with the crank held; compared with the law of cosines."""
     q = four_bar_start()
     state = jl.assemble(
         four_bar, q * jnp.array(wrong), [1.0, 0, 0], FOUR_BAR, hold=("crank", "crank'")
@@ -68,7 +68,7 @@ def test_four_bar_from_a_wrong_guess(wrong):
 
 
 def test_nonholonomic_velocities():
-    """Only v is moved: there is no position residual."""
+    """Only v changes: there is no position residual."""
     state = jl.assemble(skate, [1.0, 2.0, 0.3], [1.0, 1.0, 0.5], SKATE, hold=("theta'",))
     np.testing.assert_array_equal(state.q, [1.0, 2.0, 0.3])
     along = np.cos(0.3) + np.sin(0.3)
@@ -102,7 +102,7 @@ def test_rows_that_follow_from_others_are_named():
 
 
 def test_derivative_is_that_of_the_implicit_function():
-    """Forward, reverse and central differences, in the guess and in a length."""
+    """Forward, reverse and central differences, by the guess and by a length."""
 
     def assembled(x):
         params = {**BOBS, "l1": x["l1"]}
@@ -131,7 +131,7 @@ def test_batches():
     np.testing.assert_allclose(states.q[2], one.q, atol=1e-14)
 
 
-# ---- What cannot be had --------------------------------------------------------------------------
+# ---- Impossible requests -------------------------------------------------------------------------
 
 
 @pytest.mark.full
@@ -146,7 +146,7 @@ def test_what_is_held_in_the_way_is_named():
 
 @pytest.mark.full
 def test_more_rows_than_coordinates():
-    """A point in the plane on three lines: fixed where they meet, else nowhere."""
+    """A point in the plane on three lines: fixed at a common intersection, else impossible."""
 
     def lines(t, q, params):
         return jnp.stack([q[0] - 1.0, q[1] - 2.0, q[0] + q[1] - params])
@@ -187,7 +187,7 @@ def test_a_velocity_that_cannot_be_held_is_named():
 
 @pytest.mark.full
 def test_nearer_than_all_consistent_states_around_it():
-    """Four-bars from guesses far off: conditions of first and second order of a local minimum."""
+    """Four-bars from distant guesses: first and second order conditions of a local minimum."""
     rng = np.random.default_rng(3)
     guesses = four_bar_start(0.7) + rng.standard_normal((100, 3))
 

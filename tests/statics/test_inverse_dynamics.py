@@ -1,4 +1,4 @@
-"""Inverse dynamics: the forces that a given motion needs."""
+"""Inverse dynamics: the forces that a given motion requires."""
 
 import re
 
@@ -23,7 +23,7 @@ def draw(motion, rng):
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_it_inverts_the_equations_of_motion(name):
-    """M a + h - Q of any a, against the terms one by one; 0 for the a of the free motion."""
+    """M a + h - Q of any a, compared with separate terms; 0 for the free acceleration."""
     motion = MOTIONS[name]
     system, params, inputs = motion.system, motion.params, motion.inputs
     dq, v, a = draw(motion, np.random.default_rng(1))
@@ -53,7 +53,7 @@ def test_a_general_lagrangian_is_no_exception():
 
 
 def test_rows_are_instants():
-    """A row of states with their times is the same as one by one, inputs read at each time."""
+    """A series of states equals single evaluations; inputs are read at each time."""
     motion = MOTIONS["driven_pendulum"]
     rng = np.random.default_rng(3)
     q, v, a = (rng.uniform(-1, 1, (5, 1)) for _ in range(3))
@@ -151,7 +151,7 @@ def test_the_carnival_ride():
     q, v, a = jl.prescribed_motion(lambda t: jnp.stack([5.0 + 0.4 * t, 3.0 * t]), 0.0)
     radial, torque = jl.inverse_dynamics(ride, q, v, a)
     np.testing.assert_allclose(torque, 1200, rtol=8 * EPS)
-    np.testing.assert_allclose(torque / q[0], 240, rtol=8 * EPS)  # the Coriolis force's arm is r
+    np.testing.assert_allclose(torque / q[0], 240, rtol=8 * EPS)  # its lever arm is r
     np.testing.assert_allclose(-radial / 100, 45, rtol=8 * EPS)
 
 

@@ -1,4 +1,4 @@
-"""Energy bookkeeping: where H comes from and goes to, by name."""
+"""Power and work of all terms, by name, account for the changes of H."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ CASES = dict(gathered())
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_terms_add_up_to_the_rate_of_energy(name):
-    """dH/dt along (1, v, a) against sum_k v . Q_k - dL/dt: two routes, at one state."""
+    """dH/dt along (1, v, a) against sum_k v . Q_k - dL/dt, at one state."""
     system, q, v, params, inputs = CASES[name]
     t = jnp.array(0.25)
     a = system.acceleration(q, v, params, t=t, inputs=inputs)
@@ -38,7 +38,7 @@ def test_the_terms_add_up_to_the_rate_of_energy(name):
 
     rate = jax.jvp(H, (t, q, v), (jnp.ones_like(t), v, a))[1]
     terms = system.power(q, v, params, t=t, inputs=inputs)
-    # Both carry the rounding of M a, h and Q, each times v: 64 roundings of the largest product.
+    # Both have the rounding of M a, h and Q, each times v: 64 roundings of the largest product.
     M, h = system.mass_matrix(q, v, params, t=t), system.bias(q, v, params, t=t)
     size = np.abs(v) @ (np.abs(M) @ np.abs(a) + np.abs(h)) + sum(abs(x) for x in terms.values())
     np.testing.assert_allclose(sum(terms.values()), rate, rtol=0, atol=64 * EPS * size)
@@ -71,7 +71,7 @@ def test_the_books_close(name):
 
 
 def test_the_work_of_a_damper_is_minus_twice_its_function():
-    """dE/dt = -2 R for linear damping (Pila, sec. 3.7), by quadrature of R over the rows."""
+    """dE/dt = -2 R for linear damping (Pila, sec. 3.7), by quadrature of R over the saves."""
     system, q, v, params, _ = CASES["double_pendulum_rayleigh"]
     ts = jnp.linspace(0.0, 1.5, 2001)
     motion = jl.simulate(system, q, v, ts, params, save=("work", "power"))
@@ -95,7 +95,7 @@ def test_explicit_time_has_a_term_of_its_own():
 
 @pytest.mark.full
 def test_the_terms_keep_the_order_of_the_forces():
-    """Explicit time last; through jit, vmap and `save`, which hand dicts back alphabetically."""
+    """Explicit time last; also through jit, vmap and `save`, which return dicts alphabetically."""
     forces = tuple(
         jl.GeneralizedForce(lambda t, q, v, params: -v, name) for name in ("wind", "brake", "motor")
     )
@@ -119,7 +119,7 @@ def test_the_terms_keep_the_order_of_the_forces():
 
 
 def test_power_is_the_rate_of_work():
-    """The derivative of a row of work in its own time is the power there.
+    """The derivative of work at a save, by its time, is the power there.
 
     That derivative is the last step's, right to its local error 1e-9 over its length.
     """
@@ -140,7 +140,7 @@ def test_power_is_the_rate_of_work():
 
 
 def test_work_is_not_integrated_unless_asked_for():
-    """The state has 2 n components without it; the first quantity that wants it says so."""
+    """Without it the state has 2 n components; reading `work` raises an error with advice."""
     system, q, v, params, _ = CASES["double_pendulum_rayleigh"]
     ts = jnp.array([0.0, 0.3])
 
@@ -202,12 +202,12 @@ WELL = jl.System(lambda t, q, v, params: 0.5 * v @ v - jnp.log(q[0]), ("x", "y")
 
 
 def into_the_well(v0, save=("work",)):
-    """The forces at x = 0 are without bound; from v0 < 0 the motion ends there."""
+    """The force at x = 0 is unbounded; from v0 < 0 the motion ends there."""
     return jl.simulate(WELL, [1.0, 0.0], [v0, 0.5], [0.0, 0.1, 1.0], save=save, throw=False)
 
 
 def test_how_a_motion_with_work_ended_is_explained():
-    """The state of the failed step has work besides (q, v); that it concerns x is the state's."""
+    """The state of the failed step contains work besides (q, v); the message names x."""
     motion = into_the_well(-3.0)
     assert motion.status == jl.Status.step_below_resolution
     assert motion.message().startswith("step_below_resolution ('x')")
@@ -223,7 +223,7 @@ def test_how_a_motion_with_work_ended_is_explained():
 
 
 def test_growth_along_a_motion_with_work_is_that_of_its_state():
-    """Work is no part of what errors grow in; inside jit the status is asked for in full."""
+    """Work is not a perturbed variable; under jit the complete status is needed."""
 
     def growth(save):
         def kappa(v0):
@@ -235,10 +235,10 @@ def test_growth_along_a_motion_with_work_is_that_of_its_state():
 
 
 def test_driven_pivot_agrees_with_the_force_on_the_pivot():
-    """Explicit time does the work of the drive less the change of what H leaves out.
+    """Explicit time does the work of the drive less the change of the terms that H omits.
 
-    H = T2 - T0 + V and T + V differ by T1 + 2 T0; the pivot's horizontal force times its speed is
-    the rate of T + V, Newton's law for the bob.
+    H = T2 - T0 + V and T + V differ by T1 + 2 T0. The horizontal force of the pivot times its speed
+    is the rate of T + V, by Newton's law for the bob.
     """
     params = {"m": 0.7, "l": 0.5, "g": 9.81, "X": 0.2, "Omega": 3.0}
     m, length, X, omega = (params[k] for k in ("m", "l", "X", "Omega"))

@@ -1,4 +1,4 @@
-"""What is said about rows that are singular at a state: squares, lengths, dead points."""
+"""Advice on rows that are singular at a state: squares, lengths, dead points."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def test_other_rows(name):
 
 
 def folding(t, q, params):
-    """Two links of equal length whose end stands at the origin's height: flat at (0, pi)."""
+    """Two links of equal length whose end is at the origin: folded, as at (0, pi)."""
     return jnp.stack([jnp.sin(q[0]) + jnp.sin(q[1]), jnp.cos(q[0]) + jnp.cos(q[1])])
 
 
@@ -92,7 +92,7 @@ def test_messages_under_derivatives():
 
 
 def test_a_row_that_is_not_known_is_not_left_out():
-    """The gradient of sqrt(y^2) is NaN at 0: so is what follows from it."""
+    """The gradient of sqrt(y^2) is NaN at 0: so are all results."""
     row, q = VANISHING["root of a square"]
     a = system(row).acceleration(q, [0.0, 0.0])
     assert np.isnan(a).all()

@@ -12,7 +12,7 @@ from _systems.mechanics import GENERAL
 import jaxlag as jl
 from systems.catalogue import ENTRIES
 
-K = 32  # roundings of what is summed
+K = 32  # roundings of the summands
 EPS = np.finfo(float).eps
 
 
@@ -20,7 +20,7 @@ EPS = np.finfo(float).eps
 
 
 def springs(t, q, v, params):
-    """Three bodies in the plane, each on a spring from its own anchor, and a wheel theta."""
+    """Three bodies in the plane, each on a spring from a separate anchor, and a wheel theta."""
     at, rate = NET.unflatten(q), NET.unflatten(v)
     m, k = params["m"], params["k"]
     T = 0.5 * jnp.sum(m[:, None] * rate["x"] ** 2) + 0.5 * params["J"] * rate["theta"] ** 2
@@ -84,7 +84,7 @@ def test_params_may_be_a_module():
     ],
 )
 def test_params_may_hold_what_is_no_real_number(extra, expected):
-    """Integers, lists of them, strings, functions, None: Python sees them as they are."""
+    """Integers, lists of them, strings, functions, None: Python receives them unchanged."""
 
     def potential(t, q, params):
         x, law = q[0], params.get("law")
@@ -113,7 +113,7 @@ def test_params_may_be_none():
 
 
 def test_the_methods_pass_through_every_transform():
-    """d(theta'')/dg = -sin(theta)/l, its derivative in theta, over a batch, compiled."""
+    """d(theta'')/dg = -sin(theta)/l and its derivative by theta, batched and compiled."""
     entry = ENTRIES["simple_pendulum"]
     params = dict(entry.example.params)
 

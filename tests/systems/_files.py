@@ -1,4 +1,4 @@
-"""Reference files made on the spot: one from a closed form, one from a replayed motion."""
+"""Reference files for tests: one from a closed form, one from a replayed motion."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2
 
 
 def recorded(entry: AbstractEntry, times, motion: Motion):
-    """A file of the entry's example that holds every quantity of an already replayed case."""
+    """A file of the entry's example with every quantity of an already replayed case."""
     rows = {name: np.asarray(values) for name, values in motion.rows.items()}
     if entry.kind == "static":
         rows = {name: values[0] for name, values in rows.items()}

@@ -13,7 +13,7 @@ from numpy import cos, sin
 
 
 def bordered(M, forces, A, gamma, B=0.0):
-    """(matrix, terms) from M, rows of forces, A and the rows of the terms of gamma."""
+    """(matrix, terms) from M, the forces, A and the terms of gamma."""
     A = np.asarray(A, float)
     m, n = A.shape
     matrix = np.block([[np.asarray(M, float), -(A.T + B)], [A, np.zeros((m, m))]])

@@ -1,7 +1,7 @@
 """Equations of motion by hand of chapter 4 and of classics: Newton's and Euler's, or Lagrange's.
 
 Each function returns a matrix and terms as in `_hand_equations3`, under constraints as in
-`_hand_constrained`. Angles (phi, theta, psi) are roll, pitch and yaw where nothing else is said.
+`_hand_constrained`. Angles (phi, theta, psi) are roll, pitch and yaw unless stated otherwise.
 """
 
 import numpy as np
@@ -59,7 +59,7 @@ def space_rates(angles, rates):
 
 
 def turning(angles, rates, inertia, torques):
-    """(M, terms) of Euler's equations, moments of `inertia` and torques in body components."""
+    """(M, terms) of Euler's equations; `inertia` and torques are in body components."""
     W, parts = body_rates(angles, rates)
     w = W @ rates
     forces = [-inertia @ part for part in parts] + [-cross(w, inertia @ w)]

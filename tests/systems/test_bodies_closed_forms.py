@@ -31,7 +31,7 @@ def free_rates(times, moments, w0):
     m = (B - A) * (twice * C - square) / ((C - B) * (square - twice * A))
     even = np.linalg.det(np.eye(3)[[a, b, c]])
     sense_c = np.sign(w0[c])
-    sense_b = sense_c * np.sign(C - A) * even  # by B wB' = (C - A) wC wA where even
+    sense_b = sense_c * np.sign(C - A) * even  # by B wB' = (C - A) wC wA if even
     sine, cosine = sense_b * w0[b] / np.sqrt(about_b), w0[a] / np.sqrt(about_a)
     tau = ellipkinc(np.arctan2(sine, cosine), m) + rate * times
     sn, cn, dn, _ = ellipj(tau, m)
@@ -59,7 +59,7 @@ def test_the_free_top_turns_by_elliptic_functions(name):
     expected = free_rates(times, moments, w0)
     close(motion.u, expected)
     if name == "flip":
-        assert expected[:, 0].min() < -1.4  # turned over
+        assert expected[:, 0].min() < -1.4  # it flipped
     K = [
         space_axes(q) @ (moments * u)
         for q, u in zip(*map(np.asarray, (motion.q, motion.u)), strict=True)
@@ -69,7 +69,7 @@ def test_the_free_top_turns_by_elliptic_functions(name):
 
 @pytest.mark.full
 def test_a_torque_free_body_of_the_book_is_the_free_top():
-    """The same declaration under another name, without its torques."""
+    """The same system under another name, without its torques."""
     moments, w0 = TOPS["largest"]
     params = dict(zip(("Ix", "Iy", "Iz"), moments, strict=True))
     params |= dict.fromkeys(("tau1", "tau2", "tau3"), 0.0)
@@ -139,7 +139,7 @@ def velocities(system, params, t, q, v):
 
 
 ROUNDING = 1e-13
-"""Of equations of motion at one state. Worst measured: 1.2e-14, of the aircraft."""
+"""Tolerance of equations of motion at one state. Largest error: 1.2e-14, of the aircraft."""
 
 
 def test_the_tricycle_obeys_the_reduced_equations():
@@ -153,7 +153,7 @@ def test_the_tricycle_obeys_the_reduced_equations():
 
 
 def test_the_printed_tricycle_obeys_its_own_equations():
-    """With the steering torque m v^2 tan(phi), which the consistent one has not."""
+    """With the steering torque m v^2 tan(phi), which the consistent tricycle does not have."""
     for _, q, _, p, u, u_rate in accelerations("tricycle_book_lagrangian"):
         (v, _, _, steer), c, s = u, cos(q[3]), sin(q[3])
         m, l, inertia = p["m"], p["l"], p["I_theta"]  # noqa: E741
@@ -215,7 +215,7 @@ def test_the_quadcopter_obeys_the_body_axis_equations():
     ],
 )
 def test_the_body_obeys_eulers_equations_at_every_angle(name, torques):
-    """Not at small ones alone."""
+    """Not only at small angles."""
     for t, _, _, p, w, w_rate in accelerations(name):
         moments = np.array([p["Ix"], p["Iy"], p["Iz"]])
         left = moments * w_rate + np.cross(w, moments * w)
@@ -268,7 +268,7 @@ MOMENTS, PRODUCTS = ("Ix", "Iy", "Iz"), ("Ixy", "Ixz", "Iyz")
 
 @pytest.mark.full
 def test_the_aircraft_moves_alike_from_its_mass_center():
-    """Positions of one point of the body, turns and energies."""
+    """Positions of one point of the body, attitudes and energies are equal."""
     from_G, rc = about_center(FROM_O)
     angles, V, w = np.array([0.1, 0.2, 0.4]), np.array([18.0, 1.0, 2.0]), np.array([0.3, 0.2, -0.2])
     times, at_O = np.linspace(0.0, 2.0, 6), np.array([10.0, -5.0, -100.0])
@@ -288,7 +288,7 @@ def test_the_aircraft_moves_alike_from_its_mass_center():
 
 @pytest.mark.full
 def test_the_mass_center_of_the_aircraft_falls_freely():
-    """Without forces on a parabola, though O does not."""
+    """Without forces it moves on a parabola, although O does not."""
     p = FROM_O | dict.fromkeys((*FORCE, *TORQUE), 0.0)
     rc, times = np.array([p[name] for name in CENTER]), np.linspace(0.0, 1.5, 6)
     motion = move("rigid_aircraft", p, [0.0] * 6, (5.0, 0.5, -0.4, 0.6, -0.8, 0.5), times)

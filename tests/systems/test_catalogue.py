@@ -1,4 +1,4 @@
-"""The catalogue itself: every system collected, described, and running."""
+"""The catalogue itself: every system is collected, is described, and runs."""
 
 import re
 import sys
@@ -167,9 +167,9 @@ def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
     ),
 )
 def test_plot_writes_a_figure(name, suffix, tmp_path, capsys):
-    """A motion, a state of rest, a prescribed motion; the first two under constraints, too.
+    """A motion, an equilibrium, a prescribed motion; the first two also under constraints.
 
-    And a motion by quasi-velocities.
+    Also a motion in quasi-velocities.
     """
     path = tmp_path / f"figure{suffix}"
     assert main(["run", name, "--plot", str(path)]) == 0
@@ -191,4 +191,4 @@ def test_invariants_are_constant_within_the_tolerance_of_the_run():
     entry = ENTRIES["central_motion"]
     found = dict(drifts(entry, simulate_example(entry)))
     assert set(found) == {"p_phi"}
-    assert found["p_phi"] < 100 * TOLERANCE  # 100: the local errors of some tens of steps add up
+    assert found["p_phi"] < 100 * TOLERANCE  # 100: local errors of some tens of steps accumulate

@@ -1,6 +1,6 @@
-"""Chapter 3: energies, forces and reactions by two routes, by hand and by points and poses.
+"""Chapter 3: energies, forces and reactions by two derivations, by hand and by points and poses.
 
-Whichever of the two stands in the system's file, the other stands here.
+If the system's file has one of the two, this file has the other.
 """
 
 import jax
@@ -31,7 +31,7 @@ def straight(t, q, v, *masses):
 
 
 def planar(mass, about_origin, pose, t, q, v, center=(0.0, 0.0, 0.0)):
-    """T of a body in the plane; `pose(q)` gives its turn and the x, y of its origin."""
+    """T of a body in the plane; `pose(q)` gives its angle and the x, y of its origin."""
 
     def in_space(t, q, _):
         angle, x, y = pose(q)
@@ -42,7 +42,7 @@ def planar(mass, about_origin, pose, t, q, v, center=(0.0, 0.0, 0.0)):
 
 
 def on_strings(lengths, q):
-    """Positions of bobs, each hung from the one before, angles q from the downward vertical."""
+    """Positions of bobs, each suspended from the one before; q from the downward vertical."""
     links = jnp.stack(lengths)[:, None] * jnp.stack([sin(q), -cos(q)], axis=1)
     return jnp.cumsum(links, axis=0)
 
@@ -190,7 +190,7 @@ POTENTIAL = {
     ],
     "falling_stick": lambda q, m, L, g: [0.5 * m * g * L * np.sin(q[1])],
 }
-"""Name -> terms of V by hand, where points stand in the file."""
+"""Name -> terms of V by hand, if the file has points."""
 
 
 @pytest.mark.parametrize("name", POTENTIAL)
@@ -203,7 +203,7 @@ def test_V_by_points_is_that_by_hand(name):
 
 
 def rotor_forces(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noqa: E741
-    """Q of thrust and torques; those of the angles are W^T times torques on the body axes."""
+    """Q of thrust and torques; those of the angles are W^T times the torques in body axes."""
     psi, theta, phi = q[3:]
     psi_rate, theta_rate, phi_rate = v[3:]
     c_th, s_th, c_ph, s_ph = np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi)
@@ -239,7 +239,7 @@ FORCES = {
     "hockey_puck": lambda t, q, v, R, F1, **others: [push_on_puck(q[0], R, F1)],
     "hockey_puck_cord": lambda t, q, v, R, F1, gamma, **others: [push_on_puck(gamma, R, F1)],
 }
-"""Name -> terms of Q by hand, dampers left out, where forces at points stand in the file."""
+"""Name -> terms of Q by hand without dampers, if the file has forces at points."""
 
 
 @pytest.mark.parametrize("name", FORCES)
@@ -314,7 +314,7 @@ def along_string(force, q, params):
     ],
 )
 def test_reactions_are_what_mass_times_acceleration_lacks(name, reaction, mass, center, component):
-    """m (a_G - g) of the mass center, whatever the accelerations are."""
+    """m (a_G - g) of the mass center, for any accelerations."""
     rng = np.random.default_rng(3)
     for t, q, v, params in random_states(ENTRIES[name]):
         a = rng.uniform(-5.0, 5.0, len(q))

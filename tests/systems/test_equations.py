@@ -1,10 +1,10 @@
-"""Accelerations and multipliers against the equations of motion derived by hand.
+"""Accelerations and multipliers against equations of motion derived by hand.
 
-Each function returns the book's mass matrix and the terms on the right-hand side, so that
-M a = sum(terms); under constraints M is bordered by their rows and the solution is (a, lam). The
-hand solution and the engine's both carry rounding of relative size eps cond(M) in the solve, and
-of a few eps in every term; with K = 32 roundings allowed, they agree to
-K eps cond(M) |M^-1| sum(|terms|).
+Each function returns the book's mass matrix and the terms of the right-hand side, so that M a =
+sum(terms). Under constraints M is bordered by their rows and the solution is (a, lam). The
+solutions by hand and by jaxlag have rounding of relative size eps cond(M) from the solve, and of a
+few eps in every term. With K = 32 roundings allowed, they agree to K eps cond(M) |M^-1|
+sum(|terms|).
 """
 
 from functools import partial
@@ -154,7 +154,7 @@ PLAIN = (
 
 @pytest.fixture(scope="module", params=mostly_full(MOVING, *PLAIN))
 def evaluated(request, lowering):
-    """An entry with its quantities at random states: (entry, [((t, q, v, params), rows), ...])."""
+    """An entry with its values at random states: (entry, [((t, q, v, params), values), ...])."""
     entry = ENTRIES[request.param]
     rows = jax.jit(partial(evaluate, entry))
     states = random_states(entry)
@@ -175,7 +175,7 @@ def test_random_states_are_on_the_constraints(evaluated):
 
 
 def test_accelerations_are_those_of_the_book(evaluated):
-    """And the multipliers, where there are any."""
+    """The multipliers, too, if there are any."""
     entry, pairs = evaluated
     for (t, q, v, params), rows in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
@@ -187,9 +187,9 @@ def test_accelerations_are_those_of_the_book(evaluated):
 
 
 def test_momenta_change_by_lagrange_equations(evaluated):
-    """dp/dt along the motion, a derivative of p, is dL/dq + Q + A^T lam: two routes to one number.
+    """dp/dt along the motion, a derivative of p, equals dL/dq + Q + A^T lam.
 
-    The route through a multiplies its error by M, hence the condition number.
+    The derivation through a multiplies its error by M, hence the condition number.
     """
     entry, pairs = evaluated
     for (t, q, v, params), rows in pairs:
@@ -201,7 +201,7 @@ def test_momenta_change_by_lagrange_equations(evaluated):
 
 
 def test_energy_changes_by_the_power_of_the_forces(evaluated):
-    """dH/dt = v . (Q + A^T lam), for no Lagrangian here contains the time."""
+    """dH/dt = v . (Q + A^T lam), because no Lagrangian here contains the time."""
     entry, pairs = evaluated
     for (t, q, v, params), rows in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
@@ -212,11 +212,11 @@ def test_energy_changes_by_the_power_of_the_forces(evaluated):
 
 
 MOVED = ("spherical_pendulum_varying", "particle_on_surface", "rolling_ball_turntable")
-"""Systems with constraints that move by themselves."""
+"""Systems with constraints that depend on time."""
 
 
 def test_constraints_at_rest_do_no_work(evaluated):
-    """v . A^T lam = 0 where no row contains the time; otherwise it is not."""
+    """v . A^T lam = 0 if no row contains the time; otherwise it is not zero."""
     entry, pairs = evaluated
     led = entry.name in MOVED
     for (_, _, v, _), rows in pairs if entry.constraints else []:

@@ -1,4 +1,4 @@
-"""The errata: what is printed is wrong and what is said to be right is what the engine finds."""
+"""The errata: printed formulas are wrong, and the corrected ones agree with jaxlag."""
 
 import re
 from dataclasses import replace
@@ -78,7 +78,7 @@ def test_the_command_prints_one_line_for_each(capsys):
 
 @pytest.mark.parametrize("field", ["right", "printed"])
 def test_what_is_not_confirmed_fails_the_command(field, monkeypatch, capsys):
-    """A right formula that is as wrong as the printed one; a printed one that is right."""
+    """A corrected formula that is as wrong as the printed one; a printed one that is right."""
     first, second, *_ = ERRATA
     other = {"right": second.printed, "printed": second.right}[field]
     monkeypatch.setattr(errata, "ERRATA", (first, replace(second, **{field: other})))

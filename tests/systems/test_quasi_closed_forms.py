@@ -1,4 +1,4 @@
-"""What rolls and slides, moved by quasi-velocities: closed forms, reduced equations by hand."""
+"""Rolling and sliding bodies in quasi-velocities: closed forms, reduced equations by hand."""
 
 from functools import partial
 
@@ -30,7 +30,7 @@ def test_the_sleigh_moves_by_hyperbolic_functions(v0, omega0):
 
 @pytest.mark.full
 def test_the_sleigh_ends_forwards_from_every_start():
-    """At v = sqrt(2 T/m); from backwards it has turned by pi sqrt(J/m)/a then."""
+    """At v = sqrt(2 T/m); after backward motion it has rotated by pi sqrt(J/m)/a."""
     m, a, J = SLEIGH["m"], SLEIGH["a"], SLEIGH["I"] + SLEIGH["m"] * SLEIGH["a"] ** 2
     starts = np.array([[-1.0, 1e-6], [-1.0, -1e-6], [-0.3, 0.9], [0.0, -1.1], [0.7, 0.2]])
     ends = [0.0, 90.0]  # e^(-kappa t) of the slowest is below 1e-16 then
@@ -74,7 +74,7 @@ def suslov(times, I1, I2, I3, I13, I23, wx, wy):
 @pytest.mark.full
 @pytest.mark.parametrize(("wx", "wy"), [(0.8, -0.5), (-0.9, 0.1)])
 def test_the_suslov_body_turns_by_hyperbolic_functions(wx, wy):
-    """On either way from one direction to its opposite; the angles stay off gimbal lock."""
+    """In both ways from one direction to its opposite; the angles avoid gimbal lock."""
     times = np.linspace(0.0, 2.0, 6)
     motion = move("suslov", SUSLOV, (0.1, 0.2, 0.0), {"wx": wx, "wy": wy}, times)
     found = np.column_stack([motion["wx"], motion["wy"], motion.lam["wz"]])
@@ -85,7 +85,7 @@ def test_the_suslov_body_turns_by_hyperbolic_functions(wx, wy):
 
 @pytest.mark.full
 def test_the_suslov_body_ends_about_one_fixed_direction():
-    """I13 wx + I23 wy = 0, whose sense is that of s = delta + pi/2, whatever the start."""
+    """I13 wx + I23 wy = 0, in the direction of s = delta + pi/2, for any start."""
     starts = np.array([[0.02, 0.05], [-0.04, 0.03], [0.05, -0.02], [-0.05, 0.001]])
     params = SUSLOV | {"I13": 1.1, "I23": -0.9}  # fast enough to be there before gimbal lock
 
@@ -118,9 +118,9 @@ def turntable(times, m, a, I, Omega, g, alpha, z0, rate0):  # noqa: E741
 @pytest.mark.full
 @pytest.mark.parametrize(("k", "alpha"), [(2 / 5, 0.0), (2 / 3, 0.002)], ids=["level", "tilted"])
 def test_the_ball_goes_round_the_turntable(k, alpha):
-    """At 2/7 (solid) and 2/5 (hollow) of the table's rate, once; on the tilt it drifts, too.
+    """At 2/7 (solid) and 2/5 (hollow) of the table's rate, once; on the tilt it also drifts.
 
-    A ball so large that it does not come to gimbal lock.
+    The ball is so large that it does not reach gimbal lock.
     """
     params = {"m": 0.3, "a": 1.0, "I": 0.3 * k, "Omega": 3.0, "g": 9.81, "alpha": alpha}
     rate = {2 / 5: 2 / 7, 2 / 3: 2 / 5}[k] * params["Omega"]
@@ -140,7 +140,7 @@ def test_the_ball_goes_round_the_turntable(k, alpha):
     close(motion.lam["s_y"], force.imag)
     drift = 1j * params["g"] * sin(alpha) / (k * params["Omega"]) * times[-1]
     close(motion.q[-1, :2], [(z0 + drift).real, (z0 + drift).imag])
-    assert np.ptp(motion.energy) > 1e-3 * motion.energy[0]  # the table works
+    assert np.ptp(motion.energy) > 1e-3 * motion.energy[0]  # the table does work
 
 
 # ---- Disks and edges -----------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def test_the_ball_goes_round_the_turntable(k, alpha):
 
 @pytest.mark.full
 def test_the_upright_disk_goes_round_a_circle():
-    """Of radius R theta'/phi', once."""
+    """One circle of radius R theta'/phi'."""
     params = {"m": 1.2, "R": 0.4, "I": 0.1, "J": 0.05, "tau_theta": 0.0, "tau_phi": 0.0}
     roll, turn, phi0 = 3.0, -0.8, 0.3
     times = np.linspace(0.0, 2 * np.pi / abs(turn), 7)
@@ -195,7 +195,7 @@ def test_the_knife_edge_does_not_slide_down_the_slope(v0, turn, phi0):
 
 @pytest.mark.full
 def test_the_nonholonomic_particle_slows_by_its_constraint():
-    """Not by the L into which the constraint is put: that has another motion."""
+    """Not by the L with the constraint inserted: that has another motion."""
     m, start, (x_rate, y_rate) = 2.5, (1.0, -1.3, -0.5), (-0.7, 1.1)
     times = np.linspace(0.0, 3.0, 6)
     u0 = {"xdot": x_rate, "ydot": y_rate}
@@ -214,7 +214,7 @@ def test_the_nonholonomic_particle_slows_by_its_constraint():
 
 @pytest.mark.full
 def test_the_disk_rolls_steadily():
-    """Where w1' = 0 by hand: inclined, its center on a circle about a point at rest."""
+    """By hand for w1' = 0: inclined, its center on a circle about a point at rest."""
     m, R, I_d, I_a, g = 1.0, 0.5, 0.0625, 0.125, 9.81
     theta, w2, psi0 = 1.1, 1.4, 0.3
     c, s = cos(theta), sin(theta)
@@ -263,7 +263,7 @@ def test_the_disk_wobbles_by_the_reduced_equations():
 
 
 def by_dop853(rates, start, times):
-    """The solution at `times` of the reduced equations."""
+    """The solution of the reduced equations at `times`."""
     span, method = (times[0], times[-1]), "DOP853"
     found = solve_ivp(rates, span, start, method, t_eval=times, rtol=1e-13, atol=1e-14)
     return found.y.T
@@ -322,7 +322,7 @@ def test_the_snakeboard_moves_by_the_reduced_equations(torques):
     close(np.column_stack([motion.q, motion.u[:, :3]]), expected)
     momentum = BOARD["J_r"] * (motion.rate("theta") + motion.rate("psi"))
     if torques is GAIT:
-        assert np.hypot(*(motion.q[-1, :2] - motion.q[0, :2])) > 1.0  # driven from inside alone
+        assert np.hypot(*(motion.q[-1, :2] - motion.q[0, :2])) > 1.0  # by internal torques alone
         assert np.ptp(momentum) > 0.1
     else:
         close(momentum, np.full(7, momentum[0]))

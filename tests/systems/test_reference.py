@@ -1,4 +1,4 @@
-"""Reference files are read strictly: every departure from the format is a named error."""
+"""Reference files are read strictly: every deviation from the format is a named error."""
 
 import copy
 import json
@@ -201,7 +201,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def of(name):
-    """A file of the entry's example with a single row, as parsed."""
+    """A file of the entry's example with a single save, as parsed."""
     entry = ENTRIES[name]
     start = [x[entry.file_columns] for x in entry.start()] if entry.kind == "trajectory" else []
     params = {name: np.asarray(x) for name, x in entry.example.params.items()}
@@ -241,7 +241,7 @@ def test_quasi_velocities_stand_in_their_order_those_that_vanish_included(files)
 
 
 def test_a_file_may_be_written_in_independent_coordinates(files):
-    """It says nothing of constraints then, nor of what belongs to all coordinates."""
+    """It then contains no constraints, and no fields of all coordinates."""
     raw = files["falling_stick_friction"]
     assert raw["coordinates"] == ["x_c", "theta"]
     assert raw["constraints"] == []

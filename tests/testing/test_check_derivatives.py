@@ -1,4 +1,4 @@
-"""The check of derivatives: what is looked at, the report, what is refused."""
+"""The check of derivatives: states and functions, the report, invalid arguments."""
 
 import dataclasses
 from pathlib import Path
@@ -33,7 +33,7 @@ from jaxlag._model._forces import AbstractForce
 from systems.catalogue import ENTRIES
 from tests._user import unchecked  # noqa: F401
 
-# ---- What is looked at ------------------------------------------------------------------------
+# ---- States and functions ---------------------------------------------------------------------
 
 
 def test_states():
@@ -133,7 +133,7 @@ def test_inputs_that_depend_on_the_state():
 
 
 class Springs(AbstractForce):
-    """A force of a class of its own, whose derivative is not finite at q = 0."""
+    """A force of a user class whose derivative is not finite at q = 0."""
 
     name: str = eqx.field(static=True, default="springs")
 
@@ -215,7 +215,7 @@ CLEAN = (
 
 @pytest.mark.parametrize("name", mostly_full(CLEAN, *CLEAN[:2]))
 def test_systems_of_the_book_pass(name):
-    """A dissipative one, one with friction by reactions, one in quasi-velocities among them."""
+    """Among them a dissipative one, one with friction by reactions, one in quasi-velocities."""
     entry = ENTRIES[name]
     report = testing.check_derivatives(entry.system, *entry.start(), entry.example.params)
     assert report.ok, report
@@ -235,7 +235,7 @@ def test_a_potential_that_is_singular_is_said_to_be():
 
 
 def test_the_report_is_a_table():
-    """One row for what is the same at several states."""
+    """One line for equal findings at several states."""
     report = checked(scanned)
     text = str(report).splitlines()
     assert text[0] == "derivatives of lagrangian (order 3)"
@@ -254,7 +254,7 @@ def test_reports_are_not_changed():
         report.findings = ()
 
 
-# ---- What is refused --------------------------------------------------------------------------
+# ---- Invalid arguments ------------------------------------------------------------------------
 
 
 def test_what_is_refused():
@@ -295,7 +295,7 @@ def test_functions_of_wrong_shapes_are_refused():
 
 
 def test_a_kink_in_one_argument_excuses_no_other():
-    """1/2 (|q| - l)^2 at q = 0 and l = 0: its Hessian is 1, and comes out as 0."""
+    """1/2 (|q| - l)^2 at q = 0 and l = 0: its Hessian is 1, but it is computed as 0."""
 
     def spring(q, params):
         return 0.5 * (jl.math.norm(q) - params["c"]) ** 2

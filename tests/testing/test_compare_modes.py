@@ -1,4 +1,4 @@
-"""Derivatives that are wrong: modes against each other, and differences."""
+"""Wrong derivatives: modes compared with each other and with differences."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def right_once_rule(primals, tangents):
     [(right, None), (lambda x: 1.00001 * right(x), 1), (lambda x: -right(x), 1), (right_once, 2)],
 )
 def test_rules_of_the_users_own(derivative, order):
-    """The lowest order that is wrong, be it by one part in 10^5."""
+    """The lowest wrong order is named, even if it is wrong by one part in 10^5."""
     function = rule_of(derivative)
     report = check(lambda q, params: function(q[0]) + q[1])
     assert report.ok == (order is None)
@@ -41,7 +41,7 @@ def test_rules_of_the_users_own(derivative, order):
 
 
 def test_one_wrong_rule_among_several():
-    """None is singled out, but all are named."""
+    """The wrong one cannot be identified: all are named."""
     fine, wrong = rule_of(right), rule_of(lambda x: 2.0 * right(x))
     (finding, *_) = check(lambda q, params: fine(q[0]) + right_once(q[1]) + wrong(q[1])).findings
     assert (finding.kind, finding.order, finding.primitive) == ("wrong", 1, "")
@@ -106,7 +106,7 @@ def test_kinks_and_jumps_are_no_findings():
 
 
 def test_extrapolated_quotients():
-    """Exact for cubics; doubt covers a jump and a kink, and nearly nothing where f is smooth."""
+    """Exact for cubics; `doubt` covers a jump and a kink, and is nearly 0 for smooth f."""
 
     def around(f, x):
         h = step(np.finfo(float).eps)
@@ -115,7 +115,7 @@ def test_extrapolated_quotients():
     value, doubt = around(lambda x: x**3 - 2 * x, 0.7)
     assert value == pytest.approx(3 * 0.7**2 - 2, rel=1e-11)
     assert doubt < 1e-4
-    value, doubt = around(lambda x: float(np.sign(x)), 0.0)  # of derivative 0 on either side
+    value, doubt = around(lambda x: float(np.sign(x)), 0.0)  # of derivative 0 on each side
     assert abs(value) < doubt
     value, doubt = around(abs, 0.0)
     assert abs(value - 1.0) <= doubt

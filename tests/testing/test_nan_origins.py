@@ -1,4 +1,4 @@
-"""Where a derivative that is not finite is born: the operation and the line."""
+"""The origin of a derivative that is not finite: the operation and the line."""
 
 import jax
 import jax.numpy as jnp
@@ -89,7 +89,7 @@ NOT_FINITE = {
     "potential", mostly_full(NOT_FINITE, *list(NOT_FINITE)[::2]), ids=lambda f: f.__name__
 )
 def test_where_a_derivative_is_born_that_is_not_finite(potential):
-    """At zero alone; the operation and its line, not another of the same kind."""
+    """Only at zero; the operation and its line, not another of the same kind."""
     primitive, order, mode = NOT_FINITE[potential]
     report = checked(potential)
     assert not report.ok
@@ -105,7 +105,7 @@ def test_where_a_derivative_is_born_that_is_not_finite(potential):
 
 @pytest.mark.parametrize(("potential", "inner"), [(jitted, helper), (scanned, turn)])
 def test_inside_jitted_helpers_and_loops(potential, inner):
-    """On the line inside; `scanned` at "one" as well, where its second row is 0."""
+    """On the line inside; `scanned` also at "one", where its second entry is 0."""
     report = checked(potential)
     assert places(report) == here("sqrt", inner, "# wrong")
     assert {f.order for f in report.findings} == {1}
@@ -113,7 +113,7 @@ def test_inside_jitted_helpers_and_loops(potential, inner):
 
 
 def test_inside_choices_under_vmap():
-    """Both branches are computed there, in programs of their own."""
+    """Both branches are computed there, in separate programs."""
 
     def chosen(q):
         return lax.cond(q > -1.0, lambda x: jnp.cos(x) + jnp.sqrt(x), lambda x: x / 2.0, q)  # wrong
@@ -126,13 +126,13 @@ def test_inside_choices_under_vmap():
 
 
 def choosing(q):
-    """log(0) is taken, 1/0 is not."""
+    """log(0) is selected, 1/0 is not."""
     taken = jnp.log(q)  # wrong
     return jnp.where(jnp.array([True, False]), taken, 1.0 / q)
 
 
 def entry_by_entry(q):
-    """1/0 in the entry that is taken, log(0) in the other one."""
+    """1/0 in the selected entry, log(0) in the other one."""
     entries = jnp.log(q) + 1.0
     entries = entries + 1.0 / (q - 1.0)  # wrong
     return jnp.where(jnp.array([False, True]), entries, 0.0)
@@ -172,7 +172,7 @@ def before_an_open_loop(q):
     ids=lambda f: getattr(f, "__name__", f),
 )
 def test_followed_through_choices_and_loops(function, primitive):
-    """Back to the one operation that the result inherits it from."""
+    """Back to the one operation from which the result inherits it."""
     q = jnp.array([0.0, 1.0])
     program = TracedProgram(function, q)
     found = program.origins(program.closed, q)
@@ -185,7 +185,7 @@ def test_the_line_that_calls_the_check_is_not_named():
 
 
 def test_every_origin_is_named():
-    """Those of one state in the order of the program."""
+    """Those of one state in program order."""
     report = check(lambda q, params: length(q, params) + angle(q, params))
     assert places(report) == here("sqrt", length, "# wrong") | here("atan2", angle, "# wrong")
     assert [f.primitive for f in report.findings] == ["sqrt", "atan2"]
@@ -215,7 +215,7 @@ def test_what_the_hints_say_helps():
 
 
 def test_what_is_left_out_of_the_result_is_no_finding():
-    """Infinite, but masked in every derivative: only the root of `hidden` is named."""
+    """Infinite, but masked in every derivative: of `hidden` only the root is named."""
 
     def masked(q, params):
         inverse = lax.stop_gradient(1.0 / q[0])
@@ -225,7 +225,7 @@ def test_what_is_left_out_of_the_result_is_no_finding():
 
 
 def test_choices_by_cond_stay_safe_under_vmap():
-    """JAX hands a branch that is not taken an argument without derivatives."""
+    """JAX passes an argument without derivatives to the branch that is not taken."""
 
     def chosen(q, params):
         return lax.cond(q[0] != 0, lambda x: jnp.sin(x) / x, lambda x: 1.0 + 0.0 * x, q[0])
@@ -279,7 +279,7 @@ def test_integers_are_left_alone():
 
 
 def test_inside_loops_without_a_fixed_number_of_turns():
-    """Born in the fourth turn, since the third leaves 0: 1.0625^2, 0.75^2, 0.5^2, 0."""
+    """Created in the fourth iteration, as the third gives 0: 1.0625^2, 0.75^2, 0.5^2, 0."""
 
     def shrink(carry):
         k, x = carry

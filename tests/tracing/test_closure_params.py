@@ -1,4 +1,4 @@
-"""Traced values that a declaration closes over are arguments like params."""
+"""Traced values in the closure of a declaration are treated like params."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ TS = jnp.array([0.0, 0.5, 1.0])
 
 
 def swing(k):
-    """The end of a motion whose Lagrangian, force and input close over k."""
+    """End of a motion whose Lagrangian, force and input close over k."""
     drag = jl.GeneralizedForce(
         lambda t, q, v, params, inputs: (inputs["u"] - 0.1 * k) * v + inputs["w"] * params["one"],
         "drag",
@@ -84,7 +84,7 @@ def test_forces_of_a_motion_move_with_what_its_system_closes_over():
 
 
 def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
-    """Of the values of a table derivatives write what a step reads, which is seen of inputs."""
+    """Table values stay inputs: their derivatives are written only where a step reads them."""
     force = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * v, "push")
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(force,))
 
@@ -98,7 +98,7 @@ def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
 
 @pytest.mark.parametrize("formulation", ["multipliers", "quasi"])
 def test_nothing_is_traced_twice_for_the_sake_of_closures(monkeypatch, formulation):
-    """Not even where a declared function has no part in the motion."""
+    """Not even for a declared function that the motion does not use."""
     quasi = jl.QuasiVelocities(lambda t, q, v, params: 2.0 * v, ("u",))
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), quasi=quasi)
     run = partial(jl.simulate, system, [0.0], [1.0], TS, {}, formulation=formulation)
@@ -131,7 +131,7 @@ def test_a_driven_system_is_assembled_without_its_inputs():
 
 
 def test_reverse_derivatives_are_written_without_tracing_again():
-    """The values closed over belong to a transform that is over by then."""
+    """The closure values belong to a transform that has ended by then."""
     traced = []
 
     def end(k):
@@ -150,7 +150,7 @@ def test_reverse_derivatives_are_written_without_tracing_again():
         ]
 
     _, pull = jax.vjp(end, 2.0)
-    # Once to see what they close over, once for the motion.
+    # Once to find the closure values, once for the motion.
     assert sorted(traced) == ["lagrangian"] * 2 + ["ramp"] * 2
     pull(1.0)
     assert len(traced) == 4

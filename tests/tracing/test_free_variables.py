@@ -1,4 +1,4 @@
-"""What declared functions read from outside: a change of it is named, and changes nothing."""
+"""Free variables of declared functions: a change is reported and has no effect."""
 
 from enum import Enum
 from functools import partial, wraps
@@ -328,6 +328,6 @@ def test_what_changes_outside_is_named_and_changes_nothing(declared):
     assert system.acceleration(*at) == -2.0
     change()
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
-        assert system.acceleration(*at) == -2.0  # a compiled program says so as well
+        assert system.acceleration(*at) == -2.0  # a compiled program warns, too
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
         assert system.energy([1.0], [0.0], {}) == 2.0

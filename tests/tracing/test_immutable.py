@@ -1,4 +1,4 @@
-"""What params may hold besides numbers: a program keyed by what changes would not notice."""
+"""Static leaves of params must be immutable: they are part of the key of compiled programs."""
 
 import enum
 import functools
@@ -234,7 +234,7 @@ def test_energies_that_need_no_program_are_of_what_is_there_now():
 
 
 def test_a_function_that_reads_another_number_is_refused(monkeypatch):
-    """As a leaf and in a static field; the program would hold the former number."""
+    """As a leaf and in a static field; otherwise the program would hold the former number."""
     params = {"law": of_number}, {"law": Static(of_number)}, {"law": Frozen(of_number)}
     for each in params:
         check_keys(each)

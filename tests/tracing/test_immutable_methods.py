@@ -1,6 +1,6 @@
-"""What objects in params read by methods, properties and attributes: one rule for all of them.
+"""Values that objects in params read by methods, properties and attributes: one rule for all.
 
-What can change in place is refused at once, a number when it has changed.
+Mutable values are refused at once, a number only after a change.
 """
 
 import argparse
@@ -274,7 +274,7 @@ class Described(Module):
 
 
 class Named(Module):
-    """Read where it is made, a log, a constant: none of these is the motion's."""
+    """Reads a global when constructed, a log and a constant: none affects the motion."""
 
     def __init__(self, name):
         self.k = TABLE[name]
@@ -415,7 +415,7 @@ FIXED = {
 }
 PARTIAL = functools.partial(of_own_attribute)
 PARTIAL.k = 2.0  # pyright: ignore[reportAttributeAccessIssue]
-# By what changes: what is given, and the words.
+# By the kind of change: the leaf, the changed place and the message.
 NUMBER = "STIFFNESS, which its methods read from outside, was 2.0 before and is 5.0 now. Make it"
 CHANGED = {
     "named tuple": (PairOfNumber(), "STIFFNESS", NUMBER),

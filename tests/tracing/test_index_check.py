@@ -19,7 +19,7 @@ import jaxlag as jl
     ],
 )
 def test_an_index_beyond_the_coordinates_is_refused(lowering, read, named):
-    """JAX reads the nearest element instead, which is another system."""
+    """JAX would read the nearest element instead: that is another system."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - read(q) ** 2, ("x",), lowering=lowering)
     match = (
         rf"^`lagrangian` and `forces` must take indices from -1 to 0 of q, .* but {named} was taken"

@@ -1,4 +1,4 @@
-"""Params split into what is traced and what keys the compiled program, and when that recompiles."""
+"""Params split into traced values and the static key of the program; when this recompiles."""
 
 from collections import Counter
 from functools import partial
@@ -143,7 +143,7 @@ def test_different_static_halves_are_different_keys(one, other):
 
 
 def test_a_key_keeps_what_it_was_made_of():
-    """Whatever becomes of the array it was made from: a Solution keeps its params this way."""
+    """Later changes of the original array have no effect: a Solution stores its params this way."""
     mask = np.array([True, False])
     static = split({"mask": mask})[1]
     mask[0] = False
@@ -199,7 +199,7 @@ def test_other_values_never_recompile(counted, params, expected):
     found, traced = run(params)
     assert not traced
     if expected is None:
-        assert np.isnan(found)  # M = -4: refused by its status, by the same program
+        assert np.isnan(found)  # M = -4: refused by the status, in the same program
     else:
         assert found == expected
 
@@ -213,7 +213,7 @@ def test_other_starts_times_and_steps_never_recompile(counted):
 
 
 def test_an_array_for_a_python_number_compiles_once_more(counted):
-    """A Python float takes the state's precision, a numpy number or array brings its own."""
+    """A Python float takes the state's precision; a numpy number or array has its own."""
     params = {"m": np.array(2.0), "k": np.float64(3.0), "n": 2}
     assert counted.run(params)[0] == -1.5
     assert counted.run({"m": jnp.ones(()) * 4, "k": np.array(3.0), "n": 2}) == (-0.75, False)
@@ -227,7 +227,7 @@ def test_a_new_integer_is_a_new_program_with_its_own_result(counted):
 
 
 def test_a_new_text_or_mask_is_a_new_program_with_its_own_result(counted):
-    """A table of integers is none."""
+    """New values of an integer table do not recompile."""
 
     def run(**static):
         return counted.run({"m": 1.0, "k": 3.0, "n": 2} | static)
@@ -282,7 +282,7 @@ def test_a_bad_leaf_is_named_by_its_path(params, message):
 
 
 def test_a_bad_leaf_is_named_under_derivatives_too():
-    """The one that is differentiated, and the one beside it."""
+    """The differentiated leaf, and another one."""
     for bad in ("m", "k"):
 
         def end(x, bad=bad):
@@ -294,7 +294,7 @@ def test_a_bad_leaf_is_named_under_derivatives_too():
 
 
 def test_random_keys_are_traced():
-    """Another one compiles nothing anew; whoever reads it gets it."""
+    """A new key does not recompile; functions that read it get its value."""
 
     def noisy(t, q, v, params):
         return 0.5 * v[0] ** 2 - jax.random.uniform(params["key"], dtype=q.dtype) * q[0]

@@ -1,4 +1,4 @@
-"""Static values that compare equal and are not alike: each has a program of its own."""
+"""Static values that compare equal but differ: each has its own program."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Declared functions are traced once: what they read from outside holds as it was then."""
+"""Declared functions are traced once: free variables keep their values at tracing."""
 
 import pickle
 import warnings
@@ -18,7 +18,7 @@ GRAVITY = 2.0
 
 
 def fall(system, ts=TS):
-    """Where it is at the end, its energy and its acceleration there."""
+    """Position at the end, energies, and acceleration at the end."""
     motion = jl.simulate(system, [0.0], [0.0], ts, {})
     return motion.q[-1, 0], motion.energy, system.acceleration(motion.q[-1], motion.v[-1], {})[0]
 
@@ -114,7 +114,7 @@ def test_the_function_is_called_once_for_each_kind_of_arguments():
     assert calls == 1
     system.energy([0.0], [1.0], params | {"n": 3})
     assert calls == 2
-    system.check([0.0], [1.0], params)  # on numbers, for functions that look at them
+    system.check([0.0], [1.0], params)  # called with numbers, for functions that test values
     assert calls == 3
 
 
@@ -133,7 +133,7 @@ def _module_level(t, q, v, params):
 
 
 def test_an_object_keeps_its_attributes_to_itself():
-    """Of whatever names: they are not those of what stands for it."""
+    """Of any name: the wrapper does not take them for its own."""
 
     class Spring:
         def __init__(self):
@@ -150,7 +150,7 @@ def test_an_object_keeps_its_attributes_to_itself():
     inner = jl.System(
         coordinates=("x",), kinetic=kinetic, potential=potential, quasi=quasi, written_in="u"
     )
-    outer = jl.System(inner.lagrangian, ("x",))  # an L of v that is made of one of u
+    outer = jl.System(inner.lagrangian, ("x",))  # an L of v derived from an L of u
     np.testing.assert_allclose(outer.mass_matrix([0.5], params={}), [[9.0]], rtol=1e-15)
 
 
@@ -160,7 +160,7 @@ def test_a_system_of_named_functions_is_pickled():
 
 
 def test_params_that_have_no_hash_are_params_still():
-    """No compiled program is keyed by them; energies need none."""
+    """They key no compiled program; energies need none."""
     system = jl.System(lambda t, q, v, p: 0.5 * len(p["names"]) * v @ v, ("x",))
     assert system.energy([0.0], [1.0], {"names": {"a", "b"}}) == 1.0
 
@@ -203,11 +203,11 @@ def test_constants_are_owned_and_what_has_none_is_shared():
     assert jaxpr_as_fun(mine)(jnp.ones(2))[0] == expected
 
 
-# ---- Numbers that are ints, functions in loops ---------------------------------------------------
+# ---- Integers as numbers, functions in loops -----------------------------------------------------
 
 
 def test_the_third_int_of_one_leaf_is_warned_about():
-    """Each compiles anew; exponents that stay, and flags, are no matter."""
+    """Each compiles anew; constant exponents and flags give no warning."""
 
     def stiff(t, q, v, params):
         kinetic = 0.5 * params["m"] * v[0] ** 2
@@ -228,7 +228,7 @@ def test_the_third_int_of_one_leaf_is_warned_about():
     assert "Write 3.0 where it is a number" in str(said[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        of(4)  # once is enough
+        of(4)  # no second warning
 
 
 def test_a_function_made_in_a_loop_is_told_once(caplog):

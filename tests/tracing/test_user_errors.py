@@ -1,4 +1,4 @@
-"""What goes wrong inside functions of the user's, said by name, with the line and what to write."""
+"""Errors inside functions of the user: the message names the function, the line and a fix."""
 
 import equinox as eqx
 import jax
@@ -76,11 +76,11 @@ def test_a_common_fault_is_named(kind):
     make, message = WRONG[kind]
     with pytest.raises(ValueError, match=message) as caught:
         make()
-    assert caught.value.__cause__ is not None  # what Python or JAX said stays to be seen
+    assert caught.value.__cause__ is not None  # the original error stays visible
 
 
 def test_other_faults_are_left_as_they_are():
-    """Of the user's own, and what is no key of a dict."""
+    """Errors raised by the user, and errors other than missing keys."""
 
     def own(t, q, v, params):
         raise RuntimeError("mine")
@@ -92,7 +92,7 @@ def test_other_faults_are_left_as_they_are():
 
 
 def test_derivatives_say_the_same():
-    """Without a word of tracers."""
+    """The message does not mention tracers."""
 
     def end(m):
         return run(params={"m": m}).q[-1, 0]
@@ -113,7 +113,7 @@ class Model(eqx.Module):
 
 
 def test_modules_with_arrays_belong_into_params():
-    """Refused as functions, with what to write; so written it works, derivatives included."""
+    """Refused as functions, with advice; as params they work, derivatives included."""
     model = Model(jnp.array(2.0))
     for function in (model, model.energy):
         with pytest.raises(ValueError, match=r"holds arrays\. Put the module into params"):
