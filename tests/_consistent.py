@@ -13,9 +13,9 @@ def onto_constraints(system, params, t, q, v):
     def velocity(v):
         return jnp.hstack([*system.residuals(q, v, params, t=t)[1].values()])
 
-    def nearer(_, q):
+    def newton_step(_, q):
         return q - jnp.linalg.pinv(jax.jacfwd(position)(q)) @ position(q)
 
-    q = jax.lax.fori_loop(0, 20, nearer, jnp.asarray(q))
+    q = jax.lax.fori_loop(0, 20, newton_step, jnp.asarray(q))
     v = v - jnp.linalg.pinv(jax.jacfwd(velocity)(v)) @ velocity(v)
     return q, v

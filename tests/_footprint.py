@@ -24,7 +24,7 @@ def maps():
         return 0
 
 
-def held():
+def resident_bytes():
     """Current memory of this process, bytes; 0 if the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()

@@ -18,12 +18,12 @@ class Operation(NamedTuple):
     inside: tuple[str, ...]
 
 
-def operations(function, *args, turns=None):
+def operations(function, *args, iterations=None):
     """Every operation that one call of `function` executes, including those of nested programs.
 
-    A while loop has no known number of iterations: `turns` is assumed.
+    A while loop has no known number of iterations: `iterations` is assumed.
     """
-    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), turns))
+    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), iterations))
 
 
 def names(program):
@@ -45,7 +45,7 @@ def largest(program):
     return max(math.prod(shape) for operation in program for shape in operation.shapes)
 
 
-def _walk(jaxpr, times, inside, turns):
+def _walk(jaxpr, times, inside, iterations):
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         shapes = tuple(getattr(v.aval, "shape", ()) for v in eqn.outvars)
@@ -55,10 +55,10 @@ def _walk(jaxpr, times, inside, turns):
         yield Operation(name, shapes, times, inside)
         repeats = eqn.params["length"] if name == "scan" else 1
         if name == "while":
-            assert turns is not None, "a while loop has no number of turns to count"
-            repeats = turns
+            assert iterations is not None, "a while loop has no known number of iterations"
+            repeats = iterations
         for inner in _executed(name, eqn):
-            yield from _walk(inner, times * repeats, (*inside, name), turns)
+            yield from _walk(inner, times * repeats, (*inside, name), iterations)
 
 
 def _executed(name, eqn):

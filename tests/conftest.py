@@ -20,7 +20,7 @@ if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
 
 import jax
 import pytest
-from _footprint import BYTES, MAPS, Footprint, held, maps
+from _footprint import BYTES, MAPS, Footprint, maps, resident_bytes
 
 import jaxlag as jl  # before the first compilation: it sets XLA's bound on small loops
 from jaxlag._lowering import ArrayProgram
@@ -47,11 +47,11 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 BOTH = {
     "test_batch": {"test_lanes_equal_single_runs"},
     "test_gradients": {"test_forward_equals_reverse_under_both_lowerings"},
-    "test_batching": {"test_chunks_are_what_is_compiled"},
+    "test_batching": {"test_compiled_program_loops_over_chunks"},
     "test_both": {
         "test_accelerations_are_compiled_from_the_lowering_in_use",
         "test_solves_are_compiled_from_the_lowering_in_use",
-        "test_only_systems_left_at_auto_follow",
+        "test_only_systems_at_auto_follow_the_lowering",
     },
     "test_simulate": {"test_small_oscillation_has_its_closed_form", "test_array_coordinates"},
 }
@@ -82,7 +82,7 @@ def drop():
 def bounded():
     """Drop compiled programs within a module at half the bounds of `Footprint`."""
     yield
-    if maps() > MAPS / 2 or held() > BYTES / 2:
+    if maps() > MAPS / 2 or resident_bytes() > BYTES / 2:
         drop()
 
 

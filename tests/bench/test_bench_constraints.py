@@ -52,8 +52,8 @@ def test_residuals_are_distances_and_the_energy_is_in_units_of_the_start():
     assert np.allclose(record.position, [0.0, off, 0.0, 0.0], rtol=1e-5, atol=1e-15)
     assert np.allclose(record.velocity, [0.0, 0.0, out / math.sqrt(2.0), 0.0], atol=1e-14)
     fall = (BOBS["m1"] + BOBS["m2"]) * 9.81 * off / mechanism.energy
-    push = 0.5 * BOBS["m2"] * out**2 / mechanism.energy
-    assert np.allclose(record.energy, [0.0, -fall, push, 3.0], rtol=1e-8, atol=1e-15)
+    gain = 0.5 * BOBS["m2"] * out**2 / mechanism.energy
+    assert np.allclose(record.energy, [0.0, -fall, gain, 3.0], rtol=1e-8, atol=1e-15)
 
 
 def test_figures_of_a_known_record():
@@ -81,8 +81,8 @@ def test_a_run_that_failed_has_no_figures():
     assert constraints.times([0.5, 1.0], done)["min_us"] == 0.5
 
 
-def drifted(mechanism, stabilisation, position=1e-14, velocity=1e-14, energy=1.0, ratio=1.0):
-    case = constraints.Case(mechanism, "multipliers", stabilisation)
+def drifted(mechanism, stabilization, position=1e-14, velocity=1e-14, energy=1.0, ratio=1.0):
+    case = constraints.Case(mechanism, "multipliers", stabilization)
     columns = {"position": position, "velocity": velocity, "energy": energy, "ratio": ratio}
     return {**case._asdict(), **columns, "growth": 100.0}
 
@@ -108,7 +108,7 @@ def test_drift_is_judged_by_the_worst_mechanism_and_missed_by_nan():
     assert len(references) == 2  # none for Baumgarte, which has no rows
 
 
-def test_curves_are_drawn_as_far_as_they_go(tmp_path):
+def test_curves_are_drawn_up_to_a_failure(tmp_path):
     key = ("a", "multipliers", "projection")
     records = {key: recorded([0.0, 1e-14, math.nan]), ("b", *key[1:]): recorded([0.0, 0.0, 1.0])}
     path = tmp_path / "new" / "drift.png"
@@ -123,7 +123,7 @@ def test_without_matplotlib_there_are_no_curves(tmp_path, monkeypatch):
 
 
 @pytest.mark.full
-def test_drift_is_measured_and_told(tmp_path, monkeypatch, capsys):
+def test_drift_is_measured_and_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(results, "FOLDER", tmp_path)
     monkeypatch.setattr(constraints, "QUICK_STEPS", 2000)
     command.main(["constraints", "--quick"])

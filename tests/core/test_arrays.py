@@ -53,7 +53,7 @@ def test_states_of_16_bits_are_refused(ask, message, dtype):
         ask(q, v)
 
 
-def test_one_of_more_bits_decides():
+def test_mixed_precisions_use_the_wider_one():
     """16 bits with float32 give float32, as for any two precisions."""
     half = jnp.asarray(Q0, jnp.float16)
     options = {"dt": 0.5, "method": "euler"}

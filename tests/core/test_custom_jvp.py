@@ -96,7 +96,7 @@ def _(primals, tangents):
 
 @pytest.mark.parametrize("loop", ["fori_loop", "jit", "checkpoint", "vmap"])
 @pytest.mark.parametrize("mode", ["grad", "jacrev"])
-def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
+def test_rules_may_call_functions_linear_in_tangents(mode, loop):
     """Reverse derivatives transpose such a call: of 1 / (1 + x^2), first and second order."""
 
     def f(x):
@@ -110,7 +110,7 @@ def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
         np.testing.assert_allclose(twice(pair, looped)(x), second, rtol=1e-13)
 
 
-def test_reverse_derivatives_of_single_precision_in_loops():
+def test_float32_derivatives_in_loops_equal_float64():
     """Equations with a division, compared with double precision."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 * (1 + q[0] ** 2) + jnp.cos(p * q[0]), ("x",)
@@ -128,7 +128,7 @@ def test_reverse_derivatives_of_single_precision_in_loops():
         assert abs(float(one) - float(other)) <= 32 * float(jnp.finfo(jnp.float32).eps) * 0.02
 
 
-def test_rules_by_jax_are_dropped_by_the_loops_of_jax():
+def test_jax_loops_may_drop_custom_jvp_rules():
     """The reason for a primitive, until all supported versions of JAX keep such rules."""
     found = jax.jvp(jax.grad(LOOPS["scan"](users)), (X,), (1.0,))[1]
     assert np.isclose(found, 4 * np.sin(X)) or np.isclose(found, 2 * np.cos(X))
@@ -148,19 +148,19 @@ def scaled_rule(primals, tangents):
     SEEN.append(jax.tree.map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None))
     dot = jnp.zeros_like(tree["x"]) if tangents[0]["x"] is None else tangents[0]["x"]
     moved = 0.0 if tangents[2] is None else tangents[2]
-    rows = dot * factor + tree["x"] * moved
-    return scaled(*primals), ({"sum": 10.0 * jnp.sum(rows), "count": None}, rows)
+    products = dot * factor + tree["x"] * moved
+    return scaled(*primals), ({"sum": 10.0 * jnp.sum(products), "count": None}, products)
 
 
 scaled.defjvp(scaled_rule, symbolic_zeros=True)
 
 
-def test_trees_integers_and_zero_tangents():
+def test_rules_accept_trees_integers_and_zero_tangents():
     x = jnp.array([1.0, 2.0])
 
     def total(x, factor):
-        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
-        return sums["sum"] + rows[0]
+        sums, products = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + products[0]
 
     SEEN.clear()
     np.testing.assert_allclose(jax.grad(total)(x, 5.0), [55.0, 50.0])
@@ -172,13 +172,13 @@ def test_trees_integers_and_zero_tangents():
 
 
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
-def test_rows_of_some_arguments(axes):
+def test_vmap_over_some_arguments_equals_single_calls(axes):
     x, factor = jnp.arange(6.0).reshape(3, 2), jnp.array([2.0, 3.0, 5.0])
     given = x if axes[0] == 0 else x[0], factor if axes[1] == 0 else factor[0]
 
     def total(x, factor):
-        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
-        return sums["sum"] + rows[0]
+        sums, products = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + products[0]
 
     for derivative in (jax.grad, jax.jacfwd):
         by = derivative(total, argnums=(0, 1))
@@ -188,19 +188,19 @@ def test_rows_of_some_arguments(axes):
             for i in range(3)
         ]
         for k in (0, 1):
-            np.testing.assert_allclose(found[k], jnp.stack([row[k] for row in single]))
+            np.testing.assert_allclose(found[k], jnp.stack([gradient[k] for gradient in single]))
     # The derivative of the batch, not the batch of derivatives.
     whole = jax.jit(jax.jacrev(lambda *given: jax.vmap(total, axes)(*given), argnums=(0, 1)))
     jac = whole(*given)[0]
     for i in range(3):
-        row = jac[i, i] if axes[0] == 0 else jac[i]
+        gradient = jac[i, i] if axes[0] == 0 else jac[i]
         expected = jax.grad(total)(
             given[0][i] if axes[0] == 0 else given[0], given[1][i] if axes[1] == 0 else given[1]
         )
-        np.testing.assert_allclose(row, expected)
+        np.testing.assert_allclose(gradient, expected)
 
 
-def test_a_number_without_a_transform_is_computed_at_once():
+def test_calls_on_numbers_are_not_traced():
     """Nothing is traced if nothing is differentiated."""
     calls = []
 
@@ -217,7 +217,7 @@ def test_a_number_without_a_transform_is_computed_at_once():
         assert jax.grad(seen)(2.0) == 3.0
 
 
-def test_rules_within_rules_are_kept():
+def test_nested_rules_survive_loops():
     """The rule of the outer function calls a function with a rule by `jax.custom_jvp`."""
 
     @jax.custom_jvp
@@ -228,10 +228,10 @@ def test_rules_within_rules_are_kept():
     def _(primals, tangents):
         return outer(*primals), users(*primals) * tangents[0]
 
-    kept = LOOPS["scan"](keeping_rules(outer))
-    first = jax.grad(kept)(X)
-    second = jax.jvp(jax.grad(kept), (X,), (1.0,))[1]
-    third = jax.grad(lambda x: jax.jvp(jax.grad(kept), (x,), (1.0,))[1])(X)
+    looped = LOOPS["scan"](keeping_rules(outer))
+    first = jax.grad(looped)(X)
+    second = jax.jvp(jax.grad(looped), (X,), (1.0,))[1]
+    third = jax.grad(lambda x: jax.jvp(jax.grad(looped), (x,), (1.0,))[1])(X)
     np.testing.assert_allclose([first, second, third], np.array([1, 2, 4]) * np.sin(X), rtol=1e-15)
 
 
@@ -332,7 +332,7 @@ def matrix(derivative):
         return lambda f: lambda w: jnp.stack([jax.jvp(f, (w,), (e,))[1] for e in jnp.eye(2)], -1)
     if derivative == "grad":
 
-        def rows(f):
+        def by_grad(f):
             def of(w):
                 if jax.eval_shape(f, w).shape == ():
                     return jax.grad(f)(w)
@@ -340,7 +340,7 @@ def matrix(derivative):
 
             return of
 
-        return rows
+        return by_grad
     return DERIVATIVES[derivative]
 
 
@@ -368,12 +368,12 @@ def check(function, loops, pairs, rtol):
 
 
 @pytest.mark.parametrize("name", CHEAP)
-def test_second_derivatives_of_values_in_loops(name):
+def test_second_derivatives_of_values_are_right_in_loops(name):
     check(CHEAP[name], ["map"], [("jvp", "grad"), ("grad", "grad")], 1e-10)
 
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
-def test_second_derivatives_of_motions_in_loops(lowering):
+def test_second_derivatives_of_motions_are_right_in_loops(lowering):
     """Also without a loop by the user: the loop over steps drops no rule either."""
     angle = end(pendulum(users, lowering), method="bosh3", dt=0.25)
 
@@ -394,19 +394,19 @@ def test_second_derivatives_of_motions_in_loops(lowering):
 @pytest.mark.full
 @pytest.mark.parametrize("loop", AROUND)
 @pytest.mark.parametrize("name", CHEAP)
-def test_all_pairs_of_values(name, loop):
+def test_all_pairs_of_modes_agree_on_values(name, loop):
     check(CHEAP[name], [loop], PAIRS, 1e-10)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("loop", AROUND)
-def test_all_pairs_of_motions(loop):
+def test_all_pairs_of_modes_agree_on_motions(loop):
     check(MOTIONS["auto"], [loop], PAIRS, 1e-7)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", MOTIONS)
-def test_pairs_of_all_methods(name):
+def test_pairs_of_modes_agree_for_all_methods(name):
     pairs = [("jvp", "grad"), ("jvp", "jacfwd"), ("grad", "jvp")]
     if "implicit" not in name:
         pairs.append(("grad", "grad"))

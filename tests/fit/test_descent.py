@@ -19,7 +19,7 @@ from jaxlag._fit._setup import build_shooting, readers_of
 
 
 @pytest.mark.full
-def test_a_descent_finds_what_least_squares_finds():
+def test_descent_agrees_with_least_squares():
     pieces = experiment(sigma={"x": NOISE}).windows(1.0)
     start = TRUE | {"l": 0.68, "c": 0.08}
     descent = jl.Descent(optax.adam(3e-3), epochs=400, batch=2)
@@ -35,7 +35,7 @@ def test_a_descent_finds_what_least_squares_finds():
 
 
 @pytest.mark.parametrize("segments", [1, 5])
-def test_the_cost_is_guessed_without_bias(segments):
+def test_estimate_of_the_cost_is_unbiased(segments):
     """The mean over all parts of equal size is the cost of least squares, including gaps."""
     data = experiment(sigma={"x": NOISE})
     data = (data, jl.Experiment(data.ts, {"x": angles(seed=1)}, sigma={"x": NOISE}))
@@ -56,7 +56,7 @@ def test_the_cost_is_guessed_without_bias(segments):
 
 
 @pytest.mark.full
-def test_a_network_in_the_potential_is_found():
+def test_network_in_the_potential_is_fitted():
     """A hardening spring, fitted by a linear spring and a network.
 
     It predicts better than the linear spring alone, and the energy is conserved.
@@ -98,7 +98,7 @@ def test_a_network_in_the_potential_is_found():
 
 
 @pytest.mark.full
-def test_a_segment_that_fails_moves_nothing():
+def test_failed_segment_does_not_change_the_fit():
     """A spring that breaks at x = 2, where one recording starts."""
 
     def force(t, q, v, p):
@@ -138,7 +138,7 @@ def test_derivatives_that_are_not_finite_are_counted():
 
 
 @pytest.mark.full
-def test_of_more_than_200_numbers_no_covariance_is_computed():
+def test_covariance_is_omitted_for_more_than_200_parameters():
     def lagrangian(t, q, v, p):
         return 0.5 * v[0] ** 2 - 2.0 * q[0] ** 2 - p["net"](q)
 
@@ -172,6 +172,6 @@ def test_motions_of_a_descent_are_counted():
         ((optax.sgd(1.0),), {"gap": 0.0}, r"`gap` must be positive, but it was 0"),
     ],
 )
-def test_bad_arguments_are_named(arguments, options, message):
+def test_invalid_arguments_are_named(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         jl.Descent(*arguments, **options)

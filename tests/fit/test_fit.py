@@ -39,7 +39,7 @@ def test_parameters_start_and_noise_are_found(segments):
 
 
 @pytest.mark.full
-def test_segments_find_what_one_motion_does():
+def test_segments_give_the_estimates_of_one_motion():
     """Joined ever more tightly they are one motion: the estimates are equal.
 
     The tolerance is a hundredth of their standard deviations.
@@ -51,7 +51,7 @@ def test_segments_find_what_one_motion_does():
 
 
 @pytest.mark.full
-def test_the_covariance_is_that_of_the_dense_derivatives():
+def test_covariance_equals_that_of_dense_derivatives():
     """(J^T J)^-1 of params and starts, from central differences of simulations."""
     data = experiment(sigma={"x": NOISE})
     found = fit(data)
@@ -72,16 +72,16 @@ def test_the_covariance_is_that_of_the_dense_derivatives():
 
 
 @pytest.mark.full
-def test_several_experiments_with_gaps_and_other_rates():
+def test_gaps_and_sampling_rates_do_not_affect_estimates():
     """Padding and gaps have no effect: the fit equals that of the present samples."""
     short = np.linspace(0.0, 1.0, 23)
     y = angles()
     with_gap = y.copy()
     with_gap[40:70] = np.nan
     second = {"x": angles(short, 0.6, seed=1)}
-    kept = np.isfinite(with_gap)
+    selected = np.isfinite(with_gap)
     one = fit((jl.Experiment(TS, {"x": with_gap}), jl.Experiment(short, second)))
-    same = jl.Experiment(TS[kept], {"x": y[kept]}), jl.Experiment(short, second)
+    same = jl.Experiment(TS[selected], {"x": y[selected]}), jl.Experiment(short, second)
     # Fixed steps do not depend on the save times.
     other = fit(same)
     within(one, ("l", "c"))
@@ -92,7 +92,7 @@ def test_several_experiments_with_gaps_and_other_rates():
 
 
 @pytest.mark.full
-def test_a_driven_motion_and_its_rate():
+def test_driven_motion_is_fitted_by_its_rate_and_a_channel():
     """Torque from a table, in segments; a measured rate and a user-defined channel."""
     times = np.linspace(0.0, 3.0, 61)
     torque = jl.LinearInterpolation(times, 0.8 * np.sin(3.0 * times))
@@ -124,7 +124,7 @@ def test_a_driven_motion_and_its_rate():
     within(found, ("l", "m"))
 
 
-def test_what_cannot_be_known_is_named():
+def test_unidentifiable_parameters_are_named():
     """L is m times a function of l and g/l: a free swing determines g/l and c/(m l^2)."""
     found = fit(experiment(), ("m", "l", "g"), TRUE | {"c": 0.05})
     assert len(found.unidentifiable) == 1
@@ -134,7 +134,7 @@ def test_what_cannot_be_known_is_named():
     np.testing.assert_allclose(ratio, TRUE["g"] / TRUE["l"], rtol=3e-3)
 
 
-def test_priors_decide_what_measurements_do_not():
+def test_priors_determine_unidentifiable_parameters():
     prior = {"g": jl.Prior(9.81, 0.01)}
     found = fit(experiment(), ("l", "g", "m"), TRUE | {"l": 0.6}, priors=prior)
     assert not found.unidentifiable
@@ -143,7 +143,7 @@ def test_priors_decide_what_measurements_do_not():
 
 
 @pytest.mark.full
-def test_a_search_that_errors_of_the_solver_stop_is_said():
+def test_search_stopped_by_errors_of_the_solver_gives_a_warning():
     """Dry friction with a steep change of sign, which steps at 1e-5 sometimes skip."""
     dry = jl.GeneralizedForce(lambda t, q, v, p: -p["f"] * jnp.tanh(v / 0.02), "dry")
     system, ts = pendulum.with_forces(dry), np.linspace(0.0, 8.0, 401)
@@ -171,7 +171,7 @@ def test_motions_are_counted():
     assert found.solves == 3 * found.iterations
 
 
-def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
+def test_known_start_is_fixed_and_uncertain_one_is_weighted():
     exact = fit(experiment(q0=[1.0], v0=[0.0], start_sigma=0.0))
     assert exact.starts[0].tolist() == [1.0, 0.0]
     free = fit(experiment())
@@ -181,7 +181,7 @@ def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
 
 
 @pytest.mark.full
-def test_a_segment_that_fails_is_named_and_does_not_count():
+def test_failed_segment_is_named_and_omitted():
     """A spring that breaks at x = 2: beyond, the force is NaN."""
 
     def force(t, q, v, p):
@@ -209,7 +209,7 @@ def pulse(t, q, v, p):
 
 @pytest.mark.full
 @pytest.mark.parametrize("sigma", [{"x": NOISE}, None])
-def test_a_segment_that_fails_within_a_chain_moves_nothing(sigma):
+def test_failed_segment_within_a_chain_does_not_change_the_fit(sigma):
     """The gap at this segment is not closed: the next segment has a separate start."""
     system = pendulum.with_forces(jl.GeneralizedForce(pulse, "pulse"))
     with pytest.warns(UserWarning, match=r"starts at t = 1\.2 s ended with nonfinite: it does not"):
@@ -237,7 +237,7 @@ def test_a_channel_that_is_not_finite_is_named():
 
 
 @pytest.mark.full
-def test_warnings_name_what_they_are_about():
+def test_warnings_name_parameters_and_channels():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
         fit(
             experiment(),
@@ -271,7 +271,7 @@ def test_no_warning_without_reason():
         (1.0, np.inf, r"`sigma` must be positive and finite, .* Leave the prior out"),
     ],
 )
-def test_bad_priors_are_named(mean, sigma, message):
+def test_invalid_priors_are_named(mean, sigma, message):
     with pytest.raises(ValueError, match=message):
         jl.Prior(mean, sigma)
 
@@ -333,6 +333,6 @@ def test_bad_priors_are_named(mean, sigma, message):
         ({"data": jl.Experiment(TS[:2], {"x": TS[:2]})}, r"at least as many numbers as there are"),
     ],
 )
-def test_bad_arguments_are_named(changes, message):
+def test_invalid_arguments_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         fit(changes.pop("data", experiment()), **changes)

@@ -43,7 +43,7 @@ def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
     assert list(counts) == [count, end(moving)[1]]
 
 
-def test_steady_motion_beside_a_pendulum_at_rest():
+def test_pendulum_at_rest_beside_a_steady_motion_has_derivatives():
     """Error estimates of a uniform motion vanish, too."""
     system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 9.0 * jnp.cos(q[1]), ("x", "a"))
 
@@ -54,7 +54,7 @@ def test_steady_motion_beside_a_pendulum_at_rest():
 
 
 @pytest.mark.parametrize("start", [0.0, pytest.param(1e-9, marks=pytest.mark.full)])
-def test_a_slow_motion_beside_a_fast_one_at_rest(start):
+def test_fast_spring_at_rest_beside_a_slow_one_has_derivatives(start):
     """Two springs of 0.1 and 10 rad/s: perturbations of the fast one go through 100 rad."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - 0.005 * q[0] ** 2 - 50.0 * q[1] ** 2, ("slow", "fast")
@@ -68,7 +68,7 @@ def test_a_slow_motion_beside_a_fast_one_at_rest(start):
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["kvaerno3", "kvaerno5"])
-def test_implicit_methods_at_rest(method):
+def test_implicit_methods_at_rest_have_derivatives(method):
     """They would step over unresolved oscillations and damp them: theta'' = -4 sin theta."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + 4.0 * jnp.cos(q[0]), ("a",))
 
@@ -80,7 +80,7 @@ def test_implicit_methods_at_rest(method):
 
 
 @pytest.mark.full
-def test_implicit_methods_at_rest_step_over_what_decays():
+def test_implicit_methods_at_rest_step_over_decaying_modes():
     """A dashpot of 1e6/s beside a spring: oscillations of 1 rad/s bound the steps, it does not."""
     dashpot = jl.Rayleigh(lambda t, q, v, p: 0.5e6 * v[1] ** 2, "dashpot")
     system = jl.System(
@@ -99,7 +99,7 @@ def test_implicit_methods_at_rest_step_over_what_decays():
     assert steps < 1000
 
 
-def test_what_turns_and_what_decays():
+def test_turning_rate_excludes_decaying_modes():
     """Eigenvalues +-3i and -1 +- 5i oscillate or nearly so, -100 and -7 +- i decay, 2 grows."""
 
     def block(real, imaginary):
@@ -117,7 +117,7 @@ def test_what_turns_and_what_decays():
 
 @pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 30.0, 1e4])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_fastest_rate(rate, dtype):
+def test_spectral_size_is_about_the_fastest_rate(rate, dtype):
     """In range although its 16th power is not; within the 16th root of the ratio of units."""
     J = jnp.asarray([[0.0, 1.0, 0.0], [-(rate**2), 0.0, 0.0], [0.0, 0.0, 0.0]], dtype)
     assert 0.9 * rate <= spectral_size(J)[0] <= max(rate, 1 / rate) ** (1 / 16) * 1.1 * rate

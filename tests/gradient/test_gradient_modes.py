@@ -107,11 +107,11 @@ def test_all_modes_agree(forward, name):
     this = case(name)
     for mode in MODES if name in ALL_MODES else MODES[:1]:
 
-        def pulled(x, tolerance, mode=mode):
-            _, pullback, kind = jax.vjp(lambda x: this.end(x, tolerance, mode), x, has_aux=True)
-            return pullback(this.weights)[0], kind
+        def reverse(x, tolerance, mode=mode):
+            _, vjp_fn, kind = jax.vjp(lambda x: this.end(x, tolerance, mode), x, has_aux=True)
+            return vjp_fn(this.weights)[0], kind
 
-        program = jax.jit(pulled)
+        program = jax.jit(reverse)
         for tolerance in (1e-9, 1e-11):
             _, dy = forward(name, tolerance)
             bar, kind = program(this.x, tolerance)
@@ -128,7 +128,7 @@ def test_all_modes_agree(forward, name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", SPANS)
-def test_the_derivative_is_that_of_the_motion(forward, name):
+def test_derivative_equals_that_of_the_motion(forward, name):
     """Against differences of solves at a tight tolerance; as accurate as the solution."""
     this = case(name)
     solve = jax.jit(lambda x: this.end(x, TIGHT)[0])
@@ -152,7 +152,7 @@ def test_the_derivative_is_that_of_the_motion(forward, name):
 
 
 @pytest.mark.full
-def test_points_are_thinned_out_on_long_motions():
+def test_checkpoints_are_thinned_out_on_long_motions():
     """3 checkpoints for 300 steps: the same gradient as from all states."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
 
@@ -180,7 +180,7 @@ def test_points_are_thinned_out_on_long_motions():
 
 @pytest.mark.full
 @pytest.mark.parametrize("mode", ["recorded", "checkpoints", "forward"])
-def test_lanes_that_reach_rows_in_different_turns(mode):
+def test_lanes_that_reach_saves_in_different_iterations_have_gradients(mode):
     """Some have several saves in a step, some one in several; each has its own gradient."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
     rng = np.random.default_rng(0)
@@ -235,14 +235,14 @@ def test_gradients_are_traced_once():
     assert first <= 2 * len(count)
 
 
-def test_memory_decides():
+def test_capacity_follows_from_the_memory():
     """The times of all steps take 8 bytes each, and 5 more with knots; states take the rest."""
     state, size, steps = 4, 8, 16384
     times = 8 * steps
     assert capacity_for("auto", None, steps, 2, state, size) == 512
-    room = capacity_for("auto", times + 10_000, steps, 2, state, size)
-    assert room == 128
-    assert needed(room, steps, state, size) <= times + 10_000
+    capacity = capacity_for("auto", times + 10_000, steps, 2, state, size)
+    assert capacity == 128
+    assert needed(capacity, steps, state, size) <= times + 10_000
     assert capacity_for("auto", times, steps, 2, state, size) == 0
     assert needed(0, steps, state, size, knots=True) == 13 * steps
     assert capacity_for("recorded", None, 1000, 2, state, size) >= 1000
@@ -276,7 +276,7 @@ def test_memory_decides():
         ),
     ],
 )
-def test_memory_that_does_not_do(options, message):
+def test_insufficient_memory_is_refused(options, message):
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
     with pytest.raises(ValueError, match=message):
         jl.simulate(free, [0.0], [1.0], [0.0, 1.0], **options)
@@ -305,7 +305,7 @@ def test_an_integer_has_no_derivative():
 
 
 @pytest.mark.full
-def test_every_transform():
+def test_all_transforms_give_equal_derivatives():
     """Nested batches, gradients through scans, reverse over reverse: equal results."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
     p, starts = jnp.array(9.81), jnp.linspace(0.1, 1.2, 6).reshape(2, 3, 1)
@@ -324,7 +324,7 @@ def test_every_transform():
         np.testing.assert_allclose(a, b, rtol=1e-11)
 
     single = jax.jit(jax.grad(loss, 1))
-    one_by_one = np.array([[single(q, p) for q in row] for row in starts])
+    one_by_one = np.array([[single(q, p) for q in lane] for lane in starts])
     batch = jax.vmap(jax.vmap(jax.grad(loss, 1), (0, None)), (0, None))
     same(jax.jit(batch)(starts, p), one_by_one)
     together = jax.grad(lambda p: jnp.sum(jax.vmap(lambda q: loss(q, p))(starts[0])))

@@ -46,8 +46,8 @@ def derivatives(lowering):
             def both(x, dx):
                 weights = jnp.arange(1.0, 1.0 + jax.eval_shape(state, x).shape[0])
                 y, dy = jax.jvp(state, (x,), (dx,))
-                _, pullback = jax.vjp(state, x)
-                return y, dy, weights, pullback(weights)[0]
+                _, vjp_fn = jax.vjp(state, x)
+                return y, dy, weights, vjp_fn(weights)[0]
 
             results[name] = (state, x, direction(x), both(x, direction(x)))
         return results[name]
@@ -57,12 +57,12 @@ def derivatives(lowering):
 
 def forward_equals_reverse(derivatives, name):
     """<w, J dx> = <J^T w, dx>, to rounding, because both differentiate one sequence of steps."""
-    _, _, dx, (_, dy, weights, pulled) = derivatives(name)
+    _, _, dx, (_, dy, weights, gradient) = derivatives(name)
     scale = jnp.sum(jnp.abs(weights * dy)) + dot(
-        jax.tree.map(jnp.abs, pulled), jax.tree.map(jnp.abs, dx)
+        jax.tree.map(jnp.abs, gradient), jax.tree.map(jnp.abs, dx)
     )
     # Measured 2026-11-21: at most 4e-15 of the scale.
-    assert abs(dot(weights, dy) - dot(pulled, dx)) <= 1e-13 * scale
+    assert abs(dot(weights, dy) - dot(gradient, dx)) <= 1e-13 * scale
 
 
 def test_forward_equals_reverse_under_both_lowerings(derivatives):
@@ -105,16 +105,16 @@ def recorded(motion: Motion, x):
         problem = _solve.split(_simulate.build_problem(plan, values)[2])
         if outcome is None:
             return _solve._recorded(problem)
-        rows = _solve._replay(problem, outcome, problem.differentiable)
+        replayed = _solve._replay(problem, outcome, problem.differentiable)
         n = motion.system.size
-        return jnp.concatenate([rows.saved[-1], rows.saved[1, :n]])
+        return jnp.concatenate([replayed.saved[-1], replayed.saved[1, :n]])
 
     outcome = jax.jit(lambda x: on_grid(None, x))(x)
     return jax.jit(lambda x: on_grid(outcome, x))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_derivative_is_that_of_the_recorded_grid(derivatives, name):
+def test_derivative_equals_that_of_the_recorded_grid(derivatives, name):
     """Central differences of the steps, repeated on the grid recorded at x."""
     _, x, dx, (y, dy, _, _) = derivatives(name)
     again = recorded(MOTIONS[name], x)
@@ -173,7 +173,7 @@ def test_derivative_matches_variational_equations(name):
 
 
 @pytest.mark.full
-def test_dependence_on_times(derivatives):
+def test_derivatives_by_times_are_velocities(derivatives):
     """dq/dt1 = v(t1); a shift of all times of an autonomous motion changes nothing."""
     state, x, _, (y, *_) = derivatives("double_pendulum")
     zero = jax.tree.map(jnp.zeros_like, x)
@@ -187,12 +187,12 @@ def test_dependence_on_times(derivatives):
 
 
 @pytest.mark.full
-def test_rows_move_with_their_own_time():
+def test_saves_have_derivatives_by_their_own_time():
     """d x(ts[i]) / d ts[i] = v, also on a step of a fixed grid and on a knot."""
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
-    row = jax.grad(lambda ts: jl.simulate(free, [0.0], [2.0], ts, dt=0.25).q[1, 0])
+    save = jax.grad(lambda ts: jl.simulate(free, [0.0], [2.0], ts, dt=0.25).q[1, 0])
     for middle in (0.5, 0.51):
-        slope = row(jnp.array([0.0, middle, 1.0]))
+        slope = save(jnp.array([0.0, middle, 1.0]))
         np.testing.assert_allclose(slope, [-2.0, 2.0, 0.0], rtol=0, atol=1e-13)
 
     def pushed(at, knot):
@@ -203,13 +203,13 @@ def test_rows_move_with_their_own_time():
         ts = jnp.stack([0.0, at, 1.0])
         return jl.simulate(system, [0.0], [0.0], ts, inputs={"u": table}).q[1, 0]
 
-    by_row, by_knot = jax.grad(pushed, argnums=(0, 1))(0.5, 0.5)
-    np.testing.assert_allclose(by_row, 5 * 0.5 / 2, rtol=1e-12)  # v = 5 t^2 / (2 knot)
+    by_time, by_knot = jax.grad(pushed, argnums=(0, 1))(0.5, 0.5)
+    np.testing.assert_allclose(by_time, 5 * 0.5 / 2, rtol=1e-12)  # v = 5 t^2 / (2 knot)
     np.testing.assert_allclose(by_knot, -5 * 0.5 / 6, rtol=1e-12)  # x = 5 t^3 / (6 knot)
 
 
 @pytest.mark.parametrize("mode", mostly_full(("recorded", "checkpoints", "forward"), "recorded"))
-def test_dependence_on_the_start_under_a_table(mode):
+def test_derivative_by_the_start_time_under_a_table_is_exact(mode):
     """x'' = 1 + 2 t from rest at t0: dx(t1)/dt0 = -(1 + 2 t0) (t1 - t0).
 
     The reference of times in between has no effect.
@@ -255,7 +255,7 @@ def test_derivative_by_switching_time():
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["kvaerno3", "tsit5"])
 @pytest.mark.parametrize("dt", [None, 0.02])
-def test_every_kind_of_solver(method, dt):
+def test_forward_equals_reverse_for_every_kind_of_solver(method, dt):
     """fwd = rev for implicit and explicit, adaptive and fixed steps."""
     tolerance = {} if dt else {"rtol": 1e-6, "atol": 1e-6}
     state, x = end(MOTIONS["central_motion"], method=method, dt=dt, **tolerance)
@@ -332,7 +332,7 @@ def test_vmap_of_grad_equals_loop_of_grad(name, dt, rtol):
 
 
 @pytest.mark.full
-def test_unreached_rows_keep_the_gradient_finite():
+def test_saves_that_are_not_reached_keep_the_gradient_finite():
     """A motion that fails has NaN saves, and a finite gradient of the saves that it reached."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.sqrt(1.0 - q[0]), ("x",)
@@ -347,15 +347,15 @@ def test_unreached_rows_keep_the_gradient_finite():
     assert np.isfinite(slope).all()
     assert slope[0] > 0.5  # saves at 0.25, 0.5, 0.75 depend on v0
 
-    def dead(q0):
+    def failed(q0):
         m = jl.simulate(system, q0, [0.0], [0.0, 1.0, 2.0], 0.1, throw=False)
         return jnp.sum(jnp.where(jnp.isnan(m.q[1:]), 0.0, m.q[1:]))
 
-    np.testing.assert_array_equal(jax.grad(dead)(jnp.array([2.0])), [0.0])
+    np.testing.assert_array_equal(jax.grad(failed)(jnp.array([2.0])), [0.0])
 
 
 @pytest.mark.full
-def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
+def test_wrong_sign_of_the_tangent_rule_is_detected(derivatives, monkeypatch):
     """The comparisons above fail for a wrong sign of the tangent rule."""
     _, x, dx, (_, dy, _, _) = derivatives("central_motion")
     right = _solve.changes
@@ -373,7 +373,7 @@ def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
 
 
 @pytest.mark.full
-def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
+def test_wrong_sign_of_the_adjoint_is_detected(derivatives, monkeypatch):
     """The comparison of forward with reverse fails for a wrong sign of the transposed map."""
     _, x, dx, (_, dy, weights, _) = derivatives("central_motion")
     right = _tangent_map.adjoint_sweep
@@ -381,6 +381,6 @@ def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
         _tangent_map, "adjoint_sweep", lambda *args: jax.tree.map(jnp.negative, right(*args))
     )
     state, _ = end(MOTIONS["central_motion"], max_steps=4098)  # another program: no cache is used
-    pulled = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)
+    gradient = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)
     scale = jnp.sum(jnp.abs(weights * dy))
-    assert abs(dot(weights, dy) - dot(pulled, dx)) > 1e-3 * scale
+    assert abs(dot(weights, dy) - dot(gradient, dx)) > 1e-3 * scale

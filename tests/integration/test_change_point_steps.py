@@ -26,12 +26,12 @@ NARROW, CLOSE = narrow(float), narrow(float) / 3
 
 
 @pytest.mark.parametrize("method", ["dopri8", "tsit5", "prince9", "kvaerno5"])
-def test_no_stage_is_near_the_place(method):
+def test_stages_are_far_from_the_change_point(method):
     """The step across is at most the proposed one; its stages are as far away as possible."""
     nodes = np.array([0.0, *nodes_of(METHODS[method]()), 1.0])
     gap = widest_gap(nodes.tolist())
-    apart = np.min(np.abs(nodes - gap))
-    assert apart > 0.03
+    clearance = np.min(np.abs(nodes - gap))
+    assert clearance > 0.03
     t, h = jnp.array(2.0), jnp.array(0.3)
     for left in (0.05, 0.1, 0.25, 0.5, 0.8):
         known = ahead_of(t, left * h, 0.5 * SHORT)
@@ -50,7 +50,7 @@ def ahead_of(t, left, apart):
     return no_crossing(t, 1, float)._replace(time=t + left, apart=jnp.array(apart))
 
 
-def test_what_is_saved_across_shortens_the_step():
+def test_saves_beyond_the_change_point_shorten_the_step():
     """It leads up to a row length of NARROW, by at most 0.9 of the distance; then across."""
     t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
     for apart, without in ((0.9 * AHEAD, h), (0.9 * SHORT, 0.1 / gap), (2 * NARROW, 0.1 / gap)):
@@ -66,7 +66,7 @@ def test_what_is_saved_across_shortens_the_step():
     np.testing.assert_allclose(beside.step(t, h, gap, due=jnp.array(2.25)), 0.001 / gap, rtol=1e-12)
 
 
-def test_a_motion_that_ends_at_the_place_or_beyond_it():
+def test_last_step_is_short_or_has_no_stage_at_the_change_point():
     """The last step is short, or has the change point between its stages."""
     t, h, gap = jnp.array(2.0), jnp.array(0.3), 0.6
     far, near = ahead_of(t, 0.1, SHORT), ahead_of(t, 0.1, NARROW)
@@ -81,7 +81,7 @@ def test_a_motion_that_ends_at_the_place_or_beyond_it():
     np.testing.assert_allclose((0.1 - lead) / (0.11 - lead), gap, rtol=1e-9)
 
 
-def test_where_the_place_is_to_be_expected():
+def test_time_of_the_change_point_is_extrapolated_linearly():
     """A row length that goes linearly through zero; none if it grows, or is long."""
     t0, t1, t2 = jnp.array(0.0), jnp.array(1.0), jnp.array(1.5)
     begin = no_crossing(t0, 2, float)
@@ -97,7 +97,7 @@ def test_where_the_place_is_to_be_expected():
     assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
 
 
-def test_for_how_long_rows_may_depend():
+def test_dependent_rows_are_accepted_for_a_limited_distance():
     """Over twice the distance that the decrease of the rows implies; at a cusp this is exceeded."""
     t0, t1 = jnp.array(0.0), jnp.array(1.0)
     moved = jnp.array([0.6, 0.8])
@@ -105,11 +105,11 @@ def test_for_how_long_rows_may_depend():
     begin = begin.onwards(t0, t1, jnp.array(0.0), 0.05 * moved)
     assert begin.depends
     assert begin.passes
-    way = 2 * LOST
-    across = begin.onwards(t0, t1, jnp.array(0.9 * LOST), 0.95 * way * moved)
+    distance = 2 * LOST
+    across = begin.onwards(t0, t1, jnp.array(0.9 * LOST), 0.95 * distance * moved)
     assert across.passes
     assert across.onwards(t0, t1, jnp.array(0.1), 0.1 * moved).passes  # little of it at the point
-    assert not across.onwards(t0, t1, jnp.array(LOST), 2 * way * moved).passes
+    assert not across.onwards(t0, t1, jnp.array(LOST), 2 * distance * moved).passes
     # s = d^(3/2), step by step from 1 to the dependent part
     ends = np.geomspace(1.0, LOST ** (2 / 3), 30)
     cusp = no_crossing(t0, 2, float)

@@ -57,7 +57,7 @@ def exact(speed, ts):
     return jnp.sin(jl.simulate(PENDULUM, jnp.zeros(1), speed[None], ts, **tight).q[:, 0])
 
 
-def test_flat_places_are_passed_at_every_tolerance():
+def test_flat_configurations_are_passed_at_every_tolerance():
     """Three revolutions, with saves along the whole motion, also near the change points."""
     ts = jnp.linspace(0.0, 4.0, 161)
     run = jax.jit(jax.vmap(moved, in_axes=(0, None, None)))
@@ -72,7 +72,7 @@ def test_flat_places_are_passed_at_every_tolerance():
 
 
 @pytest.mark.full
-def test_flat_places_in_float32_are_passed_or_named():
+def test_flat_configurations_in_float32_are_passed_or_reported():
     ts = jnp.linspace(0.0, 2.0, 41)
     expected = jax.vmap(exact, in_axes=(0, None))(SPEEDS, ts)
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -93,7 +93,7 @@ def test_flat_places_in_float32_are_passed_or_named():
         np.testing.assert_allclose(found.q[passed, :, 0], expected[passed], atol=5e-3)
 
 
-def test_it_stops_before_them_where_told_to():
+def test_option_stop_ends_motions_before_change_points():
     """At every tolerance, with status rank_change; the last time is the change point within it."""
     run = jax.jit(jax.vmap(lambda s, e: moved(s, jnp.linspace(0, 2, 3), e, change_points="stop")))
     tolerances = jnp.array([1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
@@ -106,13 +106,13 @@ def test_it_stops_before_them_where_told_to():
 
 
 @pytest.mark.full
-def test_the_row_is_named():
+def test_message_of_a_stop_names_the_row():
     found = moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="stop")
     assert "rank_change ('rods[" in found.message()
     assert "change_points='stop'" in found.message()
 
 
-def test_another_word_is_an_error():
+def test_invalid_option_is_refused():
     with pytest.raises(ValueError, match=r"`change_points` must be one of 'pass', 'stop'.*'go'"):
         moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="go")
 
@@ -122,15 +122,15 @@ def test_a_fast_four_bar_passes_its_change_point(rtol):
     """Three times; with constant energy, and back to the start."""
     q0, v0, params = change_point_start()
     options = {"throw": False, "rtol": rtol, "atol": rtol}
-    there = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
-    assert there.status == jl.Status.ok
+    forward = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
+    assert forward.status == jl.Status.ok
     # Measured: 2e-5, 1.3e-9, 3e-13 of 15 J; 4e-5, 6e-9, 1.4e-12.
     energy = {1e-6: 1e-4, 1e-9: 1e-8, 1e-12: 5e-12}[rtol]
-    np.testing.assert_allclose(there.energy, there.energy[0], atol=energy)
-    q1, v1 = there.last_state
-    back = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
-    assert back.status == jl.Status.ok
-    np.testing.assert_allclose(back.q[-1], q0, atol=10 * energy)
+    np.testing.assert_allclose(forward.energy, forward.energy[0], atol=energy)
+    q1, v1 = forward.last_state
+    backward = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
+    assert backward.status == jl.Status.ok
+    np.testing.assert_allclose(backward.q[-1], q0, atol=10 * energy)
 
 
 def change_point_start():
@@ -160,7 +160,7 @@ def flat_at(speed):
 
 
 @pytest.mark.parametrize("method", mostly_full(["auto", "tsit5"], "auto"))
-def test_states_at_the_place_and_beside_it(method):
+def test_states_at_and_near_a_change_point_are_accurate(method):
     """Saved there, and at the end of a motion there, at every tolerance."""
     when = np.array([flat_at(speed) for speed in SPEEDS[::4].tolist()])
     beside = np.array([-1e-2, -1e-4, -1e-7, 0.0, 1e-7, 1e-4, 1e-2])
@@ -219,7 +219,7 @@ def test_rounding_does_not_shorten_the_steps(rtol):
 
 
 @pytest.mark.full
-def test_equal_steps_that_meet_the_place_say_so():
+def test_fixed_steps_that_meet_a_change_point_report_it():
     """Those with an end or a stage there; all others keep their accuracy."""
     when = flat_at(1.0)
     nodes = np.clip(np.unique(nodes_of(METHODS["dopri8"]())), 0.0, 1.0)
@@ -235,16 +235,16 @@ def test_equal_steps_that_meet_the_place_say_so():
     passed = found.status == jl.Status.ok
     assert ((found.status == jl.Status.rank_change) | passed).all()
     assert jnp.sum(passed) <= 1  # measured: of the first stage after the start, right to 5e-13
-    apart = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
-    assert (apart.status == jl.Status.ok).all()
+    shifted = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
+    assert (shifted.status == jl.Status.ok).all()
     expected = exact(jnp.ones(()), jnp.array([0.0, 0.8]))[-1]
-    for end in (*found.q[passed, -1, 0], *apart.q[:, -1, 0]):
+    for end in (*found.q[passed, -1, 0], *shifted.q[:, -1, 0]):
         np.testing.assert_allclose(end, expected, atol=1e-8)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("how", [{"rtol": 1e-9, "atol": 1e-9}, {"dt": 0.02, "method": "dopri8"}])
-def test_a_force_that_is_nan_before_the_place_is_not_taken_for_it(how):
+def test_nan_force_before_a_change_point_is_reported_as_nonfinite(how):
     """NaN at x0 = 0.95, where rows have a third of their length left; they vanish at x0 = 1."""
     wrong = lambda t, q, v, p: jnp.where(q[0] > p, jnp.nan, 0.0) * jnp.ones(4)  # noqa: E731
     force, rows = jl.GeneralizedForce(wrong, "wrong"), jl.Holonomic(rods, "rods")
@@ -255,7 +255,7 @@ def test_a_force_that_is_nan_before_the_place_is_not_taken_for_it(how):
 
 
 @pytest.mark.full
-def test_a_crank_at_constant_speed_is_saved_where_it_is_folded():
+def test_saves_in_a_folded_configuration_are_accurate():
     """A parallelogram that is flat at t = 2, which is a save time."""
     entry = ENTRIES["four_bar"]
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
@@ -274,7 +274,7 @@ def test_a_crank_at_constant_speed_is_saved_where_it_is_folded():
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("method", ["auto", "tsit5", "kvaerno5"])
-def test_all_forms_pass(lowering, formulation, method):
+def test_change_points_are_passed_in_all_formulations(lowering, formulation, method):
     ts = jnp.linspace(0.0, 4.0, 41)
     how = {"method": method, "formulation": formulation}
     found = moved(jnp.ones(()), ts, 1e-9, parallelogram(lowering), **how)
@@ -286,7 +286,7 @@ def test_all_forms_pass(lowering, formulation, method):
 
 @pytest.mark.full
 @pytest.mark.parametrize("stabilization", [None, jl.Baumgarte(5.0, 5.0)])
-def test_without_a_projection_it_stops(stabilization):
+def test_motion_without_projection_stops(stabilization):
     """Beyond the change point nothing would move the state back to its branch."""
     for rtol in (1e-6, 1e-9, 1e-12):
         found = moved(jnp.ones(()), [0.0, 1.0], rtol, stabilization=stabilization)
@@ -311,7 +311,7 @@ def test_fixed_steps_keep_their_order():
 
 
 @pytest.mark.full
-def test_derivatives_across():
+def test_derivatives_across_change_points_are_accurate():
     """First derivatives in both modes, and second ones, against those of the pendulum."""
     ts = jnp.linspace(0.0, 3.0, 31)
 
@@ -329,7 +329,7 @@ def test_derivatives_across():
 
 @pytest.mark.full
 @pytest.mark.parametrize("stop", [False, True])
-def test_derivatives_of_what_is_saved_there(stop):
+def test_derivatives_of_saves_at_change_points_are_accurate(stop):
     """By the start and by the save times, forward and reverse, single and in lanes."""
     speeds = SPEEDS[:3]
     when = jnp.asarray([flat_at(speed) for speed in speeds.tolist()])
@@ -337,17 +337,19 @@ def test_derivatives_of_what_is_saved_there(stop):
     ts = jnp.concatenate([jnp.zeros((3, 1)), ts], axis=1)
 
     def of(motion):
-        forward, back = (jax.jit(jax.vmap(d(motion, (0, 1)))) for d in (jax.jacfwd, jax.jacrev))
+        forward, reverse_mode = (
+            jax.jit(jax.vmap(d(motion, (0, 1)))) for d in (jax.jacfwd, jax.jacrev)
+        )
         return (
             forward(speeds, ts),
-            back(speeds, ts),
+            reverse_mode(speeds, ts),
             jax.jit(jax.jacrev(motion, 1))(speeds[0], ts[0]),
         )
 
-    there, back, alone = of(lambda s, ts: moved(s, ts, 1e-12).q[:, 0])
+    forward_mode, reverse_mode, alone = of(lambda s, ts: moved(s, ts, 1e-12).q[:, 0])
     expected = of(exact)[0]
     # Measured: 2e-9 of 0.8, 3e-8 of 5.
-    for found in (there, back):
+    for found in (forward_mode, reverse_mode):
         np.testing.assert_allclose(found[0], expected[0], atol=2e-8)
         np.testing.assert_allclose(found[1], expected[1], atol=3e-7)
     np.testing.assert_allclose(alone, expected[1][0], atol=3e-7)
@@ -361,7 +363,7 @@ TOLERANCES = jnp.array([1e-4, 1e-6, 1e-9, 1e-12])
 UNITS = jnp.array([[1.0, 1.0], [1e-6, 1e-6], [1e3, 1e3], [1.0, 1e-6], [1e-3, 1e3]])
 
 
-def along(curve, q0, v0):
+def motion_of_a_bead(curve, q0, v0):
     """A bead along a curve without forces, at every tolerance, in every unit."""
     rows = (jl.Holonomic(lambda t, q, units: curve(q / units), "wire"),)
     system, ts = jl.System(free, ("x", "y"), constraints=rows), jnp.linspace(0.0, 4.0, 9)
@@ -375,10 +377,10 @@ def along(curve, q0, v0):
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(TOLERANCES, UNITS)
 
 
-def test_where_ways_cross_a_bead_goes_straight_on():
+def test_bead_passes_a_node_along_its_tangent():
     """A figure eight, a quarter of which is 1.311 long: twice through its node."""
     eight = lambda q: (q @ q) ** 2 - q[0] ** 2 + q[1] ** 2  # noqa: E731
-    status, q, _, _ = along(eight, [1.0, 0.0], [0.0, 1.0])
+    status, q, _, _ = motion_of_a_bead(eight, [1.0, 0.0], [0.0, 1.0])
     assert (status == jl.Status.ok).all()
     s = 4.0 - 3 * 1.3110287771460600  # length beyond the node
     r = s - s**5 / 10  # the lemniscate sine, to 5e-13
@@ -402,10 +404,10 @@ CURVES = {
 
 
 @pytest.mark.parametrize("name", mostly_full(list(CURVES), "cusp"))
-def test_where_ways_do_not_cross_a_bead_stops(name):
+def test_bead_stops_at_cusps_and_contact_points(name):
     """At a cusp, and where two curves touch: at every tolerance, shortly before the point."""
     curve, q0, v0 = CURVES[name]
-    status, _, last_time, v = along(curve, q0, v0)
+    status, _, last_time, v = motion_of_a_bead(curve, q0, v0)
     assert (status == jl.Status.rank_change).all()
     np.testing.assert_allclose(last_time, jnp.full_like(last_time, last_time[-1, 0]), rtol=0.03)
     off = np.abs(np.linalg.norm(v, axis=-1) / np.linalg.norm(v0) - 1.0)

@@ -62,7 +62,7 @@ def largest_residuals(motion):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_minimal_coordinates_move_the_same(motion, formulation):
+def test_motion_equals_that_in_minimal_coordinates(motion, formulation):
     """q, v, a and energy are mapped from the angles; tensions follow from their accelerations."""
     found = motion(formulation)
     angles = jl.simulate(minimal, THETA, OMEGA, TS, BOBS, **TIGHT)
@@ -78,8 +78,8 @@ def test_minimal_coordinates_move_the_same(motion, formulation):
     np.testing.assert_allclose(found.energy, angles.energy[0], atol=1e-9)
     # The lower rod acts on its bob along itself: m2 (a2 - g) = 2 lam (r2 - r1).
     rod = found.q[:, 2:] - found.q[:, :2]
-    pull = BOBS["m2"] * (a[:, 2:] + jnp.array([0.0, 9.81]))
-    np.testing.assert_allclose(2 * found.lam["rod2"][:, None] * rod, pull, atol=1e-8)
+    force = BOBS["m2"] * (a[:, 2:] + jnp.array([0.0, 9.81]))
+    np.testing.assert_allclose(2 * found.lam["rod2"][:, None] * rod, force, atol=1e-8)
 
 
 @pytest.mark.full
@@ -92,12 +92,12 @@ def test_formulations_agree(motion):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_constraints_hold_at_every_row(motion, formulation):
+def test_constraints_hold_at_every_save(motion, formulation):
     """To rounding."""
     assert largest_residuals(motion(formulation)) <= 1e-13
 
 
-def test_projection_is_what_holds_them():
+def test_constraints_hold_only_with_projection():
     """To rounding with projection; without it the drift is visible."""
     system, q0, v0, params = double_pendulum()
     loose = {"rtol": 1e-6, "atol": 1e-6, "method": "bosh3"}
@@ -108,21 +108,21 @@ def test_projection_is_what_holds_them():
 
 
 @pytest.mark.full
-def test_baumgarte_damps_what_is_left():
+def test_baumgarte_damps_initial_residuals():
     """(d/dt + 20/s)^2 phi = 0: an initial residual decays; without damping it stays."""
     system, q0, v0, params = double_pendulum()
-    left = []
+    residuals = []
     for stabilization in (None, jl.Baumgarte(20.0, 20.0)):
         found = jl.simulate(
             system, q0 * (1 + 3e-9), v0, TS, params, stabilization=stabilization, **TIGHT
         )
         phi = rods(0.0, found.q[-1], params)
-        left.append(float(jnp.max(jnp.abs(phi))))
-    assert left[0] > 1e-9
-    assert left[1] < 1e-11
+        residuals.append(float(jnp.max(jnp.abs(phi))))
+    assert residuals[0] > 1e-9
+    assert residuals[1] < 1e-11
 
 
-def test_a_knife_edge_runs_in_a_circle():
+def test_knife_edge_moves_on_a_circle():
     """Constant speed u along the edge and turning rate w: a circle of radius u / w; closed form."""
     u, w = 0.8, 1.3
     found = jl.simulate(skate, [0, 0, 0], [u, 0, w], np.linspace(0, 3, 7), SKATE, **TIGHT)
@@ -135,7 +135,7 @@ def test_a_knife_edge_runs_in_a_circle():
 
 
 @pytest.mark.full
-def test_a_pin_that_is_led_does_work():
+def test_work_of_a_moving_pin_is_the_change_of_energy():
     """Rheonomic rows: their work, -b . lam, is the change of energy."""
     q0, v0 = led_start()
     ts = np.linspace(0, 1.5, 5)
@@ -187,7 +187,7 @@ def test_redundant_rows_change_nothing(motion):
         pytest.param(redundant, id="redundant"),
     ],
 )
-def test_derivatives_along_consistent_families(system):
+def test_derivatives_along_consistent_starts_agree(system):
     """fwd = rev = central differences in the chart of angles, with projection."""
 
     def end(x):
@@ -238,7 +238,7 @@ def test_contradictory_rows_are_named(rows, row):
 # ---- Starts --------------------------------------------------------------------------------------
 
 
-def test_inconsistent_starts():
+def test_inconsistent_starts_are_refused_or_assembled():
     """Refused by name, or moved to the nearest consistent state."""
     system, q0, v0, params = double_pendulum()
     wrong = q0.at[3].add(0.05)
@@ -252,7 +252,7 @@ def test_inconsistent_starts():
 
 
 @pytest.mark.full
-def test_inconsistent_starts_in_a_batch():
+def test_inconsistent_starts_in_a_batch_have_a_status():
     """Traced starts get a status."""
     system, q0, v0, params = double_pendulum()
 
@@ -294,7 +294,7 @@ def test_a_dead_point_is_passed():
 
 
 @pytest.mark.full
-def test_a_start_at_a_dead_point():
+def test_start_at_a_dead_point_follows_a_branch():
     """One row vanishes there: a branch is followed; between branches a failure is reported.
 
     With crank = pi/2 + a, rod = -pi/2 + b the row y is cos(a) - cos(b): a = b or a = -b.
@@ -319,7 +319,7 @@ def test_a_start_at_a_dead_point():
 
 
 @pytest.mark.full
-def test_a_dead_point_is_passed_fast():
+def test_dead_points_are_passed_at_high_speed():
     """At high speed, with the null-space formulation."""
     equal = {**SLIDER, "r": 1.0}
     q0, v0 = slider_start(0.5, 10.0, equal)
@@ -345,7 +345,7 @@ def pin(t, q, params):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_links_without_mass(formulation):
+def test_massless_links_are_solved(formulation):
     """M is singular; with params traced or not, also if L does not contain the rate at all."""
     ts = [0.0, 1.0]
     pendulum = jl.System(

@@ -22,7 +22,7 @@ def through(q, integral, t0, t1, t):
     return hermite(t0, y0, f0, t1, y1, f1, t, 2)
 
 
-def test_polynomials_are_themselves_between_the_ends_and_beyond():
+def test_polynomials_are_reproduced_inside_and_beyond_the_step():
     """Of degree 5 in the coordinates, of degree 3 in integrals."""
     c = jnp.array([[0.3, -1.2, 0.7, 2.1, -0.4, 0.9], [1.0, 0.2, -0.8, 0.1, 1.3, -0.6]])
     q = lambda t: jnp.array([jnp.polyval(c[0], t), jnp.polyval(c[1], t)])  # noqa: E731
@@ -50,7 +50,7 @@ def test_errors_are_of_order_6_and_5():
     np.testing.assert_allclose(slopes, [6.0, 5.0, 4.0], atol=0.1)
 
 
-def test_which_step_leads_to_a_time():
+def test_reached_time_follows_from_the_kind_of_step():
     """The end of a step to this time, of the step that contains it, or half of the way."""
     t0, t, end = jnp.array(1.0), jnp.array(1.5), jnp.array(4.0)
     found = [float(reached_time(jnp.array(int(reach)), t0, t, end)) for reach in Reach]

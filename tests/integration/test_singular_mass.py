@@ -49,7 +49,7 @@ def case(name, lowering):
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 @pytest.mark.parametrize("name", CASES)
-def test_no_acceleration(name, lowering):
+def test_singular_mass_gives_nan_accelerations(name, lowering):
     system, params, q, v, _ = case(name, lowering)
     assert np.all(np.isnan(system.acceleration(q, v, params)))
 
@@ -71,7 +71,7 @@ def test_no_acceleration(name, lowering):
         for lowering in ("auto", "array")
     ],
 )
-def test_no_motion_and_the_coordinate_named(name, method, options, lowering):
+def test_singular_mass_ends_motions_and_names_the_coordinate(name, method, options, lowering):
     system, params, q, v, where = case(name, lowering)
     motion = jl.simulate(system, q, v, [0.0, 0.5], params, method=method, throw=False, **options)
     assert motion.status == jl.Status.mass_singular
@@ -81,7 +81,7 @@ def test_no_motion_and_the_coordinate_named(name, method, options, lowering):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("method", "options"), METHODS[:4])
-def test_inertia_lost_on_the_way(method, options):
+def test_motion_ends_when_inertia_vanishes(method, options):
     system = jl.System(turning, ("a",))
     motion = jl.simulate(
         system, [0.0], [1.0], [0.0, 2.0], {}, method=method, throw=False, **options
@@ -93,7 +93,7 @@ def test_inertia_lost_on_the_way(method, options):
     assert float(motion.last_state[0][0]) < 1.0 + 1e-9
 
 
-def test_what_is_regular_needs_no_look():
+def test_regular_mass_needs_no_check_per_evaluation():
     """A positive constant inertia is not tested, one of params is tested once per solve."""
     for lagrangian, lines in (
         (lambda t, q, v, p: 0.5 * (v @ v), 0),

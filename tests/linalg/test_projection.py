@@ -24,7 +24,7 @@ from jaxlag._linalg._projection import ConstraintProjector, project
     ("method", "order", "steps"),
     [("tsit5", 5, (60, 120)), ("bosh3", 3, (200, 400)), ("heun", 2, (400, 800))],
 )
-def test_the_order_is_kept(method, order, steps):
+def test_projection_preserves_the_order(method, order, steps):
     """Order from the errors at several saves; the reference is the motion in angles."""
     ts = [0.0, 0.5, 1.0, 1.5, 2.0]
     exact = jl.simulate(minimal, THETA, OMEGA, ts, BOBS, rtol=1e-13, atol=1e-13)
@@ -53,7 +53,7 @@ def circle(q):
 
 
 @pytest.mark.parametrize("off", [1e-12, 1e-6, 1e-3, 0.1])
-def test_a_projection_ends_on_the_surface(off):
+def test_projection_satisfies_the_constraints(off):
     """From near and far: phi and its rate are rounding; corrections follow the initial normals."""
     q, v = (1 + off) * jnp.array([0.6, 0.8]), jnp.array([0.3, 0.1])
     surface = circle(q)
@@ -66,7 +66,7 @@ def test_a_projection_ends_on_the_surface(off):
     np.testing.assert_allclose(on, [0.6, 0.8], atol=allowed)
 
 
-def test_far_from_the_surface_none_is_found():
+def test_projection_without_solution_is_not_found():
     """No point satisfies the residual: `found` is False after a bounded number of iterations."""
     q = jnp.array([0.6, 0.8])
     shifted = circle(q)._replace(position=lambda x: jnp.stack([x @ x + 1.0]))
@@ -75,7 +75,7 @@ def test_far_from_the_surface_none_is_found():
 
 
 @pytest.mark.parametrize("off", [1e-9, 1e-3, 0.03])
-def test_the_derivative_is_that_of_the_solved_equations(off):
+def test_derivative_equals_that_of_the_solved_equations(off):
     """For any number of iterations, compared with differences; the next test mutates it."""
 
     def projected(q, differentiable=True):
@@ -92,7 +92,7 @@ def test_the_derivative_is_that_of_the_solved_equations(off):
     np.testing.assert_allclose(back @ d, jnp.array([1.0, 2.0]) @ forward, rtol=1e-12)
 
 
-def test_without_its_sweeps_the_derivative_is_wrong(monkeypatch):
+def test_derivative_without_sweeps_is_wrong(monkeypatch):
     """A mutation: mu is constant, as if the path to the surface did not depend on the start."""
     monkeypatch.setattr(_projection, "SWEEPS", 0)
     q = jnp.array([0.66, 0.88])
@@ -107,7 +107,7 @@ def test_without_its_sweeps_the_derivative_is_wrong(monkeypatch):
     assert np.abs(forward - slope).max() > 1e-3
 
 
-def test_saved_rows_are_projected():
+def test_saved_states_are_projected():
     """Also saves inside a step."""
     system, q0, v0, params = double_pendulum()
     ts = jnp.array([0.0, 0.13, 0.37, 0.7])

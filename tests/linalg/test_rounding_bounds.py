@@ -40,7 +40,7 @@ def converged(q):
         (lambda q: jnp.ones(1000, q.dtype) @ jnp.full(1000, q[1]) - 1300.0, 1300.0),
     ],
 )
-def test_rounding_is_that_of_the_terms(function, size, dtype):
+def test_rounding_bound_has_the_size_of_the_terms(function, size, dtype):
     """The bound is right within a factor of 4; values that vanish are below 4 times the bound."""
     q, eps = jnp.array([0.3, 1.3], dtype), float(jnp.finfo(dtype).eps)
     value, rounding = jax.jit(lambda q: with_rounding(function, q))(q)
@@ -61,13 +61,13 @@ def test_rows_that_are_rounding_everywhere_are_void(dtype):
 
     for q in ([0.3, 0.0], [2.0, 0.0], [-1.1, 0.0]):
         q = jnp.array(q, dtype)
-        there, void, size = row_sizes(rows, q, rows(q))
-        assert there.tolist() == [False, False, False, True]
+        nonzero, void, size = row_sizes(rows, q, rows(q))
+        assert nonzero.tolist() == [False, False, False, True]
         assert void.tolist() == [True, True, False, False]
         assert float(size[1]) > 0.1
     q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometer size
-    there, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
-    assert there.tolist() == [True]
+    nonzero, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
+    assert nonzero.tolist() == [True]
     assert void.tolist() == [False]
 
 
@@ -128,7 +128,7 @@ def systems(kind, alone, lowering="auto"):
         ("Pfaffian", True, {}),
     ),
 )
-def test_a_row_that_says_nothing_changes_nothing(kind, alone, options, dtype):
+def test_void_rows_change_nothing(kind, alone, options, dtype):
     options = dict(options)
     system, without = systems(kind, alone, options.pop("lowering", "auto"))
     q, v, ts = (jnp.asarray(x, dtype) for x in (*START, [0.0, 0.1]))
@@ -147,7 +147,7 @@ def test_a_row_that_says_nothing_changes_nothing(kind, alone, options, dtype):
     ("kind", "alone"),
     mostly_full([(k, a) for k in VOID for a in (False, True)], ("led", True), ("holonomic", False)),
 )
-def test_a_row_that_says_what_cannot_be_is_told(kind, alone, gap):
+def test_contradictory_rows_are_reported(kind, alone, gap):
     """In position, rate or acceleration."""
     system, _ = systems(kind, alone)
     found = jl.simulate(system, *START, [0.0, 0.1], gap, **SHORT)
@@ -159,7 +159,7 @@ def test_a_row_that_says_what_cannot_be_is_told(kind, alone, gap):
 
 
 @pytest.mark.parametrize("stabilization", mostly_full(["projection", None], "projection"))
-def test_a_row_that_says_so_later_is_told(stabilization):
+def test_rows_that_become_contradictory_are_reported(stabilization):
     late = jl.Holonomic(lambda t, q, p: identity(q) + jnp.maximum(t - 0.05, 0.0) ** 2, "late")
     system = jl.System(falling, ("x", "y"), constraints=(late,))
     found = jl.simulate(system, *START, [0.0, 0.1], stabilization=stabilization, **SHORT)
@@ -167,7 +167,7 @@ def test_a_row_that_says_so_later_is_told(stabilization):
     assert 0.03 < found.last_time < 0.07
 
 
-def test_a_closure_in_a_tilted_plane():
+def test_closure_in_a_tilted_plane_has_one_void_row():
     """Assembly, equilibrium and a batch: the third row is 0 = 0."""
 
     def closure(t, q, params):
@@ -195,7 +195,7 @@ def test_a_closure_in_a_tilted_plane():
     np.testing.assert_allclose(energy[:, 1], energy[:, 0], atol=1e-6)
 
 
-def test_terms_that_cancel_are_no_contradiction():
+def test_canceling_terms_are_not_contradictory():
     """gamma is 2e3 (v_z^2 - v_y^2): its terms cancel to rounding."""
 
     def weighted(t, q, params):

@@ -11,7 +11,7 @@ from jaxlag._lowering._symbolic._evaluate import evaluate
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
-def test_matrices_that_are_not_symmetric_are_eliminated(m):
+def test_nonsymmetric_matrices_are_eliminated(m):
     """The graph agrees with arrays; leading minors that are not positive are reported."""
     graph, rng = Graph(), np.random.default_rng(m)
     S = [[graph.input("q", m * k + j) for j in range(m)] for k in range(m)]

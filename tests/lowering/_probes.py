@@ -36,11 +36,11 @@ def _(primals, tangents):
 
 
 def unrolled_scan(x):
-    def turn(carry, row):
-        return carry * jnp.cos(row) + row, carry * row
+    def body(carry, entry):
+        return carry * jnp.cos(entry) + entry, carry * entry
 
-    last, rows = lax.scan(turn, x[0], x)
-    return last + rows @ WEIGHTS
+    last, entries = lax.scan(body, x[0], x)
+    return last + entries @ WEIGHTS
 
 
 def reversed_scan(x):

@@ -44,11 +44,11 @@ def test_a_constant_mass_matrix_is_eliminated_before_the_loop(of):
     assert count(before, "gt") > 0
     assert count(each, "div", "gt", "select_n") == 0
     end, start = solve(of())
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     assert count(step, "div") == STEP
 
 
-def test_what_depends_on_params_alone_is_computed_before_the_loop():
+def test_terms_of_params_alone_are_computed_before_the_loop():
     """Functions and powers of params, in L and in forces."""
 
     def lagrangian(t, q, v, params):
@@ -95,7 +95,7 @@ def test_no_force_code_without_forces():
     assert len(bare) < len(dragged) < len(waved)
 
 
-def test_no_table_is_searched_where_there_is_none():
+def test_solves_without_tables_have_no_searches():
     """A solve with a number as input has no searches and reads of tables."""
     searches = {"dynamic_slice", "gather", "scatter", "dynamic_update_slice"}
     motion = MOTIONS["driven_pendulum"]
@@ -106,7 +106,7 @@ def test_no_table_is_searched_where_there_is_none():
                 motion.system, q0, [0.0], [0.0, 1.0], motion.params, inputs=inputs, throw=False
             ).q
 
-        return loop(operations(end, motion.q0, turns=1))
+        return loop(operations(end, motion.q0, iterations=1))
 
     plain, table = step({"tau": jnp.array(0.3)}), step(motion.inputs)
     assert names(plain).isdisjoint(searches)
@@ -114,7 +114,7 @@ def test_no_table_is_searched_where_there_is_none():
     assert len(plain) < len(table)
 
 
-def test_no_bias_is_computed_where_it_is_zero():
+def test_zero_bias_has_no_arithmetic():
     """Free bodies coupled by gears: zeros, or NaN for a singular M, and no arithmetic."""
 
     def free(t, q, v, params):
@@ -124,7 +124,7 @@ def test_no_bias_is_computed_where_it_is_zero():
     assert "mul" in names(evaluation(geared()))
 
 
-def test_time_is_not_read_where_nothing_depends_on_it():
+def test_time_is_read_only_if_the_equations_depend_on_it():
     """No operation of the evaluation reads t."""
 
     def reads_time(lagrangian):
@@ -150,7 +150,7 @@ def test_time_is_not_read_where_nothing_depends_on_it():
 
 
 @pytest.mark.parametrize("chosen", ["scalar", "array"])
-def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
+def test_systems_without_constraints_evaluate_no_rows(chosen, monkeypatch):
     """Rows and gamma are never evaluated; no array has the size of M with rows appended."""
 
     def asked(*args):
@@ -191,6 +191,6 @@ def test_values_of_params_do_not_change_the_program(special):
             return coupled(t, q, v, params)
 
         end, start = solve(geared(lagrangian=fresh, **values))
-        return operations(end, *start, turns=1)
+        return operations(end, *start, iterations=1)
 
     assert program(**special) == program()

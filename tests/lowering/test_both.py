@@ -19,8 +19,8 @@ def acceleration(q, v):
     return DOUBLE.system.acceleration(q, v, PARAMS)
 
 
-@pytest.mark.parametrize("turn", [1, 2])
-def test_accelerations_are_compiled_from_the_lowering_in_use(lowering, turn):
+@pytest.mark.parametrize("call", [1, 2])
+def test_accelerations_are_compiled_from_the_lowering_in_use(lowering, call):
     """Read from the cache of jit: a program left over from the other lowering would show."""
     q, v = jnp.array([1.0, 0.5]), jnp.array([0.2, -0.3])
     acceleration(q, v)
@@ -33,11 +33,11 @@ def test_solves_are_compiled_from_the_lowering_in_use(lowering):
     def solve(q0):
         return jl.simulate(DOUBLE.system, q0, [0.0, 0.0], [0.0, 0.1], PARAMS, throw=False).q
 
-    inside = loop(operations(solve, jnp.array([1.0, 0.5]), turns=1))
+    inside = loop(operations(solve, jnp.array([1.0, 0.5]), iterations=1))
     assert ("custom_linear_solve" in names(inside)) == (lowering == "array")
 
 
-def test_only_systems_left_at_auto_follow(lowering):
+def test_only_systems_at_auto_follow_the_lowering(lowering):
     kinds = {"auto": ArrayProgram if lowering == "array" else ScalarProgram}
     for chosen, kind in (kinds | {"scalar": ScalarProgram, "array": ArrayProgram}).items():
         system = jl.System(DOUBLE.system.lagrangian, ("a", "b"), lowering=chosen)

@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from _families import mostly_full
-from _running_error import U, carried, rounded
+from _running_error import U, evaluate_with_bounds, rounded
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES
@@ -96,8 +96,8 @@ def states(n):
 def values(params, q, v):
     flat = [np.ravel(x) for x in jax.tree.leaves(params) if is_float(x)]
     given = {("t", 0): 0.3, ("sense", 0): 1.0}
-    for name, row in (("q", q), ("v", v), ("params", np.concatenate([*flat, []]))):
-        given |= {(name, i): float(x) for i, x in enumerate(row)}
+    for name, vector in (("q", q), ("v", v), ("params", np.concatenate([*flat, []]))):
+        given |= {(name, i): float(x) for i, x in enumerate(vector)}
     return given
 
 
@@ -106,7 +106,9 @@ def worst(written, program, params, n):
     ratios, errors, apart = [0.0], [0.0], [0.0]
     for q, v in states(n):
         given = values(params, q, v)
-        for left, right in zip(carried(written, given), carried(program, given), strict=True):
+        for left, right in zip(
+            evaluate_with_bounds(written, given), evaluate_with_bounds(program, given), strict=True
+        ):
             if not np.isfinite(left.value) or not mpmath.isfinite(left.exact):
                 continue
             tiny = U * abs(left.value) + 1e-300
@@ -120,7 +122,7 @@ def worst(written, program, params, n):
     "name",
     mostly_full([*HARD, *SCENES, *FREE], "bead", "quartic", "top", "double_pendulum_positions"),
 )
-def test_no_form_is_worse_than_the_lagrangian_as_it_is_written(name):
+def test_error_bounds_are_not_worse_than_those_of_the_lagrangian(name):
     system, params = case(name)
     ratio, error, apart = worst(*both(system, params), params, system.size)
     assert ratio <= WORSE
@@ -128,7 +130,7 @@ def test_no_form_is_worse_than_the_lagrangian_as_it_is_written(name):
     assert apart <= 1.0  # literals in L are multiplied in double precision
 
 
-def test_what_loses_digits_is_found():
+def test_error_bounds_detect_lost_digits():
     """Expanded, (q - a)^4 loses all digits: both the bound and the error show it."""
 
     def multiplied(t, q, v, p):
@@ -141,12 +143,13 @@ def test_what_loses_digits_is_found():
 
     params = np.array([1e6])
     given = values(params, [1e6 + 0.5], [0.0])
-    good, bad = (
-        carried(both(jl.System(L, ("x",)), params)[0], given)[0] for L in (written, multiplied)
+    better, worse = (
+        evaluate_with_bounds(both(jl.System(L, ("x",)), params)[0], given)[0]
+        for L in (written, multiplied)
     )
-    assert abs(good.exact - bad.exact) < 1e-20
-    assert bad.bound > 1e3 > WORSE * good.bound
-    assert abs(float(bad.value - bad.exact)) > 1e-3
+    assert abs(better.exact - worse.exact) < 1e-20
+    assert worse.bound > 1e3 > WORSE * better.bound
+    assert abs(float(worse.value - worse.exact)) > 1e-3
 
 
 SLACK = 10.0  # times the change by rounding of the inputs; measured: at most 2.5
@@ -185,24 +188,24 @@ def out_of_range(written, program, given):
 @pytest.mark.parametrize(
     "name", mostly_full(SINGLE, "lennard_jones", "kepler", "top", "double_pendulum")
 )
-def test_range_is_kept_in_single_precision(name):
+def test_single_precision_stays_in_range(name):
     system, params = case(name)
     programs = both(system, params, np.float32)
     off = [out_of_range(*programs, given) for given in scaled(params, system.size)]
     assert max(off) <= SLACK
 
 
-def test_what_leaves_the_range_is_found():
+def test_range_check_detects_overflow():
     """A literal is factored out of a power."""
 
     def written(t, q, v, p):
         return 0.5 * v @ v - (q[0] / p[0]) ** 8
 
-    def pulled(t, q, v, p):
+    def factored(t, q, v, p):
         return 0.5 * v @ v - q[0] ** 8 / p[0] ** 8
 
     params = np.array([2e10])
     given = values(params, [1.5e10], [0.0])
-    one, two = (both(jl.System(L, ("x",)), params, np.float32)[0] for L in (written, pulled))
+    one, two = (both(jl.System(L, ("x",)), params, np.float32)[0] for L in (written, factored))
     assert out_of_range(one, one, given) <= 1.0
     assert out_of_range(one, two, given) > 1e4 * SLACK

@@ -25,7 +25,7 @@ def at(system, params, q, v):
 
 
 @pytest.mark.parametrize("a", [1e4, 1e6, 1e8])
-def test_differences_of_coordinates_and_params_stay_what_they_are(a):
+def test_differences_of_coordinates_and_params_keep_their_digits(a):
     """Expanded, (q - a)^4 + (q - b)^4 loses all digits; the numbers here are exact."""
     L = lambda t, q, v, p: 0.5 * v @ v - (q[0] - p["a"]) ** 4 - (q[0] - p["b"]) ** 4  # noqa: E731
     found = at(jl.System(L, ("x",)), {"a": a, "b": a + 0.25}, [a + 0.5], [0.0])
@@ -115,7 +115,7 @@ IN_SI_UNITS = {
 
 
 @pytest.mark.parametrize("name", IN_SI_UNITS)
-def test_single_precision_does_for_si_units(name):
+def test_single_precision_suffices_for_si_units(name):
     """Accelerations and their Jacobian against double precision; products would overflow."""
     lagrangian, q, v, params = IN_SI_UNITS[name]
     system = jl.System(lagrangian, {"x": (len(q),)})

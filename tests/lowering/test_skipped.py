@@ -103,7 +103,7 @@ def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
 
 
 @pytest.mark.parametrize("definite", [True, False])
-def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
+def test_traced_params_use_the_shorter_program_for_definite_mass(definite):
     """The constants of the other program are NaN: they are not read."""
     system, params, q, _ = case("double_pendulum_cartesian")
     program, state = system._program, State(jnp.zeros(()), q, 0.1 * q, params, {})
@@ -154,7 +154,7 @@ def test_a_step_in_quasi_velocities_has_no_constraint(name):
         )
         return motion.q[-1]
 
-    step = loop(operations(end, params, q0, u0, turns=1))
+    step = loop(operations(end, params, q0, u0, iterations=1))
     matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "scan", "lu", "geqrf"}
     assert names(step).isdisjoint(matrices)
     assert not [o for o in step if o.inside.count("while") > 1]
@@ -166,7 +166,7 @@ def test_a_step_in_quasi_velocities_has_no_constraint(name):
 def test_a_step_with_constraints_has_no_matrix():
     """Neither in its stages nor in the projection; the only inner loops are Newton's."""
     end, start = solve(case("double_pendulum_cartesian"))
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "sort", "lu"}
     assert names(step).isdisjoint(matrices)
     assert all(o.shapes == ((),) for o in step if o.name == "dot_general")
@@ -176,10 +176,10 @@ def test_a_step_with_constraints_has_no_matrix():
 
 
 @pytest.mark.parametrize("name", ["top", "cart_pendulum"])
-def test_a_step_evaluates_it_once_per_stage(name):
+def test_step_evaluates_the_equations_once_per_stage(name):
     """The same numbers times the stages, and the step-size control, which has no matrix."""
     end, start = solve(case(name))
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     functions, divisions = CEILINGS[name]
     assert count(step, "sincos") <= STAGES * functions
     assert count(step, "div") <= STAGES * divisions + STEP
@@ -187,7 +187,7 @@ def test_a_step_evaluates_it_once_per_stage(name):
     assert count(step, "dot_general") == 0
 
 
-def test_the_counts_see_what_arrays_cost():
+def test_counters_find_operations_of_the_array_program():
     """The counters themselves: the array program of the same system exceeds every ceiling."""
     system, *rest = case("top")
     arrays = jl.System(system.lagrangian, {"q": (3,)}, lowering="array")
@@ -244,7 +244,7 @@ def instructions(lines):
     "name",
     mostly_full((*CEILINGS, *CONSTRAINED), "pendulum", "top", "cart_pendulum"),
 )
-def test_no_library_is_called_and_no_product_of_arrays_is_left(name):
+def test_compiled_solve_has_no_library_call_and_no_array_product(name):
     """No LAPACK in the whole solve, no dot in its loops."""
     assert "custom-call" not in instructions(compiled(name).splitlines())
     inside = instructions(in_loops(compiled(name)))
@@ -252,14 +252,14 @@ def test_no_library_is_called_and_no_product_of_arrays_is_left(name):
     assert {"multiply", "add"} <= inside
 
 
-def test_the_reading_of_hlo_sees_products_and_libraries():
+def test_hlo_parser_finds_products_and_libraries():
     """The parser itself: a loop with both, on arrays too large for unrolling."""
 
-    def turn(c):
+    def body(c):
         return c[0] + 1, jnp.linalg.cholesky(c[1] @ c[1].T)
 
     def run(A):
-        return jax.lax.while_loop(lambda c: c[0] < 3, turn, (0, A))[1]
+        return jax.lax.while_loop(lambda c: c[0] < 3, body, (0, A))[1]
 
     text = jax.jit(run).lower(jnp.eye(40)).compile().as_text()
     assert {"dot", "custom-call"} <= instructions(in_loops(text))

@@ -36,7 +36,7 @@ def test_a_free_particle_has_a_constant_mass_and_no_bias():
     assert (bare.mass, bare.bias_zero, bare.mass_constant) == (frozenset(), True, True)
 
 
-def test_a_constant_force_is_a_bias_though_it_depends_on_nothing():
+def test_constant_force_is_a_bias_without_dependencies():
     """Zero is distinguished from a constant by value."""
     found = structure(lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[0])
     assert (found.bias, found.bias_zero) == (frozenset(), False)
@@ -44,7 +44,7 @@ def test_a_constant_force_is_a_bias_though_it_depends_on_nothing():
     assert (with_params.bias, with_params.bias_zero) == (frozenset({"params"}), False)
 
 
-def test_values_of_params_never_decide():
+def test_structure_does_not_depend_on_values_of_params():
     """k = 0 and k = 1 have the same structure: it is read from the program."""
     found = [
         structure(lambda t, q, v, params: 0.5 * v @ v - params["k"] * q @ q, {"k": k})
@@ -80,7 +80,7 @@ PLAIN = "cart_pendulum", "quadcopter", "rolling_disk", "falling_stick_friction",
 
 
 @pytest.mark.parametrize("name", mostly_full([*ENTRIES, *GENERAL], *PLAIN))
-def test_nothing_unlisted_moves_a_term(name):
+def test_terms_do_not_change_with_unlisted_arguments(name):
     """Soundness in numbers: a change of an unlisted argument changes no bit of a term."""
     case = ENTRIES[name].example if name in ENTRIES else GENERAL[name]
     system = ENTRIES[name].system if name in ENTRIES else GENERAL[name].system
@@ -92,12 +92,12 @@ def test_nothing_unlisted_moves_a_term(name):
         M = system.mass_matrix(q, v, params, t=t)
         return {"mass": M, "bias": system.bias(q, v, params, t=t)}
 
-    here = terms(**state)
+    before = terms(**state)
     for argument, value in state.items():
-        there = terms(**(state | {argument: value + 0.37}))
+        after = terms(**(state | {argument: value + 0.37}))
         for term in ("mass", "bias"):
             if argument not in getattr(found, term):
-                np.testing.assert_array_equal(here[term], there[term])
+                np.testing.assert_array_equal(before[term], after[term])
 
 
 # ---- Ways of writing a quadratic energy ----------------------------------------------------------
@@ -138,14 +138,14 @@ LOOPS = {
 
 
 @pytest.mark.parametrize("form", LOOPS)
-def test_a_quadratic_kinetic_energy_is_seen_through_loops(form):
+def test_quadratic_kinetic_energy_is_detected_through_loops(form):
     found = structure(LOOPS[form])
     assert found.quadratic
     assert found.mass_constant
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
+def test_quadratic_kinetic_energy_is_detected_in_any_form(form):
     found = structure(FORMS[form])
     assert found.quadratic
     assert found.mass_constant
@@ -163,14 +163,14 @@ def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
     ],
     ids=["fourth", "third", "sqrt", "cosh", "where"],
 )
-def test_what_is_not_quadratic_is_seen(lagrangian):
+def test_energies_that_are_not_quadratic_are_detected(lagrangian):
     found = structure(lagrangian)
     assert "v" in found.mass
     assert not found.quadratic
     assert not found.mass_constant
 
 
-def test_powers_that_are_not_quadratic_are_seen():
+def test_powers_that_are_not_quadratic_are_detected():
     """The second derivative of v**1.0 is 0 * v**-1: NaN at rest, so that M is not taken there."""
     for power in (1.0, 2.5, 3.0, -1.0):
         found = structure(lambda t, q, v, params, k=power: 0.5 * v @ v + jnp.sum(v**k))
@@ -186,15 +186,15 @@ def dependences(function, **arguments):
     return ["".join(sorted(names)) for names in found]
 
 
-def test_dependence_goes_round_a_loop_to_the_end():
+def test_dependence_is_followed_through_all_iterations_of_a_loop():
     """a -> b -> c -> d takes three iterations; e passes through; outputs depend on the carries."""
 
-    def turn(carry, row):
+    def body(carry, x):
         a, b, c, d, e = carry
-        return (a, a * b, b, c, e), (row + d, e)
+        return (a, a * b, b, c, e), (x + d, e)
 
-    def function(a, b, c, d, e, rows):
-        return jax.lax.scan(turn, (a, b, c, d, e), rows)
+    def function(a, b, c, d, e, xs):
+        return jax.lax.scan(body, (a, b, c, d, e), xs)
 
     found = dependences(function, a=1.0, b=1.0, c=1.0, d=1.0, e=1.0, r=jnp.ones(9))
     assert found == ["a", "ab", "abc", "abcd", "e", "abcdr", "e"]
@@ -202,7 +202,7 @@ def test_dependence_goes_round_a_loop_to_the_end():
     assert once == ["ak", "k"]
 
 
-def test_dependence_in_a_while_loop_is_that_of_its_condition_too():
+def test_dependence_of_a_while_loop_includes_its_condition():
     """Variables that decide the number of iterations affect only what the iterations change."""
 
     def function(limit, x, y, k):
@@ -226,7 +226,7 @@ def test_dependence_in_a_while_loop_is_that_of_its_condition_too():
     assert dependences(late, x=1.0, y=1.0, z=1.0) == ["xy", "y", "xyz"]
 
 
-def test_dependence_of_a_choice_is_that_of_every_branch_and_of_the_index():
+def test_dependence_of_a_choice_includes_every_branch_and_the_index():
     def function(k, x, y, z):
         branches = [lambda x, y, z: (x, z), lambda x, y, z: (y, z), lambda x, y, z: (1.0, 2 * z)]
         return jax.lax.switch(k, branches, x, y, z)
@@ -320,7 +320,7 @@ def test_python_numbers_take_the_precision_of_the_state():
 # ---- Explain -------------------------------------------------------------------------------------
 
 
-def said(name):
+def explained_lines(name):
     """The lines of `explain`, with single blanks."""
     system, params = (
         (ENTRIES[name].system, dict(ENTRIES[name].example.params))
@@ -351,33 +351,33 @@ def said(name):
     ],
 )
 def test_explain_states_what_was_found(name, line):
-    assert [found for found in said(name) if found.startswith(line)] != []
+    assert [found for found in explained_lines(name) if found.startswith(line)] != []
 
 
-def test_explain_says_what_is_not_there():
+def test_explain_states_absent_dependencies():
     lines = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR).explain(None).splitlines()
     assert "mass matrix   depends on nothing" in lines
     assert "bias          zero" in lines
 
 
-def test_explain_says_how_the_mass_matrix_is_solved():
-    for n, said in (
+def test_explain_states_how_the_mass_matrix_is_solved():
+    for n, algorithm in (
         (8, "unrolled"),
         (9, "in a loop over rows (n > 8)"),
         (17, "by library Cholesky (n > 16)"),
     ):
         explained = chain(n, lowering="array").explain(GENERAL["chain"].params)
-        assert f"mass solve    one factorization per evaluation, {said}" in explained
+        assert f"mass solve    one factorization per evaluation, {algorithm}" in explained
 
 
-def test_explain_says_that_a_constant_mass_matrix_is_factored_once():
+def test_explain_states_that_a_constant_mass_matrix_is_factored_once():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR, lowering="array")
     explained = system.explain(None)
     assert "mass solve    one factorization once per solve, unrolled" in explained
     assert "h by" not in explained
 
 
-def test_explain_refuses_what_is_no_lagrangian():
+def test_explain_refuses_vector_valued_lagrangians():
     system = jl.System(lambda t, q, v, params: 0.5 * v**2, PAIR)
     with pytest.raises(
         ValueError, match=r"^`lagrangian` must return a real scalar, but it returned "

@@ -33,8 +33,8 @@ def marked(t, q, v, params):
 
 def evaluations(program):
     """Evaluations of the mark, one for each reversed array of MARK entries."""
-    turned = [o for o in program if o.name == "rev"]
-    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in turned)
+    marks = [o for o in program if o.name == "rev"]
+    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in marks)
 
 
 def at_rest(n):
@@ -84,7 +84,7 @@ def test_small_systems_take_one_elimination(n, derivative):
 
 @pytest.mark.parametrize("derivative", [None, gradient, tangent])
 @pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, MIDDLE])
-def test_middling_systems_take_one_elimination_by_rows(n, derivative):
+def test_medium_systems_take_one_elimination_by_rows(n, derivative):
     """The elimination divides one row of M per iteration, each solve's loops one number."""
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
@@ -93,7 +93,7 @@ def test_middling_systems_take_one_elimination_by_rows(n, derivative):
     assert count(program, "div") == n + 2 * n * (2 if derivative else 1)
 
 
-def test_the_counts_see_a_second_factorization():
+def test_counters_find_a_second_factorization():
     """The counter itself: the two forms that the tests above exclude."""
 
     def twice(M, r):
@@ -108,7 +108,7 @@ def test_the_counts_see_a_second_factorization():
     assert "svd" in names(operations(jnp.linalg.pinv, jnp.eye(SMALL)))
 
 
-def test_a_factor_at_hand_is_used():
+def test_given_factor_is_used():
     def solve(M, r):
         factor = factor_mass(M)
         return solve_mass(M, r, factor), solve_mass(M, 2 * r, factor)
@@ -130,7 +130,7 @@ def test_no_array_is_larger_than_the_mass_matrix(n, derivative):
 
 
 @pytest.mark.parametrize("n", [SMALL, LARGE])
-def test_the_bias_holds_vectors_only(n):
+def test_bias_has_vectors_only(n):
     assert largest(operations(chain(n).bias, *at_rest(n))) == n
 
 
@@ -148,7 +148,7 @@ def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
     assert found == {2: 4, 10: 4}
 
 
-def test_the_mass_matrix_evaluates_it_once_per_column():
+def test_mass_matrix_evaluates_the_lagrangian_once_per_column():
     """The mark counts: forward and reverse mode, and the tangents of both for every column."""
     found = {
         n: evaluations(
@@ -161,7 +161,7 @@ def test_the_mass_matrix_evaluates_it_once_per_column():
     assert found == {2: 2 + 2 * 2, 10: 2 + 2 * 10}
 
 
-def test_the_acceleration_evaluates_what_mass_and_bias_do():
+def test_acceleration_needs_no_more_evaluations_than_mass_and_bias():
     n = 10
     program = operations(
         jl.System(marked, {"theta": (n,)}, lowering="array").acceleration, *at_rest(n)
@@ -198,7 +198,7 @@ def test_no_force_code_without_forces():
     assert {"rev", "sinh"} <= names(pushed)
 
 
-def test_only_the_forces_asked_for_are_computed():
+def test_only_named_forces_are_computed():
     force = chain(4, PUSHED).generalized_force
     found = {
         chosen: names(operations(partial(force, names=chosen), *at_rest(4))) & {"rev", "sinh"}
@@ -212,7 +212,7 @@ def test_only_the_forces_asked_for_are_computed():
     }
 
 
-def test_tables_are_searched_only_where_there_are_tables():
+def test_only_systems_with_tables_search_them():
     def pulled(t, q, v, params, inputs):
         return inputs["u"] * q
 
@@ -275,7 +275,7 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
     found = {}
     for lagrangian in (coupled, hidden):
         solve = partial(swung, lagrangian, n)
-        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, turns=1))
+        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, iterations=1))
         solves = count(inside, "custom_linear_solve")
         assert solves > 0
         assert names(inside) & FACTORIZATIONS <= {"cholesky"}
@@ -284,7 +284,7 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
     assert found[hidden] > 0
 
 
-def test_the_factor_is_made_where_the_solve_is_prepared():
+def test_mass_matrix_is_factored_in_precompute():
     """Once per solve: the columns of M and its elimination; no other evaluation of L for M."""
     n, system = SMALL, of(coupled, SMALL)
     q = v = jnp.linspace(0.1, 1.0, n)
@@ -303,7 +303,7 @@ def test_the_factor_is_made_where_the_solve_is_prepared():
     assert count(inside, "div") == 2 * n
 
 
-def test_no_bias_is_computed_where_it_is_zero():
+def test_zero_bias_has_no_arithmetic():
     """A free body: the loop contains no derivative of L, only the solve."""
     n = SMALL
     for lagrangian, left in ((free, set()), (coupled, {"dot_general", "mul"})):
@@ -331,7 +331,7 @@ DERIVATIVES = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("derivative", DERIVATIVES)
-def test_derivatives_go_through_the_factor(derivative):
+def test_derivatives_with_a_constant_factor_are_right(derivative):
     """Those of a whole solve agree with M factored at every state, to rounding."""
     of_order = DERIVATIVES[derivative]
     once, anew = (jax.jit(of_order(partial(swung, f, 2)))(INERTIA) for f in (coupled, hidden))
@@ -341,7 +341,7 @@ def test_derivatives_go_through_the_factor(derivative):
 
 
 @pytest.mark.parametrize("n", [3, UNROLL_UP_TO + 1])
-def test_derivatives_of_one_acceleration_go_through_the_factor(n):
+def test_derivatives_of_one_acceleration_with_a_factor_are_right(n):
     """To third order, reverse and forward, batched, for both kinds of factor."""
     q = jnp.linspace(0.1, 1.0, n)
 
@@ -364,7 +364,7 @@ def test_derivatives_of_one_acceleration_go_through_the_factor(n):
 
 
 @pytest.mark.parametrize("n", [3, pytest.param(UNROLL_UP_TO + 1, marks=pytest.mark.full)])
-def test_a_constant_mass_matrix_without_inertia_ends_in_its_status(n):
+def test_indefinite_constant_mass_matrix_ends_in_mass_singular(n):
     """The factor contains the health of its pivots."""
     q0, params = jnp.linspace(0.1, 1.0, n), {"a": -0.05, "k": 1.0}
     options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
@@ -401,7 +401,7 @@ def test_terms_without_constraints_have_no_rows(chosen):
 
 
 @pytest.mark.parametrize("chosen", ["scalar", "array"])
-def test_terms_are_those_of_the_public_methods(chosen):
+def test_terms_equal_those_of_public_methods(chosen):
     entry = ENTRIES["cart_pendulum"]
     declared, params = entry.system, dict(entry.example.params)
     system = jl.System(declared.lagrangian, ("x", "a"), forces=declared.forces, lowering=chosen)

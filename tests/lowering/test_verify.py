@@ -15,11 +15,11 @@ from systems import lamina_on_parabola, rigid_aircraft
 EPS = np.finfo(float).eps
 
 
-@pytest.mark.parametrize("bad", [np.nan, 0.0])
-def test_bad_params_at_first_use_decide_nothing(bad):
+@pytest.mark.parametrize("mass", [np.nan, 0.0])
+def test_invalid_params_at_first_use_have_no_effect(mass):
     """A program is made for all params of these shapes, whichever come first."""
     system = jl.System(lambda t, q, v, p: 0.5 * p["m"] * v @ v + jnp.cos(q[0]), ("x",))
-    found = lowered(system, {"m": bad})
+    found = lowered(system, {"m": mass})
     assert found.equations is not None
     assert found.reason.startswith("equal to the array program at ")
     np.testing.assert_allclose(
@@ -27,7 +27,7 @@ def test_bad_params_at_first_use_decide_nothing(bad):
     )
 
 
-def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
+def test_program_right_only_for_given_params_is_not_used(monkeypatch):
     """Wrong for k other than 1: random params show it."""
     derive = _lower.derive
 
@@ -41,7 +41,7 @@ def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
     assert "differs from the array program" in lowered(system, {"k": 1.0}).reason
 
 
-def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
+def test_program_finite_where_the_array_program_is_nan_is_not_used(monkeypatch):
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -52,7 +52,7 @@ def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
     assert "one of them has no value" in lowered(system).reason
 
 
-def test_too_few_states_to_compare_at_decide_for_the_array_program():
+def test_too_few_finite_states_select_the_array_program():
     """L is finite only near a state that random ones miss."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
     assert "only 0 of 32 random states" in lowered(system).reason
@@ -67,7 +67,7 @@ def test_too_few_states_to_compare_at_decide_for_the_array_program():
         (lambda t, q, v, p: 0.5 * v[0] ** 2 + 0.5 * (v[1] + v[2]) ** 2 - q @ q, 3),
     ],
 )
-def test_a_coordinate_without_inertia_leaves_no_acceleration(lagrangian, n):
+def test_coordinate_without_inertia_makes_accelerations_nan(lagrangian, n):
     """M is singular everywhere: M and h are compared instead of the acceleration."""
     system = jl.System(lagrangian, {"x": (n,)})
     assert lowered(system).reason == "equal to the array program at 8 random states"
@@ -88,8 +88,8 @@ SHAPES = {
 def _wrong(equations, part, graph):
     """Equations with the last entry of one part off by 1e-9."""
 
-    def off(rows):
-        *others, last = rows
+    def off(entries):
+        *others, last = entries
         if isinstance(last, list):
             return [*others, off(last)]
         return [*others, graph.scale(last, 1.0 + 1e-9)]
@@ -127,7 +127,7 @@ def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
 
 
 @pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
-def test_params_that_are_traced_need_not_be_known(module):
+def test_traced_params_have_a_scalar_program(module):
     """Random params are not inertias of a body; under jit over params a scalar program is used."""
     found = []
     params = jax.tree.map(jnp.asarray, dict(module.entry.example.params))
@@ -167,7 +167,7 @@ def test_a_program_that_gives_nan_is_not_used(monkeypatch):
     assert "differs from the array program" in system.explain({"k": 2.0})
 
 
-def test_constrained_states_of_indefinite_mass_are_not_compared_at():
+def test_constrained_states_of_indefinite_mass_are_not_compared():
     """Known params besides random ones, for which M may be indefinite on the constraints."""
 
     def lagrangian(t, q, v, params):
@@ -178,7 +178,7 @@ def test_constrained_states_of_indefinite_mass_are_not_compared_at():
     assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
 
 
-def test_params_at_hand_are_compared_with():
+def test_given_params_are_compared():
     """An inertia that random params would make indefinite."""
     declared, params, q0, _ = case("lamina_two_forces_fixed_direction")
 
@@ -195,7 +195,7 @@ def test_params_at_hand_are_compared_with():
 
 
 @pytest.mark.full
-def test_too_many_operations_go_to_the_array_program():
+def test_too_many_operations_select_the_array_program():
     scene = SCENES["chain_8"]
     names = {"q": (8,)}
     short = jl.System(scene.lagrangian, names)
@@ -207,7 +207,7 @@ def test_too_many_operations_go_to_the_array_program():
     )
 
 
-def test_bad_lowering_is_refused():
+def test_invalid_lowering_is_refused():
     with pytest.raises(
         ValueError, match=r"^`lowering` must be 'auto', 'scalar' or 'array', but it"
     ):

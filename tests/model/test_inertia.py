@@ -32,12 +32,12 @@ T = jnp.array(0.4)
     ],
     ids=str,
 )
-def test_an_inertia_that_no_body_has_is_refused(inertia, message):
+def test_impossible_inertia_is_refused(inertia, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         energy.RigidBody(1.0, inertia)
 
 
-def test_check_finds_it_in_a_declared_system():
+def test_check_finds_impossible_inertia_in_a_system():
     """`check` does not trace and sees the values inside a Lagrangian."""
 
     def kinetic(t, q, v, params):
@@ -51,7 +51,7 @@ def test_check_finds_it_in_a_declared_system():
         system.check(*state, {"I": -0.4})
 
 
-def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
+def test_literals_in_a_traced_lagrangian_are_checked():
     """Literals have values under jit, each independently; traced values are not checked."""
 
     def kinetic(mass, inertia, center=None):
@@ -93,7 +93,7 @@ def test_an_inertia_about_the_mass_center_is_refused(dtype):
         energy.RigidBody(2.0, (0.0, 0.0, 0.1), (0.3, 0.2, 0.0))
 
 
-def test_a_point_mass_is_a_body():
+def test_point_mass_is_a_valid_body():
     """The inertia about the mass center vanishes up to rounding, for any mass center."""
     for c in np.random.default_rng(5).normal(size=(100, 3)):
         for dtype in (np.float64, np.float32):
@@ -123,7 +123,7 @@ def test_a_body_may_be_given_in_integers():
     assert jax.grad(lambda body: body.kinetic_from_rates(V, w))(eye).mass == 7
 
 
-def test_integers_are_not_rounded_to():
+def test_integer_positions_do_not_round_results():
     """9.81 m/s^2 stays 9.81 along integer positions."""
     np.testing.assert_allclose(energy.gravity(2.0, jnp.array([0, 2]), [0.0, -9.81]), 4 * 9.81)
     np.testing.assert_allclose(energy.gravity(2, [0, 2], [0, -10]), 40)

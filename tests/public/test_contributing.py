@@ -79,8 +79,8 @@ def test_a_system_is_found_by_its_name(added, monkeypatch, capsys):
     monkeypatch.setitem(test_catalogue.MODULES, name, module)
     assert catalogue.find(name) is module.entry
     test_catalogue.test_every_module_is_collected_under_its_own_name()
-    test_catalogue.test_the_docstring_says_what_the_system_is(name)
-    test_catalogue.test_the_book_place_is_that_of_the_docstring(name)
+    test_catalogue.test_docstring_describes_the_system(name)
+    test_catalogue.test_docstring_contains_the_place_in_the_book(name)
     assert main(["run", name]) == 0
     assert "status   ok" in capsys.readouterr().out
     assert_equal_to_hand_equations(module.entry, follow([by_hand])[name])
@@ -96,11 +96,11 @@ def assert_equal_to_hand_equations(entry, by_hand):
         np.testing.assert_allclose(found, expected, rtol=0, atol=32 * EPS * np.sum(np.abs(terms)))
 
 
-def test_a_force_law_has_the_power_it_says(monkeypatch):
-    law, use, said, tests = example("A force law")
+def test_force_law_has_the_stated_power(monkeypatch):
+    law, use, output, tests = example("A force law")
     made = follow([law], dict(vars(_forces)))["PointDamper"]
     monkeypatch.setattr(jl, "PointDamper", made, raising=False)
-    namespace = follow([use, said, tests])
+    namespace = follow([use, output, tests])
     assert run_tests(namespace) == 2
     motion = namespace["motion"]
     # 1e-9 per step for the energy and for the work, over some dozen steps.
@@ -121,7 +121,7 @@ def test_a_solver_has_its_order(added, monkeypatch):
     test_methods_alone.test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped=False)
 
 
-def test_a_bench_row_runs_within_its_bound():
+def test_benchmark_case_runs_within_its_bound():
     rows = _extremes.Rows()
     follow(example("A row of a benchmark"), vars(_extremes) | {"rows": rows})
     (case,) = rows.cases
@@ -129,7 +129,7 @@ def test_a_bench_row_runs_within_its_bound():
     assert stability.judged(case, quick=True)["verdict"] == "within"
 
 
-def test_modules_of_the_examples_import_what_they_may(tmp_path):
+def test_modules_of_the_examples_import_only_allowed_packages(tmp_path):
     (_, _, solver), _ = example("A solver")
     path = tmp_path / "_sofroniou4.py"
     path.write_text(solver)
@@ -178,24 +178,24 @@ def test_every_name_of_a_module_exists(path):
             thing = getattr(thing, part)
 
 
-def test_the_table_of_packages_is_that_of_the_test():
+def test_table_of_packages_equals_that_of_the_test():
     text = ARCHITECTURE.read_text()
     base, to_system = test_layers._BASE, test_layers._TO_SYSTEM
-    said = {"*base*": base, "*to system*": to_system}
+    groups = {"*base*": base, "*to system*": to_system}
     found = {}
     for name, allowed in re.findall(r"^\| `(\w+)` \| .* \|(.*)\|$", text, re.MULTILINE):
-        words = re.findall(r"\*[\w ]+\*|\w+", allowed)
-        found[name] = {part for word in words for part in said.get(word, (word,))}
+        packages = re.findall(r"\*[\w ]+\*|\w+", allowed)
+        found[name] = {part for package in packages for part in groups.get(package, (package,))}
     assert found == {name: set(allowed) for name, allowed in test_layers.ALLOWED.items()}
 
 
-def test_places_kept_free_are_free():
+def test_reserved_names_of_packages_are_free():
     part = ARCHITECTURE.read_text().split("## Where a new capability goes")[1]
     names = re.findall(r"^- `(\w+)`, above", part, re.MULTILINE)
     assert len(names) == 5
     assert not set(names) & {path.stem for path in Path(jl.__file__).parent.iterdir()}
 
 
-def test_set_up_lines_are_those_of_the_readme():
+def test_set_up_lines_equal_those_of_the_readme():
     lines = re.findall(r"^pip install -e .*$", CONTRIBUTING.read_text(), re.MULTILINE)
     assert lines == re.findall(r"^pip install -e .*$", (ROOT / "README.md").read_text(), re.M)

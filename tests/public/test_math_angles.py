@@ -18,7 +18,7 @@ from jaxlag import math
 PI = np.pi
 
 
-def test_atan2_values_are_those_of_numpy():
+def test_atan2_values_equal_those_of_numpy():
     """In every quadrant, on the axes with either sign of zero, and across 600 orders of magnitude.
 
     Scaling costs at most one rounding.
@@ -46,7 +46,7 @@ def derivatives_of_direction(y, x):
     return first, second, np.array([[[yyy, yyx], [yyx, yxx]], [[yyx, yxx], [yxx, xxx]]])
 
 
-def test_atan2_to_third_order():
+def test_atan2_is_accurate_to_third_order():
     """Largest errors 1, 2 and 15 EPS r^-k, of a third derivative up to 2 r^-3."""
     derivatives = ladder(of_pair("atan2"))
     for size in (1e-100, 1e-8, 1.0, 1e8, 1e100, 1e200, 1e300):
@@ -59,7 +59,7 @@ def test_atan2_to_third_order():
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-200])
-def test_atan2_of_tiny_arguments_to_first_order(size):
+def test_atan2_of_tiny_arguments_is_accurate_to_first_order(size):
     """The second derivative, of order r^-2, overflows."""
     gradient = ladder(of_pair("atan2"))(size * np.array([0.3, -0.4]))[1]
     close(gradient, np.array([-1.6, -1.2]) / size, 4)
@@ -67,22 +67,22 @@ def test_atan2_of_tiny_arguments_to_first_order(size):
 
 def pair(angle, lengths=(2.0, 0.7), heading=0.4):
     """Two vectors of the plane; the second is rotated from the first by `angle`."""
-    turn = np.array([heading, heading + angle])
-    return np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.array(lengths)[:, None]
+    headings = np.array([heading, heading + angle])
+    return np.stack([np.cos(headings), np.sin(headings)], axis=1) * np.array(lengths)[:, None]
 
 
 between = of_pair("angle_between")
 
 
 @pytest.mark.full
-def turned(ab):
+def signed_angle(ab):
     """The signed angle, as a difference of two directions."""
     return math.atan2(ab[1, 1], ab[1, 0]) - math.atan2(ab[0, 1], ab[0, 0])
 
 
-def test_angle_to_third_order_in_the_plane():
+def test_angle_in_the_plane_is_accurate_to_third_order():
     """The angle from a to b up to sign: no derivative loses digits near 0 and pi."""
-    derivatives, expected = ladder(between), ladder(turned, ONE_EACH)
+    derivatives, expected = ladder(between), ladder(signed_angle, ONE_EACH)
     for angle in (1e-12, 1e-8, 1e-4, 0.01, 0.5, 2.0, 3.1, PI - 1e-4, PI - 1e-8, PI - 1e-12):
         for sign in (1.0, -1.0):
             ab = pair(sign * angle)
@@ -100,7 +100,7 @@ def test_angle_to_third_order_in_the_plane():
 
 @pytest.mark.full
 @pytest.mark.parametrize("n", [3, 5])
-def test_angle_in_any_dimension_far_from_its_ends(n):
+def test_angle_far_from_its_ends_equals_acos_in_any_dimension(n):
     """Against acos(a.b/(|a| |b|)), for which JAX is accurate there."""
     rng = np.random.default_rng(n)
     ab = rng.normal(size=(2, n))
@@ -132,7 +132,7 @@ def test_parallel_vectors_have_angle_zero_or_pi_without_derivatives(n, dtype):
                 assert_array_equal(values, 0.0)
 
 
-def test_angle_far_below_rounding_of_the_vectors():
+def test_angle_far_below_rounding_of_the_vectors_is_exact():
     a, b = jnp.array([1.0, 0.0]), jnp.array([1.0, 1e-200])
     assert_array_equal(math.angle_between(a, b), 1e-200)
     assert_array_equal(jax.grad(math.angle_between, 1)(a, b), [-1e-200, 1.0])
@@ -141,7 +141,7 @@ def test_angle_far_below_rounding_of_the_vectors():
 
 
 @pytest.mark.parametrize("other", [[1.0, 2.0], [-1.0, -2.0], [0.0, 0.0], [-0.0, -0.0]])
-def test_angle_with_a_vector_of_no_length(other):
+def test_angle_with_a_zero_vector_is_zero(other):
     for ab in ([[0.0, 0.0], other], [other, [-0.0, 0.0]]):
         for values in ladder(between)(jnp.array(ab)):
             assert_array_equal(values, 0.0)

@@ -32,15 +32,15 @@ from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
 # ---- Matrices ----------------------------------------------------------------------------------
 
 
-def test_elementary_rotations_turn_the_axes_the_right_way():
+def test_elementary_rotations_follow_the_right_hand_rule():
     """Right-hand rule: about x from y to z, about y from z to x, about z from x to y."""
     x, y, z = np.eye(3)
-    for turn, axis, start, end in (
+    for rotate, axis, start, end in (
         (rotation.about_x, x, y, z),
         (rotation.about_y, y, z, x),
         (rotation.about_z, z, x, y),
     ):
-        R = np.asarray(turn(0.3))
+        R = np.asarray(rotate(0.3))
         np.testing.assert_array_equal(R @ axis, axis)
         found = R @ start
         np.testing.assert_allclose(found, np.cos(0.3) * start + np.sin(0.3) * end, atol=EPS)
@@ -60,7 +60,7 @@ def book_direction_cosines(psi, theta, phi):
     )
 
 
-def test_yaw_pitch_roll_is_the_matrix_of_the_book():
+def test_yaw_pitch_roll_equals_the_matrix_of_the_book():
     for x in anywhere("yaw_pitch_roll", np.random.default_rng(0), 20):
         T = rotation.direction_cosines(yaw_pitch_roll.matrix(x))
         assert worst(T, book_direction_cosines(*x)) <= 4 * EPS  # worst 0
@@ -71,8 +71,8 @@ def test_angles_are_successive_elementary_rotations():
 
     def differences(x):
         a, b, c = x
-        turns = rotation.about_x, rotation.about_y, rotation.about_z
-        X, Y, Z = ([turn(angle) for angle in (a, b, c)] for turn in turns)
+        rotations = rotation.about_x, rotation.about_y, rotation.about_z
+        X, Y, Z = ([rotate(angle) for angle in (a, b, c)] for rotate in rotations)
         return (
             yaw_pitch_roll.matrix(x) - rotation.compose(Z[0], Y[1], X[2]),
             zxz.matrix(x) - rotation.compose(Z[0], X[1], Z[2]),
@@ -142,7 +142,7 @@ def test_skew_is_the_cross_product():
     assert worst(bracket, crosses(np.cross(a, b))) <= 25 * EPS  # worst 0
 
 
-def test_skew_turns_with_its_vector():
+def test_skew_rotates_with_its_vector():
     rng = np.random.default_rng(6)
     a, R = rng.normal(size=(COUNT, 3)), batch(zxz.matrix, anywhere("zxz", rng))
     turned = R @ crosses(a) @ R.transpose(0, 2, 1)
@@ -153,7 +153,7 @@ def test_skew_turns_with_its_vector():
 
 
 @every
-def test_the_matrix_moves_with_the_rates(kind):
+def test_rates_give_the_derivative_of_the_matrix(kind):
     """dR/dt = R [w_body]x = [w_space]x R by jvp along x + t x_dot; w_space = R w_body."""
     rng = np.random.default_rng(7)
     x, p = anywhere(kind, rng), ALL[kind]
@@ -176,7 +176,7 @@ def test_the_matrix_moves_with_the_rates(kind):
     assert worst(w_space_too, w_space) <= atol
 
 
-def test_rates_of_yaw_pitch_roll_are_those_of_the_book():
+def test_rates_of_yaw_pitch_roll_equal_those_of_the_book():
     """M, its inverse and det M = cos(theta), printed for (phi, theta, psi): the reverse order."""
     for x in principal("yaw_pitch_roll", np.random.default_rng(8), 20):
         sT, sF, cT, cF = np.sin(x[1]), np.sin(x[2]), np.cos(x[1]), np.cos(x[2])
@@ -189,7 +189,7 @@ def test_rates_of_yaw_pitch_roll_are_those_of_the_book():
         assert abs(np.linalg.det(W[:, ::-1]) - cT) <= 4 * EPS
 
 
-def test_determinants_of_the_rate_matrices():
+def test_determinants_of_the_rate_matrices_equal_closed_forms():
     """-cos(theta) and -sin(theta); W W^T = 4 E/(e.e) for the quaternion."""
     rng = np.random.default_rng(9)
     for kind, expected in LOCK.items():
@@ -203,21 +203,21 @@ def test_determinants_of_the_rate_matrices():
 
 @every
 @pytest.mark.parametrize("frame", ["body", "space"])
-def test_rates_can_be_undone(kind, frame):
+def test_rates_are_invertible(kind, frame):
     """The part of a quaternion's x_dot along x is no rotation, and is omitted."""
     rng = np.random.default_rng(10)
     p, x = ALL[kind], principal(kind, rng)
     x_dot, w = rng.normal(size=x.shape), rng.normal(size=(COUNT, 3))
-    rates, undo = getattr(p, f"{frame}_rates"), getattr(p, f"from_{frame}_rates")
-    there = batch(lambda x, x_dot: undo(x, rates(x, x_dot)), x, x_dot)
-    back = batch(lambda x, w: rates(x, undo(x, w)), x, w)
+    rates, invert = getattr(p, f"{frame}_rates"), getattr(p, f"from_{frame}_rates")
+    x_dot_again = batch(lambda x, x_dot: invert(x, rates(x, x_dot)), x, x_dot)
+    w_again = batch(lambda x, w: rates(x, invert(x, w)), x, w)
     if kind == "quaternion":
-        along = np.sum(x * x_dot, axis=1)[:, None] * x
-        assert worst(np.sum(x * there, axis=1), 0) <= 5 * EPS  # worst 1.5
-        x_dot = x_dot - along
+        radial = np.sum(x * x_dot, axis=1)[:, None] * x
+        assert worst(np.sum(x * x_dot_again, axis=1), 0) <= 5 * EPS  # worst 1.5
+        x_dot = x_dot - radial
     # Some roundings of |x_dot|, |w| <= 5, times 1/|det W| <= 5 at 0.2 rad from lock.
-    assert worst(there, x_dot) <= 25 * EPS  # worst 8
-    assert worst(back, w) <= 25 * EPS  # worst 8
+    assert worst(x_dot_again, x_dot) <= 25 * EPS  # worst 8
+    assert worst(w_again, w) <= 25 * EPS  # worst 8
 
 
 def test_a_scaled_quaternion_is_the_same_rotation():
@@ -256,7 +256,7 @@ def test_quaternion_products_are_matrix_products():
 
 
 @every
-def test_from_matrix_undoes_matrix_in_the_principal_ranges(kind):
+def test_from_matrix_inverts_matrix_in_the_principal_ranges(kind):
     x = principal(kind, np.random.default_rng(13))
     found = batch(lambda x: ALL[kind].from_matrix(ALL[kind].matrix(x)), x)
     # Angles are ratios of entries of at least sin(0.2), and are at most pi.
@@ -310,7 +310,7 @@ def test_at_exact_gimbal_lock_the_first_angle_is_zero():
     np.testing.assert_array_equal(zxz.from_matrix(np.eye(3)), np.zeros(3))
 
 
-def test_quaternions_of_half_turns():
+def test_quaternions_of_half_turns_are_accurate():
     """All four branches by value; at 1e-9 rad from a half turn no digits cancel."""
     for i, e in enumerate(np.eye(4)):
         R = -np.eye(3) if i else np.eye(3)

@@ -91,7 +91,7 @@ def by_quaternion(p, x, a, b):
         ("quaternion", by_quaternion),
     ],
 )
-def test_single_precision_stays_single(kind, function):
+def test_float32_results_agree_with_float64(kind, function):
     p, rng = ALL[kind], np.random.default_rng(20)
     x = principal(kind, rng, 50).astype(np.float32)
     a, b = rng.normal(size=(2, 50, 3)).astype(np.float32)
@@ -105,21 +105,21 @@ def test_single_precision_stays_single(kind, function):
 
 
 @every
-def test_gradients_in_single_precision_stay_single(kind):
+def test_float32_gradients_stay_float32(kind):
     x = jnp.asarray(principal(kind, np.random.default_rng(21), 1)[0], jnp.float32)
     for function in functions(ALL[kind]).values():
         gradient = jax.eval_shape(jax.grad(lambda x, f=function: jnp.sum(f(x))), x)
         assert gradient.dtype == jnp.float32
 
 
-def test_numbers_and_lists_are_taken():
+def test_numbers_and_lists_are_accepted():
     expected = np.asarray(zxz.matrix(np.array([1.0, 2.0, 3.0])))
     np.testing.assert_array_equal(zxz.matrix([1, 2, 3]), expected)
     np.testing.assert_array_equal(zxz.matrix((1.0, 2, 3.0)), expected)
     np.testing.assert_array_equal(rotation.skew([1, 2, 3]), [[0, -3, 2], [3, 0, -1], [-2, 1, 0]])
 
 
-def test_the_names_are_the_coordinates():
+def test_parametrizations_have_names_of_coordinates():
     assert yaw_pitch_roll.names == ("psi", "theta", "phi")
     assert zxz.names == ("phi", "theta", "psi")
     assert quaternion.names == ("e0", "e1", "e2", "e3")

@@ -21,7 +21,7 @@ def called(patch, seconds, system=PAIR, **options):
     return jl.simulate(system, [0.1, 0.2], [0.0, 0.0], [0.0, 1.0], {"k": 2.0}, **options)
 
 
-def test_a_long_compilation_is_said_once(monkeypatch, caplog):
+def test_long_compilation_is_logged_once(monkeypatch, caplog):
     caplog.set_level(logging.WARNING, logger="jaxlag")
     called(monkeypatch, 4.0, dt=0.5)
     assert not caplog.records
@@ -36,7 +36,7 @@ def test_a_long_compilation_is_said_once(monkeypatch, caplog):
 
 
 @pytest.mark.full
-def test_nothing_is_said_inside_a_transform_nor_proposed_twice(monkeypatch, caplog):
+def test_log_is_empty_under_transforms_and_omits_advice_in_use(monkeypatch, caplog):
     caplog.set_level(logging.WARNING, logger="jaxlag")
     jax.jit(lambda k: called(monkeypatch, 12.0, dt=k).q)(jnp.array(0.5))
     assert not caplog.records

@@ -33,7 +33,7 @@ def exact():
 
 @pytest.mark.full
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-7, 1e-9])
-def test_half_as_much_again_as_the_error(exact, tolerance):
+def test_estimate_is_about_1_5_times_the_error(exact, tolerance):
     """By a method of higher order, whose own error is at most a few hundredths of it."""
     motion = jl.simulate(*PENDULUM, rtol=tolerance, atol=tolerance, estimate_error=True)
     found = ratios(motion, exact, so_far=False)
@@ -45,13 +45,13 @@ def test_half_as_much_again_as_the_error(exact, tolerance):
     ("method", "dt"),
     [("tsit5", 0.01), ("dopri8", 0.05), ("gauss4", 0.02)],
 )
-def test_with_fixed_steps(exact, method, dt):
+def test_estimate_with_fixed_steps_has_the_size_of_the_error(exact, method, dt):
     motion = jl.simulate(*PENDULUM, method=method, dt=dt, estimate_error=True)
     found = ratios(motion, exact, so_far=True)
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
-def test_of_a_motion_that_is_exact_but_for_rounding():
+def test_estimate_of_an_exact_motion_covers_rounding():
     """Free fall, a parabola: the difference of two motions is rounding, and may be 0."""
     fall = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - p["g"] * q[0], ("x",))
     ts = np.linspace(0.0, 8.0, 33)
@@ -66,7 +66,7 @@ def test_of_a_motion_that_is_exact_but_for_rounding():
 
 
 @pytest.mark.full
-def test_of_the_same_order_where_there_is_no_higher_one(exact):
+def test_estimate_of_the_same_order_has_the_size_of_the_error(exact):
     """Most ratios are between 1 and 2; the error is the largest so far."""
     motion = jl.simulate(*PENDULUM, method="kvaerno5", rtol=1e-6, atol=1e-6, estimate_error=True)
     found = ratios(motion, exact, so_far=True)
@@ -74,7 +74,7 @@ def test_of_the_same_order_where_there_is_no_higher_one(exact):
 
 
 @pytest.mark.full
-def test_the_motion_itself_is_the_same():
+def test_estimate_does_not_change_the_motion():
     with_estimate = jl.simulate(*PENDULUM, estimate_error=True)
     without = jl.simulate(*PENDULUM)
     assert without.error is None
@@ -84,7 +84,7 @@ def test_the_motion_itself_is_the_same():
 
 
 @pytest.mark.full
-def test_lanes_and_jit():
+def test_estimate_in_lanes_equals_the_single_one():
     system, q0, v0, ts, params = PENDULUM
     solve = jax.jit(
         jax.vmap(lambda q: jl.simulate(system, q, v0, ts, params, estimate_error=True).error[0])
@@ -95,7 +95,7 @@ def test_lanes_and_jit():
     np.testing.assert_allclose(solve(starts)[1], single, rtol=1e-2, atol=1e-13)
 
 
-def test_what_cannot_be_estimated(unchecked):  # noqa: F811
+def test_unsupported_estimates_are_refused(unchecked):  # noqa: F811
     controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     method = (diffrax.Tsit5(), controller)
     with pytest.raises(
@@ -108,7 +108,7 @@ def test_what_cannot_be_estimated(unchecked):  # noqa: F811
         jl.simulate(*PENDULUM, estimate_error=1e-6)
 
 
-def test_a_method_that_holds_traced_numbers():
+def test_estimate_accepts_methods_with_traced_numbers():
     """It is compared with itself as the same method, without comparing its traced numbers."""
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2, ("x",))
 

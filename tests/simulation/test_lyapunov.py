@@ -57,7 +57,7 @@ def norm_of_exponential(t, rate=RATE):
         (DAMPED, [0.7, -0.3], 20.0),
     ],
 )
-def test_kappa_is_what_it_says(params, start, span):
+def test_kappa_is_the_largest_scaled_norm(params, start, span):
     """The largest scaled norm over all pairs of save times, Phi by scipy's matrix exponential."""
     rtol, atol = 1e-3, 2e-4
     ts = span * np.linspace(0.0, 1.0, 41) ** 1.5
@@ -80,7 +80,7 @@ def test_kappa_is_what_it_says(params, start, span):
     np.testing.assert_allclose(ratio.kappa, growth.kappa, rtol=1e-12)
 
 
-def test_a_rotation_grows_nothing():
+def test_rotation_has_no_growth():
     """x'' = -x in fixed units: Phi is a rotation."""
     motion = linear_motion({"k": 1.0, "c": 0.0}, [0.7, -0.3], np.linspace(0.0, 20.0, 41))
     growth = jl.lyapunov(motion, rtol=0.0)
@@ -120,9 +120,9 @@ def test_inverted_pendulum_has_its_exponent_and_horizon():
     early = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], 0.4 * ts))
     np.testing.assert_allclose(early.horizon, horizon, rtol=1e-3)  # extrapolated
     assert "beyond its end (extrapolated)" in str(early)
-    back = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], -ts))
-    np.testing.assert_allclose(back.kappa, growth.kappa, rtol=1e-7)
-    np.testing.assert_allclose(back.horizon, growth.horizon, rtol=1e-7)
+    backward = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], -ts))
+    np.testing.assert_allclose(backward.kappa, growth.kappa, rtol=1e-7)
+    np.testing.assert_allclose(backward.horizon, growth.horizon, rtol=1e-7)
 
 
 def test_a_motion_beyond_its_horizon_warns():
@@ -139,7 +139,7 @@ def test_a_motion_beyond_its_horizon_warns():
         jl.lyapunov(several(jnp.zeros((2, 2))))
 
 
-def test_nothing_overflows():
+def test_large_growth_does_not_overflow():
     """Growth of e^940, in segments of e^23."""
     growth = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 300.0, 41)))
     expected = 300 * RATE + np.log((RATE + 1 / RATE) / 2)
@@ -191,9 +191,9 @@ def test_exponent_of_chaos_by_two_nearby_trajectories():
             solve_ivp(hand_written, (0.0, 1.0), y, method="DOP853", rtol=1e-10, atol=1e-10).y[:, -1]
             for y in (near, far)
         )
-        apart = np.linalg.norm(far - near)
-        rates.append(np.log(apart / distance))
-        far = near + (far - near) * distance / apart
+        separation = np.linalg.norm(far - near)
+        rates.append(np.log(separation / distance))
+        far = near + (far - near) * distance / separation
     blocks = np.mean(np.reshape(rates[40:], (8, 15)), axis=1)
     error = np.std(blocks, ddof=1) / np.sqrt(8)
     # Two samples of one chaotic region: they differ by at most three times the combined error.
@@ -268,7 +268,7 @@ def test_a_table_is_read_on_both_sides_of_its_knots():
 
 
 @pytest.mark.full
-def test_batches_have_lanes_of_their_own():
+def test_batch_equals_single_motions():
     """Equal to single motions, under vmap and jit; a failed lane is NaN with its status."""
     ts = np.linspace(0.0, 10.0, 41)
     k = jnp.array([4.0, -G, jnp.nan])
@@ -294,7 +294,7 @@ def test_batches_have_lanes_of_their_own():
 
 
 @pytest.mark.full
-def test_float32_has_tolerances_of_its_own():
+def test_float32_has_separate_default_tolerances():
     """A state in float32, time in float64."""
     params = {"k": np.float32(-G), "c": np.float32(0.0)}
     start = np.float32([0.0]), np.float32([0.0])
@@ -307,7 +307,7 @@ def test_float32_has_tolerances_of_its_own():
     np.testing.assert_allclose(growth.horizon, expected, rtol=1e-2)  # extrapolated
 
 
-def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
+def test_unsupported_arguments_are_refused(unchecked):  # noqa: F811
     ts = np.linspace(0.0, 10.0, 41)
     motion = linear_motion(INVERTED, [0.0, 0.0], ts)
     with pytest.raises(ValueError, match=r"lyapunov: `motion` must be a jl.Solution, but it was"):
@@ -339,7 +339,7 @@ def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
 
 
 @pytest.mark.full
-def test_many_coordinates_at_many_times():
+def test_many_coordinates_and_segments_agree_with_few_segments():
     """12 coordinates and 32 segments: more at once exceeds what XLA compiles in one loop."""
     motion = jl.simulate(
         quadcopter.system, *quadcopter.start(), np.linspace(0, 2, 33), quadcopter.example.params

@@ -86,7 +86,7 @@ def test_constrained_growth_is_that_of_the_angle(X):
 
 
 @pytest.mark.full
-def test_growth_on_a_knife_edge():
+def test_growth_on_a_knife_edge_has_its_closed_form():
     """Pfaffian rows restrict only velocities: closed form in (x, y, theta, speed, turning rate)."""
     ts = np.linspace(0.0, 6.0, 41)
     z0 = jnp.array([0.1, 0.2, 0.3, 0.8, 1.3])
@@ -126,7 +126,7 @@ def test_quasi_velocities_do_not_change_growth():
 
 
 @pytest.mark.full
-def test_rows_that_follow_from_others_change_nothing():
+def test_dependent_rows_do_not_change_growth():
     def twice(t, q, params):
         rows = rods(t, q, params)
         return jnp.concatenate([rows, 2 * rows[:1]])

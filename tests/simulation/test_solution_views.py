@@ -52,7 +52,7 @@ def test_motions_of_a_batch_are_taken_by_index(batch, motion):
         motion[3]
 
 
-def test_a_batch_says_how_many_ended_how(batch):
+def test_message_of_a_batch_counts_statuses(batch):
     first, second = batch.message().splitlines()
     assert first == "5 motions: 3 ok, 2 nonfinite"
     assert second.startswith("[2]: nonfinite")

@@ -15,7 +15,7 @@ METHODS = [jl.solvers.Dopri8, jl.solvers.Prince9, jl.solvers.Dopri5, jl.solvers.
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_unweighted_stages_change_nothing_of_step_and_estimate(method):
+def test_unweighted_stages_have_no_weight_in_step_and_estimate(method):
     tableau = tableau_of(method)
     assert (
         tableau.unweighted
@@ -30,19 +30,19 @@ def test_unweighted_stages_change_nothing_of_step_and_estimate(method):
         assert (i in tableau.unweighted) == (tableau.b[i] == 0 and tableau.e[i] == 0)
 
 
-def test_what_is_unseen():
+def test_unseen_error_equals_that_by_hand():
     """By hand: an end that differs from the stage before, an early kick, neither."""
-    apart = [1.0, 0.5, 0.5, 0.2, 2.0]  # |2.0 - 0.2| > 0.3 * 2.0
+    late = [1.0, 0.5, 0.5, 0.2, 2.0]  # |2.0 - 0.2| > 0.3 * 2.0
     kick = [1.0, 0.5, -7.0, 1.0, 1.1]  # 7.0 > 3 * 1.1
     smooth = [1.0, 0.5, 3.2, 1.0, 1.1]  # 3.2 < 3 * 1.1, 0.1 < 0.3 * 1.1
-    k = [jnp.array(stage) for stage in zip(apart, kick, smooth, strict=True)]
+    k = [jnp.array(stage) for stage in zip(late, kick, smooth, strict=True)]
     np.testing.assert_allclose(unseen(k, (1, 2)), [1.8, 7.0, 0.0], rtol=1e-15)
     np.testing.assert_allclose(unseen(k, (2,)), [0.0, 7.0, 0.0], rtol=1e-15)  # one stage only
 
 
 @pytest.mark.parametrize("looped", [False, True])
 @pytest.mark.parametrize("method", METHODS)
-def test_the_estimate_of_a_smooth_step_is_that_of_the_method(method, looped):
+def test_estimate_of_a_smooth_step_equals_that_of_the_method(method, looped):
     """At steps of up to a sixth of the period of a pendulum."""
 
     def swing(t, y, args):
@@ -114,7 +114,7 @@ def test_a_ball_does_not_fall_through_a_stiff_floor():
     + [pytest.param(jl.solvers.Dopri8(looped=True), marks=pytest.mark.full)],
     ids=str,
 )
-def test_energies_of_bounces(method):
+def test_energies_after_bounces_are_right(method):
     """At most 1 % off; 70 and 105 of 1,000 were more, up to 1e6 times, by the default method.
 
     At 1e-6 the stiffest contacts have errors of 1e-3 in energy: tolerances of 1e-6 m for depths of
@@ -130,7 +130,7 @@ def test_energies_of_bounces(method):
         assert np.sum(off > 0.01) <= few
 
 
-def test_energies_on_a_smooth_wall():
+def test_energies_at_a_smooth_wall_are_right():
     """A wall of 2.5 mm: 150 of 400 were wrong at every tolerance."""
     rng = np.random.default_rng(1)
     h, k = 10 ** rng.uniform(-1, 2, 400), 10 ** rng.uniform(5, 7, 400)
@@ -142,14 +142,14 @@ def test_energies_on_a_smooth_wall():
         assert np.max(off) < 1e-3
 
 
-def test_steps_of_bounded_length_do_not_either():
+def test_steps_of_bounded_length_resolve_a_stiff_floor():
     h, k, t = falls(200)
     _, _, energy, status = dropped(spring, dt_max=jnp.array(0.05))(h, k, t, 1e-9)
     assert np.all(status == jl.Status.ok)
     np.testing.assert_allclose(energy, G * h, rtol=1e-4)
 
 
-def test_a_barrier_too_steep_for_numbers():
+def test_overflow_in_a_steep_barrier_shortens_the_step():
     """exp(-q/w) overflows at stages far inside: the step is repeated with a shorter length."""
 
     def barrier(t, q, v, params):
@@ -161,7 +161,7 @@ def test_a_barrier_too_steep_for_numbers():
     np.testing.assert_allclose(energy, G * h, rtol=1e-6)
 
 
-def test_explain_does_not_advise_a_looser_tolerance_there():
+def test_explain_does_not_advise_a_looser_tolerance_for_bounces():
     for lagrangian in (spring, softplus):
         system = jl.System(lagrangian, ("x",))
         motion = jl.simulate(system, [1.0], [0.0], [0.0, 3.0], {"k": 1e5})

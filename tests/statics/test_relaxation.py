@@ -59,9 +59,9 @@ def rest_of(params, q0):
 def unbalanced(q, params):
     """Largest force along the constraints over the largest force, and the position residual."""
     F, A = jax.grad(potential, 1)(0.0, q, params), jax.jacobian(opening, 1)(0.0, q, params)
-    along = jnp.cross(A[0], A[1])
-    along = along / jnp.linalg.norm(along)
-    return jnp.abs(along @ F) / jnp.max(jnp.abs(F)), jnp.max(jnp.abs(opening(0.0, q, params)))
+    tangent = jnp.cross(A[0], A[1])
+    tangent = tangent / jnp.linalg.norm(tangent)
+    return jnp.abs(tangent @ F) / jnp.max(jnp.abs(F)), jnp.max(jnp.abs(opening(0.0, q, params)))
 
 
 def test_four_bars_come_to_rest_from_any_configuration():
@@ -85,7 +85,7 @@ def test_four_bars_come_to_rest_in_single_precision():
 
 
 @pytest.mark.full
-def test_derivatives_at_a_rest_that_relaxation_found():
+def test_derivatives_at_a_relaxed_state_are_right():
     """Forward, reverse, and central differences that start at the rest, by k and the pivot."""
     params, q0 = four_bars(24)
     found = rest_of(params, q0)
@@ -99,10 +99,10 @@ def test_derivatives_at_a_rest_that_relaxation_found():
         return jl.equilibrium(FOUR_BAR, start, moved, throw=False).q
 
     x = jnp.array([one["k"] + 1.0, *one["g"]])
-    there = q(x, q0[i])
+    rest = q(x, q0[i])
     forward, reverse = jax.jacfwd(q)(x, q0[i]), jax.jacrev(q)(x, q0[i])
     h = 1e-5
-    steps = [(q(x + h * e, there) - q(x - h * e, there)) / (2 * h) for e in np.eye(3)]
+    steps = [(q(x + h * e, rest) - q(x - h * e, rest)) / (2 * h) for e in np.eye(3)]
     np.testing.assert_allclose(reverse, forward, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(forward, np.stack(steps, axis=1), rtol=1e-6, atol=1e-8)
 
@@ -128,7 +128,7 @@ def test_forces_without_potential_lead_to_rest():
     np.testing.assert_allclose(rest.stiffness, [[1.0, -1.5], [1.5, 1.0]], atol=16 * EPS)
 
 
-def test_what_was_tried_is_said_where_nothing_balances():
+def test_failed_search_states_what_was_tried():
     """A bead that is pushed along a hoop, and a mass in V = -x: neither comes to rest."""
     hoop = jl.System(
         lambda t, q, v, params: 0.5 * v @ v,

@@ -58,14 +58,14 @@ VALLEY = plane(lambda q, params: jnp.exp(-q[0] - q[1]) + (q[0] - q[1]) ** 2 / 2)
         pytest.param(VALLEY, [5.0, 0.0], None, id="valley", marks=pytest.mark.full),
     ],
 )
-def test_forces_that_only_die_away_are_not_balanced(system, q0, params):
+def test_decaying_forces_have_no_equilibrium(system, q0, params):
     """For any force at the start, and although it underflows in the end."""
     far = jl.equilibrium(system, jnp.asarray(q0), params, throw=False)
     assert far.status == jl.Status.implicit_solve_failed
     assert not far.stable
 
 
-def test_a_well_is_found_from_outside_of_its_bend():
+def test_well_is_found_from_beyond_its_inflection():
     """V = -1e6 exp(-q^2) from q = 1, where Newton's step and the least |F| lead outwards."""
     rest = jl.equilibrium(GAUSSIAN, [1.0])
     np.testing.assert_allclose(rest.q, 0, atol=EPS)
@@ -73,7 +73,7 @@ def test_a_well_is_found_from_outside_of_its_bend():
 
 
 @pytest.mark.parametrize("start", [0.01, 1e-10])
-def test_a_root_is_found_from_where_the_force_is_immense(start):
+def test_root_is_found_from_immense_forces(start):
     """Lennard-Jones from 0.01 r0, 1e27 times the force unit, and 1e131 times: r0 = 1, K = 72."""
     rest = jl.equilibrium(LENNARD_JONES, [start])
     np.testing.assert_allclose(rest.q, [1.0], rtol=4 * EPS)
@@ -137,7 +137,7 @@ def test_weak_gravity_and_wide_orbits_are_resolved():
 
 
 @pytest.mark.parametrize("order", [3, 4, 6])
-def test_a_higher_order_is_found_and_not_called_stable(order):
+def test_root_of_higher_order_is_found_and_not_stable(order):
     """V = q^n from 1: Newton's step q/(n - 1) ends below tol = 1e-10 of 1 + q."""
     rest = jl.equilibrium(one(lambda x, params: x**order), [1.0])
     assert abs(rest.q[0]) / (order - 1) <= 1e-10 * (1 + abs(rest.q[0]))
@@ -161,7 +161,7 @@ def test_two_unstressed_springs_in_line_balance(angle):
 
 
 @pytest.mark.full
-def test_a_ring_of_equilibria_is_found_and_not_called_stable():
+def test_ring_of_equilibria_is_found_and_not_stable():
     """A single spring of length 1 about a pivot."""
     ring = plane(lambda q, params: jl.energy.spring(100.0, q, params))
     rest = jl.equilibrium(ring, [2.0, 0.1], 1.0)
@@ -169,7 +169,7 @@ def test_a_ring_of_equilibria_is_found_and_not_called_stable():
     assert not rest.stable
 
 
-def test_the_zero_length_of_a_spring_is_stable_without_unstretched_length_only():
+def test_zero_length_is_stable_only_for_springs_without_free_length():
     """Otherwise V is the tip of a cone: the force points away in all directions."""
     pivot = plane(lambda q, params: jl.energy.spring(100.0, q, params))
     assert jl.equilibrium(pivot, [0.0, 0.0], 0.0).stable
@@ -219,16 +219,16 @@ def test_multipliers_of_dependent_rows_do_not_depend_on_the_start():
         return jax.jvp(lam, (params,), (direction,))
 
     starts = [jnp.array(q0) for q0 in ((0.3, -1.2), (0.9, -0.9), (0.5, -0.4))]
-    still = {"k": 0.0, "l": 0.0}
-    (_, q), _ = found(params, starts[0], still)
+    no_change = {"k": 0.0, "l": 0.0}
+    (_, q), _ = found(params, starts[0], no_change)
     expected = system.multipliers(q, jnp.zeros(2), params)["rod"]
     h = 1e-5
     for q0 in starts:
-        np.testing.assert_allclose(found(params, q0, still)[0][0], expected, rtol=1e-13)
+        np.testing.assert_allclose(found(params, q0, no_change)[0][0], expected, rtol=1e-13)
         for name, value in params.items():
-            slope = found(params, q0, {**still, name: 1.0})[1][0]
+            slope = found(params, q0, {**no_change, name: 1.0})[1][0]
             moved = [{**params, name: value + s * h} for s in (1, -1)]
-            ahead, behind = (found(p, q0, still)[0][0] for p in moved)
+            ahead, behind = (found(p, q0, no_change)[0][0] for p in moved)
             np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-7)
 
 
@@ -269,7 +269,7 @@ def test_forces_that_feed_energy_in_make_a_minimum_unstable(D, stable):
 
 
 @pytest.mark.full
-def test_a_cyclic_coordinate_leaves_the_derivatives_of_others_alone():
+def test_cyclic_coordinate_does_not_affect_derivatives_of_others():
     cyclic = plane(lambda q, params: (q[0] - params**2) ** 2 / 2)
 
     def q(p):
@@ -293,7 +293,7 @@ def test_free_carts_on_a_spring_have_the_derivative_of_least_norm():
     np.testing.assert_allclose(jax.hessian(q)(0.7), [1.0, -1.0], rtol=16 * EPS)
 
 
-def test_where_no_equilibrium_was_found_there_is_no_derivative():
+def test_failed_search_has_nan_derivatives():
     def q(p):
         return jl.equilibrium(EXPONENTIAL, [0.3], p, throw=False, max_steps=8).q[0]
 
@@ -302,7 +302,7 @@ def test_where_no_equilibrium_was_found_there_is_no_derivative():
     assert np.isnan(jax.jvp(q, (0.7,), (1.0,))[1])
 
 
-def test_a_failing_lane_does_not_spoil_the_derivative_of_another():
+def test_failed_lane_does_not_affect_derivatives_of_others():
     well = one(lambda x, params: jnp.exp(-x) + params * x)
 
     def q(p):

@@ -27,7 +27,7 @@ CASES = dict(gathered())
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_terms_add_up_to_the_rate_of_energy(name):
+def test_power_terms_add_up_to_the_rate_of_energy(name):
     """dH/dt along (1, v, a) against sum_k v . Q_k - dL/dt, at one state."""
     system, q, v, params, inputs = CASES[name]
     t = jnp.array(0.25)
@@ -52,7 +52,7 @@ def test_the_terms_add_up_to_the_rate_of_energy(name):
         *(pytest.param(name, marks=pytest.mark.full) for name in ("cart_pendulum", "bead")),
     ],
 )
-def test_the_books_close(name):
+def test_work_of_all_terms_equals_the_change_of_energy(name):
     """H - H(0) = the work of all terms, within some tens of local errors."""
     system, q, v, params, inputs = CASES[name]
     ts = jnp.linspace(0.0, 1.5, 7)
@@ -84,7 +84,7 @@ def test_the_work_of_a_damper_is_minus_twice_its_function():
     np.testing.assert_allclose(motion.work[name][-1], -2 * simpson, rtol=1e-8)
 
 
-def test_explicit_time_has_a_term_of_its_own():
+def test_explicit_time_has_a_separate_term():
     system, q, v, params, _ = CASES["driven_pivot"]
     assert list(system.power(q, v, params)) == ["explicit time"]
     system, q, v, params, _ = CASES["chain"]
@@ -94,7 +94,7 @@ def test_explicit_time_has_a_term_of_its_own():
 
 
 @pytest.mark.full
-def test_the_terms_keep_the_order_of_the_forces():
+def test_power_terms_keep_the_order_of_the_forces():
     """Explicit time last; also through jit, vmap and `save`, which return dicts alphabetically."""
     forces = tuple(
         jl.GeneralizedForce(lambda t, q, v, params: -v, name) for name in ("wind", "brake", "motor")
@@ -139,7 +139,7 @@ def test_power_is_the_rate_of_work():
         np.testing.assert_allclose(rate[name], expected, rtol=1e-7)
 
 
-def test_work_is_not_integrated_unless_asked_for():
+def test_work_is_integrated_only_on_request():
     """Without it the state has 2 n components; reading `work` raises an error with advice."""
     system, q, v, params, _ = CASES["double_pendulum_rayleigh"]
     ts = jnp.array([0.0, 0.3])
@@ -177,24 +177,24 @@ def test_work_has_batches_and_derivatives():
 
 
 @pytest.mark.full
-def test_work_done_backwards_is_given_back():
+def test_work_backwards_in_time_has_the_opposite_sign():
     system, q, v, params, _ = CASES["cart_pendulum"]
     ts = jnp.array([0.0, 0.4, 1.0])
-    there = jl.simulate(system, q, v, ts, params, save=("work",))
-    back = jl.simulate(system, there.q[-1], there.v[-1], ts[::-1], params, save=("work",))
-    for name, W in there.work.items():
-        np.testing.assert_allclose(back.work[name][-1], -W[-1], atol=1e-6)
+    forward = jl.simulate(system, q, v, ts, params, save=("work",))
+    backward = jl.simulate(system, forward.q[-1], forward.v[-1], ts[::-1], params, save=("work",))
+    for name, W in forward.work.items():
+        np.testing.assert_allclose(backward.work[name][-1], -W[-1], atol=1e-6)
 
 
-def test_rows_not_reached_have_no_work():
+def test_saves_that_are_not_reached_have_nan_work():
     system, q, v, params, _ = CASES["cart_pendulum"]
     motion = jl.simulate(
         system, q, v, [0.0, 0.1, 5.0], params, save=("work", "power"), max_steps=8, throw=False
     )
     assert motion.status == jl.Status.max_steps
-    for rows in (*motion.work.values(), *motion.power.values()):
-        assert np.isfinite(rows[:2]).all()
-        assert np.isnan(rows[2])
+    for series in (*motion.work.values(), *motion.power.values()):
+        assert np.isfinite(series[:2]).all()
+        assert np.isnan(series[2])
 
 
 DRAG = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "drag")
@@ -206,7 +206,7 @@ def into_the_well(v0, save=("work",)):
     return jl.simulate(WELL, [1.0, 0.0], [v0, 0.5], [0.0, 0.1, 1.0], save=save, throw=False)
 
 
-def test_how_a_motion_with_work_ended_is_explained():
+def test_message_of_a_failed_motion_with_work_names_the_coordinate():
     """The state of the failed step contains work besides (q, v); the message names x."""
     motion = into_the_well(-3.0)
     assert motion.status == jl.Status.step_below_resolution
@@ -222,7 +222,7 @@ def test_how_a_motion_with_work_ended_is_explained():
     np.testing.assert_array_equal(where, [0, -1])
 
 
-def test_growth_along_a_motion_with_work_is_that_of_its_state():
+def test_perturbation_growth_does_not_depend_on_work():
     """Work is not a perturbed variable; under jit the complete status is needed."""
 
     def growth(save):
@@ -248,15 +248,15 @@ def test_driven_pivot_agrees_with_the_force_on_the_pivot():
     def pivot_rate(t):
         return -X * omega * jnp.sin(omega * t)
 
-    def left_out(t, q, v):  # T + V - H = T1 + 2 T0
+    def omitted_terms(t, q, v):  # T + V - H = T1 + 2 T0
         return m * pivot_rate(t) * length * v[0] * jnp.cos(q[0]) + m * pivot_rate(t) ** 2
 
     def x_rate(t, q, v):
         return pivot_rate(t) + length * v[0] * jnp.cos(q[0])
 
-    along = (t, q, v), (jnp.ones_like(t), v, a)
-    force = m * jax.jvp(x_rate, *along)[1]
+    point_and_rates = (t, q, v), (jnp.ones_like(t), v, a)
+    force = m * jax.jvp(x_rate, *point_and_rates)[1]
     (power,) = DRIVEN.power(q, v, params, t=t).values()
     np.testing.assert_allclose(
-        power + jax.jvp(left_out, *along)[1], force * pivot_rate(t), rtol=64 * EPS
+        power + jax.jvp(omitted_terms, *point_and_rates)[1], force * pivot_rate(t), rtol=64 * EPS
     )

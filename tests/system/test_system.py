@@ -71,12 +71,12 @@ def quantities(system, quadratic, params, t, q, v, x, b):
     def energy(t, q, v):
         return system.energy(q, v, params, t=t)
 
-    def along(s):
+    def curve(s):
         """(t, q, q') on the cubic with velocity v, acceleration x, jerk b at s = 0."""
         return t + s, q + s * v + s**2 * x / 2 + s**3 * b / 6, v + s * x + s**2 * b / 2
 
     momentum = jax.grad(L, argnums=2)
-    _, p_dot = jax.jvp(lambda s: momentum(*along(s)), (0.0,), (1.0,))
+    _, p_dot = jax.jvp(lambda s: momentum(*curve(s)), (0.0,), (1.0,))
     found = {
         "M": system.mass_matrix(q, v, params, t=t),
         "h": system.bias(q, v, params, t=t),
@@ -115,9 +115,9 @@ class Evaluated(NamedTuple):
     def __iter__(self):
         """The quantities of one state after another, with t, q, v, x."""
         _, t, q, v, x, _ = self.states
-        rows = self.found | {"t": t, "q": q, "v": v, "x": x}
+        arrays = self.found | {"t": t, "q": q, "v": v, "x": x}
         for i in range(STATES):
-            yield {key: np.asarray(value[i]) for key, value in rows.items()}
+            yield {key: np.asarray(value[i]) for key, value in arrays.items()}
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
 
 
 @pytest.mark.parametrize("name", OF_BOOK)
-def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evaluate):
+def test_bias_is_mass_rate_times_velocity_less_lagrangian_gradient(name, evaluate):
     """h = M' v - d(T - V)/dq for p = M v and M without time."""
     for s in evaluate(name):
         expected = s["M_q"] @ s["v"] @ s["v"] - s["L_q"]
@@ -267,7 +267,7 @@ def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate
 # ---- Lagrangians with known answers ----------------------------------------------------------
 
 
-def test_a_charge_circles_in_a_magnetic_field(evaluate):
+def test_charge_in_a_magnetic_field_obeys_its_equation(evaluate):
     """m a = e B (v_y, -v_x); p = m v + e A; H = m v^2/2."""
     params, _, q, v, _, _ = random_states("charged")
     found = evaluate("charged").found
@@ -280,7 +280,7 @@ def test_a_charge_circles_in_a_magnetic_field(evaluate):
     assert np.max(abs(found["C"])) == 0.0  # gyroscopic terms are not Coriolis terms
 
 
-def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
+def test_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
     """l theta'' = -g sin(theta) - x_p'' cos(theta), x_p = X cos(Omega t)."""
     params, t, q, v, _, _ = random_states("driven_pivot")
     found = evaluate("driven_pivot").found
@@ -290,7 +290,7 @@ def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
     agree(found["a"][:, 0], expected, g / length, X * omega**2 / length, v**2)
 
 
-def test_a_relativistic_particle_gets_heavier(evaluate):
+def test_relativistic_particle_obeys_its_equation(evaluate):
     """M = gamma m (1 + gamma^2 v v^T/c^2), gamma m a = F - (v . F) v/c^2, H = gamma m c^2 + V."""
     params, _, q, v, _, _ = random_states("relativistic")
     found = evaluate("relativistic").found
@@ -306,16 +306,16 @@ def test_a_relativistic_particle_gets_heavier(evaluate):
     agree(found["a"], a, *(np.linalg.cond(M) * norm(g)))
     agree(found["H"], (gamma * m * c**2 + m * g * q[:, :1])[:, 0], m * c**2)
     # On one line, as in textbooks: M = gamma^3 m, a = -g/gamma^3.
-    along = {key: value[0] for key, value in params.items()}
-    g3 = (1 - (1.5 / along["c"]) ** 2) ** -1.5
+    single = {key: value[0] for key, value in params.items()}
+    g3 = (1 - (1.5 / single["c"]) ** 2) ** -1.5
     q, v = jnp.zeros(2), jnp.array([1.5, 0.0])
-    M = jax.jit(RELATIVISTIC.mass_matrix)(q, v, along)
-    a = jax.jit(RELATIVISTIC.acceleration)(q, v, along)
-    np.testing.assert_allclose(M[0, 0], g3 * along["m"], rtol=K * EPS)
-    np.testing.assert_allclose(a, [-along["g"] / g3, 0.0], rtol=K * EPS)
+    M = jax.jit(RELATIVISTIC.mass_matrix)(q, v, single)
+    a = jax.jit(RELATIVISTIC.acceleration)(q, v, single)
+    np.testing.assert_allclose(M[0, 0], g3 * single["m"], rtol=K * EPS)
+    np.testing.assert_allclose(a, [-single["g"] / g3, 0.0], rtol=K * EPS)
 
 
-def test_where_mass_depends_on_velocity_it_must_be_given():
+def test_velocity_must_be_given_if_mass_depends_on_it():
     params = GENERAL["relativistic"].params
     with pytest.raises(
         ValueError,
@@ -331,15 +331,15 @@ def test_where_mass_depends_on_velocity_it_must_be_given():
         RELATIVISTIC.coriolis_matrix([0.0, 0.0], [1.0, 0.0], params)
 
 
-def test_time_reaches_every_method_and_starts_at_zero():
+def test_time_is_read_by_every_method_and_defaults_to_zero():
     params, q, v = GENERAL["bead"].params, jnp.array([0.3]), jnp.array([0.7])
     names = ("mass_matrix", "coriolis_matrix", "momentum", "energy", "bias", "acceleration")
 
     def values(**t):
         return [jnp.ravel(getattr(BEAD, name)(q, v, params, **t)) for name in names]
 
-    silent, zero, later = jax.jit(lambda: (values(), values(t=0.0), values(t=10.0)))()
-    np.testing.assert_array_equal(silent, zero)
+    default, zero, later = jax.jit(lambda: (values(), values(t=0.0), values(t=10.0)))()
+    np.testing.assert_array_equal(default, zero)
     growth = dict(zip(names, np.divide(later, zero), strict=True))
     for name in names[:4]:
         np.testing.assert_allclose(growth[name], 2.0, rtol=K * EPS)  # all grow as m (1 + t/10)

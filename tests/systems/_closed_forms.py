@@ -40,8 +40,8 @@ def exact_motion(name, times, q0, v0, params):
     """(q, v) of the system's closed form at `times`, each (S, n)."""
     q0, v0 = (jnp.asarray(x, float) for x in (q0, v0))
     params = {key: jnp.asarray(value, float) for key, value in params.items()}
-    along = jax.jit(jax.vmap(lambda t: ENTRIES[name].exact(t, q0, v0, params)))
-    return tuple(map(np.asarray, along(jnp.asarray(times))))
+    exact = jax.jit(jax.vmap(lambda t: ENTRIES[name].exact(t, q0, v0, params)))
+    return tuple(map(np.asarray, exact(jnp.asarray(times))))
 
 
 def close_to_exact(name, motion, params, tolerance=CLOSE):

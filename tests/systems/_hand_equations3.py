@@ -81,9 +81,9 @@ def quadcopter(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noqa:
         [-f4 * l, -f1 * l, -b * (w2**2 + w4**2)],
         -np.cross(omega, spin),
     ]
-    still = np.zeros(3)
-    return M, [np.concatenate([x, still]) for x in forces] + [
-        np.concatenate([still, x]) for x in torques
+    zeros = np.zeros(3)
+    return M, [np.concatenate([x, zeros]) for x in forces] + [
+        np.concatenate([zeros, x]) for x in torques
     ]
 
 

@@ -100,7 +100,7 @@ KINETIC = {
 
 
 @pytest.mark.parametrize("name", mostly_full(KINETIC, "lamina_two_forces", "two_link_robot_arm"))
-def test_T_is_the_same_by_another_route(name):
+def test_kinetic_energy_agrees_with_another_derivation(name):
     entry = ENTRIES[name]
 
     @jax.jit
@@ -119,7 +119,7 @@ def from_pivot(p):
     return third, third + np.array([p["xb"], p["yb"], 0.0])
 
 
-def test_the_pendulum_has_one_energy_from_three_origins():
+def test_energy_of_the_pendulum_is_equal_from_three_origins():
     """The errors are those of the parts of l^2, whose sum is (r + |c|)^2, c = (xb, yb)."""
     entry = ENTRIES["physical_pendulum_three_origins"]
     for t, q, v, p in random_states(entry):
@@ -167,7 +167,7 @@ def potential_of_the_arm(t, q, mA, m, l1, l2, g, **others):
         ("two_link_robot_arm", potential_of_the_arm),
     ],
 )
-def test_V_is_the_weight_by_hand(name, by_hand):
+def test_potential_equals_the_weight_by_hand(name, by_hand):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         V, scale = by_hand(t, q, **params)
@@ -195,7 +195,7 @@ def motors(t, q, tauO0, tauA0, Omega, **others):
         ("two_link_robot_arm", motors),
     ],
 )
-def test_generalized_forces_are_those_by_hand(name, by_hand):
+def test_generalized_forces_equal_those_by_hand(name, by_hand):
     """To K eps times the forces: no lever arm here is as long as 1 m."""
     entry = ENTRIES[name]
     for t, q, v, params in random_states(entry):
@@ -216,7 +216,7 @@ def velocity_in_body_axes(pose, r, t, q, v, params):
     return R.T @ jl.energy.velocity(position, t, q, v, params), size
 
 
-def test_the_particle_on_the_frame_moves_as_the_book_says():
+def test_velocity_of_the_particle_on_the_frame_agrees_with_the_book():
     """Equations 2.6 and 2.7."""
     for t, q, v, p in random_states(FRAME):
         r2 = np.array([p["x2"], p["y2"], p["z2"]])
@@ -230,7 +230,7 @@ def test_the_particle_on_the_frame_moves_as_the_book_says():
         np.testing.assert_allclose(found, origin + relative, rtol=0, atol=tolerance)
 
 
-def test_the_disk_turns_and_its_particle_moves_as_the_book_says():
+def test_rates_of_the_disk_and_its_particle_agree_with_the_book():
     """Equations 2.8 to 2.10 and 2.14."""
     for t, q, v, p in random_states(DISK):
         from_bend = np.array([p["x"], p["y"], p["z"] + p["s"]])
@@ -251,7 +251,7 @@ def test_the_disk_turns_and_its_particle_moves_as_the_book_says():
         np.testing.assert_allclose(found, size, rtol=0, atol=tolerance)
 
 
-def test_the_moment_on_the_load_is_the_closed_form():
+def test_moment_on_the_load_equals_the_closed_form():
     """m l2 [l2 theta2'' + l1 (theta1'' cos(d) + theta1'^2 sin(d))] with d = theta2 - theta1."""
     entry = ENTRIES["two_link_robot_arm"]
     for t, q, v, p in random_states(entry):

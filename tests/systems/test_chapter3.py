@@ -170,7 +170,7 @@ KINETIC = {
 @pytest.mark.parametrize(
     "name", mostly_full(KINETIC, "cart_pendulum", "spherical_pendulum_elastic", "quadcopter")
 )
-def test_T_is_the_same_by_another_route(name):
+def test_kinetic_energy_agrees_with_another_derivation(name):
     entry = ENTRIES[name]
 
     @jax.jit
@@ -194,7 +194,7 @@ POTENTIAL = {
 
 
 @pytest.mark.parametrize("name", POTENTIAL)
-def test_V_by_points_is_that_by_hand(name):
+def test_potential_by_points_equals_that_by_hand(name):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         terms = POTENTIAL[name](q, **params)
@@ -224,8 +224,8 @@ def rotor_forces(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noq
         *(b * w**2 * about_z for w in (w1, w3)),
         *(-b * w**2 * about_z for w in (w2, w4)),
     ]
-    still = np.zeros(3)
-    return [np.append(x, still) for x in forces] + [np.append(still, x) for x in torques]
+    zeros = np.zeros(3)
+    return [np.append(x, zeros) for x in forces] + [np.append(zeros, x) for x in torques]
 
 
 FORCES = {
@@ -243,7 +243,7 @@ FORCES = {
 
 
 @pytest.mark.parametrize("name", FORCES)
-def test_forces_at_points_have_the_hand_generalized_forces(name):
+def test_forces_at_points_equal_generalized_forces_by_hand(name):
     entry = ENTRIES[name]
     drives = [force.name for force in entry.system.forces if not isinstance(force, jl.Rayleigh)]
     for t, q, v, params in random_states(entry):
@@ -278,7 +278,7 @@ def sleeve_end_force(t, q, v, params):
         ("sleeve_pendulum", "drive", jl.PointForce(sleeve_end, sleeve_end_force, "end")),
     ],
 )
-def test_hand_generalized_forces_are_those_of_points(name, by_hand, by_point):
+def test_generalized_forces_by_hand_equal_those_of_points(name, by_hand, by_point):
     system = ENTRIES[name].system
     for t, q, v, params in random_states(ENTRIES[name]):
         Q = system.generalized_force(q, v, params, t=t, names=[by_hand])
@@ -313,7 +313,9 @@ def along_string(force, q, params):
         ("falling_stick", normal_force, "m", stick_center, lambda force, q, params: force[1]),
     ],
 )
-def test_reactions_are_what_mass_times_acceleration_lacks(name, reaction, mass, center, component):
+def test_reactions_equal_mass_times_acceleration_less_gravity(
+    name, reaction, mass, center, component
+):
     """m (a_G - g) of the mass center, for any accelerations."""
     rng = np.random.default_rng(3)
     for t, q, v, params in random_states(ENTRIES[name]):

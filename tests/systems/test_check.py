@@ -90,7 +90,7 @@ def replayed(entry, times):
 
 
 @pytest.mark.parametrize("name", mostly_full([*PLAIN, *KINDS], *PLAIN))
-def test_every_wrong_number_is_found(name):
+def test_every_wrong_number_is_detected(name):
     """Each number of each compared field in turn, including the first saves of derived fields."""
     entry = ENTRIES[name]
     times = np.linspace(0.0, min(2.0, getattr(entry.example, "duration", 2.0)), 6)
@@ -102,17 +102,17 @@ def test_every_wrong_number_is_found(name):
     compared = [
         path for path in places(raw) if path[2] not in ("params", "times", "error_estimate")
     ]
-    assert len(compared) == sum(rows.size for rows in motion.rows.values())
+    assert len(compared) == sum(values.size for values in motion.rows.values())
     for path in compared:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
-        row = next((key for key in path[2:] if isinstance(key, int)), 0)
-        row = 0 if entry.kind == "static" else row
+        index = next((key for key in path[2:] if isinstance(key, int)), 0)
+        index = 0 if entry.kind == "static" else index
         (case,) = read(nudged(raw, path)).cases
         outside = [deviation for deviation in compare(case, motion.rows) if not deviation.ok]
-        assert [(deviation.field, deviation.row) for deviation in outside] == [(field, row)]
+        assert [(deviation.field, deviation.row) for deviation in outside] == [(field, index)]
 
 
-def test_a_prescribed_motion_is_the_input():
+def test_prescribed_motion_of_the_file_is_the_input():
     """The forces are those of the file's q, v, a; the motion in the file must be the system's."""
     entry = ENTRIES["carnival_ride"]
     times = np.linspace(0.0, 2.0, 6)
@@ -129,7 +129,7 @@ def test_a_prescribed_motion_is_the_input():
     )
 
 
-def test_a_state_of_rest_that_is_not_found_is_a_failure(tmp_path, capsys):
+def test_missing_equilibrium_fails_the_check(tmp_path, capsys):
     """Without a spring the sleeve falls: the file cannot be right."""
     entry = ENTRIES["sleeve_pendulum_equilibrium"]
     raw = recorded(entry, None, replayed(entry, None))
@@ -165,8 +165,8 @@ def test_a_wrong_number_fails_the_command(path, tmp_path, capsys):
     is_input = path[2] in ("params", "times") or path[2:4] in (("q", 0), ("v", 0))
     if not is_input:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
-        row = next(key for key in path[2:] if isinstance(key, int))
-        assert f"in {field}, row {row}; out of tolerance: {field}\n" in out
+        index = next(key for key in path[2:] if isinstance(key, int))
+        assert f"in {field}, row {index}; out of tolerance: {field}\n" in out
 
 
 def test_other_cases_of_a_known_system_pass(tmp_path):
@@ -193,7 +193,7 @@ def test_new_numbers_do_not_compile_again():
     assert [program._cache_size() for program in compiled] == counts
 
 
-def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
+def test_failed_motion_fails_the_check(tmp_path, capsys):
     """A negative stiffness diverges: the file is right only at its start."""
     raw = harmonic()
     raw["cases"][0]["params"]["k"] = -1e9
@@ -202,10 +202,10 @@ def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
 
 
 def test_a_refused_file_does_not_hide_the_others(tmp_path, capsys):
-    bad, nameless = harmonic(), harmonic() | {"system": None}
-    bad["cases"][0]["energy"]["W"] = [0.0] * 6
+    wrong, nameless = harmonic(), harmonic() | {"system": None}
+    wrong["cases"][0]["energy"]["W"] = [0.0] * 6
     files = [
-        written(tmp_path / "bad.json", bad),
+        written(tmp_path / "bad.json", wrong),
         written(tmp_path / "right.json", harmonic()),
         str(tmp_path / "none.json"),
         written(tmp_path / "nameless.json", nameless),

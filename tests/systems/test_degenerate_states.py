@@ -111,7 +111,7 @@ def derivatives(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_derivatives_at_degenerate_states(name):
+def test_derivatives_at_degenerate_states_are_right(name):
     """Gradient and Hessian of the accelerations: both modes, and differences."""
     of = derivatives(name)
     for place, (q, v) in states(name).items():

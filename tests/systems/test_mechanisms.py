@@ -55,7 +55,7 @@ CLOSED = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", CLOSED)
-def test_the_motion_is_that_in_one_coordinate(name):
+def test_motion_equals_that_in_one_coordinate(name):
     """L of the crank alone; angle of the crank, q and v of all links, and the reactions."""
     module, chart = CLOSED[name]
     entry = module.entry
@@ -81,8 +81,8 @@ def test_the_motion_is_that_in_one_coordinate(name):
 
     a = jax.vmap(accelerations)(jnp.asarray(TIMES), alone.q, alone.v, alone.a)
     lam = np.stack([whole.lam[row] for row in entry.constraints], axis=1)
-    for row, found in enumerate(lam):
-        force = force_on_last_head(module, params, *(np.asarray(x[row]) for x in (q, v, a)))
+    for i, found in enumerate(lam):
+        force = force_on_last_head(module, params, *(np.asarray(x[i]) for x in (q, v, a)))
         np.testing.assert_allclose(found, force, rtol=0, atol=AGREEMENT * np.max(np.abs(lam)))
     if name == "slider_crank":
         size = AGREEMENT * np.max(np.abs(lam))
@@ -101,8 +101,8 @@ def force_on_last_head(module, params, q, v, a):
 def pin_force(masses, lengths, g, q, v, a):
     q, v, a = (x[: len(masses)] for x in (q, v, a))
     links = (lengths * np.array([cos(q), sin(q)])).T
-    turned = (lengths * np.array([-sin(q), cos(q)])).T
-    pulls = turned * a[:, None] - links * v[:, None] ** 2  # second derivatives of the links
+    normals = (lengths * np.array([-sin(q), cos(q)])).T
+    pulls = normals * a[:, None] - links * v[:, None] ** 2  # second derivatives of the links
     heads, accelerations = np.cumsum(links, axis=0), np.cumsum(pulls, axis=0)
     forces = masses[:, None] * (accelerations - 0.5 * pulls + [0.0, g])
     spins = masses * lengths**2 / 12 * a
@@ -156,8 +156,8 @@ def nodes(q, ends):
 
 def rods(t, q, v, params):
     """Slender rods by the rates of their ends: T = m (v1^2 + v1 . v2 + v2^2)/6 each."""
-    still = jnp.zeros((2, 2))
-    r, rate = nodes(q, still), nodes(v, still)
+    zeros = jnp.zeros((2, 2))
+    r, rate = nodes(q, zeros), nodes(v, zeros)
     T = params["m"] / 6 * jnp.sum(rate[1:] ** 2 + rate[1:] * rate[:-1] + rate[:-1] ** 2)
     return T - params["m"] * params["g"] * jnp.sum(r[:, 1])  # each rod is half at either end
 
@@ -197,7 +197,7 @@ def loop_states(count):
 
 
 @pytest.mark.full
-def test_the_loop_accelerates_as_in_cartesian_coordinates():
+def test_acceleration_of_the_loop_equals_the_cartesian_one():
     """The force on its pin is that of Newton's law for the links."""
 
     @jax.jit
@@ -217,7 +217,7 @@ def test_the_loop_accelerates_as_in_cartesian_coordinates():
 
 
 @pytest.mark.full
-def test_the_loop_hangs_as_a_catenary_of_links():
+def test_equilibrium_of_the_loop_is_a_catenary_of_links():
     """tan(theta_k) = (k - (n + 1)/2) m g/H with tension H; each pin carries half the weight."""
     guess = np.linspace(-0.9, 1.0, LINKS)
     rest = jl.equilibrium(ANGLES, guess, LOOP)
@@ -229,7 +229,7 @@ def test_the_loop_hangs_as_a_catenary_of_links():
 
 
 @pytest.mark.full
-def test_the_loop_moves_as_in_cartesian_coordinates():
+def test_motion_of_the_loop_equals_the_cartesian_one():
     (q, v), times = next(loop_states(1)), np.linspace(0.0, 2.0, 9)
     angles = jl.simulate(ANGLES, q, v, times, LOOP, **TIGHT)
     start = TO_JOINTS.state(0.0, q, v, LOOP)

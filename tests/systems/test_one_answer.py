@@ -62,7 +62,7 @@ def same_motion(entry, one, other):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
-def test_quasi_velocities_move_as_velocities_do(name):
+def test_quasi_velocities_give_the_motion_of_multipliers(name):
     """From u0 or from v0; multipliers of the omitted rows equal those of the bordered equations."""
     entry = ENTRIES[name]
     params, (q0, v0) = dict(entry.example.params), entry.start()
@@ -75,7 +75,7 @@ def test_quasi_velocities_move_as_velocities_do(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", FEW)
-def test_quasi_velocities_move_as_on_the_tangent_space(name):
+def test_quasi_velocities_give_the_motion_of_the_null_space(name):
     entry = ENTRIES[name]
     params, (q0, v0) = dict(entry.example.params), entry.start()
     by_null_space = simulate(entry, "null_space", q0, params, v0=v0)
@@ -84,7 +84,7 @@ def test_quasi_velocities_move_as_on_the_tangent_space(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", FEW)
-def test_rows_written_out_are_those_of_quasi_velocities(name):
+def test_explicit_rows_give_the_motion_of_quasi_velocities(name):
     """The same system declared without them, its constraints by `jl.Pfaffian`."""
     entry = ENTRIES[name]
     system, (q0, v0) = entry.system, entry.start()
@@ -110,7 +110,7 @@ def test_rows_written_out_are_those_of_quasi_velocities(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
-def test_derivatives_are_the_same_in_both_forms(name):
+def test_derivatives_are_equal_in_both_formulations(name):
     """Of an end quantity, by start and parameters, along starts that satisfy the constraints.
 
     A few systems in reverse mode, every component; all others in forward mode, in a random
@@ -133,8 +133,8 @@ def test_derivatives_are_the_same_in_both_forms(name):
 
     params = {key: jnp.asarray(value, float) for key, value in entry.example.params.items()}
     values = params, q0, u0
-    flat, back = ravel_pytree(values)
-    direction = back(jnp.asarray(np.random.default_rng(3).normal(size=flat.size)))
+    flat, unravel = ravel_pytree(values)
+    direction = unravel(jnp.asarray(np.random.default_rng(3).normal(size=flat.size)))
 
     def derivative(form):
         if name in FEW:

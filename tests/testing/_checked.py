@@ -60,14 +60,14 @@ def length(q, params):
     return stretched + jnp.sqrt(q[0] ** 2 + q[1] ** 2)  # wrong
 
 
-def turn(total, x):
+def scan_body(total, x):
     y = jnp.cos(x)
     return total + y * jnp.sqrt(x * x), y  # wrong
 
 
 def scanned(q, params):
-    total, rows = lax.scan(turn, jnp.zeros(()), q)
-    return total + jnp.sum(rows)
+    total, entries = lax.scan(scan_body, jnp.zeros(()), q)
+    return total + jnp.sum(entries)
 
 
 def rule_of(derivative):

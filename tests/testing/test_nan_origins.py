@@ -14,8 +14,8 @@ from _checked import (
     length,
     line_of,
     places,
+    scan_body,
     scanned,
-    turn,
 )
 from _families import mostly_full
 from jax import lax
@@ -88,7 +88,7 @@ NOT_FINITE = {
 @pytest.mark.parametrize(
     "potential", mostly_full(NOT_FINITE, *list(NOT_FINITE)[::2]), ids=lambda f: f.__name__
 )
-def test_where_a_derivative_is_born_that_is_not_finite(potential):
+def test_origin_of_a_derivative_that_is_not_finite_is_named(potential):
     """Only at zero; the operation and its line, not another of the same kind."""
     primitive, order, mode = NOT_FINITE[potential]
     report = checked(potential)
@@ -103,8 +103,8 @@ def test_where_a_derivative_is_born_that_is_not_finite(potential):
         assert finding.where in str(report)
 
 
-@pytest.mark.parametrize(("potential", "inner"), [(jitted, helper), (scanned, turn)])
-def test_inside_jitted_helpers_and_loops(potential, inner):
+@pytest.mark.parametrize(("potential", "inner"), [(jitted, helper), (scanned, scan_body)])
+def test_origins_inside_jitted_helpers_and_loops_are_named(potential, inner):
     """On the line inside; `scanned` also at "one", where its second entry is 0."""
     report = checked(potential)
     assert places(report) == here("sqrt", inner, "# wrong")
@@ -112,7 +112,7 @@ def test_inside_jitted_helpers_and_loops(potential, inner):
     assert [f.state for f in report.findings] == ["zero", "one"]
 
 
-def test_inside_choices_under_vmap():
+def test_origins_inside_choices_under_vmap_are_named():
     """Both branches are computed there, in separate programs."""
 
     def chosen(q):
@@ -143,20 +143,20 @@ def before_a_loop(q):
     return lax.scan(lambda total, x: (total + jnp.cos(x), x), start, q)[0]
 
 
-def rows_of_a_loop(q):
-    rows = jnp.log(q)  # wrong
-    return lax.scan(lambda total, x: (jnp.cos(total), total + x), 1.0, rows, reverse=True)[1]
+def entries_of_a_loop(q):
+    entries = jnp.log(q)  # wrong
+    return lax.scan(lambda total, x: (jnp.cos(total), total + x), 1.0, entries, reverse=True)[1]
 
 
-def shared_by_turns(q):
+def shared_by_iterations(q):
     shared = jnp.log(q[0])  # wrong
     return lax.fori_loop(0, 3, lambda k, x: x + shared, q[1])
 
 
 def before_an_open_loop(q):
     start = jnp.log(q[0])  # wrong
-    turns = lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 2.0), (0, start))
-    return turns[1] + q[1] / 3.0
+    result = lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 2.0), (0, start))
+    return result[1] + q[1] / 3.0
 
 
 @pytest.mark.parametrize(
@@ -165,13 +165,13 @@ def before_an_open_loop(q):
         (choosing, "log"),
         (entry_by_entry, "div"),
         (before_a_loop, "log"),
-        (rows_of_a_loop, "log"),
-        (shared_by_turns, "log"),
+        (entries_of_a_loop, "log"),
+        (shared_by_iterations, "log"),
         (before_an_open_loop, "log"),
     ],
     ids=lambda f: getattr(f, "__name__", f),
 )
-def test_followed_through_choices_and_loops(function, primitive):
+def test_origins_are_followed_through_choices_and_loops(function, primitive):
     """Back to the one operation from which the result inherits it."""
     q = jnp.array([0.0, 1.0])
     program = TracedProgram(function, q)
@@ -204,17 +204,17 @@ def test_hints_name_the_function_to_use():
 
 
 @pytest.mark.full
-def test_what_the_hints_say_helps():
-    def mended(q, params):
+def test_following_the_hints_removes_the_findings():
+    def corrected(q, params):
         x = q[0] ** 2
         safe = jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
         turned = jl.math.atan2(q[1], q[0])
         return jl.math.norm(q) + turned + jl.math.sinc(q[0]) + safe + jl.math.sqrt(x)
 
-    assert check(mended).ok
+    assert check(corrected).ok
 
 
-def test_what_is_left_out_of_the_result_is_no_finding():
+def test_masked_infinities_are_not_findings():
     """Infinite, but masked in every derivative: of `hidden` only the root is named."""
 
     def masked(q, params):
@@ -233,7 +233,7 @@ def test_choices_by_cond_stay_safe_under_vmap():
     assert check(chosen).ok
 
 
-def test_under_vmap_alone():
+def test_findings_only_under_vmap_are_named():
     @jax.custom_batching.custom_vmap
     def ratio(x):
         return lax.cond(x > 0, lambda x: jnp.sin(x) / x, lambda x: 1.0 + 0.0 * x, x)
@@ -258,7 +258,7 @@ def test_under_vmap_alone():
     assert "no reverse derivatives" in str(report)
 
 
-def test_which_arguments_it_takes():
+def test_variables_of_a_finding_are_named():
     def lagrangian(t, q, v, params):
         return v @ v + jnp.sqrt(params["c"]) + jnp.sqrt(t) + jnp.sqrt(q[0] + v[1] ** 2)
 
@@ -273,12 +273,12 @@ def test_which_arguments_it_takes():
     assert {(f.state, f.variables) for f in later.findings} == {("zero", "q or v")}
 
 
-def test_integers_are_left_alone():
+def test_integer_params_are_not_differentiated():
     report = check(lambda q, params: q[0] ** params["n"], {"k": 1.0, "n": 3})
     assert report.ok
 
 
-def test_inside_loops_without_a_fixed_number_of_turns():
+def test_origins_inside_loops_without_a_fixed_number_of_iterations():
     """Created in the fourth iteration, as the third gives 0: 1.0625^2, 0.75^2, 0.5^2, 0."""
 
     def shrink(carry):

@@ -17,8 +17,8 @@ def ruled(x, k):
     return plainly(x, k)
 
 
-def backward(kept, y):
-    x, k = kept
+def backward(residuals, y):
+    x, k = residuals
     first = jnp.cos(x[0]) * k * y[0] + x[1] ** 2 * y[1]
     return jnp.stack([first, 2 * x[0] * x[1] * y[1]]), jnp.sin(x[0]) * y[0]
 
@@ -74,7 +74,7 @@ def test_motions_have_forward_derivatives(method):
     np.testing.assert_allclose(ended(ruled, method), ended(plainly, method), rtol=0, atol=1e-12)
 
 
-def test_the_rule_counts_and_not_the_body():
+def test_derivatives_follow_the_rule_not_the_body():
     """In forward and reverse derivatives; here the rule gives twice the derivative of the body."""
 
     @jax.custom_vjp

@@ -249,7 +249,7 @@ class _Rule(Enum):
         return _RULES["k"]
 
 
-class _Row(NamedTuple):
+class _Pair(NamedTuple):
     x: float = 1.0
 
     def stiffness(self):
@@ -292,7 +292,7 @@ def _global_by_its_name():
 
 OUTSIDE = [
     partial(_method_of, _Rule.LINEAR),
-    partial(_method_of, _Row()),
+    partial(_method_of, _Pair()),
     partial(_method_of, _Word("a")),
     _own_attribute,
     _global_by_its_name,
@@ -321,7 +321,7 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize("declared", OUTSIDE)
-def test_what_changes_outside_is_named_and_changes_nothing(declared):
+def test_changed_free_variables_are_named_and_have_no_effect(declared):
     lagrangian, change, name = declared()
     system = jl.System(lagrangian, ("x",))
     at = [0.0], [0.0], {}

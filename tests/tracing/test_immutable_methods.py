@@ -25,7 +25,7 @@ from jaxlag._tracing._traced_function import traced_function
 
 TABLE = {"k": 2.0}
 STIFFNESS = 2.0
-ROW = (1.0, 2.0)
+NUMBERS = (1.0, 2.0)
 LOG = logging.getLogger(__name__)
 
 
@@ -52,7 +52,7 @@ class PairOfFields(NamedTuple):
     x: float = 1.0
 
     def k(self):
-        return self.x * ROW[0]
+        return self.x * NUMBERS[0]
 
 
 class Plain:
@@ -285,7 +285,7 @@ class Named(Module):
 
     def __call__(self, x):
         LOG.info("called")
-        return self.k * ROW[0] * jnp.sin(x)
+        return self.k * NUMBERS[0] * jnp.sin(x)
 
     def plot(self):
         from matplotlib import pyplot
@@ -301,7 +301,7 @@ class Frozen:
         object.__setattr__(self, "double", 2.0)
 
     def law(self):
-        return ROW[1]
+        return NUMBERS[1]
 
 
 @dataclass(frozen=True)
@@ -442,7 +442,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_can_change_in_place_is_refused_at_once(name):
+def test_mutable_values_are_refused_at_once(name):
     leaf, message = REFUSED[name]
     for _ in range(2):
         with pytest.raises(ValueError, match=rf"^`params\['a'\].*` must be .*{message}"):
@@ -450,7 +450,7 @@ def test_what_can_change_in_place_is_refused_at_once(name):
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_what_cannot_change_is_accepted(name):
+def test_immutable_values_are_accepted(name):
     for _ in range(2):
         check_keys({"a": FIXED[name]})
     if name == "counting":
@@ -459,7 +459,7 @@ def test_what_cannot_change_is_accepted(name):
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_a_number_is_refused_when_it_has_changed(name, monkeypatch):
+def test_numbers_are_refused_after_a_change(name, monkeypatch):
     leaf, place, message = CHANGED[name]
     for _ in range(2):
         check_keys({"a": leaf})
@@ -472,7 +472,7 @@ def test_a_number_is_refused_when_it_has_changed(name, monkeypatch):
         check_keys({"a": leaf})
 
 
-def test_a_motion_is_never_of_a_former_number(monkeypatch):
+def test_programs_never_use_a_former_number(monkeypatch):
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["x"].k * q[0], ("x",))
     params = {"x": PairOfNumber()}
     assert system.acceleration([0.0], [0.0], params) == -2.0

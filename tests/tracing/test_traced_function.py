@@ -27,7 +27,7 @@ def changed(name, before, now):
     return pytest.warns(UserWarning, match=f"^{name}, which .* was {before} .* and is {now} now")
 
 
-def test_a_global_holds_as_it_was_when_it_was_traced(monkeypatch):
+def test_globals_keep_their_value_at_tracing(monkeypatch):
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v - GRAVITY * q[0]
 
@@ -45,7 +45,7 @@ def test_a_global_holds_as_it_was_when_it_was_traced(monkeypatch):
     assert acceleration == -2.0
 
 
-def test_a_function_defined_anew_reads_anew(monkeypatch):
+def test_redefined_functions_read_current_values(monkeypatch):
     def declare():
         return jl.System(lambda t, q, v, params: 0.5 * v @ v - GRAVITY * q[0], ("x",))
 
@@ -83,7 +83,7 @@ def test_forces_constraints_and_quasi_velocities_are_traced_once():
         np.testing.assert_array_equal(numbers(), before)
 
 
-def test_nothing_is_said_of_what_stays():
+def test_unchanged_free_variables_give_no_warning():
     k, table = np.array([2.0]), {"a": [1.0, np.nan]}
 
     def lagrangian(t, q, v, params):
@@ -97,7 +97,7 @@ def test_nothing_is_said_of_what_stays():
             k = k.copy()  # another array of the same numbers
 
 
-def test_the_function_is_called_once_for_each_kind_of_arguments():
+def test_functions_are_traced_once_per_kind_of_arguments():
     calls = 0
 
     def lagrangian(t, q, v, params):
@@ -118,7 +118,7 @@ def test_the_function_is_called_once_for_each_kind_of_arguments():
     assert calls == 3
 
 
-def test_a_function_of_a_system_is_taken_as_it_is():
+def test_lagrangian_of_a_system_is_reused_unchanged():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",))
     again = jl.System(system.lagrangian, ("x",))
     assert again == system
@@ -132,7 +132,7 @@ def _module_level(t, q, v, params):
     return 0.5 * v @ v
 
 
-def test_an_object_keeps_its_attributes_to_itself():
+def test_attributes_of_callables_do_not_clash():
     """Of any name: the wrapper does not take them for its own."""
 
     class Spring:
@@ -159,7 +159,7 @@ def test_a_system_of_named_functions_is_pickled():
     assert pickle.loads(pickle.dumps(system)) == system
 
 
-def test_params_that_have_no_hash_are_params_still():
+def test_unhashable_params_work_for_energies():
     """They key no compiled program; energies need none."""
     system = jl.System(lambda t, q, v, p: 0.5 * len(p["names"]) * v @ v, ("x",))
     assert system.energy([0.0], [1.0], {"names": {"a", "b"}}) == 1.0
@@ -180,7 +180,7 @@ def test_an_input_is_traced_once():
         np.testing.assert_array_equal(forces(TS[:2]), before[:2])
 
 
-def test_constants_are_owned_and_what_has_none_is_shared():
+def test_programs_copy_constants_and_share_the_rest():
     k = np.array([1.0, 2.0])
 
     @jax.jit
@@ -223,15 +223,15 @@ def test_the_third_int_of_one_leaf_is_warned_about():
         for m, on in ((1, True), (2, False), (1.0, True), (2.0, True), (3.0, True), (2, True)):
             of(m, on=on)
     message = r"^params\['m'\] of .*stiff.* is the Python int 3"
-    with pytest.warns(UserWarning, match=message) as said:
+    with pytest.warns(UserWarning, match=message) as warned:
         of(3)
-    assert "Write 3.0 where it is a number" in str(said[0].message)
+    assert "Write 3.0 where it is a number" in str(warned[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         of(4)  # no second warning
 
 
-def test_a_function_made_in_a_loop_is_told_once(caplog):
+def test_functions_defined_in_a_loop_are_logged_once(caplog):
     def made(k):
         return traced_function(lambda t: k * t)
 

@@ -72,14 +72,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_a_common_fault_is_named(kind):
+def test_common_mistakes_are_named(kind):
     make, message = WRONG[kind]
     with pytest.raises(ValueError, match=message) as caught:
         make()
     assert caught.value.__cause__ is not None  # the original error stays visible
 
 
-def test_other_faults_are_left_as_they_are():
+def test_other_errors_are_unchanged():
     """Errors raised by the user, and errors other than missing keys."""
 
     def own(t, q, v, params):
@@ -91,7 +91,7 @@ def test_other_faults_are_left_as_they_are():
     assert translate(good, [0.0, [1.0], [0.0], PARAMS], TypeError("other")) is None
 
 
-def test_derivatives_say_the_same():
+def test_derivatives_give_the_same_message():
     """The message does not mention tracers."""
 
     def end(m):
