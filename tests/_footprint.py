@@ -1,8 +1,8 @@
-"""What a test process holds: memory maps and memory, their peaks reported and bounded.
+"""Memory maps and memory of each test process: peaks are reported and bounded.
 
-Every compiled program keeps memory maps. Linux gives a process some 65,000 of them, and one that
-runs out dies in whatever test comes next. So each process counts its own after every test, the
-summary names the peaks, and a run beyond the bounds fails.
+Every compiled program holds memory maps. Linux allows a process some 65,000 of them; beyond, the
+process dies in the next test. Each process therefore counts its maps after every test. The summary
+names the peaks, and a run beyond the bounds fails.
 """
 
 import resource
@@ -11,21 +11,21 @@ from pathlib import Path
 
 import pytest
 
-MAPS = 20_000  # a third of what Linux gives
+MAPS = 20_000  # a third of the limit of Linux
 BYTES = 4e9
 UNIT = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, bytes
 
 
 def maps():
-    """Number of memory maps of this process; 0 where the system does not tell."""
+    """Number of memory maps of this process; 0 if the system does not report it."""
     try:
         return Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:
         return 0
 
 
-def held():
-    """Memory of this process now, bytes; 0 where the system does not tell."""
+def resident_bytes():
+    """Current memory of this process, bytes; 0 if the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except OSError:
@@ -33,7 +33,7 @@ def held():
 
 
 class Footprint:
-    """Counts in every process of a run; the one that the workers report to sums up."""
+    """Counts in every process of a run; the main process collects the counts of the workers."""
 
     def __init__(self, most_maps=MAPS, most_bytes=BYTES):
         self.bounds = most_maps, most_bytes
@@ -41,16 +41,16 @@ class Footprint:
         self.reports = {}
 
     def pytest_runtest_logreport(self, report):
-        """Before teardown, since after the last test of a module its programs are gone.
+        """Count before teardown: after the last test of a module its programs are dropped.
 
-        A process that hands its tests to workers hears of theirs, too: its own count is low.
+        The main process of several workers receives their reports, too: its own count is low.
         """
         if report.when == "call" and (count := maps()) > self.most:
             self.most, self.after = count, report.nodeid
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node):
-        """Of a worker that crashed nothing is known; the run has failed then."""
+        """A crashed worker has no report; the run has failed then."""
         if footprint := getattr(node, "workeroutput", {}).get("footprint"):
             self.reports[node.gateway.id] = footprint
 

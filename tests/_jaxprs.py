@@ -1,4 +1,4 @@
-"""Programs read as jaxprs: which operations they do, how often, and on arrays of which size."""
+"""Programs as jaxprs: their operations, how often these are executed, and sizes of arrays."""
 
 import math
 from typing import NamedTuple
@@ -18,12 +18,12 @@ class Operation(NamedTuple):
     inside: tuple[str, ...]
 
 
-def operations(function, *args, turns=None):
-    """Every operation that one call of `function` executes, those of nested programs included.
+def operations(function, *args, iterations=None):
+    """Every operation that one call of `function` executes, including those of nested programs.
 
-    A while loop has no number of turns to count: `turns` says how many to assume.
+    A while loop has no known number of iterations: `iterations` is assumed.
     """
-    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), turns))
+    return list(_walk(jax.make_jaxpr(function)(*args).jaxpr, 1, (), iterations))
 
 
 def names(program):
@@ -45,7 +45,7 @@ def largest(program):
     return max(math.prod(shape) for operation in program for shape in operation.shapes)
 
 
-def _walk(jaxpr, times, inside, turns):
+def _walk(jaxpr, times, inside, iterations):
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         shapes = tuple(getattr(v.aval, "shape", ()) for v in eqn.outvars)
@@ -55,19 +55,19 @@ def _walk(jaxpr, times, inside, turns):
         yield Operation(name, shapes, times, inside)
         repeats = eqn.params["length"] if name == "scan" else 1
         if name == "while":
-            assert turns is not None, "a while loop has no number of turns to count"
-            repeats = turns
+            assert iterations is not None, "a while loop has no known number of iterations"
+            repeats = iterations
         for inner in _executed(name, eqn):
-            yield from _walk(inner, times * repeats, (*inside, name), turns)
+            yield from _walk(inner, times * repeats, (*inside, name), iterations)
 
 
 def _executed(name, eqn):
     params = eqn.params
-    if name == "linear_map":  # holds its programs as functions
+    if name == "linear_map":  # its programs are functions
         form, count = params["form"], params["count"]
         like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
         return [jax.make_jaxpr(form.forward)(like[:count], like[count:]).jaxpr]
-    if name == "custom_linear_solve":  # its products and its transpose serve derivatives only
+    if name == "custom_linear_solve":  # its product and its transpose are for derivatives only
         return [params["jaxprs"].solve.jaxpr]
     found = [leaf for value in params.values() for leaf in _leaves(value)]
     return [leaf.jaxpr if isinstance(leaf, ClosedJaxpr) else leaf for leaf in found]

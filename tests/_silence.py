@@ -1,4 +1,4 @@
-"""Tests of what is not warned about."""
+"""Check that code gives no warning."""
 
 import warnings
 from contextlib import contextmanager
@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_warning():
-    """Warnings are errors, but JAX's of a kept program that another process is just writing."""
+    """Warnings are errors, except JAX's about a cached program that another process is writing."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="Error reading persistent compilation cache")

@@ -1,4 +1,4 @@
-"""The package as its users run it: jaxtyping's checks, on in the tests, are off for them."""
+"""The package as users run it: jaxtyping's checks are on in the tests and off for users."""
 
 import jaxtyping
 import pytest
@@ -6,7 +6,7 @@ import pytest
 
 @pytest.fixture
 def unchecked():
-    """Switches the run-time type checks off, for arguments whose type is wrong on purpose."""
+    """Switch off run-time type checks, for arguments of an intentionally wrong type."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,7 +1,7 @@
 """Every test runs in float64 with strict dtype promotion; warnings of the project are errors.
 
-Compiling is what the tests cost. A module shares its programs, they are dropped after it, and what
-was compiled is kept on disk for the next run.
+Most of the time of the tests is compilation. Tests of a module share compiled programs, which are
+dropped after the module. A cache on disk keeps them for the next run.
 """
 
 import ctypes
@@ -10,9 +10,9 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
-# Half of the time of compiling goes to XLA's emitters of fusions, which run a pipeline of passes
-# for each, and an eighth to what LLVM does to loops; without both the arithmetic is the same. XLA
-# reads this once, before the first compilation; from jax 0.12 on there is no choice.
+# XLA's emitters of fusions take half of the compile time: they run a pipeline of passes for each
+# fusion. LLVM's passes on loops take an eighth. The arithmetic is the same without both. XLA reads
+# this once, before the first compilation; jax 0.12 and later have no such option.
 if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
     flags = os.environ.get("XLA_FLAGS", "")
     flags += " --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
@@ -20,16 +20,16 @@ if tuple(map(int, version("jax").split(".")[:2])) < (0, 12):
 
 import jax
 import pytest
-from _footprint import BYTES, MAPS, Footprint, held, maps
+from _footprint import BYTES, MAPS, Footprint, maps, resident_bytes
 
 import jaxlag as jl  # before the first compilation: it sets XLA's bound on small loops
 from jaxlag._lowering import ArrayProgram
 
-# Traced programs are many small objects that live long: looking through them for cycles after every
-# 700 new ones takes 3 % of the time.
+# A traced program consists of many long-lived objects. Searching them for cycles after every 700
+# new ones takes 3 % of the time.
 gc.set_threshold(200_000, 20, 100)
 
-# Here and, by the environment, in the processes that tests start.
+# For this process and, through the environment, for processes that tests start.
 caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 for setting, value in {
     "jax_compilation_cache_dir": str(caches / "jaxlag-tests"),
@@ -42,16 +42,16 @@ for setting, value in {
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Tests that run under both lowerings, by module. That both give the same accelerations and
-# derivatives is tested for every system in test_scalar_program.
+# Tests that run under both lowerings, by module. test_scalar_program compares accelerations and
+# derivatives of both for every system.
 BOTH = {
     "test_batch": {"test_lanes_equal_single_runs"},
     "test_gradients": {"test_forward_equals_reverse_under_both_lowerings"},
-    "test_batching": {"test_chunks_are_what_is_compiled"},
+    "test_batching": {"test_compiled_program_loops_over_chunks"},
     "test_both": {
         "test_accelerations_are_compiled_from_the_lowering_in_use",
         "test_solves_are_compiled_from_the_lowering_in_use",
-        "test_only_systems_left_at_auto_follow",
+        "test_only_systems_at_auto_follow_the_lowering",
     },
     "test_simulate": {"test_small_oscillation_has_its_closed_form", "test_array_coordinates"},
 }
@@ -67,11 +67,11 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("lowering", ["auto", "array"], indirect=True, scope="module")
 
 
-trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's: memory freed goes back
+trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc: return freed memory to the system
 
 
 def drop():
-    """Let go of everything compiled."""
+    """Drop all compiled programs."""
     jax.clear_caches()
     gc.collect()
     if trim is not None:
@@ -80,19 +80,19 @@ def drop():
 
 @pytest.fixture(autouse=True)
 def bounded():
-    """A module of many programs lets go of them on the way, half the bounds of the guard left."""
+    """Drop compiled programs within a module at half the bounds of `Footprint`."""
     yield
-    if maps() > MAPS / 2 or held() > BYTES / 2:
+    if maps() > MAPS / 2 or resident_bytes() > BYTES / 2:
         drop()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def lowering(request):
-    """The lowering that systems left at "auto" get: "auto", or "array" where a test asks for both.
+    """The lowering of systems at "auto": "auto", or "array" for tests that run under both.
 
-    A system is equal to itself under both, so nothing compiled may be carried over from one to
-    the other. The caches of jaxlag hold structure and scalar programs, which do not depend on
-    the lowering in use; fixtures that hold results ask for this one, so as to be made anew.
+    A system is equal to itself under both, so compiled programs must not carry over from one to the
+    other. jaxlag's caches hold structure and scalar programs, which do not depend on the lowering
+    in use. Fixtures that hold results depend on this one, so that they are computed for each.
     """
     wanted = getattr(request, "param", "auto")
     with pytest.MonkeyPatch.context() as patch:

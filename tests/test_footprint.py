@@ -1,4 +1,4 @@
-"""The bounds on memory maps and memory: a run beyond them fails and says where, others do not."""
+"""Runs beyond the bounds on memory maps and memory fail and name the test; others pass."""
 
 import os
 import re
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from _footprint import held
+from _footprint import resident_bytes
 
 CONFTEST = """
 from _footprint import Footprint
@@ -27,15 +27,15 @@ def test_few():
 
 
 @pytest.fixture(scope="module")
-def kept():
-    kept = []
-    yield kept
-    for each in kept:
-        each.close()
+def mappings():
+    mappings = []
+    yield mappings
+    for mapping in mappings:
+        mapping.close()
 
 
-def test_many(kept):
-    kept += [mmap.mmap(-1, mmap.PAGESIZE) for _ in range(3000)]
+def test_many(mappings):
+    mappings += [mmap.mmap(-1, mmap.PAGESIZE) for _ in range(3000)]
 """
 
 
@@ -51,7 +51,7 @@ def run(folder, workers, maps=20_000, size=4e9):
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="maps are not told here")
 @pytest.mark.parametrize("workers", [0, 2])
-def test_too_many_maps_fail_the_run_and_name_the_test(tmp_path, workers):
+def test_run_with_too_many_maps_fails_and_names_the_test(tmp_path, workers):
     status, output = run(tmp_path, workers, maps=2500)
     assert status == 1
     assert "2 passed" in output
@@ -59,7 +59,7 @@ def test_too_many_maps_fail_the_run_and_name_the_test(tmp_path, workers):
     assert re.search(r"3\d\d\d memory maps \(bound 2500, most after .*::test_many\)", line)
 
 
-def test_too_much_memory_fails_the_run(tmp_path):
+def test_run_with_too_much_memory_fails(tmp_path):
     status, output = run(tmp_path, 1, size=1e6)
     assert status == 1
     assert "GB (bound 0.0)  TOO MUCH" in output
@@ -73,10 +73,10 @@ def test_every_worker_reports_and_a_run_within_the_bounds_passes(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is not told here")
-def test_memory_is_that_of_now():
-    before = held()
+def test_memory_is_current():
+    before = resident_bytes()
     block = b"x" * (64 << 20)
-    full = held()
+    full = resident_bytes()
     assert 60e6 < full - before < 80e6
     del block
-    assert held() < full - 60e6
+    assert resident_bytes() < full - 60e6

@@ -1,6 +1,6 @@
-"""Which package may import which, by the syntax tree: late imports and those for types count, too.
+"""Which package may import which, by the syntax tree: includes late imports and those for types.
 
-One way: model -> lowering -> system -> integration -> gradient -> simulation -> fit.
+The order is model -> lowering -> system -> integration -> gradient -> simulation -> fit.
 """
 
 import ast
@@ -15,10 +15,10 @@ ROOT = Path(jaxlag.__file__).parent
 REPO = Path(__file__).parents[1]
 FILES = sorted(ROOT.rglob("*.py"))
 MOST = 20
-"""Source files in a folder."""
+"""Largest number of source files in a folder."""
 FOLDERS = sorted(
     {path.parent for top in ("jaxlag", "bench", "systems") for path in (REPO / top).rglob("*.py")}
-    - {REPO / "systems" / "catalogue" / "chapter3"}  # 35 systems, each to be read by itself
+    - {REPO / "systems" / "catalogue" / "chapter3"}  # 35 independent systems
 )
 
 _BASE = ("_core", "_linalg", "_tracing", "_model")
@@ -56,7 +56,7 @@ WITHIN_LOWERING = {
 
 
 def name(path: Path) -> str:
-    """As it is imported."""
+    """The module name in imports."""
     parts = ("jaxlag", *path.relative_to(ROOT).with_suffix("").parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -78,30 +78,30 @@ def imported(path: Path) -> list[tuple[int, str]]:
     return found
 
 
-def test_every_package_has_its_place():
+def test_every_package_has_allowed_imports():
     assert {module.split(".")[1] for module in MODULES if "." in module} == set(ALLOWED)
 
 
 @pytest.mark.parametrize("module", sorted(MODULES.keys() - {"jaxlag"}))
-def test_a_module_imports_only_what_lies_below(module):
+def test_modules_import_only_lower_packages(module):
     package, *inner = module.split(".")[1:]
     for line, other in imported(MODULES[module]):
         at = f"{MODULES[module]}:{line} imports {other}"
         assert other != "jaxlag", f"{at}, which is for users"
-        there, *part = other.split(".")[1:]
-        assert there == package or there in ALLOWED[package], at
-        if there == package == "_lowering" and inner and inner[0] in WITHIN_LOWERING:
+        target, *part = other.split(".")[1:]
+        assert target == package or target in ALLOWED[package], at
+        if target == package == "_lowering" and inner and inner[0] in WITHIN_LOWERING:
             assert part, at
             assert part[0] == inner[0] or part[0] in WITHIN_LOWERING[inner[0]], at
 
 
-def test_no_two_modules_need_one_another():
-    """A facade stands above what it gathers, and what it gathers does not import it."""
+def test_imports_have_no_cycle():
+    """A facade imports its modules; they do not import it."""
     needs = {module: {other for _, other in imported(path)} for module, path in MODULES.items()}
     assert len(list(TopologicalSorter(needs).static_order())) == len(MODULES)
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=str)
-def test_a_folder_can_be_read_at_once(folder):
+def test_folders_have_few_source_files(folder):
     files = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
     assert len(files) <= MOST

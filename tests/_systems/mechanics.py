@@ -1,4 +1,4 @@
-"""Systems declared for the tests: where the ten of the book stop, and chains of any length."""
+"""Systems for the tests beyond those of the book, and chains of any length."""
 
 from functools import cache
 from typing import NamedTuple
@@ -57,7 +57,7 @@ def relativistic(t, q, v, params):
 
 
 def rotating_bead(t, q, v, params):
-    """Bead on the wire y = s^2/2, turned at Omega, its mass growing: M depends on t and q."""
+    """Bead on the wire y = s^2/2 that rotates at Omega; its mass grows: M depends on t and q."""
     m = params["m"] * (1 + 0.1 * t)
     s, s_rate = q[0], v[0]
     x, y = s, 0.5 * s**2

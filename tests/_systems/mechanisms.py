@@ -1,4 +1,4 @@
-"""Mechanisms with constraints that several tests share, with what is known of them."""
+"""Mechanisms with constraints and consistent starts that several tests share."""
 
 from typing import Any, NamedTuple
 
@@ -77,7 +77,7 @@ def links(t, q, v, params):
 
 
 def closure(t, q, params):
-    """Where the head of the last link is, from the other pivot (d, 0)."""
+    """Position of the head of the last link relative to the other pivot (d, 0)."""
     lengths = jnp.stack([params["a"], params["b"], params["c"]])
     return jnp.stack([lengths @ jnp.cos(q) - params["d"], lengths @ jnp.sin(q)])
 
@@ -129,7 +129,7 @@ def slider_start(crank, rate, params=SLIDER):
     return jnp.array([crank, rod, x]), jnp.array([rate, rod_rate, x_rate])
 
 
-# ---- A knife edge on a plane: not integrable -----------------------------------------------------
+# ---- A knife edge on a plane: nonholonomic -------------------------------------------------------
 
 
 def skate_lagrangian(t, q, v, params):
@@ -144,7 +144,7 @@ skate = jl.System(skate_lagrangian, ("x", "y", "theta"), constraints=(jl.Pfaffia
 SKATE = {"m": 1.5, "I": 0.2}
 
 
-# ---- A pendulum whose pin is led along the x axis: rheonomic -------------------------------------
+# ---- A pendulum whose pivot has a prescribed motion along the x axis: rheonomic ------------------
 
 
 def led(t, q, params):

@@ -1,4 +1,4 @@
-"""Systems in quasi-velocities: one with everything, a body in angles, a sleigh."""
+"""Systems in quasi-velocities: one with all terms, a body in angles, a sleigh."""
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,13 @@ def skewed(t, q, v, params):
 
 
 def in_v(t, q, v, params):
-    """L of (t, q, v): inertia that turns, terms linear in v, a potential, explicit time."""
+    """L of (t, q, v): M(t, q), terms linear in v, a potential, explicit time."""
     M = jnp.diag(params["m"]) + 0.2 * jnp.outer(jnp.cos(q), jnp.cos(q)) * (1.0 + 0.1 * t)
     return 0.5 * v @ M @ v + jnp.sin(q[0] + t) * v[1] - 0.5 * params["w"] * (q @ q)
 
 
 def in_u(t, q, u, params):
-    """L of (t, q, u), the same that `in_v` is where u = U(t, q, v)."""
+    """L of (t, q, u), equal to `in_v` for u = U(t, q, v)."""
     theta = jax.jacfwd(lambda v: skewed(t, q, v, params))(jnp.zeros(3))
     theta_0 = skewed(t, q, jnp.zeros(3), params)
     return in_v(t, q, jnp.linalg.solve(theta, u - theta_0), params)
@@ -84,7 +84,7 @@ def angles(**options):
     return jl.System(spinning, ("psi", "theta", "phi"), quasi=quasi, written_in="u", **options)
 
 
-# ---- A sleigh by tall kinematics and by square ones ----------------------------------------------
+# ---- A sleigh in tall and in square quasi-velocities ---------------------------------------------
 
 
 def sleigh_rates(t, q, u, params):

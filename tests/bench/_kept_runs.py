@@ -1,4 +1,4 @@
-"""What a kept run of a benchmark holds."""
+"""Fields of a stored run of a benchmark."""
 
 from bench._harness import results
 

@@ -1,4 +1,4 @@
-"""The benchmarks measure finished work, keep what they found, and judge it."""
+"""The benchmarks measure finished work, store their results and judge them."""
 
 import io
 import json
@@ -18,7 +18,7 @@ from systems.catalogue.chapter3.double_pendulum import system
 
 
 class Clock:
-    """A clock that stands still but for the work that is waited for."""
+    """A clock that only waiting for work advances."""
 
     def __init__(self, monkeypatch):
         self.now = 0.0
@@ -29,7 +29,7 @@ class Clock:
 
 
 class Pending:
-    """An output that takes time, but only of those who wait for it."""
+    """An output that takes time only if it is waited for."""
 
     def __init__(self, clock, seconds):
         self.clock, self.seconds = clock, seconds
@@ -48,12 +48,12 @@ def test_the_timer_waits_for_every_output(clock):
     assert timing.seconds(lambda: {"q": clock.pending(5.0), "v": [clock.pending(2.0)]}) == 7.0
 
 
-def test_the_timer_sees_nothing_of_outputs_not_waited_for(clock, monkeypatch):
+def test_timer_misses_outputs_that_are_not_waited_for(clock, monkeypatch):
     monkeypatch.setattr(jax, "block_until_ready", lambda x: x)
     assert timing.seconds(lambda: clock.pending(5.0)) == 0.0
 
 
-def test_a_program_known_to_be_slow_takes_long():
+def test_timer_measures_a_slow_program():
     runs = []
 
     def sleep(x):
@@ -65,12 +65,12 @@ def test_a_program_known_to_be_slow_takes_long():
         return jax.pure_callback(sleep, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
     program = timing.build(slow, jnp.zeros(()))
-    assert not runs  # compilation is measured apart
+    assert not runs  # compilation is measured separately
     assert timing.seconds(lambda: program.call(jnp.zeros(()))) >= 0.2
     assert len(runs) == 1
 
 
-def test_calls_take_turns_after_one_to_warm_up(clock):
+def test_calls_are_interleaved_after_a_warm_up(clock):
     order = []
     calls = {name: lambda name=name: order.append(name) or clock.pending(1.0) for name in "ab"}
     samples = timing.interleaved(calls, rounds=2)
@@ -78,14 +78,14 @@ def test_calls_take_turns_after_one_to_warm_up(clock):
     assert samples == {"a": [1.0] * 6, "b": [1.0] * 6}
 
 
-def test_a_call_over_its_budget_sits_out(clock):
+def test_call_over_its_budget_is_skipped(clock):
     calls = {"slow": lambda: clock.pending(9.0), "fast": lambda: clock.pending(0.1)}
     samples = timing.interleaved(calls, rounds=6, budget_s=2.0)
     assert len(samples["slow"]) == RUNS_PER_ROUND
     assert len(samples["fast"]) == 6 * RUNS_PER_ROUND
 
 
-def test_times_are_per_lane_in_the_unit_named():
+def test_times_are_per_lane_in_the_given_unit():
     columns = timing.spread([3e-3, 1e-3, 2e-3], "us", lanes=10)
     assert columns["repeats"] == 3
     assert math.isclose(columns["min_us"], 100.0)
@@ -112,7 +112,7 @@ def report(figure=12.0):
     return Report([{"case": "a", "min_ms": 0.123456789}], [target], [Reference("1 ms", "peer")])
 
 
-def test_results_hold_all_fields(tmp_path):
+def test_results_have_all_fields(tmp_path):
     path = results.save("solve", "Headline.", report(), results.circumstances(), False, tmp_path)
     assert path == tmp_path / "solve.json"
     content = json.loads(path.read_text())
@@ -124,7 +124,7 @@ def test_results_hold_all_fields(tmp_path):
     assert run["versions"]["jax"] == jax.__version__
 
 
-def test_a_run_replaces_the_last_on_its_jax_and_keeps_the_others(tmp_path):
+def test_run_replaces_only_the_last_one_of_its_jax_version(tmp_path):
     def save(jax_version, quick=False):
         circumstances = {**results.circumstances(), "versions": {"jax": jax_version}}
         return results.save("solve", "Headline.", report(), circumstances, quick, tmp_path)
@@ -146,14 +146,14 @@ def test_a_missed_target_makes_the_exit_status_1(
     assert f"target {verdict:<6}  {figure:g} >= 10" in capsys.readouterr().out
 
 
-def test_an_unknown_name_is_answered_with_the_nearest(capsys):
+def test_unknown_name_gets_the_nearest_known_one(capsys):
     assert command.main(["gradeint"]) == 2
     assert "'gradeint'. Did you mean gradient?" in capsys.readouterr().err
     assert command.main(["xyz"]) == 2
     assert f"Known: {', '.join(BENCHMARKS)}." in capsys.readouterr().err
 
 
-def test_the_list_names_every_benchmark_and_what_it_measures(capsys):
+def test_list_names_and_describes_every_benchmark(capsys):
     assert command.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(BENCHMARKS)
@@ -161,7 +161,7 @@ def test_the_list_names_every_benchmark_and_what_it_measures(capsys):
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
-def test_results_of_full_runs_are_kept(name):
+def test_results_of_full_runs_are_stored(name):
     content = json.loads((results.FOLDER / f"{name}.json").read_text())
     assert content["benchmark"] == name
     for run in content["runs"]:
@@ -169,7 +169,7 @@ def test_results_of_full_runs_are_kept(name):
         assert not run["quick"]
 
 
-def test_workers_start_under_their_own_settings_alone(monkeypatch):
+def test_workers_start_with_their_own_settings_only(monkeypatch):
     started = []
 
     class Process:
@@ -192,11 +192,11 @@ def test_workers_start_under_their_own_settings_alone(monkeypatch):
 
 
 @pytest.mark.parametrize("field", [pendulum.by_hand, pendulum.naive])
-def test_all_equations_compared_are_those_of_the_system(field):
+def test_compared_equations_equal_those_of_the_system(field):
     y = jnp.array([0.7, -1.1, 0.4, 1.3])
     params = {name: value * (1.0 + 0.1 * i) for i, (name, value) in enumerate(params_of_bench())}
     expected = jnp.concatenate([y[2:], system.acceleration(y[:2], y[2:], params)])
-    # Round-off of an acceleration of about 10 rad/s^2 through a 2 x 2 solve.
+    # Rounding of an acceleration of about 10 rad/s^2 by a 2 x 2 solve.
     assert jnp.max(jnp.abs(field(0.0, y, params) - expected)) < 1e-13
 
 

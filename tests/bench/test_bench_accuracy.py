@@ -19,7 +19,7 @@ FILES = accuracy.MOVING
 
 
 def errors(saves, *, kappa=100.0, steps=100, size=1e4, ends=None, estimates=None):
-    """Errors at made-up rows; the floor is 10 eps kappa sqrt(steps) size, 2.2e-8 by default."""
+    """Errors at made-up saves; the floor is 10 eps kappa sqrt(steps) size, 2.2e-8 by default."""
     saves = np.array(saves, float)
     return Errors(
         saves=saves,
@@ -49,14 +49,14 @@ def test_the_upper_bound_is_ten_kappa(largest, verdict):
         assert row["of_bound"] == math.inf
 
 
-def test_the_upper_bound_has_the_floor_of_round_off():
+def test_upper_bound_has_the_floor_of_rounding():
     floor = 10 * EPS * 100 * 10 * 1e13
     assert judged(errors([1000 + 0.99 * floor], size=1e13))["upper"] == "within"
     assert judged(errors([1000 + 1.01 * floor], size=1e13))["upper"] == "beyond"
     assert math.isclose(judged(errors([1.0], size=1e13))["floor"], floor)
 
 
-def test_the_bound_holds_at_every_time_with_its_own_kappa():
+def test_bound_uses_the_kappa_of_each_time():
     found = errors([50.0, 50.0])._replace(kappa=np.array([1.0, 100.0]))
     assert judged(found)["upper"] == "beyond"
     assert judged(found._replace(kappa=np.array([100.0, 100.0])))["upper"] == "within"
@@ -72,7 +72,7 @@ def test_the_bound_holds_at_every_time_with_its_own_kappa():
         (1e-9, 19, "floor"),
     ],
 )
-def test_the_lower_bound(largest, steps, verdict):
+def test_lower_bound_depends_on_error_steps_and_floor(largest, steps, verdict):
     assert judged(errors([1e-10, largest], steps=steps))["lower"] == verdict
 
 
@@ -87,10 +87,10 @@ def test_motions_that_never_leave_the_floor_are_exact():
 
 def test_errors_at_saves_are_compared_with_those_at_step_ends():
     assert judged(errors([2.0, 6.0], ends=[4.0, 1.0]))["saves_to_ends"] == 1.5
-    assert judged(errors([1e-9], ends=[1e-10]))["saves_to_ends"] is None  # round-off alone
+    assert judged(errors([1e-9], ends=[1e-10]))["saves_to_ends"] is None  # only rounding
 
 
-def test_estimates_are_compared_at_every_row_above_round_off():
+def test_estimates_are_compared_at_every_save_above_rounding():
     found = judged(errors([1e-12, 1.0, 2.0, 1.5], estimates=[5.0, 0.5, 4.0, 4.5]))
     figures = [found[f"estimate_{which}"] for which in ("least", "most", "of_largest")]
     assert figures == [0.5, 3.0, 2.0]
@@ -116,17 +116,17 @@ def row(**changes):
     ],
 )
 def test_every_miss_is_counted_and_named(changes, missed):
-    targets, told = conclusions([row(), row(system="b", **changes)])
+    targets, lines = conclusions([row(), row(system="b", **changes)])
     assert [target.met for target in targets] == [k != missed for k in range(4)]
-    named = [line.what for line in told if "MISSED" in line.what]
+    named = [line.what for line in lines if "MISSED" in line.what]
     assert len(named) == (missed is not None)
     assert all("b (regular) to 1e-04" in what for what in named)
 
 
-def test_every_moving_system_has_two_references_of_its_own_parameters():
+def test_every_moving_system_has_two_references_with_its_parameters():
     assert sorted(STARTS) == sorted(FILES)
-    kept = sorted(path.stem for path in references.FOLDER.glob("*.json"))
-    assert kept == sorted(FILES)
+    stored = sorted(path.stem for path in references.FOLDER.glob("*.json"))
+    assert stored == sorted(FILES)
     for name in FILES:
         params, motions = references.load(name)
         assert params == references.plain(ENTRIES[name].example.params), name
@@ -157,10 +157,10 @@ class TestManyDigits:
 
         motion = Motion(system, params or {})
         start = motion.start(q, v)
-        rows, _ = integrated(motion.rates, start, times, 1e-26, 13)
-        return rows
+        states, _ = integrated(motion.rates, start, times, 1e-26, 13)
+        return states
 
-    def test_operations(self, gmpy2):
+    def test_operations_equal_those_of_jax(self, gmpy2):
         from bench._multiprecision.equations import precise
         from bench._multiprecision.jaxpr_code import Floats, Tape, compiled, read
 
@@ -183,7 +183,7 @@ class TestManyDigits:
             found = np.array([float(y) for y in program([gmpy2.mpfr(a) for a in x])])
             np.testing.assert_allclose(found, expected(jnp.array(x)), rtol=1e-14, atol=1e-15)
 
-    def test_reading_beside_an_array_is_refused(self):
+    def test_reading_outside_an_array_is_refused(self):
         from bench._multiprecision.jaxpr_code import Floats, Tape, read
 
         tape = Tape()
@@ -191,7 +191,7 @@ class TestManyDigits:
         with pytest.raises(NotImplementedError, match="outside"):
             read(tape, lambda x: x.at[jnp.array([5])].get(mode="fill", fill_value=-1), x)
 
-    def test_a_mass_on_a_spring(self, gmpy2):
+    def test_mass_on_a_spring_agrees_with_its_closed_form(self, gmpy2):
         def lagrangian(t, q, v, params):
             return 0.5 * v[0] ** 2 - 0.5 * params["k"] * q[0] ** 2
 
@@ -202,8 +202,8 @@ class TestManyDigits:
             x = gmpy2.cos(1.5 * t) / 4 + gmpy2.sin(1.5 * t) / gmpy2.mpfr(1.5)
             assert abs(y[0] - x) < 1e-24
 
-    def test_an_orbit(self, gmpy2):
-        """Kepler's, e = 1/2, a = 1, from the nearest point."""
+    def test_kepler_orbit_agrees_with_its_closed_form(self, gmpy2):
+        """A Kepler orbit, e = 1/2, a = 1, from the pericenter."""
 
         def lagrangian(t, q, v, params):
             return 0.5 * v @ v + 1 / jnp.linalg.norm(q)
@@ -222,11 +222,11 @@ class TestManyDigits:
         motion = Motion(system, {})
         half, zero = gmpy2.mpfr("0.5"), gmpy2.mpfr(0)
         start = [half, zero, zero, gmpy2.sqrt(gmpy2.mpfr(3))]
-        rows, _ = integrated(motion.rates, start, [0.0, 4.0], 1e-26, 13)
-        assert abs(rows[-1][0] - (gmpy2.cos(E) - half)) < 1e-22
-        assert abs(rows[-1][1] - gmpy2.sqrt(1 - half**2) * gmpy2.sin(E)) < 1e-22
+        states, _ = integrated(motion.rates, start, [0.0, 4.0], 1e-26, 13)
+        assert abs(states[-1][0] - (gmpy2.cos(E) - half)) < 1e-22
+        assert abs(states[-1][1] - gmpy2.sqrt(1 - half**2) * gmpy2.sin(E)) < 1e-22
 
-    def test_a_bead_on_a_circle_with_and_without_a_constraint(self, gmpy2):
+    def test_constrained_bead_on_a_circle_agrees_with_the_free_one(self, gmpy2):
         def cartesian(t, q, v, params):
             return 0.5 * v @ v - params["g"] * q[1]
 
@@ -250,7 +250,7 @@ class TestManyDigits:
         assert abs(found[0] - gmpy2.sin(theta)) < 1e-21
         assert abs(found[1] + gmpy2.cos(theta)) < 1e-21
 
-    def test_rows_that_contradict_one_another_are_named(self):
+    def test_contradictory_rows_are_refused(self):
         from bench._multiprecision.equations import Singular
 
         two = [jl.Holonomic(lambda t, q, params, r=r: q @ q - r, f"r{r}") for r in (1.0, 4.0)]
@@ -260,19 +260,19 @@ class TestManyDigits:
         with pytest.raises(Singular):
             self.follow(system, [1.0, 0.0], [0.0, 1.0], [0.0, 1.0])
 
-    def test_what_a_heavy_top_keeps(self, gmpy2):
-        """The momenta of psi and phi and the energy along the rows of its file."""
+    def test_heavy_top_has_constant_momenta_and_energy(self, gmpy2):
+        """The momenta of psi and phi and the energy at the saves of its file."""
         from bench._multiprecision.equations import precise
 
         precise()
         content = json.loads((references.FOLDER / "heavy_symmetric_top.json").read_text())
         p = {name: gmpy2.mpfr(value) for name, value in content["params"].items()}
         for motion in content["motions"]:
-            kept = [
+            constants = [
                 self.of_top(gmpy2, p, [gmpy2.mpfr(x) for x in q], [gmpy2.mpfr(x) for x in v])
                 for q, v in zip(motion["q"], motion["v"], strict=True)
             ]
-            for values in zip(*kept, strict=True):
+            for values in zip(*constants, strict=True):
                 assert max(abs(x - values[0]) / (1 + abs(values[0])) for x in values) < 1e-20
 
     def of_top(self, gmpy2, p, q, v):
@@ -284,16 +284,16 @@ class TestManyDigits:
         return spin, about, kinetic + p["m"] * p["g"] * p["l"] * cos
 
     @pytest.mark.parametrize("name", ["simple_pendulum", "falling_stick_multiplier"])
-    def test_a_file_is_made_again_digit_by_digit(self, name):
+    def test_file_is_reproduced_digit_by_digit(self, name):
         entry = ENTRIES[name]
-        kept = json.loads((references.FOLDER / f"{name}.json").read_text())["motions"]
+        stored = json.loads((references.FOLDER / f"{name}.json").read_text())["motions"]
         again = references.made(entry.system, entry.example.params, STARTS[name][:1])
-        assert references.differences(kept[0], again[0]) <= references.AGREEMENT
+        assert references.differences(stored[0], again[0]) <= references.AGREEMENT
         params = entry.example.params | {"g": entry.example.params["g"] * (1 + 2e-16)}
         wrong = references.made(entry.system, params, STARTS[name][:1])
-        assert references.differences(kept[0], wrong[0]) > references.AGREEMENT
+        assert references.differences(stored[0], wrong[0]) > references.AGREEMENT
 
-    def test_the_command_compares_with_the_file(self, tmp_path, monkeypatch, capsys):
+    def test_command_compares_with_the_file(self, tmp_path, monkeypatch, capsys):
         text = (references.FOLDER / "hockey_puck.json").read_text()
         monkeypatch.setattr(references, "FOLDER", tmp_path)
         path = tmp_path / "hockey_puck.json"
@@ -305,7 +305,7 @@ class TestManyDigits:
         assert references.main(["--check", "hockey_puck"]) == 1
         assert "NOT TRUSTED" in capsys.readouterr().out
 
-    def test_a_wrong_digit_is_found(self):
+    def test_wrong_digit_is_detected(self):
         content = json.loads((references.FOLDER / "simple_pendulum.json").read_text())
         motion = content["motions"][0]
         assert references.differences(motion, motion) == 0
@@ -317,18 +317,18 @@ class TestManyDigits:
         assert references.differences(motion, wrong) > references.AGREEMENT
 
 
-def test_a_motion_that_breaks_off_is_beyond_its_bound(monkeypatch):
+def test_failed_motion_is_beyond_its_bound(monkeypatch):
     params, motions = references.load("simple_pendulum")
     monkeypatch.setattr(accuracy, "rows_of", lambda *_: 1 / 0)
     (row,) = accuracy.safely("simple_pendulum", params, motions[0], (1e-4,))
     assert "ZeroDivisionError" in row["grows"]
-    targets, told = conclusions([row])
+    targets, lines = conclusions([row])
     assert not targets[0].met
-    assert "simple_pendulum (regular) to 1e-04, MISSED" in told[0].what
+    assert "simple_pendulum (regular) to 1e-04, MISSED" in lines[0].what
 
 
 @pytest.mark.full
-def test_rows_of_a_motion_and_of_a_wrong_reference():
+def test_only_a_wrong_reference_is_beyond_the_bound():
     params, motions = references.load("simple_pendulum")
     right = accuracy.rows_of("simple_pendulum", params, motions[0], (1e-5, 1e-9))
     assert [row["upper"] for row in right] == ["within"] * 2

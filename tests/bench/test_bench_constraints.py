@@ -18,7 +18,7 @@ from bench.constraints import _drift_plot
 
 
 def recorded(position, energy=0.0, steps=1_000_000):
-    """A record with these curves, numbers for constants."""
+    """A record with these curves; numbers give constant curves."""
     position = np.asarray(position, float)
     zero = np.zeros(len(position))
     return constraints.Record(np.linspace(0, steps, len(zero)), position, zero, energy + zero)
@@ -43,17 +43,17 @@ def test_residuals_are_distances_and_the_energy_is_in_units_of_the_start():
     mechanism = double_pendulum()
     off, out = 1e-6, 1e-3
     q, v = (np.tile(x, (4, 1)) for x in (mechanism.q0, mechanism.v0))
-    q[1] -= [0.0, off, 0.0, off]  # the first rod too long
-    v[2] -= [0.0, 0.0, 0.0, out]  # the second rod lengthening, at half sqrt(2) of its two ends'
+    q[1] -= [0.0, off, 0.0, off]  # the first rod is too long
+    v[2] -= [0.0, 0.0, 0.0, out]  # the second rod lengthens: out / sqrt(2) over its two ends
     v[3] *= 2.0
     record = constraints.record(mechanism, jnp.asarray(q), jnp.asarray(v), 30)
     assert np.array_equal(record.steps, [0.0, 10.0, 20.0, 30.0])
-    # To second order in off, which is small beside the rod.
+    # To second order in off, which is small relative to the rod.
     assert np.allclose(record.position, [0.0, off, 0.0, 0.0], rtol=1e-5, atol=1e-15)
     assert np.allclose(record.velocity, [0.0, 0.0, out / math.sqrt(2.0), 0.0], atol=1e-14)
     fall = (BOBS["m1"] + BOBS["m2"]) * 9.81 * off / mechanism.energy
-    push = 0.5 * BOBS["m2"] * out**2 / mechanism.energy
-    assert np.allclose(record.energy, [0.0, -fall, push, 3.0], rtol=1e-8, atol=1e-15)
+    gain = 0.5 * BOBS["m2"] * out**2 / mechanism.energy
+    assert np.allclose(record.energy, [0.0, -fall, gain, 3.0], rtol=1e-8, atol=1e-15)
 
 
 def test_figures_of_a_known_record():
@@ -81,8 +81,8 @@ def test_a_run_that_failed_has_no_figures():
     assert constraints.times([0.5, 1.0], done)["min_us"] == 0.5
 
 
-def drifted(mechanism, stabilisation, position=1e-14, velocity=1e-14, energy=1.0, ratio=1.0):
-    case = constraints.Case(mechanism, "multipliers", stabilisation)
+def drifted(mechanism, stabilization, position=1e-14, velocity=1e-14, energy=1.0, ratio=1.0):
+    case = constraints.Case(mechanism, "multipliers", stabilization)
     columns = {"position": position, "velocity": velocity, "energy": energy, "ratio": ratio}
     return {**case._asdict(), **columns, "growth": 100.0}
 
@@ -105,10 +105,10 @@ def test_drift_is_judged_by_the_worst_mechanism_and_missed_by_nan():
     ]
     without = [("1e-08 to 1e-06", "position residual without stabilisation")]
     assert references[:1] == without
-    assert len(references) == 2  # none of Baumgarte, who has no rows
+    assert len(references) == 2  # none for Baumgarte, which has no rows
 
 
-def test_curves_are_drawn_as_far_as_they_go(tmp_path):
+def test_curves_are_drawn_up_to_a_failure(tmp_path):
     key = ("a", "multipliers", "projection")
     records = {key: recorded([0.0, 1e-14, math.nan]), ("b", *key[1:]): recorded([0.0, 0.0, 1.0])}
     path = tmp_path / "new" / "drift.png"
@@ -123,7 +123,7 @@ def test_without_matplotlib_there_are_no_curves(tmp_path, monkeypatch):
 
 
 @pytest.mark.full
-def test_drift_is_measured_and_told(tmp_path, monkeypatch, capsys):
+def test_drift_is_measured_and_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(results, "FOLDER", tmp_path)
     monkeypatch.setattr(constraints, "QUICK_STEPS", 2000)
     command.main(["constraints", "--quick"])
@@ -138,7 +138,7 @@ def test_drift_is_measured_and_told(tmp_path, monkeypatch, capsys):
     assert all(row["velocity"] < 1e-12 for row in rolling[1:])  # projection, quasi-velocities
     assert projection["position"] < 1e-12
     assert projection["velocity"] < 1e-12
-    # A tumbling motion at 0.01 s drifts by far more than rounding, and grows with its square.
+    # A tumbling motion at 0.01 s drifts far more than rounding, and the drift grows quadratically.
     assert 1e-12 < none["position"] < 1e-6
     assert none["growth"] > 10.0
     assert none["ratio"] == 1.0

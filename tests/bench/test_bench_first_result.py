@@ -1,4 +1,4 @@
-"""The benchmark of first results: equations by hand, judging, one process."""
+"""The benchmark of first results: equations by hand, verdicts, one process."""
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +27,11 @@ def expected(motion, y):
 @pytest.mark.parametrize(
     "name", mostly_full(BEGINNINGS, "cart pendulum", "quadcopter", "rotating body", "5 bodies")
 )
-def test_equations_by_hand_are_those_of_the_system(name):
+def test_equations_by_hand_equal_those_of_the_system(name):
     motion = BEGINNINGS[name]()
     y = motion.start()
     right = np.asarray(expected(motion, y))
-    # Some hundred roundings, through a solve of up to 12 unknowns with a condition of some 1e3.
+    # Some hundred roundings, through a solve of up to 12 unknowns with a condition of about 1e3.
     allowed = 1e5 * EPS * np.max(np.abs(right))
     np.testing.assert_allclose(motion.by_hand()(0.0, y, motion.params), right, rtol=0, atol=allowed)
     if motion.rates is not None:
@@ -63,7 +63,7 @@ def test_the_worst_row_of_every_kind_is_judged():
         assert any(claim in found for found in missed)
 
 
-def test_ends_apart_stop_the_benchmark(monkeypatch):
+def test_different_ends_stop_the_benchmark(monkeypatch):
     def first(side, scene, case, cache):
         end = [1.0] if side == "jaxlag" else [1.1]
         spent = dict.fromkeys(("import_s", "derive_s", "lower_s", "compile_s", "run_ms"), 0.1)
@@ -74,7 +74,7 @@ def test_ends_apart_stop_the_benchmark(monkeypatch):
         first_result.run(quick=True)
 
 
-def test_a_process_says_what_it_spent():
+def test_process_reports_its_times():
     found = first_result.first("jaxlag", "simple pendulum", "2 rows", None)
     for part in ("derive_s", "lower_s", "compile_s"):  # they overlap
         assert 0 < found[part] < found["first_s"]

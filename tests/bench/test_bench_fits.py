@@ -1,4 +1,4 @@
-"""Fits of real recordings: their models by a second route, their reading, and reduced sets."""
+"""Fits of real recordings: models derived independently, reading of files, reduced sets."""
 
 import gzip
 import math
@@ -39,13 +39,13 @@ def test_tables_have_comments_and_names(tmp_path):
     columns = table(path)
     assert columns["t"].tolist() == [0.0, 0.5, 0.25]
     found = pieces(columns, "seg")
-    assert {number: rows["t"].tolist() for number, rows in found.items()} == {
+    assert {number: piece["t"].tolist() for number, piece in found.items()} == {
         1: [0.0, 0.5],
         3: [0.25],
     }
 
 
-def test_windows_of_recordings_that_are_too_short_are_left_out():
+def test_windows_omit_recordings_that_are_too_short():
     long, short = (jl.Experiment(np.arange(n) / 10, {"x": np.arange(n)}) for n in (25, 9))
     assert [len(x.ts) for x in windows([long, short], 1.0)] == [10, 10]
     fine = jl.Experiment(np.arange(497) * 2e-3, {"x": np.arange(497)})
@@ -53,13 +53,13 @@ def test_windows_of_recordings_that_are_too_short_are_left_out():
     assert len(windows([fine], 0.994)) == 1
 
 
-def test_a_prediction_of_which_a_motion_failed_misses_all():
+def test_prediction_with_a_failed_motion_has_infinite_errors():
     rms = {"rms": lambda channel: np.array([1.0, 2.0])}
     assert missed(SimpleNamespace(failed=(), **rms), "q").tolist() == [1.0, 2.0]
     assert missed(SimpleNamespace(failed=("one",), **rms), "q").tolist() == [np.inf, np.inf]
 
 
-def test_the_folder_of_recordings_must_be_named_and_there(tmp_path, monkeypatch):
+def test_folder_of_recordings_must_be_named_and_exist(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXLAG_DATA", raising=False)
     with pytest.raises(DataError, match=r"--data must name the folder of recordings, or JAXLAG_"):
         folder(None)
@@ -69,7 +69,7 @@ def test_the_folder_of_recordings_must_be_named_and_there(tmp_path, monkeypatch)
     assert folder(None) == tmp_path
 
 
-def test_the_command_says_what_it_lacks(tmp_path, capsys):
+def test_command_names_a_missing_folder(tmp_path, capsys):
     assert command.main(["fits", "--data", str(tmp_path / "nowhere")]) == 2
     assert "--data must name a folder" in capsys.readouterr().err
 
@@ -87,52 +87,52 @@ def test_recordings_that_are_missing_are_named(tmp_path, monkeypatch):
     assert "multiarm_pendulum" not in named
 
 
-def test_angles_of_a_video_are_from_where_gravity_points(tmp_path):
-    """Hanging, and the second arm level; both go on beyond half a turn."""
-    turns = np.linspace(0.0, 5.0, 60)
-    joint = 1000 + 500 * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    tip = joint + 400 * np.stack([np.cos(turns + 1.5), np.sin(turns + 1.5)], axis=1)
-    rows = np.concatenate([np.full((60, 2), 1000.0), joint, tip], axis=1)
-    lines = "\n".join(",".join(f"{x:.6f}" for x in row) for row in rows)
+def test_angles_of_a_video_are_relative_to_gravity(tmp_path):
+    """Hanging, and the second arm level; both move beyond half a turn."""
+    angles = np.linspace(0.0, 5.0, 60)
+    joint = 1000 + 500 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    tip = joint + 400 * np.stack([np.cos(angles + 1.5), np.sin(angles + 1.5)], axis=1)
+    points = np.concatenate([np.full((60, 2), 1000.0), joint, tip], axis=1)
+    lines = "\n".join(",".join(f"{x:.6f}" for x in point) for point in points)
     written(tmp_path / "ibm_double_pendulum" / "9.csv.gz", lines)
     found = video.angles(tmp_path, "9").channels["theta"]
     # Six decimals of 400: 2e-9 rad.
-    np.testing.assert_allclose(found, np.stack([turns, turns + 1.5], axis=1), atol=1e-8)
+    np.testing.assert_allclose(found, np.stack([angles, angles + 1.5], axis=1), atol=1e-8)
 
 
-def test_a_flight_ends_where_a_corner_comes_near():
-    """A cube on its edge, sinking: its lowest corner is sqrt(2) half edges below the centre."""
+def test_flight_ends_where_a_corner_is_near_the_ground():
+    """A sinking cube on its edge: its lowest corner is sqrt(2) half edges below the center."""
     half = np.sqrt(0.5)
     e = np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0, 0.0
     z = np.linspace(0.3, 0.05, 26)
-    rows = {"z": z} | {
+    columns = {"z": z} | {
         name: np.full(26, x) for name, x in zip(("qw", "qx", "qy", "qz"), e, strict=True)
     }
     lowest = z - 2 * half * cube.HALF
-    assert cube.flight(rows) == np.count_nonzero(lowest >= cube.CLEAR)
+    assert cube.flight(columns) == np.count_nonzero(lowest >= cube.CLEAR)
     corners = cube.HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     below = np.min(corners @ np.asarray(rotation.quaternion.matrix(jnp.array(e))).T, axis=0)[2]
     np.testing.assert_allclose(below, -2 * half * cube.HALF, rtol=10 * EPS)
 
 
-# ---- Models by a second route --------------------------------------------------------------------
+# ---- Models derived independently ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arms", [1, 2, 3])
-def test_base_params_say_what_masses_and_lengths_do(arms):
-    """The published form by positions of mass centres, and per its first moment of inertia."""
+def test_base_params_give_the_published_lagrangian(arms):
+    """The published form by positions of mass centers, and over its first moment of inertia."""
     p = multiarm.PUBLISHED[arms]
 
     def by_positions(q, v):
-        def centres(q):
+        def centers(q):
             joint, found = jnp.zeros(2), []
             for k in range(arms):
-                along = jnp.stack([jnp.sin(q[k]), jnp.cos(q[k])])
-                found.append(joint + p[f"a{k + 1}"] * along)
-                joint = joint + p.get(f"L{k + 1}", 0.0) * along
+                direction = jnp.stack([jnp.sin(q[k]), jnp.cos(q[k])])
+                found.append(joint + p[f"a{k + 1}"] * direction)
+                joint = joint + p.get(f"L{k + 1}", 0.0) * direction
             return jnp.stack(found)
 
-        x, rate = jax.jvp(centres, (q,), (v,))
+        x, rate = jax.jvp(centers, (q,), (v,))
         m = jnp.array([p[f"m{k + 1}"] for k in range(arms)])
         I = jnp.array([p[f"I{k + 1}"] for k in range(arms)])  # noqa: E741
         return 0.5 * m @ jnp.sum(rate**2, axis=1) + 0.5 * I @ v**2 - p["g"] * m @ x[:, 1]
@@ -160,8 +160,8 @@ def test_friction_acts_between_arms():
 
 
 @pytest.mark.parametrize("design", ["A", "C.1"])
-def test_arms_by_energies_of_links_and_rotors(design):
-    """Links with inertia about their joints, rotors that turn six times as fast as the joints."""
+def test_lagrangian_of_arms_equals_energies_of_links_and_rotors(design):
+    """Links with inertia about their joints; rotors rotate six times as fast as the joints."""
     m1, m2, l1, r1, r2, I1, I2, Ir = actuated.DESIGNS[design]["published"]
     p, g = actuated.published(design), actuated.G
     q, v = jnp.array([0.4, -1.1]), jnp.array([1.3, -0.7])
@@ -188,7 +188,7 @@ def test_wrong_starts_are_wrong_by_half():
 
 
 def fewest(count, share, chance=1e-4):
-    """The least number of successes among so many that chance explains, each of this share."""
+    """The least number of successes that chance explains, of `count` with this share each."""
     total = 0.0
     for k in range(count + 1):
         total += math.comb(count, k) * share**k * (1 - share) ** (count - k)
@@ -198,8 +198,8 @@ def fewest(count, share, chance=1e-4):
 
 
 @pytest.mark.full
-def test_a_chaotic_motion_gives_its_params():
-    """Of all three params inside their 99 % intervals the least likely is 0.97 = 1 - 3 * 0.01."""
+def test_params_of_a_chaotic_motion_are_recovered():
+    """That all three params are in their 99 % intervals has a probability of 0.97 or more."""
     ts = synthetic.times(float(synthetic.lyapunov_exponent()))
     tally = synthetic.recovered(ts, 8, synthetic.SEGMENTS)
     assert tally.near == 8
@@ -207,9 +207,9 @@ def test_a_chaotic_motion_gives_its_params():
 
 
 @pytest.mark.full
-def test_intervals_hold_the_truth_as_often_as_they_say():
+def test_intervals_contain_the_truth_at_the_stated_rate():
     ts = synthetic.times(float(synthetic.lyapunov_exponent()))
     count = 100
-    held = np.round(count * synthetic.coverage(ts, count)).astype(int)
-    assert np.all(held >= fewest(count, 0.95))
-    assert np.all(count - held >= fewest(count, 0.05))
+    contained = np.round(count * synthetic.coverage(ts, count)).astype(int)
+    assert np.all(contained >= fewest(count, 0.95))
+    assert np.all(count - contained >= fewest(count, 0.05))

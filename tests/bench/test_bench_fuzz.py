@@ -1,4 +1,4 @@
-"""The fuzzer: what it draws, that it finds what is wrong, and what it leaves behind."""
+"""The fuzzer: systems that it draws, errors that it detects, reports that it writes."""
 
 import jax
 import jax.numpy as jnp
@@ -29,18 +29,18 @@ SMALL = Drawn(
 )
 
 
-def test_what_is_drawn_is_a_system_of_its_own_for_every_seed():
+def test_every_seed_draws_a_different_system():
     drawn = [draw(seed) for seed in SEEDS]
     assert drawn == [draw(seed) for seed in SEEDS]
     assert len({x.lagrangian for x in drawn}) == len(drawn)
     assert {x.dtype for x in drawn} == {"float32", "float64"}
     assert {x.n for x in drawn} == {1, 2, 3, 4, 5}
     used = " ".join(x.lagrangian for x in map(draw, range(300)))
-    for template in (*ONE, *TWO):  # by the longest piece that every use of it has
+    for template in (*ONE, *TWO):  # by the longest piece that every use contains
         assert max(template.replace("{1}", "{0}").split("{0}"), key=len) in used
 
 
-def test_every_operation_is_one_of_jax():
+def test_every_operation_exists_in_jax():
     q = jnp.array([0.3, -0.7])
     for template in (*ONE, *TWO):
         tree = (template, ("q[0]",), ("q[1]",))[: 2 + (template in TWO)]
@@ -50,7 +50,7 @@ def test_every_operation_is_one_of_jax():
         assert L.shape == (), text(tree)
 
 
-def test_smaller_systems_are_smaller_and_systems():
+def test_smaller_systems_are_valid():
     drawn = draw(5)
     found = list(smaller(drawn))
     assert len(found) > 5
@@ -60,7 +60,7 @@ def test_smaller_systems_are_smaller_and_systems():
         check_traceable(other.system, params, jnp.float64, {})
 
 
-def test_a_wrong_program_is_found_and_written_down(monkeypatch):
+def test_wrong_program_is_detected_and_reported(monkeypatch):
     right = ScalarProgram.acceleration
 
     def wrong(self, *args, **options):
@@ -75,23 +75,23 @@ def test_a_wrong_program_is_found_and_written_down(monkeypatch):
     find = report.rows[-1]
     assert find["kind"].startswith("seed 7: ")
     assert find["systems"] > 1.0
-    # Made smaller as far as it differs: of the force nothing is left.
+    # Reduced as long as it differs: no force remains.
     assert find["declared"].startswith("L = 1.0 * (0.5 * (2.0 * v[0] ** 2) - (")
     assert "; Q = []; params = {'a': [0.1, " in find["declared"]
     assert [target.met for target in report.targets] == [False, True]
 
 
 def test_a_run_draws_every_kind():
-    """Of ten systems four are free, three constrained, two quasi, one a loop; some of them move."""
+    """Of ten systems four are free, three constrained, two quasi, one a loop; some move."""
     names = [fuzz.kind_of(seed).name for seed in range(400)]
     assert set(names) == {kind.name for kind in fuzz.KINDS}
-    of = {word: sum(word in name for name in names) for word in ("free", "constrained", "quasi")}
+    of = {part: sum(part in name for name in names) for part in ("free", "constrained", "quasi")}
     assert of == {"free": 160, "constrained": 120, "quasi": 80}
     assert 0 < sum("mov" in name or "motion" in name for name in names) < 20
 
 
 def test_a_run_counts_what_it_compared(monkeypatch):
-    """Until enough are equal; what cannot be compared counts for nothing."""
+    """Until enough are equal; systems that cannot be compared do not count."""
     kind = fuzz.QUASI._replace(
         draw=lambda seed: seed,
         compared=lambda seed: Compared("equal" if seed % 2 else "not compared: odd", 0.25),
@@ -112,16 +112,16 @@ def test_a_run_counts_what_it_compared(monkeypatch):
     ("off", "least", "most"),
     [(0.0, 0.0, 0.0), (1e-15, 0.0, 0.1), (1e-9, 1e3, 1e6), (np.nan, np.inf, np.inf)],
 )
-def test_differences_are_measured_by_what_roundings_change(off, least, most):
+def test_differences_are_measured_relative_to_rounding(off, least, most):
     right = np.array([[[1.0, 2.0]], [[1.0 + 1e-15, 2.0]]])
     found = right[0] + off
     assert least <= _system_programs._off(right, found, right[0], 2.0**-52) <= most
-    # Where the array program has no value, anything is right.
+    # If the array program has no value, any result is right.
     assert _system_programs._off(np.full_like(right, np.nan), found, right[0], 2.0**-52) == 0.0
 
 
-def test_roundings_show_the_digits_that_a_result_has():
-    """(1 + x) - 1 has the digits that 1 + x has; what is only moved has all."""
+def test_random_rounding_shows_the_digits_of_a_result():
+    """(1 + x) - 1 has the digits of 1 + x; a result that is only moved has all digits."""
 
     def cancels(x):
         return jax.jit(lambda x: (1.0 + x) - 1.0)(x), -jnp.stack([x, x])[::-1]
@@ -145,9 +145,9 @@ def _moves(x):
     y = lax.pad(x, x[0, 0], ((1, 0, 2), (0, 2, 0)))
     z = lax.pad(x, x[0, 0], ((-1, 0, 0), (0, -2, 1)))
     parts = [*lax.split(x, (1, 2), axis=1), jnp.concatenate([x, x[:, ::-1]], 1), x[:, ::2]]
-    rows = [jnp.stack([x, 2 * x], 1), *jnp.unstack(x, axis=1), x.T, x.reshape(3, 2), x[1, 2]]
-    kept = [lax.stop_gradient(x), jnp.copy(x), lax.broadcast_in_dim(x[0], (2, 3, 4), (1,))]
-    return y, z, parts, rows, kept
+    stacked = [jnp.stack([x, 2 * x], 1), *jnp.unstack(x, axis=1), x.T, x.reshape(3, 2), x[1, 2]]
+    unchanged = [lax.stop_gradient(x), jnp.copy(x), lax.broadcast_in_dim(x[0], (2, 3, 4), (1,))]
+    return y, z, parts, stacked, unchanged
 
 
 def _numbers(x, k):
@@ -173,15 +173,15 @@ def _solves(x):
 
 
 def _loops(x):
-    def step(carry, row):
-        return 0.5 * carry + row, carry * row
+    def step(carry, x_i):
+        return 0.5 * carry + x_i, carry * x_i
 
     once = lax.scan(step, x[0], x)
-    back = lax.scan(step, x[0], x, reverse=True)
+    backward = lax.scan(step, x[0], x, reverse=True)
     branch = lax.cond(x[0, 0] > 0.0, jnp.sin, jnp.cos, x)
     grown = jax.grad(lambda x: lax.fori_loop(0, 3, lambda i, y: jnp.sin(y + i), x).sum())(x)
     key = jax.random.key(3)
-    return once, back, branch, grown, jax.random.normal(jax.random.split(key)[0], (3,))
+    return once, backward, branch, grown, jax.random.normal(jax.random.split(key)[0], (3,))
 
 
 def _primitives(jaxpr):
@@ -203,7 +203,7 @@ CALLED = [
 
 
 @pytest.mark.parametrize("case", CALLED, ids=lambda case: case[0].__name__.strip("_"))
-def test_operations_are_those_of_jax(case):
+def test_operations_equal_those_of_jax(case):
     f, *args = case
     traced = jax.make_jaxpr(f)(*args)
     found = evaluated(traced, args)
@@ -217,13 +217,13 @@ def test_operations_are_those_of_jax(case):
             np.testing.assert_array_equal(x, y)
 
 
-def test_every_operation_is_tried():
+def test_every_operation_is_tested():
     tried = {name for f, *args in CALLED for name in _primitives(jax.make_jaxpr(f)(*args).jaxpr)}
-    tried |= {"add_any"}  # of sums that derivatives make
+    tried |= {"add_any"}  # from sums in derivatives
     assert set(NUMPY) <= tried
 
 
-def test_roundings_reach_the_inside_of_loops():
+def test_random_rounding_applies_inside_loops():
     traced = jax.make_jaxpr(lambda x: lax.scan(lambda c, _: (c * x, None), x, None, 3)[0])(1.1)
     rng = np.random.default_rng(0)
     off = [float(evaluated(traced, [np.float64(1.1)], 1e-3, rng)[0]) / 1.1**4 - 1 for _ in range(9)]

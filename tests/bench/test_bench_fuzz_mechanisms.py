@@ -1,4 +1,4 @@
-"""The fuzzer's constrained systems, quasi-velocities and loops: what it draws, knows and finds."""
+"""The fuzzer's constrained systems, quasi-velocities and loops: draws, references, errors."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ NUMBERS = {"a": [0.1, 0.2, 0.3], "b": 2.0, "k": 1.0}
 
 
 def mechanism(*rows, q, v, masses=None, quasi=None, potential="9.81 * q[1]", **changes):
-    """A mass point, or another with these inertias."""
+    """A mass point, or another system with these inertias."""
     masses = (2.0,) * len(q) if masses is None else masses
     units = changes.pop("units", (1.0,) * len(q))
     dtype = changes.pop("dtype", "float64")
@@ -34,17 +34,17 @@ AGAIN = Row("Pfaffian", "3.0 * (q[0] * v[0] + q[1] * v[1])", "dependent")
 VOID = Row("holonomic", "(jnp.sin(q[0]) ** 2 + jnp.cos(q[0]) ** 2 - 1.0) * q[1]", "void")
 AT = {"q": (0.6, -0.8), "v": (0.8, 0.6)}
 DOUBLED = mechanism(ROD, AGAIN, VOID, **AT)
-# At x = 0.6 the second row is the first, and asks for another acceleration.
+# At x = 0.6 the second row equals the first, but requires another acceleration.
 BENT = mechanism(ROD, Row("holonomic", f"{ROD.text} + (q[0] - 0.6) ** 2", "bent"), **AT)
 TURNED = Quasi(("q[0] * v[0] + q[1] * v[1]", "q[0] * v[1] - q[1] * v[0]"), None, 2, (0,))
 IN_QUASI = mechanism(quasi=TURNED, **AT)
 
 
-# ---- What is drawn -------------------------------------------------------------------------------
+# ---- Drawn systems -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("module", [_random_mechanisms, _random_quasi])
-def test_mechanisms_are_their_own_for_every_seed(module):
+def test_every_seed_draws_a_different_mechanism(module):
     drawn = [module.draw(seed) for seed in range(40)]
     assert drawn == [module.draw(seed) for seed in range(40)]
     assert len({x.written for x in drawn}) == len(drawn)
@@ -79,18 +79,18 @@ def test_quasi_velocities_of_every_kind_are_drawn():
     assert any(row.kind == "holonomic" for x in drawn for row in x.rows)
 
 
-def test_smaller_mechanisms_have_something_left_out():
+def test_smaller_mechanisms_are_shorter():
     drawn = _random_mechanisms.draw(4)
     found = list(smaller(drawn))
     assert len(found) > 2
     assert min(len(x.written) for x in found) < len(drawn.written)
 
 
-# ---- What is known -------------------------------------------------------------------------------
+# ---- References ----------------------------------------------------------------------------------
 
 
-def test_the_reference_of_a_pendulum():
-    """Rod of 1 m at 2.5 kg, two rows that share its tension by least norm, and an empty one."""
+def test_reference_of_a_pendulum_equals_its_closed_form():
+    """Rod of 1 m, two rows that share its tension by least norm, and a void one."""
     found = prepare(DOUBLED._replace(v=(1.6, 1.2)), 4)
     units = found.equations.units
     assert found.equations.outcome == "solution"
@@ -105,8 +105,8 @@ def test_the_reference_of_a_pendulum():
     np.testing.assert_allclose(lam, [-tension / 2.0, -tension / 3.0, 0.0], rtol=1e-14)
 
 
-def test_derivatives_of_the_reference_are_differences():
-    """Along the direction that keeps to the constraints, of a row weighted by a function, too."""
+def test_derivatives_of_the_reference_agree_with_differences():
+    """Along the direction that satisfies the constraints, also for a row times a function."""
     weighted = Row("holonomic", f"(1.5 + jnp.sin(q[0])) * ({ROD.text})", "dependent")
     whole = mechanism(ROD, weighted, q=(0.6, -0.8, 0.3), v=(0.8, 0.6, -0.4))
     found = prepare(whole, 1)
@@ -137,13 +137,13 @@ def test_derivatives_of_the_reference_are_differences():
     ],
     ids=["bent", "bent at rest", "a massless link", "a coordinate without inertia"],
 )
-def test_what_has_a_solution(changed, outcome):
+def test_mechanisms_have_the_expected_outcome(changed, outcome):
     assert prepare(changed, 1).equations.outcome == outcome
     assert compared(changed).kind == "equal"
 
 
-def test_directions_keep_to_rows_of_every_size():
-    """One of 1e-9 beside one of 1e9: their residuals do not change along the direction."""
+def test_directions_satisfy_rows_of_every_size():
+    """One of 1e-9 beside one of 1e9: their residuals are constant along the direction."""
     rows = (
         Row("Pfaffian", "1e9 * ((1.6 + 0.4 * jnp.sin(q[1])) * v[0] + 0.3 * v[1])"),
         Row("Pfaffian", "1e-9 * (v[1] + 0.5 * jnp.cos(q[0]) * v[2])"),
@@ -157,25 +157,25 @@ def test_directions_keep_to_rows_of_every_size():
     assert np.linalg.norm(found.direction.v) > 1e-3
 
 
-def test_rows_that_contradict_by_little_are_left_out_in_single_precision():
-    """What they leave open, 1e-3, is far above roundings: a program may solve for either."""
+def test_nearly_contradictory_rows_are_omitted_in_float32():
+    """The contradiction, 1e-3, is far above rounding: a program may solve for either row."""
     bent = Row("holonomic", f"{ROD.text} + 2e-3 * (q[0] - 0.6) ** 2", "bent")
     with pytest.raises(Unclear, match="nearly contradict"):
         prepare(mechanism(ROD, bent, **AT, dtype="float32"), 1)
 
 
-def test_what_is_near_to_a_border_is_left_out():
+def test_nearly_dependent_rows_are_omitted():
     near = Row("holonomic", f"{ROD.text} + 1e-6 * (q[0] - 0.6)", "dependent")
     with pytest.raises(Unclear, match="nearly dependent"):
         prepare(mechanism(ROD, near, **AT), 1)
     assert compared(mechanism(ROD, near, **AT)).kind.startswith("not compared: ")
 
 
-# ---- What is found -------------------------------------------------------------------------------
+# ---- Detected errors -----------------------------------------------------------------------------
 
 
 def found_in(*kinds):
-    """Which quantities differ, and that something does."""
+    """The quantities that differ; asserts that some do."""
     results = [compared(x) for x in kinds]
     assert all(x.kind == "differs" for x in results), results
     return [x.what for x in results]
@@ -189,40 +189,40 @@ def test_sound_programs_are_equal(dtype):
         assert found.worst < 0.5
 
 
-def test_multipliers_of_other_than_least_norm_are_found(monkeypatch):
+def test_multipliers_without_least_norm_are_detected(monkeypatch):
     monkeypatch.setattr(_array_terms, "shared", lambda A, lam, *_: lam)
     assert found_in(DOUBLED) == ["arrays: lam"]
 
 
-def test_a_bias_of_the_other_sign_is_found(monkeypatch):
+def test_bias_of_the_other_sign_is_detected(monkeypatch):
     right = ArrayTerms.gamma
     monkeypatch.setattr(ArrayTerms, "gamma", lambda self, *args: -right(self, *args))
     (what,) = found_in(DOUBLED)
     assert what.endswith((": a", ": lam", ": da", ": dlam"))
 
 
-def test_a_contradiction_that_is_not_told_is_found(monkeypatch):
+def test_unreported_contradiction_is_detected(monkeypatch):
     monkeypatch.setattr(_array_terms, "redundant_rows_hold", lambda *_: jnp.array(True))
     assert found_in(BENT) == ["arrays: a number where rows or masses are contradictory"]
 
 
-def test_a_solution_that_is_refused_is_found(monkeypatch):
+def test_refused_solution_is_detected(monkeypatch):
     monkeypatch.setattr(_array_terms, "redundant_rows_hold", lambda *_: jnp.array(False))
     assert found_in(DOUBLED) == ["arrays: a is no number"]
 
 
-def test_a_row_that_says_nothing_taken_for_one_is_found(monkeypatch):
-    """Its rounding is solved with, or multipliers are given to it."""
+def test_void_row_that_counts_is_detected(monkeypatch):
+    """Its rounding is solved with, or it has a multiplier."""
 
-    def all_there(rows, q, A, sure=False):
+    def all_nonzero(rows, q, A, sure=False):
         whole = jnp.ones(A.shape[0], bool)
         return _row_residuals.Sizes(whole, ~whole, jnp.linalg.norm(A, axis=1))
 
-    monkeypatch.setattr(_array_terms, "row_sizes", all_there)
+    monkeypatch.setattr(_array_terms, "row_sizes", all_nonzero)
     found_in(DOUBLED)
 
 
-def test_wrong_scalars_are_found(monkeypatch):
+def test_wrong_scalars_are_detected(monkeypatch):
     right = ScalarProgram._run
     monkeypatch.setattr(
         ScalarProgram, "_run", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
@@ -231,8 +231,8 @@ def test_wrong_scalars_are_found(monkeypatch):
         assert "scalars" in what
 
 
-def test_wrong_rates_of_quasi_velocities_are_found(monkeypatch):
-    """What is left of v' at u' = 0, forgotten."""
+def test_wrong_rates_of_quasi_velocities_are_detected(monkeypatch):
+    """The part of v' at u' = 0 is omitted."""
 
     def velocity_rate(self, du):
         return self._jvp_fn(du)
@@ -242,7 +242,7 @@ def test_wrong_rates_of_quasi_velocities_are_found(monkeypatch):
     assert what.startswith("quasi, arrays: ")
 
 
-def test_singular_kinematics_that_give_numbers_are_found(monkeypatch):
+def test_singular_kinematics_that_give_numbers_are_detected(monkeypatch):
     rows = ("(q[0] - 0.6) * v[0]", "v[1]")
     singular = mechanism(quasi=Quasi(rows, None, 2, singular=True), **AT)
     assert compared(singular).kind == "equal"
@@ -271,14 +271,14 @@ LOOPED = _loops.Looped(
 
 
 @pytest.mark.parametrize("loop", _loops.LOOPS)
-def test_loops_are_equal_to_what_is_unrolled(loop):
+def test_loops_equal_unrolled_code(loop):
     found = _loops.compared(LOOPED._replace(loop=loop, within="checkpoint"))
     assert (found.kind, found.what) == ("equal", "second derivative")
     assert found.worst < 0.5
 
 
-def test_a_rule_that_is_dropped_in_a_loop_is_found(monkeypatch):
-    """JAX drops it where a reverse derivative takes the body of a scan apart."""
+def test_rule_that_is_dropped_in_a_loop_is_detected(monkeypatch):
+    """JAX drops it where a reverse derivative splits the body of a scan."""
     monkeypatch.setattr(_traced_function, "with_rules_kept", lambda program: program)
     monkeypatch.setattr(_from_jaxpr, "with_rule_kept", lambda eqn: eqn)
     system = _loops.having(DOUBLED._replace(rows=()).system, DOUBLED.drawn, _loops.ruled)
@@ -299,8 +299,8 @@ def test_motions_are_compared_by_their_ends_and_statuses(monkeypatch):
     assert _mechanism_motions.compared(DOUBLED).kind == "differs"
 
 
-def test_the_weight_of_a_row_of_rounding_may_be_beyond_all_numbers():
-    """In float32, 1 over the square of its rounding: what is left out is not multiplied by 0."""
+def test_weight_of_a_row_of_rounding_may_overflow():
+    """In float32, 1 over the square of its rounding: omitted rows are not multiplied by 0."""
     drawn = _random_mechanisms.draw(294)
     assert (drawn.drawn.dtype, drawn.rows[1].role) == ("float32", "void")
     assert compared(drawn).kind == "equal"

@@ -1,4 +1,4 @@
-"""Lines of work over error: swept, timed and interpolated; everybody gets to the end."""
+"""Lines of work over error: swept, timed and interpolated; every library reaches the end."""
 
 import math
 from functools import cache
@@ -22,7 +22,7 @@ motion_of = cache(lambda name: MOTIONS[name]())
 
 
 class Result:
-    """An answer that is there only after it has been waited for."""
+    """A result that exists only after it has been waited for."""
 
     def __init__(self, q):
         self.q, self.waited = q, False
@@ -33,7 +33,7 @@ class Result:
 
 
 def made_up_line(errors, results=None):
-    """One that ends off by what is given, knob by knob."""
+    """A line with the given errors, knob by knob."""
 
     def make(knob):
         def call():
@@ -55,7 +55,7 @@ def test_sweeps_wait_for_every_result():
     results = []
     line = made_up_line({1e-2: 1e-3, 1e-3: 1e-4}, results)
     calls, points = swept(line, float, patience_s=10.0)
-    assert len(results) == 4  # one to warm up and one to time, for each
+    assert len(results) == 4  # one to warm up and one to time, for each knob
     assert all(result.waited for result in results)
     assert list(calls) == ["0.01", "0.001"]
     assert [point["error"] for point in points] == [1e-3, 1e-4]
@@ -77,24 +77,24 @@ def test_a_deliberately_long_computation_shows_its_full_time(monkeypatch):
     assert points[0]["swept_s"] == [5.0, 5.0]
 
 
-def test_sweeps_end_where_rounding_takes_over_and_where_patience_does():
+def test_sweeps_end_at_rounding_or_without_patience():
     errors = {10.0**-k: max(10.0**-k, 1e-9) for k in range(2, 16)}
     _, points = swept(made_up_line(errors), float, patience_s=10.0)
     assert len(points) == 8 + _sweep.PATIENCE
     plateau = {10.0**-k: 1e-6 if k < 10 else 1e-14 for k in range(2, 16)}
     _, points = swept(made_up_line(plateau), float, patience_s=10.0)
-    assert points[-1]["error"] == 1e-14  # stability, not rounding, held the error up
+    assert points[-1]["error"] == 1e-14  # stability, not rounding, limited the error
     _, points = swept(made_up_line(errors), float, patience_s=-1.0)
-    assert points == []  # its first run was longer than any patience
+    assert points == []  # its first run exceeded any patience
 
 
-def test_failed_runs_are_no_points():
+def test_failed_runs_give_no_points():
     errors = {1e-1: math.nan, 1e-2: 2.0 * _sweep.WRONG, 1e-3: 1e-4}
     calls, points = swept(made_up_line(errors), float, patience_s=10.0)
     assert (len(calls), len(points)) == (1, 1)
 
 
-def test_a_line_without_a_point_says_why():
+def test_line_without_a_point_gives_the_reason():
     line = made_up_line({1e-1: math.nan})
     assert swept(line, float, patience_s=0.5)[1] == []
     assert line.why_none(0.5) == "no run of at most 2 s ended with an error below 0.1"
@@ -105,22 +105,22 @@ def points(*pairs):
     return [{"error": error, "min_us": us} for error, us in pairs]
 
 
-def test_times_at_equal_error_are_interpolated_and_never_beyond_the_line():
+def test_times_at_equal_error_are_interpolated_but_not_extrapolated():
     line = points((1e-4, 10.0), (1e-6, 40.0), (1e-8, 160.0))
     assert math.isclose(time_at(line, 1e-5, "min_us"), 20.0)
     assert math.isclose(time_at(line, 1e-6, "min_us"), 40.0)
     assert math.isclose(time_at(line, 1e-7, "min_us"), 80.0)
     assert time_at(line, 1e-9, "min_us") is None
-    assert time_at(line, 1e-2, "min_us") == 10.0  # its loosest suffices
+    assert time_at(line, 1e-2, "min_us") == 10.0  # its loosest one suffices
     assert time_at([], 1e-2, "min_us") is None
 
 
-def test_the_cheapest_way_to_an_error_counts():
+def test_cheapest_time_to_an_error_counts():
     line = points((1e-4, 10.0), (1e-7, 20.0), (1e-5, 30.0), (1e-9, 90.0))
     assert 10.0 < time_at(line, 1e-6, "min_us") < 20.0
 
 
-def test_tolerances_and_steps_go_from_loose_to_tight():
+def test_tolerances_and_steps_decrease():
     found = _sweep.tolerances(2.5, 14.0)
     assert len(found) == 24
     assert math.isclose(found[0], 10**-2.5)
@@ -135,7 +135,7 @@ def test_tolerances_and_steps_go_from_loose_to_tight():
 # ---- Lines ---------------------------------------------------------------------------------------
 
 
-def test_every_solver_of_ours_has_a_line():
+def test_every_solver_of_jaxlag_has_a_line():
     from jaxlag._simulation._methods import METHODS
     from jaxlag.solvers import AbstractFixedStep
 
@@ -151,14 +151,14 @@ def test_every_solver_of_ours_has_a_line():
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["gauss8", "variational4"])
-def test_canonical_methods_have_a_line_where_the_state_is_of_quasi_velocities(method):
+def test_canonical_methods_have_a_line_for_quasi_velocities(method):
     motion = motion_of("heavy top")._replace(t1=0.1)
     line = _jax.with_jaxlag(motion, method)
     assert line.read(line.make(0.1 / 64)()).steps == 64
 
 
 @pytest.mark.parametrize("lanes", mostly_full([False, True], False))
-def test_lines_in_jax_get_to_the_end(lanes):
+def test_lines_in_jax_reach_the_end(lanes):
     motion = MOTIONS["16 double pendulums" if lanes else "double pendulum, regular"]()
     if lanes:
         motion = motion._replace(q0=motion.q0[:2], v0=motion.v0[:2])
@@ -191,7 +191,7 @@ def test_a_library_that_cannot_be_imported_is_named_with_its_error(monkeypatch):
     assert notes[1] == ("no line", "Kepler, e = 0.6, jaxlag x, jax 0.12: ValueError: no")
 
 
-def test_scipy_reaches_the_end_kept_here():
+def test_scipy_reaches_the_stored_end():
     pytest.importorskip("scipy")
     motion = MOTIONS["Cartesian double pendulum"]()
     line = _peers.lines(motion)["scipy DOP853"][1](motion)
@@ -202,10 +202,10 @@ def test_scipy_reaches_the_end_kept_here():
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["heavy top", "chain of 8 links"])
-def test_every_library_gets_to_the_end_kept_here(name):
+def test_every_library_reaches_the_stored_end(name):
     motion = motion_of(name)
     missing = _peers.missing()
-    for words, (library, make) in _peers.lines(motion).items():
+    for label, (library, make) in _peers.lines(motion).items():
         if library in missing:
             continue
         line = make(motion)
@@ -214,7 +214,7 @@ def test_every_library_gets_to_the_end_kept_here(name):
             error = min(error, motion.error(line.read(line.make(knob)()).q, exact(name)))
             if error < 1e-5:
                 break
-        assert error < 1e-5, words
+        assert error < 1e-5, label
 
 
 def exact(name):
@@ -233,5 +233,5 @@ def test_dop853_in_numba_takes_the_steps_of_scipy():
     other = integrate.solve_ivp(rates, (0, 10), motion.start(), "DOP853", rtol=1e-8, atol=1e-8)
     assert abs(accepted - (len(other.t) - 1)) <= 2
     assert attempts > accepted
-    # Steps that differ by a rounding of the controller end within the error of either.
+    # Steps that differ by rounding of the controller end within the error of either.
     assert np.max(np.abs(y - other.y[:, -1])) < 1e-7

@@ -1,4 +1,4 @@
-"""Accelerations compared with code by others: right, timed alike, judged."""
+"""Accelerations compared with other code: they are right, timed alike and judged."""
 
 import math
 import time
@@ -30,21 +30,21 @@ def array_of(name):
 
 
 @pytest.mark.parametrize("name", mostly_full(BY_HAND, "pendulum", "top"))
-def test_hand_written_equations_are_those_of_the_scene(name):
+def test_hand_written_equations_equal_those_of_the_scene(name):
     plain = BY_HAND[name]
     contenders = {"by hand": (plain, True), "called": (_rk4.called(plain), True)}
     assert off(name, contenders) < lowering.AGREEMENT
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cart_pole", "kepler", "top", "chain_3"])
-def test_equations_by_sympy_are_those_of_the_scene(name, monkeypatch):
+def test_equations_by_sympy_equal_those_of_the_scene(name, monkeypatch):
     pytest.importorskip("sympy")
     from bench.lowering import _sympy
 
     monkeypatch.setattr(_sympy, "PATIENCE_S", 3.0)
     forms = _sympy.forms(name, SCENES[name])
     assert "as derived" in forms
-    assert off(name, {words: (form, True) for words, form in forms.items()}) < lowering.AGREEMENT
+    assert off(name, {label: (form, True) for label, form in forms.items()}) < lowering.AGREEMENT
 
 
 def test_sympy_stops_simplifying_when_its_time_is_up(monkeypatch):
@@ -58,7 +58,7 @@ def test_sympy_stops_simplifying_when_its_time_is_up(monkeypatch):
 
 def test_the_scalar_program_is_timed_on_scalars_and_the_array_program_on_arrays():
     scene = SCENES["double_pendulum"]
-    assert [_rk4.by_jaxlag(scene, words)[1] for words in ("auto", "array")] == [True, False]
+    assert [_rk4.by_jaxlag(scene, label)[1] for label in ("auto", "array")] == [True, False]
     assert len(_rk4.parts(scene.q0, True)) == 2
     assert [x.shape for x in _rk4.parts(scene.q0, False)] == [(2,)]
 
@@ -88,7 +88,7 @@ def test_libraries_compute_the_accelerations_of_the_chain(name, n):
     assert library.evaluations == 12
 
 
-def test_the_loop_of_numba_is_the_same():
+def test_loop_of_numba_equals_that_of_jax():
     pytest.importorskip("numba")
     scene, steps = links(3), 50
     equations, scalar = _rk4.by_jaxlag(scene)
@@ -98,7 +98,7 @@ def test_the_loop_of_numba_is_the_same():
     assert np.max(np.abs(found - expected)) < 1e-13
 
 
-def test_libraries_that_cannot_be_imported_are_left_out(monkeypatch):
+def test_libraries_that_cannot_be_imported_are_omitted(monkeypatch):
     monkeypatch.setattr(_chains, "MODULES", dict.fromkeys(LIBRARIES, "no_such_module"))
     assert _chains.missing() == list(LIBRARIES)
     assert _chains.libraries(links(2), 3) == {}
@@ -155,11 +155,11 @@ def test_rows_of_the_lowering_are_judged():
         "operations of aircraft": (410.0, True),
         "operations of chain_8": (720.0, True),
     }
-    told = {what: figure for figure, what in references}
-    assert told["sympy: cannot be imported"] == "left out"
-    assert told["times as long: jaxlag as numba, chain of 32"] == "9"
+    notes = {what: figure for figure, what in references}
+    assert notes["sympy: cannot be imported"] == "left out"
+    assert notes["times as long: jaxlag as numba, chain of 32"] == "9"
     both = "times as long: jaxlag as the best of both, theirs also called"
-    assert told[f"{both}, mean of 2; worst b"] == "1.41; 4"
+    assert notes[f"{both}, mean of 2; worst b"] == "1.41; 4"
 
 
 def test_a_system_without_a_scalar_program_misses_its_count():

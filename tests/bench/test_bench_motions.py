@@ -41,8 +41,8 @@ def acceleration(motion, y):
 
 
 @pytest.mark.parametrize("name", mostly_full(SINGLE, "heavy top"))
-def test_explicit_equations_are_those_of_the_system(name):
-    """And so are all forms they are given to solvers in."""
+def test_explicit_equations_equal_those_of_the_system(name):
+    """So are all forms in which solvers get them."""
     motion = motion_of(name)
     y = state_near_the_start(motion, 1)
     n = len(motion.q0)
@@ -50,12 +50,12 @@ def test_explicit_equations_are_those_of_the_system(name):
     if motion.speeds is None:
         speeds, rates = v, a
     else:
-        along = lambda q, v: motion.speeds(0.0, q, v, motion.params)  # noqa: E731
-        speeds, rates = jax.jvp(along, (q, v), (v, a))
+        speeds_of = lambda q, v: motion.speeds(0.0, q, v, motion.params)  # noqa: E731
+        speeds, rates = jax.jvp(speeds_of, (q, v), (v, a))
     assert np.allclose(speeds, y[n:], rtol=1e-13, atol=1e-13)
-    # Rounding of the terms that cancel: k r of the spring, M of the chain (condition about 1e3).
-    cancelling = motion.params.get("k", 1e2 if n == 8 else 1.0)
-    bound = 300 * EPS * max(float(jnp.max(jnp.abs(rates))), cancelling)
+    # Rounding of terms that cancel: k r of the spring, M of the chain (condition about 1e3).
+    canceling = motion.params.get("k", 1e2 if n == 8 else 1.0)
+    bound = 300 * EPS * max(float(jnp.max(jnp.abs(rates))), canceling)
     expected = np.array(motion.evaluate(y))
     assert np.max(np.abs(expected[n:] - rates)) < bound
 
@@ -67,10 +67,10 @@ def test_explicit_equations_are_those_of_the_system(name):
     naive = jax.jit(_jax.naive(motion))(0.0, jnp.concatenate([q, v]), params)
     assert (
         np.max(np.abs(naive - jnp.concatenate([v, a]))) < 10 * bound
-    )  # its solve knows no structure
+    )  # its solve uses no structure
 
 
-def test_no_operation_is_written_twice():
+def test_generated_source_repeats_no_operation():
     motion = MOTIONS["heavy top"]()
     lines = _straight_line.source(motion.rates, motion.params, 6).splitlines()
     right = [line.split(" = ")[1] for line in lines if " = x" in line or " = (" in line]
@@ -79,22 +79,24 @@ def test_no_operation_is_written_twice():
     assert len(set(operations)) == len(operations)
 
 
-def test_ends_are_kept_for_every_motion_to_20_digits():
+def test_ends_are_stored_for_every_motion_to_20_digits():
     ends = json.loads(exact_ends.PATH.read_text())["ends"]
     assert list(ends) == list(MOTIONS)
     for name, make in MOTIONS.items():
         motion = make()
         assert exact_ends.exact_end(name).shape == motion.q0.shape
-        words = np.ravel(ends[name])
-        assert all(len(word.lstrip("-0.").split("E")[0].replace(".", "")) >= 17 for word in words)
+        numbers = np.ravel(ends[name])
+        assert all(
+            len(number.lstrip("-0.").split("E")[0].replace(".", "")) >= 17 for number in numbers
+        )
 
 
 @pytest.mark.parametrize(("name", "e"), [("Kepler, e = 0.6", 0.6), ("Kepler, e = 0.9", 0.9)])
-def test_orbits_close(name, e):
-    """After 100 periods: where they began, but for the rounding of the span and of the start."""
+def test_stored_ends_of_orbits_are_their_starts(name, e):
+    """After 100 periods they are at their start, up to rounding of the span and of the start."""
     motion = motion_of(name)
     off = np.abs(exact_ends.exact_end(name) - motion.q0)
-    # Starts to one rounding: the period is off by as much, times its growth with 1 / (1 - e).
+    # The start has an error of one rounding, the period as much, times its growth with 1 / (1 - e).
     late = motion.t1 * EPS * 4.0 / (1.0 - e)
     assert off[0] < EPS
     assert off[1] < motion.v0[1] * late
@@ -102,7 +104,7 @@ def test_orbits_close(name, e):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", ["rigid aircraft", "rolling disk", "16 double pendulums"])
-def test_ends_are_those_of_a_tight_solve(name):
+def test_stored_ends_equal_those_of_a_tight_solve(name):
     motion = motion_of(name)
     line = _jax.with_jaxlag(motion, "dopri8")
     solved = line.read(line.make(1e-13)())

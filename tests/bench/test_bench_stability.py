@@ -1,4 +1,4 @@
-"""Stress rows: verdicts, names, exact orbits."""
+"""Stress cases: verdicts, names, exact orbits."""
 
 import math
 
@@ -29,8 +29,8 @@ def stressed(bound=1.0, statuses=(), figure=0.5, found=("ok",)):
         (stressed(statuses=("mass_singular",), found=("nonfinite",)), "failed"),
     ],
 )
-def test_verdicts_on_stress(case, verdict):
-    """A wrong answer that looks right is the worst; a status counts only where one is due."""
+def test_verdicts_follow_from_figures_and_statuses(case, verdict):
+    """The worst is a wrong answer that looks right; a status counts only where one is expected."""
     row = stability.judged(case, quick=True)
     assert row["verdict"] == verdict
     targets, named = stability.conclusions([row], 1)
@@ -42,7 +42,7 @@ def test_verdicts_on_stress(case, verdict):
     assert bool(named) == (verdict in ("silent", "failed"))
 
 
-def test_a_stress_row_that_breaks_off_fails_alone():
+def test_stress_case_that_raises_an_error_fails_alone():
     def run(quick):
         raise ValueError("`q0` must be finite")
 
@@ -51,7 +51,7 @@ def test_a_stress_row_that_breaks_off_fails_alone():
     assert row["statuses"] == "raised ValueError: `q0` must be finite"
 
 
-def test_stress_rows_are_named_once_and_quick_ones_exist():
+def test_stress_cases_have_unique_names_and_quick_ones_exist():
     names = [case.name for case in stability.CASES]
     assert len(set(names)) == len(names)
     assert set(names) >= stability.QUICK
@@ -65,7 +65,7 @@ def test_a_quick_run_is_judged_by_its_own_bound():
 
 
 def oscillating(drift, noise):
-    """Two incommensurate oscillations of 1e12, in 20 motions of 200 000 steps, rows 20 apart."""
+    """Two incommensurate oscillations of 1e12, in 20 motions of 200 000 steps, a save every 20."""
     steps = np.arange(1, 10_001) * 20
     random = np.random.default_rng(0)
     phases = random.uniform(0, 2 * np.pi, (2, 20, 1))
@@ -75,40 +75,40 @@ def oscillating(drift, noise):
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.03, -0.03])
-def test_a_drift_shows_below_oscillations_and_walks(drift):
-    """Without one the figure is within what a walk of its size explains, with one it is beyond."""
+def test_drift_is_detected_below_oscillations_and_walks(drift):
+    """Without one the figure is within that of a random walk of its size, with one it is beyond."""
     length = _drifts.Length(200_000, 5_000, 20)
     found = _drifts.drift(oscillating(drift, 1.0), 20, ("ok",))
-    bound = _drifts.walked(3, length)  # of a walk of 1.04 eps a step
+    bound = _drifts.walked(3, length)  # of a random walk of 1.04 eps per step
     assert (found.figure <= bound) == (drift == 0.0)
     mean = float(found.details.split()[1])
     assert abs(mean - drift) < 4e-3
 
 
-def test_a_drift_that_cannot_be_told_is_beyond_its_bound():
-    """An error bar that is too wide fails the row as a drift does."""
+def test_undetermined_drift_is_beyond_its_bound():
+    """A wide error bar fails the case as a drift does."""
     found = _drifts.drift(oscillating(0.0, 30.0), 20, ("ok",))
     assert found.figure > _drifts.walked(3, _drifts.Length(200_000, 5_000, 20))
 
 
-def test_a_derivative_by_the_imaginary_part_is_that_of_the_motion():
-    """Of motions written by hand, against a difference."""
-    along = np.array([0.3, -1.0])
+def test_derivative_by_the_imaginary_part_equals_that_of_the_motion():
+    """Of motions written by hand, compared with a difference."""
+    direction = np.array([0.3, -1.0])
     ends = [
-        _reference_motions.double_pendulum([1.0, 0.5] + h * along, 1.0, 2.0)[0]
+        _reference_motions.double_pendulum([1.0, 0.5] + h * direction, 1.0, 2.0)[0]
         for h in (1e-4, -1e-4)
     ]
-    slope = _reference_motions.double_pendulum(np.array([1.0, 0.5]), 1.0, 2.0, along)[1]
+    slope = _reference_motions.double_pendulum(np.array([1.0, 0.5]), 1.0, 2.0, direction)[1]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-4, rtol=0, atol=1e-6)
 
 
 @pytest.mark.full
-def test_orbits_of_the_stress_rows_are_exact():
+def test_orbits_of_the_stress_cases_are_exact():
     """Kepler's solution against a tight solve, at two eccentricities."""
     q0, v0, e = _long_runs.kepler_starts(3)
     ts = np.linspace(0.0, 20.0, 5)
     exact = _long_runs.kepler(q0, v0, e, ts)
-    for row in range(3):
+    for i in range(3):
         options = {"rtol": 1e-13, "atol": 1e-13}
-        motion = jl.simulate(_long_runs.ORBIT, q0[row], v0[row], ts, {}, **options)
-        np.testing.assert_allclose(motion.q, exact[row], rtol=0, atol=1e-10)
+        motion = jl.simulate(_long_runs.ORBIT, q0[i], v0[i], ts, {}, **options)
+        np.testing.assert_allclose(motion.q, exact[i], rtol=0, atol=1e-10)

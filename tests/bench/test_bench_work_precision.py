@@ -1,4 +1,4 @@
-"""Work over error: who is fastest is told and judged right, a run is measured and told."""
+"""Work over error: the fastest lines are reported and judged correctly, and a run is measured."""
 
 import json
 import math
@@ -40,28 +40,28 @@ def made_up_rows(ours=1.0):
     return rows
 
 
-# ---- What is said of the rows --------------------------------------------------------------------
+# ---- Reports of the rows -------------------------------------------------------------------------
 
 
-def test_the_fastest_are_told_at_equal_error():
+def test_fastest_lines_at_equal_error_are_reported():
     table = _ranking.fastest(made_up_rows())
     at = {(row["system"], row["error"]): row for row in table}
     regular = at[_ranking.REGULAR, "1e-06"]
     assert (regular["jaxlag_us"], regular["peer_us"]) == (100.0, 80.0)
     assert (regular["peer"], regular["naive_us"]) == ("heyoka", 3000.0)
-    told = {
+    figures = {
         reference.what: reference.figure
         for reference in _ranking.fastest_references(made_up_rows())
     }
-    words = f"{_ranking.REGULAR}: fastest at 1e-09; jaxlag dopri8 100 us"
-    assert told[words] == "jaxlag dopri8, jax 0.12.0 1 us"
+    text = f"{_ranking.REGULAR}: fastest at 1e-09; jaxlag dopri8 100 us"
+    assert figures[text] == "jaxlag dopri8, jax 0.12.0 1 us"
 
 
 TIMES = "times as long: jaxlag "
 SYSTEMS = (_ranking.REGULAR, "Kepler, e = 0.6")
 
 
-def test_targets_are_judged_and_what_misses_is_explained():
+def test_targets_are_judged_and_misses_are_explained():
     targets, profiles = _ranking.judged(made_up_rows(), SYSTEMS)
     found = {target.claim: (round(target.figure, 6), target.met) for target in targets}
     best = "times as long: jaxlag as the best of heyoka and numba, double pendulum, regular"
@@ -83,12 +83,12 @@ def test_targets_are_judged_and_what_misses_is_explained():
     assert any(reference.what.startswith("3.75 times the best peer") for reference in slow)
     assert not any("times diffrax by hand" in reference.what for reference in slow)
     slower = {reference.what for reference in _ranking.judged(made_up_rows(ours=5.0), SYSTEMS)[1]}
-    words = "1.25 times diffrax by hand with the setting: Kepler, e = 0.6 at 1e-09"
-    assert words in slower
+    text = "1.25 times diffrax by hand with the setting: Kepler, e = 0.6 at 1e-09"
+    assert text in slower
 
 
 @pytest.mark.parametrize(("fixed", "expected"), [(70.0, (70.0, 0.6)), (0.0, (0.0, 0.6))])
-def test_the_time_besides_the_steps_is_told(fixed, expected):
+def test_time_besides_the_steps_is_fitted(fixed, expected):
     points = [{"steps": n, "min_us": fixed + 0.6 * n} for n in (50, 90, 200, 400)]
     assert np.allclose(_ranking.fixed_and_each(points), expected, atol=1e-9)
 
@@ -103,11 +103,11 @@ def test_the_time_besides_the_steps_is_not_negative():
 def test_a_system_that_failed_misses_its_targets():
     targets, _ = _ranking.judged(made_up_rows(), [*SYSTEMS, _ranking.LANES])
     lost = [target for target in targets if _ranking.LANES in target.claim]
-    assert len(lost) == 4  # two of its own, and it is the worst of all twice
+    assert len(lost) == 4  # two of its own, and twice it is the worst of all
     assert not any(target.met for target in lost)
 
 
-def test_an_error_we_never_reach_is_missed_and_one_only_we_reach_is_met():
+def test_unreached_errors_miss_targets_and_unmatched_ones_meet_them():
     rows = rows_of("a", "jaxlag x", (1e-3, 1.0), (1e-7, 2.0)) + rows_of(
         "a", "heyoka", (1e-3, 1.0), (1e-10, 2.0)
     )
@@ -129,7 +129,7 @@ def test_a_target_without_the_peer_is_not_met():
     assert not any(target.met for target in against)
 
 
-def test_the_worst_is_the_largest_or_what_is_unknown():
+def test_worst_is_the_largest_or_an_unknown():
     assert _ranking.worst({"a": 1.0, "b": 3.0}, smallest=False) == ("b", 3.0)
     assert _ranking.worst({"a": 1.0, "b": 3.0}, smallest=True) == ("a", 1.0)
     assert _ranking.worst({"a": 1.0, "b": math.nan}, smallest=True)[0] == "b"
@@ -138,7 +138,7 @@ def test_the_worst_is_the_largest_or_what_is_unknown():
 # ---- Diagrams and the command --------------------------------------------------------------------
 
 
-def test_diagrams_group_lines_and_lead_with_our_fastest(tmp_path):
+def test_diagrams_group_lines_and_highlight_the_fastest_of_jaxlag(tmp_path):
     pytest.importorskip("matplotlib")
     rows = made_up_rows()
     regular = [row for row in rows if row["system"] == _ranking.REGULAR]
@@ -163,7 +163,7 @@ def test_options_of_another_benchmark_are_refused(capsys):
     assert "solve has no option --system" in capsys.readouterr().err
 
 
-def test_a_system_whose_process_dies_is_named_and_the_others_go_on(tmp_path, monkeypatch):
+def test_failed_process_is_named_and_the_others_continue(tmp_path, monkeypatch):
     def contest(name, quick, python):
         if name == "heavy top":
             raise RuntimeError("a worker ended early with status -11")
@@ -191,7 +191,7 @@ def test_an_unknown_system_is_refused():
 
 
 class FakeWorker:
-    """A process that knows one fast and one slow point."""
+    """A process with one fast and one slow point."""
 
     def __init__(self, benchmark, quick, settings, **options):
         self.kind = settings[work_precision.KIND]
@@ -222,7 +222,7 @@ class FakeWorker:
         pass
 
 
-def test_processes_take_turns_and_long_runs_sit_out(monkeypatch):
+def test_processes_alternate_and_long_runs_are_skipped(monkeypatch):
     monkeypatch.setattr(work_precision, "Worker", FakeWorker)
     rows, notes = work_precision.contest("heavy top", False, "another/python")
     assert {row["line"] for row in rows} == {
@@ -230,7 +230,7 @@ def test_processes_take_turns_and_long_runs_sit_out(monkeypatch):
     }
     assert all(set(row) == COLUMNS for row in rows)
     fast, slow = rows[:2]
-    assert fast["repeats"] == 6  # three turns, then its time is up
+    assert fast["repeats"] == 6  # three rounds, then its time is up
     assert math.isclose(fast["min_us"], 10e3)
     assert (slow["repeats"], slow["min_us"]) == (2, 0.3e6)
     assert notes == [("7.0", "version of heyoka")]
@@ -239,7 +239,7 @@ def test_processes_take_turns_and_long_runs_sit_out(monkeypatch):
 
 
 class AbsentWorker(FakeWorker):
-    """One whose other interpreter has no jax."""
+    """A worker whose other interpreter has no jax."""
 
     def __init__(self, benchmark, quick, settings, **options):
         if "interpreter" in options:
@@ -247,16 +247,16 @@ class AbsentWorker(FakeWorker):
         super().__init__(benchmark, quick, settings, **options)
 
 
-def test_another_interpreter_that_cannot_do_it_is_named(monkeypatch):
+def test_failing_interpreter_is_named(monkeypatch):
     monkeypatch.setattr(work_precision, "Worker", AbsentWorker)
     rows, notes = work_precision.contest("heavy top", False, "another/python")
     assert len(rows) == 6
-    words = "another jax: another/python: a worker ended early with status 1"
-    assert ("left out", words) in notes
+    text = "another jax: another/python: a worker ended early with status 1"
+    assert ("left out", text) in notes
 
 
 @pytest.mark.full
-def test_a_quick_run_is_measured_and_told(tmp_path, monkeypatch, capsys):
+def test_quick_run_is_measured_and_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(results, "FOLDER", tmp_path)
     command.main(["work-precision", "--quick"])
     assert "times as long: jaxlag as the best peer" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""States given by the user: their precision."""
+"""Precision of states given by the user."""
 
 import jax
 import jax.numpy as jnp
@@ -53,8 +53,8 @@ def test_states_of_16_bits_are_refused(ask, message, dtype):
         ask(q, v)
 
 
-def test_one_of_more_bits_decides():
-    """As for any two precisions."""
+def test_mixed_precisions_use_the_wider_one():
+    """16 bits with float32 give float32, as for any two precisions."""
     half = jnp.asarray(Q0, jnp.float16)
     options = {"dt": 0.5, "method": "euler"}
     mixed = run(q0=half, v0=jnp.asarray(V0, jnp.float32), **options)

@@ -1,4 +1,4 @@
-"""Vmapped solves: chunks of lanes, against the same trajectories one by one."""
+"""Vmapped solves in chunks of lanes, compared with the same trajectories one by one."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ TS = np.linspace(0.0, 0.5, 4)
 
 
 def run(q0, params=PARAMS, system=double_pendulum.system, method="dopri8"):
-    """Fixed steps: no decision that rounding could turn."""
+    """Fixed steps, so that rounding does not change the steps."""
     return jl.simulate(system, q0, [0.3, -0.4], TS, params, dt=0.01, method=method, throw=False)
 
 
@@ -32,8 +32,8 @@ def single(lowering):
 
 @pytest.mark.full
 @pytest.mark.parametrize("count", [1, 5, 16, 37])
-def test_every_lane_is_its_own_solve(single, count):
-    """To 1e3 roundings: below, at and beyond one chunk, the last of them not full."""
+def test_lanes_equal_single_solves(single, count):
+    """Agreement to 1e3 eps below, at and above one chunk; the last chunk is not full."""
     q0 = starts(count)
     batch = jax.jit(jax.vmap(lambda q0: run(q0).q))(q0)
     assert batch.shape == (count, 4, 2)
@@ -42,8 +42,8 @@ def test_every_lane_is_its_own_solve(single, count):
 
 
 @pytest.mark.full
-def test_only_what_is_mapped_differs(single):
-    """A batch of params at one start."""
+def test_batch_of_params_equals_single_solves(single):
+    """One start, a batch of params."""
     lengths = jnp.linspace(0.8, 1.2, 20)
     batch = jax.jit(jax.vmap(lambda h1: run(jnp.array([0.5, 0.2]), PARAMS | {"h1": h1}).q))(lengths)
     for i in (0, 19):
@@ -52,8 +52,8 @@ def test_only_what_is_mapped_differs(single):
 
 
 @pytest.mark.full
-def test_vmaps_of_vmaps_are_one_batch():
-    """Three by seven, the inner params shared by none, one or all of a row."""
+def test_nested_vmaps_equal_one_batch():
+    """3 x 7 lanes with params constant along the inner axis; also with other batch axes."""
     q0, lengths = starts(3, 7), jnp.linspace(0.8, 1.2, 3)
 
     def one(q0, h1):
@@ -68,8 +68,8 @@ def test_vmaps_of_vmaps_are_one_batch():
 
 @pytest.mark.full
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
-def test_derivatives_pass_through(derivative):
-    """Forward and reverse, first and second order, of the batch as of its trajectories."""
+def test_derivatives_of_batches_equal_single_ones(derivative):
+    """Forward, reverse and second derivatives: vmap of the derivative, derivative of the vmap."""
     q0 = starts(3)
 
     def last(q0):
@@ -85,8 +85,8 @@ def test_derivatives_pass_through(derivative):
         np.testing.assert_allclose(own, mapped[i], rtol=0, atol=1e5 * EPS * scale)
 
 
-def test_lanes_end_by_themselves():
-    """One lane that leaves the floats, in a chunk and in the filling of the last one."""
+def test_failed_lanes_do_not_affect_others():
+    """Lanes that diverge, in a full chunk and in the padded last one, do not affect others."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v + 0.25 * params * jnp.sum(q**4)
@@ -100,65 +100,65 @@ def test_lanes_end_by_themselves():
     stiffness = jnp.full(33, -1.0).at[jnp.array([3, 32])].set(200.0)
     motion = jax.jit(jax.vmap(one))(stiffness)
     alone = jax.jit(one)(-1.0)
-    bad = np.isin(np.arange(33), [3, 32])
-    assert (np.asarray(motion.status) != 0).tolist() == bad.tolist()
-    assert np.isnan(motion.q[bad, -1]).all()
-    np.testing.assert_allclose(motion.q[~bad], np.broadcast_to(alone.q, (31, 3, 2)), atol=1e-9)
+    failed = np.isin(np.arange(33), [3, 32])
+    assert (np.asarray(motion.status) != 0).tolist() == failed.tolist()
+    assert np.isnan(motion.q[failed, -1]).all()
+    np.testing.assert_allclose(motion.q[~failed], np.broadcast_to(alone.q, (31, 3, 2)), atol=1e-9)
 
 
-def test_chunks_are_what_is_compiled(lowering):
-    """37 trajectories: a loop over 3 chunks of rows of 16 numbers; on arrays one loop of 37."""
-    program = operations(jax.vmap(lambda q0: run(q0).q), starts(37), turns=1)
-    rows = {s for o in program if "while" in o.inside and o.name == "div" for s in o.shapes}
+def test_compiled_program_loops_over_chunks(lowering):
+    """37 trajectories: a loop over 3 chunks of 16 lanes; on arrays one loop of 37."""
+    program = operations(jax.vmap(lambda q0: run(q0).q), starts(37), iterations=1)
+    shapes = {s for o in program if "while" in o.inside and o.name == "div" for s in o.shapes}
     if lowering == "auto":
         assert any(o.inside[-2:] and "scan" in o.inside and "while" in o.inside for o in program)
-        assert rows
-        assert all(shape[0] == _batching.LANES for shape in rows)
-        # Rows are written by each lane at a place of its own.
+        assert shapes
+        assert all(shape[0] == _batching.LANES for shape in shapes)
+        # Each lane writes saves at an index of its own.
         assert not [o for o in program if "while" in o.inside and "scatter" in o.name]
     else:
-        assert rows
-        assert all(shape[0] == 37 for shape in rows)
+        assert shapes
+        assert all(shape[0] == 37 for shape in shapes)
 
 
-def test_chunks_of_implicit_methods():
-    """130 trajectories in 3 loops of 44, whatever the equations are computed on."""
+def test_implicit_methods_run_in_larger_chunks():
+    """130 trajectories in 3 loops of 44, independently of the lowering."""
     many = jax.vmap(lambda q0: run(q0, method="gauss2").q)
-    program = operations(many, starts(130), turns=1)
-    rows = {s for o in program if "while" in o.inside and o.name == "lu" for s in o.shapes}
-    assert rows
-    assert all(shape[0] == 44 for shape in rows if len(shape) > 2)
+    program = operations(many, starts(130), iterations=1)
+    shapes = {s for o in program if "while" in o.inside and o.name == "lu" for s in o.shapes}
+    assert shapes
+    assert all(shape[0] == 44 for shape in shapes if len(shape) > 2)
 
 
 @pytest.mark.parametrize("lanes", [3, _batching.LANES + 1])
 @pytest.mark.parametrize("dtype", [float, np.int32])
-def test_rows_are_put_where_each_lane_says(lanes, dtype):
+def test_set_entry_writes_at_the_index_of_each_lane(lanes, dtype):
     rng = np.random.default_rng(0)
     buffer = jnp.asarray(rng.integers(0, 9, (lanes, 5, 2)), dtype)
-    row = jnp.asarray(rng.integers(0, 9, (lanes, 2)))
+    entry = jnp.asarray(rng.integers(0, 9, (lanes, 2)))
     index = jnp.asarray(rng.integers(0, 5, lanes), jnp.int32)
     right = np.array(buffer)
-    right[np.arange(lanes), index] = row
+    right[np.arange(lanes), index] = entry
     each = jax.vmap(set_entry)
-    np.testing.assert_array_equal(jax.jit(each)(buffer, index, row), right)
+    np.testing.assert_array_equal(jax.jit(each)(buffer, index, entry), right)
     same = np.array(buffer)
-    same[:, 2] = row[0]
-    several = jax.vmap(set_entry, (0, None, None))(buffer, jnp.asarray(2), row[0])
+    same[:, 2] = entry[0]
+    several = jax.vmap(set_entry, (0, None, None))(buffer, jnp.asarray(2), entry[0])
     np.testing.assert_array_equal(several, same)
     assert several.dtype == dtype
-    # Directions inside of trajectories, and the other way round.
+    # Directions within trajectories, and trajectories within directions.
     once, twice = jax.vmap(set_entry, (0, None, 0)), jnp.stack([buffer, 2 * buffer], 1)
-    found = jax.jit(jax.vmap(once))(twice, index, jnp.stack([row, 2 * row], 1))
+    found = jax.jit(jax.vmap(once))(twice, index, jnp.stack([entry, 2 * entry], 1))
     np.testing.assert_array_equal(found, np.stack([right, 2 * right], 1))
-    found = jax.jit(jax.vmap(each, (1, None, 1)))(twice, index, jnp.stack([row, 2 * row], 1))
+    found = jax.jit(jax.vmap(each, (1, None, 1)))(twice, index, jnp.stack([entry, 2 * entry], 1))
     np.testing.assert_array_equal(found, np.stack([right, 2 * right]))
-    if dtype is float:  # linear in the buffer and the row
-        row = row.astype(dtype)
-        dots = jax.jvp(lambda b, r: each(b, index, r), (buffer, row), (-buffer, -row))
+    if dtype is float:  # linear in the buffer and the entry
+        entry = entry.astype(dtype)
+        dots = jax.jvp(lambda b, r: each(b, index, r), (buffer, entry), (-buffer, -entry))
         np.testing.assert_array_equal(dots[1], -right)
 
 
-def test_explain_says_which():
+def test_explain_states_the_chunk_size():
     line = "batches       by jax.vmap: 16 trajectories at a time in one loop"
     assert line in double_pendulum.system.explain(PARAMS)
     arrays = jl.System(double_pendulum.system.lagrangian, ("a", "b"), lowering="array")
@@ -166,8 +166,8 @@ def test_explain_says_which():
 
 
 @pytest.mark.full
-def test_many_rows_of_a_costly_scene():
-    """XLA shares among cores an operation that costs much, but cannot in a native loop."""
+def test_batch_with_many_saves_of_costly_equations_equals_single_solves():
+    """XLA splits costly operations over threads, which is impossible in a native loop."""
 
     def rubbing(t, q, v, params):
         speeds = v[0], v[1] - v[0]

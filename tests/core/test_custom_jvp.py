@@ -1,7 +1,7 @@
-"""Rules of their own stay with functions: through every transform, to second derivatives.
+"""Custom derivative rules survive every transform, up to second derivatives.
 
-The rule of `sine` is unlike the derivative of its body: f' = 2 f, so that f'' = 4 f. What drops it
-gives -f.
+The rule of `sine` differs from the derivative of its body: f' = 2 f, so that f'' = 4 f. A transform
+that drops the rule gives -f.
 """
 
 import itertools
@@ -60,14 +60,14 @@ def _(primals, tangents):
 
 
 def of_pairs(fs, pairs):
-    """All second derivatives at X, in one program."""
+    """All second derivatives at X, by one compiled program."""
     found = jax.jit(lambda x: [twice(pair, f)(x) for f in fs for pair in pairs])(jnp.asarray(X))
     return dict(zip(itertools.product(range(len(fs)), pairs), map(float, found), strict=True))
 
 
 @pytest.mark.parametrize("loop", LOOPS)
 def test_rules_survive_loops(loop):
-    """Ours, and one by `jax.custom_jvp` in a program in which they are kept."""
+    """Rules of `CustomJVP`, and of `jax.custom_jvp` under `keeping_rules`."""
     found = of_pairs([LOOPS[loop](f) for f in (sine, keeping_rules(users))], PAIRS)
     wanted = 4 * np.sin(X)
     assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
@@ -88,7 +88,7 @@ def quotient(x, y):
 
 @quotient.defjvp
 def _(primals, tangents):
-    """Calls the function itself on tangents, which it is linear in."""
+    """Calls the function itself on tangents, in which it is linear."""
     (_, y), (dx, dy) = primals, tangents
     z = quotient(*primals)
     return z, quotient(dx - z * dy, y)
@@ -96,8 +96,8 @@ def _(primals, tangents):
 
 @pytest.mark.parametrize("loop", ["fori_loop", "jit", "checkpoint", "vmap"])
 @pytest.mark.parametrize("mode", ["grad", "jacrev"])
-def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
-    """Reverse derivatives turn such a call round: of 1 / (1 + x^2), once and twice."""
+def test_rules_may_call_functions_linear_in_tangents(mode, loop):
+    """Reverse derivatives transpose such a call: of 1 / (1 + x^2), first and second order."""
 
     def f(x):
         return quotient(jnp.ones_like(x), 1.0 + x * x)
@@ -110,8 +110,8 @@ def test_rules_may_call_what_is_linear_in_tangents(mode, loop):
         np.testing.assert_allclose(twice(pair, looped)(x), second, rtol=1e-13)
 
 
-def test_reverse_derivatives_of_single_precision_in_loops():
-    """Where the equations divide; as in double precision."""
+def test_float32_derivatives_in_loops_equal_float64():
+    """Equations with a division, compared with double precision."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 * (1 + q[0] ** 2) + jnp.cos(p * q[0]), ("x",)
     )
@@ -128,15 +128,15 @@ def test_reverse_derivatives_of_single_precision_in_loops():
         assert abs(float(one) - float(other)) <= 32 * float(jnp.finfo(jnp.float32).eps) * 0.02
 
 
-def test_rules_by_jax_are_dropped_by_the_loops_of_jax():
-    """Why the rule is a primitive's. Once this fails, on all supported versions, it need not be."""
+def test_jax_loops_may_drop_custom_jvp_rules():
+    """The reason for a primitive, until all supported versions of JAX keep such rules."""
     found = jax.jvp(jax.grad(LOOPS["scan"](users)), (X,), (1.0,))[1]
     assert np.isclose(found, 4 * np.sin(X)) or np.isclose(found, 2 * np.cos(X))
 
 
 @CustomJVP
 def scaled(tree, count, factor):
-    """Of a dict, an integer and a number."""
+    """A function of a dict, an integer and a number."""
     return {"sum": jnp.sum(tree["x"]) * factor, "count": count + 1}, tree["x"] * factor
 
 
@@ -148,19 +148,19 @@ def scaled_rule(primals, tangents):
     SEEN.append(jax.tree.map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None))
     dot = jnp.zeros_like(tree["x"]) if tangents[0]["x"] is None else tangents[0]["x"]
     moved = 0.0 if tangents[2] is None else tangents[2]
-    rows = dot * factor + tree["x"] * moved
-    return scaled(*primals), ({"sum": 10.0 * jnp.sum(rows), "count": None}, rows)
+    products = dot * factor + tree["x"] * moved
+    return scaled(*primals), ({"sum": 10.0 * jnp.sum(products), "count": None}, products)
 
 
 scaled.defjvp(scaled_rule, symbolic_zeros=True)
 
 
-def test_trees_integers_and_zero_tangents():
+def test_rules_accept_trees_integers_and_zero_tangents():
     x = jnp.array([1.0, 2.0])
 
     def total(x, factor):
-        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
-        return sums["sum"] + rows[0]
+        sums, products = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + products[0]
 
     SEEN.clear()
     np.testing.assert_allclose(jax.grad(total)(x, 5.0), [55.0, 50.0])
@@ -172,13 +172,13 @@ def test_trees_integers_and_zero_tangents():
 
 
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
-def test_rows_of_some_arguments(axes):
+def test_vmap_over_some_arguments_equals_single_calls(axes):
     x, factor = jnp.arange(6.0).reshape(3, 2), jnp.array([2.0, 3.0, 5.0])
     given = x if axes[0] == 0 else x[0], factor if axes[1] == 0 else factor[0]
 
     def total(x, factor):
-        sums, rows = scaled({"x": x}, jnp.asarray(3), factor)
-        return sums["sum"] + rows[0]
+        sums, products = scaled({"x": x}, jnp.asarray(3), factor)
+        return sums["sum"] + products[0]
 
     for derivative in (jax.grad, jax.jacfwd):
         by = derivative(total, argnums=(0, 1))
@@ -188,20 +188,20 @@ def test_rows_of_some_arguments(axes):
             for i in range(3)
         ]
         for k in (0, 1):
-            np.testing.assert_allclose(found[k], jnp.stack([row[k] for row in single]))
+            np.testing.assert_allclose(found[k], jnp.stack([gradient[k] for gradient in single]))
     # The derivative of the batch, not the batch of derivatives.
     whole = jax.jit(jax.jacrev(lambda *given: jax.vmap(total, axes)(*given), argnums=(0, 1)))
     jac = whole(*given)[0]
     for i in range(3):
-        row = jac[i, i] if axes[0] == 0 else jac[i]
+        gradient = jac[i, i] if axes[0] == 0 else jac[i]
         expected = jax.grad(total)(
             given[0][i] if axes[0] == 0 else given[0], given[1][i] if axes[1] == 0 else given[1]
         )
-        np.testing.assert_allclose(row, expected)
+        np.testing.assert_allclose(gradient, expected)
 
 
-def test_a_number_without_a_transform_is_computed_at_once():
-    """Nothing is traced where there is nothing to differentiate."""
+def test_calls_on_numbers_are_not_traced():
+    """Nothing is traced if nothing is differentiated."""
     calls = []
 
     @CustomJVP
@@ -217,8 +217,8 @@ def test_a_number_without_a_transform_is_computed_at_once():
         assert jax.grad(seen)(2.0) == 3.0
 
 
-def test_rules_within_rules_are_kept():
-    """The rule of the outer function calls one by `jax.custom_jvp` itself."""
+def test_nested_rules_survive_loops():
+    """The rule of the outer function calls a function with a rule by `jax.custom_jvp`."""
 
     @jax.custom_jvp
     def outer(x):
@@ -228,14 +228,14 @@ def test_rules_within_rules_are_kept():
     def _(primals, tangents):
         return outer(*primals), users(*primals) * tangents[0]
 
-    kept = LOOPS["scan"](keeping_rules(outer))
-    first = jax.grad(kept)(X)
-    second = jax.jvp(jax.grad(kept), (X,), (1.0,))[1]
-    third = jax.grad(lambda x: jax.jvp(jax.grad(kept), (x,), (1.0,))[1])(X)
+    looped = LOOPS["scan"](keeping_rules(outer))
+    first = jax.grad(looped)(X)
+    second = jax.jvp(jax.grad(looped), (X,), (1.0,))[1]
+    third = jax.grad(lambda x: jax.jvp(jax.grad(looped), (x,), (1.0,))[1])(X)
     np.testing.assert_allclose([first, second, third], np.array([1, 2, 4]) * np.sin(X), rtol=1e-15)
 
 
-# ---- What jaxlag makes of it --------------------------------------------------------------------
+# ---- Derivatives of jaxlag's functions in loops --------------------------------------------------
 
 
 def pendulum(function, lowering="auto"):
@@ -327,12 +327,12 @@ AROUND = {
 
 
 def matrix(derivative):
-    """From a function of params to the row, or the matrix, of its derivatives."""
+    """Maps a function of params to the function that returns its gradient or Jacobian."""
     if derivative == "jvp":
         return lambda f: lambda w: jnp.stack([jax.jvp(f, (w,), (e,))[1] for e in jnp.eye(2)], -1)
     if derivative == "grad":
 
-        def rows(f):
+        def by_grad(f):
             def of(w):
                 if jax.eval_shape(f, w).shape == ():
                     return jax.grad(f)(w)
@@ -340,12 +340,12 @@ def matrix(derivative):
 
             return of
 
-        return rows
+        return by_grad
     return DERIVATIVES[derivative]
 
 
 def hessian_of(function):
-    """In no loop, where no rule is dropped."""
+    """Second derivatives without a loop, where no rule is dropped."""
 
     def total(w):
         return function(STARTS[0], w) + function(STARTS[1], w)
@@ -354,7 +354,7 @@ def hessian_of(function):
 
 
 def check(function, loops, pairs, rtol):
-    """Everything in one program; forward derivatives alone, and no loop, say what is right."""
+    """All in one program; the reference is forward over forward without a loop."""
     chosen = list(itertools.product(loops, pairs))
     ways = [
         matrix(outer)(matrix(inner)(eqx.Partial(AROUND[loop], function)))
@@ -368,13 +368,13 @@ def check(function, loops, pairs, rtol):
 
 
 @pytest.mark.parametrize("name", CHEAP)
-def test_second_derivatives_of_values_in_loops(name):
+def test_second_derivatives_of_values_are_right_in_loops(name):
     check(CHEAP[name], ["map"], [("jvp", "grad"), ("grad", "grad")], 1e-10)
 
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
-def test_second_derivatives_of_motions_in_loops(lowering):
-    """And without a loop of the user's: that of the steps drops no rule either."""
+def test_second_derivatives_of_motions_are_right_in_loops(lowering):
+    """Also without a loop by the user: the loop over steps drops no rule either."""
     angle = end(pendulum(users, lowering), method="bosh3", dt=0.25)
 
     def alone(w):
@@ -394,19 +394,19 @@ def test_second_derivatives_of_motions_in_loops(lowering):
 @pytest.mark.full
 @pytest.mark.parametrize("loop", AROUND)
 @pytest.mark.parametrize("name", CHEAP)
-def test_all_pairs_of_values(name, loop):
+def test_all_pairs_of_modes_agree_on_values(name, loop):
     check(CHEAP[name], [loop], PAIRS, 1e-10)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("loop", AROUND)
-def test_all_pairs_of_motions(loop):
+def test_all_pairs_of_modes_agree_on_motions(loop):
     check(MOTIONS["auto"], [loop], PAIRS, 1e-7)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", MOTIONS)
-def test_pairs_of_all_methods(name):
+def test_pairs_of_modes_agree_for_all_methods(name):
     pairs = [("jvp", "grad"), ("jvp", "jacfwd"), ("grad", "jvp")]
     if "implicit" not in name:
         pairs.append(("grad", "grad"))

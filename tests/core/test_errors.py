@@ -19,12 +19,12 @@ from jaxlag._core._errors import invalid, shortened, unsupported
         ("names of the inputs", "names of the inputs"),
     ],
 )
-def test_a_name_stands_in_back_ticks(argument, shown):
+def test_argument_names_are_in_back_ticks(argument, shown):
     error = invalid(argument, "be finite", "it was nan", "Leave it out.")
     assert str(error) == f"{shown} must be finite, but it was nan. Leave it out."
 
 
-def test_what_no_argument_is_wrong_with_is_not_supported():
+def test_unsupported_states_the_reason_and_a_fix():
     error = unsupported("`at` of a batch", "its shape is (2,)", "Take one of them.")
     assert str(error) == "`at` of a batch is not supported: its shape is (2,). Take one of them."
 
@@ -51,7 +51,7 @@ def test_long_arrays_are_shortened(text, shown):
 
 
 @pytest.mark.parametrize("piece", ["[", "[1 ", "[1     ", "1 ", "]"])
-def test_what_never_closes_stays_as_it_is(piece):
+def test_unclosed_brackets_stay_unchanged(piece):
     assert shortened(piece * 10_000) == piece * 10_000
 
 

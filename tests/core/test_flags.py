@@ -1,4 +1,4 @@
-"""JAX's switches for strict programs and for debugging: none of them meets a fault of ours."""
+"""JAX's flags for strict promotion and for debugging raise no error in jaxlag."""
 
 import contextlib
 import subprocess
@@ -87,7 +87,7 @@ PLAIN = {
     "infs": ["eager"],
     "nans": ["eager"],
 }
-LEFT_OUT = {("infs", "growth"), ("infs", "fit")}  # infinite where they mean "never", "unknown"
+LEFT_OUT = {("infs", "growth"), ("infs", "fit")}  # their results contain inf: "never", "unknown"
 
 
 def check(flag, job):
@@ -97,14 +97,14 @@ def check(flag, job):
 
 
 @pytest.mark.parametrize(("flag", "job"), [(f, job) for f, jobs in PLAIN.items() for job in jobs])
-def test_switches(flag, job):
+def test_main_jobs_run_under_each_flag(flag, job):
     check(flag, job)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("job", JOBS)
 @pytest.mark.parametrize("flag", FLAGS)
-def test_all_switches(flag, job):
+def test_all_jobs_run_under_all_flags(flag, job):
     if (flag, job) in LEFT_OUT:
         pytest.skip("some of its numbers are infinite")
     check(flag, job)
@@ -125,6 +125,6 @@ with jax.disable_jit():
 
 
 @pytest.mark.full
-def test_without_jit():
-    """In a process in which types are not checked: counters of loops are Python's there."""
+def test_gradients_without_jit_equal_compiled_ones():
+    """In a process without type checks: without jit, loop counters are Python integers."""
     subprocess.run([sys.executable, "-c", WITHOUT_JIT], check=True)

@@ -1,4 +1,4 @@
-"""What was pickled when all modules lay in one folder is refused, with what to do."""
+"""Pickles of the former layout, with all modules in one folder, are refused with advice."""
 
 import pickle
 import sys
@@ -21,7 +21,7 @@ def test_a_pickle_of_the_old_layout_is_refused(name):
         pickle.loads(old)
 
 
-def test_names_that_are_there_and_names_of_others_are_as_ever():
+def test_present_names_and_other_packages_load_as_usual():
     new = pickle.loads(b"cjaxlag._system._system\nSystem\n.")
     assert new is jaxlag.System
     with pytest.raises(ModuleNotFoundError, match="No module named 'jaxlogs'"):
@@ -30,7 +30,7 @@ def test_names_that_are_there_and_names_of_others_are_as_ever():
     assert not hasattr(jaxlag, "nothing")
 
 
-def test_python_asks_once():
+def test_install_adds_one_finder():
     _old_pickles.install()
     finders = [x for x in sys.meta_path if type(x).__module__ == _old_pickles.__name__]
     assert len(finders) == 1

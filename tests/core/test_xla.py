@@ -58,7 +58,7 @@ def test_solver_loop_is_one_native_function():
     assert "Warning" not in done.stderr
 
 
-def test_existing_options_are_kept():
+def test_existing_options_stay_set():
     done = child(
         XLA_FLAGS="--xla_backend_extra_options=xla_cpu_enable_concurrency_optimized_scheduler=false"
     )
@@ -69,7 +69,7 @@ OLD = pytest.mark.skipif(not _xla.needed(), reason="this jax raised the bound it
 
 
 @OLD
-def test_switches_leave_everything_alone():
+def test_switches_disable_the_setting():
     done = child(JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES="0")
     assert "entry loops left: 0" not in done.stdout
     assert "JAXLAG_XLA_FLAGS=0 and JAXLAG_XLA_ATTRIBUTES=0" in done.stdout
@@ -77,7 +77,7 @@ def test_switches_leave_everything_alone():
 
 
 @OLD
-def test_compilation_before_import_is_said_once():
+def test_compilation_before_import_warns_once():
     done = child(first="jax.jit(lambda x: x + 1)(1.0)", JAXLAG_XLA_ATTRIBUTES="0")
     assert done.stderr.count("Solves will be several times slower") == 1
     assert "its loop setting came too late" in done.stdout
@@ -131,26 +131,26 @@ print(free.explain({"m": 1.0}).splitlines()[-1])
 """
 
 
-@pytest.mark.full  # minutes, in two processes of its own
+@pytest.mark.full  # minutes, in two separate processes
 @OLD
-def test_attributes_do_what_the_setting_does():
-    """Every transformation, in a process of its own, since they are internal to XLA."""
+def test_attributes_have_the_effect_of_the_setting():
+    """Every transformation, in a separate process: the attributes are internal to XLA."""
     found = {}
     for attributes in "01":
         done = child(code=EVERYTHING, JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES=attributes)
-        numbers, used, said = done.stdout.splitlines()
+        numbers, used, explanation = done.stdout.splitlines()
         found[attributes] = json.loads(numbers)
-        # XLA marks small loops of its own, such as the search in a table. The last two programs
+        # XLA itself marks small loops, such as the search in a table. The last two programs
         # multiply by a large matrix.
         marked = [True] * 12 + [False] * 2
         assert attributes == "0" or used == str(marked)
-        assert ("by attributes of their calls" in said) == (attributes == "1")
+        assert ("by attributes of their calls" in explanation) == (attributes == "1")
     for a, b in zip(found["0"], found["1"], strict=True):
-        # One rounding in a fused product moves a step: rtol = atol = 1e-9.
+        # One rounding in a fused product changes a step, within rtol = atol = 1e-9.
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
 
 
-def test_attributes_are_for_versions_they_were_tested_on(monkeypatch):
+def test_attributes_are_used_only_for_tested_versions(monkeypatch):
     monkeypatch.setattr(_xla, "in_force", lambda: False)
     monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
     assert _xla.by_attribute()
@@ -162,7 +162,7 @@ def test_attributes_are_for_versions_they_were_tested_on(monkeypatch):
 
 
 def test_only_plain_operations_are_marked():
-    """What calls a library or the host, nested in a loop, is left to XLA as it is."""
+    """Calls of a library or of the host, nested in a loop, are left to XLA."""
 
     def plain(function, x):
         looped = lambda x: jax.lax.scan(lambda c, _: (function(c), None), x, None, 3)[0]  # noqa: E731
@@ -172,7 +172,7 @@ def test_only_plain_operations_are_marked():
     assert plain(lambda x: jnp.sin(x) + M[0] * x, M)
     assert plain(lambda x: jax.lax.cond(x[0, 0] > 0, jnp.cos, jnp.tan, x), M)
     assert not plain(lambda x: x @ x, M)
-    # A vmap makes a product of matrices of it, but not where the vector is a row of a method.
+    # vmap makes a matrix product of it, unless the vector holds coefficients of a method's stages.
     assert not plain(lambda x: jnp.eye(8) @ x, jnp.ones(8))
     body = jax.make_jaxpr(lambda x: jnp.ones(8) @ x)(jnp.ones((8, 4))).jaxpr
     assert _xla._plain(body, stages=8)
@@ -183,7 +183,7 @@ def test_only_plain_operations_are_marked():
 
 
 def test_scalar_programs_are_plain():
-    """Else every loop would run operation by operation where XLA's setting came too late."""
+    """Otherwise every loop would run operation by operation if XLA's setting came too late."""
     program, params = (
         double_pendulum.system._program,
         dict.fromkeys(("m1", "m2", "h1", "h2", "g"), 1.0),
@@ -198,7 +198,7 @@ def test_scalar_programs_are_plain():
         assert _xla._plain(traced.jaxpr)
 
 
-def test_merging():
+def test_merged_flags_extend_existing_ones():
     flag = f"{_xla.EXTRA}{_xla.OPTION}={_xla.BYTES}"
     assert _xla.merged("") == flag
     assert _xla.merged("--a=1") == f"--a=1 {flag}"

@@ -1,4 +1,4 @@
-"""A pendulum whose parameters are known, as it would be measured."""
+"""A pendulum with known parameters, and simulated measurements of it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ OPTIONS = {"simulate_options": STEPS}
 
 
 def tight(tolerance, **options):
-    """Options of a motion of this tolerance."""
+    """Options of a motion with this tolerance."""
     return {"rtol": tolerance, "atol": tolerance} | options
 
 
@@ -37,7 +37,7 @@ driven = jl.System(
 
 
 def angles(ts=TS, q0=1.0, seed=0, noise=NOISE, **options):
-    """Measured angles of the true pendulum; the truth is far more accurate than they are."""
+    """Measured angles of the true pendulum; the simulation is far more accurate than they are."""
     system = driven if options else pendulum
     motion = jl.simulate(system, [q0], [0.0], ts, TRUE, rtol=1e-11, atol=1e-11, **options)
     return np.asarray(motion["x"]) + noise * np.random.default_rng(seed).normal(size=len(ts))
@@ -54,7 +54,7 @@ def fit(data, free=("l", "c"), params0=None, system=pendulum, **options):
 
 
 def within(found, names, deviations=3.5):
-    """Estimates within so many of their own standard deviations of the truth."""
+    """Estimates are within so many of their standard deviations of the truth."""
     for name in names:
         assert found.std[name] < 0.05 * TRUE[name]
         assert abs(found.params[name] - TRUE[name]) < deviations * found.std[name], name

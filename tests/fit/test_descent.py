@@ -1,4 +1,4 @@
-"""Fits by gradients of few segments at a time."""
+"""Fits by gradients of a few segments at a time."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ from jaxlag._fit._setup import build_shooting, readers_of
 
 
 @pytest.mark.full
-def test_a_descent_finds_what_least_squares_finds():
+def test_descent_agrees_with_least_squares():
     pieces = experiment(sigma={"x": NOISE}).windows(1.0)
     start = TRUE | {"l": 0.68, "c": 0.08}
     descent = jl.Descent(optax.adam(3e-3), epochs=400, batch=2)
@@ -35,8 +35,8 @@ def test_a_descent_finds_what_least_squares_finds():
 
 
 @pytest.mark.parametrize("segments", [1, 5])
-def test_the_cost_is_guessed_without_bias(segments):
-    """The mean over all parts of equal size is the cost of the least squares, gaps included."""
+def test_estimate_of_the_cost_is_unbiased(segments):
+    """The mean over all parts of equal size is the cost of least squares, including gaps."""
     data = experiment(sigma={"x": NOISE})
     data = (data, jl.Experiment(data.ts, {"x": angles(seed=1)}, sigma={"x": NOISE}))
     free = unknowns(TRUE, ("l",), {})
@@ -51,14 +51,16 @@ def test_the_cost_is_guessed_without_bias(segments):
     whole = 0.5 * sum(float(jnp.sum(r**2)) for r in jax.tree.leaves(residuals))
     order = rng.permutation(len(x)).reshape(2, -1)
     parts = [float(cost_of(guess, problem, jnp.asarray(which), join)) for which in order]
-    # Solved in other batches: equal to rounding of terms of 1e-16 * (angle/NOISE)^2 * rows.
+    # Solved in other batches: equal to rounding of terms of 1e-16 * (angle/NOISE)^2 * samples.
     np.testing.assert_allclose(np.mean(parts), whole, rtol=1e-9)
 
 
 @pytest.mark.full
-def test_a_network_in_the_potential_is_found():
-    """A spring that hardens, fitted as a linear one and a network: it predicts what the linear one
-    does not, and the energy is that of a conservative system."""
+def test_network_in_the_potential_is_fitted():
+    """A hardening spring, fitted by a linear spring and a network.
+
+    It predicts better than the linear spring alone, and the energy is conserved.
+    """
 
     def true(t, q, v, params):
         return 0.5 * v[0] ** 2 - 2.0 * q[0] ** 2 - 1.5 * q[0] ** 4
@@ -96,8 +98,8 @@ def test_a_network_in_the_potential_is_found():
 
 
 @pytest.mark.full
-def test_a_segment_that_fails_moves_nothing():
-    """A spring that breaks at x = 2, where one recording begins."""
+def test_failed_segment_does_not_change_the_fit():
+    """A spring that breaks at x = 2, where one recording starts."""
 
     def force(t, q, v, p):
         return -p["k"] * q + 1e-15 * jnp.sqrt(2.0 - q)
@@ -136,7 +138,7 @@ def test_derivatives_that_are_not_finite_are_counted():
 
 
 @pytest.mark.full
-def test_of_more_than_200_numbers_no_covariance_is_computed():
+def test_covariance_is_omitted_for_more_than_200_parameters():
     def lagrangian(t, q, v, p):
         return 0.5 * v[0] ** 2 - 2.0 * q[0] ** 2 - p["net"](q)
 
@@ -154,7 +156,7 @@ def test_of_more_than_200_numbers_no_covariance_is_computed():
 
 
 def test_motions_of_a_descent_are_counted():
-    """Whole parts of equal size: one segment of five sits each epoch out."""
+    """Parts of equal size: each epoch omits one segment of five."""
     descent = jl.Descent(optax.sgd(1.0), epochs=3, batch=2)
     assert descent.steps(5) == (2, 2)
     assert descent.solves(5) == 3 * 2 * 2
@@ -170,6 +172,6 @@ def test_motions_of_a_descent_are_counted():
         ((optax.sgd(1.0),), {"gap": 0.0}, r"`gap` must be positive, but it was 0"),
     ],
 )
-def test_bad_arguments_are_named(arguments, options, message):
+def test_invalid_arguments_are_named(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         jl.Descent(*arguments, **options)

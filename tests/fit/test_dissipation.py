@@ -1,4 +1,4 @@
-"""Friction that a fit finds to give energy is named."""
+"""Fitted friction that adds energy is named."""
 
 import warnings
 
@@ -13,13 +13,13 @@ NOISE = 1e-3 * np.random.default_rng(0).normal(size=61)
 
 
 def fitted(force, growth, c0=0.1):
-    """A swing that grows as exp(growth t), fitted with a force that depends on c."""
+    """An oscillation that grows as exp(growth t), fitted with a force that depends on c."""
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 2 * q[0] ** 2, ("x",), forces=(force,))
     x = 0.3 * np.exp(growth * TS) * np.cos(2 * TS) + NOISE
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         found = jl.fit(system, jl.Experiment(TS, {"x": x}), {"c": c0}, free=("c",))
-    return found, [str(x.message) for x in told]
+    return found, [str(x.message) for x in warned]
 
 
 RAYLEIGH = jl.Rayleigh(lambda t, q, v, p: 0.5 * p["c"] * v[0] ** 2, "friction")
@@ -36,22 +36,24 @@ def test_negative_friction_is_named(force, c0):
     assert f"adds energy: {force.name}" in str(found)
 
 
-def test_friction_and_what_is_meant_to_drive_are_not():
+def test_positive_friction_and_driving_forces_are_not_named():
     assert fitted(RAYLEIGH, -0.05)[0].feeding == {}
     drive = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * (q**2 - 0.01) * v, "drive")
     assert fitted(drive, 0.05)[0].feeding == {}
 
 
-def test_friction_that_may_be_none_and_forces_without_power_are_not():
-    """Zero within two standard deviations; across the velocity, whose power is rounding."""
-    still, texts = fitted(DRAG, 0.0)
-    assert abs(still.params["c"]) < 2 * still.std["c"]
-    assert still.feeding == {}
+def test_insignificant_friction_and_powerless_forces_are_not_named():
+    """Zero within two standard deviations; normal to the velocity, with a power of rounding."""
+    undamped, texts = fitted(DRAG, 0.0)
+    assert abs(undamped.params["c"]) < 2 * undamped.std["c"]
+    assert undamped.feeding == {}
     assert not any("adds energy" in text for text in texts)
-    turn = jl.GeneralizedForce(
+    gyroscopic = jl.GeneralizedForce(
         lambda t, q, v, p: jnp.cross(p["w"] * jnp.array([0.3, -0.7, 1.0]), v), "turn"
     )
-    spatial = jl.System(lambda t, q, v, p: 0.5 * v @ v - 2 * q @ q, {"x": (3,)}, forces=(turn,))
+    spatial = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - 2 * q @ q, {"x": (3,)}, forces=(gyroscopic,)
+    )
     ts = TS[::3]
     motion = jl.simulate(spatial, [0.3, 0.1, 0.0], [0.0, 0.2, 0.5], ts, {"w": 0.4})
     data = jl.Experiment(ts, {"x": np.asarray(motion.q)}, sigma={"x": 1e-3})

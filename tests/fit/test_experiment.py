@@ -8,7 +8,7 @@ import jaxlag as jl
 
 
 @pytest.mark.full
-def test_windows_and_parts():
+def test_windows_and_parts_divide_a_recording():
     pieces = experiment().windows(1.0)
     assert [len(piece.ts) for piece in pieces] == [50, 50, 50]
     assert pieces[1].ts[0] == TS[50]
@@ -30,7 +30,7 @@ def test_windows_and_parts():
         (0.03, r"`seconds` must cover two samples or more, but it was 0\.03"),
     ],
 )
-def test_bad_windows_are_named(seconds, message):
+def test_invalid_windows_are_named(seconds, message):
     with pytest.raises(ValueError, match=message):
         experiment().windows(seconds)
 
@@ -60,6 +60,6 @@ NAN = np.full(len(TS), np.nan)
         (TS, {"x": TS}, {"start_sigma": 0.0}, r"be given together with q0 and v0"),
     ],
 )
-def test_a_bad_experiment_is_named(ts, channels, options, message):
+def test_invalid_experiment_is_named(ts, channels, options, message):
     with pytest.raises(ValueError, match=message):
         jl.Experiment(ts, channels, **options)

@@ -1,4 +1,4 @@
-"""Fits of motions whose parameters are known; every warning and error by name."""
+"""Fits of motions with known parameters; every warning and error by name."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,7 @@ def test_parameters_start_and_noise_are_found(segments):
     assert found.converged
     within(found, ("l", "c"))
     np.testing.assert_allclose(found.starts[0], [1.0, 0.0], atol=5e-3)
-    # Of 151 samples the standard deviation is known to 6 %.
+    # A standard deviation of 151 samples is known to 6 %.
     np.testing.assert_allclose(found.noise["x"], NOISE, rtol=0.2)
     np.testing.assert_allclose(found.rms("x"), NOISE, rtol=0.2)
     low, high = found.interval()["l"]
@@ -39,9 +39,11 @@ def test_parameters_start_and_noise_are_found(segments):
 
 
 @pytest.mark.full
-def test_segments_find_what_one_motion_does():
-    """Joined ever more tightly they are one motion: the same estimates, within a hundredth of
-    their standard deviations."""
+def test_segments_give_the_estimates_of_one_motion():
+    """Joined ever more tightly they are one motion: the estimates are equal.
+
+    The tolerance is a hundredth of their standard deviations.
+    """
     one, many = (fit(experiment(), segments=k, rtol=1e-7, atol=1e-7) for k in (1, 5))
     for name in ("l", "c"):
         assert abs(one.params[name] - many.params[name]) < 1e-2 * one.std[name]
@@ -49,7 +51,7 @@ def test_segments_find_what_one_motion_does():
 
 
 @pytest.mark.full
-def test_the_covariance_is_that_of_the_dense_derivatives():
+def test_covariance_equals_that_of_dense_derivatives():
     """(J^T J)^-1 of params and starts, from central differences of simulations."""
     data = experiment(sigma={"x": NOISE})
     found = fit(data)
@@ -70,17 +72,17 @@ def test_the_covariance_is_that_of_the_dense_derivatives():
 
 
 @pytest.mark.full
-def test_several_experiments_with_gaps_and_other_rates():
-    """Padding and gaps count nothing: as a fit of the rows that are there."""
+def test_gaps_and_sampling_rates_do_not_affect_estimates():
+    """Padding and gaps have no effect: the fit equals that of the present samples."""
     short = np.linspace(0.0, 1.0, 23)
     y = angles()
     with_gap = y.copy()
     with_gap[40:70] = np.nan
     second = {"x": angles(short, 0.6, seed=1)}
-    kept = np.isfinite(with_gap)
+    selected = np.isfinite(with_gap)
     one = fit((jl.Experiment(TS, {"x": with_gap}), jl.Experiment(short, second)))
-    same = jl.Experiment(TS[kept], {"x": y[kept]}), jl.Experiment(short, second)
-    # Fixed steps do not depend on which rows are saved.
+    same = jl.Experiment(TS[selected], {"x": y[selected]}), jl.Experiment(short, second)
+    # Fixed steps do not depend on the save times.
     other = fit(same)
     within(one, ("l", "c"))
     np.testing.assert_allclose(one.values, other.values, rtol=1e-6)
@@ -90,8 +92,8 @@ def test_several_experiments_with_gaps_and_other_rates():
 
 
 @pytest.mark.full
-def test_a_driven_motion_and_its_rate():
-    """Torque from a table, in segments; a measured rate and a channel of one's own."""
+def test_driven_motion_is_fitted_by_its_rate_and_a_channel():
+    """Torque from a table, in segments; a measured rate and a user-defined channel."""
     times = np.linspace(0.0, 3.0, 61)
     torque = jl.LinearInterpolation(times, 0.8 * np.sin(3.0 * times))
     motion = jl.simulate(driven, [0.2], [0.0], TS, TRUE, inputs={"torque": torque})
@@ -122,8 +124,8 @@ def test_a_driven_motion_and_its_rate():
     within(found, ("l", "m"))
 
 
-def test_what_cannot_be_known_is_named():
-    """L is m times a function of l and g/l: a free swing tells g/l and c/(m l^2)."""
+def test_unidentifiable_parameters_are_named():
+    """L is m times a function of l and g/l: a free swing determines g/l and c/(m l^2)."""
     found = fit(experiment(), ("m", "l", "g"), TRUE | {"c": 0.05})
     assert len(found.unidentifiable) == 1
     assert np.isinf(found.std["g"])
@@ -132,7 +134,7 @@ def test_what_cannot_be_known_is_named():
     np.testing.assert_allclose(ratio, TRUE["g"] / TRUE["l"], rtol=3e-3)
 
 
-def test_priors_decide_what_measurements_do_not():
+def test_priors_determine_unidentifiable_parameters():
     prior = {"g": jl.Prior(9.81, 0.01)}
     found = fit(experiment(), ("l", "g", "m"), TRUE | {"l": 0.6}, priors=prior)
     assert not found.unidentifiable
@@ -141,8 +143,8 @@ def test_priors_decide_what_measurements_do_not():
 
 
 @pytest.mark.full
-def test_a_search_that_errors_of_the_solver_stop_is_said():
-    """Dry friction, whose steep change of sign steps at 1e-5 pass over now and then."""
+def test_search_stopped_by_errors_of_the_solver_gives_a_warning():
+    """Dry friction with a steep change of sign, which steps at 1e-5 sometimes skip."""
     dry = jl.GeneralizedForce(lambda t, q, v, p: -p["f"] * jnp.tanh(v / 0.02), "dry")
     system, ts = pendulum.with_forces(dry), np.linspace(0.0, 8.0, 401)
     true = TRUE | {"f": 0.1}
@@ -169,7 +171,7 @@ def test_motions_are_counted():
     assert found.solves == 3 * found.iterations
 
 
-def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
+def test_known_start_is_fixed_and_uncertain_one_is_weighted():
     exact = fit(experiment(q0=[1.0], v0=[0.0], start_sigma=0.0))
     assert exact.starts[0].tolist() == [1.0, 0.0]
     free = fit(experiment())
@@ -179,8 +181,8 @@ def test_a_known_start_is_kept_and_a_rough_one_is_weighed():
 
 
 @pytest.mark.full
-def test_a_segment_that_fails_is_named_and_does_not_count():
-    """A spring that breaks at x = 2: beyond, the force is not a number."""
+def test_failed_segment_is_named_and_omitted():
+    """A spring that breaks at x = 2: beyond, the force is NaN."""
 
     def force(t, q, v, p):
         return -p["k"] * q + 1e-15 * jnp.sqrt(2.0 - q)
@@ -201,14 +203,14 @@ def test_a_segment_that_fails_is_named_and_does_not_count():
 
 
 def pulse(t, q, v, p):
-    """Nothing, but for a while not a number."""
+    """A force of zero that is NaN for a while."""
     return jnp.where((t > 1.3) & (t < 1.5), jnp.nan, 0.0) * v
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("sigma", [{"x": NOISE}, None])
-def test_a_segment_that_fails_within_a_chain_moves_nothing(sigma):
-    """The gap that it leaves is not closed: what follows has a start of its own."""
+def test_failed_segment_within_a_chain_does_not_change_the_fit(sigma):
+    """The gap at this segment is not closed: the next segment has a separate start."""
     system = pendulum.with_forces(jl.GeneralizedForce(pulse, "pulse"))
     with pytest.warns(
         UserWarning, match=r"starts at t = 1\.2 s ended with nonfinite: it is ignored"
@@ -218,7 +220,7 @@ def test_a_segment_that_fails_within_a_chain_moves_nothing(sigma):
     assert len(found.failed) == 1
     assert found.gap < 1e-6
     within(found, ("l",))
-    # As two motions, one after the other.
+    # As two consecutive motions.
     data = experiment(sigma=sigma)
     parts = fit((data.part(slice(0, 61)), data.part(slice(91, None))), system=system)
     np.testing.assert_allclose(found.params["l"], parts.params["l"], atol=0.5 * parts.std["l"])
@@ -237,7 +239,7 @@ def test_a_channel_that_is_not_finite_is_named():
 
 
 @pytest.mark.full
-def test_warnings_name_what_they_are_about():
+def test_warnings_name_parameters_and_channels():
     with pytest.warns(UserWarning, match=r"c starts on its bound"):
         fit(
             experiment(),
@@ -249,7 +251,7 @@ def test_warnings_name_what_they_are_about():
     assert found.params["spare"] == 1.0
     spare = {
         "transforms": {"spare": jl.transforms.Bounded(0.0, 1.0)}
-    }  # on its bound, but not held there
+    }  # on its bound, but not fixed there
     with pytest.warns(UserWarning, match=r"nothing measured depends on spare"):
         found = fit(experiment(), ("l", "spare"), TRUE | {"spare": 1.0}, **spare)
     assert found.on_bound == ()
@@ -271,7 +273,7 @@ def test_no_warning_without_reason():
         (1.0, np.inf, r"`sigma` must be positive and finite, .* Leave the prior out"),
     ],
 )
-def test_bad_priors_are_named(mean, sigma, message):
+def test_invalid_priors_are_named(mean, sigma, message):
     with pytest.raises(ValueError, match=message):
         jl.Prior(mean, sigma)
 
@@ -333,6 +335,6 @@ def test_bad_priors_are_named(mean, sigma, message):
         ({"data": jl.Experiment(TS[:2], {"x": TS[:2]})}, r"at least as many numbers as there are"),
     ],
 )
-def test_bad_arguments_are_named(changes, message):
+def test_invalid_arguments_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         fit(changes.pop("data", experiment()), **changes)

@@ -1,4 +1,4 @@
-"""Fits with transforms: bounds that end a search, are left again, or change nothing."""
+"""Fits with transforms: bounds that end a search, are left again, or have no effect."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jaxlag._fit import _multiple_shooting
 
 
 @pytest.mark.full
-def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
+def test_transforms_do_not_change_estimates_and_covariances():
     plain = fit(experiment())
     held = fit(
         experiment(),
@@ -22,7 +22,7 @@ def test_transforms_hold_and_their_errors_are_in_the_parameter_s_unit():
 
 @pytest.mark.full
 @pytest.mark.parametrize("start", [1e-6, 1e-12, 1e-18])
-def test_a_search_does_not_depend_on_the_size_that_a_number_starts_at(start):
+def test_search_does_not_depend_on_the_size_of_the_start(start):
     plain = fit(experiment())
     with no_warning():
         found = fit(experiment(), ("l", "c"), TRUE | {"l": 0.69, "c": start})
@@ -31,8 +31,8 @@ def test_a_search_does_not_depend_on_the_size_that_a_number_starts_at(start):
 
 
 @pytest.mark.full
-def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
-    """From a third, so that rounding would show; and a search that begins there leaves it again."""
+def test_parameter_on_its_bound_equals_it_exactly():
+    """The bound is 0.1 + 0.2, so that rounding would show; a search may leave its first bound."""
     bound = jl.transforms.Bounded(0.1 + 0.2, 1.0)
     with pytest.warns(UserWarning, match="c ended on its bound"):
         found = fit(
@@ -49,14 +49,14 @@ def test_a_number_that_ends_on_its_bound_is_the_bound_to_the_last_digit():
 
 
 @pytest.mark.full
-def test_without_bounds_no_box_is_compiled(monkeypatch):
-    """Numbers that may go anywhere take plain steps of least squares."""
+def test_bounded_least_squares_are_compiled_only_for_bounds(monkeypatch):
+    """Unbounded parameters take plain steps of least squares."""
 
     def box(*_):
         raise AssertionError("a box")
 
     monkeypatch.setattr(_multiple_shooting, "box_least_squares", box)
-    data = experiment().part(slice(0, 77))  # of a shape that no other test has compiled
+    data = experiment().part(slice(0, 77))  # a shape that no other test has compiled
     fit(data)
     with pytest.raises(AssertionError, match="a box"):
         fit(data, transforms={"l": jl.transforms.Positive()})
@@ -68,8 +68,8 @@ BOUNDS = [jl.transforms.Bounded(0.1, 1.0), jl.transforms.Bounded(0.1, np.inf)]
 @pytest.mark.parametrize(
     "bounds", [BOUNDS[0], pytest.param(BOUNDS[1], marks=pytest.mark.full)], ids=["both", "one"]
 )
-def test_a_parameter_that_ends_on_its_bound_is_named_and_the_others_are_known(bounds):
-    """As where it is held there; the truth is below."""
+def test_parameter_on_its_bound_is_named_and_others_are_estimated(bounds):
+    """As if it were fixed there; the truth is below the bound."""
     data, start = experiment(sigma={"x": NOISE}), TRUE | {"l": 0.5, "c": 0.3}
     with pytest.warns(UserWarning, match=r"c ended on its bound, 0\.1: widen the bound, or leave"):
         found = fit(data, params0=start, transforms={"c": bounds})
@@ -85,8 +85,8 @@ def test_a_parameter_that_ends_on_its_bound_is_named_and_the_others_are_known(bo
 
 
 @pytest.mark.full
-def test_a_parameter_comes_back_from_its_bound():
-    """It starts there, or is driven there by a length that is far off."""
+def test_parameter_leaves_its_bound_again():
+    """It starts there, or is moved there by a length that is far off."""
     bounds = {"c": jl.transforms.Bounded(0.0, np.inf)}
     with pytest.warns(UserWarning, match=r"c starts on its bound\."):
         found = fit(experiment(), params0=TRUE | {"l": 0.5, "c": 0.0}, transforms=bounds)
@@ -97,10 +97,10 @@ def test_a_parameter_comes_back_from_its_bound():
 
 
 @pytest.mark.full
-def test_friction_that_is_not_there_ends_at_zero():
-    """Data of a pendulum without any: c goes to 0, the end of what is positive."""
+def test_absent_friction_ends_at_zero():
+    """Data of a pendulum without friction: c goes to 0, the limit of positive values."""
     motion = jl.simulate(pendulum, [1.0], [0.0], TS, TRUE | {"c": 0.0}, rtol=1e-11, atol=1e-11)
-    # Noise that would have it negative.
+    # Noise that would make it negative.
     y = np.asarray(motion["x"]) * (1.0 + 2e-3 * TS)
     start = TRUE | {"l": 0.5, "c": 0.3}
     with pytest.warns(UserWarning, match=r"c ended on its bound, .*e-\d+: widen the bound"):

@@ -1,4 +1,4 @@
-"""What noise leaves of a fit: its estimate, degrees of freedom, outliers, intervals."""
+"""Noise in fits: its estimate, degrees of freedom, outliers, intervals."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import jaxlag as jl
 
 @pytest.mark.full
 @pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
-def test_outliers_count_for_less(loss):
+def test_robust_losses_reduce_the_effect_of_outliers(loss):
     y = angles()
     y[::10] += 0.3
     data = jl.Experiment(TS, {"x": y}, sigma={"x": NOISE})
@@ -21,8 +21,8 @@ def test_outliers_count_for_less(loss):
 
 @pytest.mark.full
 @pytest.mark.parametrize("noise", [1e-4, 1e-7])
-def test_segments_are_one_motion_however_precise_measurements_are(noise):
-    """A spring; to a hundredth of the standard deviation."""
+def test_segments_agree_with_one_motion_for_any_precision(noise):
+    """A spring; agreement to a hundredth of the standard deviation."""
     spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
     ts = np.linspace(0.0, 10.0, 101)
     x = 0.3 * np.cos(2.0 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
@@ -36,8 +36,8 @@ def test_segments_are_one_motion_however_precise_measurements_are(noise):
 
 
 @pytest.mark.full
-def test_a_number_that_is_zero_is_known_as_well_as_any():
-    """An offset whose truth is 0: its relative changes move nothing, it does."""
+def test_parameter_of_value_zero_has_its_standard_deviation():
+    """An offset with true value 0: relative changes of it have no effect, absolute ones have."""
     spring = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * (q[0] - p["x0"]) ** 2, ("x",)
     )
@@ -52,13 +52,13 @@ def test_a_number_that_is_zero_is_known_as_well_as_any():
     noise = 1e-4
     x = 0.3 * np.cos(2 * ts) + noise * np.random.default_rng(1).normal(size=len(ts))
     found = jl.fit(spring, jl.Experiment(ts, {"x": x}), start, **options)
-    # Of the mean of independent measurements: k and the start swing, and share little of it.
+    # As for the mean of independent measurements: k and the start oscillate, with little overlap.
     np.testing.assert_allclose(found.std["x0"], noise / np.sqrt(len(ts)), rtol=0.1)
     assert abs(found.params["x0"]) < 3.5 * found.std["x0"]
 
 
 @pytest.mark.full
-def test_starts_that_are_known_take_nothing_from_the_noise():
+def test_known_starts_take_no_degrees_of_freedom():
     rng = np.random.default_rng(0)
     ts = np.linspace(0.0, 1.0, 3)
     data = [
@@ -73,12 +73,12 @@ def test_starts_that_are_known_take_nothing_from_the_noise():
     ]
     found = fit(data, ("l",))
     np.testing.assert_allclose(found.freedom, 119.0, atol=1e-6)
-    rows = np.concatenate([each["x"] for each in found.residuals])
-    np.testing.assert_allclose(found.noise["x"], np.sqrt(np.sum(rows**2) / 119), rtol=1e-3)
+    residuals = np.concatenate([each["x"] for each in found.residuals])
+    np.testing.assert_allclose(found.noise["x"], np.sqrt(np.sum(residuals**2) / 119), rtol=1e-3)
 
 
 @pytest.mark.full
-def test_starts_on_a_rod_are_two_numbers_each():
+def test_starts_on_a_rod_take_two_degrees_of_freedom_each():
     rng = np.random.default_rng(0)
     rod = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - p["g"] * q[1],
@@ -94,12 +94,12 @@ def test_starts_on_a_rod_are_two_numbers_each():
         data.append(jl.Experiment(ts, {"r": r + 5e-3 * rng.normal(size=r.shape)}))
     found = jl.fit(rod, data, TRUE | {"l": 0.72}, free=("l",), simulate_options=tight(1e-7))
     np.testing.assert_allclose(found.freedom, 80 - 21, atol=1e-4)
-    # 59 numbers tell it to 9 %.
+    # 59 numbers determine it to 9 %.
     np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
 
 
-def test_a_prior_takes_part_of_what_it_tells():
-    """One that is as good as exact leaves nothing to be told."""
+def test_degrees_of_freedom_account_for_priors():
+    """A nearly exact prior leaves nothing to estimate."""
     data = experiment(sigma={"x": NOISE})
     free, known = (fit(data, ("l",), priors={"l": jl.Prior(0.7, s)}) for s in (1e3, 1e-9))
     np.testing.assert_allclose(free.freedom, 151 - 3, atol=1e-3)
@@ -108,7 +108,7 @@ def test_a_prior_takes_part_of_what_it_tells():
 
 @pytest.mark.full
 @pytest.mark.parametrize("loss", ["soft_l1", "huber", "cauchy"])
-def test_outliers_are_not_noise(loss):
+def test_estimate_of_the_noise_excludes_outliers(loss):
     y = angles()
     y[::10] += 0.3
     found = fit(jl.Experiment(TS, {"x": y}), loss=loss)
@@ -116,7 +116,7 @@ def test_outliers_are_not_noise(loss):
     assert abs(found.params["l"] - TRUE["l"]) < 4 * found.std["l"]
 
 
-def test_intervals_of_few_measurements_are_those_of_student():
+def test_intervals_of_few_measurements_follow_students_distribution():
     found = fit(experiment().part(slice(0, 150, 30)), ("l",))
     np.testing.assert_allclose(found.freedom, 2.0, atol=1e-6)
     low, high = found.interval()["l"]
@@ -127,7 +127,7 @@ def test_intervals_of_few_measurements_are_those_of_student():
 
 
 @pytest.mark.full
-def test_columns_measured_by_turns():
+def test_columns_measured_alternately_are_fitted():
     two = jl.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * p["k"] @ q**2, {"q": (2,)})
     noise = 1e-4 * np.random.default_rng(0).normal(size=(151, 2))
     q = 0.3 * np.cos(np.outer(TS, [2.0, 1.5])) + noise

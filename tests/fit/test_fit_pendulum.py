@@ -1,4 +1,4 @@
-"""fit-pendulum: what it finds is true, its errors are honest, bad input is named."""
+"""fit-pendulum: estimates are right, their errors are realistic, invalid input is named."""
 
 import gzip
 import os
@@ -35,7 +35,7 @@ NOISE = 2e-3
 NAMES = pendulum.NAMES
 
 
-def test_accelerations_are_the_equation_of_motion():
+def test_accelerations_obey_the_equation_of_motion():
     params = {"J": 0.2, "mgl": 3.0, "c": 0.03, "f": 0.1, "k": 0.02, "u0": 0.05, "zero": 0.3}
     for q, v, u in ((1.0, 2.0, 0.7), (-2.5, -0.05, -0.3), (4.0, 0.0, 0.0)):
         friction = 0.03 * v + 0.1 * np.tanh(v / pendulum.V_S) + 0.02 * v * abs(v)
@@ -49,8 +49,8 @@ def test_accelerations_are_the_equation_of_motion():
 
 
 @pytest.mark.parametrize(("truth", "torque"), [(FREE, False), (DRIVEN, True)])
-def test_regression_tells_where_to_begin(truth, torque):
-    # Noise is in q'' alone. Measured: within 0.5 %, of J and u0 within 4 % and 0.05 N m.
+def test_regression_gives_an_initial_guess(truth, torque):
+    # Only q'' has noise. Measured: within 0.5 %; J and u0 within 4 % and 0.05 N m.
     found = guess(list(synthetic(truth, torque, NOISE, seed=4).segments.values()))
     assert found["mgl"] == pytest.approx(truth["mgl"], rel=0.1)
     assert found["J"] == pytest.approx(truth["J"], rel=0.1)
@@ -62,7 +62,7 @@ def test_regression_tells_where_to_begin(truth, torque):
     ("model", "friction"),
     [("viscous", {}), ("+ Coulomb", {"f": 0.2}), ("+ quadratic", {"f": 0.2, "k": 0.02})],
 )
-def test_free_swing_finds_the_truth_and_its_friction(model, friction):
+def test_free_swing_is_fitted_with_its_model_of_friction(model, friction):
     truth = dict.fromkeys(NAMES, 0.0) | FREE | friction
     trials = try_models(synthetic(truth, torque=False, noise=NOISE, seed=1))
     assert choose({name: trial.fit for name, trial in trials.items()}) == model
@@ -73,7 +73,7 @@ def test_free_swing_finds_the_truth_and_its_friction(model, friction):
         assert abs(trial.fit.params[name] - truth[name]) < 4 * trial.fit.std[name], name
     for name in "cfk":
         assert name in pendulum.MODELS[model] or abs(trial.fit.params[name]) < 1e-8, name
-    # Only noise is left. 1000 test samples: its rms is known to 2 %, less what starts take.
+    # Only noise remains. 1000 test samples: its rms is known to 2 %, less the part of the starts.
     assert mrad(trial.fit) == pytest.approx(1e3 * NOISE, rel=0.05)
     assert mrad(trial.test) == pytest.approx(1e3 * NOISE, rel=0.08)
     assert mrad(trial.ahead) > mrad(trial.test)
@@ -81,7 +81,7 @@ def test_free_swing_finds_the_truth_and_its_friction(model, friction):
 
 
 @pytest.mark.full
-def test_driven_pendulum_finds_its_inertia():
+def test_driven_pendulum_is_fitted_with_its_inertia():
     recording = synthetic(DRIVEN, torque=True, noise=NOISE, seed=2)
     trials = try_models(recording)
     assert choose({name: trial.fit for name, trial in trials.items()}) == "+ Coulomb"
@@ -94,9 +94,9 @@ def test_driven_pendulum_finds_its_inertia():
 
 
 @pytest.mark.full
-def test_standard_errors_are_honest():
-    # Deviations over standard errors, squared: mean 1 if these are right. 60 recordings of 4
-    # parameters: the mean scatters by about 0.1.
+def test_standard_errors_match_the_deviations():
+    # The squares of deviations over standard errors have mean 1 if the errors are right. For 60
+    # recordings of 4 parameters the mean scatters by about 0.1.
     truth = dict.fromkeys(NAMES, 0.0) | FREE | {"f": 0.2}
     clean = [w for each in cut(synthetic(truth, False, 0.0), 1.0).values() for w in each]
     noise = np.random.default_rng(3)
@@ -117,12 +117,14 @@ def test_standard_errors_are_honest():
 # Recordings.
 
 
-def rows(*columns):
+def table(*columns):
     return np.column_stack(columns).tolist()
 
 
-def write(path, header, rows, *, comment="# units: s, rad\n"):
-    text = comment + header + "\n" + "\n".join(",".join(map(str, row)) for row in rows) + "\n"
+def write(path, header, records, *, comment="# units: s, rad\n"):
+    text = (
+        comment + header + "\n" + "\n".join(",".join(map(str, record)) for record in records) + "\n"
+    )
     if path.suffix == ".gz":
         path.write_bytes(gzip.compress(text.encode()))
     else:
@@ -135,21 +137,21 @@ def swing(count=300):
     return t, np.round(0.5 * np.cos(7.0 * t), 6)
 
 
-def test_read_knows_columns_by_name(tmp_path):
+def test_read_finds_columns_by_name(tmp_path):
     t, q = swing()
     seg = (t >= 1.5).astype(int) + 3
-    upright = read(write(tmp_path / "a.csv.gz", "seg,t,theta1", rows(seg, t, q + np.pi)))
+    upright = read(write(tmp_path / "a.csv.gz", "seg,t,theta1", table(seg, t, q + np.pi)))
     assert list(upright.segments) == [3, 4]
     assert not upright.driven
     np.testing.assert_allclose(angle(upright.segments[3]), q[:150], rtol=0, atol=1e-12)
-    hanging = read(write(tmp_path / "b.csv", "tau_meas,v,q,t", rows(-q, q, q, t), comment=""))
+    hanging = read(write(tmp_path / "b.csv", "tau_meas,v,q,t", table(-q, q, q, t), comment=""))
     assert hanging.driven
     assert hanging.spacing == pytest.approx(0.01)
     np.testing.assert_array_equal(angle(hanging.segments[0]), q)
     np.testing.assert_array_equal(hanging.segments[0].inputs["torque"].values, -q)
 
 
-def test_windows_and_what_is_held_out():
+def test_split_holds_out_windows():
     t, q = swing(250)
     pieces = {n: segment(f"segment {n}", t + 5 * n, q, q) for n in (0, 1, 3)}
     recording = Recording("three", pieces)
@@ -179,7 +181,7 @@ def angle(piece):
     return piece.channels["q"][:, 0]
 
 
-def bad_files():
+def invalid_files():
     t, q = swing()
     late = t.copy()
     late[200:] += 0.5
@@ -188,37 +190,41 @@ def bad_files():
     return {
         "unknown": (
             "t,angle",
-            rows(t, q),
+            table(t, q),
             r"must name t, one angle .* but it names t, angle\. Ren",
         ),
-        "two": ("t,q,theta1", rows(t, q, q), r"one angle .* names t, q, theta1\."),
-        "no_time": ("q", rows(q), r"must name t, one angle"),
-        "backwards": ("t,q", rows(t[::-1], q), r"t of .* must increase strictly .* Sort the rows"),
-        "gap": ("t,q", rows(late, q), r"sampled evenly.* 1\.99 s is followed by 2\.5 s"),
-        "nan": ("t,q", rows(t, holes), r"must hold finite numbers, but q was nan in row 8\."),
-        "words": ("t,q", [*rows(t, q), ("x", 1)], r"must be a table of numbers, but .*'x'"),
-        "ragged": ("t,q,v", rows(t, q), r"as many columns as its header names, 3, but .* have 2"),
+        "two": ("t,q,theta1", table(t, q, q), r"one angle .* names t, q, theta1\."),
+        "no_time": ("q", table(q), r"must name t, one angle"),
+        "backwards": ("t,q", table(t[::-1], q), r"t of .* must increase strictly .* Sort the rows"),
+        "gap": ("t,q", table(late, q), r"sampled evenly.* 1\.99 s is followed by 2\.5 s"),
+        "nan": ("t,q", table(t, holes), r"must hold finite numbers, but q was nan in row 8\."),
+        "words": ("t,q", [*table(t, q), ("x", 1)], r"must be a table of numbers, but .*'x'"),
+        "ragged": ("t,q,v", table(t, q), r"as many columns as its header names, 3, but .* have 2"),
         "empty": ("t,q", [], r"must have a header and rows"),
-        "half": ("seg,t,q", rows(t * 0 + 0.5, t, q), r"seg of .* must hold integers, .* was 0\.5"),
-        "one_row": ("seg,t,q", [*rows(t * 0, t, q), (1, 9, 0)], r"2 rows or more in every segment"),
-        "still": ("t,q", rows(t, 0 * t), r"must move, but its angle was always 0"),
-        "idle": ("t,q,tau_meas", rows(t, q, 0 * t), r"tau_meas of .* must vary"),
+        "half": ("seg,t,q", table(t * 0 + 0.5, t, q), r"seg of .* must hold integers, .* was 0\.5"),
+        "one_row": (
+            "seg,t,q",
+            [*table(t * 0, t, q), (1, 9, 0)],
+            r"2 rows or more in every segment",
+        ),
+        "still": ("t,q", table(t, 0 * t), r"must move, but its angle was always 0"),
+        "idle": ("t,q,tau_meas", table(t, q, 0 * t), r"tau_meas of .* must vary"),
         "short": (
             "t,q",
-            rows(t[:50], q[:50]),
+            table(t[:50], q[:50]),
             r"must last one window of 1 s or more, but .* 0\.5 s",
         ),
         "brief": (
             "t,q",
-            rows(t[:150], q[:150]),
+            table(t[:150], q[:150]),
             r"must have windows to train on and .* to test on",
         ),
     }
 
 
-@pytest.mark.parametrize("name", bad_files())
-def test_bad_files_are_named_with_what_they_lack(name, tmp_path, capsys):
-    header, lines, message = bad_files()[name]
+@pytest.mark.parametrize("name", invalid_files())
+def test_invalid_files_are_refused_with_the_reason(name, tmp_path, capsys):
+    header, lines, message = invalid_files()[name]
     path = write(tmp_path / f"{name}.csv", header, lines)
     with pytest.raises(DataError, match=message):
         try_models(read(path))
@@ -244,11 +250,11 @@ def test_bad_files_are_named_with_what_they_lack(name, tmp_path, capsys):
         (["plain.csv.gz"], r"gzipped if its name ends in \.gz"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message, tmp_path, monkeypatch, capsys):
+def test_invalid_arguments_are_named(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     t, q = swing()
-    write(Path("free.csv"), "t,q", rows(t, q))
-    write(Path("driven.csv"), "t,q,tau_meas", rows(t, q, q))
+    write(Path("free.csv"), "t,q", table(t, q))
+    write(Path("driven.csv"), "t,q,tau_meas", table(t, q, q))
     Path("plain.csv.gz").write_text("t,q\n")
     assert fit_pendulum.main(arguments) == 1
     assert re.search(message, capsys.readouterr().err)
@@ -258,14 +264,14 @@ def test_bad_arguments_are_named(arguments, message, tmp_path, monkeypatch, caps
 
 
 @pytest.mark.full
-def test_without_a_file_it_fits_a_synthetic_pendulum(tmp_path, monkeypatch, capsys):
+def test_command_without_a_file_fits_a_synthetic_pendulum(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert fit_pendulum.main([]) == 0
     lines = capsys.readouterr().out.splitlines()
-    rows = {line.split("  ")[0]: line.split() for line in lines}
-    assert rows["truth"][1:] == ["60", "0.05", "0.2", "0", "0.01"]
-    # mgl/J, c/J, f/J, zero of the model that is true, within 4 of the errors printed beneath.
-    estimates = np.array(rows["+ Coulomb"][2:6], float)
+    cells = {line.split("  ")[0]: line.split() for line in lines}
+    assert cells["truth"][1:] == ["60", "0.05", "0.2", "0", "0.01"]
+    # mgl/J, c/J, f/J, zero of the true model, within 4 of the errors in the next line.
+    estimates = np.array(cells["+ Coulomb"][2:6], float)
     errors = np.array(lines[lines.index(next(x for x in lines if "+ Coulomb  " in x)) + 1].split())
     assert np.all(np.abs(estimates - [60, 0.05, 0.2, 0.01]) < 4 * errors[1:5].astype(float))
     assert any(line.startswith("chosen: '+ Coulomb'") for line in lines)
@@ -274,7 +280,7 @@ def test_without_a_file_it_fits_a_synthetic_pendulum(tmp_path, monkeypatch, caps
 
 
 @pytest.mark.full
-def test_without_matplotlib_the_figure_is_left_out(tmp_path, monkeypatch, capsys):
+def test_command_without_matplotlib_omits_the_figure(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(report, "can_plot", lambda: False)
     assert fit_pendulum.main([]) == 0
@@ -286,12 +292,12 @@ def test_without_matplotlib_the_figure_is_left_out(tmp_path, monkeypatch, capsys
     assert "--plot must be left out without matplotlib" in capsys.readouterr().err
 
 
-# Measured pendulums, where the recordings are at hand.
+# Measured pendulums, if the recordings are available.
 
 
 @pytest.mark.full
 @pytest.mark.skipif(not SINGLE.exists(), reason="set JAXLAG_DATA to the folder of recordings")
-def test_free_arm():
+def test_free_arm_is_fitted_to_the_measured_errors():
     recording = read(SINGLE)
     trials = try_models(recording)
     assert choose({model: trial.fit for model, trial in trials.items()}) == "+ quadratic"
@@ -310,7 +316,7 @@ def test_free_arm():
 
 @pytest.mark.full
 @pytest.mark.skipif(not DDP.exists(), reason="set JAXLAG_DATA to the folder of recordings")
-def test_driven_arm_tried_on_another_recording():
+def test_driven_arm_predicts_another_recording():
     trials = try_models(read(DDP), read(ILQR))
     assert choose({model: trial.fit for model, trial in trials.items()}) == "+ Coulomb"
     # Measured: train 3.39 (mean of windows 3.16) to beat 3.3; test 18.16 to beat 26 mrad.

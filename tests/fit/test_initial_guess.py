@@ -1,4 +1,4 @@
-"""Where a search for states begins: what was measured, and what was said of it."""
+"""Initial guesses of states, by measurements and given starts."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,29 +17,29 @@ turned = jl.System(
 MOVED = np.outer(np.cos(TS), [0.3, 0.1]) + np.outer(np.sin(TS), [0.2, -0.4])
 
 
-def states(data, rows=(0, 40), system=turned, params=None):
-    return initial_states(system, data, list(rows), {"k": 1.0} if params is None else params, {})
+def states(data, indices=(0, 40), system=turned, params=None):
+    return initial_states(system, data, list(indices), {"k": 1.0} if params is None else params, {})
 
 
-def test_values_and_slopes_of_what_was_measured():
-    """Parabolas of 5 rows: slopes to h^2 of the third derivative, 4e-4."""
+def test_guess_has_values_and_slopes_of_measurements():
+    """Parabolas of 5 samples: slopes to h^2 times the third derivative, 4e-4."""
     found = states(jl.Experiment(TS, {"q": MOVED}))
     rates = np.outer(-np.sin(TS), [0.3, 0.1]) + np.outer(np.cos(TS), [0.2, -0.4])
     np.testing.assert_allclose(found[:, :2], MOVED[[0, 40]], atol=1e-5)
     np.testing.assert_allclose(found[:, 2:], rates[[0, 40]] @ TURN.T, atol=1e-3)
 
 
-def test_v0_is_that_of_the_quasi_velocities():
-    """One row of them where it is given, all of them where there are as many as times."""
+def test_v0_holds_quasi_velocities():
+    """The first state for one vector, all states for one vector per time."""
     found = states(jl.Experiment(TS, {"q": MOVED}, v0=[1.0, 2.0]))
     np.testing.assert_array_equal(found[0, 2:], [1.0, 2.0])
     assert np.all(np.abs(found[1, 2:]) < 0.6)
-    along = np.arange(302.0).reshape(151, 2)
-    found = states(jl.Experiment(TS, {"q": MOVED}, v0=along))
-    np.testing.assert_array_equal(found[:, 2:], along[[0, 40]])
+    series = np.arange(302.0).reshape(151, 2)
+    found = states(jl.Experiment(TS, {"q": MOVED}, v0=series))
+    np.testing.assert_array_equal(found[:, 2:], series[[0, 40]])
 
 
-def test_v0_of_the_speeds_that_kinematics_take():
+def test_v0_holds_the_velocities_of_kinematics():
     ring = jl.System(
         lambda t, q, v, p: 0.5 * v @ v,
         {"r": (2,)},
@@ -55,14 +55,14 @@ def test_v0_of_the_speeds_that_kinematics_take():
     assert (start_size(ring), start_freedom(ring, {})) == (3, 1)
 
 
-def test_columns_have_parabolas_of_their_own():
+def test_columns_have_separate_parabolas():
     q = MOVED.copy()
     q[::2, 0] = q[1::2, 1] = np.nan
     found = states(jl.Experiment(TS, {"q": q}), (0, 1, 150))
     np.testing.assert_allclose(found[:, :2], MOVED[[0, 1, 150]], atol=1e-4)
 
 
-def test_a_column_without_numbers_is_simulated():
+def test_column_without_measurements_is_simulated():
     q = MOVED.copy()
     q[:, 1] = np.nan
     data = jl.Experiment(TS, {"q": q}, q0=MOVED[0], v0=TURN @ [0.2, -0.4])
@@ -83,7 +83,7 @@ def test_starts_of_another_length_are_named(given, message):
         states(jl.Experiment(TS, {"q": MOVED}, **given))
 
 
-def test_freedom_of_a_start():
+def test_start_of_a_pendulum_has_two_freedoms():
     assert (start_size(pendulum), start_freedom(pendulum, TRUE)) == (2, 2)
     found = states(experiment(), (0,), pendulum, TRUE)
     np.testing.assert_allclose(found[0, 0], angles()[0], atol=1e-2)

@@ -1,4 +1,4 @@
-"""Predictions of recordings that were not fitted, from starts that were."""
+"""Predictions of recordings that were not fitted, from fitted starts."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,13 +13,13 @@ def predict(data, params=TRUE, **options):
 
 
 def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
-    """Starts fitted to the first half second of two recordings of unequal length."""
+    """Starts are fitted to the first half second of two recordings of unequal length."""
     short = jl.Experiment(TS[:100], {"x": angles(TS[:100], seed=1)}, name="short")
     found = predict((experiment(), short), settle=0.5)
-    # 26 samples tell the start to about NOISE/2, which the motion keeps.
+    # 26 samples determine the start to about NOISE/2, which the motion preserves.
     assert 0.8 * NOISE < found.rms("x")[0] < 1.6 * NOISE
     np.testing.assert_allclose(found.starts[0], [1.0, 0.0], atol=8e-3)
-    assert [rows.sum() for rows in found.predicted] == [151 - 26, 100 - 26]
+    assert [selected.sum() for selected in found.predicted] == [151 - 26, 100 - 26]
     assert found.residuals[1]["x"].shape == (100, 1)
     wrong = predict((experiment(), short), TRUE | {"l": 0.8}, settle=0.5)
     assert wrong.rms("x")[0] > 20 * NOISE
@@ -30,8 +30,8 @@ def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
 
 
 @pytest.mark.full
-def test_a_start_fitted_to_all_rows():
-    """It is that of least squares: as small as any of the starts nearby."""
+def test_start_fitted_to_all_samples_is_optimal():
+    """It is the start of least squares: no start nearby has a smaller error."""
     found = predict(experiment())
     assert found.predicted[0].all()
 
@@ -48,7 +48,7 @@ def test_a_start_fitted_to_all_rows():
 
 
 @pytest.mark.full
-def test_a_fit_predicts_as_its_params_do():
+def test_predictions_of_a_fit_equal_those_of_its_params():
     found = jl.fit(pendulum, experiment(), TRUE | {"l": 0.6, "c": 0.1}, free=("l", "c"), **OPTIONS)
     other = jl.Experiment(TS, {"x": angles(seed=5, q0=0.6)}, name="other")
     own = found.predict(other, settle=1.0)
@@ -57,7 +57,7 @@ def test_a_fit_predicts_as_its_params_do():
     assert own.rms("x")[0] < 1.5 * NOISE
 
 
-def test_a_search_that_did_not_converge_is_said():
+def test_search_that_does_not_converge_gives_a_warning():
     with pytest.warns(
         UserWarning, match=r"search for initial states did not converge in 1 iterations: raise"
     ):
@@ -66,8 +66,8 @@ def test_a_search_that_did_not_converge_is_said():
 
 
 @pytest.mark.full
-def test_a_motion_that_fails_is_said():
-    """A stop of the clock at x = 1.2, which one of the two passes."""
+def test_failed_motion_gives_a_warning():
+    """A force that is NaN beyond x = 1.2, which one of the two motions passes."""
 
     def stop(t, q, v, p):
         return jnp.where(jnp.abs(q) > 1.2, jnp.nan, 0.0) * v
@@ -80,7 +80,7 @@ def test_a_motion_that_fails_is_said():
     assert 0.8 * NOISE < found.rms("x")[0] < 1.2 * NOISE
 
 
-def test_figures_show_what_was_measured(tmp_path):
+def test_figures_show_measurements_and_motions(tmp_path):
     many = [experiment(name=f"run {k}") for k in range(6)]
     found = predict(many, settle=0.5)
     figure = found.plot()
@@ -108,6 +108,6 @@ def test_figures_show_what_was_measured(tmp_path):
         ),
     ],
 )
-def test_bad_arguments_are_named(options, message):
+def test_invalid_arguments_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         predict(experiment(), **options)

@@ -1,4 +1,4 @@
-"""Candidate forces ranked by what they predict."""
+"""Candidate forces ranked by their predictions."""
 
 from types import SimpleNamespace
 
@@ -41,7 +41,7 @@ def compare(candidates, **options):
 
 
 @pytest.mark.full
-def test_the_term_that_acts_ranks_first():
+def test_active_term_ranks_first():
     found = compare({"cubic": cubic, "viscous": viscous}, settle=0.5)
     assert [model.name for model in found.models] == ["viscous", "cubic", "none"]
     best = found.best
@@ -54,8 +54,8 @@ def test_the_term_that_acts_ranks_first():
 
 
 @pytest.mark.full
-def test_combinations_and_what_is_useless():
-    """Both terms predict no better than the one that acts, within the noise."""
+def test_combinations_are_no_better_than_the_active_term():
+    """Both terms predict no better than the active one, within the noise."""
     found = compare({"cubic": cubic, "viscous": viscous}, most=2)
     both = found["cubic + viscous"]
     assert len(found.models) == 4
@@ -66,8 +66,8 @@ def test_combinations_and_what_is_useless():
 
 
 @pytest.mark.full
-def test_candidates_that_never_meet_may_share_params():
-    """The second begins at the estimates of the first, and ends where it does from elsewhere."""
+def test_separate_candidates_may_share_params():
+    """The second search starts at the estimates of the first, and ends as from elsewhere."""
     both = jl.Candidate(*viscous.forces, *cubic.forces, params0=viscous.params0 | cubic.params0)
     found = compare({"viscous": viscous, "viscous, cubic": both})["viscous, cubic"].fit
     alone = compare({"viscous, cubic": both})["viscous, cubic"].fit
@@ -76,8 +76,8 @@ def test_candidates_that_never_meet_may_share_params():
         np.testing.assert_allclose(found.params[name], alone.params[name], atol=near)
 
 
-def test_where_the_search_of_a_model_begins():
-    """At the estimates of the best that shares most of its params; not on a bound."""
+def test_search_starts_at_estimates_of_the_best_related_model():
+    """At the estimates of the best model that shares most of its params; not on a bound."""
 
     def ranked(error, params, on_bound=(), converged=True, fitted=None):
         data = jl.Experiment([0.0, 1.0], {"x": [0.0, 2.0]})  # ranges over 1
@@ -93,7 +93,7 @@ def test_where_the_search_of_a_model_begins():
         return Ranked("", error, fit, None)
 
     own = {"l": 1.0, "c": 1.0, "k": np.ones(2)}
-    none, bad = ranked(3.0, {"l": 2.0}), ranked(1.0, {"l": 9.0, "c": 9.0}, converged=False)
+    none, unconverged = ranked(3.0, {"l": 2.0}), ranked(1.0, {"l": 9.0, "c": 9.0}, converged=False)
     far = ranked(np.inf, {"l": 8.0, "c": 8.0})
     better, worse = ranked(1.5, {"l": 3.0, "c": 4.0, "x": 1.0}), ranked(2.0, {"l": 5.0, "c": 6.0})
     bound = ranked(1.0, {"l": 7.0, "k": np.zeros(2)}, ("k[1]",))
@@ -101,13 +101,13 @@ def test_where_the_search_of_a_model_begins():
     def start(*models, transforms=None):
         return _estimates(own, {"l"}, models, transforms or {})
 
-    assert start() == start(none) == start(none, bad, far) == {}
-    assert start(none, bad, worse, far, better) == {"l": 3.0, "c": 4.0}
+    assert start() == start(none) == start(none, unconverged, far) == {}
+    assert start(none, unconverged, worse, far, better) == {"l": 3.0, "c": 4.0}
     assert start(none, bound) == {"l": 7.0}
-    # What was held out has no say.
+    # Held-out data have no effect.
     fits = ranked(9.0, {"l": 6.5, "c": 6.6}, fitted=1.0)
     assert start(better, fits) == {"l": 6.5, "c": 6.6}
-    # Neither do params of another form, or that a transform does not allow.
+    # Nor have params of another form, or those that a transform excludes.
     other = ranked(1.0, {"l": 3.0, "c": 4.0, "k": np.ones(3)})
     assert start(other) == {"l": 3.0, "c": 4.0}
     bounds = {"c": jl.transforms.Bounded(0.0, 2.0), "l": jl.transforms.Positive()}
@@ -142,7 +142,7 @@ def test_forces_are_added_to_a_system():
         ({"a": viscous}, {"most": 2}, r"`most` must be an integer from 1 to the 1 candidates"),
     ],
 )
-def test_bad_arguments_are_named(candidates, options, message):
+def test_invalid_arguments_are_named(candidates, options, message):
     with pytest.raises(ValueError, match=message):
         compare(candidates, **options)
 

@@ -1,4 +1,4 @@
-"""Inputs of experiments as those of one batch: each row is the signal of its own experiment."""
+"""Inputs of experiments in one batch: each lane is the signal of its experiment."""
 
 import equinox as eqx
 import jax
@@ -63,7 +63,7 @@ ALIKE = {
 
 
 @pytest.mark.parametrize("name", ALIKE)
-def test_every_row_is_the_signal_of_its_experiment(name):
+def test_every_lane_is_the_signal_of_its_experiment(name):
     signals = ALIKE[name]
     batch = stacked([{"u": signal} for signal in signals], [1.0] * len(signals))
     t, q, v, params = jnp.array(0.45), jnp.array([0.2]), jnp.array([0.1]), {"m": 1.5}
@@ -71,12 +71,12 @@ def test_every_row_is_the_signal_of_its_experiment(name):
     def values(inputs):
         return evaluate(inputs, t, q, v, params)["u"]
 
-    found = jax.vmap(lambda row: values(row.at({"m": 1.5}, jnp.asarray(TS))))(batch)
+    found = jax.vmap(lambda lane: values(lane.at({"m": 1.5}, jnp.asarray(TS))))(batch)
     expected = [values({"u": signal}) for signal in signals]
     np.testing.assert_allclose(found, expected, rtol=1e-15)
 
 
-def test_knots_that_an_experiment_lacks_lie_beyond_its_end():
+def test_missing_knots_lie_beyond_the_end():
     signals = ALIKE["knots"]
     batch = stacked([{"u": signal} for signal in signals], [1.0, 1.0, 2.0, 3.0])
     knots = batch.at({"m": 1.5}, jnp.asarray(TS))["u"].ends[:, 1:-1]
@@ -98,14 +98,14 @@ def test_knots_that_an_experiment_lacks_lie_beyond_its_end():
         ([{"u": TABLES[0]}, {}], r"names of the inputs must be the same .* \['u'\] or \[\]"),
     ],
 )
-def test_what_no_batch_can_be_made_of_is_named(inputs, message):
+def test_inputs_that_cannot_be_stacked_are_named(inputs, message):
     with pytest.raises(ValueError, match=message):
         stacked(inputs, [1.0, 1.0])
 
 
 def test_shapes_that_differ_are_named():
-    row = stacked([{"u": jl.TimeFunction(ramp)}, {"u": jnp.ones(2)}], [1.0, 1.0])
-    one = jax.tree.map(lambda x: x[0], row).at({"m": 1.5}, jnp.asarray(TS))
+    lane = stacked([{"u": jl.TimeFunction(ramp)}, {"u": jnp.ones(2)}], [1.0, 1.0])
+    one = jax.tree.map(lambda x: x[0], lane).at({"m": 1.5}, jnp.asarray(TS))
     with pytest.raises(ValueError, match=r"inputs\['u'\]` .* one shape .* had \[\(\), \(2,\)\]"):
         evaluate(one, jnp.array(0.5), jnp.ones(1), jnp.ones(1), {})
 
@@ -118,13 +118,13 @@ def recorded(signal):
     return jl.Experiment(TS, {"x": motion["x"]}, inputs=inputs, sigma={"x": 1e-3}, **start)
 
 
-def test_a_fit_of_experiments_with_functions_of_their_own():
+def test_experiments_with_separate_functions_are_fitted():
     records = [recorded(x) for x in (*JUMPS, jl.TimeFunction(ramp))]
     found = jl.fit(SYSTEM, records, {"m": 1.0}, free=("m",))
     np.testing.assert_allclose(found.params["m"], 2.0, rtol=1e-8)
 
 
-def test_predictions_and_descents_with_feedback():
+def test_predictions_and_descents_accept_feedback():
     records = [recorded(x) for x in (jl.Feedback(held_back), jl.TimeFunction(jnp.sin))]
     np.testing.assert_allclose(jl.predict(SYSTEM, records, {"m": 2.0}).rms("x"), 0.0, atol=1e-8)
     descent = jl.Descent(optax.sgd(1e-6), epochs=2)

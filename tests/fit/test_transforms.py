@@ -24,20 +24,20 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_start_gives_the_value_back(name):
+def test_start_inverts_the_transform(name):
     transform, value = CASES[name]
     u, on_bound = transform.start("x", value)
     assert not on_bound
     assert len(u) == len(transform.entries(value.shape))
     found = transform.value(jnp.asarray(u), value.shape)
     np.testing.assert_allclose(found, value, rtol=0, atol=1e-14 * np.max(np.abs(value)))
-    # As many independent directions as there are numbers.
+    # As many independent directions as variables.
     by_u = jax.jacfwd(lambda u: jnp.ravel(transform.value(u, value.shape)))(jnp.asarray(u))
     assert np.linalg.matrix_rank(by_u) == len(u)
 
 
 @pytest.mark.parametrize("name", ["spd", "inertia", "moments", "body"])
-def test_whatever_the_unknowns_the_value_is_valid(name):
+def test_values_are_valid_for_any_variables(name):
     transform, value = CASES[name]
     count = len(transform.entries(value.shape))
     for u in np.random.default_rng(0).normal(scale=2.0, size=(50, count)):
@@ -91,13 +91,13 @@ def test_crossed_bounds_are_named(lower, upper, message):
         jl.transforms.Bounded(lower, upper)
 
 
-def test_a_start_on_a_bound_stays_there():
+def test_start_on_a_bound_is_reported():
     u, on_bound = jl.transforms.Bounded(0.0, 2.0).start("x", 0.0)
     assert on_bound
     assert u.tolist() == [0.0]
 
 
-def test_beyond_a_bound_the_value_is_on_it_and_the_derivative_leads_back():
+def test_values_beyond_a_bound_are_clipped_with_a_slope_back():
     bounded = jl.transforms.Bounded(0.0, 2.0)
     value, slope = jax.value_and_grad(lambda u: bounded.value(u, (3,))[0])(jnp.array([-1.0, 0, 3]))
     assert value == 0.0

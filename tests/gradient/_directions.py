@@ -1,4 +1,4 @@
-"""Directions in trees of arrays."""
+"""Random directions in trees of arrays, and products of trees."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Derivatives of motions at rest, or steady beside slower ones: steps that see perturbations."""
+"""Derivatives of motions at rest, or steady beside slower ones: steps resolve perturbations."""
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,9 @@ from jaxlag._integration._linearized_rates import spectral_size, turning_rate
 @pytest.mark.full
 @pytest.mark.parametrize("form", ["auto", "array"])
 def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
-    """Error estimates see nothing there, and steps of any length would do for the motion.
+    """Error estimates vanish there: the motion alone would allow steps of any length.
 
-    Single, and beside a lane that moves. Tolerance 1e-9 over some ten steps.
+    Single, and with a moving lane. Tolerance 1e-9 over some ten steps.
     """
 
     def lagrangian(t, q, v, params):
@@ -39,12 +39,12 @@ def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
     slope = jax.jit(jax.vmap(jax.jacrev(end, has_aux=True)))
     lanes, counts = slope(jnp.stack([rest, moving]))
     np.testing.assert_allclose(lanes[0], flow, rtol=0, atol=1e-7)
-    # A motion that error estimates see keeps its steps, whether or not it is differentiated.
+    # A motion with nonzero error estimates has the same steps, differentiated or not.
     assert list(counts) == [count, end(moving)[1]]
 
 
-def test_steady_motion_beside_a_pendulum_at_rest():
-    """Error estimates do not see a uniform motion either."""
+def test_pendulum_at_rest_beside_a_steady_motion_has_derivatives():
+    """Error estimates of a uniform motion vanish, too."""
     system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 9.0 * jnp.cos(q[1]), ("x", "a"))
 
     def angle(start):
@@ -54,8 +54,8 @@ def test_steady_motion_beside_a_pendulum_at_rest():
 
 
 @pytest.mark.parametrize("start", [0.0, pytest.param(1e-9, marks=pytest.mark.full)])
-def test_a_slow_motion_beside_a_fast_one_at_rest(start):
-    """Two springs, of 0.1 and 10 rad/s: the fast one turns a hundred times unseen."""
+def test_fast_spring_at_rest_beside_a_slow_one_has_derivatives(start):
+    """Two springs of 0.1 and 10 rad/s: perturbations of the fast one go through 100 rad."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - 0.005 * q[0] ** 2 - 50.0 * q[1] ** 2, ("slow", "fast")
     )
@@ -68,8 +68,8 @@ def test_a_slow_motion_beside_a_fast_one_at_rest(start):
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["kvaerno3", "kvaerno5"])
-def test_implicit_methods_at_rest(method):
-    """They would step over swings that nobody sees, and damp them: theta'' = -4 sin theta."""
+def test_implicit_methods_at_rest_have_derivatives(method):
+    """They would step over unresolved oscillations and damp them: theta'' = -4 sin theta."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + 4.0 * jnp.cos(q[0]), ("a",))
 
     def angle(v0):
@@ -80,8 +80,8 @@ def test_implicit_methods_at_rest(method):
 
 
 @pytest.mark.full
-def test_implicit_methods_at_rest_step_over_what_decays():
-    """A dashpot of 1e6/s beside a spring: swings of 1 rad/s bound the steps, it does not."""
+def test_implicit_methods_at_rest_step_over_decaying_modes():
+    """A dashpot of 1e6/s beside a spring: oscillations of 1 rad/s bound the steps, it does not."""
     dashpot = jl.Rayleigh(lambda t, q, v, p: 0.5e6 * v[1] ** 2, "dashpot")
     system = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - 0.5 * q[0] ** 2 - 5e3 * q[1] ** 2,
@@ -99,8 +99,8 @@ def test_implicit_methods_at_rest_step_over_what_decays():
     assert steps < 1000
 
 
-def test_what_turns_and_what_decays():
-    """Eigenvalues +-3i and -1 +- 5i turn or nearly, -100 and -7 +- i decay, 2 grows."""
+def test_turning_rate_excludes_decaying_modes():
+    """Eigenvalues +-3i and -1 +- 5i oscillate or nearly so, -100 and -7 +- i decay, 2 grows."""
 
     def block(real, imaginary):
         return np.array([[real, imaginary], [-imaginary, real]])
@@ -117,8 +117,8 @@ def test_what_turns_and_what_decays():
 
 @pytest.mark.parametrize("rate", [1e-3, 0.05, 1.0, 30.0, 1e4])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_fastest_rate(rate, dtype):
-    """In range though its 16th power is not; within the 16th root of the units' disparity."""
+def test_spectral_size_is_about_the_fastest_rate(rate, dtype):
+    """In range although its 16th power is not; within the 16th root of the ratio of units."""
     J = jnp.asarray([[0.0, 1.0, 0.0], [-(rate**2), 0.0, 0.0], [0.0, 0.0, 0.0]], dtype)
     assert 0.9 * rate <= spectral_size(J)[0] <= max(rate, 1 / rate) ** (1 / 16) * 1.1 * rate
     assert spectral_size(jnp.zeros((2, 2), dtype))[0] == 0.0

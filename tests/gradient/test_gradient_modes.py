@@ -1,4 +1,4 @@
-"""Every way through the steps gives one derivative, for every kind of equations."""
+"""All gradient modes give the same derivative, for every kind of equations."""
 
 from functools import cache, partial
 
@@ -13,7 +13,7 @@ import jaxlag as jl
 from jaxlag._gradient._modes import capacity_for, needed
 from systems.catalogue import find
 
-# Seconds that each runs for. Starts are assembled where they have to stay on constraints.
+# Duration of each motion, s. Starts are assembled if constraints apply.
 SPANS = {
     "double_pendulum": 2.0,
     "sleeve_pendulum": 2.0,
@@ -24,10 +24,10 @@ SPANS = {
     "tricycle": 2.0,
 }
 LONG = ("double_pendulum_cartesian", "falling_stick_friction", "rigid_aircraft", "tricycle")
-"""Those whose right-hand side is long: by tsit5, of which half as much is compiled."""
+"""Those with a long right-hand side: by tsit5, which compiles half as much."""
 MODES = ("recorded", "checkpoints", "forward")
 ALL_MODES = ("double_pendulum", "double_pendulum_cartesian", "tricycle")
-"""The others are differentiated backwards in one mode."""
+"""The others have one reverse mode tested."""
 TIGHT = 1e-13
 
 
@@ -99,37 +99,37 @@ def forward(lowering):
 @pytest.mark.full
 @pytest.mark.parametrize("name", SPANS)
 def test_all_modes_agree(forward, name):
-    """Reverse in each mode against forward: <w, J dx> = <J^T w, dx>; at a tight tolerance, too.
+    """Reverse in each mode against forward: <w, J dx> = <J^T w, dx>; also at a tight tolerance.
 
-    Taken again through the step-size control the steps would be others there: error estimates
-    are differences that round differently in every program.
+    If the step-size control were evaluated again, steps would differ there: error estimates are
+    differences that round differently in every program.
     """
     this = case(name)
     for mode in MODES if name in ALL_MODES else MODES[:1]:
 
-        def pulled(x, tolerance, mode=mode):
-            _, pullback, kind = jax.vjp(lambda x: this.end(x, tolerance, mode), x, has_aux=True)
-            return pullback(this.weights)[0], kind
+        def reverse(x, tolerance, mode=mode):
+            _, vjp_fn, kind = jax.vjp(lambda x: this.end(x, tolerance, mode), x, has_aux=True)
+            return vjp_fn(this.weights)[0], kind
 
-        program = jax.jit(pulled)
+        program = jax.jit(reverse)
         for tolerance in (1e-9, 1e-11):
             _, dy = forward(name, tolerance)
             bar, kind = program(this.x, tolerance)
             scale = jnp.sum(jnp.abs(this.weights * dy)) + dot(
                 jax.tree.map(jnp.abs, bar), jax.tree.map(jnp.abs, this.dx)
             )
-            # Derivatives of the same steps: round-off, and that of projections solved to 1e-15.
+            # Derivatives of the same steps: rounding, and that of projections solved to 1e-15.
             assert abs(dot(this.weights, dy) - dot(bar, this.dx)) <= 1e-12 * scale
             wanted = {jl.GradientMode[mode]}
             if mode == "checkpoints":
-                wanted.add(jl.GradientMode.recorded)  # where all steps fit
+                wanted.add(jl.GradientMode.recorded)  # if all steps fit
             assert jl.GradientMode(int(kind)) in wanted
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", SPANS)
-def test_the_derivative_is_that_of_the_motion(forward, name):
-    """Against differences of solves at a tight tolerance; as accurate as the solution is."""
+def test_derivative_equals_that_of_the_motion(forward, name):
+    """Against differences of solves at a tight tolerance; as accurate as the solution."""
     this = case(name)
     solve = jax.jit(lambda x: this.end(x, TIGHT)[0])
 
@@ -146,14 +146,14 @@ def test_the_derivative_is_that_of_the_motion(forward, name):
     np.testing.assert_allclose(dy, extrapolated, rtol=0, atol=allowed)
     loose, loose_dot = forward(name, 1e-9)
     off = np.abs(loose - y).max() / np.abs(y).max()
-    # Local errors of 1e-9 in the state: what they make of the derivative is no more than ten times
-    # what they make of the solution, down to the tolerance itself.
+    # Local errors are 1e-9 of the state. Their effect on the derivative is at most ten times their
+    # effect on the solution, down to the tolerance itself.
     assert np.abs(loose_dot - dy).max() <= 10 * max(off, 1e-9) * np.abs(dy).max()
 
 
 @pytest.mark.full
-def test_points_are_thinned_out_on_long_motions():
-    """3 states for 300 steps: the same gradient as from all of them."""
+def test_checkpoints_are_thinned_out_on_long_motions():
+    """3 checkpoints for 300 steps: the same gradient as from all states."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
 
     def angle(q0, mode, max_steps):
@@ -180,8 +180,8 @@ def test_points_are_thinned_out_on_long_motions():
 
 @pytest.mark.full
 @pytest.mark.parametrize("mode", ["recorded", "checkpoints", "forward"])
-def test_lanes_that_reach_rows_in_different_turns(mode):
-    """Some with several rows in a step, some with one in several; all with their own gradients."""
+def test_lanes_that_reach_saves_in_different_iterations_have_gradients(mode):
+    """Some have several saves in a step, some one in several; each has its own gradient."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
     rng = np.random.default_rng(0)
     parts, weights = np.sort(rng.uniform(0.0, 1.0, 30)), rng.uniform(-1.0, 1.0, 31)
@@ -210,7 +210,7 @@ def test_lanes_that_reach_rows_in_different_turns(mode):
 
 
 def test_gradients_are_traced_once():
-    """Other values of start, params and tolerance trace nothing anew."""
+    """New values of start, params and tolerance trace nothing again."""
     count = []
 
     def lagrangian(t, q, v, p):
@@ -228,21 +228,21 @@ def test_gradients_are_traced_once():
     first = len(count)
     gradient(jnp.array([0.7]), 9.7, 1e-8)
     assert len(count) == first
-    # Reverse mode looks at the Lagrangian no more often than the solve does.
+    # Reverse mode traces the Lagrangian at most twice as often as the solve does.
     again = jl.System(lambda *args: lagrangian(*args), ("x",))
     del count[:]
     jax.jit(lambda q0: jl.simulate(again, q0, [0.0], [0.0, 1.0], 9.81).q[-1, 0])(jnp.array([1.0]))
     assert first <= 2 * len(count)
 
 
-def test_memory_decides():
-    """The times of all steps take 8 bytes each, and 5 more with knots; states what is left."""
+def test_capacity_follows_from_the_memory():
+    """The times of all steps take 8 bytes each, and 5 more with knots; states take the rest."""
     state, size, steps = 4, 8, 16384
     times = 8 * steps
     assert capacity_for("auto", None, steps, 2, state, size) == 512
-    room = capacity_for("auto", times + 10_000, steps, 2, state, size)
-    assert room == 128
-    assert needed(room, steps, state, size) <= times + 10_000
+    capacity = capacity_for("auto", times + 10_000, steps, 2, state, size)
+    assert capacity == 128
+    assert needed(capacity, steps, state, size) <= times + 10_000
     assert capacity_for("auto", times, steps, 2, state, size) == 0
     assert needed(0, steps, state, size, knots=True) == 13 * steps
     assert capacity_for("recorded", None, 1000, 2, state, size) >= 1000
@@ -276,7 +276,7 @@ def test_memory_decides():
         ),
     ],
 )
-def test_memory_that_does_not_do(options, message):
+def test_insufficient_memory_is_refused(options, message):
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
     with pytest.raises(ValueError, match=message):
         jl.simulate(free, [0.0], [1.0], [0.0, 1.0], **options)
@@ -292,7 +292,7 @@ def test_memory_counts_the_terms_of_work():
 
 
 def test_an_integer_has_no_derivative():
-    """JAX says so; an integer among the params is no leaf that moves."""
+    """JAX refuses it; an integer in params is not differentiated."""
     spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - p["k"] * q[0] ** p["n"], ("x",))
 
     def end(params):
@@ -305,8 +305,8 @@ def test_an_integer_has_no_derivative():
 
 
 @pytest.mark.full
-def test_every_transform():
-    """Batches of batches, gradients through scans, reverse over reverse: all the same numbers."""
+def test_all_transforms_give_equal_derivatives():
+    """Nested batches, gradients through scans, reverse over reverse: equal results."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
     p, starts = jnp.array(9.81), jnp.linspace(0.1, 1.2, 6).reshape(2, 3, 1)
 
@@ -324,7 +324,7 @@ def test_every_transform():
         np.testing.assert_allclose(a, b, rtol=1e-11)
 
     single = jax.jit(jax.grad(loss, 1))
-    one_by_one = np.array([[single(q, p) for q in row] for row in starts])
+    one_by_one = np.array([[single(q, p) for q in lane] for lane in starts])
     batch = jax.vmap(jax.vmap(jax.grad(loss, 1), (0, None)), (0, None))
     same(jax.jit(batch)(starts, p), one_by_one)
     together = jax.grad(lambda p: jnp.sum(jax.vmap(lambda q: loss(q, p))(starts[0])))
@@ -340,4 +340,4 @@ def test_every_transform():
     third = jax.jit(jax.jacfwd(jax.hessian(loss, 1), 1))(starts[0, 0], p)
     h = 1e-3
     by_differences = (second(starts[0, 0], p + h) - second(starts[0, 0], p - h)) / (2 * h)
-    np.testing.assert_allclose(third, by_differences, rtol=1e-5)  # h^2 times the fifth, over it
+    np.testing.assert_allclose(third, by_differences, rtol=1e-5)  # h^2 times the fifth derivative

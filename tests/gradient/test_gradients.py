@@ -46,8 +46,8 @@ def derivatives(lowering):
             def both(x, dx):
                 weights = jnp.arange(1.0, 1.0 + jax.eval_shape(state, x).shape[0])
                 y, dy = jax.jvp(state, (x,), (dx,))
-                _, pullback = jax.vjp(state, x)
-                return y, dy, weights, pullback(weights)[0]
+                _, vjp_fn = jax.vjp(state, x)
+                return y, dy, weights, vjp_fn(weights)[0]
 
             results[name] = (state, x, direction(x), both(x, direction(x)))
         return results[name]
@@ -56,17 +56,17 @@ def derivatives(lowering):
 
 
 def forward_equals_reverse(derivatives, name):
-    """<w, J dx> = <J^T w, dx>; round-off only, as both differentiate one sequence of steps."""
-    _, _, dx, (_, dy, weights, pulled) = derivatives(name)
+    """<w, J dx> = <J^T w, dx>, to rounding, because both differentiate one sequence of steps."""
+    _, _, dx, (_, dy, weights, gradient) = derivatives(name)
     scale = jnp.sum(jnp.abs(weights * dy)) + dot(
-        jax.tree.map(jnp.abs, pulled), jax.tree.map(jnp.abs, dx)
+        jax.tree.map(jnp.abs, gradient), jax.tree.map(jnp.abs, dx)
     )
-    # Measured worst 2026-11-21: 4e-15 of the scale.
-    assert abs(dot(weights, dy) - dot(pulled, dx)) <= 1e-13 * scale
+    # Measured 2026-11-21: at most 4e-15 of the scale.
+    assert abs(dot(weights, dy) - dot(gradient, dx)) <= 1e-13 * scale
 
 
 def test_forward_equals_reverse_under_both_lowerings(derivatives):
-    """Of a driven motion, by its start, params, table and times."""
+    """A driven motion, by its start, params, table and times."""
     forward_equals_reverse(derivatives, "driven_pendulum")
 
 
@@ -77,7 +77,7 @@ def test_forward_equals_reverse(derivatives, name):
 
 
 def recorded(motion: Motion, x):
-    """The rows as a function of x on the grid recorded at x."""
+    """The saves as a function of x on the grid recorded at x."""
     caught = {}
 
     def catch(plan, values):
@@ -105,17 +105,17 @@ def recorded(motion: Motion, x):
         problem = _solve.split(_simulate.build_problem(plan, values)[2])
         if outcome is None:
             return _solve._recorded(problem)
-        rows = _solve._replay(problem, outcome, problem.differentiable)
+        replayed = _solve._replay(problem, outcome, problem.differentiable)
         n = motion.system.size
-        return jnp.concatenate([rows.saved[-1], rows.saved[1, :n]])
+        return jnp.concatenate([replayed.saved[-1], replayed.saved[1, :n]])
 
     outcome = jax.jit(lambda x: on_grid(None, x))(x)
     return jax.jit(lambda x: on_grid(outcome, x))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_derivative_is_that_of_the_recorded_grid(derivatives, name):
-    """Central differences of the steps taken again on the grid recorded at x."""
+def test_derivative_equals_that_of_the_recorded_grid(derivatives, name):
+    """Central differences of the steps, repeated on the grid recorded at x."""
     _, x, dx, (y, dy, _, _) = derivatives(name)
     again = recorded(MOTIONS[name], x)
     np.testing.assert_allclose(again(x), y, rtol=0, atol=1e-12)
@@ -131,7 +131,7 @@ def test_derivative_is_that_of_the_recorded_grid(derivatives, name):
 
 
 def variational(motion: Motion, dx):
-    """dx(t1) along the variational equations by scipy, for changes of q0, v0 and params."""
+    """dx(t1) by the variational equations with scipy, for changes of q0, v0 and params."""
     n = motion.system.size
 
     @jax.jit
@@ -147,7 +147,7 @@ def variational(motion: Motion, dx):
     knots = [] if motion.inputs is None else np.asarray(motion.inputs["tau"].times[1:-1])
     marks = [0.0, *[k for k in knots if k < motion.t1], motion.t1]
     for a, b in itertools.pairwise(marks):
-        # Stay off the far side of a jump: the input is right-continuous.
+        # Do not read beyond a jump: the input is right-continuous.
         late = np.nextafter(b, a) if b in knots else b
         fun = lambda t, y: rate(min(t, late), y[: 2 * n], y[2 * n :])  # noqa: E731, B023
         y = solve_ivp(fun, (a, b), y, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
@@ -157,7 +157,7 @@ def variational(motion: Motion, dx):
 @pytest.mark.full
 @pytest.mark.parametrize("name", MOTIONS)
 def test_derivative_matches_variational_equations(name):
-    """At tight tolerance the frozen grid's derivative is the motion's."""
+    """At a tight tolerance the derivative of the fixed grid is that of the motion."""
     motion = MOTIONS[name]
     state, x = end(motion, rtol=1e-12, atol=1e-12)
     dx = direction(x, 1)
@@ -173,45 +173,47 @@ def test_derivative_matches_variational_equations(name):
 
 
 @pytest.mark.full
-def test_dependence_on_times(derivatives):
-    """dq/dt1 = v(t1), and moving the whole clock of an autonomous motion changes nothing."""
+def test_derivatives_by_times_are_velocities(derivatives):
+    """dq/dt1 = v(t1); a shift of all times of an autonomous motion changes nothing."""
     state, x, _, (y, *_) = derivatives("double_pendulum")
     zero = jax.tree.map(jnp.zeros_like, x)
     one = jnp.array(1.0)
     jvp = jax.jit(lambda dx: jax.jvp(state, (x,), (dx,))[1])
     by_end = jvp(zero | {"t1": one})
-    np.testing.assert_allclose(by_end[:2], y[2:4], rtol=1e-7, atol=0)  # v is good to the tolerance
-    # t1 -> t1 + s, t0 -> t0 + s, and the middle row 0.6 t1 moves by 0.6 s only.
+    np.testing.assert_allclose(by_end[:2], y[2:4], rtol=1e-7, atol=0)  # v is right to 1e-9
+    # t1 -> t1 + s, t0 -> t0 + s, and the middle save 0.6 t1 moves by 0.6 s only.
     by_clock = jvp(zero | {"t0": one, "t1": one})
     assert np.abs(by_clock[:4]).max() < 1e-9 * np.abs(y).max()
 
 
 @pytest.mark.full
-def test_rows_move_with_their_own_time():
-    """d x(ts[i]) / d ts[i] = v, on a mark of a fixed grid and on a knot as anywhere else."""
+def test_saves_have_derivatives_by_their_own_time():
+    """d x(ts[i]) / d ts[i] = v, also on a step of a fixed grid and on a knot."""
     free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
-    row = jax.grad(lambda ts: jl.simulate(free, [0.0], [2.0], ts, dt=0.25).q[1, 0])
+    save = jax.grad(lambda ts: jl.simulate(free, [0.0], [2.0], ts, dt=0.25).q[1, 0])
     for middle in (0.5, 0.51):
-        slope = row(jnp.array([0.0, middle, 1.0]))
+        slope = save(jnp.array([0.0, middle, 1.0]))
         np.testing.assert_allclose(slope, [-2.0, 2.0, 0.0], rtol=0, atol=1e-13)
 
     def pushed(at, knot):
-        """The row at `at` under a force 5 t / knot, up to the knot."""
+        """The save at `at` under a force 5 t / knot, up to the knot."""
         force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
         system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
         table = jl.LinearInterpolation(jnp.stack([0.0, knot, 1.0]), jnp.array([0.0, 5.0, 1.0]))
         ts = jnp.stack([0.0, at, 1.0])
         return jl.simulate(system, [0.0], [0.0], ts, inputs={"u": table}).q[1, 0]
 
-    by_row, by_knot = jax.grad(pushed, argnums=(0, 1))(0.5, 0.5)
-    np.testing.assert_allclose(by_row, 5 * 0.5 / 2, rtol=1e-12)  # v = 5 t^2 / (2 knot)
+    by_time, by_knot = jax.grad(pushed, argnums=(0, 1))(0.5, 0.5)
+    np.testing.assert_allclose(by_time, 5 * 0.5 / 2, rtol=1e-12)  # v = 5 t^2 / (2 knot)
     np.testing.assert_allclose(by_knot, -5 * 0.5 / 6, rtol=1e-12)  # x = 5 t^3 / (6 knot)
 
 
 @pytest.mark.parametrize("mode", mostly_full(("recorded", "checkpoints", "forward"), "recorded"))
-def test_dependence_on_the_start_under_a_table(mode):
-    """x'' = 1 + 2 t from rest at t0: dx(t1)/dt0 = -(1 + 2 t0) (t1 - t0), whatever t0 is counted
-    from in between."""
+def test_derivative_by_the_start_time_under_a_table_is_exact(mode):
+    """x'' = 1 + 2 t from rest at t0: dx(t1)/dt0 = -(1 + 2 t0) (t1 - t0).
+
+    The reference of times in between has no effect.
+    """
     force = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(force,))
     table = jl.LinearInterpolation([0.0, 1.0, 2.0, 3.0], [1.0, 3.0, 5.0, 7.0])
@@ -253,7 +255,7 @@ def test_derivative_by_switching_time():
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["kvaerno3", "tsit5"])
 @pytest.mark.parametrize("dt", [None, 0.02])
-def test_every_kind_of_solver(method, dt):
+def test_forward_equals_reverse_for_every_kind_of_solver(method, dt):
     """fwd = rev for implicit and explicit, adaptive and fixed steps."""
     tolerance = {} if dt else {"rtol": 1e-6, "atol": 1e-6}
     state, x = end(MOTIONS["central_motion"], method=method, dt=dt, **tolerance)
@@ -265,7 +267,7 @@ def test_every_kind_of_solver(method, dt):
 
 
 def test_hessian_of_a_short_program_is_right():
-    """All orders of the two modes, against differences of the gradient; sines by polynomial."""
+    """All orders of the two modes, against differences of the gradient; sines are polynomials."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))
     q0, p, h = jnp.array([0.1]), jnp.array(9.81), 1e-4
 
@@ -274,7 +276,7 @@ def test_hessian_of_a_short_program_is_right():
         return jnp.sum(motion.q[1:] ** 2)
 
     slope = jax.jit(jax.grad(loss))
-    by_differences = (slope(p + h) - slope(p - h)) / (2 * h)  # off by h^2 and by roundings over h
+    by_differences = (slope(p + h) - slope(p - h)) / (2 * h)  # errors: h^2 and rounding over h
     forward, reverse = jax.jacfwd, jax.grad
     for outer, inner in itertools.product((forward, reverse), repeat=2):
         found = jax.jit(outer(inner(loss)))(p)
@@ -283,7 +285,7 @@ def test_hessian_of_a_short_program_is_right():
 
 @pytest.mark.full
 def test_hessian_is_symmetric_and_right():
-    """jacfwd of grad: symmetric to round-off, equal to differences of the gradient (fixed grid)."""
+    """jacfwd of grad: symmetric to rounding, equal to differences of the gradient (fixed grid)."""
     motion = MOTIONS["central_motion"]
 
     def angle(z):
@@ -311,7 +313,7 @@ def test_hessian_is_symmetric_and_right():
     ],
 )
 def test_vmap_of_grad_equals_loop_of_grad(name, dt, rtol):
-    """To round-off on a fixed grid; an adaptive one is chosen by errors that round differently."""
+    """To rounding on a fixed grid; an adaptive one depends on errors that round differently."""
     motion = MOTIONS[name]
 
     def angle(q0, params):
@@ -330,8 +332,8 @@ def test_vmap_of_grad_equals_loop_of_grad(name, dt, rtol):
 
 
 @pytest.mark.full
-def test_unreached_rows_keep_the_gradient_finite():
-    """A lane that dies on the way has NaN rows, and a finite gradient in what it did reach."""
+def test_saves_that_are_not_reached_keep_the_gradient_finite():
+    """A motion that fails has NaN saves, and a finite gradient of the saves that it reached."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.sqrt(1.0 - q[0]), ("x",)
     )  # undefined beyond x = 1
@@ -343,22 +345,22 @@ def test_unreached_rows_keep_the_gradient_finite():
     (_, status), slope = jax.value_and_grad(reached, has_aux=True)(jnp.array([1.0]))
     assert status == jl.Status.nonfinite
     assert np.isfinite(slope).all()
-    assert slope[0] > 0.5  # rows at 0.25, 0.5, 0.75 move with v0
+    assert slope[0] > 0.5  # saves at 0.25, 0.5, 0.75 depend on v0
 
-    def dead(q0):
+    def failed(q0):
         m = jl.simulate(system, q0, [0.0], [0.0, 1.0, 2.0], 0.1, throw=False)
         return jnp.sum(jnp.where(jnp.isnan(m.q[1:]), 0.0, m.q[1:]))
 
-    np.testing.assert_array_equal(jax.grad(dead)(jnp.array([2.0])), [0.0])
+    np.testing.assert_array_equal(jax.grad(failed)(jnp.array([2.0])), [0.0])
 
 
 @pytest.mark.full
-def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
-    """The comparisons above fail when the tangent rule is wrong in sign."""
+def test_wrong_sign_of_the_tangent_rule_is_detected(derivatives, monkeypatch):
+    """The comparisons above fail for a wrong sign of the tangent rule."""
     _, x, dx, (_, dy, _, _) = derivatives("central_motion")
     right = _solve.changes
     monkeypatch.setattr(_solve, "changes", lambda *args: jax.tree.map(jnp.negative, right(*args)))
-    state, _ = end(MOTIONS["central_motion"], max_steps=4097)  # another program: nothing cached
+    state, _ = end(MOTIONS["central_motion"], max_steps=4097)  # another program: no cache is used
     _, wrong = jax.jit(lambda x, dx: jax.jvp(state, (x,), (dx,)))(x, dx)
     np.testing.assert_allclose(wrong, -dy, rtol=1e-9)
     again = recorded(MOTIONS["central_motion"], x)
@@ -371,14 +373,14 @@ def test_a_flipped_sign_is_caught(derivatives, monkeypatch):
 
 
 @pytest.mark.full
-def test_a_flipped_sign_backwards_is_caught(derivatives, monkeypatch):
-    """The comparison of forward with reverse fails when the transposed map is wrong in sign."""
+def test_wrong_sign_of_the_adjoint_is_detected(derivatives, monkeypatch):
+    """The comparison of forward with reverse fails for a wrong sign of the transposed map."""
     _, x, dx, (_, dy, weights, _) = derivatives("central_motion")
     right = _tangent_map.adjoint_sweep
     monkeypatch.setattr(
         _tangent_map, "adjoint_sweep", lambda *args: jax.tree.map(jnp.negative, right(*args))
     )
-    state, _ = end(MOTIONS["central_motion"], max_steps=4098)  # another program: nothing cached
-    pulled = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)
+    state, _ = end(MOTIONS["central_motion"], max_steps=4098)  # another program: no cache is used
+    gradient = jax.jit(lambda x: jax.vjp(state, x)[1](weights)[0])(x)
     scale = jnp.sum(jnp.abs(weights * dy))
-    assert abs(dot(weights, dy) - dot(pulled, dx)) > 1e-3 * scale
+    assert abs(dot(weights, dy) - dot(gradient, dx)) > 1e-3 * scale

@@ -1,4 +1,4 @@
-"""Derivatives of rows that a motion does not reach are NaN; what masks them keeps its own."""
+"""Derivatives of saves that a motion does not reach are NaN; a loss may mask them."""
 
 import jax
 import jax.numpy as jnp
@@ -8,19 +8,19 @@ import pytest
 import jaxlag as jl
 from jaxlag._gradient._unreached_saves import unreached
 
-# V = p/x: repelled for p > 0, drawn into the center for p < 0, which no motion survives.
+# V = p/x: repulsion for p > 0; for p < 0 attraction into the center, where motions fail.
 central = jl.System(lambda t, q, v, p: 0.5 * v @ v - p / q[0], ("x",))
 TS = jnp.array([0.0, 0.1, 2.0])
 P = 3.0
 
 
-def rows(p):
+def saves(p):
     motion = jl.simulate(central, [1.0], [0.0], TS, p, method="tsit5", throw=False)
     return motion.q[:, 0], motion.ok
 
 
 def last(p):
-    return rows(p)[0][-1]
+    return saves(p)[0][-1]
 
 
 def energy(p):
@@ -28,8 +28,8 @@ def energy(p):
 
 
 def masked(p):
-    """Of one motion that arrives, and one that does not."""
-    found, ok = jax.vmap(rows)(jnp.stack([p, -p]))
+    """Of one motion that reaches the end, and one that does not."""
+    found, ok = jax.vmap(saves)(jnp.stack([p, -p]))
     return jnp.sum(jnp.where(ok, found[:, -1], 0.0))
 
 
@@ -39,7 +39,7 @@ def found():
         return {
             "lost": [d(last)(-p) for d in (jax.grad, jax.jacfwd, jax.hessian)],
             "second, forwards": jax.jacfwd(jax.jacfwd(last))(-p),
-            "kept": [d(lambda p: rows(p)[0][1])(-p) for d in (jax.grad, jax.jacfwd)],
+            "reached": [d(lambda p: saves(p)[0][1])(-p) for d in (jax.grad, jax.jacfwd)],
             "energy": [d(energy)(-p) for d in (jax.grad, jax.jacfwd)],
             "masked": [d(masked)(p) for d in (jax.grad, jax.jacfwd)],
             "alone": jax.jacfwd(last)(p),
@@ -49,33 +49,33 @@ def found():
     return jax.tree.map(np.asarray, jax.jit(everything)(P))
 
 
-def test_what_is_not_reached_has_no_derivative(found):
+def test_saves_that_are_not_reached_have_nan_derivatives(found):
     assert np.all(np.isnan(found["lost"])), found["lost"]
     assert np.isnan(found["second, forwards"])
     assert np.isnan(found["all"])
     assert np.all(np.isnan(found["energy"]))
 
 
-def test_rows_before_the_failure_have_theirs(found):
+def test_saves_before_the_failure_have_derivatives(found):
     """x'' = p/x^2, so that dx(t)/dp = t^2/2 to first order in t^2."""
-    np.testing.assert_allclose(found["kept"], 0.1**2 / 2, rtol=0.05)
-    np.testing.assert_allclose(*found["kept"], rtol=1e-12)
+    np.testing.assert_allclose(found["reached"], 0.1**2 / 2, rtol=0.05)
+    np.testing.assert_allclose(*found["reached"], rtol=1e-12)
 
 
-def test_a_loss_may_leave_failed_motions_out(found):
+def test_loss_may_mask_failed_motions(found):
     np.testing.assert_allclose(found["masked"], found["alone"], rtol=1e-12)
 
 
-def test_backwards_only_what_is_asked_for_is_lost():
+def test_reverse_mode_loses_only_the_requested_saves():
     reached, given = jnp.array([True, False]), jnp.array([1.0, 2.0])
     change, dots = jnp.ones(2), jnp.ones((2, 3))
 
-    def along(change, dots):
+    def tangent(change, dots):
         return unreached(reached, given, change, dots)
 
-    np.testing.assert_array_equal(along(change, dots), [[1.0] * 3, [np.nan] * 3])
-    back = jax.vjp(along, change, dots)[1]
-    for row, lost in ((0, 0.0), (1, np.nan)):
-        by_change, by_dots = back(jnp.zeros((2, 3)).at[row].set(1.0))
+    np.testing.assert_array_equal(tangent(change, dots), [[1.0] * 3, [np.nan] * 3])
+    back = jax.vjp(tangent, change, dots)[1]
+    for save, lost in ((0, 0.0), (1, np.nan)):
+        by_change, by_dots = back(jnp.zeros((2, 3)).at[save].set(1.0))
         np.testing.assert_array_equal(by_change, [lost, lost])
-        np.testing.assert_array_equal(by_dots, [[1.0 - row] * 3, [0.0] * 3])
+        np.testing.assert_array_equal(by_dots, [[1.0 - save] * 3, [0.0] * 3])

@@ -1,4 +1,4 @@
-"""A mass that is pushed by what a table says."""
+"""A mass under a force given by a table."""
 
 import jaxlag as jl
 

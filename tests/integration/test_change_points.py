@@ -1,7 +1,7 @@
-"""Change points: places where ways of moving meet are passed along the tangent, or stopped before.
+"""Change points, where branches of motion meet: passed along the tangent, or stopped before.
 
 The windows benchmark of multibody dynamics (IFToMM A02): rods of length 1 in parallelograms, which
-lie flat twice in every turn. The motion on the parallelogram is that of one pendulum.
+are flat twice per revolution. The motion on the parallelogram branch is that of one pendulum.
 """
 
 import jax
@@ -17,7 +17,7 @@ from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._simulation._methods import METHODS
 from systems.catalogue import ENTRIES
 
-SIDE = (0.0, 1.0)  # where the fixed ends are
+SIDE = (0.0, 1.0)  # x of the fixed pivots
 SPEEDS = jnp.linspace(0.9, 1.5, 24)
 Q0 = jnp.array([0.0, 1.0, 1.0, 1.0])
 ENERGY = 1.5 * 9.81
@@ -46,19 +46,19 @@ PENDULUM = jl.System(lambda t, q, v, p: 5 / 6 * v[0] ** 2 - 2 * 9.81 * jnp.cos(q
 
 
 def moved(speed, ts, rtol, system=WINDOW, **options):
-    """The motion from upright, with the tops at this speed."""
+    """The motion from upright; the tops have this speed."""
     v0 = jnp.stack([speed, 0.0 * speed, speed, 0.0 * speed])
     return jl.simulate(system, Q0, v0, ts, rtol=rtol, atol=rtol, throw=False, **options)
 
 
 def exact(speed, ts):
-    """x of the tops."""
+    """x of the tops, by the pendulum."""
     tight = {"rtol": 1e-13, "atol": 1e-13, "throw": False}
     return jnp.sin(jl.simulate(PENDULUM, jnp.zeros(1), speed[None], ts, **tight).q[:, 0])
 
 
-def test_flat_places_are_passed_at_every_tolerance():
-    """Three turns, with rows all along the way, near the places too."""
+def test_flat_configurations_are_passed_at_every_tolerance():
+    """Three revolutions, with saves along the whole motion, also near the change points."""
     ts = jnp.linspace(0.0, 4.0, 161)
     run = jax.jit(jax.vmap(moved, in_axes=(0, None, None)))
     expected = jax.vmap(exact, in_axes=(0, None))(SPEEDS, ts)
@@ -67,12 +67,12 @@ def test_flat_places_are_passed_at_every_tolerance():
         found = run(SPEEDS, ts, rtol)
         assert (found.status == jl.Status.ok).all()
         np.testing.assert_allclose(found.q[..., 0], expected, atol=off)
-        # On the branch that it came on: the top stays level.
+        # The branch is the same as before: the top stays level.
         np.testing.assert_allclose(found.q[..., 3], found.q[..., 1], atol=1e-12)
 
 
 @pytest.mark.full
-def test_flat_places_in_float32_are_passed_or_named():
+def test_flat_configurations_in_float32_are_passed_or_reported():
     ts = jnp.linspace(0.0, 2.0, 41)
     expected = jax.vmap(exact, in_axes=(0, None))(SPEEDS, ts)
     single = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -82,8 +82,9 @@ def test_flat_places_in_float32_are_passed_or_named():
         at_once = {"rtol": rtol, "atol": rtol, "throw": False}
         return jl.simulate(WINDOW, single(Q0), v0, single(ts), **at_once)
 
-    # Measured: 24 and 23 of 24 motions pass, off by 1e-3 and 9e-4. Others end there and say so.
-    # Of 384 motions 376 and 370, off by 1e-2 at most and by 3e-5 in the median at 1e-5: rounding.
+    # Measured: 24 and 23 of 24 motions pass, off by 1e-3 and 9e-4. Others end there with their
+    # status. Of 384 motions 376 and 370 pass, off by 1e-2 at most and by 3e-5 in the median at
+    # 1e-5: rounding.
     for rtol in (1e-4, 1e-5):
         found = jax.jit(jax.vmap(run, in_axes=(0, None)))(single(SPEEDS), rtol)
         assert found.q.dtype == jnp.float32
@@ -92,8 +93,8 @@ def test_flat_places_in_float32_are_passed_or_named():
         np.testing.assert_allclose(found.q[passed, :, 0], expected[passed], atol=5e-3)
 
 
-def test_it_stops_before_them_where_told_to():
-    """At every tolerance, by its name; far from them nothing is different."""
+def test_option_stop_ends_motions_before_change_points():
+    """At every tolerance, with status rank_change; the last time is the change point within it."""
     run = jax.jit(jax.vmap(lambda s, e: moved(s, jnp.linspace(0, 2, 3), e, change_points="stop")))
     tolerances = jnp.array([1e-4, 1e-6, 1e-8, 1e-10, 1e-12])
     found = run(jnp.ones(5), tolerances)
@@ -105,35 +106,35 @@ def test_it_stops_before_them_where_told_to():
 
 
 @pytest.mark.full
-def test_the_row_is_named():
+def test_message_of_a_stop_names_the_row():
     found = moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="stop")
     assert "rank_change ('rods[" in found.message()
     assert "change_points='stop'" in found.message()
 
 
-def test_another_word_is_an_error():
+def test_invalid_option_is_refused():
     with pytest.raises(ValueError, match=r"`change_points` must be one of 'pass', 'stop'.*'go'"):
         moved(jnp.ones(()), [0.0, 1.0], 1e-9, change_points="go")
 
 
 @pytest.mark.parametrize("rtol", mostly_full([1e-6, 1e-9, 1e-12], 1e-12))
 def test_a_fast_four_bar_passes_its_change_point(rtol):
-    """Three times; with its energy, and back to where it started."""
+    """Three times; with constant energy, and back to the start."""
     q0, v0, params = change_point_start()
     options = {"throw": False, "rtol": rtol, "atol": rtol}
-    there = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
-    assert there.status == jl.Status.ok
+    forward = jl.simulate(four_bar, q0, v0, np.linspace(0, 3, 301), params, **options)
+    assert forward.status == jl.Status.ok
     # Measured: 2e-5, 1.3e-9, 3e-13 of 15 J; 4e-5, 6e-9, 1.4e-12.
     energy = {1e-6: 1e-4, 1e-9: 1e-8, 1e-12: 5e-12}[rtol]
-    np.testing.assert_allclose(there.energy, there.energy[0], atol=energy)
-    q1, v1 = there.last_state
-    back = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
-    assert back.status == jl.Status.ok
-    np.testing.assert_allclose(back.q[-1], q0, atol=10 * energy)
+    np.testing.assert_allclose(forward.energy, forward.energy[0], atol=energy)
+    q1, v1 = forward.last_state
+    backward = jl.simulate(four_bar, q1, -v1, [0.0, 3.0], params, **options)
+    assert backward.status == jl.Status.ok
+    np.testing.assert_allclose(backward.q[-1], q0, atol=10 * energy)
 
 
 def change_point_start():
-    """(q, v, params) of a four-bar with a + d = b + c, which lies flat once in a turn."""
+    """(q, v, params) of a four-bar with a + d = b + c, which is flat once per revolution."""
     params = {"a": 0.4, "b": 1.0, "c": 0.6, "d": 1.2}
     q0 = four_bar_start(1.0, params)
     start = jl.assemble(four_bar, q0, [5.0, 0.0, 0.0], params, hold=("crank'",))
@@ -151,7 +152,7 @@ def test_a_four_bar_stops_before_its_change_point():
 
 
 def flat_at(speed):
-    """When the windows first lie flat, by the integral of dtheta / theta'."""
+    """Time at which the windows are first flat, by the integral of dtheta / theta'."""
     x, w = np.polynomial.legendre.leggauss(40)
     angle = np.pi / 4 * (1 + x)
     rate = lambda a: np.sqrt(speed**2 + 2.4 * 9.81 * (1 - np.cos(a)))  # noqa: E731
@@ -159,8 +160,8 @@ def flat_at(speed):
 
 
 @pytest.mark.parametrize("method", mostly_full(["auto", "tsit5"], "auto"))
-def test_states_at_the_place_and_beside_it(method):
-    """Saved there, and at the end of a motion there: at every tolerance."""
+def test_states_at_and_near_a_change_point_are_accurate(method):
+    """Saved there, and at the end of a motion there, at every tolerance."""
     when = np.array([flat_at(speed) for speed in SPEEDS[::4].tolist()])
     beside = np.array([-1e-2, -1e-4, -1e-7, 0.0, 1e-7, 1e-4, 1e-2])
     exact_state = lambda s, t: jl.simulate(  # noqa: E731
@@ -184,7 +185,7 @@ def test_states_at_the_place_and_beside_it(method):
 
 
 def angles_of_a_parallelogram(speeds, starts, ts, rtol):
-    """Its links' angles to one line: that of the coupler stays 0, whatever rounding makes of it."""
+    """Angles of its links to one line: that of the coupler stays 0 up to rounding."""
     entry = ENTRIES["four_bar"]
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 3.0}
     at_once = {"rtol": rtol, "atol": rtol, "throw": False}
@@ -207,7 +208,7 @@ def angles_of_a_parallelogram(speeds, starts, ts, rtol):
 
 @pytest.mark.parametrize("rtol", mostly_full([1e-6, 1e-9, 1e-11, 1e-12, 1e-13], 1e-12))
 def test_rounding_does_not_shorten_the_steps(rtol):
-    """Where a coordinate is nothing but the rounding of the others: 0, as its velocity."""
+    """One coordinate and its velocity are only the rounding of the others."""
     rng = np.random.default_rng(5)
     starts, speeds = jnp.asarray(rng.uniform(0.3, 2.8, 40)), jnp.asarray(-rng.uniform(2.5, 5, 40))
     status, off, steps = angles_of_a_parallelogram(speeds, starts, jnp.linspace(0, 2, 5), rtol)
@@ -218,8 +219,8 @@ def test_rounding_does_not_shorten_the_steps(rtol):
 
 
 @pytest.mark.full
-def test_equal_steps_that_meet_the_place_say_so():
-    """By an end, or by a stage of the method: and those that do not keep their accuracy."""
+def test_fixed_steps_that_meet_a_change_point_report_it():
+    """Those with an end or a stage there; all others keep their accuracy."""
     when = flat_at(1.0)
     nodes = np.clip(np.unique(nodes_of(METHODS["dopri8"]())), 0.0, 1.0)
     steps = when / (20 + np.unique([0.0, *nodes, 1.0]))
@@ -233,18 +234,18 @@ def test_equal_steps_that_meet_the_place_say_so():
     found = jax.vmap(run)(jnp.asarray(steps))
     passed = found.status == jl.Status.ok
     assert ((found.status == jl.Status.rank_change) | passed).all()
-    assert jnp.sum(passed) <= 1  # measured: by the first stage after the start, right to 5e-13
-    apart = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
-    assert (apart.status == jl.Status.ok).all()
+    assert jnp.sum(passed) <= 1  # measured: of the first stage after the start, right to 5e-13
+    shifted = jax.vmap(run)(jnp.asarray(steps) * (1 + 1e-4))
+    assert (shifted.status == jl.Status.ok).all()
     expected = exact(jnp.ones(()), jnp.array([0.0, 0.8]))[-1]
-    for end in (*found.q[passed, -1, 0], *apart.q[:, -1, 0]):
+    for end in (*found.q[passed, -1, 0], *shifted.q[:, -1, 0]):
         np.testing.assert_allclose(end, expected, atol=1e-8)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("how", [{"rtol": 1e-9, "atol": 1e-9}, {"dt": 0.02, "method": "dopri8"}])
-def test_a_force_that_is_nan_before_the_place_is_not_taken_for_it(how):
-    """At x0 = 0.95, where rows have a third of their length left: none at x0 = 1."""
+def test_nan_force_before_a_change_point_is_reported_as_nonfinite(how):
+    """NaN at x0 = 0.95, where rows have a third of their length left; they vanish at x0 = 1."""
     wrong = lambda t, q, v, p: jnp.where(q[0] > p, jnp.nan, 0.0) * jnp.ones(4)  # noqa: E731
     force, rows = jl.GeneralizedForce(wrong, "wrong"), jl.Holonomic(rods, "rods")
     system = jl.System(window, ("x0", "y0", "x1", "y1"), forces=[force], constraints=[rows])
@@ -254,8 +255,8 @@ def test_a_force_that_is_nan_before_the_place_is_not_taken_for_it(how):
 
 
 @pytest.mark.full
-def test_a_crank_at_constant_speed_is_saved_where_it_is_folded():
-    """A parallelogram folded flat at t = 2, of which a save time is one."""
+def test_saves_in_a_folded_configuration_are_accurate():
+    """A parallelogram that is flat at t = 2, which is a save time."""
     entry = ENTRIES["four_bar"]
     params = dict(entry.example.params) | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0, "g": 0.0}
     q0, ts = np.array([2.0, 0.0, 2.0 - np.pi]), np.linspace(0.0, 4.0, 41)
@@ -273,7 +274,7 @@ def test_a_crank_at_constant_speed_is_saved_where_it_is_folded():
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("method", ["auto", "tsit5", "kvaerno5"])
-def test_all_forms_pass(lowering, formulation, method):
+def test_change_points_are_passed_in_all_formulations(lowering, formulation, method):
     ts = jnp.linspace(0.0, 4.0, 41)
     how = {"method": method, "formulation": formulation}
     found = moved(jnp.ones(()), ts, 1e-9, parallelogram(lowering), **how)
@@ -285,8 +286,8 @@ def test_all_forms_pass(lowering, formulation, method):
 
 @pytest.mark.full
 @pytest.mark.parametrize("stabilization", [None, jl.Baumgarte(5.0, 5.0)])
-def test_without_a_projection_it_stops(stabilization):
-    """Beyond the place nothing would move the state back to the way that it came on."""
+def test_motion_without_projection_stops(stabilization):
+    """Beyond the change point nothing would move the state back to its branch."""
     for rtol in (1e-6, 1e-9, 1e-12):
         found = moved(jnp.ones(()), [0.0, 1.0], rtol, stabilization=stabilization)
         assert found.status == jl.Status.rank_change
@@ -295,7 +296,7 @@ def test_without_a_projection_it_stops(stabilization):
 
 @pytest.mark.full
 def test_fixed_steps_keep_their_order():
-    """Across the place, wherever in a step it lies; without constraints the slope is 8.2."""
+    """Across the change point, anywhere in a step; without constraints the slope is 8.2."""
     ts = jnp.array([0.0, 0.6, 1.2])
 
     @jax.jit
@@ -306,12 +307,12 @@ def test_fixed_steps_keep_their_order():
 
     sizes = np.array([1 / 15, 1 / 20, 1 / 30])
     slope = np.polyfit(np.log(sizes), np.log([float(off(h)) for h in sizes]), 1)[0]
-    assert 7.9 <= slope <= 8.8  # measured: 8.4, as the place lies nearer to the middle of steps
+    assert 7.9 <= slope <= 8.8  # measured: 8.4, the change point is nearer to the middle of steps
 
 
 @pytest.mark.full
-def test_derivatives_across():
-    """First ones forwards and backwards, and second ones, against those of the pendulum."""
+def test_derivatives_across_change_points_are_accurate():
+    """First derivatives in both modes, and second ones, against those of the pendulum."""
     ts = jnp.linspace(0.0, 3.0, 31)
 
     def all_of(end):
@@ -321,32 +322,34 @@ def test_derivatives_across():
 
     found = all_of(lambda s: moved(s, ts, 1e-12).q[-1, 0])
     expected = all_of(lambda s: exact(s, ts)[-1])
-    # Of 1,000 starts the worst: 1e-12, 2e-11, 1e-11, 5e-11.
+    # Largest errors of 1,000 starts: 1e-12, 2e-11, 1e-11, 5e-11.
     for value, right in zip(found, expected, strict=True):
         np.testing.assert_allclose(value, right, rtol=2e-10, atol=2e-12)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("stop", [False, True])
-def test_derivatives_of_what_is_saved_there(stop):
-    """In the start and in the times themselves, forwards and backwards, alone and in lanes."""
+def test_derivatives_of_saves_at_change_points_are_accurate(stop):
+    """By the start and by the save times, forward and reverse, single and in lanes."""
     speeds = SPEEDS[:3]
     when = jnp.asarray([flat_at(speed) for speed in speeds.tolist()])
     ts = when[:, None] + jnp.array([-0.1, -1e-3, 0.0] if stop else [-0.1, 0.0, 1e-3, 0.1])
     ts = jnp.concatenate([jnp.zeros((3, 1)), ts], axis=1)
 
     def of(motion):
-        forward, back = (jax.jit(jax.vmap(d(motion, (0, 1)))) for d in (jax.jacfwd, jax.jacrev))
+        forward, reverse_mode = (
+            jax.jit(jax.vmap(d(motion, (0, 1)))) for d in (jax.jacfwd, jax.jacrev)
+        )
         return (
             forward(speeds, ts),
-            back(speeds, ts),
+            reverse_mode(speeds, ts),
             jax.jit(jax.jacrev(motion, 1))(speeds[0], ts[0]),
         )
 
-    there, back, alone = of(lambda s, ts: moved(s, ts, 1e-12).q[:, 0])
+    forward_mode, reverse_mode, alone = of(lambda s, ts: moved(s, ts, 1e-12).q[:, 0])
     expected = of(exact)[0]
     # Measured: 2e-9 of 0.8, 3e-8 of 5.
-    for found in (there, back):
+    for found in (forward_mode, reverse_mode):
         np.testing.assert_allclose(found[0], expected[0], atol=2e-8)
         np.testing.assert_allclose(found[1], expected[1], atol=3e-7)
     np.testing.assert_allclose(alone, expected[1][0], atol=3e-7)
@@ -360,8 +363,8 @@ TOLERANCES = jnp.array([1e-4, 1e-6, 1e-9, 1e-12])
 UNITS = jnp.array([[1.0, 1.0], [1e-6, 1e-6], [1e3, 1e3], [1.0, 1e-6], [1e-3, 1e3]])
 
 
-def along(curve, q0, v0):
-    """A bead along a curve, by nothing but its speed: at every tolerance, in every unit."""
+def motion_of_a_bead(curve, q0, v0):
+    """A bead along a curve without forces, at every tolerance, in every unit."""
     rows = (jl.Holonomic(lambda t, q, units: curve(q / units), "wire"),)
     system, ts = jl.System(free, ("x", "y"), constraints=rows), jnp.linspace(0.0, 4.0, 9)
 
@@ -374,13 +377,13 @@ def along(curve, q0, v0):
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(TOLERANCES, UNITS)
 
 
-def test_where_ways_cross_a_bead_goes_straight_on():
-    """A figure of eight, of which a quarter is 1.311 long: through its node, and once more."""
+def test_bead_passes_a_node_along_its_tangent():
+    """A figure eight, a quarter of which is 1.311 long: twice through its node."""
     eight = lambda q: (q @ q) ** 2 - q[0] ** 2 + q[1] ** 2  # noqa: E731
-    status, q, _, _ = along(eight, [1.0, 0.0], [0.0, 1.0])
+    status, q, _, _ = motion_of_a_bead(eight, [1.0, 0.0], [0.0, 1.0])
     assert (status == jl.Status.ok).all()
-    s = 4.0 - 3 * 1.3110287771460600  # beyond it
-    r = s - s**5 / 10  # the lemniscate's sine, to 5e-13
+    s = 4.0 - 3 * 1.3110287771460600  # length beyond the node
+    r = s - s**5 / 10  # the lemniscate sine, to 5e-13
     angle = np.pi / 4 - np.arcsin(r**2) / 2
     end = r * np.array([np.cos(angle), -np.sin(angle)])
     off = np.max(np.linalg.norm(q[:, :, -1] - end, axis=-1), axis=1)
@@ -401,12 +404,12 @@ CURVES = {
 
 
 @pytest.mark.parametrize("name", mostly_full(list(CURVES), "cusp"))
-def test_where_ways_do_not_cross_a_bead_stops(name):
-    """At a cusp, and where two curves touch: at every tolerance, a little way before the place."""
+def test_bead_stops_at_cusps_and_contact_points(name):
+    """At a cusp, and where two curves touch: at every tolerance, shortly before the point."""
     curve, q0, v0 = CURVES[name]
-    status, _, last_time, v = along(curve, q0, v0)
+    status, _, last_time, v = motion_of_a_bead(curve, q0, v0)
     assert (status == jl.Status.rank_change).all()
     np.testing.assert_allclose(last_time, jnp.full_like(last_time, last_time[-1, 0]), rtol=0.03)
     off = np.abs(np.linalg.norm(v, axis=-1) / np.linalg.norm(v0) - 1.0)
-    # Measured, the worst: 1.7e-2 (the last state is 3 mm beyond the cusp), 3e-7, 2e-10, 4e-12.
+    # Measured at most: 1.7e-2 (the last state is 3 mm beyond the cusp), 3e-7, 2e-10, 4e-12.
     assert (np.max(off, axis=1) <= np.array([5e-2, 2e-6, 1e-9, 2e-11])).all()

@@ -1,4 +1,4 @@
-"""Constraints where numbers are extreme: far away, unequal masses, singular states, no inertia."""
+"""Extreme constraints: far from the origin, unequal masses, singular states, no inertia."""
 
 import jax
 import jax.numpy as jnp
@@ -21,16 +21,16 @@ def free(t, q, v, params):
 # ---- Rows that were left out ---------------------------------------------------------------------
 
 
-def parting(t, q, params):
-    """Two rows that are one at y = 0 and part where y grows."""
+def diverging(t, q, params):
+    """Two rows that are equal at y = 0 and differ as y grows."""
     return jnp.stack([q[0], q[0] + q[1] ** 3])
 
 
 @pytest.mark.parametrize(
     "stabilization", mostly_full(["projection", None, jl.Baumgarte(5.0, 5.0)], "projection")
 )
-def test_rows_that_part_are_told(stabilization):
-    system = jl.System(free, ("x", "y"), constraints=(jl.Holonomic(parting, ("a", "b")),))
+def test_rows_that_become_inconsistent_are_reported(stabilization):
+    system = jl.System(free, ("x", "y"), constraints=(jl.Holonomic(diverging, ("a", "b")),))
     motion = jl.simulate(
         system,
         [0.0, 0.0],
@@ -45,8 +45,8 @@ def test_rows_that_part_are_told(stabilization):
 
 
 @pytest.mark.parametrize("gap", mostly_full([1e-6, 1e-9, 1e-11, 1e-13], 1e-9, 1e-13))
-def test_a_small_contradiction_is_one(gap):
-    """Two lengths of one rod; what is below rounding is none."""
+def test_small_contradictions_are_reported(gap):
+    """Two lengths of one rod; differences below rounding do not count."""
     rods = (jl.Holonomic(rod, "rod"), jl.Holonomic(lambda t, q, p: rod(t, q, p) - p, "other"))
     system = jl.System(pendulum, ("x", "y"), constraints=rods)
     motion = jl.simulate(
@@ -59,7 +59,7 @@ def test_a_small_contradiction_is_one(gap):
         assert "('other')" in motion.message()
 
 
-# ---- Time backwards ------------------------------------------------------------------------------
+# ---- Backward in time ----------------------------------------------------------------------------
 
 
 def pendulum(t, q, v, params):
@@ -72,8 +72,8 @@ def rod(t, q, params):
 
 @pytest.mark.full
 @pytest.mark.parametrize("traced", [False, True])
-def test_baumgarte_damps_backwards(traced):
-    """There and back: alpha has the sense of time."""
+def test_baumgarte_damps_backward_in_time(traced):
+    """Forward and backward: alpha has the direction of time."""
     system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
 
     def end(ts):
@@ -99,7 +99,7 @@ def links(t, q, x0):
 
 
 @pytest.mark.full
-def test_lengths_are_those_of_the_rows_not_of_the_frame():
+def test_motion_does_not_depend_on_the_distance_from_the_origin():
     """Two rods of 1 m that hang 100 km from the origin move as they do near it."""
     system = jl.System(
         chain, {"a": (3,), "b": (3,)}, constraints=(jl.Holonomic(links, ("upper", "lower")),)
@@ -129,8 +129,8 @@ def hanging(t, q, params):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_masses_may_be_as_unequal_as_they_like(formulation):
-    """Against one coordinate, params traced: M = 1e12 m."""
+def test_masses_of_ratio_1e12_move_accurately(formulation):
+    """Compared with one coordinate; params traced: M = 1e12 m."""
     system = jl.System(cart, ("X", "x", "y"), constraints=(jl.Holonomic(hanging, "rod"),))
     angle, heavy, light = 1.0, 1e11, 0.1
     start = [0.0, sin(angle), -cos(angle)], [0.0, 0.0, 0.0]
@@ -156,8 +156,8 @@ def almost(t, q, angle):
 
 
 @pytest.mark.parametrize("angle", [1e-2, 2e-4, 5e-5])
-def test_almost_dependent_rows_have_their_reactions(angle):
-    """Both hold x and y; digits are lost as sin(angle)^2 says."""
+def test_reactions_of_almost_dependent_rows_are_accurate(angle):
+    """Both rows hold x and y; sin(angle)^2 gives the lost digits."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v @ v - G * q[1] + q[0] - 3.0 * q[2],
         ("x", "y", "z"),
@@ -179,7 +179,7 @@ def polar(t, q, v, params):
 
 
 @pytest.mark.parametrize("traced", mostly_full([False, True], False))
-def test_a_start_where_a_coordinate_has_no_inertia(traced):
+def test_start_with_singular_inertia_is_solved(traced):
     """A slot through the center of polar coordinates: r = sin(t)."""
     slot = jl.Holonomic(lambda t, q, params: q[1] - 0.3, "slot")
     system = jl.System(polar, ("r", "phi"), constraints=(slot,))
@@ -191,13 +191,13 @@ def test_a_start_where_a_coordinate_has_no_inertia(traced):
     np.testing.assert_allclose(found, sin(1.0), atol=1e-10)
 
 
-def test_whether_a_coordinate_has_inertia_is_asked_of_traced_states_too():
-    """A slot that turns with rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, from the center as well."""
-    turn = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
+def test_traced_start_with_singular_inertia_is_solved():
+    """A slot that rotates at rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, also from the center."""
+    rotation = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
     system = jl.System(
         lambda t, q, v, params: 0.5 * (v[0] ** 2 + (q[0] * v[1]) ** 2),
         ("r", "phi"),
-        constraints=(turn,),
+        constraints=(rotation,),
     )
 
     def end(r):
@@ -226,8 +226,8 @@ def geared():
 
 
 @pytest.mark.parametrize("formulation", mostly_full(["multipliers", "null_space"], "multipliers"))
-def test_wheels_without_inertia(formulation):
-    """Held by a row of velocities beside one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
+def test_massless_wheels_move_with_the_body(formulation):
+    """Held by one row of velocities and one of positions: x = 0.3 cos t, a = (x - 0.3)/r."""
     motion = jl.simulate(
         geared(),
         [0.3, 0.0, 0.0],
@@ -241,14 +241,14 @@ def test_wheels_without_inertia(formulation):
     np.testing.assert_allclose(motion.q[-1], [x, (x - 0.3) / 0.5, (0.3 - x)], atol=1e-10)
 
 
-def test_a_guess_for_wheels_without_inertia():
+def test_massless_wheels_are_assembled():
     state = jl.assemble(geared(), [0.3, 0.1, 0.0], [0.2, 0.0, 0.0], 0.5)
     np.testing.assert_allclose(state.q[1] + 2 * state.q[2], 0.0, atol=1e-15)
     np.testing.assert_allclose(state.v[0], 0.5 * state.v[1], atol=1e-15)
 
 
-def test_all_of_a_heavy_state_may_be_held():
-    """Nothing is left to move, and nothing needs to."""
+def test_complete_state_may_be_held():
+    """Nothing is free to move, and nothing needs to move."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * p * v @ v, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),)
     )
@@ -257,43 +257,43 @@ def test_all_of_a_heavy_state_may_be_held():
     np.testing.assert_array_equal(state.q, [0.6, -0.8])
 
 
-# ---- Loops that lie flat, where a row is sin(pi) -----------------------------------------------
+# ---- Flat loops, where a row is sin(pi) --------------------------------------------------------
 
 
 PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
 
 
 @pytest.mark.parametrize("crank", [0.0, np.pi])
-def test_what_rounding_leaves_of_a_row_is_no_row(crank):
-    """Of the pin only y holds; forces along x are not found in 1e-16 of a row."""
+def test_rows_of_rounding_do_not_count(crank):
+    """Only y of the pin holds; no forces along x are computed from a row of 1e-16."""
     params, q, v = PARALLELOGRAM, [crank, 0.0, crank + np.pi], [0.3, 0.2, -0.7]
     found = jl.assemble(four_bar, q, v, params)
     assert int(found.rank) == 1
     A = np.array([0.5 * cos(crank), 1.0, 0.5 * cos(crank + np.pi)])
     M = four_bar.mass_matrix(q, params=params)
-    way = np.linalg.solve(M, A)
-    np.testing.assert_allclose(found.v, v - way * (A @ v) / (A @ way), atol=1e-12)
+    direction = np.linalg.solve(M, A)
+    np.testing.assert_allclose(found.v, v - direction * (A @ v) / (A @ direction), atol=1e-12)
     rest = four_bar.multipliers(q, np.zeros(3), params)["pin"]
     h = four_bar.bias(q, np.zeros(3), params)
-    expected = way @ h / (A @ way)
+    expected = direction @ h / (A @ direction)
     np.testing.assert_allclose(rest, [0.0, expected], rtol=1e-12, atol=1e-12)
 
 
-def test_no_acceleration_satisfies_rows_that_contradict():
-    """Turning through the flat place the links would have to leave the pin."""
+def test_contradictory_rows_give_nan_accelerations():
+    """To rotate through the flat configuration the links would have to leave the pin."""
     a = four_bar.acceleration([0.0, 0.0, np.pi], [1.0, -0.5, 0.0], PARALLELOGRAM)
     assert np.all(np.isnan(a))
 
 
 def once_more(t, q, v, params):
-    """A row twice, once by a factor that turns with x."""
+    """One row twice, once times a factor that depends on x."""
     row = 0.7 * v[1] + 0.3 * params
     return jnp.stack([(1.5 + jnp.sin(q[0])) * row, row])
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dtype):
-    """The factor's rate times what rounding leaves of the row: the row itself asks for 0."""
+def test_rounding_of_one_row_does_not_contradict_another(dtype):
+    """The factor's rate times the rounding of the row: the row itself requires 0."""
     system = jl.System(free, ("x", "y"), constraints=(jl.Pfaffian(once_more, "rows"),))
     params = jnp.arange(0.1, 1.2, 0.1, dtype=dtype)
     q, speed = jnp.asarray([0.3, 0.1], dtype), dtype(2.0)
@@ -307,11 +307,11 @@ def test_rounding_that_an_acceleration_has_from_one_row_is_none_of_the_others(dt
     np.testing.assert_allclose(found, np.zeros((11, 2)), atol=16 * np.finfo(dtype).eps)
 
 
-# ---- Starts that cannot be solved with -----------------------------------------------------------
+# ---- Starts that cannot be solved ----------------------------------------------------------------
 
 
 def test_a_row_that_vanishes_at_the_start_is_named():
-    """The user's state is kept, finite as it is."""
+    """The user's state is returned; it is finite."""
     system = jl.System(
         free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, params: q[0] ** 2, "flat"),)
     )
@@ -321,7 +321,7 @@ def test_a_row_that_vanishes_at_the_start_is_named():
     np.testing.assert_array_equal(motion.last_state[0], [0.0, 1.0])
 
 
-def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
+def test_residual_that_is_not_finite_is_reported_as_nonfinite():
     system = jl.System(
         free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, p: jnp.log(q[0]), "log"),)
     )
@@ -329,8 +329,8 @@ def test_a_residual_that_is_not_finite_is_not_called_inconsistent():
     assert motion.status == jl.Status.nonfinite
 
 
-def test_a_lane_without_a_start_spoils_no_derivative():
-    """Neither one that is not a number nor one off the constraint, in what all lanes share."""
+def test_lane_without_a_start_does_not_affect_derivatives():
+    """Neither a NaN lane nor one off the constraint affects derivatives by shared params."""
     system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))
 
     def height(angle, length, g):

@@ -1,4 +1,4 @@
-"""Motion under constraints: other coordinates, other formulations, redundancy, dead points."""
+"""Motion under constraints: minimal coordinates, formulations, redundancy, dead points."""
 
 import jax
 import jax.numpy as jnp
@@ -57,13 +57,13 @@ def largest_residuals(motion):
     return float(jnp.max(jnp.stack(largest)))
 
 
-# ---- Two routes to one motion --------------------------------------------------------------------
+# ---- Independent solutions of one motion ---------------------------------------------------------
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_minimal_coordinates_move_the_same(motion, formulation):
-    """q, v, a and energy of the angles, mapped; tensions from the angles' accelerations."""
+def test_motion_equals_that_in_minimal_coordinates(motion, formulation):
+    """q, v, a and energy are mapped from the angles; tensions follow from their accelerations."""
     found = motion(formulation)
     angles = jl.simulate(minimal, THETA, OMEGA, TS, BOBS, **TIGHT)
     q, v = jax.vmap(to_cartesian)(angles.q, angles.v)
@@ -76,10 +76,10 @@ def test_minimal_coordinates_move_the_same(motion, formulation):
     a = jax.vmap(acceleration)(angles.q, angles.v, angles.a)
     np.testing.assert_allclose(found.a, a, atol=1e-9)
     np.testing.assert_allclose(found.energy, angles.energy[0], atol=1e-9)
-    # The lower rod pulls its bob along itself: m2 (a2 - g) = 2 lam (r2 - r1).
+    # The lower rod acts on its bob along itself: m2 (a2 - g) = 2 lam (r2 - r1).
     rod = found.q[:, 2:] - found.q[:, :2]
-    pull = BOBS["m2"] * (a[:, 2:] + jnp.array([0.0, 9.81]))
-    np.testing.assert_allclose(2 * found.lam["rod2"][:, None] * rod, pull, atol=1e-8)
+    force = BOBS["m2"] * (a[:, 2:] + jnp.array([0.0, 9.81]))
+    np.testing.assert_allclose(2 * found.lam["rod2"][:, None] * rod, force, atol=1e-8)
 
 
 @pytest.mark.full
@@ -92,13 +92,13 @@ def test_formulations_agree(motion):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_constraints_hold_at_every_row(motion, formulation):
-    """Rounding alone is left."""
+def test_constraints_hold_at_every_save(motion, formulation):
+    """To rounding."""
     assert largest_residuals(motion(formulation)) <= 1e-13
 
 
-def test_projection_is_what_holds_them():
-    """Rounding alone is left where states are projected; else the drift shows."""
+def test_constraints_hold_only_with_projection():
+    """To rounding with projection; without it the drift is visible."""
     system, q0, v0, params = double_pendulum()
     loose = {"rtol": 1e-6, "atol": 1e-6, "method": "bosh3"}
     drifted = jl.simulate(system, q0, v0, TS, params, stabilization=None, **loose)
@@ -108,22 +108,22 @@ def test_projection_is_what_holds_them():
 
 
 @pytest.mark.full
-def test_baumgarte_damps_what_is_left():
-    """(d/dt + 20/s)^2 phi = 0: a residual at the start dies out; without, it stays."""
+def test_baumgarte_damps_initial_residuals():
+    """(d/dt + 20/s)^2 phi = 0: an initial residual decays; without damping it stays."""
     system, q0, v0, params = double_pendulum()
-    left = []
+    residuals = []
     for stabilization in (None, jl.Baumgarte(20.0, 20.0)):
         found = jl.simulate(
             system, q0 * (1 + 3e-9), v0, TS, params, stabilization=stabilization, **TIGHT
         )
         phi = rods(0.0, found.q[-1], params)
-        left.append(float(jnp.max(jnp.abs(phi))))
-    assert left[0] > 1e-9
-    assert left[1] < 1e-11
+        residuals.append(float(jnp.max(jnp.abs(phi))))
+    assert residuals[0] > 1e-9
+    assert residuals[1] < 1e-11
 
 
-def test_a_knife_edge_runs_in_a_circle():
-    """u along the edge and turning rate constant: a circle of radius u / w; closed form."""
+def test_knife_edge_moves_on_a_circle():
+    """Constant speed u along the edge and turning rate w: a circle of radius u / w; closed form."""
     u, w = 0.8, 1.3
     found = jl.simulate(skate, [0, 0, 0], [u, 0, w], np.linspace(0, 3, 7), SKATE, **TIGHT)
     t = found.ts
@@ -135,8 +135,8 @@ def test_a_knife_edge_runs_in_a_circle():
 
 
 @pytest.mark.full
-def test_a_pin_that_is_led_does_work():
-    """Rheonomic rows: the books close with their work, -b . lam."""
+def test_work_of_a_moving_pin_is_the_change_of_energy():
+    """Rheonomic rows: their work, -b . lam, is the change of energy."""
     q0, v0 = led_start()
     ts = np.linspace(0, 1.5, 5)
     found = jl.simulate(led_pendulum, q0, v0, ts, LED, save=("work",), **TIGHT)
@@ -158,7 +158,7 @@ def test_a_pin_that_is_led_does_work():
     assert J > 0
 
 
-# ---- Rows that depend on one another -------------------------------------------------------------
+# ---- Dependent rows ------------------------------------------------------------------------------
 
 
 def repeated(t, q, params):
@@ -187,8 +187,8 @@ def test_redundant_rows_change_nothing(motion):
         pytest.param(redundant, id="redundant"),
     ],
 )
-def test_derivatives_along_consistent_families(system):
-    """fwd = rev = central differences on the chart of angles, with projection."""
+def test_derivatives_along_consistent_starts_agree(system):
+    """fwd = rev = central differences in the chart of angles, with projection."""
 
     def end(x):
         params = {**BOBS, "l1": x["l1"], "m2": x["m2"]}
@@ -238,7 +238,7 @@ def test_contradictory_rows_are_named(rows, row):
 # ---- Starts --------------------------------------------------------------------------------------
 
 
-def test_inconsistent_starts():
+def test_inconsistent_starts_are_refused_or_assembled():
     """Refused by name, or moved to the nearest consistent state."""
     system, q0, v0, params = double_pendulum()
     wrong = q0.at[3].add(0.05)
@@ -252,8 +252,8 @@ def test_inconsistent_starts():
 
 
 @pytest.mark.full
-def test_inconsistent_starts_in_a_batch():
-    """A status where traced."""
+def test_inconsistent_starts_in_a_batch_have_a_status():
+    """Traced starts get a status."""
     system, q0, v0, params = double_pendulum()
 
     def status(q0, v0):
@@ -277,7 +277,7 @@ def test_small_errors_of_a_start_are_projected_away():
 
 @pytest.mark.full
 def test_a_dead_point_is_passed():
-    """r = l: rows lose rank at every quarter turn; the crank turns on as the closed form says."""
+    """r = l: rows lose rank at every quarter turn; the crank continues as in closed form."""
     equal = {**SLIDER, "r": 1.0}
     q0, v0 = slider_start(0.9, 3.0, equal)
     found = jl.simulate(slider_crank, q0, v0, np.linspace(0, 1, 9), equal, rtol=1e-9, atol=1e-9)
@@ -294,8 +294,8 @@ def test_a_dead_point_is_passed():
 
 
 @pytest.mark.full
-def test_a_start_at_a_dead_point():
-    """One row vanishes there: a branch is followed; between branches there is no motion: told.
+def test_start_at_a_dead_point_follows_a_branch():
+    """One row vanishes there: a branch is followed; between branches a failure is reported.
 
     With crank = pi/2 + a, rod = -pi/2 + b the row y is cos(a) - cos(b): a = b or a = -b.
     """
@@ -319,8 +319,8 @@ def test_a_start_at_a_dead_point():
 
 
 @pytest.mark.full
-def test_a_dead_point_is_passed_fast():
-    """Fast, by null spaces."""
+def test_dead_points_are_passed_at_high_speed():
+    """At high speed, with the null-space formulation."""
     equal = {**SLIDER, "r": 1.0}
     q0, v0 = slider_start(0.5, 10.0, equal)
     options = {"throw": False, "rtol": 1e-9, "atol": 1e-9}
@@ -330,11 +330,11 @@ def test_a_dead_point_is_passed_fast():
     assert found.status == jl.Status.ok
 
 
-# ---- Links without mass --------------------------------------------------------------------------
+# ---- Massless links ------------------------------------------------------------------------------
 
 
 def bob(t, q, v, params):
-    """A bob on a link that may have no inertia of its own."""
+    """A bob on a link that may be massless."""
     T = 0.5 * params["m"] * (v[0] ** 2 + v[1] ** 2) + 0.5 * params["I"] * v[2] ** 2
     return T - params["m"] * 9.81 * q[1]
 
@@ -345,8 +345,8 @@ def pin(t, q, params):
 
 @pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
-def test_links_without_mass(formulation):
-    """M is singular; with params traced or not, and where L does not contain the rate at all."""
+def test_massless_links_are_solved(formulation):
+    """M is singular; with params traced or not, also if L does not contain the rate at all."""
     ts = [0.0, 1.0]
     pendulum = jl.System(
         lambda t, q, v, p: p["m"] * (0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0])), ("theta",)
@@ -372,7 +372,7 @@ def test_links_without_mass(formulation):
 
     @jax.jit
     def swings(inertias):
-        """Of links of several inertias, and how it depends on them."""
+        """Final angles for several inertias of the link, and their derivatives."""
         of = lambda inertia: angle(heavy, {"m": 2.0, "I": inertia})  # noqa: E731
         return jax.vmap(jax.value_and_grad(of))(inertias)
 
@@ -389,7 +389,7 @@ def test_links_without_mass(formulation):
 
 @pytest.mark.full
 def test_batches_equal_single_runs(motion):
-    """37 starts in lanes, one of them inconsistent."""
+    """21 starts in lanes."""
     system, _, _, params = double_pendulum()
     omegas = OMEGA + jnp.linspace(0, 1, 21)[:, None]
 

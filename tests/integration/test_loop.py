@@ -1,4 +1,4 @@
-"""The loop: order, rows as accurate as steps, landing on knots, fixed grids, lanes, direction."""
+"""The loop: order, accuracy of saves, steps that end on knots, fixed grids, lanes, direction."""
 
 import itertools
 
@@ -16,7 +16,7 @@ PENDULUM = MOTIONS["double_pendulum"]
 
 @pytest.fixture(scope="module")
 def reference(lowering):
-    """The double pendulum over 4 s, at rtol = atol = 1e-13, on 501 rows."""
+    """The double pendulum over 4 s, at rtol = atol = 1e-13, with 501 saves."""
     return run(np.linspace(0.0, 4.0, 501), rtol=1e-13, atol=1e-13)
 
 
@@ -33,11 +33,11 @@ def error(motion, reference):
 @pytest.mark.parametrize(
     ("method", "order", "h"), [("midpoint", 2, 2e-3), ("bosh3", 3, 1e-2), ("tsit5", 5, 5e-2)]
 )
-def test_order_by_slope(method, order, h):
-    """Error at t = 12 of a central motion over two halvings of a fixed step.
+def test_order_equals_the_slope_of_errors(method, order, h):
+    """Error at t = 12 of a central motion for a fixed step that is halved twice.
 
-    Order 8 has no such window in float64: its leading coefficient is so small that the error is
-    round-off (1e-14) before it stops falling like h^9.
+    Order 8 has no such range in float64: its leading coefficient is so small that the error is
+    rounding (1e-14) before it stops falling like h^9.
     """
     motion, ts = MOTIONS["central_motion"], np.array([0.0, 12.0])
 
@@ -58,10 +58,10 @@ def test_order_by_slope(method, order, h):
     "method",
     ["dopri8", "tsit5", "bosh3", "kvaerno5"],
 )
-def test_rows_are_as_accurate_as_step_ends(reference, method):
-    """501 rows: the worst error at most twice the worst at the ends of the same steps.
+def test_saves_are_as_accurate_as_step_ends(reference, method):
+    """501 saves: the largest error is at most twice the largest at the ends of the same steps.
 
-    The ends of the steps are the rows of a solve whose save times they are.
+    The ends of the steps are the saves of a solve with these save times.
     """
     tolerance = 1e-5 if method in ("bosh3", "kvaerno5") else 1e-8
     options = {"rtol": tolerance, "atol": tolerance, "method": method}
@@ -69,8 +69,8 @@ def test_rows_are_as_accurate_as_step_ends(reference, method):
     at_ends = run(ends, **options)
     truth = run(ends, rtol=1e-13, atol=1e-13)
     assert at_ends.stats["accepted"] == len(ends) - 1
-    rows = error(run(reference.ts, **options), reference)
-    assert rows.max() <= 2 * error(at_ends, truth).max()
+    errors_of_saves = error(run(reference.ts, **options), reference)
+    assert errors_of_saves.max() <= 2 * error(at_ends, truth).max()
 
 
 def step_ends(options):
@@ -94,9 +94,10 @@ def step_ends(options):
         problem = _solve.split(_simulate.build_problem(plan, values)[2])
         return _solve._recorded(problem).record
 
-    kept = record(values)
-    # A turn that was not accepted ends where the last one did; a negative one at the stop.
-    ends = np.asarray(kept.offsets)[: int(kept.turns)]
+    recorded = record(values)
+    # An iteration that was not accepted ends where the last one did; the stop has a negative
+    # offset.
+    ends = np.asarray(recorded.offsets)[: int(recorded.turns)]
     return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
 
 
@@ -105,34 +106,34 @@ def _stop():
 
 
 @pytest.mark.full
-def test_rows_cost_no_steps(reference):
+def test_saves_need_no_additional_steps(reference):
     few, many = run(np.array([0.0, 4.0])), run(reference.ts)
     assert many.stats["accepted"] == few.stats["accepted"]
     assert many.stats["rejected"] == few.stats["rejected"]
     np.testing.assert_array_equal(many.last_state[0], many.q[-1])
-    # Two programs, which round in two ways: 1.2e-14, below what the motion makes of roundings.
+    # Two programs round differently: 1.2e-14, below the growth of rounding in this motion.
     growth, steps = jl.lyapunov(many), int(many.stats["accepted"])
     floor = np.finfo(float).eps * float(growth.kappa[-1]) * np.sqrt(steps)
     np.testing.assert_allclose(many.q[-1], few.q[-1], rtol=floor)
 
 
 @pytest.mark.full
-def test_backwards_retraces_forwards(reference):
-    back = jl.simulate(
+def test_backward_motion_retraces_the_forward_one(reference):
+    backward = jl.simulate(
         PENDULUM.system, reference.q[-1], reference.v[-1], reference.ts[::-1], PENDULUM.params
     )
-    assert back.last_time == 0.0
-    np.testing.assert_allclose(back.q[::-1], reference.q, rtol=0, atol=1e-7)
+    assert backward.last_time == 0.0
+    np.testing.assert_allclose(backward.q[::-1], reference.q, rtol=0, atol=1e-7)
     traced = jax.jit(
         lambda ts: (
             jl.simulate(PENDULUM.system, reference.q[-1], reference.v[-1], ts, PENDULUM.params).q
         )
     )
-    np.testing.assert_allclose(traced(reference.ts[::-1]), back.q, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(traced(reference.ts[::-1]), backward.q, rtol=0, atol=1e-9)
 
 
 def torque_motion(table, ts, **options):
-    """theta(t) under a torque, free otherwise: closed form for piecewise constant torque."""
+    """theta(t) under a torque alone: closed form for piecewise constant torque."""
     rotor = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2,
         ("theta",),
@@ -175,10 +176,10 @@ def test_zero_order_hold_is_exact(options):
     np.testing.assert_allclose(motion.v[:, 0], expected[:, 1], rtol=0, atol=10 * atol)
 
 
-def test_zero_order_hold_backwards():
+def test_zero_order_hold_is_exact_backward_in_time():
     table = steps()
     theta, rate = held_closed_form(table, 1.5)
-    back = jl.simulate(
+    backward = jl.simulate(
         driven_rotor := jl.System(
             lambda t, q, v, p: 0.5 * v[0] ** 2,
             ("theta",),
@@ -191,9 +192,9 @@ def test_zero_order_hold_backwards():
     )
     assert driven_rotor.size == 1
     np.testing.assert_allclose(
-        back.q[:, 0], [theta, held_closed_form(table, 0.5)[0], 0.1], atol=1e-13
+        backward.q[:, 0], [theta, held_closed_form(table, 0.5)[0], 0.1], atol=1e-13
     )
-    np.testing.assert_allclose(back.v[-1], [0.2], atol=1e-13)
+    np.testing.assert_allclose(backward.v[-1], [0.2], atol=1e-13)
 
 
 def test_linear_input_is_exact():
@@ -218,20 +219,20 @@ def test_linear_input_is_exact():
 
 
 def test_steps_end_on_knots():
-    """Nine knots inside: at least ten steps, and no rejected ones for a quadratic arc."""
+    """Eight knots inside: nine steps, none of them rejected for a quadratic arc."""
     motion = torque_motion(steps(), np.array([0.0, 1.6]), method="tsit5", dt0=1.0)
     assert motion.stats["accepted"] == 9
     assert motion.stats["rejected"] == 0
 
 
 @pytest.mark.parametrize("dt", [0.25, 0.3, 0.0999])
-def test_fixed_steps_land_on_the_end(dt):
+def test_fixed_steps_end_at_the_last_time(dt):
     motion = run(np.array([0.0, 1.0]), dt=dt)
     assert motion.last_time == 1.0
     assert motion.stats["accepted"] == int(np.ceil(1.0 / dt - 1e-9))
 
 
-def test_fixed_grid_comes_from_an_integer():
+def test_fixed_grid_has_an_integer_number_of_steps():
     """10^4 steps of 1e-4 are 10^4 steps, and end at 1 exactly."""
     motion = run(np.array([0.0, 1.0]), dt=1e-4, method="heun")
     assert motion.stats["accepted"] == 10_000
@@ -239,7 +240,7 @@ def test_fixed_grid_comes_from_an_integer():
 
 
 @pytest.mark.full
-def test_float32_state_float64_time(reference):
+def test_float32_state_has_float64_time(reference):
     motion = jl.simulate(
         PENDULUM.system,
         PENDULUM.q0.astype(jnp.float32),
@@ -253,14 +254,14 @@ def test_float32_state_float64_time(reference):
     np.testing.assert_allclose(motion.q, reference.q, rtol=0, atol=3e-4)
 
 
-def test_far_from_time_zero(reference):
-    """t0 = 1e6: times resolve to 1e-10 s, which costs no more than that in the rows."""
+def test_motion_far_from_time_zero_is_accurate(reference):
+    """t0 = 1e6: times have a resolution of 1e-10 s; saves lose no more than that."""
     motion = run(1e6 + np.asarray(reference.ts), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(motion.q, reference.q, rtol=0, atol=1e-7)
 
 
 @pytest.mark.full
-def test_solver_with_memory_keeps_it_in_its_derivative():
+def test_derivatives_of_multistep_methods_are_right():
     """A two-step method: the derivative is that of the two-step recurrence."""
 
     def angle(q0, method):
@@ -281,7 +282,7 @@ def test_solver_with_memory_keeps_it_in_its_derivative():
 
 
 def test_driven_system_matches_scipy():
-    """Another integrator, another derivation: theta'' written out, knots by restarting."""
+    """Another integrator and derivation: explicit theta'', restarts at knots."""
     from scipy.integrate import solve_ivp
 
     table, params = steps(), {"J": 0.15, "mgl": 3.0, "c": 0.02, "F": 0.1}
@@ -300,8 +301,8 @@ def test_driven_system_matches_scipy():
     np.testing.assert_allclose([motion.q[-1, 0], motion.v[-1, 0]], y, rtol=0, atol=1e-9)
 
 
-class Spy(diffrax.PIDController):
-    """A controller that looks at the state, and says that the field jumps after every step."""
+class JumpingController(diffrax.PIDController):
+    """A controller that reads the state and reports a jump of the field after every step."""
 
     def adapt_step_size(self, t0, t1, y0, y1, *rest):
         assert y0.shape == y1.shape == (4,)
@@ -309,23 +310,23 @@ class Spy(diffrax.PIDController):
         return keep, next0, next1, jnp.array(True), state, result
 
 
-class Heard(jl.solvers.Dopri8):
-    """Notes what it is told of jumps."""
+class RecordingDopri8(jl.solvers.Dopri8):
+    """Records the jumps that are reported to it."""
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        told.append(made_jump)
+        reported_jumps.append(made_jump)
         return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
 
 
-told: list = []
+reported_jumps: list = []
 
 
 @pytest.mark.full
-def test_a_controller_of_the_user_is_given_arrays_and_heard():
-    """A variant of diffrax's control: the state as one array, its jumps passed on."""
-    method = (Heard(), Spy(rtol=1e-9, atol=1e-9))
+def test_custom_controller_gets_arrays_and_reports_jumps():
+    """A variant of diffrax's controller gets the state as one array; its jumps are passed on."""
+    method = (RecordingDopri8(), JumpingController(rtol=1e-9, atol=1e-9))
     motion = run([0.0, 0.5, 1.0], method=method)
-    assert len(told) > 0
-    assert all(jump is not False for jump in told)
+    assert len(reported_jumps) > 0
+    assert all(jump is not False for jump in reported_jumps)
     plain = run([0.0, 0.5, 1.0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(motion.q, plain.q, rtol=0, atol=1e-8)

@@ -1,4 +1,4 @@
-"""The loop at its edges: knots at the start, rows beside step ends, times far from zero."""
+"""Edge cases of the loop: knots at the start, saves near step ends, times far from zero."""
 
 import diffrax
 import jax
@@ -17,7 +17,7 @@ KINDS = {"hold": jl.ZeroOrderHold, "line": jl.LinearInterpolation}
 
 
 def closed_form(kind, times, values, ts, start=(0.1, 0.2)):
-    """(x, x') of x'' = u at ts, the polynomials between the knots one after another."""
+    """(x, x') of x'' = u at ts, by the polynomials between knots."""
 
     def to(t):
         x, v, now = *start, float(ts[0])
@@ -46,16 +46,16 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("options", OPTIONS)
-def test_a_knot_at_the_start_is_read_from_the_side_of_the_step(kind, options, sense):
-    """From t = 0, which is a knot, to either side: plain, and under a gradient in the table.
+def test_a_knot_at_the_start_is_read_from_the_side_of_the_step(kind, options, time_direction):
+    """From t = 0, which is a knot, in either direction: plain, and with a gradient by the table.
 
-    x is linear in the values: its derivative is the motion from rest under one of them being 1.
-    Methods of order 3 and more are exact for it, up to some roundings of each of 15 steps.
+    x is linear in the values: its derivative is the motion from rest under a table with one value
+    of 1. Methods of order 3 and more are exact for it, up to some rounding of each of 15 steps.
     """
-    ts = sense * np.array([0.0, 0.1, 0.25, 0.6, 1.0])
+    ts = time_direction * np.array([0.0, 0.1, 0.25, 0.6, 1.0])
 
     @jax.jit
     def end(values):
@@ -71,8 +71,8 @@ def test_a_knot_at_the_start_is_read_from_the_side_of_the_step(kind, options, se
     assert np.abs(units).max() > 0.01
 
 
-def test_a_step_cut_by_a_knot_leaves_the_control_alone():
-    """Below its least step a controller takes the next step as it comes: not after a short cut.
+def test_steps_cut_by_a_knot_do_not_affect_the_controller():
+    """Below its least step a controller accepts any error, but not after a step cut by a knot.
 
     x'' = 100 x from rest at 1: cosh(10 t), 11013 at t = 1, with two knots 1e-7 apart.
     """
@@ -85,8 +85,8 @@ def test_a_step_cut_by_a_knot_leaves_the_control_alone():
     np.testing.assert_allclose(motion.q[:, 0], np.cosh(10 * ts), rtol=1e-5)
 
 
-def test_a_controller_that_gives_up_is_heard():
-    """Errors too large for its least step, which it was told not to take all the same."""
+def test_failure_of_a_controller_is_reported():
+    """Errors too large for its least step, which it may not accept (force_dtmin=False)."""
     control = diffrax.PIDController(rtol=1e-10, atol=1e-10, dtmin=0.3, force_dtmin=False)
     table = jl.ZeroOrderHold([0.0, 1.0], [0.0, 0.0])
     method = (jl.solvers.Tsit5(), control)
@@ -96,18 +96,18 @@ def test_a_controller_that_gives_up_is_heard():
     assert np.isnan(motion.q[-1, 0])
 
 
-@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize(
     "options",
     [{}, pytest.param({"dt": 0.125}, marks=pytest.mark.full)],
     ids=["adaptive", "fixed"],
 )
-def test_a_row_moves_with_its_own_time(options, sense):
-    """Beside a knot and on it, where steps end: d x / d its time is x', by both modes."""
+def test_saves_have_derivatives_by_their_own_time(options, time_direction):
+    """Near a knot and on it, where steps end: d x / d its time is x', in both modes."""
     knot = 0.5
-    rows = [np.nextafter(knot, 0), knot, np.nextafter(knot, 1), knot + 4 * EPS, knot + 1e-9]
-    ts = jnp.array(sense * np.array([0.0, 0.2, *rows, 1.0]))
-    times = jnp.sort(sense * jnp.array([-1.0, 0.5, 1.0]))
+    saves = [np.nextafter(knot, 0), knot, np.nextafter(knot, 1), knot + 4 * EPS, knot + 1e-9]
+    ts = jnp.array(time_direction * np.array([0.0, 0.2, *saves, 1.0]))
+    times = jnp.sort(time_direction * jnp.array([-1.0, 0.5, 1.0]))
     table = jl.ZeroOrderHold(times, jnp.array([2.0, -7.0, 1.0]))
 
     def x(ts):
@@ -116,34 +116,34 @@ def test_a_row_moves_with_its_own_time(options, sense):
     v = moved(table, ts, **options).v[:, 0]
     for jacobian in (jax.jacfwd(x), jax.jacrev(x)):
         found = np.asarray(jax.jit(jacobian)(ts))
-        # x(ts[0]) is given; all rows but the first move with ts[0] as the table stands still.
+        # x(ts[0]) is given; all other saves depend on ts[0], because the table is fixed in time.
         np.testing.assert_allclose(np.diag(found)[1:], v[1:], rtol=0, atol=1e-12)
         others = found - np.diag(np.diag(found))
         np.testing.assert_allclose(others[:, 1:], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("solver", [diffrax.ReversibleHeun(), diffrax.LeapfrogMidpoint()])
-def test_rows_after_a_knot_see_the_jump(solver):
-    """Of solvers with memory, too: a row inside a step is as that step would have it.
+def test_saves_after_a_knot_include_the_jump(solver):
+    """Also of multistep solvers: a save inside a step equals the end of that step.
 
-    The first row lies inside the step that starts at the knot, and is the end of one of a solve
-    whose last time it is.
+    The first save lies inside the step that starts at the knot. In a solve that ends at this save
+    it is the end of a step.
     """
     table = jl.ZeroOrderHold([0.0, 0.5, 1.0], [0.0, 8.0, 0.0])
     options = {"method": solver, "dt": 0.1}
-    rows = moved(table, [0.0, 0.53, 1.0], **options)
+    motion = moved(table, [0.0, 0.53, 1.0], **options)
     alone = moved(table, [0.0, 0.53], **options)
-    np.testing.assert_allclose(rows.q[1], alone.q[-1], rtol=0, atol=8 * EPS)
-    np.testing.assert_allclose(rows.v[1], alone.v[-1], rtol=0, atol=8 * EPS)
+    np.testing.assert_allclose(motion.q[1], alone.q[-1], rtol=0, atol=8 * EPS)
+    np.testing.assert_allclose(motion.v[1], alone.v[-1], rtol=0, atol=8 * EPS)
     expected = closed_form("hold", np.array([0.0, 0.5, 1.0]), np.array([0.0, 8.0, 0.0]), [0, 0.53])
-    np.testing.assert_allclose(rows.v[1], expected[1, -1], rtol=0, atol=0.03)
+    np.testing.assert_allclose(motion.v[1], expected[1, -1], rtol=0, atol=0.03)
 
 
 @pytest.mark.parametrize(
     "times", [[0.0, 0.7, 0.3, 1.0], [0.0, 0.3, 0.3, 1.0], [0.0, np.nan, 0.3, 1.0]]
 )
-def test_traced_tables_out_of_order_are_bad_values(times):
-    """Where they have values, they raise; see test_inputs."""
+def test_unordered_traced_tables_have_status_bad_value(times):
+    """Tables with known values raise an error; see test_inputs."""
 
     @jax.jit
     def status(times):
@@ -154,10 +154,10 @@ def test_traced_tables_out_of_order_are_bad_values(times):
 
 
 @pytest.mark.parametrize("options", [{}, {"dt": 0.01}], ids=["adaptive", "fixed"])
-def test_rows_far_from_the_origin_of_time_stay_apart(options):
-    """Seconds since 1970, rows some units in the last place (2.4e-7 s) apart: x = x0 + v (t - t0).
+def test_saves_far_from_time_zero_stay_distinct(options):
+    """Seconds since 1970, saves some ulp (2.4e-7 s) apart: x = x0 + v (t - t0).
 
-    Bound: roundings of the span.
+    Bound: rounding of the span.
     """
     start = 1.7e9
     steps = np.array([0.0, 5e-7, 1e-6, 3e-6, 1e-2, 1e-2 + 1e-6, 1.0])
@@ -174,8 +174,8 @@ def test_rows_far_from_the_origin_of_time_stay_apart(options):
     [{"gradient": "checkpoints", "max_steps": 256}, {"max_steps": 1024}],
     ids=["checkpoints", "auto"],
 )
-def test_a_row_in_the_last_step_of_a_full_record(options):
-    """As many steps as there may be, all points taken: reverse is forward still."""
+def test_save_in_the_last_step_of_a_full_record_has_derivatives(options):
+    """As many steps as allowed, all checkpoints in use: reverse equals forward."""
     count, h = options["max_steps"], 1 / 128
     ts = np.array([0.0, (count - 0.5) * h, count * h])
 
@@ -191,8 +191,8 @@ def test_a_row_in_the_last_step_of_a_full_record(options):
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)
 
 
-def test_times_that_differ_less_than_they_do_from_the_start():
-    """Two knots, and two rows, whose distance from ts[0] is the same number."""
+def test_adjacent_knots_and_saves_far_from_the_start_are_distinct():
+    """Two knots, and two saves, whose distance from ts[0] is the same number."""
     pair = [0.5, np.nextafter(0.5, 1)]
     assert pair[0] + 10.0 == pair[1] + 10.0
     jump = jl.LinearInterpolation([-10.0, *pair, 2.0], [0.0, 0.0, 1.0, 1.0])
@@ -205,10 +205,10 @@ def test_times_that_differ_less_than_they_do_from_the_start():
 
 @pytest.mark.parametrize("options", [{}, {"dt": 0.1}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("ts", [[-2.0, 0.6], [0.3, 0.1], [0.1, 0.7]])
-def test_no_time_beyond_the_last_is_read(ts, options):
-    """t0 + (t1 - t0) may be more than t1, where this force has no value."""
-    sense, end = np.sign(ts[1] - ts[0]), ts[1]
-    falling = jl.TimeFunction(lambda t: jnp.sqrt(sense * (end - t)))
+def test_no_time_beyond_the_last_is_evaluated(ts, options):
+    """t0 + (t1 - t0) may exceed t1, where this force is NaN."""
+    time_direction, end = np.sign(ts[1] - ts[0]), ts[1]
+    falling = jl.TimeFunction(lambda t: jnp.sqrt(time_direction * (end - t)))
     for of in (lambda f: f, jax.jit):
         motion = of(lambda ts: moved(falling, ts, **options))(jnp.array(ts))
         assert motion.status == jl.Status.ok
@@ -216,8 +216,8 @@ def test_no_time_beyond_the_last_is_read(ts, options):
 
 
 @pytest.mark.parametrize("dtmin", [1e-3, 0.2])
-def test_a_short_step_to_a_knot_is_no_failure_of_the_control(dtmin):
-    """Neither is the short one to the last time."""
+def test_short_step_to_a_knot_is_not_a_controller_failure(dtmin):
+    """The short step to the last time is no failure, either."""
     control = diffrax.PIDController(rtol=1e-8, atol=1e-8, dtmin=dtmin, force_dtmin=False)
     table = jl.ZeroOrderHold([0.0, 0.5, 0.5 + 1e-5, 1.0], [1.0, 2.0, 3.0, 0.0])
     motion = moved(table, [0.0, 0.9, 0.9 + 1e-5], method=(jl.solvers.Tsit5(), control))
@@ -227,8 +227,8 @@ def test_a_short_step_to_a_knot_is_no_failure_of_the_control(dtmin):
     np.testing.assert_allclose(motion.q[-1, 0], expected, rtol=64 * EPS)
 
 
-def test_the_first_step_is_one_that_the_control_allows():
-    """Of at most 0.1 s: 10 steps to 1 s, as by the same method of diffrax."""
+def test_first_step_respects_the_controller():
+    """At most 0.1 s: 10 steps to 1 s, as by the same method of diffrax."""
     control = diffrax.PIDController(rtol=0.1, atol=0.1, dtmax=0.1)
     table = jl.ZeroOrderHold([0.0, 1.0], [0.0, 0.0])
     for solver in (jl.solvers.Tsit5(), diffrax.Tsit5()):
@@ -237,7 +237,7 @@ def test_the_first_step_is_one_that_the_control_allows():
 
 
 @pytest.mark.full
-def test_a_stiff_motion_backwards_in_time_is_recognized():
+def test_stiff_motion_backward_in_time_is_detected():
     """x'' = -x + 1e4 x' from 0 to -10 s."""
     damped = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
@@ -251,30 +251,30 @@ def test_a_stiff_motion_backwards_in_time_is_recognized():
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["dopri5", "gauss4"])
-def test_tables_far_from_the_origin_are_read_to_the_last_digit(method):
-    """A slope of 1e9 N/s over a millisecond, seconds since 1901."""
+def test_tables_far_from_time_zero_are_read_accurately(method):
+    """A slope of 1e9 N/s over a millisecond; times in seconds since 1901."""
     start, length = 2.0**31, 2.0**-10
     table = jl.LinearInterpolation([start, start + length], [0.0, 1e6])
     motion = moved(table, [start, start + length], method=method, dt=1e-6, max_steps=2000)
     np.testing.assert_allclose(motion.v[-1, 0], 0.2 + 0.5e6 * length, rtol=1e-12)
 
 
-def test_a_motion_that_may_not_start_has_no_rows():
+def test_motion_that_cannot_start_has_nan_saves():
     table = jl.ZeroOrderHold([-1.0, 1.0], [0.0, 0.0])
     motion = jax.jit(lambda ts: moved(table, ts))(jnp.array([0.0, -0.5, 1.0]))
     assert motion.status == jl.Status.bad_value
     assert np.isnan(motion.q[1:]).all()
 
 
-def test_the_gradient_in_a_table_takes_the_same_for_each_step():
-    """Inside its loops nothing of the size of the table is computed, but written into."""
+def test_steps_of_a_gradient_by_a_table_do_not_depend_on_its_size():
+    """Its loops compute no array of the size of the table; they only write into one."""
     size = 777
 
     def end(values):
         table = jl.LinearInterpolation(jnp.linspace(0.0, 1.0, size), values)
         return moved(table, [0.0, 0.5, 1.0]).q[-1, 0]
 
-    program = loop(operations(jax.grad(end), jnp.zeros(size), turns=1))
+    program = loop(operations(jax.grad(end), jnp.zeros(size), iterations=1))
     written = {"dynamic_update_slice", "while", "cond", "jit", "scan"}
     written |= {"custom_jvp_call", "custom_vmap_call"}
     large = {o.name for o in program if any(size <= k <= size + 3 for x in o.shapes for k in x)}

@@ -1,4 +1,4 @@
-"""Pulses and forces that begin, end or jump between steps: met, moved with, named."""
+"""Pulses and forces that begin, end or jump between steps: resolved, differentiated, reported."""
 
 import diffrax
 import jax
@@ -27,19 +27,19 @@ def pulse(t):
     return jnp.where((t >= START) & (t < END), 1000.0, 0.0)
 
 
-@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forwards", "backwards"])
+@pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize("options", [{}, {"dt": 0.4, "method": "tsit5"}], ids=["adaptive", "fixed"])
-def test_a_pulse_that_is_named_is_met(options, sense):
-    """x' = 1 after a pulse of 1 ms, to rounding: no stage reads the wrong side of its edges."""
-    ts = np.array([0.0, 10.0])[:: int(sense)]
+def test_pulse_with_knots_is_resolved(options, time_direction):
+    """x' = 1 after a pulse of 1 ms, to rounding: no stage reads across its edges."""
+    ts = np.array([0.0, 10.0])[:: int(time_direction)]
     motion = kicked(jl.TimeFunction(pulse, knots=[START, END]), ts, **options)
-    np.testing.assert_allclose(motion.v[-1, 0], sense, rtol=1e-12)
-    way = 10.0 - 0.5 * (START + END) if sense > 0 else 0.5 * (START + END)
-    np.testing.assert_allclose(motion.q[-1, 0], way, rtol=1e-12)
+    np.testing.assert_allclose(motion.v[-1, 0], time_direction, rtol=1e-12)
+    distance = 10.0 - 0.5 * (START + END) if time_direction > 0 else 0.5 * (START + END)
+    np.testing.assert_allclose(motion.q[-1, 0], distance, rtol=1e-12)
 
 
-def test_a_pulse_moves_with_its_knots():
-    """d x/d start of a pulse of given length: minus its impulse, whatever the steps."""
+def test_derivatives_by_knots_of_a_pulse_are_exact():
+    """d x/d start of a pulse of given length: minus its impulse, for any steps."""
 
     @jax.jit
     def end(start):
@@ -56,13 +56,13 @@ def test_a_pulse_moves_with_its_knots():
 
 
 @pytest.mark.parametrize(
-    # At 1e-7, worst of solution and derivatives: 4.3e-8 and 1.1e-7. Where f stood still beyond its
-    # knot, and time beyond its end, derivatives were wrong by 1e-4.
+    # At 1e-7, largest errors of solution and derivatives: 4.3e-8 and 1.1e-7. With f constant beyond
+    # its knot, and time constant beyond its end, derivatives were wrong by 1e-4.
     "method",
     ["kvaerno4", pytest.param("kvaerno5", marks=pytest.mark.full)],
 )
-def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
-    """x'' = sin 5t to a knot, cos 3t from it on: d v/d knot and d v/d end are forces there."""
+def test_stages_beyond_a_step_do_not_affect_derivatives_by_its_end(method):
+    """x'' = sin 5t up to a knot, cos 3t after it: d v/d knot and d v/d end are forces there."""
 
     @jax.jit
     def end(knot, stop):
@@ -92,26 +92,26 @@ def test_stages_beyond_a_step_leave_derivatives_in_its_end_alone(method):
 
 
 @pytest.mark.parametrize("derivatives", [False, True])
-def test_a_row_where_the_force_is_singular_is_none(derivatives):
-    """A spike that steps pass by and the step to a row meets: nothing is made up there."""
+def test_save_at_a_singular_force_is_nan(derivatives):
+    """A spike that steps miss and the step to a save meets: the save is NaN."""
     spike = jl.TimeFunction(lambda t: jnp.where(jnp.abs(t - 0.5) < 1e-9, 1e6, 0.0))
     ts = np.array([0.0, 0.5, 1.0])
 
-    def rows(x0):
+    def positions(x0):
         motion = moved(spike, ts, (x0, 0.0), {"k": 1.0}, method="dopri8")
         return motion.q[:, 0], motion
 
     if derivatives:
-        x, _, motion = jax.vjp(rows, 1.0, has_aux=True)
+        x, _, motion = jax.vjp(positions, 1.0, has_aux=True)
     else:
-        x, motion = rows(1.0)
+        x, motion = positions(1.0)
     np.testing.assert_allclose(x[np.array([0, 2])], np.cosh(ts[::2]), rtol=1e-9)
     assert np.isnan(x[1])
     assert motion.status == jl.Status.step_below_resolution
 
 
-def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
-    """Stepped over without a word of it; met by steps no longer than itself."""
+def test_pulse_between_steps_is_resolved_by_bounded_steps():
+    """Skipped without a warning; resolved by steps no longer than the pulse."""
     wide = jl.TimeFunction(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))
     ts = np.array([0.0, 10.0])
     assert kicked(wide, ts, dt0=5.0, method="tsit5").v[-1, 0] < 0.5
@@ -122,8 +122,8 @@ def test_a_pulse_between_steps_is_met_where_steps_are_bounded():
     np.testing.assert_allclose(slope, 1.0, rtol=1e-12)
 
 
-def test_a_force_that_ends_is_not_waited_for():
-    """NaN beyond x = 1 under a least step: its status is that, after a few attempts."""
+def test_force_that_becomes_nan_ends_the_motion():
+    """NaN beyond x = 1 with a least step: status nonfinite after a few attempts."""
     wall = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),

@@ -18,7 +18,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 def test_gamma_of_body_rates_is_the_cross_product():
-    """B^T Gamma = [w]x at all angles: I w' + w x I w = 0, without any small-angle step."""
+    """B^T Gamma = [w]x at all angles: I w' + w x I w = 0; no small-angle approximation."""
     system = angles()
     rng = np.random.default_rng(5)
     for _ in range(5):
@@ -63,8 +63,8 @@ def test_the_norm_of_a_quaternion_has_no_reaction():
 
 
 @pytest.mark.full
-def test_a_free_top_in_quaternions_goes_through_gimbal_lock():
-    """Against R' = R [w]x by scipy; its pitch passes within 1e-3 of 90 degrees, at large roll."""
+def test_free_top_in_quaternions_passes_gimbal_lock():
+    """Against R' = R [w]x by scipy; the pitch comes within 1e-3 of 90 degrees, at large roll."""
     w0 = np.array([0.02, 1.0, 0.6])
     ts = np.linspace(0.0, 4.0, 5)
     motion = jl.simulate(tumbling(), [1.0, 0.0, 0.0, 0.0], None, u0=w0, ts=ts, **TIGHT)
@@ -77,16 +77,18 @@ def test_a_free_top_in_quaternions_goes_through_gimbal_lock():
     start = np.concatenate([w0, np.eye(3).ravel()])
     right = solve_ivp(rates, (0, 4), start, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
     np.testing.assert_allclose(motion.u, right[:, :3], atol=1e-10)
-    for q, row in zip(motion.q, right, strict=True):
-        np.testing.assert_allclose(rotation.quaternion.matrix(q), row[3:].reshape(3, 3), atol=1e-10)
+    for q, state in zip(motion.q, right, strict=True):
+        np.testing.assert_allclose(
+            rotation.quaternion.matrix(q), state[3:].reshape(3, 3), atol=1e-10
+        )
     np.testing.assert_allclose(jnp.sum(motion.q**2, axis=1), 1.0, atol=4 * EPS)
-    # No constraint force but that of a norm which T does not contain.
+    # T does not contain the norm: its constraint force is zero.
     assert np.max(np.abs(motion.lam["unit"])) <= 1e-12
 
 
 @pytest.mark.full
 def test_a_quaternion_passes_the_attitude_at_which_angles_fail():
-    """Pitch 90 degrees with roll and yaw turning: dU/dv is singular, the quaternion is not."""
+    """Pitch 90 degrees with roll and yaw rates: dU/dv is singular, the quaternion is not."""
     w = [0.3, 0.5, 0.4]
     with pytest.raises(SimulationError, match="kinematics_singular"):
         jl.simulate(angles(), [0.1, np.pi / 2, 0.2], None, u0=w, ts=[0.0, 1.0], params={})
@@ -99,8 +101,8 @@ def test_a_quaternion_passes_the_attitude_at_which_angles_fail():
 
 
 @pytest.mark.full
-def test_the_norm_of_a_quaternion_stays_over_a_million_steps():
-    """To 1e-12, with a fixed step; without projection the error of the solver adds up."""
+def test_norm_of_a_quaternion_is_constant_over_a_million_steps():
+    """To 1e-12 with a fixed step; without projection the errors of the solver accumulate."""
     steps = 1_000_000
     start = {"v0": None, "u0": [0.1, 2.0, 0.2], "dt": 0.2, "max_steps": steps + 1}
     ts = np.linspace(0.0, 0.2 * steps, 101)
@@ -108,5 +110,5 @@ def test_the_norm_of_a_quaternion_stays_over_a_million_steps():
     motion = jl.simulate(tumbling(), q0, ts=ts, **start)
     # Measured 2026-11-22: 4e-16.
     assert np.max(np.abs(np.sum(np.asarray(motion.q) ** 2, axis=1) - 1.0)) <= 1e-12
-    left = jl.simulate(tumbling(), q0, ts=ts[:11], stabilization=None, **start)
-    assert np.max(np.abs(np.sum(np.asarray(left.q) ** 2, axis=1) - 1.0)) >= 1e-10
+    drifted = jl.simulate(tumbling(), q0, ts=ts[:11], stabilization=None, **start)
+    assert np.max(np.abs(np.sum(np.asarray(drifted.q) ** 2, axis=1) - 1.0)) >= 1e-10

@@ -1,4 +1,4 @@
-"""Kinematics taller than wide, that satisfy Pfaffian rows by themselves."""
+"""Tall kinematics, which satisfy Pfaffian rows by themselves."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
 @pytest.mark.full
-def test_tall_kinematics_are_a_square_choice_with_a_row_dropped():
+def test_tall_kinematics_equal_constrained_square_ones():
     tall, square = sleighs()
     motions = [
         jl.simulate(
@@ -33,8 +33,8 @@ def test_tall_kinematics_are_a_square_choice_with_a_row_dropped():
     np.testing.assert_allclose(motions[1].lam["v_n"], m * (v * omega + a * slowing), atol=1e-10)
 
 
-def test_no_heading_is_special():
-    """Turned by 90 degrees the motion is the same: a fixed pivot cos(theta) would be 0 there."""
+def test_motion_does_not_depend_on_the_heading():
+    """Rotated by 90 degrees the motion is the same; a fixed pivot cos(theta) would be 0 there."""
     _, square = sleighs()
     start = {"v0": None, "u0": {"v": 1.0, "omega": 0.4}, "ts": np.linspace(0, 1, 3)}
     ahead, aside = (
@@ -53,8 +53,8 @@ def offset(t, q, v, params):
 
 
 @pytest.mark.full
-def test_momenta_across_the_rows_are_not_lost():
-    """L with the rows put in gives other equations, the same for one special value of params."""
+def test_momenta_normal_to_the_rows_are_included():
+    """L with the rows inserted gives other equations, except for one value of params."""
     system = jl.System(offset, ("x", "y", "theta"), quasi=TALL, constraints=(BLADE,))
     for ahead in (0.0, 0.4):
         q = np.array([0.2, -0.1, 0.3])
@@ -77,16 +77,16 @@ def along_x(t, q, u, params):
     return jnp.stack([u[0], 0.0 * u[0], u[1]])
 
 
-def test_kinematics_that_break_a_row_on_the_way_are_told():
-    """At theta = 0 the x axis lies along the blade; as it turns it no longer does."""
+def test_kinematics_that_violate_a_row_later_are_reported():
+    """At theta = 0 the x axis is along the blade; as the sleigh rotates it no longer is."""
     astray = jl.QuasiVelocities(kinematics=along_x, names=("v", "omega"))
     system = jl.System(sleigh, ("x", "y", "theta"), quasi=astray, constraints=(BLADE,))
     with pytest.raises(SimulationError, match=r"contradictory_rows.*v_n.*kinematics.*do not"):
         jl.simulate(system, [0.0, 0.0, 0.0], None, u0=[1.0, 0.4], ts=[0.0, 2.0])
 
 
-def test_quasi_velocities_that_leave_out_a_freedom_are_told():
-    """Two rows that say the same leave two freedoms, of which one has no quasi-velocity."""
+def test_quasi_velocities_that_omit_a_freedom_are_reported():
+    """Two equivalent rows leave two freedoms, one of which has no quasi-velocity."""
 
     def twice(t, q, v, params):
         return jnp.stack([v[2], 2.0 * v[2]])
@@ -106,7 +106,7 @@ def test_quasi_velocities_that_leave_out_a_freedom_are_told():
         jl.simulate(system, [0.0] * 3, [0.3, 0.7, 0.0], [0.0, 1.0])
 
 
-def test_kinematics_that_break_a_row_are_refused():
+def test_kinematics_that_violate_a_row_are_refused():
     slanted = jl.QuasiVelocities(
         kinematics=lambda t, q, u, params: jnp.stack([u[0], 0.0 * u[0], u[1]]),
         names=("v", "omega"),

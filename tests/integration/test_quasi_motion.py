@@ -21,8 +21,8 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
     mostly_full([(in_v, "v"), (in_u, "u"), (of_u, "u")], (in_v, "v"), (in_u, "u")),
     ids=["v", "same", "u"],
 )
-def test_equations_are_those_of_lagrange(lagrangian, written_in):
-    """a from u' and v = B u + c is a from M a + h = Q, at random states."""
+def test_equations_equal_those_of_lagrange(lagrangian, written_in):
+    """a from u' and v = B u + c equals a from M a + h = Q, at random states."""
     system = declared(lagrangian, written_in)
     found = jax.jit(lambda q, v, t: system._quasi_reactions(q, v, PARAMS, t=t)["a"])
     expected = jax.jit(lambda q, v, t: system.acceleration(q, v, PARAMS, t=t))
@@ -31,7 +31,7 @@ def test_equations_are_those_of_lagrange(lagrangian, written_in):
     for t, q, v in random_states():
         kappa = cond(theta(t, q)) ** 2 * cond(mass(q, v, t))
         a, right = found(q, v, t), expected(q, v, t)
-        # Measured worst 2026-11-22: 4 eps kappa (1 + |a|).
+        # Measured 2026-11-22: at most 4 eps kappa (1 + |a|).
         assert norm(a - right) <= 64 * EPS * kappa * (1.0 + norm(right))
 
 
@@ -39,8 +39,8 @@ def test_equations_are_those_of_lagrange(lagrangian, written_in):
     "lagrangian", mostly_full([in_v, in_u, of_u], in_u), ids=["v", "same", "u"]
 )
 @pytest.mark.parametrize("constrained", mostly_full([["b"], ["a", "c"]], ["b"]))
-def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
-    """a and lam of the quasi-velocity and of the multiplier equations, on the constraints."""
+def test_multipliers_equal_those_of_the_multiplier_equations(lagrangian, constrained):
+    """a and lam of the quasi-velocity equations equal those of the multiplier equations."""
     written_in = "v" if lagrangian is in_v else "u"
     system = declared(lagrangian, written_in, tuple(constrained))
     bound = [NAMES.index(name) for name in constrained]
@@ -51,7 +51,7 @@ def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
         found = system._quasi_reactions(q, v, PARAMS, t=t)
         a, lam = system.acceleration(q, v, PARAMS, t=t), system.multipliers(q, v, PARAMS, t=t)
         scale = 1.0 + norm(a) + max(abs(x) for x in lam.values())
-        # Measured worst 2026-11-22: 2e-14 of the scale.
+        # Measured 2026-11-22: at most 2e-14 of the scale.
         assert norm(found["a"] - a) <= 1e-12 * scale
         assert set(found["multipliers"]) == set(lam) == set(constrained)
         for name, value in lam.items():
@@ -62,7 +62,7 @@ def test_multipliers_are_the_rows_left_out(lagrangian, constrained):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("lagrangian", "backwards"), [(of_u, True), (in_v, False)], ids=["u", "v"])
-def test_one_motion_by_both_formulations(lagrangian, backwards):
+def test_both_formulations_give_the_same_motion(lagrangian, backwards):
     """q, v, u to 1e-10, lam to 1e-9, with explicit time, an affine U and a force."""
     system = declared(lagrangian, "v" if lagrangian is in_v else "u", ("b",))
     ts = np.linspace(0.2, 1.5, 4)[:: -1 if backwards else 1]
@@ -77,7 +77,7 @@ def test_one_motion_by_both_formulations(lagrangian, backwards):
     np.testing.assert_allclose(one.lam["b"], other.lam["b"], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(one.a, other.a, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(one["b"], one.u[:, 1])
-    # The row holds to rounding by itself.
+    # The row holds to rounding without projection.
     assert np.max(np.abs(one["b"])) <= 64 * EPS
 
 
@@ -85,14 +85,14 @@ def test_one_motion_by_both_formulations(lagrangian, backwards):
 
 
 def blown(t, q, v, params):
-    """A blade on ice that drifts and shakes: speeds along and across, with time, and the turn."""
+    """A blade on drifting, oscillating ice: speeds along and across, with time, and rotation."""
     c, s = jnp.cos(q[2]), jnp.sin(q[2])
     along = c * v[0] + s * v[1] + 0.2 * t
     return jnp.stack([along, -s * v[0] + c * v[1] - params["w"] * jnp.sin(t), v[2]])
 
 
 def sprung(t, q, v, params):
-    """A sleigh on springs, its mass center ahead of the blade."""
+    """A sleigh on springs; its mass center is ahead of the blade."""
     m, J, a = params["m"]
     x, y = v[0] - a * jnp.sin(q[2]) * v[2], v[1] + a * jnp.cos(q[2]) * v[2]
     return 0.5 * m * (x * x + y * y) + 0.5 * J * v[2] ** 2 - 0.5 * (1.0 + 0.1 * t) * (q @ q)
@@ -115,9 +115,9 @@ def test_the_direction_of_time_may_be_traced():
         return motion.q[-1], motion.v[-1]
 
     ts = jnp.array([0.2, 0.9])
-    there = end(ts)
-    back = jl.simulate(system, *there, ts[::-1], PARAMS, **TIGHT)
-    np.testing.assert_allclose(back.q[-1], [0.3, -0.2, 0.5], atol=1e-10)
+    state = end(ts)
+    backward = jl.simulate(system, *state, ts[::-1], PARAMS, **TIGHT)
+    np.testing.assert_allclose(backward.q[-1], [0.3, -0.2, 0.5], atol=1e-10)
     again = end(ts[::-1])
     assert bool(jnp.all(jnp.isfinite(again[0])))
 
@@ -149,16 +149,16 @@ X = {
 
 
 @pytest.mark.full
-def test_derivatives_forward_reverse_and_by_differences():
-    """Fixed steps make the map smooth: central differences of it, and of the multiplier form."""
+def test_derivatives_agree_with_differences():
+    """Fixed steps make the map smooth, so that central differences apply."""
     system = on_springs()
     end = end_of(system, dt=0.05)
     rng = np.random.default_rng(0)
     dx = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=np.shape(x))), X)
     y, dy = jax.jit(lambda x, dx: jax.jvp(end, (x,), (dx,)))(X, dx)
     weights = jnp.linspace(1.0, 2.0, y.shape[0])
-    pulled = jax.jit(jax.grad(lambda x: weights @ end(x)))(X)
-    dot = sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (pulled, dx)), strict=True))
+    gradient = jax.jit(jax.grad(lambda x: weights @ end(x)))(X)
+    dot = sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (gradient, dx)), strict=True))
     # Measured 2026-11-22: 3e-16 of the scale.
     assert abs(weights @ dy - dot) <= 1e-13 * jnp.sum(jnp.abs(weights * dy))
     h = 1e-5
@@ -169,7 +169,7 @@ def test_derivatives_forward_reverse_and_by_differences():
 
 
 @pytest.mark.full
-def test_derivatives_by_both_formulations():
+def test_derivatives_of_both_formulations_agree():
     """Along a family of consistent starts, to 1e-8."""
     system = on_springs()
     one, other = (
@@ -205,7 +205,7 @@ def test_lanes_equal_single_runs():
 
 
 @pytest.mark.full
-def test_save_equals_on_demand_and_the_books_close():
+def test_saved_quantities_equal_later_ones_and_work_is_the_energy_change():
     """Work of a force that follows an input, of feedback, and of a row whose b is not zero."""
 
     def pull(t, q, v, params, inputs):
@@ -243,8 +243,8 @@ def test_save_equals_on_demand_and_the_books_close():
 
 
 @pytest.mark.full
-def test_a_lagrangian_with_a_loop():
-    """What has no scalar form runs on arrays, and gives the same."""
+def test_lagrangian_with_a_loop_equals_the_plain_one():
+    """An L without scalar form uses arrays, and gives the same motion."""
 
     def looped(t, q, v, params):
         def add(k, total):

@@ -1,4 +1,4 @@
-"""Motions that come to places where their quasi-velocities are singular."""
+"""Motions that reach a singularity of their quasi-velocities."""
 
 from functools import partial
 
@@ -32,7 +32,7 @@ def drag(t, q, v, params):
 
 
 def weighted(U=cosine, lagrangian=free, **options):
-    """By default y runs freely past 90 degrees, where the first quasi-velocity vanishes."""
+    """By default y moves freely past 90 degrees, where the first quasi-velocity vanishes."""
     quasi = jl.QuasiVelocities(U, ("a", "b"))
     forces = (jl.Rayleigh(drag, "drag"),)
     return jl.System(lagrangian, ("x", "y"), quasi=quasi, forces=forces, **options)
@@ -47,7 +47,7 @@ def dragged(q0, v0, t):
 
 
 def singular_at(y0, vy):
-    """When y gets to 90 degrees."""
+    """Time at which y reaches 90 degrees."""
     return -np.log(1 - (np.pi / 2 - y0) * DRAG / vy) / DRAG
 
 
@@ -60,7 +60,7 @@ def accepted(determinant, count=20_000):
 
 
 def test_no_zero_within_a_step_is_missed():
-    """Crossed once, twice, touched, and as poles; whatever else the determinant does besides."""
+    """Crossed once, twice, touched, and as poles, for any growth of the determinant."""
     rng = np.random.default_rng(0)
     s, r = rng.uniform(0, 1, (2, 20_000))
     grows, fast = rng.uniform(-1, 1, 20_000), rng.uniform(0.1, 1.5, 20_000)
@@ -75,8 +75,8 @@ def test_no_zero_within_a_step_is_missed():
         assert not np.any(accepted(missed))
 
 
-def test_what_stays_clear_is_left_alone():
-    """Zeros a quarter of a step away along the motion, 0.6 beside it; growth by a factor of 7."""
+def test_determinants_without_near_zeros_are_accepted():
+    """Zeros a quarter step away in time, or 0.6 off the real axis; growth by a factor of 7."""
     rng = np.random.default_rng(1)
     s = rng.uniform(0, 1, 20_000)
     for sound in (
@@ -93,8 +93,8 @@ def test_what_stays_clear_is_left_alone():
 # ---- One motion --------------------------------------------------------------------------------
 
 
-def test_a_motion_ends_just_before_a_singular_place():
-    """In lanes, which know nothing of multipliers: where it stays clear it is left alone."""
+def test_motion_ends_just_before_a_singularity():
+    """In lanes, which cannot continue with multipliers; other lanes are unaffected."""
 
     @jax.jit
     @jax.vmap
@@ -105,21 +105,21 @@ def test_a_motion_ends_just_before_a_singular_place():
 
     y0 = np.array([0.1, -0.5, 0.1, 0.1])
     at = singular_at(y0, V0[1])
-    ends = np.array([3.0, 3.0, at[2] - 1e-3, -1.0])  # the last one runs backwards
+    ends = np.array([3.0, 3.0, at[2] - 1e-3, -1.0])  # the last one goes backward in time
     ts = np.stack([0 * ends, 0.3 * ends, ends], axis=1)
-    status, where, time, (q, v), rows = solve(y0, ts)
+    status, where, time, (q, v), saves = solve(y0, ts)
     assert status.tolist() == [SINGULAR, SINGULAR, 0, 0]
     assert where.tolist() == [0, 0, -1, -1]
     np.testing.assert_allclose(time[:2], at[:2], atol=1e-6)
     assert np.all(time[:2] < at[:2])
     np.testing.assert_allclose(q[:, 0], dragged(0.0, V0[0], time), atol=1e-5)
     np.testing.assert_allclose(v, V0 * np.exp(-DRAG * time)[:, None], atol=1e-4)
-    assert np.all(np.isfinite(rows[:, 1]))
-    assert np.all(np.isnan(rows[:2, 2]))
+    assert np.all(np.isfinite(saves[:, 1]))
+    assert np.all(np.isnan(saves[:2, 2]))
 
 
-def test_auto_goes_on_with_multipliers_and_says_so():
-    """From u0 as well, what is saved being quasi-velocities; named quasi-velocities fail."""
+def test_auto_continues_with_multipliers_and_reports_it():
+    """Also from u0 and with saved quasi-velocities; formulation="quasi" fails instead."""
     ts, steps = np.array([0.0, 1.0, 3.0]), {"method": "dopri5", "dt": 0.05}
     at = singular_at(Q0[1], V0[1])
     u0 = {"a": np.cos(Q0[1]) * V0[0], "b": V0[1]}
@@ -141,7 +141,7 @@ def squared(t, q, v, params):
 
 
 def mixed(t, q, v, params):
-    """Rows that come to lie in line at y = 90 degrees."""
+    """Rows that become parallel at y = 90 degrees."""
     return jnp.stack([v[0] + v[1], jnp.sin(q[1]) * v[0] + v[1]])
 
 
@@ -154,7 +154,7 @@ def given(t, q, u, params):
 
 
 def vanishing(t, q, u, params):
-    """Here v follows from u, and u not from v."""
+    """Here v follows from u, but u not from v."""
     return jnp.stack([u[0] * jnp.cos(q[1]), u[1]])
 
 
@@ -190,42 +190,42 @@ WAYS = (
 
 @pytest.mark.full
 @pytest.mark.parametrize("kind", SYSTEMS)
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: way.get("method", "default"))
-def test_no_motion_crosses_without_a_word(kind, way):
-    """From random starts, forwards; rows before are those of the free motion."""
+@pytest.mark.parametrize("options", WAYS, ids=lambda options: options.get("method", "default"))
+def test_no_motion_crosses_a_singularity_unreported(kind, options):
+    """From random starts, forward; saves before are those of the free motion."""
     rng = np.random.default_rng(2)
     y0, vy = rng.uniform(-1, 1, 50), rng.uniform(0.9, 2, 50)
     start = np.stack([0 * y0, y0], axis=1), np.stack([rng.uniform(0.5, 2, 50), vy], axis=1)
     at = np.full(50, 1.4) if kind == "by time" else singular_at(y0, vy)
-    part = rng.uniform(0.3, 2.0, 50)  # of the way to the singular place
+    part = rng.uniform(0.3, 2.0, 50)  # of the time to the singularity
     part = np.where(np.abs(part - 1) < 0.2, 1.3, part)
     ts = np.stack([0 * at, part * at], axis=1)
 
     @jax.jit
     @jax.vmap
     def solve(q0, v0, ts):
-        motion = jl.simulate(SYSTEMS[kind], q0, v0, ts, {}, formulation="quasi", **way)
+        motion = jl.simulate(SYSTEMS[kind], q0, v0, ts, {}, formulation="quasi", **options)
         return motion.ok, motion.status, motion.q[-1]
 
     ok, status, q = solve(*start, ts)
     np.testing.assert_array_equal(ok, part < 1)
-    # Where u grows beyond all numbers, or implicit equations are hard to solve beside a zero of
-    # second order, steps shrink first.
-    hard = "vanish" in kind or (kind, way.get("method")) == ("in line", "kvaerno5")
+    # If u grows without bound, or if implicit equations are hard to solve near a zero of second
+    # order, steps shrink first.
+    hard = "vanish" in kind or (kind, options.get("method")) == ("in line", "kvaerno5")
     shrunk = {int(Status.step_below_resolution), int(Status.max_steps)} if hard else {}
     assert set(np.asarray(status)[part > 1].tolist()) <= {SINGULAR, *shrunk}
     right = dragged(start[0], start[1], ts[:, 1:])
-    bound = 1e3 * way.get("rtol", 1e-6)
+    bound = 1e3 * options.get("rtol", 1e-6)
     np.testing.assert_allclose(q[part < 1], right[part < 1], atol=bound)
 
 
 def skew(t, q, v, params):
-    """Nearly dependent everywhere, and as much as that at all times."""
+    """Nearly dependent everywhere, and equally so at all times."""
     return jnp.stack([v[0] + 1e-5 * (2.0 + jnp.sin(q[1])) * v[1], v[0]])
 
 
 @pytest.mark.full
-def test_nearly_dependent_quasi_velocities_are_no_fault():
+def test_nearly_dependent_quasi_velocities_are_accepted():
     ts = np.array([0.0, 1.0, 20.0])
     motion = jl.simulate(weighted(skew), Q0, V0, ts, {})
     assert motion.formulation == "quasi"
@@ -233,8 +233,8 @@ def test_nearly_dependent_quasi_velocities_are_no_fault():
 
 
 @pytest.mark.full
-def test_a_place_is_passed_nearby():
-    """y swings to within 1e-3 of 90 degrees: every motion is right, and none refused."""
+def test_motions_near_a_singularity_are_right():
+    """y oscillates to within 1e-3 of 90 degrees: every motion is right, and none is refused."""
 
     def spring(t, q, v, params):
         return 0.5 * (v @ v) - 0.5 * q[1] ** 2
@@ -251,33 +251,33 @@ def test_a_place_is_passed_nearby():
     status, q = solve(y0)
     assert not np.any(status)
     np.testing.assert_allclose(q, np.stack([0 * y0 + 4.9, y0 * np.cos(7.0)], axis=1), atol=1e-6)
-    status, _ = solve(2 * np.pi - 3 * np.pi / 2 + np.logspace(-3, -0.3, 20))  # beyond, both ways
+    status, _ = solve(2 * np.pi - 3 * np.pi / 2 + np.logspace(-3, -0.3, 20))  # beyond, either way
     assert set(np.asarray(status).tolist()) == {SINGULAR}
 
 
 @pytest.mark.full
-def test_in_single_precision():
+def test_float32_motion_ends_before_a_singularity():
     start = (jnp.asarray(x, jnp.float32) for x in (Q0, V0))
     ts = np.array([0.0, 0.8, 3.0])
     motion = jl.simulate(CROSSING, *start, ts, {}, formulation="quasi", throw=False)
     assert int(motion.status) == SINGULAR
     # The determinant is sqrt(eps / (200 tol)) there, a hundredth of a radian away.
-    left = np.cos(Q0[1]) * np.sqrt(np.finfo(np.float32).eps / 200e-5)
-    assert 0 < singular_at(Q0[1], V0[1]) - motion.last_time < 1.5 * left
+    margin = np.cos(Q0[1]) * np.sqrt(np.finfo(np.float32).eps / 200e-5)
+    assert 0 < singular_at(Q0[1], V0[1]) - motion.last_time < 1.5 * margin
     np.testing.assert_allclose(motion["x"][1], dragged(0.0, V0[0], 0.8), atol=1e-4)
 
 
 @pytest.mark.full
-def test_derivatives_are_those_of_a_failed_motion():
-    """Inside transforms there is no going on: NaN at the end, derivatives of the rows before."""
+def test_derivatives_equal_those_of_a_failed_motion():
+    """Under transforms there is no continuation: NaN at the end, derivatives of saves before."""
 
-    def x(vx, row):
+    def x(vx, save):
         v0 = jnp.stack([vx, V0[1]])
-        return jl.simulate(CROSSING, Q0, v0, [0.0, 0.8, 3.0], {}, throw=False)["x"][row]
+        return jl.simulate(CROSSING, Q0, v0, [0.0, 0.8, 3.0], {}, throw=False)["x"][save]
 
     value, _ = jax.jvp(lambda vx: x(vx, -1), (0.9,), (1.0,))
     assert np.isnan(value)
-    for slope in (jax.grad(x), lambda vx, row: jax.jvp(lambda vx: x(vx, row), (vx,), (1.0,))[1]):
+    for slope in (jax.grad(x), lambda vx, save: jax.jvp(lambda vx: x(vx, save), (vx,), (1.0,))[1]):
         np.testing.assert_allclose(slope(0.9, 1), dragged(0.0, 1.0, 0.8), rtol=1e-8)
 
 
@@ -289,11 +289,11 @@ def test_l_in_u_keeps_its_status():
     assert motion.formulation == "quasi"
 
 
-# ---- Where nothing changes nothing is computed -------------------------------------------------
+# ---- Constant determinants ---------------------------------------------------------------------
 
 
 def turned(t, q, v, params):
-    """dU/dv turns, its determinant does not change."""
+    """dU/dv rotates; its determinant is constant."""
     c, s = jnp.cos(q[1]), jnp.sin(q[1])
     return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
 
@@ -303,7 +303,7 @@ def constant(t, q, v, params):
 
 
 @pytest.mark.parametrize(
-    ("U", "lowering", "looked_at"),
+    ("U", "lowering", "computed"),
     mostly_full(
         [
             (turned, "auto", False),
@@ -316,15 +316,15 @@ def constant(t, q, v, params):
         (cosine, "auto", True),
     ),
 )
-def test_determinants_that_never_change_are_not_computed(U, lowering, looked_at, monkeypatch):
-    """The program of the steps is the same as where nobody asks."""
+def test_constant_determinants_are_not_computed(U, lowering, computed, monkeypatch):
+    """The program of the steps equals that without the check."""
 
     def steps():
-        system = weighted(partial(U), lowering=lowering)  # of its own, so that nothing is kept
+        system = weighted(partial(U), lowering=lowering)  # a new system, so that no cache is used
         solve = partial(jl.simulate, system, Q0, V0, [0.0, 1.0], method="tsit5")
-        program = operations(lambda k: solve({"k": k}, dt=0.1).q, 0.3, turns=1)
+        program = operations(lambda k: solve({"k": k}, dt=0.1).q, 0.3, iterations=1)
         return [(o.name, o.shapes) for o in loop(program)]
 
-    asked = steps()
+    checked = steps()
     monkeypatch.setattr(_problem, "usual", lambda *_: None)
-    assert (asked != steps()) == looked_at
+    assert (checked != steps()) == computed

@@ -1,4 +1,4 @@
-"""States within a step by the polynomial through its ends."""
+"""States within a step by the Hermite polynomial through its ends."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ EPS = np.finfo(float).eps
 
 
 def ends(q, integral, t):
-    """(y, dy/dt) of coordinates and of an integral, functions of time."""
+    """(y, dy/dt) of coordinates and of an integral, given as functions of time."""
     v, w = (jax.jacfwd(f) for f in (q, integral))
     y = jnp.concatenate([q(t), v(t), integral(t)])
     return y, jnp.concatenate([v(t), jax.jacfwd(v)(t), w(t)])
@@ -22,8 +22,8 @@ def through(q, integral, t0, t1, t):
     return hermite(t0, y0, f0, t1, y1, f1, t, 2)
 
 
-def test_polynomials_are_themselves_between_the_ends_and_beyond():
-    """Of degree 5 in the coordinates, of degree 3 in what is integrated."""
+def test_polynomials_are_reproduced_inside_and_beyond_the_step():
+    """Of degree 5 in the coordinates, of degree 3 in integrals."""
     c = jnp.array([[0.3, -1.2, 0.7, 2.1, -0.4, 0.9], [1.0, 0.2, -0.8, 0.1, 1.3, -0.6]])
     q = lambda t: jnp.array([jnp.polyval(c[0], t), jnp.polyval(c[1], t)])  # noqa: E731
     work = lambda t: jnp.polyval(c[0, :4], t)[None]  # noqa: E731
@@ -37,7 +37,7 @@ def test_polynomials_are_themselves_between_the_ends_and_beyond():
 
 
 def test_errors_are_of_order_6_and_5():
-    """Of coordinates and of velocities; of order 4 of what is integrated."""
+    """Of coordinates and of velocities; of order 4 for integrals."""
     q = lambda t: jnp.array([jnp.sin(t), jnp.exp(-t)])  # noqa: E731
     work = lambda t: jnp.exp(t)[None]  # noqa: E731
     steps, part = np.array([0.2, 0.1, 0.05]), 0.3
@@ -50,8 +50,8 @@ def test_errors_are_of_order_6_and_5():
     np.testing.assert_allclose(slopes, [6.0, 5.0, 4.0], atol=0.1)
 
 
-def test_which_step_leads_to_a_time():
-    """One to it, the one that it lies in, or one half the way there."""
+def test_reached_time_follows_from_the_kind_of_step():
+    """The end of a step to this time, of the step that contains it, or half of the way."""
     t0, t, end = jnp.array(1.0), jnp.array(1.5), jnp.array(4.0)
     found = [float(reached_time(jnp.array(int(reach)), t0, t, end)) for reach in Reach]
     assert found == [1.5, 4.0, 1.25]

@@ -1,4 +1,4 @@
-"""Motions under forces that depend on multipliers, against closed forms."""
+"""Motions under forces that depend on multipliers, compared with closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +35,8 @@ def uphill(t, q, v, params):
 
 
 def drag(t, q, v, params, lam):
-    along = jnp.array([cos(SLOPE), sin(SLOPE)])
-    return -params * lam["plane"] * jnp.sign(uphill(t, q, v, params)) * along
+    tangent = jnp.array([cos(SLOPE), sin(SLOPE)])
+    return -params * lam["plane"] * jnp.sign(uphill(t, q, v, params)) * tangent
 
 
 BLOCK = jl.System(
@@ -54,18 +54,18 @@ def slid(mu, ts, speed=SPEED, **options):
     return jl.simulate(BLOCK, [0.0, 0.0], v0, ts, mu, **TIGHT, **options)
 
 
-def test_a_block_slides_as_coulomb_says():
+def test_block_slides_by_coulombs_law():
     ts = np.linspace(0.0, 0.9 * STOP, 4)
     motion = slid(MU, ts)
     deceleration = G * (sin(SLOPE) + MU * cos(SLOPE))
-    way = SPEED * ts - 0.5 * deceleration * ts**2
-    np.testing.assert_allclose(motion.q, np.outer(way, [cos(SLOPE), sin(SLOPE)]), atol=1e-13)
+    distance = SPEED * ts - 0.5 * deceleration * ts**2
+    np.testing.assert_allclose(motion.q, np.outer(distance, [cos(SLOPE), sin(SLOPE)]), atol=1e-13)
     np.testing.assert_allclose(motion.lam["plane"], M * G * cos(SLOPE), rtol=1e-13)
 
 
 @pytest.mark.full
-def test_the_way_depends_on_friction_as_it_should():
-    """d way/d mu = -g cos(slope) t^2/2."""
+def test_derivative_of_the_distance_by_friction_is_exact():
+    """d distance/d mu = -g cos(slope) t^2/2."""
     ts = np.array([0.0, 0.5 * STOP])
 
     def height(mu):
@@ -75,17 +75,17 @@ def test_the_way_depends_on_friction_as_it_should():
     np.testing.assert_allclose(jax.grad(height)(MU), expected, rtol=1e-12)
 
 
-def test_a_motion_ends_where_sliding_does():
-    """Friction would push on: beyond, it is another system."""
+def test_motion_ends_when_sliding_ends():
+    """Friction would go on pushing: beyond, it is another system."""
     motion = slid(MU, np.array([0.0, 2 * STOP]), throw=False)
     assert motion.status == Status.no_reaction_solution
-    np.testing.assert_allclose(motion.last_time, STOP, rtol=1e-9)  # rejected steps close in on it
+    np.testing.assert_allclose(motion.last_time, STOP, rtol=1e-9)  # rejected steps approach it
     with pytest.raises(jl.SimulationError, match=r"(?s)plane.*contact lifts off, its sliding"):
         slid(MU, np.array([0.0, 2 * STOP]))
 
 
-def test_a_start_that_slides_not():
-    """No sense of the friction is known."""
+def test_start_without_sliding_is_refused():
+    """The direction of friction is unknown."""
     with pytest.raises(jl.SimulationError, match="contact lifts off, its sliding"):
         slid(MU, np.array([0.0, 0.1]), speed=0.0)
 
@@ -102,8 +102,8 @@ def nothing(t, q, v, params, lam):
 
 
 @pytest.mark.full
-def test_a_particle_leaves_a_cylinder():
-    """From rest near the top, where cos(angle from there) = 2/3 cos(the one at the start)."""
+def test_motion_ends_when_a_particle_leaves_a_cylinder():
+    """From rest near the top, where the cosine of the angle is 2/3 of that at the start."""
     contact = jl.GeneralizedForce(nothing, "none", reaction=True, contact="cylinder")
     system = jl.System(
         particle, ("x", "y"), forces=(contact,), constraints=(jl.Holonomic(cylinder, "cylinder"),)
@@ -148,7 +148,7 @@ REST = np.array([0.0, HIGH, 0.0])
 
 @pytest.mark.full
 @pytest.mark.parametrize("mu", [0.2, 1.2])
-def test_a_sledge_brakes(mu):
+def test_two_runners_share_the_friction(mu):
     """N_front - N_rear = mu m g h / w about the center; beyond mu = w/h it tips over."""
     v = np.array([3.0, 0.0, 0.0])
     np.testing.assert_allclose(SLEDGE.acceleration(REST, v, mu), [-mu * G, 0, 0], atol=1e-13)
@@ -161,7 +161,7 @@ def test_a_sledge_brakes(mu):
 
 
 @pytest.mark.full
-def test_a_sledge_tips_over():
+def test_motion_ends_when_a_sledge_tips_over():
     with pytest.raises(jl.SimulationError, match=r"(?s)rear.*contact lifts off"):
         jl.simulate(SLEDGE, REST, [3.0, 0.0, 0.0], [0.0, 0.1], 1.05 * WIDE / HIGH)
 
@@ -169,11 +169,11 @@ def test_a_sledge_tips_over():
 # ---- No solution ---------------------------------------------------------------------------------
 
 
-def test_painleve():
-    """A stick that is pushed ahead by its lower end: (1/3 + cos^2)/(sin cos) <= mu has none."""
+def test_painleve_paradox_has_no_reaction_solution():
+    """A stick pushed ahead by its lower end: no solution for mu >= (1/3 + cos^2)/(sin cos)."""
     entry = falling_stick_friction.entry
     params = dict(entry.example.params)
-    theta = np.arctan(2.0)  # where that is least, 4/3
+    theta = np.arctan(2.0)  # the minimum, 4/3
     q0 = [0.0, 0.5 * params["L"] * sin(theta), theta]
     for mu in (1.33, 1.34):
         v0, ts = [-1.0, 0.0, 0.0], [0.0, 1e-4]
@@ -183,7 +183,7 @@ def test_painleve():
         assert np.all(np.isfinite(a)) == (mu < 4 / 3)
 
 
-# ---- Rows that depend on one another ------------------------------------------------------------
+# ---- Dependent rows -----------------------------------------------------------------------------
 
 
 def doubled(t, q, params):
@@ -195,12 +195,12 @@ def rate(t, q, v, params):
 
 
 def sliding_on(rows, read, lowering="auto"):
-    """The block on contacts of these names, with friction on those that are read."""
+    """The block on these contacts, with friction on those in `read`."""
 
     def drag(t, q, v, params, lam):
-        along = jnp.array([cos(SLOPE), sin(SLOPE)])
-        pressed = sum(share * lam[name] for name, share in read.items())
-        return -params * pressed * jnp.sign(uphill(t, q, v, params)) * along
+        tangent = jnp.array([cos(SLOPE), sin(SLOPE)])
+        normal_force = sum(share * lam[name] for name, share in read.items())
+        return -params * normal_force * jnp.sign(uphill(t, q, v, params)) * tangent
 
     force = jl.GeneralizedForce(drag, "drag", reaction=True)
     return jl.System(particle, ("x", "y"), forces=(force,), constraints=rows, lowering=lowering)
@@ -231,35 +231,37 @@ CONTACTS = {
 
 @pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
 @pytest.mark.parametrize("kind", mostly_full(list(CONTACTS), "both", "rate"))
-def test_a_contact_that_is_declared_twice_drags_once(kind, lowering):
-    """Whichever row the friction reads; what it reads is what is told, and the books are kept."""
+def test_contact_declared_twice_has_friction_once(kind, lowering):
+    """Whichever row friction reads: it reads the reported multipliers; work is consistent."""
     rows, read, shares = CONTACTS[kind]
     system = sliding_on(rows, read, lowering)
-    ts, along = np.linspace(0.0, 0.9 * STOP, 3), np.array([cos(SLOPE), sin(SLOPE)])
-    start = [0.0, 0.0], SPEED * along
+    ts, tangent = np.linspace(0.0, 0.9 * STOP, 3), np.array([cos(SLOPE), sin(SLOPE)])
+    start = [0.0, 0.0], SPEED * tangent
     normal, deceleration = M * G * cos(SLOPE), G * (sin(SLOPE) + MU * cos(SLOPE))
     motion = jl.simulate(system, *start, ts, MU, save=("work",), **TIGHT)
-    way = SPEED * ts - 0.5 * deceleration * ts**2
-    np.testing.assert_allclose(motion.q, np.outer(way, along), atol=1e-12)
+    distance = SPEED * ts - 0.5 * deceleration * ts**2
+    np.testing.assert_allclose(motion.q, np.outer(distance, tangent), atol=1e-12)
     for name, share in shares.items():
         np.testing.assert_allclose(motion.lam[name], share * normal, rtol=1e-12, atol=1e-12)
     done = sum(motion.work.values())[-1]
     np.testing.assert_allclose(motion.energy[-1] - motion.energy[0], done, rtol=1e-12)
     a = system.acceleration(*start, MU)
-    np.testing.assert_allclose(a, -deceleration * along, rtol=1e-12)
-    push = system.generalized_force(*start, MU)
-    np.testing.assert_allclose(push, -MU * normal * along, rtol=1e-12)
+    np.testing.assert_allclose(a, -deceleration * tangent, rtol=1e-12)
+    force = system.generalized_force(*start, MU)
+    np.testing.assert_allclose(force, -MU * normal * tangent, rtol=1e-12)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
-def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
-    """d way/d mu, as of one contact."""
+def test_derivatives_of_a_contact_declared_twice_are_those_of_one(lowering):
+    """d distance/d mu, as of one contact."""
     system = sliding_on(*CONTACTS["both"][:2], lowering)
-    ts, along = np.array([0.0, 0.5 * STOP]), np.array([cos(SLOPE), sin(SLOPE)])
+    ts, tangent = np.array([0.0, 0.5 * STOP]), np.array([cos(SLOPE), sin(SLOPE)])
 
     def height(mu):
-        return jl.simulate(system, [0.0, 0.0], SPEED * along, ts, mu, **TIGHT, throw=False).q[-1, 1]
+        return jl.simulate(system, [0.0, 0.0], SPEED * tangent, ts, mu, **TIGHT, throw=False).q[
+            -1, 1
+        ]
 
     expected = -0.5 * G * cos(SLOPE) * ts[-1] ** 2 * sin(SLOPE)
     np.testing.assert_allclose(jax.grad(height)(MU), expected, rtol=1e-11)
@@ -267,7 +269,7 @@ def test_derivatives_of_a_contact_that_is_declared_twice(lowering):
 
 
 def turned(t, q, params):
-    """A contact, and a row that psi takes away: sin(psi) is 0, or what rounding leaves at pi."""
+    """A contact, and a row that psi removes: sin(psi) is 0, or its rounding at pi."""
     return jnp.stack([q[1], jnp.sin(q[2]) * (q[1] + 0.5 * q[0])])
 
 
@@ -281,8 +283,8 @@ def turned_drag(t, q, v, params, lam):
         [("scalar", np.pi), ("scalar", 0.0), ("array", np.pi), ("array", 0.0)], ("scalar", np.pi)
     ),
 )
-def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
-    """Deceleration 0.1 g, and the derivative of its way in every start."""
+def test_row_of_rounding_has_no_share(lowering, psi):
+    """Deceleration 0.1 g, and the derivative of the distance by the start."""
     lock = jl.Holonomic(lambda t, q, params: q[2] - params, "lock")
     system = jl.System(
         lambda t, q, v, params: 0.5 * v @ v - G * q[1],
@@ -293,22 +295,22 @@ def test_a_row_that_is_rounding_takes_no_share(lowering, psi):
     )
 
     @jax.jit
-    def way(x):
+    def distance(x):
         q = jnp.stack([x, 0.0, psi])
         start = q, jnp.array([1.0, 0.0, 0.0])
         return jl.simulate(
             system, *start, jnp.array([0.0, 0.5]), psi, dt=0.1, method="tsit5", throw=False
         ).q[-1, 0]
 
-    value, slope = jax.value_and_grad(way)(0.0)
+    value, slope = jax.value_and_grad(distance)(0.0)
     np.testing.assert_allclose(value, 0.5 - 0.5 * 0.1 * G * 0.25, rtol=1e-12)
     np.testing.assert_allclose(slope, 1.0, rtol=1e-12)
     a = system.acceleration([0.0, 0.0, psi], [1.0, 0.0, 0.0], psi)
     np.testing.assert_allclose(a, [-0.1 * G, 0.0, 0.0], atol=1e-12)
 
 
-def test_damped_rows_are_those_that_are_solved_with():
-    """A holonomic row that a read Pfaffian one would replace is not damped: refused."""
+def test_baumgarte_with_replaced_rows_is_refused():
+    """A Pfaffian row that a force reads would replace the damped holonomic row: refused."""
     system = sliding_on((PLANE, RATE), {"rate": 1.0})
     with pytest.raises(
         ValueError, match=r"^`stabilization` must be 'projection' .* and a force reads 'rate'"
@@ -318,17 +320,19 @@ def test_damped_rows_are_those_that_are_solved_with():
         )
 
 
-def test_known_contacts_are_not_looked_at_again():
-    """Apart where values are known: then nothing is shared, in either lowering; else it may be."""
-    apart = sliding_on((PLANE, jl.Holonomic(lambda t, q, p: q[0], "wall")), {"plane": 1, "wall": 1})
+def test_contacts_are_independent_only_by_known_values():
+    """Independent rows are known only from values; for traced values multipliers may be shared."""
+    independent = sliding_on(
+        (PLANE, jl.Holonomic(lambda t, q, p: q[0], "wall")), {"plane": 1, "wall": 1}
+    )
     same = sliding_on((PLANE, AGAIN), {"plane": 1.0, "again": 1.0})
     given = MU, jnp.array(0.0), jnp.zeros(2), jnp.zeros(2), {}
-    assert contact_rows_independent(apart, *given)
+    assert contact_rows_independent(independent, *given)
     assert not contact_rows_independent(same, *given)
     found = []
-    jax.jit(lambda q: found.append(contact_rows_independent(apart, MU, 0.0, q, None, {})) or q)(
-        jnp.zeros(2)
-    )
+    jax.jit(
+        lambda q: found.append(contact_rows_independent(independent, MU, 0.0, q, None, {})) or q
+    )(jnp.zeros(2))
     assert found == [False]
 
 
@@ -341,7 +345,7 @@ FEET = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
 
 def feet(t, q, params):
-    """Heights of the feet, for small angles; params: (friction, where the mass center is)."""
+    """Heights of the feet, for small angles; params: (friction, position of the mass center)."""
     arms = FEET - params[1]
     return q[2] + arms[:, 1] * q[3] - arms[:, 0] * q[4]
 
@@ -352,8 +356,8 @@ def feet_drag(t, q, v, params, lam):
 
 @pytest.mark.full
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
-def test_four_feet_share_as_equals(lowering):
-    """Of three alone one might have to pull; of least norm all four press."""
+def test_four_feet_share_the_load_by_least_norm(lowering):
+    """With three of them alone one might pull; with least norm all four push."""
     force = jl.GeneralizedForce(feet_drag, "drag", reaction=True, contact="feet")
     system = jl.System(
         table,
@@ -376,7 +380,7 @@ def test_four_feet_share_as_equals(lowering):
 # ---- The solve -----------------------------------------------------------------------------------
 
 
-def test_forces_that_are_not_affine_take_the_array_program():
+def test_forces_that_are_not_affine_use_the_array_program():
     """mu |lam|: the same motion, by Newton's method."""
 
     def drag_of_size(t, q, v, params, lam):
@@ -393,8 +397,8 @@ def test_forces_that_are_not_affine_take_the_array_program():
     assert "not affine in multipliers" in str(system.explain(MU))
 
 
-def test_two_sticks_do_not_excuse_one_another():
-    """Two uncoupled ones, pushed too hard each: the determinant of both is positive."""
+def test_uncoupled_contacts_are_checked_separately():
+    """Two uncoupled sticks, each without solution: the determinant of both is positive."""
     one = falling_stick_friction.entry.system
 
     def both(t, q, v, params):

@@ -1,4 +1,4 @@
-"""Mass matrices that are singular or indefinite where nothing pushes: by every kind of method."""
+"""Singular or indefinite mass matrices in directions without forces, by all kinds of methods."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,12 +8,12 @@ import jaxlag as jl
 
 
 def pair(t, q, v, params):
-    """Inertia of b' + c' alone, and no force along either."""
+    """Inertia of b' + c' only, and no force along either."""
     return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2 + 0.5 * params["m"] * (v[1] + v[2]) ** 2
 
 
 def idle(t, q, v, params):
-    """A coordinate that nothing is said of."""
+    """A coordinate that does not occur."""
     return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
 
 
@@ -22,7 +22,7 @@ def negative(t, q, v, params):
 
 
 def turning(t, q, v, params):
-    """Inertia that falls below 0 where q > 1."""
+    """Inertia that is negative for q > 1."""
     return 0.5 * (1 - q[0]) * v[0] ** 2 + q[0]
 
 
@@ -49,7 +49,7 @@ def case(name, lowering):
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 @pytest.mark.parametrize("name", CASES)
-def test_no_acceleration(name, lowering):
+def test_singular_mass_gives_nan_accelerations(name, lowering):
     system, params, q, v, _ = case(name, lowering)
     assert np.all(np.isnan(system.acceleration(q, v, params)))
 
@@ -71,7 +71,7 @@ def test_no_acceleration(name, lowering):
         for lowering in ("auto", "array")
     ],
 )
-def test_no_motion_and_the_coordinate_named(name, method, options, lowering):
+def test_singular_mass_ends_motions_and_names_the_coordinate(name, method, options, lowering):
     system, params, q, v, where = case(name, lowering)
     motion = jl.simulate(system, q, v, [0.0, 0.5], params, method=method, throw=False, **options)
     assert motion.status == jl.Status.mass_singular
@@ -81,20 +81,20 @@ def test_no_motion_and_the_coordinate_named(name, method, options, lowering):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("method", "options"), METHODS[:4])
-def test_inertia_lost_on_the_way(method, options):
+def test_motion_ends_when_inertia_vanishes(method, options):
     system = jl.System(turning, ("a",))
     motion = jl.simulate(
         system, [0.0], [1.0], [0.0, 2.0], {}, method=method, throw=False, **options
     )
-    # The speed grows beyond all bounds: implicit equations of a step across have no solution.
+    # The speed is unbounded: implicit equations of a step across have no solution.
     ends = jl.Status.mass_singular, jl.Status.step_below_resolution, jl.Status.implicit_solve_failed
     assert motion.status in ends
     assert float(motion.last_time) < 2.0
     assert float(motion.last_state[0][0]) < 1.0 + 1e-9
 
 
-def test_what_is_regular_needs_no_look():
-    """An inertia that is a positive number is not looked at; one of params once per solve."""
+def test_regular_mass_needs_no_check_per_evaluation():
+    """A positive constant inertia is not tested, one of params is tested once per solve."""
     for lagrangian, lines in (
         (lambda t, q, v, p: 0.5 * (v @ v), 0),
         (lambda t, q, v, p: 0.5 * p["m"] * (v @ v), 0),

@@ -1,4 +1,4 @@
-"""Coordinates in units a million times one another: what holds in like ones holds in these."""
+"""Coordinates in units of ratio 1e6: results are the same as in equal units."""
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,13 @@ def falling(t, q, v, params):
 
 
 def bending(t, q, params):
-    """The second row is the first at y = 1e-5, but asks for another acceleration there."""
+    """The second row equals the first at y = 1e-5, but requires another acceleration there."""
     r = q[0] - 1e5 * q[1]
     return jnp.stack([r, r + params * (1e5 * q[1] - 1.0) ** 2])
 
 
-def test_a_contradiction_is_told_beside_large_numbers():
-    """The accelerations that two rows ask of y are 2e-5 apart, that of z is 1000."""
+def test_contradiction_is_reported_beside_large_accelerations():
+    """The accelerations of y by two rows differ by 2e-5, that of z is 1000."""
     system = jl.System(falling, ("x", "y", "z"), constraints=(jl.Holonomic(bending, "rows"),))
     state = [1.0, 1e-5, 0.0], [1.0, 1e-5, 0.0]
     assert np.all(np.isnan(system.acceleration(*state, 1.0)))
@@ -35,14 +35,14 @@ def pressed(t, q, v, params):
 
 
 def led(t, q, params):
-    """As many rows as coordinates: nothing moves, whatever the forces."""
+    """As many rows as coordinates: nothing moves, for any forces."""
     return jnp.stack(
         [q[0] - 1e-5 * q[2] + 9e3 * q[1], 0.7 * q[0] + 1e-5 * q[2], q[1] + 1e-9 * q[2]]
     )
 
 
-def test_what_rows_hold_still_has_an_acceleration():
-    """Forces of 1e4 in units of inertia leave accelerations their rounding, no contradiction."""
+def test_fully_constrained_system_has_accelerations_of_rounding():
+    """Forces of 1e4 in units of inertia leave only rounding in accelerations."""
     system = jl.System(pressed, ("x", "y", "z"), constraints=(jl.Holonomic(led, "rows"),))
     at_rest = np.zeros(3), np.zeros(3)
     units = np.array([1.0, 1e9, 1e-9]) ** -0.5
@@ -58,8 +58,8 @@ def test_what_rows_hold_still_has_an_acceleration():
 
 def crossed(t, q, u, params):
     """x in units of 1e5, y and b in units of 1e-6."""
-    turn = jnp.cos(q[0] * 1e-5)
-    return jnp.stack([1e5 * (u[0] + 0.3 * turn * 1e6 * u[1]), 1e-6 * (1e6 * u[1] + 0.3 * u[0])])
+    cosine = jnp.cos(q[0] * 1e-5)
+    return jnp.stack([1e5 * (u[0] + 0.3 * cosine * 1e6 * u[1]), 1e-6 * (1e6 * u[1] + 0.3 * u[0])])
 
 
 def swinging(t, q, u, params):
@@ -71,20 +71,20 @@ def plainly(q, u):
     b = np.array([[1.0, 0.3 * np.cos(q[0])], [0.3, 1.0]])
     v = b @ u
     turning = np.array([[0.0, -0.3 * np.sin(q[0]) * v[0]], [0.0, 0.0]])  # B'
-    mass, pull = np.diag([1.0, 2.0]), np.array([-np.cos(q[0]), -2.0 * q[1]])
+    mass, force = np.diag([1.0, 2.0]), np.array([-np.cos(q[0]), -2.0 * q[1]])
     theta = np.linalg.inv(b)  # u = theta v, p = mass u
     p = mass @ u
     rate = -theta @ turning @ theta
-    # The slopes of theta v in x, at a fixed v: x alone turns B.
-    bent = -theta @ np.array([[0.0, -0.3 * np.sin(q[0])], [0.0, 0.0]]) @ theta @ v
-    bending = np.array([p @ bent, 0.0])
-    effort = pull - rate.T @ p + bending
+    # The slopes of theta v by x, at constant v: B depends on x alone.
+    slopes = -theta @ np.array([[0.0, -0.3 * np.sin(q[0])], [0.0, 0.0]]) @ theta @ v
+    bending = np.array([p @ slopes, 0.0])
+    effort = force - rate.T @ p + bending
     du = np.linalg.solve(mass, b.T @ effort)
     return b @ du + turning @ u
 
 
-def test_kinematics_of_unlike_units():
-    """u from v, and L written in u: by every program what it is in units of 1."""
+def test_kinematics_of_unlike_units_equal_those_of_equal_units():
+    """u from v, and L written in u: every program gives the result in units of 1."""
     quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))
     system = jl.System(swinging, ("x", "y"), quasi=quasi, written_in="u")
     units, speeds = np.array([1e5, 1e-6]), np.array([1.0, 1e-6])
@@ -110,7 +110,7 @@ def test_kinematics_of_unlike_units():
 
 
 @pytest.mark.full
-def test_motions_of_unlike_units():
+def test_formulations_agree_for_unlike_units():
     quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))
     motions = [
         jl.simulate(
@@ -137,18 +137,18 @@ def slanted(t, q, v, params):
 
 
 @pytest.mark.parametrize("derivative", [False, True])
-def test_velocities_from_quasi_velocities_of_unlike_units(derivative):
-    """There and back to rounding, though rows of dU/dv are 1e-9 from parallel."""
+def test_quasi_velocities_of_unlike_units_are_inverted_to_rounding(derivative):
+    """The round trip is exact to rounding, although rows of dU/dv are 1e-9 from parallel."""
     quasi = jl.QuasiVelocities(slanted, ("a", "b"))
     q, v = jnp.array([0.4, 0.1]), jnp.array([1.3e5, 0.7e-4])
 
-    def there_and_back(v):
+    def round_trip(v):
         return quasi.velocities(jnp.zeros(()), q, quasi.of(jnp.zeros(()), q, v, None), None)
 
     if derivative:
-        found = jax.jacrev(there_and_back)(v) @ v, jax.jvp(there_and_back, (v,), (v,))[1]
+        found = jax.jacrev(round_trip)(v) @ v, jax.jvp(round_trip, (v,), (v,))[1]
     else:
-        found = (there_and_back(v),)
+        found = (round_trip(v),)
     for x in found:
         np.testing.assert_allclose(x, v, rtol=1e-14)
 
@@ -157,7 +157,7 @@ SCALES = np.array([1.0, 1e-6, 1e6])
 
 
 def turned(x):
-    """In no row as in the others are the units of what enters it."""
+    """The units of the inputs differ from row to row."""
     c, s = jnp.cos(x), jnp.sin(x)
     return jnp.array([[1.6, 0.3 * s, 0.0], [0.0, 1.6, 0.3 * c], [0.3, 0.0, 1.6 + 0.4 * s]])
 
@@ -167,42 +167,44 @@ def round_about(t, q, u, params):
 
 
 def led_along(t, q, u, params):
-    """A fourth coordinate that the others lead."""
+    """A fourth coordinate that depends on the others."""
     w = u / SCALES
     more = 1e3 * (w[0] - jnp.sin(q[0]) * w[2])
     return jnp.append(SCALES * (turned(q[0]) @ w), more)
 
 
 @pytest.mark.parametrize(("kinematics", "n"), [(round_about, 3), (led_along, 4)])
-def test_quasi_velocities_by_kinematics_of_unlike_units(kinematics, n):
-    """There and back is the identity, its first and second derivatives too, in both modes."""
+def test_kinematics_of_unlike_units_are_inverted_to_rounding(kinematics, n):
+    """The round trip is the identity; so are its first and second derivatives, in both modes."""
     quasi = jl.QuasiVelocities(kinematics=kinematics, names=("a", "b", "c"))
     q, x, dx = jnp.full(n, 0.4), jnp.array([0.7, -0.3, 0.5]), jnp.array([0.1, 0.2, -0.4])
 
-    def there_and_back(q, x):
-        still = jnp.zeros(())
-        return quasi.of(still, q, quasi.velocities(still, q, SCALES * x, None), None) / SCALES
+    def round_trip(q, x):
+        t = jnp.zeros(())
+        return quasi.of(t, q, quasi.velocities(t, q, SCALES * x, None), None) / SCALES
 
-    def along(q, x):
-        return jax.jvp(there_and_back, (q, x), (jnp.ones(n), dx))[1]
+    def tangent(q, x):
+        return jax.jvp(round_trip, (q, x), (jnp.ones(n), dx))[1]
 
-    # Measured 2026-11-27: 6e-16. By derivatives of the factors 1e-5.
+    # Measured 2026-11-27: 6e-16. With derivatives of the factors: 1e-5.
     off = 1e-13
-    np.testing.assert_allclose(there_and_back(q, x), x, atol=off)
-    np.testing.assert_allclose(along(q, x), dx, atol=off)
-    np.testing.assert_allclose(jax.jvp(along, (q, x), (jnp.ones(n), dx))[1], np.zeros(3), atol=off)
-    of_q, of_x = jax.vjp(there_and_back, q, x)[1](jnp.ones(3))
+    np.testing.assert_allclose(round_trip(q, x), x, atol=off)
+    np.testing.assert_allclose(tangent(q, x), dx, atol=off)
+    np.testing.assert_allclose(
+        jax.jvp(tangent, (q, x), (jnp.ones(n), dx))[1], np.zeros(3), atol=off
+    )
+    of_q, of_x = jax.vjp(round_trip, q, x)[1](jnp.ones(3))
     np.testing.assert_allclose(of_q, np.zeros(n), atol=off)
     np.testing.assert_allclose(of_x, np.ones(3), atol=off)
 
 
 def off_the_way(t, q, u, params):
-    """In single precision; the second coordinate is led at twice the speed of the first."""
+    """In single precision; the second coordinate moves at twice the speed of the first."""
     return jnp.stack([u[0], 2.0 * u[0], 1e3 * (u[1] + 0.3 * u[0])])
 
 
-def test_velocities_that_kinematics_do_not_reach():
-    """Of tall kinematics the nearest, over the lengths of rows; its derivatives as well."""
+def test_velocities_outside_the_kinematics_are_projected():
+    """Tall kinematics take the nearest, relative to the lengths of rows; derivatives, too."""
     quasi = jl.QuasiVelocities(kinematics=off_the_way, names=("a", "b"))
     v = jnp.array([1.0, 1.0, 1e3], jnp.float32)
 
@@ -222,15 +224,15 @@ def uneven(t, q, v, params):
     return jnp.array([1e-6, 1e-4, 1e5]) * (C @ (v / jnp.array([1e6, 1e-6, 1e-4])))
 
 
-def test_velocities_are_refined_until_they_are_right():
-    """Measured 2026-11-27: 8e-16; with a single step of refinement 1e-10."""
+def test_velocities_are_refined_to_rounding():
+    """Measured 2026-11-27: 8e-16; with one step of refinement 1e-10."""
     quasi = jl.QuasiVelocities(uneven, ("a", "b", "c"))
     t, v = jnp.zeros(()), jnp.array([0.7e6, -0.3e-6, 0.5e-4])
     np.testing.assert_allclose(quasi.velocities(t, v, quasi.of(t, v, v, None), None), v, rtol=1e-13)
 
 
 def test_quasi_velocities_may_read_arrays_from_outside():
-    """As every other function may, those beside constrained names as well."""
+    """Like every other function, also with constrained names."""
     matrix = np.array([[0.5, -1.0], [2.0, 0.25]])
 
     def U(t, q, v, params):

@@ -1,4 +1,4 @@
-"""M bordered by constraint rows: both ways to solve, singular M, dependent rows, reactions."""
+"""M bordered by constraint rows: both formulations, singular M, dependent rows, reactions."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def scene(n, m, singular=False, seed=0):
 
 
 def dense(M, A, r, c):
-    """(x, lam) by one library solve of the whole, and the condition of that."""
+    """(x, lam) by one dense solve of the whole matrix, and its condition number."""
     n, m = len(M), len(A)
     K = np.block([[M, -A.T], [-A, np.zeros((m, m))]])
     z = np.linalg.solve(K, np.concatenate([r, c]))
@@ -38,8 +38,8 @@ def dense(M, A, r, c):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("singular", [False, True])
 @pytest.mark.parametrize(("n", "m"), mostly_full(SIZES, *SIZES[::2]))
-def test_solves_as_the_whole_matrix_does(n, m, singular, formulation):
-    """Also where M is singular, but positive on A x = 0."""
+def test_solve_equals_the_dense_solve(n, m, singular, formulation):
+    """Also for a singular M that is positive on A x = 0."""
     M, A, r, c = scene(n, m, singular)
     x, lam, condition = dense(M, A, r, c)
     found = jax.jit(lambda *a: solve_kkt(*a, formulation=formulation))(M, A, r, c)
@@ -50,21 +50,21 @@ def test_solves_as_the_whole_matrix_does(n, m, singular, formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_dependent_rows_are_left_out(formulation):
-    """Copies, multiples and sums of rows change x and A^T lam by rounding alone."""
+    """Copies, multiples and sums of rows change x and A^T lam only by rounding."""
     M, A, r, c = scene(6, 3, singular=True)
     x, lam, condition = dense(M, A, r, c)
     M, r = jnp.array(M), jnp.array(r)
     more = np.vstack([A, -3.0 * A[1], A[0] + A[2]])
     c_more = np.concatenate([c, [-3.0 * c[1], c[0] + c[2]]])
-    kept = independent_rows(M, jnp.array(more))
-    assert int(kept.sum()) == 3
-    found, reduced = solve_kkt(M, jnp.array(more), r, jnp.array(c_more), kept, formulation)
+    active_rows = independent_rows(M, jnp.array(more))
+    assert int(active_rows.sum()) == 3
+    found, reduced = solve_kkt(M, jnp.array(more), r, jnp.array(c_more), active_rows, formulation)
     allowed = 100 * EPS * condition * (norm(x) + norm(lam))
     np.testing.assert_allclose(found, x, atol=allowed)
     np.testing.assert_allclose(more.T @ reduced, A.T @ lam, atol=allowed)
-    assert (np.asarray(reduced)[~np.asarray(kept)] == 0).all()
+    assert (np.asarray(reduced)[~np.asarray(active_rows)] == 0).all()
 
-    # Least norm: no other multipliers of the same force are shorter, in the norm stated.
+    # Least norm: no other multipliers of the same force are smaller in this norm.
     shortest = np.asarray(least_norm(jnp.array(more), reduced))
     np.testing.assert_allclose(more.T @ shortest, A.T @ lam, atol=allowed)
     sizes = norm(more, axis=1)
@@ -75,10 +75,10 @@ def test_dependent_rows_are_left_out(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_derivatives_agree_with_differences(formulation):
-    """Forward, reverse and central, with a row left out, in all arguments."""
+    """Forward, reverse and central differences in all arguments, with one row left out."""
     M, A, r, c = scene(4, 2, singular=True, seed=1)
     A, c = np.vstack([A, 2.0 * A[0]]), np.append(c, 2.0 * c[0])
-    kept = jnp.array([True, True, False])
+    active_rows = jnp.array([True, True, False])
     rng = np.random.default_rng(2)
     dM = rng.normal(size=(4, 4))
     point = tuple(map(jnp.asarray, (M, A, r, c)))
@@ -86,7 +86,7 @@ def test_derivatives_agree_with_differences(formulation):
     move = tuple(map(jnp.asarray, move))
 
     def f(M, A, r, c):
-        return jnp.concatenate(solve_kkt(M, A, r, c, kept, formulation))
+        return jnp.concatenate(solve_kkt(M, A, r, c, active_rows, formulation))
 
     _, forward = jax.jvp(f, point, move)
     weights = jnp.arange(1.0, 8.0)
@@ -101,8 +101,8 @@ def test_derivatives_agree_with_differences(formulation):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_rows_that_became_dependent_are_told(formulation):
-    """Every component is NaN, and the health says which row."""
+def test_nearly_dependent_rows_give_nan_and_are_reported(formulation):
+    """Every component is NaN, and `healthy` is False for the dependent row."""
     M, A, r, c = scene(4, 1)
     A = jnp.array(np.vstack([A, A + 1e-8]))
     c = jnp.array([c[0], c[0]])
@@ -114,7 +114,7 @@ def test_rows_that_became_dependent_are_told(formulation):
     assert rank_floor(jnp.dtype(float)) > 1e-16
 
 
-def test_no_inertia_along_the_rows_is_told():
+def test_singular_mass_on_the_null_space_gives_nan():
     """M must be positive on A x = 0."""
     M = jnp.diag(jnp.array([1.0, 0.0, 0.0]))
     A = jnp.array([[0.0, 1.0, 0.0]])
@@ -126,7 +126,7 @@ def test_no_inertia_along_the_rows_is_told():
 # ---- Reactions -----------------------------------------------------------------------------------
 
 
-def test_forces_linear_in_the_multipliers_are_solved_for_at_once():
+def test_forces_linear_in_multipliers_equal_the_dense_solve():
     M, A, r, c = scene(5, 2, singular=True)
     G = 0.1 * np.random.default_rng(3).normal(size=(5, 2))
     K = np.block([[M, -(A.T + G)], [-A, np.zeros((2, 2))]])
@@ -136,8 +136,8 @@ def test_forces_linear_in_the_multipliers_are_solved_for_at_once():
     np.testing.assert_allclose(found, z, atol=100 * EPS * np.linalg.cond(K) * norm(z))
 
 
-def test_forces_by_the_size_of_a_multiplier_are_found_by_newton():
-    """Friction mu |lam| against either sign of lam, and its derivative."""
+def test_forces_by_the_size_of_a_multiplier_satisfy_the_equations():
+    """Friction mu |lam| for either sign of lam, and its derivative."""
     M, A, r, c = map(jnp.asarray, scene(3, 1))
     g = jnp.array([0.3, -0.2, 0.1])
 
@@ -154,7 +154,7 @@ def test_forces_by_the_size_of_a_multiplier_are_found_by_newton():
     np.testing.assert_allclose(jax.jvp(lambda r: solved(r)[0], (r,), (d,))[1], slope, atol=1e-8)
 
 
-def test_painleve():
+def test_painleve_paradox_gives_nan():
     """A rod on a rough floor: with mu above 4/3 at 45 degrees, A M^-1 (A^T + G) is negative."""
     M = jnp.diag(jnp.array([1.0, 1.0, 1.0 / 12]))
     s = c = 0.5 * np.sqrt(0.5)

@@ -1,4 +1,4 @@
-"""The solve with the mass matrix: unrolled up to n = 8, by rows up to n = 16, by library above.
+"""The solve with the mass matrix: unrolled up to n = 8, a loop up to n = 16, a library above.
 
 Elimination without pivoting is backward stable on symmetric positive definite matrices: the
 computed x solves a system whose M and r differ by some n EPS of their norms.
@@ -20,7 +20,7 @@ from jaxlag._linalg._mass_solve import (
 
 EPS = np.finfo(float).eps
 SIZES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 16, 17, 18)
-WAYS = (3, UNROLL_UP_TO + 2, LOOP_UP_TO + 2)  # one size for each way of solving
+WAYS = (3, UNROLL_UP_TO + 2, LOOP_UP_TO + 2)  # one size for each algorithm
 
 
 @jax.jit
@@ -38,7 +38,7 @@ def unhealthy(M):
 
 
 def definite(rng, n, condition):
-    """Symmetric, eigenvalues from 1 down to 1/condition along random axes."""
+    """Symmetric matrix with eigenvalues from 1 down to 1/condition along random axes."""
     axes, _ = np.linalg.qr(rng.normal(size=(n, n)))
     M = (axes * np.geomspace(1.0, 1.0 / condition, n)) @ axes.T
     return (M + M.T) / 2
@@ -73,7 +73,7 @@ def test_solve_works_in_single_precision():
 
 
 @pytest.mark.parametrize("n", WAYS)
-def test_a_given_factor_serves_any_right_hand_side(n):
+def test_factor_is_reusable_for_any_right_hand_side(n):
     rng = np.random.default_rng(n)
     M, R = definite(rng, n, 10.0), rng.normal(size=(3, n))
     X = jax.jit(lambda M, R: [solve_mass(M, r, factor) for factor in [factor_mass(M)] for r in R])
@@ -84,37 +84,37 @@ def test_a_given_factor_serves_any_right_hand_side(n):
 # ---- Not positive definite ---------------------------------------------------------------------
 
 
-def with_pivot(rng, n, bad, pivot):
-    """Symmetric with elimination pivots 1, but `pivot` at `bad`: L D L^T in whole numbers."""
+def with_pivot(rng, n, index, pivot):
+    """Symmetric with elimination pivots 1 except `pivot` at `index`: L D L^T of integers."""
     L = np.tril(rng.integers(-2, 3, (n, n)), -1) + np.eye(n)
-    D = np.where(np.arange(n) == bad, pivot, 1.0)
+    D = np.where(np.arange(n) == index, pivot, 1.0)
     return (L * D) @ L.T
 
 
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("pivot", [0.0, -1.0, np.nan])
-def test_the_first_bad_pivot_is_named_and_the_solution_is_nan(n, pivot):
+def test_first_nonpositive_pivot_is_reported_and_solution_is_nan(n, pivot):
     rng = np.random.default_rng(n)
-    for bad in range(n):
-        M = with_pivot(rng, n, bad, 1.0)
+    for index in range(n):
+        M = with_pivot(rng, n, index, 1.0)
         if np.isnan(pivot):
-            M[bad, bad] = np.nan
+            M[index, index] = np.nan
         else:
-            M = with_pivot(rng, n, bad, pivot)
-        assert unhealthy(M) == bad
+            M = with_pivot(rng, n, index, pivot)
+        assert unhealthy(M) == index
         assert np.all(np.isnan(solve(M, np.ones(n))))
 
 
 @pytest.mark.parametrize("n", SIZES)
 def test_the_coordinate_without_inertia_is_named(n):
-    for bad in range(n):
-        M = np.diag(np.where(np.arange(n) == bad, 0.0, 2.0))
-        assert unhealthy(M) == bad
+    for index in range(n):
+        M = np.diag(np.where(np.arange(n) == index, 0.0, 2.0))
+        assert unhealthy(M) == index
         assert np.all(np.isnan(solve(M, np.ones(n))))
 
 
 def of_rank_less_one(rng, n):
-    """The last row is a combination of the others, which are well conditioned."""
+    """The last row is a linear combination of the others, which are well conditioned."""
     M = np.zeros((n, n))
     M[:-1, :-1] = definite(rng, n - 1, 4.0)
     combination = rng.uniform(-1.0, 1.0, n - 1)
@@ -124,14 +124,14 @@ def of_rank_less_one(rng, n):
 
 
 @pytest.mark.parametrize("n", SIZES[1:])
-def test_a_singular_matrix_is_found_through_its_rounding(n):
-    """Of rank n - 1, the rest well conditioned: the last pivot is rounding, of either sign."""
+def test_singular_matrices_are_detected_despite_rounding(n):
+    """Rank n - 1, otherwise well conditioned: the last pivot is rounding, of either sign."""
     for seed in range(10):
         assert unhealthy(of_rank_less_one(np.random.default_rng([n, seed]), n)) == n - 1
 
 
 @pytest.mark.parametrize("n", WAYS)
-def test_a_bad_matrix_in_a_batch_harms_no_other(n):
+def test_indefinite_matrix_in_a_batch_does_not_affect_others(n):
     rng = np.random.default_rng(n)
     M = np.stack([definite(rng, n, 10.0), with_pivot(rng, n, 1, -1.0), definite(rng, n, 10.0)])
     r = rng.normal(size=(3, n))
@@ -145,8 +145,8 @@ def test_a_bad_matrix_in_a_batch_harms_no_other(n):
 
 
 @pytest.mark.parametrize("n", WAYS)
-def test_units_of_the_coordinates_change_nothing(n):
-    """M -> D M D, r -> D r gives x -> x/D: exactly, where D are powers of two, 1e-6 to 1e6."""
+def test_solution_scales_with_units_of_coordinates(n):
+    """M -> D M D, r -> D r gives x -> x/D: exactly for powers of two D from 1e-6 to 1e6."""
     rng = np.random.default_rng(n)
     M, r = definite(rng, n, 100.0), rng.normal(size=n)
     D = 2.0 ** np.round(np.linspace(-20, 20, n))[rng.permutation(n)]
@@ -158,7 +158,7 @@ def test_units_of_the_coordinates_change_nothing(n):
 
 
 @pytest.mark.parametrize(("upper", "lower"), [(1.0, 1e8), (1e8, 1.0), (1.0, 1e12), (1e12, 1.0)])
-def test_extreme_mass_ratios_are_healthy(upper, lower):
+def test_extreme_mass_ratios_are_positive_definite(upper, lower):
     """A straight double pendulum of unit links: M = [[m1 + m2, m2], [m2, m2]], det = m1 m2."""
     M, r = np.array([[upper + lower, lower], [lower, lower]]), np.array([1.0, 3.0])
     assert unhealthy(M) == -1
@@ -181,14 +181,14 @@ def test_derivatives_are_those_of_the_inverse(n):
     """x' = y(r' - M' x) and x'' = y(r'' - M'' x - 2 M' x') with y = M^-1, forward and reverse."""
     M, r, w = curve(np.random.default_rng(n), n)
 
-    def along(s):
+    def solution_at(s):
         powers = jnp.array([1.0, s, s**2 / 2])
         return solve_mass(jnp.tensordot(powers, np.stack(M), 1), powers @ r)
 
     def weighted(s):
-        return w @ along(s)
+        return w @ solution_at(s)
 
-    x, x1 = jax.jit(lambda: jax.jvp(along, (0.0,), (1.0,)))()
+    x, x1 = jax.jit(lambda: jax.jvp(solution_at, (0.0,), (1.0,)))()
     expected1 = np.linalg.solve(M[0], r[1] - M[1] @ x)
     expected2 = np.linalg.solve(M[0], r[2] - M[2] @ x - 2 * M[1] @ expected1)
     condition = np.linalg.cond(M[0])
@@ -223,7 +223,7 @@ def test_second_derivatives_agree_with_differences(n):
     second, third, low, high = jax.jit(
         lambda: (jax.grad(first)(0.0), jax.grad(jax.jacfwd(first))(0.0), first(-h), first(h))
     )()
-    # Truncation is h^2/6 of the derivative after next, some kappa times the next one.
+    # The truncation error is h^2/6 times the fourth derivative, about kappa times the third.
     condition = np.linalg.cond(M[0])
     atol = h**2 * condition * abs(third) + 10 * n * EPS * condition * max(abs(low), abs(high)) / h
     np.testing.assert_allclose(second, (high - low) / (2 * h), rtol=0, atol=atol)
@@ -231,7 +231,7 @@ def test_second_derivatives_agree_with_differences(n):
 
 
 @pytest.mark.parametrize("n", WAYS)
-def test_cotangents_are_the_outer_product(n):
+def test_cotangent_of_mass_matrix_is_an_outer_product(n):
     """Of w . x: lam = M^-1 w for r, and -lam x^T for M."""
     rng = np.random.default_rng(n)
     M, r, w = definite(rng, n, 30.0), rng.normal(size=n), rng.normal(size=n)

@@ -1,4 +1,4 @@
-"""Projection keeps the order of a solver, and leaves nothing but rounding."""
+"""Projection preserves the order of a solver and satisfies constraints to rounding."""
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ from jaxlag._linalg._projection import ConstraintProjector, project
     ("method", "order", "steps"),
     [("tsit5", 5, (60, 120)), ("bosh3", 3, (200, 400)), ("heun", 2, (400, 800))],
 )
-def test_the_order_is_kept(method, order, steps):
-    """Slope of the error, over several rows, against the motion of the angles."""
+def test_projection_preserves_the_order(method, order, steps):
+    """Order from the errors at several saves; the reference is the motion in angles."""
     ts = [0.0, 0.5, 1.0, 1.5, 2.0]
     exact = jl.simulate(minimal, THETA, OMEGA, ts, BOBS, rtol=1e-13, atol=1e-13)
     q_exact, _ = jax.vmap(to_cartesian)(exact.q, exact.v)
@@ -53,21 +53,21 @@ def circle(q):
 
 
 @pytest.mark.parametrize("off", [1e-12, 1e-6, 1e-3, 0.1])
-def test_a_projection_ends_on_the_surface(off):
-    """From near and far: phi and its rate at rounding; along the normals of the start."""
+def test_projection_satisfies_the_constraints(off):
+    """From near and far: phi and its rate are rounding; corrections follow the initial normals."""
     q, v = (1 + off) * jnp.array([0.6, 0.8]), jnp.array([0.3, 0.1])
     surface = circle(q)
     on, rate, found = project(surface, q, v)
     assert found
-    # From far off 12 turns that gain one digit each are not quite enough for rounding.
+    # From far off, 12 iterations that gain one digit each do not quite reach rounding.
     allowed = 1e-13 if off == 0.1 else 2e-15
     assert abs(on @ on - 1) <= allowed
     assert abs(on @ rate) <= allowed
     np.testing.assert_allclose(on, [0.6, 0.8], atol=allowed)
 
 
-def test_far_from_the_surface_none_is_found():
-    """No point satisfies the residual: said so, after a bounded number of turns."""
+def test_projection_without_solution_is_not_found():
+    """No point satisfies the residual: `found` is False after a bounded number of iterations."""
     q = jnp.array([0.6, 0.8])
     shifted = circle(q)._replace(position=lambda x: jnp.stack([x @ x + 1.0]))
     _, _, found = project(shifted, q, jnp.zeros(2))
@@ -75,8 +75,8 @@ def test_far_from_the_surface_none_is_found():
 
 
 @pytest.mark.parametrize("off", [1e-9, 1e-3, 0.03])
-def test_the_derivative_is_that_of_the_solved_equations(off):
-    """Whatever number of turns it took: against differences, and mutated it is caught."""
+def test_derivative_equals_that_of_the_solved_equations(off):
+    """For any number of iterations, compared with differences; the next test mutates it."""
 
     def projected(q, differentiable=True):
         surface = circle(q)
@@ -92,8 +92,8 @@ def test_the_derivative_is_that_of_the_solved_equations(off):
     np.testing.assert_allclose(back @ d, jnp.array([1.0, 2.0]) @ forward, rtol=1e-12)
 
 
-def test_without_its_sweeps_the_derivative_is_wrong(monkeypatch):
-    """A mutation: mu frozen, as if the way onto the surface did not depend on the start."""
+def test_derivative_without_sweeps_is_wrong(monkeypatch):
+    """A mutation: mu is constant, as if the path to the surface did not depend on the start."""
     monkeypatch.setattr(_projection, "SWEEPS", 0)
     q = jnp.array([0.66, 0.88])
 
@@ -107,8 +107,8 @@ def test_without_its_sweeps_the_derivative_is_wrong(monkeypatch):
     assert np.abs(forward - slope).max() > 1e-3
 
 
-def test_saved_rows_are_projected():
-    """Rows inside a step, too: none of them is an end of a step here."""
+def test_saved_states_are_projected():
+    """Also saves inside a step."""
     system, q0, v0, params = double_pendulum()
     ts = jnp.array([0.0, 0.13, 0.37, 0.7])
     found = jl.simulate(system, q0, v0, ts, params, dt=0.1, method="heun")

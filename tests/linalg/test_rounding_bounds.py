@@ -1,4 +1,4 @@
-"""What numbers that are 0 but for rounding are made of, and rows of such numbers."""
+"""Rounding bounds of values that vanish up to rounding, and constraint rows of such values."""
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,13 @@ def identity(q):
 
 
 def tilted(q):
-    """The third component, in the axes of a tilted plane, of a vector in that plane."""
+    """The normal component of a vector in a tilted plane, in the axes of the plane."""
     R = jnp.asarray(TILT, q.dtype)
     return (R.T @ (R @ jnp.stack([jnp.cos(q[0]) + q[1], jnp.sin(q[0]), 0.0 * q[0]])))[2]
 
 
 def converged(q):
-    """By Newton's method in a loop, whose roundings do not pile up: the root of 2 is left."""
+    """Newton's method in a loop: rounding does not accumulate; that of sqrt(2) remains."""
     return jax.lax.fori_loop(0, 20, lambda _, x: x - (x * x - 2.0) / (2.0 * x), q[0]) - q[1]
 
 
@@ -40,8 +40,8 @@ def converged(q):
         (lambda q: jnp.ones(1000, q.dtype) @ jnp.full(1000, q[1]) - 1300.0, 1300.0),
     ],
 )
-def test_rounding_is_that_of_the_terms(function, size, dtype):
-    """Within a factor of 4 either way; and what rounding leaves is no more than 4 of it."""
+def test_rounding_bound_has_the_size_of_the_terms(function, size, dtype):
+    """The bound is right within a factor of 4; values that vanish are below 4 times the bound."""
     q, eps = jnp.array([0.3, 1.3], dtype), float(jnp.finfo(dtype).eps)
     value, rounding = jax.jit(lambda q: with_rounding(function, q))(q)
     assert float(value) == float(jax.jit(function)(q))
@@ -53,7 +53,7 @@ def test_rounding_is_that_of_the_terms(function, size, dtype):
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_rows_that_are_rounding_everywhere_are_void(dtype):
-    """And what vanishes at one place, is small, or is scaled down, is not."""
+    """Rows that vanish at one state only, and small or scaled rows, are not void."""
 
     def rows(q):
         functions = [identity, tilted, lambda q: q[1] ** 2, lambda q: 1e-9 * (q[0] - q[1])]
@@ -61,13 +61,13 @@ def test_rows_that_are_rounding_everywhere_are_void(dtype):
 
     for q in ([0.3, 0.0], [2.0, 0.0], [-1.1, 0.0]):
         q = jnp.array(q, dtype)
-        there, void, size = row_sizes(rows, q, rows(q))
-        assert there.tolist() == [False, False, False, True]
+        nonzero, void, size = row_sizes(rows, q, rows(q))
+        assert nonzero.tolist() == [False, False, False, True]
         assert void.tolist() == [True, True, False, False]
         assert float(size[1]) > 0.1
-    q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometers
-    there, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
-    assert there.tolist() == [True]
+    q = jnp.array([1e-6, -2e-6], dtype)  # a mechanism of micrometer size
+    nonzero, void, _ = row_sizes(lambda q: jax.jacrev(lambda q: (q @ q)[None])(q), q, 2.0 * q[None])
+    assert nonzero.tolist() == [True]
     assert void.tolist() == [False]
 
 
@@ -86,7 +86,7 @@ ROD = jl.Holonomic(rod, "rod")
 
 
 def like(q, x):
-    """Time is double, whatever the state is."""
+    """Cast to the dtype of q: time is always float64."""
     return jnp.asarray(x, q.dtype)
 
 
@@ -102,7 +102,7 @@ SHORT = {"dt": 0.02, "method": "tsit5", "throw": False}
 
 
 def systems(kind, alone, lowering="auto"):
-    """(with the row, without it)."""
+    """(system with the row, system without it)."""
     others = () if alone else (ROD,)
     rows = (*others, VOID[kind]), others
     return tuple(jl.System(falling, ("x", "y"), constraints=r, lowering=lowering) for r in rows)
@@ -128,7 +128,7 @@ def systems(kind, alone, lowering="auto"):
         ("Pfaffian", True, {}),
     ),
 )
-def test_a_row_that_says_nothing_changes_nothing(kind, alone, options, dtype):
+def test_void_rows_change_nothing(kind, alone, options, dtype):
     options = dict(options)
     system, without = systems(kind, alone, options.pop("lowering", "auto"))
     q, v, ts = (jnp.asarray(x, dtype) for x in (*START, [0.0, 0.1]))
@@ -147,11 +147,11 @@ def test_a_row_that_says_nothing_changes_nothing(kind, alone, options, dtype):
     ("kind", "alone"),
     mostly_full([(k, a) for k in VOID for a in (False, True)], ("led", True), ("holonomic", False)),
 )
-def test_a_row_that_says_what_cannot_be_is_told(kind, alone, gap):
-    """In its place, rate or acceleration."""
+def test_contradictory_rows_are_reported(kind, alone, gap):
+    """In position, rate or acceleration."""
     system, _ = systems(kind, alone)
     found = jl.simulate(system, *START, [0.0, 0.1], gap, **SHORT)
-    if kind == "holonomic" and gap < 1e-6:  # of t^2: so little that no step sees it
+    if kind == "holonomic" and gap < 1e-6:  # times t^2: too small for a step to detect
         gap = 1e-3
         found = jl.simulate(system, *START, [0.0, 0.1], gap, **SHORT)
     assert found.status == jl.Status.contradictory_rows
@@ -159,7 +159,7 @@ def test_a_row_that_says_what_cannot_be_is_told(kind, alone, gap):
 
 
 @pytest.mark.parametrize("stabilization", mostly_full(["projection", None], "projection"))
-def test_a_row_that_says_so_later_is_told(stabilization):
+def test_rows_that_become_contradictory_are_reported(stabilization):
     late = jl.Holonomic(lambda t, q, p: identity(q) + jnp.maximum(t - 0.05, 0.0) ** 2, "late")
     system = jl.System(falling, ("x", "y"), constraints=(late,))
     found = jl.simulate(system, *START, [0.0, 0.1], stabilization=stabilization, **SHORT)
@@ -167,8 +167,8 @@ def test_a_row_that_says_so_later_is_told(stabilization):
     assert 0.03 < found.last_time < 0.07
 
 
-def test_a_closure_in_a_tilted_plane():
-    """Assembled, at rest, and in a batch: its third row is 0 = 0."""
+def test_closure_in_a_tilted_plane_has_one_void_row():
+    """Assembly, equilibrium and a batch: the third row is 0 = 0."""
 
     def closure(t, q, params):
         R = jnp.asarray(TILT, q.dtype)
@@ -195,8 +195,8 @@ def test_a_closure_in_a_tilted_plane():
     np.testing.assert_allclose(energy[:, 1], energy[:, 0], atol=1e-6)
 
 
-def test_terms_that_cancel_are_no_contradiction():
-    """gamma is 2e3 (v_z^2 - v_y^2): it is 0 but for the rounding of its terms."""
+def test_canceling_terms_are_not_contradictory():
+    """gamma is 2e3 (v_z^2 - v_y^2): its terms cancel to rounding."""
 
     def weighted(t, q, params):
         r = q[0] - 1e3 * q[1] ** 2 + 1e3 * q[2] ** 2
@@ -211,7 +211,7 @@ def test_terms_that_cancel_are_no_contradiction():
         motion = jl.simulate(system, *state, [0.0, 0.1], 0.0, **SHORT)
         assert motion.status == jl.Status.ok, motion.message()
         np.testing.assert_allclose(motion.q[-1], [0.0, y + 0.07, y + 0.07], atol=1e-12)
-    # A row that bends away from the other as the motion goes is told.
+    # A row that deviates from the other during the motion is reported.
     state = [0.0, 0.3, 0.2], [0.28, 0.7, 0.7]
     offset = jl.Holonomic(
         lambda t, q, p: weighted(t, q, p) - jnp.array([-50.0, -50.0 * (2.0 + jnp.sin(q[1]))]),

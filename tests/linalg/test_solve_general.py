@@ -1,4 +1,4 @@
-"""The solve with matrices that are not symmetric, on the graph and on arrays."""
+"""The solve with nonsymmetric matrices, on the graph and on arrays."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +11,8 @@ from jaxlag._lowering._symbolic._evaluate import evaluate
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
-def test_matrices_that_are_not_symmetric_are_eliminated(m):
-    """On the graph as on arrays; told where a leading minor is not positive."""
+def test_nonsymmetric_matrices_are_eliminated(m):
+    """The graph agrees with arrays; leading minors that are not positive are reported."""
     graph, rng = Graph(), np.random.default_rng(m)
     S = [[graph.input("q", m * k + j) for j in range(m)] for k in range(m)]
     right = [graph.input("v", k) for k in range(m)]

@@ -8,7 +8,7 @@ from jaxlag._lowering import ScalarProgram
 
 
 def lowered(system, params=None):
-    """For a state of its quasi-velocities, where it has any."""
+    """With quasi-velocities as the state, if the system has any."""
     program = system._program
     assert isinstance(program, ScalarProgram)
     if system.quasi is not None:

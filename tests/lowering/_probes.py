@@ -18,7 +18,7 @@ def doubled(x):
 
 @doubled.defjvp
 def _(primals, tangents):
-    """Twice the true derivative, to tell the rule from the primal."""
+    """Twice the true derivative, to distinguish the rule from the primal."""
     (x,), (dx,) = primals, tangents
     return doubled(x), 2.0 * jnp.cos(x) * dx
 
@@ -36,11 +36,11 @@ def _(primals, tangents):
 
 
 def unrolled_scan(x):
-    def turn(carry, row):
-        return carry * jnp.cos(row) + row, carry * row
+    def body(carry, entry):
+        return carry * jnp.cos(entry) + entry, carry * entry
 
-    last, rows = lax.scan(turn, x[0], x)
-    return last + rows @ WEIGHTS
+    last, entries = lax.scan(body, x[0], x)
+    return last + entries @ WEIGHTS
 
 
 def reversed_scan(x):
@@ -153,7 +153,7 @@ PROBES = {
     "constant": lambda x: jnp.sum(WEIGHTS) + 0.0 * x[0],
 }  # fmt: skip
 
-# What has no scalar form, and the primitive that the reason names.
+# Functions without a scalar form, and the primitive that the reason names.
 FALLBACKS = {
     "sort": (lambda x: jnp.sort(x) @ WEIGHTS, "sort"),
     "index by argmax": (lambda x: x[jnp.argmax(x)], "index that depends on values"),

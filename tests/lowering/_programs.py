@@ -1,4 +1,4 @@
-"""Programs of a solve: what is computed once, at every evaluation, and in all."""
+"""Programs of a solve: the part before the loop, one evaluation, and the whole."""
 
 from typing import Any, NamedTuple
 
@@ -14,8 +14,9 @@ from systems.catalogue import ENTRIES
 
 SCALAR = {"add", "sub", "mul", "div", "neg", "sincos", "sqrt", "tanh", "gt", "and", "select_n"}
 PACKING = {"slice", "squeeze", "stack", "reshape", "jit", "custom_jvp_call"}
-# Divisions of a step itself: 1/h; by that, of the gains of q and v, their errors and what these do
-# not see; the error over its tolerance, two in the factor by which h changes.
+# Divisions of the step-size control: 1/h; with it, those of the increments of q and v, of their
+# errors and of the errors of unweighted stages; the error over its tolerance; two in the factor of
+# h.
 STEP = 9
 
 
@@ -48,13 +49,13 @@ def floats(values):
 
 
 def prelude(case):
-    """The operations done once per solve."""
+    """Operations done once per solve."""
     system, params, q, inputs = case
     return operations(lambda params: system._program.precompute(q, params, inputs), params)
 
 
 def evaluation(case, regular=False):
-    """The operations of one acceleration inside a solve; whether M is known to be regular."""
+    """Operations of one acceleration inside a solve; `regular` if M is known to be regular."""
     system, params, q, inputs = case
     program = system._program.regular() if regular else system._program
     constants = program.precompute(q, params, inputs)
@@ -66,7 +67,7 @@ def evaluation(case, regular=False):
 
 
 def solve(case):
-    """A solve as a function of (params, q0, v0), and such arguments."""
+    """A solve as a function of (params, q0, v0), and its arguments."""
     system, params, q0, inputs = case
 
     def end(params, q0, v0):

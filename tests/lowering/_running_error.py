@@ -1,8 +1,8 @@
 """Running error bounds of a graph, and its exact values to 50 digits.
 
-Every node carries its value in double precision, its value in 50 digits, and a first-order bound
-on the difference: what the errors of its operands become, and its own rounding (Higham, Accuracy
-and Stability of Numerical Algorithms, sec. 3.3).
+Every node has its value in double precision, its value in 50 digits, and a first-order bound on the
+difference: the propagated errors of its operands and its own rounding (Higham, Accuracy and
+Stability of Numerical Algorithms, sec. 3.3).
 """
 
 import operator
@@ -15,14 +15,14 @@ from jaxlag._lowering._graph._expression import order
 
 U = 2.0**-53
 DIGITS = 50
-ULPS = 2.0  # of a function of numpy's or XLA's
+ULPS = 2.0  # of a function of numpy or XLA
 
 _TRUTHS = {name: getattr(operator, name) for name in ("gt", "ge", "lt", "le", "eq", "ne", "and_")}
 _TRUTHS["and"] = _TRUTHS.pop("and_")
 _NAMES = {"log": "ln", "atan2": "atan2", "asin": "asin", "acos": "acos", "atan": "atan"}
 
 
-class Carried(NamedTuple):
+class BoundedValue(NamedTuple):
     """A number in double precision, in 50 digits, and a bound on the difference."""
 
     value: float
@@ -30,7 +30,7 @@ class Carried(NamedTuple):
     bound: float
 
 
-def carried(roots, inputs):
+def evaluate_with_bounds(roots, inputs):
     """The roots at inputs {(name, index): double}, which count as exact."""
     known = {}
     with mpmath.workdps(DIGITS):
@@ -41,12 +41,12 @@ def carried(roots, inputs):
 
 
 def _const(node, args, inputs):
-    return Carried(float(node.data), mpmath.mpf(float(node.data)), 0.0)
+    return BoundedValue(float(node.data), mpmath.mpf(float(node.data)), 0.0)
 
 
 def _input(node, args, inputs):
     x = float(inputs[node.data])
-    return Carried(x, mpmath.mpf(x), 0.0)
+    return BoundedValue(x, mpmath.mpf(x), 0.0)
 
 
 def _sum(node, args, inputs):
@@ -57,7 +57,7 @@ def _sum(node, args, inputs):
         value += part
         exact += mpmath.mpf(c) * x.exact
         bound += abs(c) * x.bound + U * (abs(value) + (abs(part) if abs(c) != 1.0 else 0.0))
-    return Carried(value, exact, bound)
+    return BoundedValue(value, exact, bound)
 
 
 def _product(node, args, inputs):
@@ -69,22 +69,22 @@ def _product(node, args, inputs):
         value *= power
         exact *= x.exact**e
         bound += U * abs(value)
-    return Carried(value, exact, bound)
+    return BoundedValue(value, exact, bound)
 
 
 def _call(node, args, inputs):
     name = node.data.name
     if name in _TRUTHS:
-        return Carried(*[_TRUTHS[name](*(x[k] for x in args)) for k in range(2)], 0.0)
+        return BoundedValue(*[_TRUTHS[name](*(x[k] for x in args)) for k in range(2)], 0.0)
     function = getattr(mpmath, _NAMES.get(name, name))
     exact = function(*(x.exact for x in args))
     value = float(function(*(mpmath.mpf(x.value) for x in args)))
     bound = ULPS * U * abs(value)
     for k, x in enumerate(args):
         point = [mpmath.mpf(y.value) for y in args]
-        along = lambda z, k=k, point=point: function(*point[:k], z, *point[k + 1 :])  # noqa: E731
-        bound += abs(float(mpmath.diff(along, point[k]))) * x.bound if x.bound else 0.0
-    return Carried(value, exact, bound)
+        function_of_one = lambda z, k=k, point=point: function(*point[:k], z, *point[k + 1 :])  # noqa: E731
+        bound += abs(float(mpmath.diff(function_of_one, point[k]))) * x.bound if x.bound else 0.0
+    return BoundedValue(value, exact, bound)
 
 
 def _select(node, args, inputs):
@@ -102,7 +102,7 @@ _OPS |= {"let": _same, "stop": _same}
 
 
 def rounded(roots, inputs, dtype):
-    """The roots in the arithmetic of a dtype, overflow and all."""
+    """The roots in the arithmetic of a dtype, including overflow."""
     known = {}
     with np.errstate(all="ignore"):
         for node in order(roots):
@@ -123,7 +123,7 @@ def _round(node, args, inputs, dtype):
     if node.op == "product":
         over, under = dtype(1), dtype(1)
         for x, (_, e) in zip(args, node.data, strict=True):
-            for _ in range(abs(e)):  # as the program does it, one factor after the other
+            for _ in range(abs(e)):  # as the program does it, factor by factor
                 over, under = (over * x, under) if e > 0 else (over, under * x)
         return over / under
     if node.op == "select":

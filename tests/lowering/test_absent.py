@@ -1,4 +1,4 @@
-"""What a program leaves out where there is nothing to compute."""
+"""Operations that a program omits if there is nothing to compute."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from jaxlag._lowering import ArrayTerms, State
 
 
 def coupled(t, q, v, params):
-    """Three masses on a line, geared together, each on a spring."""
+    """Three masses on a line, coupled by gears, each on a spring."""
     M = jnp.diag(params["m"]) + params["J"] * jnp.ones((3, 3))
     return 0.5 * v @ M @ v - 0.5 * params["k"] * (q @ q)
 
@@ -38,17 +38,17 @@ def geared(k=3.0, m=(1.0, 1.5, 0.7), lagrangian=coupled, forces=()):
 
 @pytest.mark.parametrize("of", [geared, lambda: case("two_mass_three_springs")])
 def test_a_constant_mass_matrix_is_eliminated_before_the_loop(of):
-    """Divisions and the sign of the pivots are in the prelude; none is left inside."""
+    """Divisions and signs of pivots are computed before the loop, none inside."""
     before, each = prelude(of()), evaluation(of())
     assert count(before, "div") > 0
     assert count(before, "gt") > 0
     assert count(each, "div", "gt", "select_n") == 0
     end, start = solve(of())
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     assert count(step, "div") == STEP
 
 
-def test_what_depends_on_params_alone_is_computed_before_the_loop():
+def test_terms_of_params_alone_are_computed_before_the_loop():
     """Functions and powers of params, in L and in forces."""
 
     def lagrangian(t, q, v, params):
@@ -67,11 +67,11 @@ def test_what_depends_on_params_alone_is_computed_before_the_loop():
     assert count(each, "div") == 0
 
 
-# ---- What is not there ---------------------------------------------------------------------------
+# ---- Omitted parts -------------------------------------------------------------------------------
 
 
 def test_no_force_code_without_forces():
-    """Every force adds to the program; without any the params of forces need not exist."""
+    """Every force adds to the program; params of absent forces need not exist."""
 
     def drag(t, q, v, params):
         return -params["c"] * jnp.tanh(v)
@@ -95,8 +95,8 @@ def test_no_force_code_without_forces():
     assert len(bare) < len(dragged) < len(waved)
 
 
-def test_no_table_is_searched_where_there_is_none():
-    """A solve whose input is a number has none of the searches and reads that tables need."""
+def test_solves_without_tables_have_no_searches():
+    """A solve with a number as input has no searches and reads of tables."""
     searches = {"dynamic_slice", "gather", "scatter", "dynamic_update_slice"}
     motion = MOTIONS["driven_pendulum"]
 
@@ -106,7 +106,7 @@ def test_no_table_is_searched_where_there_is_none():
                 motion.system, q0, [0.0], [0.0, 1.0], motion.params, inputs=inputs, throw=False
             ).q
 
-        return loop(operations(end, motion.q0, turns=1))
+        return loop(operations(end, motion.q0, iterations=1))
 
     plain, table = step({"tau": jnp.array(0.3)}), step(motion.inputs)
     assert names(plain).isdisjoint(searches)
@@ -114,8 +114,8 @@ def test_no_table_is_searched_where_there_is_none():
     assert len(plain) < len(table)
 
 
-def test_no_bias_is_computed_where_it_is_zero():
-    """Free bodies geared together: zeros, or NaN where M is singular, and no arithmetic."""
+def test_zero_bias_has_no_arithmetic():
+    """Free bodies coupled by gears: zeros, or NaN for a singular M, and no arithmetic."""
 
     def free(t, q, v, params):
         return coupled(t, q, v, params | {"k": 0.0})
@@ -124,8 +124,8 @@ def test_no_bias_is_computed_where_it_is_zero():
     assert "mul" in names(evaluation(geared()))
 
 
-def test_time_is_not_read_where_nothing_depends_on_it():
-    """The clock enters no operation of the evaluation."""
+def test_time_is_read_only_if_the_equations_depend_on_it():
+    """No operation of the evaluation reads t."""
 
     def reads_time(lagrangian):
         system, params, q, _ = geared(lagrangian=lagrangian)
@@ -141,7 +141,7 @@ def test_time_is_not_read_where_nothing_depends_on_it():
         return coupled(t, q, v, params) + jnp.cos(t) * q[0]
 
     def total_derivative(t, q, v, params):
-        """L + d/dt sin(t): other numbers, the same equations."""
+        """L + d/dt sin(t): another L with the same equations."""
         return coupled(t, q, v, params) + jnp.cos(t)
 
     assert not reads_time(coupled)
@@ -150,8 +150,8 @@ def test_time_is_not_read_where_nothing_depends_on_it():
 
 
 @pytest.mark.parametrize("chosen", ["scalar", "array"])
-def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
-    """Rows and gamma are never asked for; no array has the size of M with rows appended."""
+def test_systems_without_constraints_evaluate_no_rows(chosen, monkeypatch):
+    """Rows and gamma are never evaluated; no array has the size of M with rows appended."""
 
     def asked(*args):
         raise AssertionError("constraint rows of a system without constraints")
@@ -184,13 +184,13 @@ def test_no_constraint_is_evaluated_where_there_is_none(chosen, monkeypatch):
     ],
 )
 def test_values_of_params_do_not_change_the_program(special):
-    """One program, operation by operation, for L declared anew, so that no cache decides."""
+    """One program, operation by operation; L is declared anew, so that no cache is used."""
 
     def program(**values):
         def fresh(t, q, v, params):
             return coupled(t, q, v, params)
 
         end, start = solve(geared(lagrangian=fresh, **values))
-        return operations(end, *start, turns=1)
+        return operations(end, *start, iterations=1)
 
     assert program(**special) == program()

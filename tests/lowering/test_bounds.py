@@ -1,4 +1,4 @@
-"""What the scalar program loses of L as it is written: by error bounds, in 50 digits, in range."""
+"""Accuracy of the scalar program relative to L as written: bounds, 50 digits, range."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from _families import mostly_full
-from _running_error import U, carried, rounded
+from _running_error import U, evaluate_with_bounds, rounded
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES
@@ -18,11 +18,11 @@ from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._read_system import read_scene
 from systems.catalogue import ENTRIES
 
-WORSE = 4.0  # the bound of the program may be so many times that of L as it is written
+WORSE = 4.0  # largest ratio of the error bound of the program to that of L as written
 
 
 def bead(t, q, v, p):
-    """On r = R sin(theta)^2, turning about the axis, from its position."""
+    """On r = R sin(theta)^2, rotating about the axis, by its position."""
 
     def position(q):
         s, c = jnp.sin(q[0]), jnp.cos(q[0])
@@ -56,7 +56,7 @@ def case(name):
         scene = SCENES[name]
         return jl.System(scene.lagrangian, {"q": (len(scene.q0),)}), scene.params
     entry = ENTRIES[name]
-    # What stands beside L is the same in both.
+    # Forces and constraints are the same in both.
     return jl.System(entry.system.lagrangian, {"q": (entry.system.size,)}), entry.example.params
 
 
@@ -64,7 +64,7 @@ FREE = [name for name, entry in ENTRIES.items() if entry.system.written_in == "v
 
 
 def both(system, params, dtype=np.float64):
-    """Accelerations from L as it is written, and as the scalar program has them."""
+    """Accelerations from L as written, and from the scalar program."""
     terms, eps = ArrayTerms(system.lagrangian, ()), float(np.finfo(dtype).eps)
     params = jax.tree.map(lambda x: np.asarray(x, dtype) if is_float(x) else x, params)
     scene = read_scene(key_of(terms, jnp.zeros(system.size, dtype), params, {}, None))
@@ -96,17 +96,19 @@ def states(n):
 def values(params, q, v):
     flat = [np.ravel(x) for x in jax.tree.leaves(params) if is_float(x)]
     given = {("t", 0): 0.3, ("sense", 0): 1.0}
-    for name, row in (("q", q), ("v", v), ("params", np.concatenate([*flat, []]))):
-        given |= {(name, i): float(x) for i, x in enumerate(row)}
+    for name, vector in (("q", q), ("v", v), ("params", np.concatenate([*flat, []]))):
+        given |= {(name, i): float(x) for i, x in enumerate(vector)}
     return given
 
 
 def worst(written, program, params, n):
-    """(bound over bound, error over bound, difference of exact values over both), the largest."""
+    """Largest ratios: of the bounds, error to bound, exact difference to the sum of bounds."""
     ratios, errors, apart = [0.0], [0.0], [0.0]
     for q, v in states(n):
         given = values(params, q, v)
-        for left, right in zip(carried(written, given), carried(program, given), strict=True):
+        for left, right in zip(
+            evaluate_with_bounds(written, given), evaluate_with_bounds(program, given), strict=True
+        ):
             if not np.isfinite(left.value) or not mpmath.isfinite(left.exact):
                 continue
             tiny = U * abs(left.value) + 1e-300
@@ -120,16 +122,16 @@ def worst(written, program, params, n):
     "name",
     mostly_full([*HARD, *SCENES, *FREE], "bead", "quartic", "top", "double_pendulum_positions"),
 )
-def test_no_form_is_worse_than_the_lagrangian_as_it_is_written(name):
+def test_error_bounds_are_not_worse_than_those_of_the_lagrangian(name):
     system, params = case(name)
     ratio, error, apart = worst(*both(system, params), params, system.size)
     assert ratio <= WORSE
     assert error <= 1.0
-    assert apart <= 1.0  # numbers written in L are multiplied in double precision
+    assert apart <= 1.0  # literals in L are multiplied in double precision
 
 
-def test_what_loses_digits_is_found():
-    """Multiplied out, (q - a)^4 loses all of them: the bound says so, and so does the error."""
+def test_error_bounds_detect_lost_digits():
+    """Expanded, (q - a)^4 loses all digits: both the bound and the error show it."""
 
     def multiplied(t, q, v, p):
         a = p[0]
@@ -141,22 +143,23 @@ def test_what_loses_digits_is_found():
 
     params = np.array([1e6])
     given = values(params, [1e6 + 0.5], [0.0])
-    good, bad = (
-        carried(both(jl.System(L, ("x",)), params)[0], given)[0] for L in (written, multiplied)
+    better, worse = (
+        evaluate_with_bounds(both(jl.System(L, ("x",)), params)[0], given)[0]
+        for L in (written, multiplied)
     )
-    assert abs(good.exact - bad.exact) < 1e-20
-    assert bad.bound > 1e3 > WORSE * good.bound
-    assert abs(float(bad.value - bad.exact)) > 1e-3
+    assert abs(better.exact - worse.exact) < 1e-20
+    assert worse.bound > 1e3 > WORSE * better.bound
+    assert abs(float(worse.value - worse.exact)) > 1e-3
 
 
-SLACK = 10.0  # times what the rounding of the inputs changes; 2.5 was the most seen
-# Arrays of double precision in L: then there is no program in single precision.
+SLACK = 10.0  # times the change by rounding of the inputs; measured: at most 2.5
+# L contains arrays of double precision: then there is no program in single precision.
 MIXED = ("rotating_body_on_frame", "knife_edge_vehicle", "rotating_cylinder_disk")
 SINGLE = [name for name in (*HARD, *SCENES, *FREE) if name not in MIXED]
 
 
 def scaled(params, n):
-    """(params, q, v) of all sizes, in single precision."""
+    """(params, q, v) of all magnitudes, in single precision."""
     rng = np.random.default_rng(0)
     size = lambda: 10.0 ** rng.uniform(-4, 4)  # noqa: E731
     for _ in range(12):
@@ -166,7 +169,7 @@ def scaled(params, n):
 
 
 def out_of_range(written, program, given):
-    """The largest difference over what the rounding of inputs changes, in single precision."""
+    """Largest difference over the change by rounding of the inputs, in single precision."""
     eps, rng = 2.0**-23, np.random.default_rng(1)
     nudged = [
         {key: x * (1 + eps * rng.uniform(-1, 1)) for key, x in given.items()} for _ in range(4)
@@ -185,24 +188,24 @@ def out_of_range(written, program, given):
 @pytest.mark.parametrize(
     "name", mostly_full(SINGLE, "lennard_jones", "kepler", "top", "double_pendulum")
 )
-def test_range_is_kept_in_single_precision(name):
+def test_single_precision_stays_in_range(name):
     system, params = case(name)
     programs = both(system, params, np.float32)
     off = [out_of_range(*programs, given) for given in scaled(params, system.size)]
     assert max(off) <= SLACK
 
 
-def test_what_leaves_the_range_is_found():
-    """A literal pulled out of a power."""
+def test_range_check_detects_overflow():
+    """A literal is factored out of a power."""
 
     def written(t, q, v, p):
         return 0.5 * v @ v - (q[0] / p[0]) ** 8
 
-    def pulled(t, q, v, p):
+    def factored(t, q, v, p):
         return 0.5 * v @ v - q[0] ** 8 / p[0] ** 8
 
     params = np.array([2e10])
     given = values(params, [1.5e10], [0.0])
-    one, two = (both(jl.System(L, ("x",)), params, np.float32)[0] for L in (written, pulled))
+    one, two = (both(jl.System(L, ("x",)), params, np.float32)[0] for L in (written, factored))
     assert out_of_range(one, one, given) <= 1.0
     assert out_of_range(one, two, given) > 1e4 * SLACK

@@ -1,4 +1,4 @@
-"""How often a compiled motion and its gradient hold the equations."""
+"""Number of copies of the equations in a compiled motion and its gradient."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ def _odd(t, q, v, params):
 
 
 def copies(lowering, function_of, size=2):
-    """How often the program of `function_of(system)` contains the force."""
+    """Number of occurrences of the force in the program of `function_of(system)`."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v + 0.1 * jnp.sum(jnp.cos(q[:, None] - q)) * v[0] ** 2
@@ -29,15 +29,15 @@ def copies(lowering, function_of, size=2):
         forces=(jl.GeneralizedForce(_odd, "odd"),),
         lowering=lowering,
     )
-    program = operations(*function_of(system), turns=1)
+    program = operations(*function_of(system), iterations=1)
     return len([o for o in program if o.name == "erf_inv"])
 
 
-def motion_of(system, save=(), rows=11):
+def motion_of(system, save=(), saves=11):
     n = system.size
 
     def run(q0):
-        ts = jnp.linspace(0.0, 1.0, rows)
+        ts = jnp.linspace(0.0, 1.0, saves)
         motion = jl.simulate(system, q0, jnp.ones(n), ts, save=save, throw=False)
         return motion.q, motion.v, motion.ok, motion.saved
 
@@ -49,20 +49,23 @@ def gradient_of(system):
     return jax.grad(lambda q0: jnp.sum(run(q0)[0] ** 2)), q0
 
 
-def test_a_program_holds_the_equations_once_in_its_loop_and_once_before():
-    """On arrays: the loop over stages; the first stage and the estimate of the first step."""
+def test_program_contains_equations_once_in_its_loop_and_once_before():
+    """On arrays: in the loop over stages, and for the first stage and first step size."""
     assert copies("array", motion_of) == 2
     assert copies("array", partial(motion_of, save=("a", "energy"))) == 3
 
 
-def test_a_gradient_holds_them_once_in_each_of_its_loops():
-    """The recorded motion, states found again between points, the transposed step; before them
-    the first step, and how fast perturbations turn.
+def test_gradient_contains_equations_once_per_loop():
+    """One copy for each loop, and two before the loops.
+
+    The loops are those of the recorded motion, of the states between checkpoints and of the
+    transposed step. The other copies are for the first step size and for the rates of
+    perturbations.
     """
     assert copies("array", gradient_of) == 5
 
 
 @pytest.mark.full
-def test_a_long_scalar_program_is_looped_over_as_well():
-    """Nine elements of the force, all in one copy of the acceleration."""
+def test_long_scalar_program_has_as_many_copies():
+    """Nine components of the force: one copy of the acceleration in the loop, one before it."""
     assert copies("scalar", motion_of, size=9) == 9 * 2

@@ -1,4 +1,4 @@
-"""Digits and range: what the scalar program must not lose of L as it is written."""
+"""Digits and range of L as written that the scalar program must preserve."""
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,8 @@ def at(system, params, q, v):
 
 
 @pytest.mark.parametrize("a", [1e4, 1e6, 1e8])
-def test_differences_of_coordinates_and_params_stay_what_they_are(a):
-    """Multiplied out, (q - a)^4 + (q - b)^4 loses all digits; the numbers here are exact."""
+def test_differences_of_coordinates_and_params_keep_their_digits(a):
+    """Expanded, (q - a)^4 + (q - b)^4 loses all digits; the numbers here are exact."""
     L = lambda t, q, v, p: 0.5 * v @ v - (q[0] - p["a"]) ** 4 - (q[0] - p["b"]) ** 4  # noqa: E731
     found = at(jl.System(L, ("x",)), {"a": a, "b": a + 0.25}, [a + 0.5], [0.0])
     np.testing.assert_allclose(found, [-4.0 * (0.5**3 + 0.25**3)], rtol=16 * EPS)
@@ -41,7 +41,7 @@ def test_differences_of_coordinates_and_params_stay_what_they_are(a):
 
 @pytest.mark.parametrize("theta", [1.0, 1e-2, 1e-4, 1e-6])
 def test_squares_of_small_sines_keep_their_digits(theta):
-    """A bead on r = R sin(theta)^2 that turns about the axis, from its position: M is of sin^6.
+    """A bead on r = R sin(theta)^2 that rotates about the axis, by its position: M ~ sin^6.
 
     L = (R^2/2) [(4 c^2 s^2 + s^4) theta'^2 + s^6 phi'^2]: phi'' = -6 c/s theta' phi'.
     """
@@ -70,7 +70,7 @@ def test_sin2_plus_cos2_is_one():
 
 
 def test_powers_of_quotients_stay_in_range():
-    """(q / a)^32 where a^32 has no number."""
+    """(q / a)^32, where a^32 overflows."""
     for params, L in (
         (None, lambda t, q, v, p: 0.5 * v @ v - 2e10 * (q[0] / 2e10) ** 32),
         (2e10, lambda t, q, v, p: 0.5 * v @ v - p * (q[0] / p) ** 32),
@@ -115,8 +115,8 @@ IN_SI_UNITS = {
 
 
 @pytest.mark.parametrize("name", IN_SI_UNITS)
-def test_single_precision_does_for_si_units(name):
-    """Accelerations and their Jacobian against double precision; products would leave the range."""
+def test_single_precision_suffices_for_si_units(name):
+    """Accelerations and their Jacobian against double precision; products would overflow."""
     lagrangian, q, v, params = IN_SI_UNITS[name]
     system = jl.System(lagrangian, {"x": (len(q),)})
 
@@ -132,6 +132,6 @@ def test_single_precision_does_for_si_units(name):
     assert found.equations is not None, found.reason
     eps = float(jnp.finfo(jnp.float32).eps)
     for single, double in zip(both(jnp.float32), both(jnp.float64), strict=True):
-        # Differences of 1e-10 m carry few roundings, to the 14th power at most.
+        # Differences of 1e-10 m have few roundings; powers are up to the 14th.
         atol = 200 * eps * float(jnp.max(jnp.abs(double)))
         np.testing.assert_allclose(np.asarray(single, float), double, rtol=0, atol=atol)

@@ -1,4 +1,4 @@
-"""Programs as scalars: value and gradient of everything a user may write, or a named reason."""
+"""Programs as scalars: value and gradient of any user expression, or a named reason."""
 
 import re
 
@@ -36,8 +36,8 @@ def at(roots, point):
 
 
 @pytest.mark.parametrize("name", mostly_full(PROBES, *list(PROBES)[::4]))
-def test_values_and_derivatives_are_those_of_jax(name):
-    """Values, both modes of the gradient, and a row of the Hessian; and all of it simplified."""
+def test_values_and_derivatives_equal_those_of_jax(name):
+    """Values, both modes of the gradient and a column of the Hessian, also simplified."""
     graph, x, node = scalars(PROBES[name])
     (short,) = Expansion(graph).simplified([node])
     value = jax.jit(jax.value_and_grad(PROBES[name]))
@@ -52,19 +52,19 @@ def test_values_and_derivatives_are_those_of_jax(name):
             np.testing.assert_allclose(at([root], point)[0], expected, atol=64 * EPS * scale)
             np.testing.assert_allclose(at(reverse, point), slope, atol=256 * EPS * scale)
             np.testing.assert_allclose(at(forward, point), slope, atol=256 * EPS * scale)
-            row = second(jnp.asarray(point))[:, 0]
-            scale += np.max(np.abs(row))
-            np.testing.assert_allclose(at(hessian, point), row, atol=1024 * EPS * scale)
+            column = second(jnp.asarray(point))[:, 0]
+            scale += np.max(np.abs(column))
+            np.testing.assert_allclose(at(hessian, point), column, atol=1024 * EPS * scale)
 
 
 @pytest.mark.parametrize("name", FALLBACKS)
-def test_what_has_no_scalar_form_is_named_with_its_place(name):
+def test_expressions_without_scalar_form_are_named_with_their_file(name):
     function, primitive = FALLBACKS[name]
     with pytest.raises(Unsupported, match=rf"({primitive}).* at .*_probes\.py"):
         scalars(function)
 
 
-def test_the_reason_reaches_the_user_and_the_array_program_takes_over():
+def test_explain_states_why_the_array_program_is_used():
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v - jnp.sort(q)[0]
 
@@ -74,7 +74,7 @@ def test_the_reason_reaches_the_user_and_the_array_program_takes_over():
     np.testing.assert_array_equal(a, [0.0, -1.0])
 
 
-def test_rules_of_their_own_are_honored():
+def test_custom_rules_are_used():
     """Twice the derivative of the sine, as declared; a stopped factor is not differentiated."""
     _, x, node = scalars(PROBES["custom rule"])
     graph, x, node = scalars(PROBES["custom rule"])

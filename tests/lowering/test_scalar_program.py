@@ -1,4 +1,4 @@
-"""The scalar program against the array program: values, derivatives, structure, what is skipped."""
+"""The scalar program against the array program: values, derivatives, structure, omissions."""
 
 import re
 from functools import cache, partial
@@ -58,7 +58,7 @@ def states(q0, v0):
 
 
 @pytest.mark.parametrize("name", mostly_full([*MOVING, *SCENES], *QUICK, "chain_4"))
-def test_accelerations_are_those_of_the_array_program(name):
+def test_accelerations_equal_those_of_the_array_program(name):
     """Within 1e-13 max(1, cond(M)/1e3) of the forces over the inertia."""
     system, params, q0, v0 = case(name)
     scalar, array = pair(system)
@@ -76,8 +76,8 @@ def test_accelerations_are_those_of_the_array_program(name):
 
 
 @pytest.mark.parametrize("name", mostly_full(MOVING, *QUICK[:2]))
-def test_derivatives_are_those_of_the_array_program(name):
-    """jvp and vjp in the state and params, batched; k = 2e3 roundings. Of some the Hessian, 2e5."""
+def test_derivatives_equal_those_of_the_array_program(name):
+    """jvp and vjp by state and params, batched, to 2e3 eps; for some the Hessian, to 2e5 eps."""
     system, params, q0, v0 = case(name)
     t, q, v = states(q0, v0)
     params = jax.tree.map(jnp.asarray, params)
@@ -87,12 +87,12 @@ def test_derivatives_are_those_of_the_array_program(name):
         def total(q, v, params):
             return weights @ system.acceleration(q, v, params, t=t)
 
-        def along(q, v):
+        def tangent(q, v):
             return jax.jvp(lambda q, v: system.acceleration(q, v, params, t=t), (q, v), (v, q))[1]
 
         first = jax.grad(total, argnums=(0, 1, 2))(q, v, params)
         curvature = jax.hessian(total, argnums=(0, 1))(q, v, params) if name in CURVED else 0.0
-        return along(q, v), first, curvature, cond_of(system, q, v, t)
+        return tangent(q, v), first, curvature, cond_of(system, q, v, t)
 
     def cond_of(system, q, v, t):
         return jnp.linalg.cond(system.mass_matrix(q, v, params, t=t))
@@ -102,16 +102,16 @@ def test_derivatives_are_those_of_the_array_program(name):
     expected = jax.jit(jax.vmap(partial(everything, array)))(t, q, v)
     conditions = np.asarray(expected[3])
     for k, a, b in zip((2e3, 2e3, 2e5), found[:3], expected[:3], strict=True):
-        rows = [np.concatenate([np.ravel(x[i]) for x in jax.tree.leaves(b)]) for i in range(STATES)]
+        flat = [np.concatenate([np.ravel(x[i]) for x in jax.tree.leaves(b)]) for i in range(STATES)]
         for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
             for i in range(STATES):
-                bound = k * EPS * conditions[i] * (1.0 + norm(rows[i]))
+                bound = k * EPS * conditions[i] * (1.0 + norm(flat[i]))
                 assert np.max(np.abs(x[i] - y[i]), initial=0.0) <= bound
 
 
 @pytest.mark.full
-def test_a_rule_of_its_own_keeps_its_derivatives_of_any_order():
-    """A spring through zero length: k times the identity, and what JAX makes of it beyond."""
+def test_custom_rules_have_derivatives_of_any_order():
+    """A spring of length zero has the Jacobian -k times the identity; then JAX's derivatives."""
 
     def lagrangian(t, q, v, params):
         r = q - jnp.array([1.0, 0.0])
@@ -134,7 +134,7 @@ def test_a_rule_of_its_own_keeps_its_derivatives_of_any_order():
 
 
 def test_canceled_terms_stay_canceled():
-    """0 x = 0 and x / x = 1 for every x, where the array program gives NaN; sqrt(x^2) is no |x|."""
+    """0 x = 0 and x / x = 1 for every x, unlike the array program (NaN); sqrt(x^2) is not |x|."""
 
     def lagrangian(t, q, v, params):
         x = q[0]
@@ -156,7 +156,7 @@ def test_canceled_terms_stay_canceled():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_a_mass_matrix_that_is_not_positive_definite_gives_nan(n):
-    """Singular, indefinite and negative, wherever in the elimination it shows."""
+    """Singular, indefinite and negative matrices, with the wrong sign at any pivot."""
     rng = np.random.default_rng(n)
     B = rng.normal(size=(n, n))
 
@@ -175,16 +175,16 @@ def test_a_mass_matrix_that_is_not_positive_definite_gives_nan(n):
             assert np.all(np.isnan(a)) == (min(values) <= 0)
 
 
-@pytest.mark.parametrize("bend", ["maximum", "where", "abs"])
-def test_a_branch_that_no_random_state_enters(bend):
-    """L linear in v below v = 3 and bent there: right beyond, where no comparison looks."""
+@pytest.mark.parametrize("kink", ["maximum", "where", "abs"])
+def test_branches_outside_the_compared_states_are_right(kink):
+    """L is linear in v up to v = 3, with a kink there, which no state of the comparison reaches."""
 
     def lagrangian(t, q, v, params):
         extra = {
             "maximum": lambda v: jnp.maximum(v - 3.0, 0.0),
             "where": lambda v: jnp.where(v > 3.0, v - 3.0, 0.0),
             "abs": lambda v: 0.5 * (jnp.abs(v - 3.0) + v - 3.0),
-        }[bend](v[0])
+        }[kink](v[0])
         return 0.5 * params * v[0] ** 2 + extra * jnp.sin(q[0])
 
     scalar, array = pair(jl.System(lagrangian, ("x",)))
@@ -196,8 +196,8 @@ def test_a_branch_that_no_random_state_enters(bend):
 
 @pytest.mark.full
 @pytest.mark.parametrize("largest", ["maximum", "max", "minimum", "hypot"])
-def test_the_larger_of_two_rounded_results(largest):
-    """The derivative of max asks for equality, which a fused multiply-add may spoil."""
+def test_derivatives_of_maxima_of_rounded_results_are_right(largest):
+    """The derivative of max tests for equality, which a fused multiply-add may spoil."""
 
     def size(x):
         a, b = -0.4 * jnp.sin(x), 1 - 0.4 * jnp.cos(x)
@@ -218,8 +218,8 @@ def test_the_larger_of_two_rounded_results(largest):
 
     def plain(q, v):
         """For L = g(q) v^2/2: a = -g' v^2 / (2 g), g = 1 + length'^2."""
-        slope, bend = jax.grad(length), jax.grad(jax.grad(length))
-        return -slope(q) * bend(q) * v**2 / (1 + slope(q) ** 2)
+        slope, curvature = jax.grad(length), jax.grad(jax.grad(length))
+        return -slope(q) * curvature(q) * v**2 / (1 + slope(q) ** 2)
 
     system = jl.System(lagrangian, ("x",), lowering="scalar")
     q = np.linspace(-5.0, 6.0, 6)
@@ -230,8 +230,8 @@ def test_the_larger_of_two_rounded_results(largest):
 
 
 @pytest.mark.full
-def test_integers_that_are_traced_go_to_the_array_program():
-    """Among the params and among the inputs."""
+def test_traced_integers_use_the_array_program():
+    """Among params and among inputs."""
 
     def lagrangian(t, q, v, params):
         n, half = (jnp.asarray(x).astype(float) for x in (params["n"], params["n"] // 2))
@@ -273,8 +273,8 @@ CEILINGS = {  # operations, sines and cosines, divisions
 @pytest.mark.parametrize(
     "name", mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"}))
 )
-def test_operations_of_one_evaluation(name):
-    """Counted in the code itself and, as equations, in the jaxpr of the acceleration."""
+def test_operations_of_one_evaluation_stay_below_ceilings(name):
+    """Counted in the code itself, which has no custom call, product of arrays or factorization."""
     program = lowered(name).equations.program
     operations, functions, divisions = CEILINGS[name]
     assert program.operations <= operations
@@ -285,7 +285,7 @@ def test_operations_of_one_evaluation(name):
 
 
 def test_structure_is_found():
-    """Through rotation matrices and positions, for whatever values of the params."""
+    """Through rotation matrices and positions, for any values of params."""
 
     def found(name):
         return find(lowered(name).scene, lowered(name).equations)
@@ -301,7 +301,7 @@ def test_structure_is_found():
     assert body.mass_blocks == body.subsystems == ((0,), (1,), (2,), (3, 4, 5))
     assert body.mass_depends == {("q", 4), ("q", 5)}
     aircraft = found("aircraft")
-    assert aircraft.cyclic == (0, 1)  # not yaw: only with x and y turned along
+    assert aircraft.cyclic == (0, 1)  # not yaw: cyclic only together with a rotation of x and y
     mass = lowered("aircraft").equations.mass
     zero = lowered("aircraft").scene.graph.zero
     assert all((mass[i][j] is zero) == (i != j) for i in range(3) for j in range(3))
@@ -313,7 +313,7 @@ def test_structure_is_found():
 
 
 @pytest.mark.parametrize("name", ["top", "two_mass_three_springs"])
-def test_values_of_params_never_decide(name):
+def test_program_does_not_depend_on_values_of_params(name):
     system, params, q0, _ = case(name)
     found = []
     for factor in (0.0, 1.0):
@@ -325,7 +325,7 @@ def test_values_of_params_never_decide(name):
 
 
 def test_a_constant_mass_matrix_is_factored_before_the_loop():
-    """No division is left in the body; forces that are not declared leave nothing either."""
+    """No division is in the body; undeclared forces add no inputs."""
     program = lowered("two_mass_three_springs").equations.program
     assert program.count("div", "gt", "select") == 0
     assert any(line.op == "div" for line in program.prelude)
@@ -350,8 +350,8 @@ def inertia_by_products(t, q, v, p):
     ],
     ids=["long products", "mass"],
 )
-def test_what_would_take_long_to_derive_is_a_named_fallback(lagrangian, n, reason):
-    """Of 90 factors in each of 90 products all pairs were counted again and again: 88 s."""
+def test_long_derivations_fall_back_with_a_reason(lagrangian, n, reason):
+    """All pairs of 90 factors in each of 90 products were counted repeatedly: 88 s."""
     system = jl.System(lagrangian, tuple(f"q{i}" for i in range(n)))
     found = derived(system)
     assert found.equations is None
@@ -359,6 +359,6 @@ def test_what_would_take_long_to_derive_is_a_named_fallback(lagrangian, n, reaso
 
 
 def test_factors_of_products_are_shared():
-    """Of 20 factors, each product lacks one: 18 multiplications for each by itself, 4 together."""
+    """Each product lacks one of 20 factors: 18 multiplications separately, 4 with sharing."""
     system = jl.System(sines_of_differences, ("a", "b", "c", "d", "e"))
     assert derived(system).equations.program.operations == 185

@@ -1,4 +1,4 @@
-"""Sine and cosine by polynomial, against the library's."""
+"""Sine and cosine by polynomials, compared with the library."""
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ NEAR = np.concatenate(
     "x", [RNG.uniform(-10, 10, 20000), RNG.uniform(-1e6, 1e6, 20000), NEAR, NEAR * 1e3]
 )
 @pytest.mark.parametrize("compiled", [True, False], ids=["fused", "one by one"])
-def test_values_are_those_of_the_library(x, compiled):
-    """Sines within 2 eps of their size, near zeros as well; cosines within 2 eps."""
+def test_values_equal_those_of_the_library(x, compiled):
+    """Sines within 2 eps of their size, also near zeros; cosines within 2 eps."""
     with jax.disable_jit(not compiled):
         s, c = sincos(jnp.asarray(x))
     assert np.max(np.abs(s - np.sin(x)) / np.maximum(np.abs(np.sin(x)), 1e-300)) <= 2 * EPS
@@ -29,8 +29,8 @@ def test_values_are_those_of_the_library(x, compiled):
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["fused", "one by one"])
-def test_no_value_is_past_one(compiled):
-    """At 90 degrees sqrt(1 - sin^2) and arcsin would not be numbers."""
+def test_values_do_not_exceed_one(compiled):
+    """Otherwise sqrt(1 - sin^2) and arcsin would be NaN at 90 degrees."""
     x = np.pi * (np.arange(-2001, 2003, 2) / 2)[:, None] + np.linspace(-2e-8, 2e-8, 101)
     with jax.disable_jit(not compiled):
         s, c = sincos(jnp.asarray(x))
@@ -40,7 +40,7 @@ def test_no_value_is_past_one(compiled):
 
 
 @pytest.mark.parametrize("size", [1e8, 1e11, 1e13])
-def test_large_arguments_are_off_by_their_own_rounding(size):
+def test_errors_at_large_arguments_are_their_rounding(size):
     x = jnp.asarray(size * RNG.uniform(1.0, 2.0, 2000))
     s, c = sincos(x)
     for found, exact in ((s, np.sin(x)), (c, np.cos(x))):
@@ -48,7 +48,7 @@ def test_large_arguments_are_off_by_their_own_rounding(size):
     np.testing.assert_allclose(np.square(s) + np.square(c), 1.0, rtol=4 * EPS)
 
 
-def test_odd_values():
+def test_signed_zeros_infinities_and_huge_arguments_are_handled():
     s, c = sincos(jnp.array([0.0, -0.0, np.inf, -np.inf, np.nan]))
     np.testing.assert_array_equal(s, [0.0, 0.0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(c, [1.0, 1.0, np.nan, np.nan, np.nan])
@@ -68,8 +68,8 @@ def test_derivatives_are_cosine_and_sine():
         np.testing.assert_allclose(curvature, -np.sin(x), atol=2 * EPS)
 
 
-def test_the_polynomials_have_the_right_derivatives_themselves():
-    """JAX differentiates them where it forgets the rule: in second derivatives of loops."""
+def test_polynomials_have_the_right_derivatives():
+    """JAX differentiates them where it drops the rule: in second derivatives of loops."""
     x = jnp.asarray(RNG.uniform(-10, 10, 1000))
     ones = jnp.ones_like(x)
     (s, c), (s_dot, c_dot) = jax.jvp(by_polynomials, (x,), (ones,))
@@ -77,8 +77,8 @@ def test_the_polynomials_have_the_right_derivatives_themselves():
     np.testing.assert_allclose(c_dot, -s, atol=16 * EPS)
 
 
-def test_polynomials_are_as_exact_as_they_say():
-    """sin r to 5.3e-18 of its size, cos r to 1.4e-17, between the zeros of the other one."""
+def test_polynomials_have_the_stated_accuracy():
+    """sin r to 5.3e-18 of its size, cos r to 1.4e-17, for r up to pi/2."""
     with mpmath.workdps(40):
         for r in np.linspace(1e-3, np.pi / 2, 400).tolist():
             z, sine, cosine = mpmath.mpf(r) ** 2, mpmath.sin(r), mpmath.cos(r)

@@ -1,7 +1,7 @@
-"""What the equations of a system do not need is not in its program: read from jaxprs and HLO.
+"""Programs omit what the equations do not need: read from jaxprs and HLO.
 
-One evaluation is the acceleration as the stages of a solve compute it, with all that depends on
-params alone prepared before. Everything is counted in JAX's own program, not in the lowering's.
+One evaluation is the acceleration as computed by the stages of a solve; terms of params alone are
+computed before the loop. Operations are counted in JAX's program, not in the lowering's.
 """
 
 import re
@@ -21,7 +21,7 @@ from jaxlag._lowering import State
 from jaxlag._system._inspection import mass_definite
 from systems.catalogue import ENTRIES
 
-STAGES = 14  # evaluations in a step of order 8: 13, and the first one anew where the field jumps
+STAGES = 14  # evaluations in a step of order 8: 13, and the first one again if the field jumps
 
 CEILINGS = {  # angles of sines and cosines, divisions
     "pendulum": (1, 0),
@@ -33,7 +33,7 @@ CEILINGS = {  # angles of sines and cosines, divisions
     "symmetric_top": (1, 2),
     "top": (2, 4),
     "rigid_body": (2, 4),
-    "aircraft": (3, 4 + 6),  # long programs also divide sines, to keep them: see _straight.py
+    "aircraft": (3, 4 + 6),  # long programs also divide sines, to store them: see _execute.py
     "chain_8": (8, 12 + 16),
     # With forces:
     "double_pendulum_rayleigh": (3, 2),
@@ -48,14 +48,14 @@ CEILINGS = {  # angles of sines and cosines, divisions
 CONSTRAINED = {  # the same, with multipliers eliminated
     "spherical_pendulum_cartesian": (0, 1),
     "double_pendulum_cartesian": (0, 2),
-    "atwood_multipliers": (0, 0),  # M, A and Q do not change: solved before the first step
+    "atwood_multipliers": (0, 0),  # M, A and Q are constant: solved before the first step
     "knife_edge_vehicle": (2, 3),
     "falling_stick_friction": (1, 1),
     "slider_crank": (2, 4),
 }
 
 
-QUASI = {  # the same in quasi-velocities: v and u', no rows; the inertia is constant or diagonal
+QUASI = {  # the same in quasi-velocities: v and u', no rows; a constant or diagonal inertia
     "chaplygin_sleigh": (1, 0),
     "knife_edge_incline": (1, 0),
     "vertical_rolling_disk": (1, 0),
@@ -76,7 +76,7 @@ QUASI = {  # the same in quasi-velocities: v and u', no rows; the inertia is con
     mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"})),  # long to derive
 )
 def test_an_evaluation_stays_below_its_ceilings(name):
-    """Scalar arithmetic and nothing else: no product of arrays, no factorization, no matrix."""
+    """Only scalar arithmetic: no product of arrays, no factorization, no matrix."""
     program = evaluation(case(name))
     functions, divisions = CEILINGS[name]
     assert count(program, "sincos") <= functions
@@ -87,24 +87,24 @@ def test_an_evaluation_stays_below_its_ceilings(name):
 
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
-    """Every row costs one division where M is known to be regular."""
+    """Every row costs one division if M is known to be regular."""
     whole = case(name)
     start, known = (whole.q0, jnp.zeros_like(whole.q0)), dict(ENTRIES[name].example.params)
     assert mass_definite(whole.system, known, 0.0, *start)
-    traced = []  # where the state is traced, it is looked at elsewhere
+    traced = []  # for a traced state other states are tested
     jax.eval_shape(lambda *z: traced.append(mass_definite(whole.system, known, 0.0, *z)), *start)
     assert traced == [True]
     program = evaluation(whole, regular=True)
     functions, divisions = CONSTRAINED[name]
     assert count(program, "sincos") <= functions
     assert count(program, "div") <= divisions
-    assert names(program) <= SCALAR | PACKING | {"ne"}  # the rows that are solved with
+    assert names(program) <= SCALAR | PACKING | {"ne"}  # `ne` for the mask of active rows
     assert max(len(shape) for o in program for shape in o.shapes) <= 1
 
 
 @pytest.mark.parametrize("definite", [True, False])
-def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(definite):
-    """The other one is not read: it is poisoned."""
+def test_traced_params_use_the_shorter_program_for_definite_mass(definite):
+    """The constants of the other program are NaN: they are not read."""
     system, params, q, _ = case("double_pendulum_cartesian")
     program, state = system._program, State(jnp.zeros(()), q, 0.1 * q, params, {})
     longer, shorter = (x.precompute(q, params, {}) for x in (program, program.regular()))
@@ -119,7 +119,7 @@ def test_traced_params_take_the_shorter_program_where_the_mass_is_definite(defin
     "name", mostly_full(QUASI, "chaplygin_sleigh", "nonholonomic_particle", "heavy_symmetric_top")
 )
 def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
-    """No multipliers, no matrix, and no division but by what may vanish: cos(theta), 1 + y^2."""
+    """No multipliers or matrices; divisions only by cos(theta) or 1 + y^2, which may vanish."""
     system, params, q, _ = case(name)
     array = replace(system._terms, quasi=system.quasi, in_u=system._in_u)
     program = replace(system._program, array=array)
@@ -144,7 +144,7 @@ def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     "name", mostly_full(["chaplygin_sleigh", "rolling_disk"], "chaplygin_sleigh")
 )
 def test_a_step_in_quasi_velocities_has_no_constraint(name):
-    """Neither matrices nor Newton's loops; compiled, its loop calls no library."""
+    """Neither matrices nor Newton iterations; the compiled loop calls no library."""
     system, params, q0, _ = case(name)
     u0 = jnp.linspace(0.1, 0.2, len(system.quasi.names))
 
@@ -154,7 +154,7 @@ def test_a_step_in_quasi_velocities_has_no_constraint(name):
         )
         return motion.q[-1]
 
-    step = loop(operations(end, params, q0, u0, turns=1))
+    step = loop(operations(end, params, q0, u0, iterations=1))
     matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "scan", "lu", "geqrf"}
     assert names(step).isdisjoint(matrices)
     assert not [o for o in step if o.inside.count("while") > 1]
@@ -164,9 +164,9 @@ def test_a_step_in_quasi_velocities_has_no_constraint(name):
 
 
 def test_a_step_with_constraints_has_no_matrix():
-    """Neither in its stages nor in the projection; Newton's loops are the only ones within."""
+    """Neither in its stages nor in the projection; the only inner loops are Newton's."""
     end, start = solve(case("double_pendulum_cartesian"))
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     matrices = {"cholesky", "triangular_solve", "custom_linear_solve", "sort", "lu"}
     assert names(step).isdisjoint(matrices)
     assert all(o.shapes == ((),) for o in step if o.name == "dot_general")
@@ -176,10 +176,10 @@ def test_a_step_with_constraints_has_no_matrix():
 
 
 @pytest.mark.parametrize("name", ["top", "cart_pendulum"])
-def test_a_step_evaluates_it_once_per_stage(name):
-    """The same numbers times the stages, and the step-size control, which has no matrix either."""
+def test_step_evaluates_the_equations_once_per_stage(name):
+    """The same numbers times the stages, and the step-size control, which has no matrix."""
     end, start = solve(case(name))
-    step = loop(operations(end, *start, turns=1))
+    step = loop(operations(end, *start, iterations=1))
     functions, divisions = CEILINGS[name]
     assert count(step, "sincos") <= STAGES * functions
     assert count(step, "div") <= STAGES * divisions + STEP
@@ -187,8 +187,8 @@ def test_a_step_evaluates_it_once_per_stage(name):
     assert count(step, "dot_general") == 0
 
 
-def test_the_counts_see_what_arrays_cost():
-    """The counters themselves: the array program of the same system breaks every ceiling."""
+def test_counters_find_operations_of_the_array_program():
+    """The counters themselves: the array program of the same system exceeds every ceiling."""
     system, *rest = case("top")
     arrays = jl.System(system.lagrangian, {"q": (3,)}, lowering="array")
     program = evaluation(Case(arrays, *rest))
@@ -244,7 +244,7 @@ def instructions(lines):
     "name",
     mostly_full((*CEILINGS, *CONSTRAINED), "pendulum", "top", "cart_pendulum"),
 )
-def test_no_library_is_called_and_no_product_of_arrays_is_left(name):
+def test_compiled_solve_has_no_library_call_and_no_array_product(name):
     """No LAPACK in the whole solve, no dot in its loops."""
     assert "custom-call" not in instructions(compiled(name).splitlines())
     inside = instructions(in_loops(compiled(name)))
@@ -252,14 +252,14 @@ def test_no_library_is_called_and_no_product_of_arrays_is_left(name):
     assert {"multiply", "add"} <= inside
 
 
-def test_the_reading_of_hlo_sees_products_and_libraries():
-    """The reader itself: a loop with both, on arrays too large to be unrolled."""
+def test_hlo_parser_finds_products_and_libraries():
+    """The parser itself: a loop with both, on arrays too large for unrolling."""
 
-    def turn(c):
+    def body(c):
         return c[0] + 1, jnp.linalg.cholesky(c[1] @ c[1].T)
 
     def run(A):
-        return jax.lax.while_loop(lambda c: c[0] < 3, turn, (0, A))[1]
+        return jax.lax.while_loop(lambda c: c[0] < 3, body, (0, A))[1]
 
     text = jax.jit(run).lower(jnp.eye(40)).compile().as_text()
     assert {"dot", "custom-call"} <= instructions(in_loops(text))

@@ -1,6 +1,6 @@
-"""Declarations made to trip the scalar program: it agrees with JAX, or steps aside and says why.
+"""Difficult declarations: the scalar program agrees with JAX or falls back with a reason.
 
-Checked on the graph, which nothing has to be compiled for; the emitted code in the full run.
+The graph is checked without compilation; the full run checks the emitted code.
 """
 
 import jax
@@ -23,14 +23,14 @@ STATES = np.random.default_rng(3).uniform(-1.5, 1.5, (4, 2, 3))
 
 @pytest.fixture(autouse=True)
 def _lenient():
-    """As for a user: whole numbers and real ones mix."""
+    """As for users: integers and real numbers may be mixed."""
     with jax.numpy_dtype_promotion("standard"):
         yield
 
 
 @jax.custom_jvp
 def scaled(x, k):
-    """Its rule is given for x and k alike."""
+    """A function with one rule for x and k together."""
     return x * k
 
 
@@ -49,11 +49,11 @@ def plain(potential):
 
 
 def halves(q):
-    """Integers that Python and C round in different ways: -1 // 2."""
+    """Integers that Python and C round differently: -1 // 2."""
     return ((jnp.arange(3) - 1) // 2)[: q.size] @ q
 
 
-# name: (L, coordinates, what `explain` says of an array program; None for a scalar one)
+# name: (L, number of coordinates); ARRAY has no scalar program, SCALAR has one
 ARRAY = {
     "truths in a product": (plain(lambda q: jnp.dot(q > 0, jnp.array([True, True])) * q[0]), 2),
     "a rule for integers": (plain(lambda q: scaled(q[0], 3) ** 2), 2),
@@ -155,7 +155,7 @@ def declared(name, lowering="auto"):
 
 
 def by_array_program(system, q, v):
-    """M a + h = 0 with M and h by JAX, interpreted."""
+    """M a + h = 0 with M and h by JAX, interpreted in numpy."""
     array = system._terms
     at = np.array(0.3), q, v
     M, h = (
@@ -179,10 +179,10 @@ def test_the_graph_agrees_with_jax(name):
 
 
 @pytest.mark.parametrize("name", ARRAY)
-def test_what_has_no_scalar_program_says_why(name):
+def test_fallbacks_to_the_array_program_have_a_reason(name):
     found = lowered(declared(name))
     assert found.equations is None
-    # Nothing came to an end by an accident: each reason is one of those that are looked for.
+    # No reason is an internal error: each is one of the expected ones.
     assert "no scalar program" not in found.reason
     assert found.reason
 
@@ -196,22 +196,22 @@ def test_the_code_agrees_with_jax(name):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-# ---- Premises ------------------------------------------------------------------------------------
+# ---- Conditions of the forms ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "name",
     ["a stopped velocity", "a clipped velocity", "a choice by velocity", "|v|", "speed as a root"],
 )
-def test_forms_for_quadratic_ones_are_for_those_alone(name):
-    """M is free of v in most of these, and L still no polynomial."""
+def test_quadratic_forms_are_used_only_for_quadratic_lagrangians(name):
+    """In most of these M does not depend on v, although L is not a polynomial."""
     system = declared(name)
     equations = lowered(system).equations
     assert equations.form.startswith("derivative of the momentum")
     assert "L quadratic in v" not in system.explain(None)
 
 
-def test_degrees():
+def test_degrees_of_expressions_are_right():
     graph = Graph()
     x, y = graph.input("v", 0), graph.input("q", 0)
     half = graph.scale(graph.mul(x, x, graph.call(*_sine(y))), 0.5)
@@ -235,24 +235,24 @@ def _sine(x):
 
 
 @pytest.mark.parametrize("name", ["|q|", "a slope with a corner"])
-def test_a_slope_of_zero_is_no_linearity(name):
+def test_kinks_are_not_reported_as_linear(name):
     assert "equations linear" not in declared(name).explain(None)
 
 
-def test_what_is_linear_is_said_to_be():
+def test_linear_equations_are_reported():
     springs = plain(lambda q: 0.5 * (q[0] - q[1]) ** 2 + q[0])
     assert "equations linear" in jl.System(springs, ("x", "y")).explain(None)
 
 
-def test_a_mass_that_depends_on_time_says_so():
-    said = declared("time").explain(None)
-    assert "M depends on t;" in said
+def test_time_dependent_mass_is_reported():
+    text = declared("time").explain(None)
+    assert "M depends on t;" in text
 
 
 # ---- What fails ----------------------------------------------------------------------------------
 
 
-def test_whatever_fails_is_a_named_fallback(monkeypatch):
+def test_internal_errors_fall_back_with_a_reason(monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("somewhere\nelse")
 
@@ -262,7 +262,7 @@ def test_whatever_fails_is_a_named_fallback(monkeypatch):
     np.testing.assert_allclose(system.acceleration([0.5], [0.0]), [-1.0])
 
 
-def test_what_is_wrong_with_the_declaration_still_raises():
+def test_errors_of_the_declaration_are_raised():
     system = jl.System(lambda t, q, v, p: 0.5 * v * v, ("x", "y"))
     with pytest.raises(
         ValueError, match=r"^`lagrangian` must return a real scalar, but it returned"
@@ -298,8 +298,8 @@ MOVED = {
 }
 
 
-def test_the_interpreter_does_what_jax_does():
-    """It checks the programs, so it is checked itself; one program of all for one compilation."""
+def test_interpreter_agrees_with_jax():
+    """It checks the programs, so it is checked itself; all in one compiled program."""
     x = np.random.default_rng(0).uniform(0.1, 2.0, (2, 3))
     programs = {name: jax.make_jaxpr(f)(x) for name, f in MOVED.items()}
     expected = jax.jit(lambda x: {name: f(x) for name, f in MOVED.items()})(x)
@@ -313,8 +313,8 @@ def test_the_interpreter_does_what_jax_does():
 # ---- Singular, ties, integers -----------------------------------------------------------
 
 
-def test_one_singular_block_leaves_no_acceleration():
-    """Whichever coordinate it is, as in the array program; the motion fails at its start."""
+def test_one_singular_block_makes_all_accelerations_nan():
+    """For any coordinate, as in the array program; the motion fails at its start."""
     lagrangian = lambda t, q, v, p: 0.5 * p @ v**2 - q @ q  # noqa: E731
     system = jl.System(lagrangian, ("x", "y"))
     for masses in ([1.0, 0.0], [0.0, 1.0], [1.0, -1.0]):
@@ -344,7 +344,7 @@ TIES = {
 
 
 @pytest.mark.parametrize("name", TIES)
-def test_ties_have_the_derivative_that_jax_gives(name):
+def test_ties_have_the_derivative_of_jax(name):
     """At exactly equal arguments: q = (1, 1)."""
     equations = lowered(jl.System(plain(TIES[name]), ("x", "y"))).equations
     assert equations is not None
@@ -355,7 +355,7 @@ def test_ties_have_the_derivative_that_jax_gives(name):
 
 
 @pytest.mark.parametrize("u", [2, np.array(2), np.int32(2), jl.TimeFunction(lambda t: 2)])
-def test_whole_numbers_are_inputs_like_any_other(u):
+def test_integers_are_accepted_as_inputs(u):
     force = jl.GeneralizedForce(lambda t, q, v, p, u: jnp.stack([u["u"]]), "push")
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x",), forces=[force])
     Q = system.generalized_force([0.0], [0.0], t=0.0, inputs={"u": u})

@@ -1,4 +1,4 @@
-"""What is found in a Lagrangian from its program alone, and what `explain` says about it."""
+"""Structure of a Lagrangian from its program alone, and its description by `explain`."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def of(name):
     return GENERAL[name].system._structure(GENERAL[name].params, jnp.float64)
 
 
-# ---- What depends on what ------------------------------------------------------------------------
+# ---- Dependencies --------------------------------------------------------------------------------
 
 
 def test_a_free_particle_has_a_constant_mass_and_no_bias():
@@ -36,16 +36,16 @@ def test_a_free_particle_has_a_constant_mass_and_no_bias():
     assert (bare.mass, bare.bias_zero, bare.mass_constant) == (frozenset(), True, True)
 
 
-def test_a_constant_force_is_a_bias_though_it_depends_on_nothing():
-    """Zero is told from constant by value."""
+def test_constant_force_is_a_bias_without_dependencies():
+    """Zero is distinguished from a constant by value."""
     found = structure(lambda t, q, v, params: 0.5 * v @ v - 9.81 * q[0])
     assert (found.bias, found.bias_zero) == (frozenset(), False)
     with_params = structure(lambda t, q, v, params: 0.5 * v @ v - params["g"] * q[0], {"g": 0.0})
     assert (with_params.bias, with_params.bias_zero) == (frozenset({"params"}), False)
 
 
-def test_values_of_params_never_decide():
-    """K = 0 or k = 1, one and the same structure: it is read from the program."""
+def test_structure_does_not_depend_on_values_of_params():
+    """k = 0 and k = 1 have the same structure: it is read from the program."""
     found = [
         structure(lambda t, q, v, params: 0.5 * v @ v - params["k"] * q @ q, {"k": k})
         for k in (0.0, 1.0, np.nan)
@@ -70,7 +70,7 @@ def test_values_of_params_never_decide():
     ],
 )
 def test_dependencies_are_those_of_the_equations(name, mass, bias, time):
-    """Or of the program, where only algebra cancels them: cos^2 + sin^2 in driven_pivot."""
+    """Or those of the program if only algebra cancels them: cos^2 + sin^2 in driven_pivot."""
     found = of(name)
     assert (found.mass, found.explicit_time) == (mass, time)
     assert (found.bias, found.bias_zero) == (bias, False)
@@ -80,8 +80,8 @@ PLAIN = "cart_pendulum", "quadcopter", "rolling_disk", "falling_stick_friction",
 
 
 @pytest.mark.parametrize("name", mostly_full([*ENTRIES, *GENERAL], *PLAIN))
-def test_nothing_unlisted_moves_a_term(name):
-    """Soundness at numbers: move an argument that is not listed and nothing changes at all."""
+def test_terms_do_not_change_with_unlisted_arguments(name):
+    """Soundness in numbers: a change of an unlisted argument changes no bit of a term."""
     case = ENTRIES[name].example if name in ENTRIES else GENERAL[name]
     system = ENTRIES[name].system if name in ENTRIES else GENERAL[name].system
     found, params, n = of(name), dict(case.params), system.size
@@ -92,15 +92,15 @@ def test_nothing_unlisted_moves_a_term(name):
         M = system.mass_matrix(q, v, params, t=t)
         return {"mass": M, "bias": system.bias(q, v, params, t=t)}
 
-    here = terms(**state)
+    before = terms(**state)
     for argument, value in state.items():
-        there = terms(**(state | {argument: value + 0.37}))
+        after = terms(**(state | {argument: value + 0.37}))
         for term in ("mass", "bias"):
             if argument not in getattr(found, term):
-                np.testing.assert_array_equal(here[term], there[term])
+                np.testing.assert_array_equal(before[term], after[term])
 
 
-# ---- Forms of writing ----------------------------------------------------------------------------
+# ---- Ways of writing a quadratic energy ----------------------------------------------------------
 
 FORMS = {
     "v @ v": lambda t, q, v, params: 0.5 * v @ v,
@@ -138,14 +138,14 @@ LOOPS = {
 
 
 @pytest.mark.parametrize("form", LOOPS)
-def test_a_quadratic_kinetic_energy_is_seen_through_loops(form):
+def test_quadratic_kinetic_energy_is_detected_through_loops(form):
     found = structure(LOOPS[form])
     assert found.quadratic
     assert found.mass_constant
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
+def test_quadratic_kinetic_energy_is_detected_in_any_form(form):
     found = structure(FORMS[form])
     assert found.quadratic
     assert found.mass_constant
@@ -163,15 +163,15 @@ def test_a_quadratic_kinetic_energy_is_seen_however_it_is_written(form):
     ],
     ids=["fourth", "third", "sqrt", "cosh", "where"],
 )
-def test_what_is_not_quadratic_is_seen(lagrangian):
+def test_energies_that_are_not_quadratic_are_detected(lagrangian):
     found = structure(lagrangian)
     assert "v" in found.mass
     assert not found.quadratic
     assert not found.mass_constant
 
 
-def test_powers_that_are_not_quadratic_are_seen():
-    """The second derivative of v**1.0 is 0 * v**-1: NaN at rest, where M is then not taken."""
+def test_powers_that_are_not_quadratic_are_detected():
+    """The second derivative of v**1.0 is 0 * v**-1: NaN at rest, so that M is not taken there."""
     for power in (1.0, 2.5, 3.0, -1.0):
         found = structure(lambda t, q, v, params, k=power: 0.5 * v @ v + jnp.sum(v**k))
         assert not found.quadratic
@@ -180,21 +180,21 @@ def test_powers_that_are_not_quadratic_are_seen():
 
 
 def dependences(function, **arguments):
-    """What each output of a function of named arguments depends on, as strings of their names."""
+    """Arguments on which each output of a function depends, as strings of their names."""
     jaxpr = jax.make_jaxpr(function)(*arguments.values()).jaxpr
     found = outputs_depend_on(jaxpr, [frozenset({name}) for name in arguments])
     return ["".join(sorted(names)) for names in found]
 
 
-def test_dependence_goes_round_a_loop_to_the_end():
-    """a -> b -> c -> d takes three turns; e passes through; a row reads what the carries do."""
+def test_dependence_is_followed_through_all_iterations_of_a_loop():
+    """a -> b -> c -> d takes three iterations; e passes through; outputs depend on the carries."""
 
-    def turn(carry, row):
+    def body(carry, x):
         a, b, c, d, e = carry
-        return (a, a * b, b, c, e), (row + d, e)
+        return (a, a * b, b, c, e), (x + d, e)
 
-    def function(a, b, c, d, e, rows):
-        return jax.lax.scan(turn, (a, b, c, d, e), rows)
+    def function(a, b, c, d, e, xs):
+        return jax.lax.scan(body, (a, b, c, d, e), xs)
 
     found = dependences(function, a=1.0, b=1.0, c=1.0, d=1.0, e=1.0, r=jnp.ones(9))
     assert found == ["a", "ab", "abc", "abcd", "e", "abcdr", "e"]
@@ -202,8 +202,8 @@ def test_dependence_goes_round_a_loop_to_the_end():
     assert once == ["ak", "k"]
 
 
-def test_dependence_in_a_while_loop_is_that_of_its_condition_too():
-    """Whatever decides on the number of turns reaches what they change, and nothing else."""
+def test_dependence_of_a_while_loop_includes_its_condition():
+    """Variables that decide the number of iterations affect only what the iterations change."""
 
     def function(limit, x, y, k):
         def body(carry):
@@ -220,13 +220,13 @@ def test_dependence_in_a_while_loop_is_that_of_its_condition_too():
     assert dependences(until_met, x=1.0, y=1.0) == ["x", "xy"]
 
     def late(x, y, z):
-        """The condition reads y from the second turn on."""
+        """The condition reads y from the second iteration on."""
         return jax.lax.while_loop(lambda c: c[0] < 9.0, lambda c: (c[1], c[1], c[2] + 1), (x, y, z))
 
     assert dependences(late, x=1.0, y=1.0, z=1.0) == ["xy", "y", "xyz"]
 
 
-def test_dependence_of_a_choice_is_that_of_every_branch_and_of_the_index():
+def test_dependence_of_a_choice_includes_every_branch_and_the_index():
     def function(k, x, y, z):
         branches = [lambda x, y, z: (x, z), lambda x, y, z: (y, z), lambda x, y, z: (1.0, 2 * z)]
         return jax.lax.switch(k, branches, x, y, z)
@@ -243,7 +243,7 @@ def test_dependence_of_a_choice_is_that_of_every_branch_and_of_the_index():
 
 
 def test_control_flow_hides_no_dependence():
-    """What is read inside cond, scan and while counts."""
+    """Reads inside cond, scan and while count."""
 
     def choose(t, q, v, params):
         return jax.lax.cond(t > 1.0, lambda: 1.0 + q[0] ** 2, lambda: 2.0 + q[0] ** 2) * v @ v
@@ -257,7 +257,7 @@ def test_control_flow_hides_no_dependence():
 
 
 def test_custom_rules_are_followed():
-    """A function with its own derivative counts by what that derivative reads."""
+    """A function with a custom derivative depends on what that derivative reads."""
 
     @jax.custom_jvp
     def mass(x):
@@ -272,7 +272,7 @@ def test_custom_rules_are_followed():
 
 
 def test_dependence_is_traced_per_argument():
-    """The finder itself, on functions of (t, q, v, params)."""
+    """The search itself, on functions of (t, q, v, params)."""
     state = (jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
 
     def nothing(t, q, v, params):
@@ -309,7 +309,7 @@ def test_structure_is_traced_once_per_kind_of_params():
 
 
 def test_python_numbers_take_the_precision_of_the_state():
-    """Weakly typed in the structure as in the program: no promotion that strict JAX refuses."""
+    """Weakly typed in the structure as in the program: strict JAX refuses no promotion."""
     system = jl.System(lambda t, q, v, params: 0.5 * params["m"] * v @ v, PAIR)
     assert system._structure({"m": 2.0}, jnp.float32).quadratic
     M = system.mass_matrix(np.zeros(2, np.float32), params={"m": 2.0})
@@ -320,8 +320,8 @@ def test_python_numbers_take_the_precision_of_the_state():
 # ---- Explain -------------------------------------------------------------------------------------
 
 
-def said(name):
-    """What `explain` says, blanks closed up."""
+def explained_lines(name):
+    """The lines of `explain`, with single blanks."""
     system, params = (
         (ENTRIES[name].system, dict(ENTRIES[name].example.params))
         if name in ENTRIES
@@ -351,33 +351,33 @@ def said(name):
     ],
 )
 def test_explain_states_what_was_found(name, line):
-    assert [found for found in said(name) if found.startswith(line)] != []
+    assert [found for found in explained_lines(name) if found.startswith(line)] != []
 
 
-def test_explain_says_what_is_not_there():
+def test_explain_states_absent_dependencies():
     lines = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR).explain(None).splitlines()
     assert "mass matrix   depends on nothing" in lines
     assert "bias          zero" in lines
 
 
-def test_explain_says_how_the_mass_matrix_is_solved():
-    for n, said in (
+def test_explain_states_how_the_mass_matrix_is_solved():
+    for n, algorithm in (
         (8, "unrolled"),
         (9, "in a loop over pivots (n > 8)"),
         (17, "by library Cholesky (n > 16)"),
     ):
         explained = chain(n, lowering="array").explain(GENERAL["chain"].params)
-        assert f"mass solve    one factorization per evaluation, {said}" in explained
+        assert f"mass solve    one factorization per evaluation, {algorithm}" in explained
 
 
-def test_explain_says_that_a_constant_mass_matrix_is_factored_once():
+def test_explain_states_that_a_constant_mass_matrix_is_factored_once():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, PAIR, lowering="array")
     explained = system.explain(None)
     assert "mass solve    one factorization once per solve, unrolled" in explained
     assert "h by" not in explained
 
 
-def test_explain_refuses_what_is_no_lagrangian():
+def test_explain_refuses_vector_valued_lagrangians():
     system = jl.System(lambda t, q, v, params: 0.5 * v**2, PAIR)
     with pytest.raises(
         ValueError, match=r"^`lagrangian` must return a real scalar, but it returned "

@@ -1,7 +1,7 @@
-"""The array programs of the equations of motion, read as jaxprs: what, how often, how large.
+"""The array programs of the equations of motion as jaxprs: operations, counts, array sizes.
 
-A chain of N links stands for any system. Its Lagrangian may carry a mark: arrays turned round,
-an operation that is linear, so that every derivative of L repeats it and is counted with it.
+A chain of N links represents any system. Its Lagrangian may contain a mark: a reversal of arrays.
+This operation is linear, so that every derivative of L repeats it and is counted.
 """
 
 from functools import partial
@@ -32,9 +32,9 @@ def marked(t, q, v, params):
 
 
 def evaluations(program):
-    """Evaluations of the mark, one for each array of MARK entries that is turned round."""
-    turned = [o for o in program if o.name == "rev"]
-    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in turned)
+    """Evaluations of the mark, one for each reversed array of MARK entries."""
+    marks = [o for o in program if o.name == "rev"]
+    return sum(o.times * np.prod(o.shapes[0], dtype=int) // MARK for o in marks)
 
 
 def at_rest(n):
@@ -84,8 +84,8 @@ def test_small_systems_take_one_elimination(n, derivative):
 
 @pytest.mark.parametrize("derivative", [None, gradient, tangent])
 @pytest.mark.parametrize("n", [UNROLL_UP_TO + 1, MIDDLE])
-def test_middling_systems_take_one_elimination_by_rows(n, derivative):
-    """One row of divisions a turn of the elimination, one division a turn of each solve's loops."""
+def test_medium_systems_take_one_elimination_by_rows(n, derivative):
+    """The elimination divides one row of M per iteration, each solve's loops one number."""
     acceleration = chain(n).acceleration
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
     assert names(program) & FACTORIZATIONS == set()
@@ -93,8 +93,8 @@ def test_middling_systems_take_one_elimination_by_rows(n, derivative):
     assert count(program, "div") == n + 2 * n * (2 if derivative else 1)
 
 
-def test_the_counts_see_a_second_factorization():
-    """The counter itself: the two forms that the tests above forbid."""
+def test_counters_find_a_second_factorization():
+    """The counter itself: the two forms that the tests above exclude."""
 
     def twice(M, r):
         return solve_mass(M, solve_mass(M, r))
@@ -108,7 +108,7 @@ def test_the_counts_see_a_second_factorization():
     assert "svd" in names(operations(jnp.linalg.pinv, jnp.eye(SMALL)))
 
 
-def test_a_factor_at_hand_is_used():
+def test_given_factor_is_used():
     def solve(M, r):
         factor = factor_mass(M)
         return solve_mass(M, r, factor), solve_mass(M, 2 * r, factor)
@@ -126,11 +126,11 @@ def test_no_array_is_larger_than_the_mass_matrix(n, derivative):
     program = operations(derivative(acceleration) if derivative else acceleration, *at_rest(n))
     assert largest(program) == n * n
     with_cubes = operations(jax.jacfwd(chain(n).mass_matrix, argnums=0), *at_rest(n))
-    assert largest(with_cubes) >= n**3  # what a derivative of M would show
+    assert largest(with_cubes) >= n**3  # the size of a derivative of M
 
 
 @pytest.mark.parametrize("n", [SMALL, LARGE])
-def test_the_bias_holds_vectors_only(n):
+def test_bias_has_vectors_only(n):
     assert largest(operations(chain(n).bias, *at_rest(n))) == n
 
 
@@ -138,7 +138,7 @@ def test_the_bias_holds_vectors_only(n):
 
 
 def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
-    """Forward and reverse, each with its tangent: four, whatever n."""
+    """Forward and reverse mode, each with its tangent: four for any n."""
     found = {
         n: evaluations(
             operations(jl.System(marked, {"theta": (n,)}, lowering="array").bias, *at_rest(n))
@@ -148,8 +148,8 @@ def test_the_bias_evaluates_the_lagrangian_a_fixed_number_of_times():
     assert found == {2: 4, 10: 4}
 
 
-def test_the_mass_matrix_evaluates_it_once_per_column():
-    """The mark does count: forward and reverse, and the tangents of both for every column."""
+def test_mass_matrix_evaluates_the_lagrangian_once_per_column():
+    """The mark counts: forward and reverse mode, and the tangents of both for every column."""
     found = {
         n: evaluations(
             operations(
@@ -161,7 +161,7 @@ def test_the_mass_matrix_evaluates_it_once_per_column():
     assert found == {2: 2 + 2 * 2, 10: 2 + 2 * 10}
 
 
-def test_the_acceleration_evaluates_what_mass_and_bias_do():
+def test_acceleration_needs_no_more_evaluations_than_mass_and_bias():
     n = 10
     program = operations(
         jl.System(marked, {"theta": (n,)}, lowering="array").acceleration, *at_rest(n)
@@ -169,7 +169,7 @@ def test_the_acceleration_evaluates_what_mass_and_bias_do():
     assert evaluations(program) <= (2 + 2 * n) + 4
 
 
-# ---- What is not declared is not there -----------------------------------------------------------
+# ---- Undeclared parts are absent -----------------------------------------------------------------
 
 
 def push(t, q, v, params):
@@ -184,7 +184,7 @@ PUSHED = (jl.GeneralizedForce(push, "push"), jl.Rayleigh(drag, "drag"))
 
 
 def test_no_force_code_without_forces():
-    """A free chain is M, h and the solve of -h, not one operation more."""
+    """A free chain consists of M, h and the solve of -h, without further operations."""
     n, free = 4, chain(4)
 
     def bare(q, v, params):
@@ -198,7 +198,7 @@ def test_no_force_code_without_forces():
     assert {"rev", "sinh"} <= names(pushed)
 
 
-def test_only_the_forces_asked_for_are_computed():
+def test_only_named_forces_are_computed():
     force = chain(4, PUSHED).generalized_force
     found = {
         chosen: names(operations(partial(force, names=chosen), *at_rest(4))) & {"rev", "sinh"}
@@ -212,7 +212,7 @@ def test_only_the_forces_asked_for_are_computed():
     }
 
 
-def test_tables_are_searched_only_where_there_are_tables():
+def test_only_systems_with_tables_search_them():
     def pulled(t, q, v, params, inputs):
         return inputs["u"] * q
 
@@ -229,20 +229,20 @@ def test_tables_are_searched_only_where_there_are_tables():
     assert "dynamic_slice" in with_table - free
 
 
-# ---- What depends on params alone ----------------------------------------------------------------
+# ---- Terms of params alone -----------------------------------------------------------------------
 
 INERTIA = {"a": jnp.array(1.3), "k": jnp.array(2.0)}
 HELD = jl.GeneralizedForce(lambda t, q, v, params: params["k"] * q, "spring")
 
 
 def coupled(t, q, v, params):
-    """Masses coupled by inertia and by nothing else, in a field g = k."""
+    """Masses coupled only by inertia, in a field g = k."""
     M = params["a"] * jnp.eye(q.size) + 0.1
     return 0.5 * v @ M @ v - params["k"] * jnp.sum(q)
 
 
 def hidden(t, q, v, params):
-    """The same with a T that is written with q, so that the structure must take M to vary."""
+    """The same with q in T, so that M counts as variable."""
     return coupled(t, q, v, params) + 0.0 * jnp.sum(q) * v @ v
 
 
@@ -256,7 +256,7 @@ def of(lagrangian, n, forces=()):
 
 
 def swung(lagrangian, n, params, t1=0.2):
-    """(q, v) at t1 and half-way, by fixed steps."""
+    """(q, v) at t1 and q half-way, by fixed steps."""
     system, q0 = of(lagrangian, n, (HELD,)), jnp.linspace(0.1, 1.0, n)
     options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
     motion = jl.simulate(system, q0, -q0, [0.0, t1 / 2, t1], params, **options)
@@ -265,7 +265,7 @@ def swung(lagrangian, n, params, t1=0.2):
 
 @pytest.mark.parametrize("n", [SMALL, LARGE])
 def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
-    """Inside the loop of a whole solve there are solves and no factorization."""
+    """The loop of a whole solve contains solves and no factorization."""
 
     def factorizations(program):
         if n > UNROLL_UP_TO:
@@ -275,7 +275,7 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
     found = {}
     for lagrangian in (coupled, hidden):
         solve = partial(swung, lagrangian, n)
-        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, turns=1))
+        inside = loop(operations(lambda params, solve=solve: solve(params), INERTIA, iterations=1))
         solves = count(inside, "custom_linear_solve")
         assert solves > 0
         assert names(inside) & FACTORIZATIONS <= {"cholesky"}
@@ -284,8 +284,8 @@ def test_a_constant_mass_matrix_is_factored_before_the_loop(n):
     assert found[hidden] > 0
 
 
-def test_the_factor_is_made_where_the_solve_is_prepared():
-    """Once per solve: M's columns and its elimination, and not one more evaluation of L for M."""
+def test_mass_matrix_is_factored_in_precompute():
+    """Once per solve: the columns of M and its elimination; no other evaluation of L for M."""
     n, system = SMALL, of(coupled, SMALL)
     q = v = jnp.linspace(0.1, 1.0, n)
     constants = system._program.precompute(q, INERTIA, {})
@@ -303,8 +303,8 @@ def test_the_factor_is_made_where_the_solve_is_prepared():
     assert count(inside, "div") == 2 * n
 
 
-def test_no_bias_is_computed_where_it_is_zero():
-    """A free body: no derivative of L is left in the loop, only the solve."""
+def test_zero_bias_has_no_arithmetic():
+    """A free body: the loop contains no derivative of L, only the solve."""
     n = SMALL
     for lagrangian, left in ((free, set()), (coupled, {"dot_general", "mul"})):
         program = of(lagrangian, n)._program
@@ -331,8 +331,8 @@ DERIVATIVES = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("derivative", DERIVATIVES)
-def test_derivatives_go_through_the_factor(derivative):
-    """Those of a whole solve as where M is formed and factored at every state, to round-off."""
+def test_derivatives_with_a_constant_factor_are_right(derivative):
+    """Those of a whole solve agree with M factored at every state, to rounding."""
     of_order = DERIVATIVES[derivative]
     once, anew = (jax.jit(of_order(partial(swung, f, 2)))(INERTIA) for f in (coupled, hidden))
     for a, b in zip(jax.tree.leaves(once), jax.tree.leaves(anew), strict=True):
@@ -341,7 +341,7 @@ def test_derivatives_go_through_the_factor(derivative):
 
 
 @pytest.mark.parametrize("n", [3, UNROLL_UP_TO + 1])
-def test_derivatives_of_one_acceleration_go_through_the_factor(n):
+def test_derivatives_of_one_acceleration_with_a_factor_are_right(n):
     """To third order, reverse and forward, batched, for both kinds of factor."""
     q = jnp.linspace(0.1, 1.0, n)
 
@@ -364,8 +364,8 @@ def test_derivatives_of_one_acceleration_go_through_the_factor(n):
 
 
 @pytest.mark.parametrize("n", [3, pytest.param(UNROLL_UP_TO + 1, marks=pytest.mark.full)])
-def test_a_constant_mass_matrix_without_inertia_ends_in_its_status(n):
-    """The factor carries its pivots' health."""
+def test_indefinite_constant_mass_matrix_ends_in_mass_singular(n):
+    """The factor contains the health of its pivots."""
     q0, params = jnp.linspace(0.1, 1.0, n), {"a": -0.05, "k": 1.0}
     options = {"dt": 0.1, "method": "bosh3", "max_steps": 64, "throw": False}
     motion = jl.simulate(of(coupled, n), q0, q0, [0.0, 0.1], params, **options)
@@ -374,7 +374,7 @@ def test_a_constant_mass_matrix_without_inertia_ends_in_its_status(n):
 
 
 def test_a_lagrangian_may_hold_a_traced_value():
-    """Its structure and its program are those of this trace; a bias that is traced is not zero."""
+    """Structure and program belong to this trace; a traced bias does not count as zero."""
 
     def acceleration(lowering, c):
         def lagrangian(t, q, v, params):
@@ -401,7 +401,7 @@ def test_terms_without_constraints_have_no_rows(chosen):
 
 
 @pytest.mark.parametrize("chosen", ["scalar", "array"])
-def test_terms_are_those_of_the_public_methods(chosen):
+def test_terms_equal_those_of_public_methods(chosen):
     entry = ENTRIES["cart_pendulum"]
     declared, params = entry.system, dict(entry.example.params)
     system = jl.System(declared.lagrangian, ("x", "a"), forces=declared.forces, lowering=chosen)

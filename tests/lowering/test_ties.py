@@ -1,4 +1,4 @@
-"""Where several numbers are the largest, their derivatives are shared as JAX shares them."""
+"""At ties of max and min, derivatives are divided as in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +51,8 @@ PLAIN = {"max", "axis 0", "nested", "the same twice", "constants", "cummin", "sc
     "name",
     [name if name in PLAIN else pytest.param(name, marks=pytest.mark.full) for name in REDUCED],
 )
-def test_ties_are_shared_to_second_derivatives(name):
-    """Forces, which the graph derives, and stiffness, which JAX derives from its program."""
+def test_derivatives_at_ties_equal_those_of_jax_to_second_order(name):
+    """Forces are derived on the graph, stiffness is derived by JAX from the program."""
     reduced = REDUCED[name]
     force = accelerations(reduced, "auto")
     both = jax.jit(jax.vmap(lambda q: (force(q), jax.jacfwd(force)(q))))
@@ -62,7 +62,7 @@ def test_ties_are_shared_to_second_derivatives(name):
 
 
 @pytest.mark.parametrize("name", ["max", "cummax"])
-def test_reverse_derivatives_and_arrays_share_them_too(name):
+def test_reverse_derivatives_of_both_programs_agree_at_ties(name):
     reduced = REDUCED[name]
     expected = -jax.vmap(jax.hessian(reduced))(POINTS)
     for lowering in ("scalar", "array"):
@@ -71,10 +71,10 @@ def test_reverse_derivatives_and_arrays_share_them_too(name):
 
 
 @pytest.mark.parametrize(("primitive", "whole"), [(largest_p, jnp.max), (smallest_p, jnp.min)])
-def test_the_primitive_is_the_reduction(primitive, whole):
-    """Through transforms, in a loop whose derivatives JAX takes apart, and of a batch in part."""
+def test_primitive_equals_the_reduction(primitive, whole):
+    """Under transforms, in a loop whose derivatives JAX splits, and with a partly batched input."""
 
-    def of_row(q):
+    def of_vector(q):
         return primitive.bind(*q)
 
     def in_loop(extreme):
@@ -84,9 +84,9 @@ def test_the_primitive_is_the_reduction(primitive, whole):
         return jax.vmap(jax.jvp(jax.grad(total), (POINTS[0],), (W,))[1].dot)(jnp.eye(4))
 
     for derive in (lambda f: f, jax.grad, jax.jacfwd, jax.hessian):
-        found, right = (jax.vmap(derive(f))(POINTS) for f in (of_row, whole))
+        found, right = (jax.vmap(derive(f))(POINTS) for f in (of_vector, whole))
         np.testing.assert_allclose(found, right, rtol=1e-15)
-    np.testing.assert_allclose(in_loop(of_row), in_loop(whole), rtol=1e-15)
+    np.testing.assert_allclose(in_loop(of_vector), in_loop(whole), rtol=1e-15)
     some = jax.vmap(lambda x: primitive.bind(x, jnp.ones(()), jnp.zeros(())))(W)
     right = jax.vmap(lambda x: whole(jnp.stack([x, jnp.ones(()), jnp.zeros(())])))(W)
     np.testing.assert_array_equal(some, right)

@@ -1,4 +1,4 @@
-"""The scalar program beside the array program: what is compared, and what is found by it."""
+"""The check of the scalar program against the array program: states compared, errors found."""
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,11 @@ from systems import lamina_on_parabola, rigid_aircraft
 EPS = np.finfo(float).eps
 
 
-@pytest.mark.parametrize("bad", [np.nan, 0.0])
-def test_bad_params_at_first_use_decide_nothing(bad):
-    """A program is made for all params of these shapes, whichever came first."""
+@pytest.mark.parametrize("mass", [np.nan, 0.0])
+def test_invalid_params_at_first_use_have_no_effect(mass):
+    """A program is made for all params of these shapes, whichever come first."""
     system = jl.System(lambda t, q, v, p: 0.5 * p["m"] * v @ v + jnp.cos(q[0]), ("x",))
-    found = lowered(system, {"m": bad})
+    found = lowered(system, {"m": mass})
     assert found.equations is not None
     assert found.reason.startswith("equal to the array program at ")
     np.testing.assert_allclose(
@@ -27,8 +27,8 @@ def test_bad_params_at_first_use_decide_nothing(bad):
     )
 
 
-def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
-    """Wrong where k is not 1: the random params tell."""
+def test_program_right_only_for_given_params_is_not_used(monkeypatch):
+    """Wrong for k other than 1: random params show it."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -41,7 +41,7 @@ def test_a_program_right_for_the_params_at_hand_alone_is_not_used(monkeypatch):
     assert "differs from the array program" in lowered(system, {"k": 1.0}).reason
 
 
-def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
+def test_program_finite_where_the_array_program_is_nan_is_not_used(monkeypatch):
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -52,8 +52,8 @@ def test_a_program_with_values_where_there_are_none_is_not_used(monkeypatch):
     assert "only one of them is finite" in lowered(system).reason
 
 
-def test_too_few_states_to_compare_at_decide_for_the_array_program():
-    """L has no value but near a state that random ones miss."""
+def test_too_few_finite_states_select_the_array_program():
+    """L is finite only near a state that random ones miss."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
     assert "only 0 of 32 random states" in lowered(system).reason
     a = system.acceleration([11.0], [0.0])
@@ -67,8 +67,8 @@ def test_too_few_states_to_compare_at_decide_for_the_array_program():
         (lambda t, q, v, p: 0.5 * v[0] ** 2 + 0.5 * (v[1] + v[2]) ** 2 - q @ q, 3),
     ],
 )
-def test_a_coordinate_without_inertia_leaves_no_acceleration(lagrangian, n):
-    """M is singular everywhere: M and h are compared in place of the acceleration."""
+def test_coordinate_without_inertia_makes_accelerations_nan(lagrangian, n):
+    """M is singular everywhere: M and h are compared instead of the acceleration."""
     system = jl.System(lagrangian, {"x": (n,)})
     assert lowered(system).reason == "equal to the array program at 8 random states"
     assert np.all(np.isnan(system.acceleration(np.ones(n), np.zeros(n))))
@@ -88,13 +88,13 @@ SHAPES = {
 def _wrong(equations, part, graph):
     """Equations with the last entry of one part off by 1e-9."""
 
-    def off(rows):
-        *others, last = rows
+    def off(entries):
+        *others, last = entries
         if isinstance(last, list):
             return [*others, off(last)]
         return [*others, graph.scale(last, 1.0 + 1e-9)]
 
-    if part == "accelerations":  # the velocities are the first of them
+    if part == "accelerations":  # the velocities come first
         v, others = equations.accelerations[:2], equations.accelerations[2:]
         return equations._replace(accelerations=[*off(v), *others])
     if part == "rows":
@@ -111,7 +111,7 @@ def _wrong(equations, part, graph):
     ],
 )
 def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
-    """Params that make it so at every state; an entry of any part off by 1e-9 is found."""
+    """M is indefinite at every state for these params; an error of 1e-9 in any part is found."""
 
     def lagrangian(t, q, v, p):
         return 0.5 * (v[0] ** 2 - p["m"] * (1.0 + q[0] ** 2) * v[1] ** 2) - q @ q
@@ -127,8 +127,8 @@ def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
 
 
 @pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
-def test_params_that_are_traced_need_not_be_known(module):
-    """Random numbers are no inertia of a body: in a jit over params there is a scalar program."""
+def test_traced_params_have_a_scalar_program(module):
+    """Random params are not inertias of a body; under jit over params a scalar program is used."""
     found = []
     params = jax.tree.map(jnp.asarray, dict(module.entry.example.params))
     jax.eval_shape(lambda params: found.append(lowered(module.system, params)), params)
@@ -139,7 +139,7 @@ def test_params_that_are_traced_need_not_be_known(module):
 
 
 def test_a_program_that_differs_is_not_used(monkeypatch):
-    """One sign flipped in h: the reason says so and the array program answers."""
+    """One sign of h is flipped: the reason states the difference, and the array program is used."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -155,7 +155,7 @@ def test_a_program_that_differs_is_not_used(monkeypatch):
 
 
 def test_a_program_that_gives_nan_is_not_used(monkeypatch):
-    """Where the array program is finite; nan compares as smaller than nothing."""
+    """Where the array program is finite; comparisons with nan are False."""
     derive = _lower.derive
 
     def wrong(scene, eps, limit):
@@ -167,8 +167,8 @@ def test_a_program_that_gives_nan_is_not_used(monkeypatch):
     assert "differs from the array program" in system.explain({"k": 2.0})
 
 
-def test_constrained_states_of_indefinite_mass_are_not_compared_at():
-    """Known params beside random ones, which may make M indefinite on what rows leave free."""
+def test_constrained_states_of_indefinite_mass_are_not_compared():
+    """Known params besides random ones, for which M may be indefinite on the constraints."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * ((params["I"] - params["m"]) * v[0] ** 2 + v[1] ** 2) - q[0] * q[1]
@@ -178,8 +178,8 @@ def test_constrained_states_of_indefinite_mass_are_not_compared_at():
     assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
 
 
-def test_params_at_hand_are_compared_with():
-    """An inertia that random numbers would make indefinite."""
+def test_given_params_are_compared():
+    """An inertia that random params would make indefinite."""
     declared, params, q0, _ = case("lamina_two_forces_fixed_direction")
 
     def fresh():
@@ -195,7 +195,7 @@ def test_params_at_hand_are_compared_with():
 
 
 @pytest.mark.full
-def test_too_many_operations_go_to_the_array_program():
+def test_too_many_operations_select_the_array_program():
     scene = SCENES["chain_8"]
     names = {"q": (8,)}
     short = jl.System(scene.lagrangian, names)
@@ -207,7 +207,7 @@ def test_too_many_operations_go_to_the_array_program():
     )
 
 
-def test_bad_lowering_is_refused():
+def test_invalid_lowering_is_refused():
     with pytest.raises(
         ValueError, match=r"^`lowering` must be 'auto', 'scalar' or 'array', but it"
     ):

@@ -1,4 +1,4 @@
-"""Declared constraints: their rows, names and derivatives, and declarations that are refused."""
+"""Declared constraints: rows, names and derivatives, and declarations that are refused."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ def random_state(n, seed=0):
     return jnp.array(rng.uniform(-1, 1, n)), jnp.array(rng.uniform(-1, 1, n))
 
 
-def test_rows_of_a_position_residual():
+def test_rows_of_position_residuals_equal_closed_forms():
     """A = d phi/dq, b = d phi/dt, gamma = second derivative along the motion at a = 0."""
     q, v = random_state(3)
     t, X, w = jnp.array(0.4), LED["X"], LED["Omega"]
@@ -41,12 +41,12 @@ def test_rows_of_a_position_residual():
     np.testing.assert_allclose(A, [[1, 0, -np.cos(q[2])], [0, 1, -np.sin(q[2])]], atol=EPS)
     np.testing.assert_allclose(b, [-X * w * np.cos(w * t), 0], atol=2 * EPS)
     gamma = led_pendulum._terms.gamma(t, q, v, LED)
-    turn = v[2] ** 2
-    expected = [X * w**2 * np.sin(w * t) + turn * np.sin(q[2]), -turn * np.cos(q[2])]
+    spin = v[2] ** 2
+    expected = [X * w**2 * np.sin(w * t) + spin * np.sin(q[2]), -spin * np.cos(q[2])]
     np.testing.assert_allclose(gamma, expected, atol=8 * EPS)
 
 
-def test_rows_of_a_velocity_residual():
+def test_rows_of_velocity_residuals_equal_closed_forms():
     q, v = random_state(3)
     t = jnp.array(0.0)
     A, b = skate._terms.rows(t, q, v, SKATE)
@@ -57,8 +57,8 @@ def test_rows_of_a_velocity_residual():
     np.testing.assert_allclose(gamma, [expected], atol=4 * EPS)
 
 
-def test_accelerations_keep_the_rows():
-    """A a + gamma = 0 and M a + h = Q + A^T lam, at states off the constraints, too."""
+def test_accelerations_satisfy_the_constraints():
+    """A a + gamma = 0 and M a + h = Q + A^T lam, also at states off the constraints."""
     q, v = random_state(4, 1)
     t = jnp.array(0.0)
     a = cartesian.acceleration(q, v, BOBS)
@@ -73,18 +73,18 @@ def test_accelerations_keep_the_rows():
     np.testing.assert_allclose(left, force, atol=50 * EPS * size)
 
 
-def test_reaction_vectors():
+def test_multipliers_have_the_shape_of_the_residual():
     """A constraint with one name has multipliers in the shape of its residual."""
     q, v = led_start()
     lam = led_pendulum.multipliers(q, v, LED)
     assert list(lam) == ["pin"]
     a = led_pendulum.acceleration(q, v, LED)
-    # Newton: the pin carries m (a - g) of the mass center.
+    # Newton: the force at the pin is m (a - g) of the mass center.
     expected = LED["m"] * (a[:2] - jnp.array([0.0, -9.81]))
     np.testing.assert_allclose(lam["pin"], expected, rtol=1e-14)
 
 
-def test_names_and_residuals():
+def test_residuals_and_rows_have_declared_names():
     q, v = random_state(4)
     position, velocity = cartesian.residuals(q, v, BOBS)
     assert list(position) == list(velocity) == ["rod1", "rod2"]
@@ -109,8 +109,8 @@ def test_names_and_residuals():
 
 
 @pytest.mark.full
-def test_four_bar_multipliers_by_virtual_work():
-    """Under a torque on the crank alone lam does no work: power balance through the loop."""
+def test_four_bar_constraint_forces_do_no_work():
+    """Constraint forces do no work: power balance through the loop."""
     q = jl.assemble(four_bar, [1.0, 0.4, -1.8], [0.5, 0, 0], FOUR_BAR, hold=("crank", "crank'"))
     force = four_bar.constraint_force(q.q, q.v, FOUR_BAR)
     assert abs(force @ q.v) <= 50 * EPS * np.linalg.norm(force) * np.linalg.norm(q.v)
@@ -184,13 +184,13 @@ def declared(*constraints, forces=()):
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_bad_declarations(make, message):
+def test_invalid_declarations_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
 def solved(q, v):
-    """(1 + q q^T)^-1 v, by a factorization that has no form on scalars."""
+    """(1 + q q^T)^-1 v, by a factorization without a scalar form."""
     return jnp.linalg.solve(jnp.eye(q.shape[0]) + jnp.outer(q, q), v)
 
 
@@ -209,13 +209,13 @@ def solved(q, v):
         (lambda t, q, p: 0.0 * q[0], False),
     ],
 )
-def test_which_rows_are_known_to_be_no_rounding(phi, sure):
-    """From the program alone; of the others their numbers tell."""
+def test_layout_marks_rows_that_cannot_be_rounding(phi, sure):
+    """From the program alone; the other rows are decided by their values."""
     assert layout((jl.Holonomic(phi, "a"),), jnp.zeros(()), 3, jnp.float64).sure == (sure,)
 
 
-def test_a_row_of_the_number_0_says_nothing():
-    """It is accepted, and leaves the motion free; another number is refused, see above."""
+def test_row_of_constant_zero_has_no_effect():
+    """It is accepted and has no effect; another constant is refused, see above."""
     row = jl.Holonomic(lambda t, q, params: jnp.stack([q[0] - q[1], 0.0 * q[0]]), ("a", "zero"))
     system = declared(row)
     q, v = jnp.zeros(4), jnp.array([1.0, 1.0, 0.5, -0.5])
@@ -268,7 +268,7 @@ def test_a_row_of_the_number_0_says_nothing():
         (jl.Holonomic(lambda t, q, params: q[:2].astype(int), "a"), "return a scalar or a vector"),
     ],
 )
-def test_rows_that_are_refused_at_first_use(constraint, message):
+def test_invalid_rows_are_refused_at_first_use(constraint, message):
     system, (q, v) = declared(constraint), random_state(4)
     for use in (
         lambda: system.acceleration(q, v, BOBS),
@@ -294,7 +294,7 @@ squared.defvjp(lambda x: (x**2, x), lambda x, slope: (2.0 * x * slope,))
         lambda square: jl.Pfaffian(lambda t, q, v, p: square(q[0]) * v[0] + v[1], "rod"),
     ],
 )
-def test_rules_for_reverse_derivatives_alone_have_forward_ones(row):
+def test_constraints_with_custom_vjp_rules_have_rates(row):
     """Rates along the motion are forward derivatives: they follow from the rule."""
     q, v = jnp.array([0.6, 0.8]), jnp.array([0.8, -0.6])
     found = []
@@ -305,7 +305,7 @@ def test_rules_for_reverse_derivatives_alone_have_forward_ones(row):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_options_that_are_refused():
+def test_invalid_options_are_refused():
     mechanism = double_pendulum()
     with pytest.raises(ValueError, match="`formulation` must be among"):
         jl.simulate(*mechanism[:3], [0.0, 1.0], BOBS, formulation="penalty")
@@ -335,22 +335,22 @@ def late(t):
             ),
             [False, True, False],
         ),
-        # Without a form on scalars time tells, and what is not known to be zero may differ from it.
+        # Without a scalar form: b counts as zero only if it certainly does not depend on time.
         (jl.Holonomic(lambda t, q, p: solved(q, q)[:2], "pin"), [False, False]),
         (jl.Holonomic(lambda t, q, p: solved(q, q)[0] - late(t), "led"), [True]),
         (jl.Pfaffian(lambda t, q, v, p: solved(q, v)[0] - late(t), "led"), [True]),
         (jl.Pfaffian(lambda t, q, v, p: jnp.sum(p["W"] @ v), "wide"), [True]),
     ],
 )
-def test_rows_that_may_do_work(constraint, driven):
-    """Wherever b differs from zero, be it far from all states one would try."""
+def test_driven_rows_are_those_that_may_do_work(constraint, driven):
+    """Wherever b differs from zero, even far from usual states."""
     n = 150 if constraint.names == "wide" else 4
     params = {**BOBS, "W": jnp.ones((n, n))}
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v, {"x": (n,)}, constraints=(constraint,))
     assert system._rows(params, jnp.dtype(float)).driven == tuple(driven)
 
 
-def test_work_of_a_row_that_moves_late():
+def test_power_of_a_row_that_moves_late():
     """x follows (t - 2)^3 with unit mass: power = 3 (t - 2)^2 6 (t - 2)."""
     led = jl.System(
         lambda t, q, v, params: 0.5 * v @ v,
@@ -383,8 +383,8 @@ def test_rows_may_close_over_traced_values():
     jax.jit(found)(1.0)
 
 
-def test_special_values_of_params_decide_nothing():
-    """A row whose amplitude is zero here is still a row with time in it."""
+def test_row_structure_ignores_values_of_params():
+    """A row whose amplitude is zero here still depends on time."""
     system = jl.System(
         bobs,
         ("x1", "y1", "x2", "y2"),
@@ -395,7 +395,7 @@ def test_special_values_of_params_decide_nothing():
 
 
 def test_closure_is_traced_once_per_shape():
-    """Other values of params do not trace the declaration again."""
+    """New values of params do not trace the declaration again."""
     count = []
 
     def counted(t, q, params):

@@ -1,4 +1,4 @@
-"""Names and shapes of coordinates, and the flat vector behind them."""
+"""Names and shapes of coordinates, and their flat vector."""
 
 import re
 
@@ -24,14 +24,14 @@ def test_names_shapes_and_labels():
     assert Coordinates(["x", "theta"]) == PLAIN
 
 
-def test_labels_are_where_unflatten_puts_the_entries():
+def test_labels_match_the_order_of_unflatten():
     parts = MIXED.unflatten(jnp.arange(8.0))
     for i, label in enumerate(MIXED.labels):
         name, *index = re.findall(r"\w+", label)
         assert float(parts[name][tuple(map(int, index))]) == i
 
 
-def test_flatten_undoes_unflatten():
+def test_flatten_inverts_unflatten():
     q = jnp.arange(8.0) / 7
     parts = MIXED.unflatten(q)
     assert {name: part.shape for name, part in parts.items()} == MIXED.shapes
@@ -41,17 +41,17 @@ def test_flatten_undoes_unflatten():
 
 
 def test_unflatten_keeps_leading_axes():
-    rows = jnp.arange(48.0).reshape(2, 3, 8)
-    parts = MIXED.unflatten(rows)
+    states = jnp.arange(48.0).reshape(2, 3, 8)
+    parts = MIXED.unflatten(states)
     assert {name: part.shape for name, part in parts.items()} == {
         "x": (2, 3, 2, 3),
         "theta": (2, 3),
         "w": (2, 3, 1),
     }
-    np.testing.assert_array_equal(parts["x"][1, 2], MIXED.unflatten(rows[1, 2])["x"])
+    np.testing.assert_array_equal(parts["x"][1, 2], MIXED.unflatten(states[1, 2])["x"])
 
 
-def test_equal_tables_are_one_key():
+def test_equal_declarations_have_equal_hashes():
     assert Coordinates(("x", "theta")) == PLAIN
     assert hash(Coordinates({"x": (), "theta": ()})) == hash(PLAIN)
     others = [
@@ -83,7 +83,7 @@ def test_equal_tables_are_one_key():
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_a_bad_declaration_is_refused(declared, message):
+def test_invalid_declaration_is_refused(declared, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         Coordinates(declared)
 
@@ -100,7 +100,7 @@ def test_a_bad_declaration_is_refused(declared, message):
         ({"x": 1.0, "theta": [[0.0]]}, "`q['theta']` must have shape (), but it was (1, 1)."),
     ],
 )
-def test_bad_parts_are_refused(parts, message):
+def test_invalid_parts_are_refused(parts, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         PLAIN.flatten(parts)
     with pytest.raises(ValueError, match="^" + re.escape(message.replace("q", "v0", 1))):
@@ -123,14 +123,14 @@ def test_bad_parts_are_refused(parts, message):
         ([1.0, 2.0j], "`q` must be real, but its dtype was complex128."),
     ],
 )
-def test_a_bad_vector_is_refused(x, message):
+def test_invalid_vector_is_refused(x, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         vector(PLAIN, "q", x)
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         state_vectors(PLAIN, x, [0.0, 0.0])
 
 
-def test_the_order_of_the_entries_stands_in_the_message():
+def test_message_states_the_order_of_entries():
     with pytest.raises(ValueError, match=r"in the order \['x\[0,0\]', 'x\[0,1\]', .*'theta'"):
         vector(MIXED, "q0", [1.0])
 

@@ -1,4 +1,4 @@
-"""Applied forces: their two signatures, Rayleigh functions, names, and what is refused."""
+"""Applied forces: signatures, Rayleigh functions, names, and declarations that are refused."""
 
 import re
 from functools import partial
@@ -44,7 +44,7 @@ PARTS = {
 }
 
 
-def test_a_force_takes_inputs_or_leaves_them_out():
+def test_inputs_are_an_optional_argument_of_forces():
     assert (SPRING.takes_inputs, MOTOR.takes_inputs) == (False, True)
     np.testing.assert_allclose(SPRING(T, Q, V, PARAMS, {}), PARTS["spring"], rtol=8 * EPS)
     found = MOTOR(T, Q, V, PARAMS, {"torque": 5.0})
@@ -52,12 +52,12 @@ def test_a_force_takes_inputs_or_leaves_them_out():
 
 
 def test_a_rayleigh_force_is_the_gradient_of_its_function():
-    """Also where it is not quadratic: R = c (1 + t)(1 + x^2) sum |v|^3/3."""
+    """Also for a function that is not quadratic: R = c (1 + t)(1 + x^2) sum |v|^3/3."""
     np.testing.assert_allclose(DRAG(T, Q, V, PARAMS, {}), PARTS["drag"], rtol=8 * EPS)
     assert jl.Rayleigh(dissipation, "rayleigh").name == "rayleigh"
 
 
-def test_dissipation_of_degree_k_takes_k_times_its_function():
+def test_power_of_homogeneous_dissipation_is_k_times_its_function():
     """Euler: v . Q = -k R for R homogeneous of degree k in v; here 3."""
     R = dissipation(T, Q, V, PARAMS)
     np.testing.assert_allclose(V @ DRAG(T, Q, V, PARAMS, {}), -3 * R, rtol=8 * EPS)
@@ -73,14 +73,14 @@ def test_forces_add_up_by_name(names):
     np.testing.assert_allclose(force(), expected, rtol=16 * EPS, atol=16 * EPS)
 
 
-def test_forces_reach_the_acceleration():
+def test_forces_enter_the_acceleration():
     """M = 1: a = Q."""
     inputs = {"torque": jnp.array(5.0)}
     a = jax.jit(lambda: SYSTEM.acceleration(Q, V, PARAMS, t=T, inputs=inputs))()
     np.testing.assert_allclose(a, sum(PARTS.values()), rtol=16 * EPS)
 
 
-def test_forces_of_the_same_function_and_name_are_one():
+def test_forces_of_the_same_function_and_name_are_equal():
     assert jl.GeneralizedForce(spring, "spring") == SPRING
     assert hash(jl.GeneralizedForce(spring, "spring")) == hash(SPRING)
     assert jl.GeneralizedForce(spring, "other") != SPRING
@@ -88,7 +88,7 @@ def test_forces_of_the_same_function_and_name_are_one():
 
 
 class Law:
-    """A force with a method for its law, and one given by `partial`."""
+    """A force law as a method."""
 
     def law(self, t, q, v, params, inputs):
         return inputs["gain"] * q
@@ -98,7 +98,7 @@ def scaled(factor, t, q, v, params):
     return factor * q
 
 
-def test_methods_and_partials_are_counted_without_what_is_bound():
+def test_signatures_of_methods_and_partials_exclude_bound_arguments():
     assert jl.GeneralizedForce(Law().law, "law").takes_inputs
     force = jl.GeneralizedForce(partial(scaled, 3.0), "scaled")
     assert not force.takes_inputs
@@ -144,7 +144,7 @@ def test_methods_and_partials_are_counted_without_what_is_bound():
         ),
     ],
 )
-def test_a_bad_declaration_is_refused(make, message):
+def test_invalid_declaration_is_refused(make, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         make()
 
@@ -175,13 +175,13 @@ def test_a_bad_declaration_is_refused(make, message):
         ),
     ],
 )
-def test_a_bad_type_is_refused(make, message):
+def test_invalid_type_is_refused(make, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         make()
 
 
 def pushed_by(force):
-    """A system of two coordinates under a force, and what checks it."""
+    """A system of two coordinates under a force."""
     return jl.System(free, ("x", "y"), forces=(jl.GeneralizedForce(force, "push"),))
 
 

@@ -1,4 +1,4 @@
-"""Inertias that no body has are refused, all others are taken."""
+"""Inertias that are impossible for a body are refused, all others are accepted."""
 
 import re
 
@@ -32,13 +32,13 @@ T = jnp.array(0.4)
     ],
     ids=str,
 )
-def test_an_inertia_that_no_body_has_is_refused(inertia, message):
+def test_impossible_inertia_is_refused(inertia, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         energy.RigidBody(1.0, inertia)
 
 
-def test_check_finds_it_in_a_declared_system():
-    """Inside a Lagrangian the values are seen by `check`, which does not trace them."""
+def test_check_finds_impossible_inertia_in_a_system():
+    """`check` does not trace and sees the values inside a Lagrangian."""
 
     def kinetic(t, q, v, params):
         body = energy.RigidBody(1.0, jnp.stack([params["I"], params["I"], params["I"]]))
@@ -51,8 +51,8 @@ def test_check_finds_it_in_a_declared_system():
         system.check(*state, {"I": -0.4})
 
 
-def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
-    """Literals are values under jit too, each by itself; what is traced is left alone."""
+def test_literals_in_a_traced_lagrangian_are_checked():
+    """Literals have values under jit, each independently; traced values are not checked."""
 
     def kinetic(mass, inertia, center=None):
         return energy.RigidBody(mass, inertia, center).kinetic_from_rates(np.ones(3), np.ones(3))
@@ -70,13 +70,13 @@ def test_numbers_written_in_a_traced_lagrangian_are_looked_at():
         with pytest.raises(ValueError, match=message):
             jax.jit(function)(given)
     about_g = energy.parallel_axis([0.1, 0.1, 0.1], 1.0, [1.0, 0.0, 0.0])
-    for mass in (1.0, 9.0):  # traced: the second would be refused
+    for mass in (1.0, 9.0):  # traced: otherwise the second would be refused
         jax.jit(lambda m: kinetic(m, about_g, [1.0, 0.0, 0.0]))(mass)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_an_inertia_about_the_mass_center_is_refused(dtype):
-    """I_G given for I_O: T = -0.45 J for a motion of 1 m/s and 1 rad/s, were it taken."""
+    """I_G given for I_O: if accepted, T = -0.45 J for a motion of 1 m/s and 1 rad/s."""
     central, c = np.full(3, 0.1, dtype), np.array([1.0, 0.0, 0.0], dtype)
     message = (
         "RigidBody: `inertia` must be at least that of a point mass at the center, m (|c|^2 E - c "
@@ -93,8 +93,8 @@ def test_an_inertia_about_the_mass_center_is_refused(dtype):
         energy.RigidBody(2.0, (0.0, 0.0, 0.1), (0.3, 0.2, 0.0))
 
 
-def test_a_point_mass_is_a_body():
-    """Nothing is left about the mass center, up to rounding, wherever that is."""
+def test_point_mass_is_a_valid_body():
+    """The inertia about the mass center vanishes up to rounding, for any mass center."""
     for c in np.random.default_rng(5).normal(size=(100, 3)):
         for dtype in (np.float64, np.float32):
             c_mass, zero = np.array([*c, 0.7], dtype), np.zeros((3, 3), dtype)
@@ -111,7 +111,7 @@ def test_slender_and_plane_bodies_are_allowed():
 
 
 def test_a_body_may_be_given_in_integers():
-    """Under the tests' strict promotion, too; the mass is a number to differentiate by."""
+    """Also under strict promotion; the mass is a real number for derivatives."""
     whole = energy.RigidBody(2, [2, 5, 5], [1, 0, 0])
     same = energy.RigidBody(2.0, np.diag([2.0, 5.0, 5.0]), [1.0, 0.0, 0.0])
     assert all(jnp.issubdtype(x.dtype, jnp.floating) for x in jax.tree.leaves(whole))
@@ -123,7 +123,7 @@ def test_a_body_may_be_given_in_integers():
     assert jax.grad(lambda body: body.kinetic_from_rates(V, w))(eye).mass == 7
 
 
-def test_integers_are_not_rounded_to():
+def test_integer_positions_do_not_round_results():
     """9.81 m/s^2 stays 9.81 along integer positions."""
     np.testing.assert_allclose(energy.gravity(2.0, jnp.array([0, 2]), [0.0, -9.81]), 4 * 9.81)
     np.testing.assert_allclose(energy.gravity(2, [0, 2], [0, -10]), 40)

@@ -1,4 +1,4 @@
-"""Inputs: tables, functions of time, feedback and constants; what is read, and what is refused."""
+"""Inputs: tables, functions of time, feedback and constants; reading, and invalid inputs."""
 
 import re
 from functools import partial
@@ -33,29 +33,29 @@ def read(signal, t):
 
 
 def at(signal, times):
-    """The signal at many times; numpy arrays, each time on its own."""
+    """The signal at many times as a numpy array, each time separately."""
     return np.array([read(signal, jnp.array(t)) for t in times])
 
 
 # ---- Tables --------------------------------------------------------------------------------------
 
 
-def test_a_hold_keeps_each_value_up_to_the_next_time():
-    np.testing.assert_array_equal(at(HOLD, TIMES), VALUES)  # from the right, the last one too
+def test_zero_order_hold_keeps_each_value_up_to_the_next_time():
+    np.testing.assert_array_equal(at(HOLD, TIMES), VALUES)  # from the right, the last value, too
     before = np.nextafter(TIMES[1:], -np.inf)
     np.testing.assert_array_equal(at(HOLD, before), VALUES[:-1])
     np.testing.assert_array_equal(at(HOLD, [0.1, 0.7, 1.9, 2.1]), [3.0, -1.0, -1.0, 4.0])
 
 
-def test_a_linear_table_meets_its_values_and_runs_straight_between():
+def test_linear_interpolation_equals_numpy_interp():
     np.testing.assert_array_equal(at(LINE, TIMES), VALUES)
     times = np.array([0.1, 0.25, 0.6, 1.25, 2.1])
     expected = np.interp(times, TIMES, VALUES)
     np.testing.assert_allclose(at(LINE, times), expected, rtol=8 * EPS)
 
 
-def test_a_linear_table_has_the_slope_of_its_interval_on_either_side():
-    """At a knot itself, the slope to the right, but to the left at the last."""
+def test_linear_interpolation_has_the_slope_of_its_interval():
+    """At a knot the slope to the right; at the last knot the slope to the left."""
     slope = jax.jit(jax.vmap(jax.grad(partial(read, LINE))))
     slopes = np.diff(VALUES) / np.diff(TIMES)
     before, after = np.nextafter(TIMES, -np.inf), np.nextafter(TIMES, np.inf)
@@ -77,8 +77,8 @@ def test_tables_differentiate_with_respect_to_their_values_and_times():
     np.testing.assert_array_equal(slope.values, [0, 1, 0, 0])
 
 
-def test_a_step_reads_the_interval_it_is_told():
-    """Whatever the time: no stage of a step reads the other side of a jump."""
+def test_steps_read_the_given_interval():
+    """For any time: no stage of a step reads across a jump."""
     for t in (0.4, 0.5, 0.6):
         for i, value in enumerate(VALUES):
             found = evaluate({"u": HOLD}, jnp.array(t), Q, V, PARAMS, {"u": jnp.array(i)})
@@ -91,9 +91,9 @@ def test_locate_finds_the_interval_that_begins_at_or_before():
     times = [0.0, 0.25, 0.5, 1.0, 2.0, 2.25]
     signals = {"hold": HOLD, "line": LINE, "wave": jl.TimeFunction(jnp.sin), "gain": jnp.array(1.0)}
     found = [locate(signals, jnp.array(t)) for t in times]
-    assert [int(row["hold"]) for row in found] == [0, 0, 1, 1, 2, 3]
-    assert [int(row["line"]) for row in found] == [0, 0, 1, 1, 2, 2]
-    assert [(row["wave"], row["gain"]) for row in found] == [(None, None)] * 6
+    assert [int(intervals["hold"]) for intervals in found] == [0, 0, 1, 1, 2, 3]
+    assert [int(intervals["line"]) for intervals in found] == [0, 0, 1, 1, 2, 2]
+    assert [(intervals["wave"], intervals["gain"]) for intervals in found] == [(None, None)] * 6
 
 
 def test_tables_may_hold_vectors_and_whole_numbers():
@@ -102,12 +102,12 @@ def test_tables_may_hold_vectors_and_whole_numbers():
     assert table.times.dtype == table.values.dtype == jnp.float64
 
 
-def test_a_table_in_single_precision_stays_so():
+def test_float32_tables_stay_float32():
     table = jl.LinearInterpolation([0.0, 1.0], np.array([1.0, 2.0], np.float32))
     assert read(table, jnp.array(0.5)).dtype == jnp.float32
 
 
-def test_knots_and_range_are_those_of_all_tables():
+def test_knots_and_range_cover_all_tables():
     late = jl.ZeroOrderHold([0.25, 1.0, 3.0], [1.0, 2.0, 3.0])
     signals = {"a": HOLD, "f": jl.TimeFunction(jnp.sin), "b": late, "gain": jnp.array(1.0)}
     np.testing.assert_array_equal(all_knots(signals), [*TIMES, 0.25, 1.0, 3.0])
@@ -143,14 +143,14 @@ def test_a_function_takes_time_or_time_and_params():
     assert read(jl.TimeFunction(lambda t: 2.0), t) == 2.0
 
 
-def test_a_default_of_a_function_is_no_place_for_params():
-    """The usual way to bind a value early."""
+def test_default_of_a_function_does_not_receive_params():
+    """The usual way to bind a value at definition."""
     signals = [jl.TimeFunction(lambda t, w=w: w * t) for w in (2.0, 3.0)]
     assert [float(read(signal, jnp.array(0.5))) for signal in signals] == [1.0, 1.5]
 
 
-def test_a_hold_may_have_one_value_for_each_interval():
-    """As controls between edges are kept; the last one holds at the end, too."""
+def test_zero_order_hold_accepts_one_value_per_interval():
+    """As controls between grid edges; the last value also holds at the end."""
     hold = jl.ZeroOrderHold([0.0, 1.0, 3.0], [2.0, 5.0])
     np.testing.assert_array_equal(hold.values, [2.0, 5.0, 5.0])
     pairs = jl.ZeroOrderHold([0, 1, 3], [[1, 2], [3, 4]])
@@ -159,12 +159,12 @@ def test_a_hold_may_have_one_value_for_each_interval():
 
 
 def around(signal, t):
-    """The signal as a step from t reads it."""
+    """The signal as read by a step from t."""
     return at_interval({"u": signal}, jnp.array(t))[0]["u"]
 
 
-def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
-    """Up to the knot, and from it on; its derivative in time is that of the function."""
+def test_functions_are_read_on_the_side_of_the_knot_of_the_step():
+    """Up to the knot, and from it on; the time derivative is that of the function."""
     step = jl.TimeFunction(lambda t: jnp.where(t < 1.0, 2.0 * t, 5.0 * t), knots=[1.0, 2.0])
     np.testing.assert_array_equal(step.knots(), [1.0, 2.0])
     before, after = around(step, 0.3), around(step, 1.0)
@@ -172,7 +172,7 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
     np.testing.assert_allclose(read(before, knot), 2.0, rtol=1e-15)
     assert read(after, knot) == read(step, knot) == 5.0
     assert jax.grad(lambda t: read(before, t))(knot) == 2.0
-    late, early = knot + 2 * EPS, knot - EPS  # rounding of a step's ends is none of them
+    late, early = knot + 2 * EPS, knot - EPS  # rounding of a step's ends does not cross the knot
     np.testing.assert_allclose([read(before, late), read(after, early)], [2.0, 5.0], rtol=4 * EPS)
     assert jax.grad(lambda t: read(before, t))(late) == 2.0
     assert jax.grad(lambda t: read(after, t))(early) == 5.0
@@ -188,12 +188,12 @@ def test_a_function_is_read_on_the_side_of_its_knot_that_a_step_lies_on():
         ([], "be an array of at least 1 times"),
     ],
 )
-def test_bad_knots_of_a_function_are_refused(knots, message):
+def test_invalid_knots_of_a_function_are_refused(knots, message):
     with pytest.raises(ValueError, match=f"^TimeFunction: `knots` must {message}"):
         jl.TimeFunction(lambda t: t, knots=knots)
 
 
-def test_feedback_sees_the_state():
+def test_feedback_reads_the_state():
     found = read(jl.Feedback(lambda t, q, v, params: q[0] * v[1] + params["w"] * t), jnp.array(2.0))
     np.testing.assert_allclose(found, 0.4 * -2.0 + 3.0 * 2.0, rtol=4 * EPS)
 
@@ -223,7 +223,7 @@ def test_arrays_and_numbers_are_constants():
 
 
 def pushed(reading):
-    """Two coordinates of unit mass, pushed by `reading(inputs)`."""
+    """Two coordinates of unit mass under the force `reading(inputs)`."""
 
     def push(t, q, v, params, inputs):
         return jnp.stack([reading(inputs), 0.0 * t])
@@ -292,7 +292,7 @@ def test_every_way_of_reading_a_dict_counts_as_reading(reading):
 
 
 @pytest.mark.parametrize("t", [-0.5, 2.5])
-def test_a_table_asked_outside_its_range_is_refused(t):
+def test_evaluation_outside_a_table_is_refused(t):
     for ask in (PUSHED.acceleration, PUSHED.generalized_force, PUSHED.check):
         with pytest.raises(ValueError, match=r"^`inputs`.*cover.* 0\.0 to 2\.25"):
             ask(Q, V, t=t, inputs={"u": LINE})
@@ -302,7 +302,7 @@ def test_a_table_asked_outside_its_range_is_refused(t):
     ("ts", "cover"),
     [([-1.0, 1.0], "-1.0 to 1.0 s"), ([0.0, 3.0], "0.0 to 3.0 s"), ([1.0, -0.1], "-0.1 to 1.0 s")],
 )
-def test_a_run_beyond_its_tables_is_refused(ts, cover):
+def test_solve_beyond_its_tables_is_refused(ts, cover):
     message = (
         rf"^`inputs` must cover ts, from {cover}, but their tables cover 0\.0 to 2\.25 s\. Ext"
     )
@@ -349,15 +349,15 @@ def test_a_run_beyond_its_tables_is_refused(ts, cover):
         ([0.0, 1.0], [0.0, np.inf], "`values` must be finite, but some were nan or inf."),
     ],
 )
-def test_a_bad_table_is_refused(kind, times, values, message):
+def test_invalid_table_is_refused(kind, times, values, message):
     with pytest.raises(ValueError, match=f"^{kind.__name__}: {re.escape(message)}"):
         kind(times, values)
 
 
 @pytest.mark.parametrize("kind", [jl.ZeroOrderHold, jl.LinearInterpolation])
 @pytest.mark.parametrize("array", [list, np.array, jnp.array])
-def test_known_tables_are_as_good_under_a_transform(kind, array):
-    """Built of arrays from outside while JAX traces what is around them."""
+def test_known_tables_are_checked_under_a_transform(kind, array):
+    """Built of constant arrays while JAX traces the function around them."""
     times, values, worse = array(TIMES), array(VALUES), array([3.0, np.nan, 4.0, 10.0])
     found = jax.jit(lambda t: read(kind(times, values), t))(1.25)
     assert found == read(kind(TIMES, VALUES), jnp.array(1.25))
@@ -396,12 +396,12 @@ def test_known_tables_are_as_good_under_a_transform(kind, array):
         ),
     ],
 )
-def test_a_bad_signal_is_refused(make, message):
+def test_invalid_signal_is_refused(make, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         make()
 
 
-def test_a_function_for_an_input_is_told_how_to_be_wrapped():
+def test_unwrapped_function_gets_advice_to_wrap_it():
     with pytest.raises(
         ValueError, match=r"Wrap it in jl\.TimeFunction \(of time\) or jl\.Feedback"
     ):
@@ -431,7 +431,7 @@ def test_a_function_for_an_input_is_told_how_to_be_wrapped():
         ),
     ],
 )
-def test_a_bad_type_is_refused(make, message):
+def test_invalid_type_is_refused(make, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         make()
 

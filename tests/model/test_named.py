@@ -1,4 +1,4 @@
-"""Functions of coordinates by name: the same as those of flat vectors."""
+"""Functions of named coordinates equal those of flat vectors."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,7 +39,7 @@ def speeds(t, q, v, params):
 PARAMS = {"m": 2.0, "I": 0.5}
 
 
-def test_every_declared_function_may_be_of_names():
+def test_every_declared_function_accepts_names():
     """Lagrangian, force with inputs, constraint and quasi-velocities, by names and flat."""
     by_name = jl.System(
         lagrangian,
@@ -66,8 +66,8 @@ def test_every_declared_function_may_be_of_names():
     np.testing.assert_allclose(one["out"], 0.0, atol=1e-14)
 
 
-def test_it_is_one_function_however_often_it_is_named():
-    """So that systems made of it compile once."""
+def test_named_functions_are_equal_for_equal_names():
+    """Systems of equal functions compile once."""
     assert jl.named(NAMES)(flat) == jl.named(NAMES)(flat)
     assert hash(jl.named(NAMES)(flat)) == hash(jl.named(NAMES)(flat))
     assert jl.named(("x", "y", "z"))(flat) != jl.named(NAMES)(flat)

@@ -1,4 +1,4 @@
-"""Quasi-velocities that are refused, and motions that their kinematics end."""
+"""Invalid quasi-velocities are refused, and singular kinematics end a motion."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 @pytest.mark.full
 def test_singular_kinematics_are_named():
-    """Pitch at 90 degrees: the third rate follows from the second; traced as well."""
+    """At a pitch of 90 degrees the third rate follows from the second; also under jit."""
     system = angles()
 
     def status(pitch):
@@ -69,8 +69,8 @@ def swinging(t, q, v, params):
 @pytest.mark.parametrize(
     "pitch", mostly_full([0.5 * np.pi, -0.5 * np.pi, 1.5 * np.pi], 0.5 * np.pi)
 )
-def test_a_rate_that_rounding_leaves_is_none(pitch):
-    """Without roll the third rate is 6e-17 yaw' and nothing else."""
+def test_rates_of_rounding_count_as_singular(pitch):
+    """Without roll the third rate is 6e-17 yaw', which is rounding."""
     system, q, v = angles(), [0.0, pitch, 0.0], [0.1, 0.2, 0.3]
     for start in ({"v0": None, "u0": v}, {"v0": v}):
         motion = jl.simulate(system, q, ts=[0.0, 0.1], throw=False, **start)
@@ -81,7 +81,7 @@ def test_a_rate_that_rounding_leaves_is_none(pitch):
 
 
 @pytest.mark.full
-def test_a_lane_with_singular_kinematics_spoils_no_derivative():
+def test_lane_with_singular_kinematics_does_not_affect_derivatives():
     quasi = jl.QuasiVelocities(leaning, ("a", "b"))
     system = jl.System(swinging, ("x", "y"), quasi=quasi)
 
@@ -115,8 +115,8 @@ def test_a_lane_with_singular_kinematics_spoils_no_derivative():
 
 
 @pytest.mark.full
-def test_a_failure_that_kinematics_have_no_part_in_keeps_its_name():
-    """A force that ends, where dU/dv is singular: with multipliers U is not asked."""
+def test_failures_independent_of_kinematics_keep_their_status():
+    """A force ends where dU/dv is singular: with multipliers U is not evaluated."""
 
     def ending(t, q, v, params):
         return jnp.stack([0.0 * t, jnp.sqrt(0.1 - t), 0.0 * t])
@@ -134,11 +134,11 @@ def test_a_failure_that_kinematics_have_no_part_in_keeps_its_name():
         jl.simulate(system, [0.0] * 3, [0.0] * 3, [0.0, 1.0], formulation="multipliers")
 
 
-def bent(t, q, v, params):
+def not_affine(t, q, v, params):
     return jnp.stack([v[0] * v[1], v[1], v[2]])
 
 
-def bent_kinematics(t, q, u, params):
+def not_affine_kinematics(t, q, u, params):
     return jnp.stack([u[0], u[1] ** 2, u[0]])
 
 
@@ -160,7 +160,7 @@ def run(quasi, **options):
     ("make", "message"),
     [
         (lambda: jl.QuasiVelocities(names=NAMES), "get either U or kinematics, but it got neither"),
-        (lambda: one(kinematics=bent_kinematics), "it got both"),
+        (lambda: one(kinematics=not_affine_kinematics), "it got both"),
         (lambda: one(U=lambda t, q: q), r"callable as \(t, q, v, params\)"),
         (lambda: one(names="abc"), "sequence of names, but it was 'abc'"),
         (lambda: one(names=()), "name at least one"),
@@ -181,7 +181,7 @@ def run(quasi, **options):
         ),
         (lambda: jl.System(in_v, ("x", "y", "z"), written_in="u"), "be used with quasi-velocities"),
         (lambda: system_of(one(), written_in="w"), "`written_in` must be 'v' or 'u'"),
-        (lambda: run(one(U=bent)), "'a': `U` must be affine in v"),
+        (lambda: run(one(U=not_affine)), "'a': `U` must be affine in v"),
         (lambda: run(one(U=lambda t, q, v, p: v[:2])), r"`U` must return 3 numbers.*shape \(2,\)"),
         (
             lambda: run(one(U=lambda t, q, v, p: v.at[1].set(q[1]))),
@@ -192,7 +192,7 @@ def run(quasi, **options):
             "leave at least 3 that are not constrained.*there were 2",
         ),
         (
-            lambda: run(jl.QuasiVelocities(kinematics=bent_kinematics, names=NAMES)),
+            lambda: run(jl.QuasiVelocities(kinematics=not_affine_kinematics, names=NAMES)),
             r"`kinematics` must be affine in u, but the derivative of v\[1\]",
         ),
         (
@@ -226,7 +226,7 @@ def run(quasi, **options):
         ),
     ],
 )
-def test_bad_input_is_named(make, message):
+def test_invalid_input_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -234,14 +234,14 @@ def test_bad_input_is_named(make, message):
 PLAIN = jl.System(in_v, ("x", "y", "z"))
 
 
-def test_something_else_than_quasi_velocities_is_refused(unchecked):  # noqa: F811
+def test_other_types_are_refused(unchecked):  # noqa: F811
     with pytest.raises(ValueError, match=r"be a jl.QuasiVelocities, but it was 'u'"):
         system_of("u")
 
 
 @pytest.mark.full
-def test_rows_beside_them_are_solved_for_with_multipliers():
-    """Where quasi-velocities do not take care of a row, "auto" means multipliers."""
+def test_additional_rows_are_solved_with_multipliers():
+    """If quasi-velocities do not satisfy a row, "auto" means multipliers."""
     motion = run(one(), constraints=(BLADE,), u0=np.zeros(3))
     assert motion.formulation == "multipliers"
     np.testing.assert_allclose(motion.u[0], 0.0, atol=8 * EPS)
@@ -251,8 +251,8 @@ def braked(t, q, v, params, lam):
     return -0.2 * lam["b"] * v
 
 
-def test_a_force_may_read_what_holds_a_quasi_velocity():
-    """Solved for with multipliers then; the quasi-velocity formulation knows none."""
+def test_forces_may_read_multipliers_of_quasi_velocities():
+    """Such systems are solved with multipliers; the quasi-velocity formulation has none."""
     force = jl.GeneralizedForce(braked, "brake", reaction=True)
     quasi = one(constrained=("b",))
     system = system_of(quasi, forces=(force,))
@@ -261,15 +261,15 @@ def test_a_force_may_read_what_holds_a_quasi_velocity():
     assert motion.formulation == "multipliers"
     np.testing.assert_allclose(motion["b"], 0.0, atol=64 * EPS)
     a, force = motion.a[-1], system.constraint_force(motion.q[-1], motion.v[-1], PARAMS, t=0.2)
-    push = braked(0.2, motion.q[-1], motion.v[-1], PARAMS, {"b": motion.lam["b"][-1]})
+    brake = braked(0.2, motion.q[-1], motion.v[-1], PARAMS, {"b": motion.lam["b"][-1]})
     M, h = (f(motion.q[-1], motion.v[-1], PARAMS, t=0.2) for f in (system.mass_matrix, system.bias))
-    np.testing.assert_allclose(M @ a + h, push + force, atol=1e-13)
+    np.testing.assert_allclose(M @ a + h, brake + force, atol=1e-13)
     with pytest.raises(ValueError, match=r"need formulation='multipliers'"):
         jl.simulate(system, np.zeros(3), formulation="quasi", **start)
 
 
-def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
-    """Three speeds for three coordinates, one of which the blade's row forbids."""
+def test_kinematics_that_do_not_satisfy_a_row_use_multipliers():
+    """Three speeds for three coordinates; the blade's row excludes one of them."""
 
     def rates(t, q, u, params):
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
@@ -286,7 +286,7 @@ def test_kinematics_that_leave_a_row_are_solved_with_multipliers():
     np.testing.assert_allclose(motion.q, other.q, atol=1e-14)
 
 
-def test_what_is_found_is_said():
+def test_explain_states_the_reduced_state():
     system = declared(of_u, "u", ("b",))
     text = system.explain(PARAMS)
     assert "a, c and q form the state, b being 0" in text

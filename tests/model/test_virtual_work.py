@@ -48,27 +48,27 @@ def force_of(force, inputs=None, q=Q, v=V, t=T, params=PARAMS):
     return force(t, q, v, params, {} if inputs is None else inputs)
 
 
-def bent(t, q, params):
+def two_points(t, q, params):
     """Two points in space that move with the coordinates and with time."""
     angles = jnp.cumsum(q[:3]) + t
     x, y = jnp.cumsum(jnp.cos(angles) * q[3:]), jnp.cumsum(jnp.sin(angles))
     return jnp.stack([jnp.stack([x[0], y[1], q[4] ** 2]), jnp.stack([x[2], y[2], t * q[5]])])
 
 
-def test_a_point_force_does_the_work_of_its_displacement():
-    """Q = (dr/dq)^T F, against the Jacobian formed; two points at once."""
+def test_point_force_equals_jacobian_transpose_times_force():
+    """Q = (dr/dq)^T F, compared with the explicit Jacobian; two points at once."""
 
     def pull(t, q, v, params):
         return jnp.stack([params["F"], -0.5 * params["F"]]) * (1 + v[0])
 
-    found = force_of(jl.PointForce(bent, pull, "pull"))
-    J = np.asarray(jax.jacfwd(bent, argnums=1)(T, Q, PARAMS)).reshape(6, N)
+    found = force_of(jl.PointForce(two_points, pull, "pull"))
+    J = np.asarray(jax.jacfwd(two_points, argnums=1)(T, Q, PARAMS)).reshape(6, N)
     F = np.asarray(pull(T, Q, V, PARAMS)).reshape(6)
     assert np.all(np.abs(found - J.T @ F) <= 16 * EPS * (np.abs(J.T) @ np.abs(F)))
 
 
 def test_the_jacobian_is_never_formed():
-    """A force at the tip of a chain of 50 links: no array of 2 x 50 numbers, in any order."""
+    """A force at the tip of a chain of 50 links: no array has 2 x 50 entries, in any order."""
     n = 50
 
     def tip(t, q, params):
@@ -85,7 +85,7 @@ def test_the_jacobian_is_never_formed():
 
 
 def test_power_of_a_point_force_is_that_of_its_point():
-    """v . Q = F . dr/dt where the point moves with the coordinates alone."""
+    """v . Q = F . dr/dt if the point moves only with the coordinates."""
     found = V @ force_of(jl.PointForce(corner, constant, "pull"))
     rate = jax.jvp(lambda q: corner(T, q, PARAMS), (Q,), (V,))[1]
     np.testing.assert_allclose(found, PARAMS["F"] @ rate, rtol=64 * EPS)
@@ -118,7 +118,7 @@ def test_forces_and_torques_read_inputs():
 
 
 def test_body_torques_act_on_euler_angles_by_the_transposed_rate_matrix():
-    """Q = W^T tau with w = W (psi', theta', phi'), nothing on the position."""
+    """Q = W^T tau with w = W (psi', theta', phi'); zero for the position."""
     found = force_of(jl.Torque(body_rates, constant, "motor"))
     W = np.asarray(rotation.yaw_pitch_roll.body_rate_matrix(Q[3:]))
     np.testing.assert_array_equal(found[:3], 0)
@@ -126,7 +126,7 @@ def test_body_torques_act_on_euler_angles_by_the_transposed_rate_matrix():
 
 
 def test_a_torque_may_be_given_in_body_or_inertial_components():
-    """The same torque, its components and those of the angular velocity in either axes."""
+    """One torque: components of torque and angular velocity in body or inertial axes."""
 
     def turned(t, q, v, params):
         return orientation(q) @ params["F"]
@@ -143,7 +143,7 @@ def test_a_plane_couple_is_a_scalar():
     np.testing.assert_array_equal(force_of(couple), [-2.0, 2.0, 0, 0, 0, 0])
 
 
-def test_a_force_is_worth_one_elsewhere_with_a_couple():
+def test_force_equals_displaced_force_with_a_couple():
     """F at a point = F at the center + the couple (R arm) x F (Pila, sec. 3.12)."""
 
     def moment(t, q, v, params):
@@ -166,8 +166,8 @@ def test_a_moving_frame_adds_nothing_to_the_torque():
     np.testing.assert_array_equal(force_of(jl.Torque(carried, constant, "motor")), expected)
 
 
-def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
-    """w by [w]x = R^T dR/dt, the derivative by JAX: affine in v, found to be so."""
+def test_angular_velocity_may_be_a_derivative_of_a_rotation():
+    """w by [w]x = R^T dR/dt, differentiated by JAX: detected as affine in v."""
 
     def rates(t, q, v, params):
         R, R_rate = jax.jvp(orientation, (q,), (v,))
@@ -192,7 +192,7 @@ def test_an_angular_velocity_may_come_from_a_rotation_differentiated():
     ids=["fori_loop", "scan", "cond on q", "real power"],
 )
 def test_an_angular_velocity_may_come_from_loops_and_choices(rates):
-    """Affine in v however it is written: dw/dv at one v is that at another."""
+    """Affine in v in any form: dw/dv is the same at two values of v."""
     tau = jnp.ones_like(rates(T, Q, V, PARAMS))
     found = force_of(jl.Torque(rates, lambda t, q, v, params: tau, "motor"))
     expected = jnp.tensordot(tau, jax.jacfwd(lambda v: rates(T, Q, v, PARAMS))(0 * V + 1), tau.ndim)
@@ -230,7 +230,7 @@ def test_an_angular_velocity_that_is_not_affine_is_refused(rates):
         jl.simulate(system, Q, V, jnp.array([0.0, 1.0]), PARAMS)
 
 
-def test_both_keep_the_precision_of_the_state():
+def test_point_forces_and_torques_keep_the_precision_of_the_state():
     q, v = Q.astype(jnp.float32), V.astype(jnp.float32)
 
     def waving(t, q, v, params):  # float64, as time is
@@ -241,7 +241,7 @@ def test_both_keep_the_precision_of_the_state():
         assert force(T, q, v, single, {}).dtype == jnp.float32
 
 
-def test_derivatives_pass_through_both():
+def test_derivatives_of_point_forces_and_torques_agree():
     """d Q / d params: forward, reverse and by the closed form (Q is linear in F)."""
     for force in (jl.PointForce(corner, constant, "f"), jl.Torque(space_rates, constant, "c")):
 
@@ -273,7 +273,7 @@ def test_an_angular_velocity_of_wrong_shape_is_refused():
         force_of(couple)
 
 
-def test_force_and_torque_must_match_what_they_act_on():
+def test_shapes_of_force_and_torque_are_checked():
     def two(t, q, v, params):
         return jnp.ones(2)
 
@@ -310,7 +310,7 @@ def test_functions_must_take_the_standard_arguments(argument, declare):
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", ["", None, "explicit time"])
-def test_names_must_be_free(name):
+def test_invalid_names_are_refused(name):
     with pytest.raises(ValueError, match="PointForce: `name` must"):
         jl.PointForce(corner, constant, name)
     with pytest.raises(ValueError, match="Torque: `name` must"):

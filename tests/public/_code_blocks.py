@@ -1,4 +1,4 @@
-"""Code blocks of a document: found, run, and their printed lines compared."""
+"""Code blocks of a document: found and run; their output is compared."""
 
 import contextlib
 import io
@@ -10,7 +10,7 @@ from sybil.parsers.markdown import CodeBlockParser
 
 
 class Blocks(CodeBlockParser):
-    """Code blocks of one language, handed to the test as they are."""
+    """Code blocks of one language, as text."""
 
     def evaluate(self, example):
         raise NotImplementedError
@@ -27,12 +27,12 @@ def blocks(path):
 
 
 def run(name, found, namespace):
-    """Run the Python blocks in one namespace; how many text blocks said what was printed."""
+    """Run the Python blocks in one namespace; returns how many text blocks equal the output."""
     printed, compared = "", 0
     for line, language, text in found:
         if language == "python":
             out = io.StringIO()
-            # What optax computes needs JAX's own promotion of dtypes.
+            # optax needs JAX's standard promotion of dtypes.
             kind = "standard" if "import optax" in text else "strict"
             with contextlib.redirect_stdout(out), jax.numpy_dtype_promotion(kind):
                 exec(compile(text, f"{name}:{line}", "exec"), namespace)

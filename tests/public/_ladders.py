@@ -1,4 +1,4 @@
-"""A function and its derivatives to third order, by all mixes of modes, and how close they are."""
+"""A function and its derivatives to third order, by all mixes of modes, and comparisons."""
 
 from functools import cache
 
@@ -11,7 +11,7 @@ from jaxlag import math
 EPS = np.finfo(float).eps
 
 
-# Orders of applying forward and reverse mode: all of them but for the third order.
+# Sequences of forward and reverse mode: all up to second order, three of third order.
 F, R = jax.jacfwd, jax.jacrev
 MIXES = ((),), ((F,), (R,)), ((F, F), (F, R), (R, R), (R, F)), ((F, F, F), (R, R, R), (R, F, R))
 ONE_EACH = tuple(order[-1:] for order in MIXES)
@@ -19,7 +19,7 @@ ONE_EACH = tuple(order[-1:] for order in MIXES)
 
 @cache
 def ladder(function, mixes=MIXES):
-    """x -> [value, 1st, ...]: arrays that hold the mixes of one order along their first axis."""
+    """x -> [value, 1st, ...]: arrays with the mixes of one order along their first axis."""
 
     def derivative(modes):
         out = function
@@ -39,7 +39,7 @@ def each(function, points):
 
 
 def of_pair(name):
-    """A function of two arguments as one of its pair."""
+    """A function of two arguments as a function of their pair."""
     return PAIRS.setdefault(name, lambda x: getattr(math, name)(x[0], x[1]))
 
 

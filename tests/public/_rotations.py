@@ -1,4 +1,4 @@
-"""Samples of rotations, in all parametrizations, and how results are compared."""
+"""Samples of rotations in all parametrizations, and comparisons of results."""
 
 import itertools
 
@@ -20,7 +20,7 @@ every_angles = pytest.mark.parametrize("kind", ANGLES)
 
 
 def anywhere(kind, rng, count=COUNT):
-    """Coordinates of any size: angles of several turns, quaternions of norms 0.1 to 10."""
+    """Coordinates of any size: angles of several revolutions, quaternions of norms 0.1 to 10."""
     if kind != "quaternion":
         return rng.uniform(-10.0, 10.0, (count, 3))
     x = rng.normal(size=(count, 4))
@@ -52,7 +52,7 @@ def crosses(a):
 
 
 def cube():
-    """The 24 proper rotations that take axes to axes; half and quarter turns among them."""
+    """The 24 proper rotations that map axes to axes; half and quarter turns among them."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             R = np.eye(3)[list(order)] * np.array(signs)

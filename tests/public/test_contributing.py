@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md, followed; names and tables of both documents hold."""
+"""The worked examples of CONTRIBUTING.md run; names and tables of both documents are right."""
 
 import importlib
 import re
@@ -36,7 +36,7 @@ def example(heading):
 
 
 def follow(found, namespace=None):
-    """The names that blocks bind; what they print is compared with the text blocks."""
+    """The names that blocks define; their output is compared with the text blocks."""
     namespace = {} if namespace is None else namespace
     run("CONTRIBUTING.md", found, namespace)
     return namespace
@@ -79,15 +79,15 @@ def test_a_system_is_found_by_its_name(added, monkeypatch, capsys):
     monkeypatch.setitem(test_catalogue.MODULES, name, module)
     assert catalogue.find(name) is module.entry
     test_catalogue.test_every_module_is_collected_under_its_own_name()
-    test_catalogue.test_the_docstring_says_what_the_system_is(name)
-    test_catalogue.test_the_book_place_is_that_of_the_docstring(name)
+    test_catalogue.test_docstring_describes_the_system(name)
+    test_catalogue.test_docstring_contains_the_place_in_the_book(name)
     assert main(["run", name]) == 0
     assert "status   ok" in capsys.readouterr().out
     assert_equal_to_hand_equations(module.entry, follow([by_hand])[name])
 
 
 def assert_equal_to_hand_equations(entry, by_hand):
-    """To 32 roundings of the terms: those of a few operations, and of sines on both sides."""
+    """To 32 roundings of the terms: of a few operations, and of sines on both sides."""
     for t, angle, rate in np.random.default_rng(0).uniform(-1.0, 1.0, (8, 3)):
         q, v, params = np.array([angle]), np.array([rate]), entry.example.params
         M, terms = by_hand(t, q, v, **params)
@@ -96,14 +96,14 @@ def assert_equal_to_hand_equations(entry, by_hand):
         np.testing.assert_allclose(found, expected, rtol=0, atol=32 * EPS * np.sum(np.abs(terms)))
 
 
-def test_a_force_law_has_the_power_it_says(monkeypatch):
-    law, use, said, tests = example("A force law")
+def test_force_law_has_the_stated_power(monkeypatch):
+    law, use, output, tests = example("A force law")
     made = follow([law], dict(vars(_forces)))["PointDamper"]
     monkeypatch.setattr(jl, "PointDamper", made, raising=False)
-    namespace = follow([use, said, tests])
+    namespace = follow([use, output, tests])
     assert run_tests(namespace) == 2
     motion = namespace["motion"]
-    # 1e-9 a step for the energy and for the work, over some dozen steps.
+    # 1e-9 per step for the energy and for the work, over some dozen steps.
     change = motion.energy[-1] - motion.energy[0]
     np.testing.assert_allclose(motion.work["damper"][-1], change, rtol=0, atol=1e-7)
     assert change < -0.1
@@ -121,7 +121,7 @@ def test_a_solver_has_its_order(added, monkeypatch):
     test_methods_alone.test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped=False)
 
 
-def test_a_bench_row_runs_within_its_bound():
+def test_benchmark_case_runs_within_its_bound():
     rows = _extremes.Rows()
     follow(example("A row of a benchmark"), vars(_extremes) | {"rows": rows})
     (case,) = rows.cases
@@ -129,7 +129,7 @@ def test_a_bench_row_runs_within_its_bound():
     assert stability.judged(case, quick=True)["verdict"] == "within"
 
 
-def test_modules_of_the_examples_import_what_they_may(tmp_path):
+def test_modules_of_the_examples_import_only_allowed_packages(tmp_path):
     (_, _, solver), _ = example("A solver")
     path = tmp_path / "_sofroniou4.py"
     path.write_text(solver)
@@ -137,16 +137,16 @@ def test_modules_of_the_examples_import_what_they_may(tmp_path):
     assert packages <= {"solvers", *test_layers.ALLOWED["solvers"]}
 
 
-# ---- What both documents name ------------------------------------------------------------------
+# ---- Names in both documents -------------------------------------------------------------------
 
 
 def quoted(path):
-    """What stands in back-ticks, outside of code blocks."""
+    """Text in back-ticks, outside of code blocks."""
     return re.findall(r"`([^`]+)`", re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL))
 
 
 NEW = {"bead_on_hoop.py", "_sofroniou4.py", "_name.py"}
-"""Files that the examples make, and the pattern of names."""
+"""Files that the examples create, and the pattern of names."""
 
 
 @BOTH
@@ -178,24 +178,24 @@ def test_every_name_of_a_module_exists(path):
             thing = getattr(thing, part)
 
 
-def test_the_table_of_packages_is_that_of_the_test():
+def test_table_of_packages_equals_that_of_the_test():
     text = ARCHITECTURE.read_text()
     base, to_system = test_layers._BASE, test_layers._TO_SYSTEM
-    said = {"*base*": base, "*to system*": to_system}
+    groups = {"*base*": base, "*to system*": to_system}
     found = {}
     for name, allowed in re.findall(r"^\| `(\w+)` \| .* \|(.*)\|$", text, re.MULTILINE):
-        words = re.findall(r"\*[\w ]+\*|\w+", allowed)
-        found[name] = {part for word in words for part in said.get(word, (word,))}
+        packages = re.findall(r"\*[\w ]+\*|\w+", allowed)
+        found[name] = {part for package in packages for part in groups.get(package, (package,))}
     assert found == {name: set(allowed) for name, allowed in test_layers.ALLOWED.items()}
 
 
-def test_places_kept_free_are_free():
+def test_reserved_names_of_packages_are_free():
     part = ARCHITECTURE.read_text().split("## Where a new capability goes")[1]
     names = re.findall(r"^- `(\w+)`, above", part, re.MULTILINE)
     assert len(names) == 5
     assert not set(names) & {path.stem for path in Path(jl.__file__).parent.iterdir()}
 
 
-def test_set_up_lines_are_those_of_the_readme():
+def test_set_up_lines_equal_those_of_the_readme():
     lines = re.findall(r"^pip install -e .*$", CONTRIBUTING.read_text(), re.MULTILINE)
     assert lines == re.findall(r"^pip install -e .*$", (ROOT / "README.md").read_text(), re.M)

@@ -1,4 +1,4 @@
-"""Every documented line runs: the README's code and its printed numbers, doctests, set-up lines."""
+"""Every documented line runs: code and output of the README, doctests, set-up lines."""
 
 import doctest
 import importlib
@@ -22,18 +22,18 @@ def numbers(text):
 
 
 FIRST = 4
-"""Blocks of the README's opening example: a program and what it prints, twice."""
+"""Blocks of the README's opening example: a program and its output, twice."""
 
 
 @pytest.mark.parametrize(
     ("count", "outputs"), mostly_full([(FIRST, 2), (None, 10)], (FIRST, 2)), ids=["first", "all"]
 )
-def test_readme_runs_and_prints_what_it_says(count, outputs):
+def test_readme_prints_the_stated_output(count, outputs):
     assert run("README.md", blocks(README)[:count], {}) == outputs
 
 
 def test_readme_shows_the_same_numbers_twice():
-    """The simulated and the closed form, to the digits shown."""
+    """The simulated and the closed-form values, to the digits shown."""
     shown = [numbers(text) for _, language, text in blocks(README) if language == "text"]
     assert len(shown[0]) == 2
     assert shown[0] == pytest.approx(shown[1], abs=2e-6)
@@ -44,7 +44,7 @@ def test_first_program_is_short():
     assert sum(bool(line.strip()) for line in first.splitlines()) <= 15
 
 
-def test_two_set_up_lines():
+def test_readme_has_two_set_up_lines():
     lines = re.findall(r"^pip install -e .*$", README.read_text(), re.MULTILINE)
     assert lines == [
         'pip install -e ".[plot]" && python -m systems fit-pendulum',
@@ -73,19 +73,19 @@ def test_there_are_doctests():
 
 
 @pytest.mark.parametrize("name", mostly_full(EXAMPLES, *FEW))
-def test_doctests(name):
+def test_doctests_pass(name):
     result = doctest.testmod(EXAMPLES[name])
     assert result.failed == 0
     assert result.attempted > 0
 
 
-def test_every_public_name_says_what_it_is():
+def test_every_public_name_has_a_docstring():
     for name, thing in vars(jaxlag).items():
         if not name.startswith("_") and callable(thing):
             assert thing.__doc__, name
 
 
-def test_version_and_extras():
+def test_version_and_extras_agree():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert jaxlag.__version__ == project["version"]
     assert project["version"] in (ROOT / "CHANGELOG.md").read_text()
@@ -93,7 +93,7 @@ def test_version_and_extras():
 
 
 @pytest.mark.parametrize("name", ["energy", "math", "rotation"])
-def test_every_public_function_says_what_it_is(name):
+def test_every_public_function_has_a_docstring(name):
     module = importlib.import_module(f"jaxlag.{name}")
     public = {
         label: thing

@@ -14,7 +14,7 @@ EPS = np.finfo(float).eps
 T = jnp.array(0.4)
 RNG = np.random.default_rng(7)
 
-# A body made of six particles: masses and places along the body axes from its origin.
+# A body of six particles: masses and positions along the body axes from its origin.
 MASSES = jnp.asarray(RNG.uniform(0.2, 1.0, 6))
 PLACES = jnp.asarray(RNG.uniform(-0.5, 0.5, (6, 3)))
 MASS = jnp.sum(MASSES)
@@ -39,7 +39,7 @@ PARAMETRIZATIONS = {
 
 def pose_of(parametrization):
     def pose(t, q, params):
-        """Turned by the coordinates on a table that turns and rises by itself."""
+        """Rotated by the coordinates, on a table that rotates and rises with time."""
         table = rotation.about_z(0.7 * t)
         return table @ parametrization.matrix(q[3:]), table @ q[:3] + jnp.stack(
             [0 * t, 0 * t, t**2]
@@ -64,7 +64,7 @@ def moving(request):
     return pose_of(parametrization), q, v
 
 
-def test_a_rigid_body_moves_like_its_particles(moving):
+def test_kinetic_energy_of_a_body_is_that_of_its_particles(moving):
     """Eq. 2.16 with an offset mass center against sum 1/2 m_k v_k^2, in any parametrization."""
     pose, q, v = moving
     body = BODY.kinetic(pose, T, q, v, None)
@@ -89,7 +89,7 @@ def test_body_velocity_is_that_of_the_axes(moving):
     np.testing.assert_allclose(rates, expected, atol=64 * EPS * np.max(np.abs(rates)))
 
 
-def test_the_origin_of_a_body_is_free():
+def test_energies_do_not_depend_on_the_origin_of_a_body():
     """The same body about its mass center: the same T and V, by the parallel axis theorem."""
     pose = pose_of(rotation.yaw_pitch_roll)
     rng = np.random.default_rng(3)
@@ -108,8 +108,8 @@ def test_the_origin_of_a_body_is_free():
     np.testing.assert_allclose(
         body.gravity(central_pose, T, q, None, G), BODY.gravity(pose, T, q, None, G), rtol=64 * EPS
     )
-    back = energy.parallel_axis(central, MASS, CENTER)
-    np.testing.assert_allclose(back, INERTIA, atol=8 * EPS)
+    shifted = energy.parallel_axis(central, MASS, CENTER)
+    np.testing.assert_allclose(shifted, INERTIA, atol=8 * EPS)
 
 
 def test_rates_may_be_given_directly():
@@ -119,7 +119,7 @@ def test_rates_may_be_given_directly():
     np.testing.assert_allclose(BODY.kinetic_from_rates(V, w), expected, rtol=32 * EPS)
 
 
-def test_the_mass_matrix_of_a_free_body_is_the_books():
+def test_mass_matrix_of_a_free_body_equals_that_of_the_book():
     """d2T/d(V, w)2 = [[m E, -m [c]x], [m [c]x, I_O]] (eq. 2.16)."""
 
     def kinetic(Vw):
@@ -161,25 +161,25 @@ def test_particles_may_be_one_or_many_in_any_dimension():
     np.testing.assert_allclose(same, one + 2.4**2, rtol=8 * EPS)
 
 
-def test_gravity_points_where_it_is_told():
-    """V = m g y with y upwards."""
+def test_gravity_has_the_given_direction():
+    """V = m g y with y upward."""
     V = energy.gravity(2.0, jnp.array([5.0, 3.0]), jnp.array([0.0, -9.81]))
     np.testing.assert_allclose(V, 2 * 9.81 * 3, rtol=4 * EPS)
 
 
-def test_a_spring_is_right_at_zero_length():
+def test_spring_has_derivatives_at_zero_length():
     """V = k/2 (|r| - l0)^2; Hessian k E at r = 0 with l0 = 0, and for l0 > 0 by convention."""
     k, r = 5.0, jnp.array([0.3, -0.4, 1.2])
     np.testing.assert_allclose(energy.spring(k, r, 0.9), 0.5 * k * 0.4**2, rtol=16 * EPS)
     np.testing.assert_allclose(energy.spring(k, r), 0.5 * k * 1.3**2, rtol=8 * EPS)
     zero = jnp.zeros(3)
     for length in (0.0, 0, jnp.array(0.0), 0.7):
-        V, pull, hessian = (
+        V, gradient, hessian = (
             f(energy.spring, argnums=1)(k, zero, length) if f else energy.spring(k, zero, length)
             for f in (None, jax.grad, jax.hessian)
         )
         np.testing.assert_allclose(V, 0.5 * k * float(length) ** 2, rtol=4 * EPS)
-        np.testing.assert_array_equal(pull, 0)
+        np.testing.assert_array_equal(gradient, 0)
         np.testing.assert_array_equal(hessian, k * np.eye(3))
         third = jax.jacfwd(jax.hessian(energy.spring, argnums=1), argnums=1)(k, zero, length)
         np.testing.assert_array_equal(third, 0)
@@ -188,8 +188,8 @@ def test_a_spring_is_right_at_zero_length():
     np.testing.assert_allclose(across, np.diag([k, k * (1 - 0.5 / 2)]), atol=8 * EPS)
 
 
-def test_a_declared_system_uses_them():
-    """A spherical pendulum from one position: the motion of T and V written by hand."""
+def test_system_of_these_energies_equals_that_by_hand():
+    """A spherical pendulum by its position: the motion equals that of T and V by hand."""
 
     def position(t, q, params):
         theta, phi = q
@@ -217,8 +217,8 @@ def test_a_declared_system_uses_them():
     assert built._structure(params, jnp.float64) == hand._structure(params, jnp.float64)
 
 
-def test_bodies_may_be_params_and_fitted():
-    """A body in the params: its leaves are traced, and T's derivatives in them are right."""
+def test_bodies_may_be_params_with_derivatives():
+    """A body in params: its leaves are traced, and derivatives of T by them are right."""
 
     def kinetic(body, V, w):
         return body.kinetic_from_rates(V, w)
@@ -231,8 +231,8 @@ def test_bodies_may_be_params_and_fitted():
     np.testing.assert_allclose(gradient.center, MASS * jnp.cross(V, w), rtol=16 * EPS)
 
 
-def test_coordinates_and_velocities_are_brought_to_one_precision():
-    """Integers and mixed precisions, whatever promotion JAX is set to."""
+def test_coordinates_and_velocities_are_promoted_to_one_precision():
+    """Integers and mixed precisions, for any promotion of dtypes in JAX."""
 
     def point(t, q, params):
         return q**2
@@ -326,39 +326,51 @@ def wrong():
         "`pose` must be callable as (t, q, params), but its signature was (t, q)",
     )
 
-    def along(position, q=zero, v=zero, t=T):
+    def particles_of(position, q=zero, v=zero, t=T):
         return lambda: energy.particles(position, 1.0, t, q, v, None)
 
     yield (
         "scalar",
-        along(lambda t, q, p: q[0]),
+        particles_of(lambda t, q, p: q[0]),
         "`position` must return a vector of shape (d,), or (k, d) for k particles, but it returned "
         "shape (). Return jnp.stack([x, y])",
     )
     yield (
         "list",
-        along(lambda t, q, p: [q[0], q[1]]),
+        particles_of(lambda t, q, p: [q[0], q[1]]),
         "`position` must return an array, but it returned list. Return jnp.stack([x, y])",
     )
     yield (
         "none",
-        along(lambda t, q, p: None),
+        particles_of(lambda t, q, p: None),
         "`position` must return an array, but it returned None",
     )
     yield (
         "complex",
-        along(lambda t, q, p: jax.lax.complex(q, q)),
+        particles_of(lambda t, q, p: jax.lax.complex(q, q)),
         "`position` must be real, but its dtype was compl",
     )
     yield (
         "arity",
-        along(lambda t, q: q),
+        particles_of(lambda t, q: q),
         "`position` must be callable as (t, q, params), but its sig",
     )
-    here = along(lambda t, q, p: q, v=[1.0, 2.0])
-    yield "v", here, "`v` must have the shape of q, but their shapes were (2,) and (3,). Give one"
-    yield "q", along(lambda t, q, p: q, q="abc"), "`q` must be real numbers, but it was 'abc'."
-    yield "t", along(lambda t, q, p: q, t=zero), "`t` must be a number, but its shape was (3,)."
+    unequal_shapes = particles_of(lambda t, q, p: q, v=[1.0, 2.0])
+    yield (
+        "v",
+        unequal_shapes,
+        "`v` must have the shape of q, but their shapes were (2,) and (3,). Give one",
+    )
+    yield (
+        "q",
+        particles_of(lambda t, q, p: q, q="abc"),
+        "`q` must be real numbers, but it was 'abc'.",
+    )
+    yield (
+        "t",
+        particles_of(lambda t, q, p: q, t=zero),
+        "`t` must be a number, but its shape was (3,).",
+    )
     body = energy.RigidBody(1.0, unit)
     yield "V", lambda: body.kinetic_from_rates(1.0, zero), "`V` must have shape (3,), but its shape"
     yield (
@@ -413,6 +425,6 @@ def wrong():
 
 
 @pytest.mark.parametrize(("call", "message"), [w[1:] for w in wrong()], ids=[w[0] for w in wrong()])
-def test_wrong_arguments_are_refused(call, message):
+def test_invalid_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()

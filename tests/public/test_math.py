@@ -1,7 +1,7 @@
 """Values and derivatives to third order at, near and far from singular points.
 
 Smooth functions are compared with their power series in exact rational arithmetic, the others with
-closed forms. Tolerances are in units of EPS, about twice the worst error measured.
+closed forms. Tolerances are in units of EPS, about twice the largest error measured.
 """
 
 import math as stdlib
@@ -38,7 +38,7 @@ TABLE = {
 
 
 @pytest.mark.parametrize("name", ELEMENTWISE)
-def test_scalars_at_their_singular_points(name):
+def test_scalar_functions_are_right_at_singular_points(name):
     for point, expected in TABLE[name].items():
         for values, value in zip(ladder(getattr(math, name))(point), expected, strict=True):
             close(values, value, 2)
@@ -46,14 +46,14 @@ def test_scalars_at_their_singular_points(name):
 
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("function", [math.norm, math.unit])
-def test_vectors_at_zero(function, n):
+def test_vector_functions_are_zero_at_zero(function, n):
     for values in ladder(function)(jnp.zeros(n)):
         assert_array_equal(values, 0.0)
 
 
 @pytest.mark.parametrize("y", [0.0, -0.0])
 @pytest.mark.parametrize("x", [0.0, -0.0])
-def test_atan2_at_the_origin(y, x):
+def test_atan2_at_the_origin_has_zero_derivatives(y, x):
     value, *derivatives = ladder(of_pair("atan2"))(jnp.array([y, x]))
     assert_array_equal(value, np.arctan2(y, x))
     assert_array_equal(np.signbit(value), np.signbit(np.arctan2(y, x)))
@@ -61,7 +61,7 @@ def test_atan2_at_the_origin(y, x):
         assert_array_equal(values, 0.0)
 
 
-def test_functions_of_jax_fail_where_these_do_not():
+def test_functions_of_jax_fail_at_singular_points():
     zero = jnp.zeros(2)
     assert np.all(np.isnan(jax.hessian(jnp.linalg.norm)(zero)))
     assert np.all(np.isnan(jax.grad(lambda x: jnp.sqrt(x @ x))(zero)))
@@ -73,7 +73,7 @@ def test_functions_of_jax_fail_where_these_do_not():
     assert jax.grad(jnp.arctan2)(1e200, 1e200) == 0  # 5e-201
     assert jnp.linalg.norm(jnp.array([1e-200, 0.0])) == 0
     assert np.isnan(jax.grad(lambda x: jnp.sin(x) / x)(0.0))
-    assert abs((1 - jnp.cos(1e-7)) / math.one_minus_cos(1e-7) - 1) > 1e-4  # it cancels
+    assert abs((1 - jnp.cos(1e-7)) / math.one_minus_cos(1e-7) - 1) > 1e-4  # cancellation
 
 
 # ---- Smooth functions --------------------------------------------------------------------------
@@ -88,7 +88,7 @@ def series(coefficient, x, order):
 
 
 def even(coefficient):
-    """Of x where `coefficient` belongs to z = x^2."""
+    """Coefficients in x if `coefficient` is that in z = x^2."""
     return lambda k: Fraction(0) if k % 2 else coefficient(k // 2)
 
 
@@ -109,8 +109,8 @@ def around(threshold):
     return [1e-300, 1e-160, 1e-8, 1e-3, 0.1, 0.5, 1.0, 1.5, 0.99 * threshold, inside, threshold]
 
 
-# Name, coefficients, end of the series, tolerance of each order in EPS: twice the worst measured.
-# Where it is large, the derivative has a zero near one of the points.
+# Name, coefficients, end of the series, tolerance of each order in EPS: twice the largest error
+# measured. A large tolerance belongs to a derivative with a zero near one of the points.
 SMOOTH = [
     ("sinc", even(of_sinc), 2.0, (2, 2, 32, 6)),
     ("cosc", even(of_cosc), 4.0, (3, 3, 10, 20)),
@@ -123,8 +123,8 @@ SMOOTH = [
 @pytest.mark.parametrize(
     ("name", "coefficient", "threshold", "worst"), mostly_full(SMOOTH, SMOOTH[0], SMOOTH[3])
 )
-def test_smooth_functions_to_third_order(name, coefficient, threshold, worst):
-    """Relative errors: series, quotient, and both sides of the threshold alike."""
+def test_smooth_functions_are_accurate_to_third_order(name, coefficient, threshold, worst):
+    """Relative errors of series and quotient, on both sides of the threshold."""
     x = np.array([*around(threshold), 1.01 * threshold, 1.1 * threshold, 5.0])
     if not name.endswith("sqrt"):
         x = np.concatenate([x, -x])
@@ -133,7 +133,7 @@ def test_smooth_functions_to_third_order(name, coefficient, threshold, worst):
         close(values, expected, worst[order], scale=1e-300)
 
 
-def test_functions_of_the_square_turn_hyperbolic_below_zero():
+def test_functions_of_the_square_are_hyperbolic_below_zero():
     y = np.array([0.1, 1.0, 1.9])
     assert_allclose(math.sinc_sqrt(-(y**2)), np.sinh(y) / y, rtol=4 * EPS)
     assert_allclose(math.cosc_sqrt(-(y**2)), 2 * np.sinh(y / 2) ** 2 / y**2, rtol=4 * EPS)
@@ -144,21 +144,21 @@ def test_functions_of_the_square_turn_hyperbolic_below_zero():
 @pytest.mark.full
 def test_rotation_by_a_vector_is_smooth_at_zero():
     """R(w) e = e + w x e + w x (w x e)/2 + w x (w x (w x e))/6 + ...: the exponential series."""
-    e, along = jnp.array([1.0, -2.0, 0.5]), jnp.array([0.3, 0.7, -0.2])
+    e, direction = jnp.array([1.0, -2.0, 0.5]), jnp.array([0.3, 0.7, -0.2])
 
-    def turned(s):
-        w = s * along
+    def rotated(s):
+        w = s * direction
         z, once = w @ w, jnp.cross(w, e)
         return e + math.sinc_sqrt(z) * once + math.cosc_sqrt(z) * jnp.cross(w, once)
 
     expected = np.asarray(e)
-    for values in ladder(turned)(0.0):
+    for values in ladder(rotated)(0.0):
         assert_allclose(values, np.broadcast_to(expected, values.shape), atol=4 * EPS)
-        expected = np.cross(along, expected)
+        expected = np.cross(direction, expected)
 
 
 def test_conventions_do_not_carry_over_to_composed_functions():
-    """As documented: of |x|^2 and sinc(|x|), whose Hessians at 0 are 2 and -1/3 times 1."""
+    """As documented, for |x|^2 and sinc(|x|), whose Hessians at 0 are 2 and -1/3 times 1."""
     zero = jnp.zeros(2)
     assert_array_equal(jax.hessian(lambda x: math.norm(x) ** 2)(zero), 0.0)
     assert_array_equal(jax.hessian(lambda x: x @ x)(zero), 2 * np.eye(2))
@@ -170,8 +170,8 @@ def test_conventions_do_not_carry_over_to_composed_functions():
 # ---- Roots and inverse functions ---------------------------------------------------------------
 
 
-def test_sqrt_far_and_near():
-    """Worst error 0.5, 0.6, 1.6 and 2.1 EPS; the third derivative is some x^(-5/2)."""
+def test_sqrt_is_accurate_at_all_sizes():
+    """Largest errors 0.5, 0.6, 1.6 and 2.1 EPS; the third derivative is of order x^(-5/2)."""
     x = np.array([1e-120, 1e-100, 1e-8, 0.1, 1.0, 2.0, 3e8, 1e120])
     root = np.sqrt(x)
     expected = root, 0.5 / root, -0.25 / root / x, 0.375 / root / x / x
@@ -187,8 +187,8 @@ def inverse_cosine(x):
     return np.arccos(x), -(d**-0.5), -x * d**-1.5, -(1 + 2 * x**2) * d**-2.5
 
 
-def test_acos_and_asin_to_the_ends():
-    """Worst relative error 0.8, 1.2, 2.8 and 5 EPS; absolute near x = 0, where they have zeros."""
+def test_acos_and_asin_are_accurate_up_to_the_ends():
+    """Largest relative errors 0.8, 1.2, 2.8 and 5 EPS; absolute near x = 0, a zero of both."""
     d = np.array([2.0**-53, 1e-15, 1e-12, 1e-8, 1e-4, 0.1, 0.5])
     x = np.concatenate([1 - d, d - 1, [0.3, 1e-3, 1e-160, 0.0]])
     expected = inverse_cosine(x)
@@ -217,8 +217,8 @@ def derivatives_of_length(x):
 
 
 @pytest.mark.parametrize("n", [2, 3])
-def test_length_to_third_order(n):
-    """Worst error 3 EPS |x|^(1 - k)."""
+def test_length_is_accurate_to_third_order(n):
+    """Largest error 3 EPS |x|^(1 - k)."""
     rng = np.random.default_rng(n)
     derivatives = ladder(math.norm)
     for size in (1e-150, 1e-100, 1e-8, 1e-3, 1.0, 1e8, 1e150, 1e200, 1e300):
@@ -229,7 +229,7 @@ def test_length_to_third_order(n):
 
 
 @pytest.mark.parametrize("size", [1e-307, 1e-300, 1e-200, 1e-160])
-def test_length_of_tiny_vectors_to_second_order(size):
+def test_length_of_tiny_vectors_is_accurate_to_second_order(size):
     """The third derivative, of order |x|^-2, overflows."""
     x = size * np.array([1.0, 2.0, 2.0])
     expected = derivatives_of_length(x)
@@ -256,7 +256,7 @@ def test_direction_is_the_derivative_of_length():
             close(values, expected[order], 6, scale=r ** float(-order))
 
 
-def test_length_of_no_components_and_of_what_is_not_finite():
+def test_length_of_empty_and_nonfinite_vectors_follows_numpy():
     assert_array_equal(math.norm(np.zeros((2, 0))), np.zeros(2))
     assert_array_equal(math.norm([np.inf, 1.0]), np.inf)
     assert np.isnan(math.norm([np.nan, 1.0]))
@@ -274,8 +274,8 @@ def test_length_of_no_components_and_of_what_is_not_finite():
     ],
     ids=["norm", "unit", "sqrt", "atan2", "angle_between"],
 )
-def test_second_derivatives_within_a_loop(function, x):
-    """There JAX may pass a derivative rule over, and differentiate what the rule stands for."""
+def test_second_derivatives_within_a_loop_are_right(function, x):
+    """There JAX may skip a derivative rule and differentiate the body of the function."""
     x = jnp.array(x)
 
     def loop(v):
@@ -288,8 +288,8 @@ def test_second_derivatives_within_a_loop(function, x):
             assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
 
 
-def test_spring_of_no_length():
-    """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| drops out."""
+def test_energy_of_a_spring_has_derivatives_at_zero_length():
+    """V = k/2 (r.r - 2 l0 |r| + l0^2) at r = 0: with l0 > 0 the term in |r| has no effect."""
 
     def energy(r, rest):
         return 7.0 / 2 * (r @ r - 2 * rest * math.norm(r) + rest**2)
@@ -330,19 +330,19 @@ def of_one_argument(name):
 
 @cache
 def together(function):
-    """One derivative of each order of a batch: the orders' first axis has one entry."""
+    """One derivative of each order of a batch: the first axis of each order has length one."""
     return jax.jit(jax.vmap(ladder(function, ONE_EACH), out_axes=1))
 
 
-def test_batches_hold_every_function():
+def test_every_function_has_a_batch():
     public = {name for name in vars(math) if not name.startswith("_")}
     own = {n for n in public if getattr(vars(math)[n], "__module__", "") == math.__name__}
     assert own == set(BATCHES)
 
 
 @pytest.mark.parametrize("name", mostly_full(BATCHES, "angle_between", "norm", "sinc"))
-def test_a_singular_point_in_a_batch_harms_no_other(name):
-    """Nor a large argument: each as by itself."""
+def test_singular_point_in_a_batch_does_not_affect_others(name):
+    """Nor does a large argument: each value equals the single one."""
     x, function = np.array(BATCHES[name]), of_one_argument(name)
     batch = [values[0] for values in together(function)(x)]
     for i, point in enumerate(x):
@@ -353,7 +353,7 @@ def test_a_singular_point_in_a_batch_harms_no_other(name):
 
 
 @pytest.mark.parametrize("name", mostly_full(BATCHES, "angle_between", "norm", "sinc"))
-def test_single_precision_stays_single(name):
+def test_float32_stays_float32(name):
     """Against double precision at the same points."""
     x = np.clip(np.array(BATCHES[name]), -1e8, 1e8).astype(np.float32)
     derivatives = together(of_one_argument(name))
@@ -364,18 +364,18 @@ def test_single_precision_stays_single(name):
 
 
 @pytest.mark.parametrize("name", ELEMENTWISE)
-def test_numbers_and_integers(name):
+def test_numbers_and_integers_are_promoted(name):
     function = getattr(math, name)
     for one in (1, 1.0, np.arange(1, 2), jnp.array(1)):
         assert function(one).dtype == jnp.float64
         assert_array_equal(np.ravel(function(one)), function(jnp.array(1.0)))
-    for number in (1, 1.0):  # takes the dtype of what it meets, as in jnp
+    for number in (1, 1.0):  # takes the dtype of the other operand, as in jnp
         assert (function(number) * jnp.float32(2)).dtype == jnp.float32
     with jax.enable_x64(False):
         assert function(np.arange(1, 2)).dtype == jnp.float32
 
 
-def test_numbers_and_integers_among_vectors_and_pairs():
+def test_numbers_and_integers_in_vectors_and_pairs_are_promoted():
     assert_array_equal(math.norm([3, 4]), 5.0)
     assert_array_equal(math.unit(np.array([0, 4])), [0.0, 1.0])
     assert_array_equal(math.angle_between([1, 0], [0, 1]), PI / 2)
@@ -390,7 +390,7 @@ def test_complex_numbers_are_refused(name):
         getattr(math, name)(1j)
 
 
-def test_wrong_vectors_are_refused():
+def test_invalid_vectors_are_refused():
     for function in (math.norm, math.unit):
         with pytest.raises(ValueError, match="`x` must be a vector, but it was a scalar"):
             function(1.0)
@@ -402,7 +402,7 @@ def test_wrong_vectors_are_refused():
         math.atan2(1.0, 1j)
 
 
-def test_the_name_hides_nothing():
-    """Siblings that import math get the standard library's."""
+def test_module_does_not_hide_the_standard_library():
+    """Modules that import math get the standard library's."""
     assert jaxlag._model._coordinates.math is stdlib
     assert stdlib is not math

@@ -1,6 +1,6 @@
-"""Angles: values and derivatives to third order, at their ends, too.
+"""Angles: values and derivatives to third order, also at their ends.
 
-Tolerances are in units of EPS, about twice the worst error measured.
+Tolerances are in units of EPS, about twice the largest error measured.
 """
 
 from fractions import Fraction
@@ -18,7 +18,7 @@ from jaxlag import math
 PI = np.pi
 
 
-def test_atan2_values_are_those_of_numpy():
+def test_atan2_values_equal_those_of_numpy():
     """In every quadrant, on the axes with either sign of zero, and across 600 orders of magnitude.
 
     Scaling costs at most one rounding.
@@ -34,7 +34,7 @@ def test_atan2_values_are_those_of_numpy():
 
 
 def derivatives_of_direction(y, x):
-    """Of Im log(x + i y): k-th derivatives are those of a power, i per y."""
+    """Of Im log(x + i y): k-th derivatives are those of a power, with a factor i for each y."""
     scale = np.hypot(y, x)
     c, s = x / scale, y / scale
     with np.errstate(over="ignore"):
@@ -46,8 +46,8 @@ def derivatives_of_direction(y, x):
     return first, second, np.array([[[yyy, yyx], [yyx, yxx]], [[yyx, yxx], [yxx, xxx]]])
 
 
-def test_atan2_to_third_order():
-    """Worst error 1, 2 and 15 EPS r^-k, of a third derivative up to 2 r^-3."""
+def test_atan2_is_accurate_to_third_order():
+    """Largest errors 1, 2 and 15 EPS r^-k, of a third derivative up to 2 r^-3."""
     derivatives = ladder(of_pair("atan2"))
     for size in (1e-100, 1e-8, 1.0, 1e8, 1e100, 1e200, 1e300):
         for y, x in ((0.3, 0.7), (2.0, -0.1), (-1.0, -1.0), (1e-5, 1.0), (-1.0, 0.0), (-0.0, -1.0)):
@@ -59,30 +59,30 @@ def test_atan2_to_third_order():
 
 
 @pytest.mark.parametrize("size", [1e-300, 1e-200])
-def test_atan2_of_tiny_arguments_to_first_order(size):
+def test_atan2_of_tiny_arguments_is_accurate_to_first_order(size):
     """The second derivative, of order r^-2, overflows."""
     gradient = ladder(of_pair("atan2"))(size * np.array([0.3, -0.4]))[1]
     close(gradient, np.array([-1.6, -1.2]) / size, 4)
 
 
 def pair(angle, lengths=(2.0, 0.7), heading=0.4):
-    """Two vectors of the plane, the second turned from the first by `angle`."""
-    turn = np.array([heading, heading + angle])
-    return np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.array(lengths)[:, None]
+    """Two vectors of the plane; the second is rotated from the first by `angle`."""
+    headings = np.array([heading, heading + angle])
+    return np.stack([np.cos(headings), np.sin(headings)], axis=1) * np.array(lengths)[:, None]
 
 
 between = of_pair("angle_between")
 
 
 @pytest.mark.full
-def turned(ab):
-    """The angle with its sign, as a difference of two directions."""
+def signed_angle(ab):
+    """The signed angle, as a difference of two directions."""
     return math.atan2(ab[1, 1], ab[1, 0]) - math.atan2(ab[0, 1], ab[0, 0])
 
 
-def test_angle_to_third_order_in_the_plane():
-    """It is the angle from a to b up to sign: no digits lost near 0 and pi in any derivative."""
-    derivatives, expected = ladder(between), ladder(turned, ONE_EACH)
+def test_angle_in_the_plane_is_accurate_to_third_order():
+    """The angle from a to b up to sign: no derivative loses digits near 0 and pi."""
+    derivatives, expected = ladder(between), ladder(signed_angle, ONE_EACH)
     for angle in (1e-12, 1e-8, 1e-4, 0.01, 0.5, 2.0, 3.1, PI - 1e-4, PI - 1e-8, PI - 1e-12):
         for sign in (1.0, -1.0):
             ab = pair(sign * angle)
@@ -94,14 +94,14 @@ def test_angle_to_third_order_in_the_plane():
             value, *orders = derivatives(ab)
             close(value, np.arctan2(abs(cross), dot), 2, scale=1.0)
             for order, (values, signed) in enumerate(zip(orders, expected(ab)[1:], strict=True), 1):
-                # Worst error 60 EPS |b|^-k, of a third derivative 6 |b|^-3.
+                # Largest error 60 EPS |b|^-k, of a third derivative 6 |b|^-3.
                 close(values, sign * np.asarray(signed), 120, scale=0.7 ** float(-order))
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("n", [3, 5])
-def test_angle_in_any_dimension_far_from_its_ends(n):
-    """Against acos(a.b/(|a| |b|)), of which JAX is right there."""
+def test_angle_far_from_its_ends_equals_acos_in_any_dimension(n):
+    """Against acos(a.b/(|a| |b|)), for which JAX is accurate there."""
     rng = np.random.default_rng(n)
     ab = rng.normal(size=(2, n))
 
@@ -116,7 +116,7 @@ def test_angle_in_any_dimension_far_from_its_ends(n):
 @pytest.mark.parametrize("n", mostly_full([1, 2, 3, 5], 3))
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_parallel_vectors_have_angle_zero_or_pi_without_derivatives(n, dtype):
-    """b = c a rounded, components of all sizes: exactly, though the differences round."""
+    """b = c a rounded, components of all sizes: exact, although the differences round."""
     rng = np.random.default_rng(n)
     a = rng.normal(size=(500, n)) * 10.0 ** rng.uniform(-5, 5, (500, n))
     c = rng.normal(size=(500, 1)) * 10.0 ** rng.uniform(-5, 5, (500, 1))
@@ -132,7 +132,7 @@ def test_parallel_vectors_have_angle_zero_or_pi_without_derivatives(n, dtype):
                 assert_array_equal(values, 0.0)
 
 
-def test_angle_far_below_rounding_of_the_vectors():
+def test_angle_far_below_rounding_of_the_vectors_is_exact():
     a, b = jnp.array([1.0, 0.0]), jnp.array([1.0, 1e-200])
     assert_array_equal(math.angle_between(a, b), 1e-200)
     assert_array_equal(jax.grad(math.angle_between, 1)(a, b), [-1e-200, 1.0])
@@ -141,7 +141,7 @@ def test_angle_far_below_rounding_of_the_vectors():
 
 
 @pytest.mark.parametrize("other", [[1.0, 2.0], [-1.0, -2.0], [0.0, 0.0], [-0.0, -0.0]])
-def test_angle_with_a_vector_of_no_length(other):
+def test_angle_with_a_zero_vector_is_zero(other):
     for ab in ([[0.0, 0.0], other], [other, [-0.0, 0.0]]):
         for values in ladder(between)(jnp.array(ab)):
             assert_array_equal(values, 0.0)

@@ -1,4 +1,4 @@
-"""Former names, keywords and orders of arguments: each is refused with the present one."""
+"""Former names, keywords and orders of arguments are refused with the present ones."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,7 @@ DATA = jl.Experiment(np.linspace(0.0, 1.0, 5), {"x": np.linspace(0.0, 1.0, 5)})
 
 
 @pytest.mark.parametrize(("former", "present"), jl._RENAMED.items())
-def test_a_former_name_says_the_present_one(former, present):
+def test_former_names_give_the_present_ones(former, present):
     with pytest.raises(AttributeError, match=rf"^jaxlag\.{former} is jaxlag\.{present} now$"):
         getattr(jl, former)
     found = jl
@@ -27,7 +27,7 @@ def test_a_former_name_says_the_present_one(former, present):
     assert found.__name__ == present.rpartition(".")[2]
 
 
-def test_an_unknown_name_is_said_to_be_unknown():
+def test_unknown_names_are_refused():
     with pytest.raises(AttributeError, match=r"^module 'jaxlag' has no attribute 'Springs'$"):
         jl.Springs  # noqa: B018
 
@@ -54,7 +54,7 @@ def check_derivatives(*arguments):
         ((PARAMS, Q, V, 0.2), r"^`\w+` must get .* by name, but it got [45] arguments by position"),
     ],
 )
-def test_another_order_of_arguments_is_told_the_present_one(method, arguments, message):
+def test_former_order_of_arguments_is_refused(method, arguments, message):
     with pytest.raises(ValueError, match=message):
         method(*arguments)
 
@@ -86,13 +86,13 @@ def select_model(**options):
         (lambda **x: jl.Descent(**x), "optimiser", "optimizer="),
     ],
 )
-def test_a_former_keyword_says_the_present_one(call, former, present):
+def test_former_keywords_give_the_present_ones(call, former, present):
     with pytest.raises(ValueError, match=f"but it got {former}=. Write ") as caught:
         call(**{former: 1})
     assert present in str(caught.value)
 
 
-def test_what_became_required_is_asked_for():
+def test_new_required_arguments_are_named():
     with pytest.raises(ValueError, match=r"^`ts` must be given, .* Pass ts=jnp\.linspace"):
         jl.simulate(SYSTEM, Q, V)
     with pytest.raises(ValueError, match=r"^`v0` must be given, .* With u0= pass v0=None"):
@@ -102,7 +102,7 @@ def test_what_became_required_is_asked_for():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_options_of_a_simulation_are_those_that_it_has():
+def test_unknown_options_of_a_simulation_are_refused():
     for wrong, message in (
         ({"rtoll": 1e-6}, r"^`simulate_options` must be among .*'rtol'.* but one was 'rtoll'"),
         ({"ts": TS}, "^`ts` must be left out, since jl.fit sets it"),
@@ -113,7 +113,7 @@ def test_options_of_a_simulation_are_those_that_it_has():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_options_of_a_fit_are_those_that_a_comparison_leaves_to_it():
+def test_unknown_options_of_a_fit_are_refused():
     candidates = {"drag": jl.Candidate(jl.Rayleigh(lambda t, q, v, p: v @ v, "drag"), params0={})}
     for wrong, message in (
         ({"free": ("k",)}, r"^`fit_options` must be among .*'segments'.* but one was 'free'"),
@@ -125,12 +125,12 @@ def test_options_of_a_fit_are_those_that_a_comparison_leaves_to_it():
             )
 
 
-def test_a_renamed_class_of_rotations_says_so():
+def test_renamed_class_of_rotations_gives_the_present_name():
     with pytest.raises(AttributeError, match=r"is jaxlag\.rotation\.AbstractParametrization now$"):
         jl.rotation.AbstractParametrisation  # noqa: B018
 
 
-def test_multipliers_go_by_one_name():
+def test_multipliers_have_one_name():
     with pytest.raises(
         ValueError, match=r"^`save` must name .* but one was 'lam'\. Write 'multipli"
     ):

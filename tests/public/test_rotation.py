@@ -1,7 +1,7 @@
 """Rotations: matrices, rates and parametrizations, against the book's tables, scipy and jvp.
 
-Entries of R are at most 1 and take some three roundings, so identities of one or two products of
-them hold to some 10 EPS; the worst found over the samples is written beside each bound.
+Entries of R are at most 1 and take some three roundings, so that identities of one or two of their
+products hold to some 10 EPS. A comment at each bound gives the worst error of the samples.
 """
 
 import re
@@ -32,15 +32,15 @@ from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
 # ---- Matrices ----------------------------------------------------------------------------------
 
 
-def test_elementary_rotations_turn_the_axes_the_right_way():
-    """Right-hand rule: about x it is y to z, about y it is z to x, about z it is x to y."""
+def test_elementary_rotations_follow_the_right_hand_rule():
+    """Right-hand rule: about x from y to z, about y from z to x, about z from x to y."""
     x, y, z = np.eye(3)
-    for turn, axis, start, end in (
+    for rotate, axis, start, end in (
         (rotation.about_x, x, y, z),
         (rotation.about_y, y, z, x),
         (rotation.about_z, z, x, y),
     ):
-        R = np.asarray(turn(0.3))
+        R = np.asarray(rotate(0.3))
         np.testing.assert_array_equal(R @ axis, axis)
         found = R @ start
         np.testing.assert_allclose(found, np.cos(0.3) * start + np.sin(0.3) * end, atol=EPS)
@@ -60,19 +60,19 @@ def book_direction_cosines(psi, theta, phi):
     )
 
 
-def test_yaw_pitch_roll_is_the_matrix_of_the_book():
+def test_yaw_pitch_roll_equals_the_matrix_of_the_book():
     for x in anywhere("yaw_pitch_roll", np.random.default_rng(0), 20):
         T = rotation.direction_cosines(yaw_pitch_roll.matrix(x))
         assert worst(T, book_direction_cosines(*x)) <= 4 * EPS  # worst 0
 
 
 def test_angles_are_successive_elementary_rotations():
-    """Intrinsic, so left to right; the order matters."""
+    """Intrinsic rotations multiply from left to right; the order matters."""
 
     def differences(x):
         a, b, c = x
-        turns = rotation.about_x, rotation.about_y, rotation.about_z
-        X, Y, Z = ([turn(angle) for angle in (a, b, c)] for turn in turns)
+        rotations = rotation.about_x, rotation.about_y, rotation.about_z
+        X, Y, Z = ([rotate(angle) for angle in (a, b, c)] for rotate in rotations)
         return (
             yaw_pitch_roll.matrix(x) - rotation.compose(Z[0], Y[1], X[2]),
             zxz.matrix(x) - rotation.compose(Z[0], X[1], Z[2]),
@@ -102,13 +102,13 @@ def test_matrices_agree_with_scipy(kind):
         "zxz": lambda: Rotation.from_euler("ZXZ", x),
         "quaternion": lambda: Rotation.from_quat(x[:, [1, 2, 3, 0]]),
     }[kind]()
-    # Angles of 10 rad are halved and composed by scipy: some EPS more than ours.
+    # scipy halves and composes angles of 10 rad: its rounding is some EPS larger.
     assert worst(batch(ALL[kind].matrix, x), theirs.as_matrix()) <= 8 * EPS  # worst 2.5
 
 
 @every
 def test_each_direction_cosine_is_its_cofactor(kind):
-    """The book's nine identities, and with them T T^T = E and det T = 1."""
+    """The book's nine identities, which imply T T^T = E and det T = 1."""
     x = anywhere(kind, np.random.default_rng(4))
     T = batch(lambda x: rotation.direction_cosines(ALL[kind].matrix(x)), x)
     a = {f"{i + 1}{j + 1}": T[:, i, j] for i in range(3) for j in range(3)}
@@ -142,7 +142,7 @@ def test_skew_is_the_cross_product():
     assert worst(bracket, crosses(np.cross(a, b))) <= 25 * EPS  # worst 0
 
 
-def test_skew_turns_with_its_vector():
+def test_skew_rotates_with_its_vector():
     rng = np.random.default_rng(6)
     a, R = rng.normal(size=(COUNT, 3)), batch(zxz.matrix, anywhere("zxz", rng))
     turned = R @ crosses(a) @ R.transpose(0, 2, 1)
@@ -153,12 +153,12 @@ def test_skew_turns_with_its_vector():
 
 
 @every
-def test_the_matrix_moves_with_the_rates(kind):
+def test_rates_give_the_derivative_of_the_matrix(kind):
     """dR/dt = R [w_body]x = [w_space]x R by jvp along x + t x_dot; w_space = R w_body."""
     rng = np.random.default_rng(7)
     x, p = anywhere(kind, rng), ALL[kind]
     size = np.linalg.norm(x, axis=1)[:, None] if kind == "quaternion" else 1.0
-    x_dot = rng.normal(size=x.shape) * size  # so that w is some 1 to 10 rad/s
+    x_dot = rng.normal(size=x.shape) * size  # so that w is about 1 to 10 rad/s
 
     def all_rates(x, x_dot):
         R, R_dot = jax.jvp(p.matrix, (x,), (x_dot,))
@@ -176,8 +176,8 @@ def test_the_matrix_moves_with_the_rates(kind):
     assert worst(w_space_too, w_space) <= atol
 
 
-def test_rates_of_yaw_pitch_roll_are_those_of_the_book():
-    """M, its inverse and det M = cos(theta), printed for (phi, theta, psi): our order reversed."""
+def test_rates_of_yaw_pitch_roll_equal_those_of_the_book():
+    """M, its inverse and det M = cos(theta), printed for (phi, theta, psi): the reverse order."""
     for x in principal("yaw_pitch_roll", np.random.default_rng(8), 20):
         sT, sF, cT, cF = np.sin(x[1]), np.sin(x[2]), np.cos(x[1]), np.cos(x[2])
         M = np.array([[1, 0, -sT], [0, cF, sF * cT], [0, -sF, cF * cT]])
@@ -189,7 +189,7 @@ def test_rates_of_yaw_pitch_roll_are_those_of_the_book():
         assert abs(np.linalg.det(W[:, ::-1]) - cT) <= 4 * EPS
 
 
-def test_determinants_of_the_rate_matrices():
+def test_determinants_of_the_rate_matrices_equal_closed_forms():
     """-cos(theta) and -sin(theta); W W^T = 4 E/(e.e) for the quaternion."""
     rng = np.random.default_rng(9)
     for kind, expected in LOCK.items():
@@ -203,21 +203,21 @@ def test_determinants_of_the_rate_matrices():
 
 @every
 @pytest.mark.parametrize("frame", ["body", "space"])
-def test_rates_can_be_undone(kind, frame):
-    """Of a quaternion's x_dot the part along x is no rotation, and is left out."""
+def test_rates_are_invertible(kind, frame):
+    """The part of a quaternion's x_dot along x is no rotation, and is omitted."""
     rng = np.random.default_rng(10)
     p, x = ALL[kind], principal(kind, rng)
     x_dot, w = rng.normal(size=x.shape), rng.normal(size=(COUNT, 3))
-    rates, undo = getattr(p, f"{frame}_rates"), getattr(p, f"from_{frame}_rates")
-    there = batch(lambda x, x_dot: undo(x, rates(x, x_dot)), x, x_dot)
-    back = batch(lambda x, w: rates(x, undo(x, w)), x, w)
+    rates, invert = getattr(p, f"{frame}_rates"), getattr(p, f"from_{frame}_rates")
+    x_dot_again = batch(lambda x, x_dot: invert(x, rates(x, x_dot)), x, x_dot)
+    w_again = batch(lambda x, w: rates(x, invert(x, w)), x, w)
     if kind == "quaternion":
-        along = np.sum(x * x_dot, axis=1)[:, None] * x
-        assert worst(np.sum(x * there, axis=1), 0) <= 5 * EPS  # worst 1.5
-        x_dot = x_dot - along
+        radial = np.sum(x * x_dot, axis=1)[:, None] * x
+        assert worst(np.sum(x * x_dot_again, axis=1), 0) <= 5 * EPS  # worst 1.5
+        x_dot = x_dot - radial
     # Some roundings of |x_dot|, |w| <= 5, times 1/|det W| <= 5 at 0.2 rad from lock.
-    assert worst(there, x_dot) <= 25 * EPS  # worst 8
-    assert worst(back, w) <= 25 * EPS  # worst 8
+    assert worst(x_dot_again, x_dot) <= 25 * EPS  # worst 8
+    assert worst(w_again, w) <= 25 * EPS  # worst 8
 
 
 def test_a_scaled_quaternion_is_the_same_rotation():
@@ -232,7 +232,7 @@ def test_a_scaled_quaternion_is_the_same_rotation():
             }
             for name, function in same.items():
                 np.testing.assert_array_equal(function(scale), function(1.0), name)
-        # A change of norm alone turns nothing: cancellation of terms |e||e_dot|/(e.e) = 1.
+        # A change of norm alone is no rotation: terms of |e||e_dot|/(e.e) = 1 cancel.
         assert worst(quaternion.body_rates(e, e), 0) <= 2 * EPS  # worst 0.5
 
 
@@ -256,10 +256,10 @@ def test_quaternion_products_are_matrix_products():
 
 
 @every
-def test_from_matrix_undoes_matrix_in_the_principal_ranges(kind):
+def test_from_matrix_inverts_matrix_in_the_principal_ranges(kind):
     x = principal(kind, np.random.default_rng(13))
     found = batch(lambda x: ALL[kind].from_matrix(ALL[kind].matrix(x)), x)
-    # Angles are ratios of entries of size sin(0.2) or more, and at most pi themselves.
+    # Angles are ratios of entries of at least sin(0.2), and are at most pi.
     assert worst(found, x) <= 5 * EPS  # worst 1
     if kind == "quaternion":  # every component was the largest one for some
         assert set(np.argmax(np.abs(x), axis=1)) == {0, 1, 2, 3}
@@ -267,7 +267,7 @@ def test_from_matrix_undoes_matrix_in_the_principal_ranges(kind):
 
 @every
 def test_from_matrix_reproduces_any_rotation(kind):
-    """Several turns away, and the 24 turns of a cube, where angles are locked and e0 may be 0."""
+    """Several revolutions, and the 24 rotations of a cube: with gimbal lock, or with e0 = 0."""
     p, any_R = ALL[kind], batch(zxz.matrix, anywhere("zxz", np.random.default_rng(14)))
     R = np.concatenate([any_R, np.stack(list(cube()))])
     x, again = batch(lambda R: (p.from_matrix(R), p.matrix(p.from_matrix(R))), R)
@@ -310,8 +310,8 @@ def test_at_exact_gimbal_lock_the_first_angle_is_zero():
     np.testing.assert_array_equal(zxz.from_matrix(np.eye(3)), np.zeros(3))
 
 
-def test_quaternions_of_half_turns():
-    """All four branches by value; at 1e-9 rad from a half turn nothing is lost to cancellation."""
+def test_quaternions_of_half_turns_are_accurate():
+    """All four branches by value; at 1e-9 rad from a half turn no digits cancel."""
     for i, e in enumerate(np.eye(4)):
         R = -np.eye(3) if i else np.eye(3)
         R[max(i - 1, 0), max(i - 1, 0)] = 1.0

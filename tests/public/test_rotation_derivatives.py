@@ -12,7 +12,7 @@ from jaxlag.rotation import quaternion, yaw_pitch_roll, zxz
 
 
 def functions(p):
-    """Of x alone; x_dot and w are fixed, coordinates from matrices go along rotations."""
+    """Functions of x alone; x_dot and w are fixed, coordinates of matrices vary along rotations."""
 
     def x_dot(x):
         return jnp.array([0.3, -0.8, 0.5, 1.1], x.dtype)[: len(p.names)]
@@ -43,7 +43,7 @@ def test_derivatives_agree_with_central_differences(kind, name):
     differences = np.moveaxis(ahead - behind, 0, -1) / (2 * h)
     scale = np.max(np.abs(forward))
     assert worst(forward, reverse) <= 8 * EPS * scale  # worst 3
-    # h^2/6 of the third derivative, at most 6/0.2^2 of the first, and EPS/h of the values.
+    # h^2/6 of the third derivative, at most 6/0.2^2 times the first one, and EPS/h of the values.
     atol = (h**2 / 0.2**2 + 10 * EPS / h) * scale
     assert worst(forward, differences) <= atol
     assert scale > 0.1
@@ -91,7 +91,7 @@ def by_quaternion(p, x, a, b):
         ("quaternion", by_quaternion),
     ],
 )
-def test_single_precision_stays_single(kind, function):
+def test_float32_results_agree_with_float64(kind, function):
     p, rng = ALL[kind], np.random.default_rng(20)
     x = principal(kind, rng, 50).astype(np.float32)
     a, b = rng.normal(size=(2, 50, 3)).astype(np.float32)
@@ -100,26 +100,26 @@ def test_single_precision_stays_single(kind, function):
     eps = float(np.finfo(np.float32).eps)
     for found, expected in zip(jax.tree.leaves(single), jax.tree.leaves(double), strict=True):
         assert (found.dtype, expected.dtype) == (np.float32, np.float64)
-        # As in double: |a|, |b| <= 5 and 1/|det W| <= 5.
+        # As in double precision: |a|, |b| <= 5 and 1/|det W| <= 5.
         assert worst(found, expected) <= 25 * eps  # worst 5.5
 
 
 @every
-def test_gradients_in_single_precision_stay_single(kind):
+def test_float32_gradients_stay_float32(kind):
     x = jnp.asarray(principal(kind, np.random.default_rng(21), 1)[0], jnp.float32)
     for function in functions(ALL[kind]).values():
         gradient = jax.eval_shape(jax.grad(lambda x, f=function: jnp.sum(f(x))), x)
         assert gradient.dtype == jnp.float32
 
 
-def test_numbers_and_lists_are_taken():
+def test_numbers_and_lists_are_accepted():
     expected = np.asarray(zxz.matrix(np.array([1.0, 2.0, 3.0])))
     np.testing.assert_array_equal(zxz.matrix([1, 2, 3]), expected)
     np.testing.assert_array_equal(zxz.matrix((1.0, 2, 3.0)), expected)
     np.testing.assert_array_equal(rotation.skew([1, 2, 3]), [[0, -3, 2], [3, 0, -1], [-2, 1, 0]])
 
 
-def test_the_names_are_the_coordinates():
+def test_parametrizations_have_names_of_coordinates():
     assert yaw_pitch_roll.names == ("psi", "theta", "phi")
     assert zxz.names == ("phi", "theta", "psi")
     assert quaternion.names == ("e0", "e1", "e2", "e3")

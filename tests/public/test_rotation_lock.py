@@ -1,4 +1,4 @@
-"""At gimbal lock and near it, and quaternions of extreme norms."""
+"""Rotations at gimbal lock and near it, and quaternions of extreme norms."""
 
 import jax
 import jax.numpy as jnp
@@ -14,21 +14,21 @@ from jaxlag.rotation import quaternion, zxz
 @pytest.mark.parametrize("frame", ["body", "space"])
 @every_angles
 def test_at_gimbal_lock_two_rates_are_not_finite(kind, frame, dtype):
-    """Also at the representable angles nearest to it, and for the w of some finite x_dot."""
+    """Also at the nearest representable angles, and for w of a finite x_dot."""
     p, rng = ANGLES[kind], np.random.default_rng(16)
     lock = np.pi * np.arange(-4, 5) + (np.pi / 2 if kind == "yaw_pitch_roll" else 0.0)
     x = rng.uniform(-np.pi, np.pi, (len(lock), 3)).astype(dtype)
     x[:, 1] = lock
     x_dot, w = rng.normal(size=(2, *x.shape)).astype(dtype)
     reachable = batch(getattr(p, f"{frame}_rates"), x, x_dot)
-    undo = getattr(p, f"from_{frame}_rates")
+    invert = getattr(p, f"from_{frame}_rates")
     for rates in (reachable, w, np.zeros_like(w)):
-        found = batch(undo, x, rates)
+        found = batch(invert, x, rates)
         assert found.dtype == dtype
         assert not np.any(np.isfinite(found[:, [0, 2]]))
-    theta_dot = batch(undo, x, reachable)[:, 1]
+    theta_dot = batch(invert, x, reachable)[:, 1]
     assert worst(theta_dot, x_dot[:, 1]) <= 12 * np.finfo(dtype).eps  # worst 3, |w| <= 6
-    slope = batch(jax.jacfwd(undo), x, reachable)[:, [0, 2], 1]
+    slope = batch(jax.jacfwd(invert), x, reachable)[:, [0, 2], 1]
     assert not np.any(np.isfinite(slope))
 
 
@@ -41,20 +41,20 @@ def test_near_gimbal_lock_the_error_grows_as_its_inverse_distance(kind):
     x[:, 1] = theta
     x_dot = rng.normal(size=x.shape)
 
-    def there(x, x_dot):
+    def round_trip(x, x_dot):
         return (
             p.from_body_rates(x, p.body_rates(x, x_dot)),
             p.from_space_rates(x, p.space_rates(x, x_dot)),
         )
 
     determinant = np.abs(LOCK[kind](theta))[:, None]
-    for found in batch(there, x, x_dot):
+    for found in batch(round_trip, x, x_dot):
         # Each w is |x_dot| <= 8 times some roundings, divided by the determinant.
         assert worst((found - x_dot) * determinant, 0) <= 8 * EPS  # worst 2.3
 
 
-def test_the_smallest_nutation_is_not_taken_for_lock():
-    """sin(theta) = theta is exact there, whatever its size."""
+def test_smallest_nutation_does_not_count_as_lock():
+    """sin(theta) = theta is exact there, for any size."""
     found = zxz.from_body_rates([0.0, 1e-200, 0.0], [0.5, 3e-200, 0.0])
     np.testing.assert_allclose(found, [3.0, 0.5, -3.0], rtol=4 * EPS)
 
@@ -87,8 +87,8 @@ def test_quaternions_of_extreme_norms_are_rotations(dtype, powers):
             np.testing.assert_array_equal(found, right)
 
 
-def test_the_scale_of_a_quaternion_has_no_part_in_its_derivatives():
-    """To second order, forward and reverse, against R written out with sums of squares."""
+def test_scale_of_a_quaternion_does_not_affect_derivatives():
+    """To second order, forward and reverse, against R written with sums of squares."""
 
     def plain(x):
         a, b, c, d = x
@@ -105,6 +105,6 @@ def test_the_scale_of_a_quaternion_has_no_part_in_its_derivatives():
         ours, plain = (jax.jacfwd if order else jax.jacrev)(ours), jax.jacfwd(plain)
 
 
-def test_the_zero_quaternion_is_no_rotation():
+def test_zero_quaternion_gives_nan():
     assert np.all(np.isnan(quaternion.matrix(np.zeros(4))))
     assert np.all(np.isnan(quaternion.body_rates(np.zeros(4), np.ones(4))))

@@ -1,4 +1,4 @@
-"""What a growth says of states."""
+"""Transition matrices of a growth, and states of a motion."""
 
 import numpy as np
 

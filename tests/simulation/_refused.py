@@ -1,4 +1,4 @@
-"""A system of two springs, and what `simulate` refuses of it."""
+"""A system of two springs, and a check that `simulate` refuses arguments."""
 
 import re
 

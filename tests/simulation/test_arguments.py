@@ -1,6 +1,6 @@
-"""Bad input to `simulate` and `System`: each is refused by name, with what it must be and was.
+"""Invalid input of `simulate` and `System`: refused by name, with the condition and the value.
 
-Where values are traced nothing can be raised: a status says it instead.
+Traced values cannot raise errors: a status reports them.
 """
 
 import re
@@ -44,7 +44,7 @@ def test_the_lagrangian_must_be_a_real_scalar(lagrangian, was):
 
 
 @pytest.mark.parametrize("method", ["acceleration", "bias", "mass_matrix", "momentum", "energy"])
-def test_every_method_says_so(method):
+def test_every_method_refuses_a_vector_valued_lagrangian(method):
     system = jl.System(NOT_SCALAR[0][0], ("x", "y"))
     with pytest.raises(
         ValueError, match=r"^`lagrangian` must return a real scalar, but it returned "
@@ -131,7 +131,7 @@ def logarithmic(t, q, v, params):
 
 
 def massless(t, q, v, params):
-    """Inertia for the given coordinates only, couplings none."""
+    """Inertia for the given coordinates only, without couplings."""
     return 0.5 * jnp.sum(jnp.asarray(params["m"]) * v**2) - 0.5 * q @ q
 
 
@@ -157,10 +157,10 @@ def test_a_lagrangian_that_is_nan_at_the_start_is_refused():
 @pytest.mark.parametrize("n", [3, 9])
 def test_a_coordinate_without_inertia_is_named_by_check(n):
     system = jl.System(massless, {"s": (n,)})
-    for bad in (0, 1, n - 1):
-        params = {"m": np.where(np.arange(n) == bad, 0.0, 2.0)}
+    for index in (0, 1, n - 1):
+        params = {"m": np.where(np.arange(n) == index, 0.0, 2.0)}
         message = (
-            rf"^coordinate 's\[{bad}\]' must have inertia: d2L/dv2 positive definite, but its "
+            rf"^coordinate 's\[{index}\]' must have inertia: d2L/dv2 positive definite, but its "
             r"pivot was not positive at q = .*, v = .* Add its kinetic energy to L"
         )
         with pytest.raises(ValueError, match=message):
@@ -171,15 +171,15 @@ def test_a_coordinate_without_inertia_is_named_by_check(n):
 def test_a_coordinate_without_inertia_is_named_by_simulate(n):
     """One program per n: the masses are values."""
     system = jl.System(massless, {"s": (n,)})
-    for bad, mass in ((0, 0.0), (1, 0.0), (n - 1, -2.0)):
-        params = {"m": np.where(np.arange(n) == bad, mass, 2.0)}
+    for index, mass in ((0, 0.0), (1, 0.0), (n - 1, -2.0)):
+        params = {"m": np.where(np.arange(n) == index, mass, 2.0)}
         with pytest.raises(
             jl.SimulationError,
-            match=rf"status mass_singular \('s\[{bad}\]'\): .*give this coordinate",
+            match=rf"status mass_singular \('s\[{index}\]'\): .*give this coordinate",
         ) as caught:
             run(system, q0=np.ones(n), v0=np.zeros(n), params=params, **EULER)
         motion = caught.value.motion
-        assert (int(motion.status), int(motion.where)) == (Status.mass_singular, bad)
+        assert (int(motion.status), int(motion.where)) == (Status.mass_singular, index)
         assert np.all(np.isnan(motion.q[1:]))
 
 
@@ -286,12 +286,12 @@ def test_a_coordinate_without_inertia_is_named_by_simulate(n):
         ),
     ],
 )
-def test_a_bad_value_is_refused(changes, message):
+def test_invalid_value_is_refused(changes, message):
     refused(message, **changes)
 
 
-def test_the_bounds_themselves_are_good():
-    """Traced, not run: what lies on the right side of a bound is let through."""
+def test_values_at_the_bounds_are_accepted():
+    """Traced, not run: values just inside a bound are accepted."""
     for changes in (
         {"rtol": 10 * EPS},
         {"rtol": 0.0, "atol": 1e-9},
@@ -335,8 +335,8 @@ TRACED = {
 }
 
 
-def test_traced_bad_values_end_in_a_status():
-    """All in one batch, so that none of them harms a good one either."""
+def test_traced_invalid_values_end_in_a_status():
+    """All in one batch, so that they must not affect a valid one."""
     system = jl.System(logarithmic, ("x", "y"))
     good = {
         "q0": Q0,
@@ -365,9 +365,9 @@ def test_traced_bad_values_end_in_a_status():
     for i, (_, status) in enumerate(TRACED.values()):
         finite = np.all(np.isfinite(found.q[i])) and np.all(np.isfinite(found.v[i]))
         assert finite == (status is Status.ok)
-    rows = list(TRACED)
-    np.testing.assert_array_equal(found.where[np.array([rows.index("q0 nan")])], [1])
-    np.testing.assert_array_equal(found.where[np.array([rows.index("v0 inf")])], [0])
+    lane_names = list(TRACED)
+    np.testing.assert_array_equal(found.where[np.array([lane_names.index("q0 nan")])], [1])
+    np.testing.assert_array_equal(found.where[np.array([lane_names.index("v0 inf")])], [0])
 
 
 def growing(t, q, v, params):
@@ -376,7 +376,7 @@ def growing(t, q, v, params):
 
 
 @pytest.mark.parametrize("lowering", ["auto", "array"])
-def test_loops_without_a_number_of_turns_are_named_by_their_line(lowering):
+def test_loops_without_a_number_of_iterations_are_named_by_line(lowering):
     system = jl.System(growing, ("x",), lowering=lowering)
     line = growing.__code__.co_firstlineno + 1
     message = (
@@ -388,7 +388,7 @@ def test_loops_without_a_number_of_turns_are_named_by_their_line(lowering):
 
 
 @pytest.mark.parametrize("unread", [np.inf, np.array([1.0, np.nan])])
-def test_params_that_nothing_reads_may_be_anything(unread):
+def test_unread_params_may_have_any_value(unread):
     def lagrangian(t, q, v, params):
         return 0.5 * params["m"] * v @ v
 

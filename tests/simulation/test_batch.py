@@ -1,4 +1,4 @@
-"""Batches by vmap: 256 lanes over everything traced, one of them failing on purpose."""
+"""Batches by vmap: 256 lanes with all values traced; one of them fails intentionally."""
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +10,16 @@ import jaxlag as jl
 from jaxlag import Status
 
 LANES = 256
-BAD = 77
+FAILED = 77
 
 
 @pytest.fixture(scope="module")
 def lanes():
-    """params, q0, v0 and the values of a torque table, a draw each; lane BAD has no inertia."""
+    """Random params, q0, v0 and values of a torque table; lane `FAILED` has no inertia."""
     rng = np.random.default_rng(3)
     draw = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, (LANES, *shape)))  # noqa: E731
     params = {
-        "J": draw(0.1, 0.2).at[BAD].set(0.0),
+        "J": draw(0.1, 0.2).at[FAILED].set(0.0),
         "mgl": draw(2.0, 4.0),
         "c": draw(0.0, 0.1),
         "F": draw(0.0, 0.2),
@@ -34,34 +34,34 @@ def one(params, q0, v0, torques):
 
 
 def test_lanes_equal_single_runs(lanes):
-    """Fixed steps: every lane to round-off of its own run, whatever its neighbors do."""
+    """Fixed steps: every lane equals its single run to rounding, independently of others."""
     batch = jax.jit(jax.vmap(one))(*lanes)
     single = jax.jit(one)
-    for i in [*range(0, LANES, 17), BAD - 1, BAD, BAD + 1]:
+    for i in [*range(0, LANES, 17), FAILED - 1, FAILED, FAILED + 1]:
         alone = single(*jax.tree.map(lambda x, i=i: x[i], lanes))
         assert batch.status[i] == alone.status
         np.testing.assert_allclose(batch.q[i], alone.q, rtol=1e-13, atol=1e-13)
         np.testing.assert_allclose(batch.v[i], alone.v, rtol=1e-13, atol=1e-12)
-    assert batch.status[BAD] == Status.mass_singular
-    assert batch.where[BAD] == 0
-    assert (np.delete(np.asarray(batch.status), BAD) == Status.ok).all()
+    assert batch.status[FAILED] == Status.mass_singular
+    assert batch.where[FAILED] == 0
+    assert (np.delete(np.asarray(batch.status), FAILED) == Status.ok).all()
 
 
 @pytest.mark.full
-def test_a_failing_lane_changes_no_other(lanes):
-    """Bit for bit: the same program with that lane mended."""
+def test_failed_lane_does_not_change_others(lanes):
+    """Bit for bit: the same program with that lane corrected."""
     run = jax.jit(jax.vmap(one))
     broken = run(*lanes)
     params, *rest = lanes
-    mended = run(params | {"J": params["J"].at[BAD].set(0.15)}, *rest)
-    keep = np.arange(LANES) != BAD
-    np.testing.assert_array_equal(broken.q[keep], mended.q[keep])
-    assert np.isnan(broken.q[BAD, 1:]).all()
-    assert np.isfinite(mended.q[BAD]).all()
+    corrected = run(params | {"J": params["J"].at[FAILED].set(0.15)}, *rest)
+    others = np.arange(LANES) != FAILED
+    np.testing.assert_array_equal(broken.q[others], corrected.q[others])
+    assert np.isnan(broken.q[FAILED, 1:]).all()
+    assert np.isfinite(corrected.q[FAILED]).all()
 
 
 @pytest.mark.full
-def test_lanes_take_their_own_steps(lanes):
+def test_lanes_have_independent_steps(lanes):
     """Adaptive: step counts differ from lane to lane; results agree to the tolerance."""
     params, q0, v0, torques = jax.tree.map(lambda x: x[:8], lanes)
 
@@ -78,8 +78,8 @@ def test_lanes_take_their_own_steps(lanes):
 
 
 @pytest.mark.full
-def test_gradient_of_a_batch_survives_a_failing_lane(lanes):
-    lanes = jax.tree.map(lambda x: x[BAD - 2 : BAD + 2], lanes)
+def test_gradient_of_a_batch_with_a_failed_lane_is_finite(lanes):
+    lanes = jax.tree.map(lambda x: x[FAILED - 2 : FAILED + 2], lanes)
 
     def loss(lanes):
         motions = jax.vmap(one)(*lanes)

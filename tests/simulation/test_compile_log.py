@@ -1,4 +1,4 @@
-"""What is said where compiling takes long."""
+"""Messages about long compilations."""
 
 import itertools
 import logging
@@ -15,13 +15,13 @@ PAIR = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * q @ q, ("x", "y"))
 
 
 def called(patch, seconds, system=PAIR, **options):
-    """A simulation whose every look at the clock is so many seconds after the last."""
+    """A simulation in which each reading of the clock is so many seconds after the last."""
     clock = partial(next, itertools.count(0.0, seconds))
     patch.setattr(_simulate, "timed", partial(_compile_log.timed, clock=clock))
     return jl.simulate(system, [0.1, 0.2], [0.0, 0.0], [0.0, 1.0], {"k": 2.0}, **options)
 
 
-def test_a_long_compilation_is_said_once(monkeypatch, caplog):
+def test_long_compilation_is_logged_once(monkeypatch, caplog):
     caplog.set_level(logging.WARNING, logger="jaxlag")
     called(monkeypatch, 4.0, dt=0.5)
     assert not caplog.records
@@ -31,12 +31,12 @@ def test_a_long_compilation_is_said_once(monkeypatch, caplog):
     assert text.startswith("Compiling the motion of 2 coordinates (x, y) took 12 s")
     assert "JAX_COMPILATION_CACHE_DIR" in text
     assert "lowering='array'" in text
-    called(monkeypatch, 12.0, dt=0.25, method="heun")  # compiled already, however long it takes
+    called(monkeypatch, 12.0, dt=0.25, method="heun")  # compiled already: no message
     assert len(caplog.records) == 1
 
 
 @pytest.mark.full
-def test_nothing_is_said_inside_a_transform_nor_proposed_twice(monkeypatch, caplog):
+def test_log_is_empty_under_transforms_and_omits_advice_in_use(monkeypatch, caplog):
     caplog.set_level(logging.WARNING, logger="jaxlag")
     jax.jit(lambda k: called(monkeypatch, 12.0, dt=k).q)(jnp.array(0.5))
     assert not caplog.records

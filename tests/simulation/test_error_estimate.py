@@ -17,7 +17,7 @@ PENDULUM = entry.system, *entry.start(), TS, entry.example.params
 
 
 def ratios(motion, exact, so_far):
-    """Estimate over error at every row after the first; over the largest error so far."""
+    """Estimate over error at every save after the first, or over the largest error so far."""
     found = []
     for x, x_exact, estimate in ((motion.q, exact.q, 0), (motion.v, exact.v, 1)):
         error = np.max(np.abs(x - x_exact), axis=1)[1:]
@@ -33,8 +33,8 @@ def exact():
 
 @pytest.mark.full
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-7, 1e-9])
-def test_half_as_much_again_as_the_error(exact, tolerance):
-    """By a method of higher order, whose own error is a few hundredths of it at the most."""
+def test_estimate_is_about_1_5_times_the_error(exact, tolerance):
+    """By a method of higher order, whose own error is at most a few hundredths of it."""
     motion = jl.simulate(*PENDULUM, rtol=tolerance, atol=tolerance, estimate_error=True)
     found = ratios(motion, exact, so_far=False)
     assert np.all((found >= 1.3) & (found <= 1.7)), found  # measured 1.45 to 1.66
@@ -45,14 +45,14 @@ def test_half_as_much_again_as_the_error(exact, tolerance):
     ("method", "dt"),
     [("tsit5", 0.01), ("dopri8", 0.05), ("gauss4", 0.02)],
 )
-def test_with_fixed_steps(exact, method, dt):
+def test_estimate_with_fixed_steps_has_the_size_of_the_error(exact, method, dt):
     motion = jl.simulate(*PENDULUM, method=method, dt=dt, estimate_error=True)
     found = ratios(motion, exact, so_far=True)
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
-def test_of_a_motion_that_is_exact_but_for_rounding():
-    """Free fall, a parabola: the difference of two motions says nothing, and may be 0."""
+def test_estimate_of_an_exact_motion_covers_rounding():
+    """Free fall, a parabola: the difference of two motions is rounding, and may be 0."""
     fall = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - p["g"] * q[0], ("x",))
     ts = np.linspace(0.0, 8.0, 33)
     motion = jl.simulate(fall, [10.0], [3.0], ts, {"g": 9.81}, estimate_error=True)
@@ -66,15 +66,15 @@ def test_of_a_motion_that_is_exact_but_for_rounding():
 
 
 @pytest.mark.full
-def test_of_the_same_order_where_there_is_no_higher_one(exact):
-    """Most are between 1 and 2; here the largest error so far is meant."""
+def test_estimate_of_the_same_order_has_the_size_of_the_error(exact):
+    """Most ratios are between 1 and 2; the error is the largest so far."""
     motion = jl.simulate(*PENDULUM, method="kvaerno5", rtol=1e-6, atol=1e-6, estimate_error=True)
     found = ratios(motion, exact, so_far=True)
     assert np.all((found >= 1 / 2) & (found <= 4)), found
 
 
 @pytest.mark.full
-def test_the_motion_itself_is_the_same():
+def test_estimate_does_not_change_the_motion():
     with_estimate = jl.simulate(*PENDULUM, estimate_error=True)
     without = jl.simulate(*PENDULUM)
     assert without.error is None
@@ -84,18 +84,18 @@ def test_the_motion_itself_is_the_same():
 
 
 @pytest.mark.full
-def test_lanes_and_jit():
+def test_estimate_in_lanes_equals_the_single_one():
     system, q0, v0, ts, params = PENDULUM
     solve = jax.jit(
         jax.vmap(lambda q: jl.simulate(system, q, v0, ts, params, estimate_error=True).error[0])
     )
     starts = q0 + 0.1 * jnp.arange(3.0)[:, None]
     single = jl.simulate(system, starts[1], v0, ts, params, estimate_error=True).error[0]
-    # Differences of solutions: errors of 1e-9 that round-off moves by parts in a thousand.
+    # Differences of solutions: rounding changes errors of 1e-9 by parts in a thousand.
     np.testing.assert_allclose(solve(starts)[1], single, rtol=1e-2, atol=1e-13)
 
 
-def test_what_cannot_be_estimated(unchecked):  # noqa: F811
+def test_unsupported_estimates_are_refused(unchecked):  # noqa: F811
     controller = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     method = (diffrax.Tsit5(), controller)
     with pytest.raises(
@@ -108,8 +108,8 @@ def test_what_cannot_be_estimated(unchecked):  # noqa: F811
         jl.simulate(*PENDULUM, estimate_error=1e-6)
 
 
-def test_a_method_that_holds_traced_numbers():
-    """It is the same method beside, not to be told from itself by its numbers."""
+def test_estimate_accepts_methods_with_traced_numbers():
+    """It is compared with itself as the same method, without comparing its traced numbers."""
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2, ("x",))
 
     def solve(tol):

@@ -1,4 +1,4 @@
-"""Exported programs whose numbers of motions and of times are symbols."""
+"""Exported programs with symbolic numbers of motions and of times."""
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +20,18 @@ LINES = jl.System(PENDULUM.lagrangian, ("angle",), lowering="array")
 STARTS = {"angle": jnp.array([0.6]), "x": jnp.array([0.6, 0.8])}
 
 
-def row(count):
+def vector(count):
     return jax.ShapeDtypeStruct((count,), jnp.float64)
 
 
 def agree(function, sizes, rtol=0.0):
-    """An exported function of (b,) params and (k,) times, at other sizes, as the function itself.
+    """An exported function of (b,) params and (k,) times equals the function at other sizes.
 
     Chunks of lanes may have other sizes than without symbols: then rounding differs.
     """
     by = jax.jit(jax.vmap(function, (0, None)))
     b, k = export.symbolic_shape("b, k", constraints=["k >= 2"])
-    exported = export.export(by)(row(b), row(k))
+    exported = export.export(by)(vector(b), vector(k))
     for b, k in sizes:
         args = jnp.linspace(1.0, 2.0, b), jnp.linspace(0.0, 0.5, k)
         for x, y in zip(*map(jax.tree.leaves, (exported.call(*args), by(*args))), strict=True):
@@ -50,26 +50,26 @@ def end(system, **options):
     return of
 
 
-def test_batches_and_times_of_any_number():
+def test_exported_solves_accept_any_number_of_motions_and_times():
     agree(end(PENDULUM, method="bosh3", dt=0.1), [(3, 2), (20, 5)], rtol=1e-14)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("system", [PENDULUM, ROD, LINES], ids=["scalars", "rod", "arrays"])
 @pytest.mark.parametrize("method", ["auto", "kvaerno5"])
-def test_adaptive_motions(system, method):
-    # The tolerance of a step: steps of one lane are those of no other, but round otherwise.
+def test_exported_adaptive_solves_agree(system, method):
+    # The tolerance of a step: steps of a lane do not depend on other lanes, but round differently.
     agree(end(system, method=method), [(1, 2), (16, 3), (17, 4)], rtol=1e-9)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("gradient", ["recorded", "checkpoints", "forward"])
-def test_derivatives(gradient):
+def test_exported_derivatives_agree(gradient):
     motion = end(PENDULUM, gradient=gradient, dt=0.05)
     agree(jax.grad(lambda g, ts: jnp.sum(motion(g, ts)[0])), [(3, 2), (20, 5)], rtol=1e-12)
 
 
-def test_what_is_not_known_of_a_symbol_is_said():
+def test_unknown_properties_of_symbols_are_named():
     (k,) = export.symbolic_shape("k")
     for count, options, message in (
         (k, {}, r'at least 2 times, .* was \(k,\)\. Write jax\.export.*constraints=\["k >= 2"\]'),
@@ -77,4 +77,4 @@ def test_what_is_not_known_of_a_symbol_is_said():
     ):
         ended = jax.jit(lambda ts, options=options: end(PENDULUM, **options)(1.0, ts))
         with pytest.raises(ValueError, match=message):
-            export.export(ended)(row(count))
+            export.export(ended)(vector(count))

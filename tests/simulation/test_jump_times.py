@@ -1,6 +1,6 @@
-"""Jumps at times that params tell: named where derivatives would miss them, and knots that do not.
+"""Jumps at times given by params: derivatives miss them, which is reported, except at knots.
 
-Bends are not named: of interpolated tables and ramps derivatives are right.
+Kinks are not reported: derivatives by interpolated tables and ramps are right.
 """
 
 import warnings
@@ -53,7 +53,7 @@ JUMPING = {
     "vmapped": lambda t, x, b: jnp.sum(jax.vmap(lambda c: (t < c * b).astype(float))(TIMES)),
     "beside a bend": lambda t, x, b: jnp.maximum(t - b, 0.0) + jnp.where(t < 2 * b, 0.0, 1e-3),
 }
-BENT = {
+KINKED = {
     "ramp": lambda t, x, b: jnp.where(t < b, 0.0, 3 * (t - b)),
     "ramp that ends": lambda t, x, b: jnp.where(t < b, t / b, 1.0),
     "a delayed table": lambda t, x, b: jnp.interp(t - b, TIMES, VALUES),
@@ -76,7 +76,7 @@ def leaves(system, params, inputs=None, names=("params['b']",), ts=TS):
 
 
 def unknown(system, params):
-    """The same where no number is known, as under jit."""
+    """The same without known values, as under jit."""
     found = []
 
     def look(params):
@@ -93,22 +93,22 @@ def test_jumps_are_found(name):
     assert leaves(system, PARAMS) == unknown(system, PARAMS) == {"params['b']"}
 
 
-@pytest.mark.parametrize("name", BENT)
-def test_bends_are_not(name):
-    system = pushed(BENT[name])
+@pytest.mark.parametrize("name", KINKED)
+def test_kinks_are_not_reported_as_jumps(name):
+    system = pushed(KINKED[name])
     assert leaves(system, PARAMS) == unknown(system, PARAMS) == set()
 
 
-def test_a_jump_after_the_last_time_is_none_yet():
+def test_jump_after_the_last_time_does_not_count():
     system = pushed(JUMPING["where"])
     assert leaves(system, PARAMS | {"b": 4.0}) == set()
     assert unknown(system, PARAMS | {"b": 4.0}) == {"params['b']"}
 
 
-def test_jumps_of_energies_and_rows_and_kinematics():
-    """Whatever the equations are made of: a moving frame whose rate jumps has a momentum that does.
+def test_jumps_of_energies_and_constraints_are_found():
+    """In all parts of the equations: a moving frame with a jump in its rate has one in momentum.
 
-    A row whose second derivative bends moves nothing by a jump.
+    A row whose second derivative has a kink causes no jump.
     """
 
     def carried(power):
@@ -128,8 +128,8 @@ def test_jumps_of_energies_and_rows_and_kinematics():
     assert leaves(carried(2), PARAMS) == leaves(moved(3), PARAMS) == set()
 
 
-def test_jumps_within_inputs():
-    """Functions and constants are read; what has knots jumps where steps end."""
+def test_jumps_within_inputs_are_found():
+    """Functions and constants are searched; signals with knots jump where steps end."""
 
     def force(t, q, v, params, inputs):
         return inputs["u"] * jnp.ones(1)
@@ -157,12 +157,12 @@ def test_jumps_within_inputs():
     assert found == {"inputs['end']"}
 
 
-def test_what_refuses_other_numbers_is_no_error():
-    """What cannot be told counts as a jump; tables, keys and truth values are made up in order."""
+def test_functions_that_refuse_other_values_raise_no_error():
+    """Undecided comparisons count as jumps; made-up tables are ordered, keys and flags valid."""
 
     def guarded(t, q, v, params):
-        bent = jnp.interp(t - params["b"], TIMES, VALUES) * q
-        return eqx.error_if(bent, params["l"] < 2.0, "too short")
+        interpolated = jnp.interp(t - params["b"], TIMES, VALUES) * q
+        return eqx.error_if(interpolated, params["l"] < 2.0, "too short")
 
     force = jl.GeneralizedForce(guarded, "guarded")
     system = jl.System(spring, ("x",), forces=(force,))
@@ -192,7 +192,7 @@ MESSAGE = (
 )
 
 
-def test_derivatives_by_such_a_time_are_warned_of():
+def test_derivatives_by_a_jump_time_give_a_warning():
     with pytest.warns(UserWarning, match=MESSAGE + r".* Make that time a knot: .*ZeroOrderHold"):
         jax.grad(jax.jit(last))(1.0)
     with pytest.warns(UserWarning, match=MESSAGE):
@@ -203,7 +203,7 @@ def test_derivatives_by_such_a_time_are_warned_of():
         jax.grad(last, argnums=1)(1.0, 2.0)
 
 
-def test_numbers_that_functions_close_over_are_warned_of():
+def test_jump_times_in_closures_give_a_warning():
     def end(b):
         law = jl.GeneralizedForce(lambda t, q, v, params: jnp.where(t < b, 1.0, 0.0)[None], "push")
         system = jl.System(spring, ("x",), forces=(law,))
@@ -225,7 +225,7 @@ DRIVEN = jl.System(
 
 
 def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
-    """Within its standard deviations, in segments, the first guess on the end of one of them."""
+    """Within its standard deviations, in segments; the first guess is the end of a segment."""
     ts, true = np.linspace(0.0, 3.0, 61), {"b": 1.2, "k": 4.0}
     x = jl.simulate(DRIVEN, Q0, [0.1], ts, true, inputs=inputs(true)).q
     noise = 1e-3 * np.random.default_rng(0).normal(size=(61, 1))
@@ -233,15 +233,15 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     found = jl.fit(DRIVEN, data, {"b": 1.0, "k": 3.5}, free=("b", "k"), segments=3)
     for name, value in true.items():
         assert abs(found.params[name] - value) < 3 * found.std[name]
-    # 20 measurements of a position of 0.3 m to 1 mm each tell a time to some milliseconds.
+    # 20 measurements of a position of 0.3 m to 1 mm each determine a time to some milliseconds.
     assert found.std["b"] < 5e-3
     assert found.jumps == {}
     hidden = pushed(JUMPING["where"])
     bare = jl.Experiment(ts, data.channels, sigma=data.sigma)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         found = jl.fit(hidden, bare, {"b": 1.0, "k": 3.5}, free=("b", "k"))
-    texts = [str(x.message) for x in told]
+    texts = [str(x.message) for x in warned]
     assert any(text.startswith("Derivatives with respect to params['b'] are") for text in texts)
     assert any("b is compared at" in text and "keeps its value" in text for text in texts)
     assert not any("nothing measured depends on" in text for text in texts)
@@ -249,7 +249,7 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     assert list(found.jumps) == ["b"]
 
 
-def test_signals_may_close_over_params_where_all_have_one_function():
+def test_signals_of_one_function_may_close_over_params():
     ts = np.linspace(0.0, 1.0, 11)
 
     def turned(params):

@@ -1,4 +1,4 @@
-"""Growth of perturbations: closed forms, two routes to one number, and what is said about it."""
+"""Growth of perturbations: closed forms, independent computations, and messages."""
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ def norm_of_exponential(t, rate=RATE):
         (DAMPED, [0.7, -0.3], 20.0),
     ],
 )
-def test_kappa_is_what_it_says(params, start, span):
+def test_kappa_is_the_largest_scaled_norm(params, start, span):
     """The largest scaled norm over all pairs of save times, Phi by scipy's matrix exponential."""
     rtol, atol = 1e-3, 2e-4
     ts = span * np.linspace(0.0, 1.0, 41) ** 1.5
@@ -69,18 +69,18 @@ def test_kappa_is_what_it_says(params, start, span):
     norms = np.zeros((len(ts), len(ts)))
     Phi = expm(f * (ts[j] - ts[i])[:, None, None])
     norms[i, j] = np.linalg.norm(Phi * w[i][:, None, :] / w[j][:, :, None], 2, axis=(1, 2))
-    # Steps of 1e-10; measured worst 2026-11-22: 2e-10 of kappa and log_norm, 7e-12 of a part.
+    # Steps of 1e-10; measured 2026-11-22: at most 2e-10 of kappa and log_norm, 7e-12 of a part.
     np.testing.assert_allclose(growth.kappa, norms.max(axis=0), rtol=2e-9)
     np.testing.assert_allclose(growth.log_norm, np.log(norms[0]), rtol=0, atol=2e-9)
     exact = expm(f * np.diff(ts)[:, None, None])
     np.testing.assert_allclose(growth.transition, exact, rtol=0, atol=1e-10 * np.abs(exact).max())
-    # At s = t nothing has grown yet.
+    # At s = t nothing has grown.
     assert (growth.kappa >= 1.0).all()
     ratio = jl.lyapunov(motion, rtol=10 * rtol, atol=10 * atol)
     np.testing.assert_allclose(ratio.kappa, growth.kappa, rtol=1e-12)
 
 
-def test_a_rotation_grows_nothing():
+def test_rotation_has_no_growth():
     """x'' = -x in fixed units: Phi is a rotation."""
     motion = linear_motion({"k": 1.0, "c": 0.0}, [0.7, -0.3], np.linspace(0.0, 20.0, 41))
     growth = jl.lyapunov(motion, rtol=0.0)
@@ -104,11 +104,11 @@ def test_growth_as_a_power_of_time_is_not_exponential():
 
 
 def test_inverted_pendulum_has_its_exponent_and_horizon():
-    """Phi at the unstable equilibrium, where the motion itself needs no steps at all."""
+    """Phi at the unstable equilibrium, where the motion alone needs no steps."""
     ts = np.linspace(0.0, 10.0, 41)
     growth = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], ts))
     np.testing.assert_allclose(growth.kappa, norm_of_exponential(ts), rtol=1e-7)
-    # The rest of the other exponential after a quarter of the motion: exp(-2 RATE 2.5) = 2e-7.
+    # The other exponential after a quarter of the motion: exp(-2 RATE 2.5) = 2e-7.
     np.testing.assert_allclose(growth.exponent, RATE, rtol=1e-6)
     assert growth.exponential
     horizon = np.log(2e9 / (RATE + 1 / RATE)) / RATE
@@ -120,13 +120,13 @@ def test_inverted_pendulum_has_its_exponent_and_horizon():
     early = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], 0.4 * ts))
     np.testing.assert_allclose(early.horizon, horizon, rtol=1e-3)  # extrapolated
     assert "beyond its end (extrapolated)" in str(early)
-    back = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], -ts))
-    np.testing.assert_allclose(back.kappa, growth.kappa, rtol=1e-7)
-    np.testing.assert_allclose(back.horizon, growth.horizon, rtol=1e-7)
+    backward = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], -ts))
+    np.testing.assert_allclose(backward.kappa, growth.kappa, rtol=1e-7)
+    np.testing.assert_allclose(backward.horizon, growth.horizon, rtol=1e-7)
 
 
 def test_a_motion_beyond_its_horizon_warns():
-    """exp(RATE t) takes 6.4 s to 1e9."""
+    """exp(RATE t) reaches 1e9 after 6.4 s."""
     beyond = linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 10.0, 41))
     with pytest.warns(UserWarning, match=r"From 6\.\d+ s after its start an error of 1e-09"):
         growth = jl.lyapunov(beyond)
@@ -139,7 +139,7 @@ def test_a_motion_beyond_its_horizon_warns():
         jl.lyapunov(several(jnp.zeros((2, 2))))
 
 
-def test_nothing_overflows():
+def test_large_growth_does_not_overflow():
     """Growth of e^940, in segments of e^23."""
     growth = jl.lyapunov(linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 300.0, 41)))
     expected = 300 * RATE + np.log((RATE + 1 / RATE) / 2)
@@ -179,7 +179,7 @@ def hand_written(t, y):
 
 @pytest.mark.full
 def test_exponent_of_chaos_by_two_nearby_trajectories():
-    """Benettin's way by scipy: the distance is set back to 1e-6 after each second."""
+    """Benettin's method with scipy: the distance is reset to 1e-6 after each second."""
     start, span, distance = np.array([2.0, 2.0, 0.0, 0.0]), 160.0, 1e-6
     motion = jl.simulate(minimal, start[:2], start[2:], np.linspace(0.0, span, 201), BOBS)
     growth = jl.lyapunov(motion)
@@ -191,12 +191,12 @@ def test_exponent_of_chaos_by_two_nearby_trajectories():
             solve_ivp(hand_written, (0.0, 1.0), y, method="DOP853", rtol=1e-10, atol=1e-10).y[:, -1]
             for y in (near, far)
         )
-        apart = np.linalg.norm(far - near)
-        rates.append(np.log(apart / distance))
-        far = near + (far - near) * distance / apart
+        separation = np.linalg.norm(far - near)
+        rates.append(np.log(separation / distance))
+        far = near + (far - near) * distance / separation
     blocks = np.mean(np.reshape(rates[40:], (8, 15)), axis=1)
     error = np.std(blocks, ddof=1) / np.sqrt(8)
-    # Two samples of one chaotic sea: they differ by the errors of both, by three of them at most.
+    # Two samples of one chaotic region: they differ by at most three times the combined error.
     assert abs(growth.exponent - np.mean(blocks)) < 3 * np.hypot(growth.exponent_error, error)
     assert growth.exponential
     assert growth.exponent_error < 0.2 * growth.exponent
@@ -237,7 +237,7 @@ def test_conservative_growth_is_symplectic():
     chart = jnp.concatenate(parts, -1)
     growth = jl.lyapunov(motion)
     Phi = chart[1:] @ growth.transition @ jnp.linalg.inv(chart[:-1])
-    # Measured worst 2026-11-22: 5e-14.
+    # Measured 2026-11-22: at most 5e-14.
     J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
     np.testing.assert_allclose(
         jnp.swapaxes(Phi, 1, 2) @ J @ Phi, np.tile(J, (200, 1, 1)), atol=1e-9
@@ -264,12 +264,12 @@ def test_a_table_is_read_on_both_sides_of_its_knots():
         np.testing.assert_allclose(product(jl.lyapunov(motion)), expected, rtol=0, atol=1e-8)
 
 
-# ---- Batches, and what cannot be done ------------------------------------------------------------
+# ---- Batches, and unsupported arguments ----------------------------------------------------------
 
 
 @pytest.mark.full
-def test_batches_have_lanes_of_their_own():
-    """As single motions; under vmap and jit; a lane that failed is NaN and says why."""
+def test_batch_equals_single_motions():
+    """Equal to single motions, under vmap and jit; a failed lane is NaN with its status."""
     ts = np.linspace(0.0, 10.0, 41)
     k = jnp.array([4.0, -G, jnp.nan])
 
@@ -294,8 +294,8 @@ def test_batches_have_lanes_of_their_own():
 
 
 @pytest.mark.full
-def test_float32_has_tolerances_of_its_own():
-    """A state of float32 in time of float64."""
+def test_float32_has_separate_default_tolerances():
+    """A state in float32, time in float64."""
     params = {"k": np.float32(-G), "c": np.float32(0.0)}
     start = np.float32([0.0]), np.float32([0.0])
     motion = jl.simulate(linear, *start, np.linspace(0.0, 2.5, 41), params)
@@ -307,7 +307,7 @@ def test_float32_has_tolerances_of_its_own():
     np.testing.assert_allclose(growth.horizon, expected, rtol=1e-2)  # extrapolated
 
 
-def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
+def test_unsupported_arguments_are_refused(unchecked):  # noqa: F811
     ts = np.linspace(0.0, 10.0, 41)
     motion = linear_motion(INVERTED, [0.0, 0.0], ts)
     with pytest.raises(ValueError, match=r"lyapunov: `motion` must be a jl.Solution, but it was"):
@@ -339,8 +339,8 @@ def test_what_cannot_be_done_is_said(unchecked):  # noqa: F811
 
 
 @pytest.mark.full
-def test_many_coordinates_at_many_times():
-    """12 coordinates and 32 segments: more at once is more than XLA compiles in one loop."""
+def test_many_coordinates_and_segments_agree_with_few_segments():
+    """12 coordinates and 32 segments: more at once exceeds what XLA compiles in one loop."""
     motion = jl.simulate(
         quadcopter.system, *quadcopter.start(), np.linspace(0, 2, 33), quadcopter.example.params
     )

@@ -1,4 +1,4 @@
-"""Growth of perturbations on constraints, in every form of the equations."""
+"""Growth of perturbations under constraints, in every formulation."""
 
 import jax
 import jax.numpy as jnp
@@ -55,10 +55,10 @@ angle = jl.System(bob_by_angle, ("theta",))
 @pytest.mark.full
 @pytest.mark.parametrize("X", [0.0, 0.3])
 def test_constrained_growth_is_that_of_the_angle(X):
-    """Phi d(q, v)/d(theta, omega) = d(q, v)/d(theta, omega) Phi_angle; the pin at rest, and led."""
+    """Phi d(q, v)/d(theta, omega) = d(q, v)/d(theta, omega) Phi_angle; a fixed and a moving pin."""
     ts, params, z0 = jnp.linspace(0.0, 10.0, 41), {"X": X, "Omega": 2.0}, jnp.array([0.7, 0.4])
     q, v = jnp.split(on_rod(z0, ts[0], params), 2)
-    # Another method than the default of all other tests, which takes longer to compile.
+    # Not the default method of all other tests, which takes longer to compile.
     options = TIGHT | {"method": "tsit5"}
     motion = jl.simulate(held, q, v, ts, params, **options)
     reduced = jl.simulate(angle, z0[:1], z0[1:], ts, params, **options)
@@ -69,7 +69,7 @@ def test_constrained_growth_is_that_of_the_angle(X):
     chart = np.asarray(jax.vmap(jax.jacfwd(lambda z, t: on_rod(z, t, params)))(z, ts))
     Phi, of_angle = np.asarray(growth.transition), np.asarray(expected.transition)
     np.testing.assert_allclose(Phi @ chart[:-1], chart[1:] @ of_angle, rtol=0, atol=1e-8)
-    # What breaks the constraints does not count.
+    # Perturbations off the constraints do not count.
     assert (np.linalg.matrix_rank(Phi, tol=1e-6) == 2).all()
     error = np.hypot(growth.exponent_error, expected.exponent_error)
     assert abs(growth.exponent - expected.exponent) < error
@@ -86,8 +86,8 @@ def test_constrained_growth_is_that_of_the_angle(X):
 
 
 @pytest.mark.full
-def test_growth_on_a_knife_edge():
-    """Pfaffian rows restrict velocities alone: closed form in (x, y, theta, speed, turn)."""
+def test_growth_on_a_knife_edge_has_its_closed_form():
+    """Pfaffian rows restrict only velocities: closed form in (x, y, theta, speed, turning rate)."""
     ts = np.linspace(0.0, 6.0, 41)
     z0 = jnp.array([0.1, 0.2, 0.3, 0.8, 1.3])
 
@@ -113,7 +113,7 @@ def test_growth_on_a_knife_edge():
 
 @pytest.mark.full
 def test_quasi_velocities_do_not_change_growth():
-    """(q, v) and (q, u) are one motion, and the growth is that of (q, v)."""
+    """(q, v) and (q, u) describe one motion; the growth is that of (q, v)."""
     ts, q0 = np.linspace(0.0, 6.0, 21), jnp.array([0.1, 0.2, 0.3])
     v0 = jnp.array([0.8 * np.cos(0.3), 0.8 * np.sin(0.3), 1.3])
     _, system = sleighs()
@@ -126,7 +126,7 @@ def test_quasi_velocities_do_not_change_growth():
 
 
 @pytest.mark.full
-def test_rows_that_follow_from_others_change_nothing():
+def test_dependent_rows_do_not_change_growth():
     def twice(t, q, params):
         rows = rods(t, q, params)
         return jnp.concatenate([rows, 2 * rows[:1]])

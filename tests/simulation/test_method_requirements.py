@@ -1,4 +1,4 @@
-"""What structure-preserving methods refuse, and why."""
+"""Systems and options that structure-preserving methods refuse, with the reason."""
 
 import diffrax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ held = jl.System(spring, ("x",), constraints=(jl.Holonomic(lambda t, q, p: q[0] 
 
 
 @pytest.mark.parametrize("method", ["splitting4", "gauss4", "variational2"])
-def test_steps_are_equal(method):
+def test_structure_preserving_methods_need_fixed_steps(method):
     with pytest.raises(
         ValueError, match=r"`dt` must be given for \w+, but it was left out.*dt=0.01"
     ):
@@ -54,7 +54,7 @@ def test_steps_are_equal(method):
         (held, r"without constraints, but it has constraints \('stop'\)"),
     ],
 )
-def test_what_does_not_split(system, message):
+def test_systems_that_do_not_split_are_refused(system, message):
     rest = [0.3] * system.size
     with pytest.raises(ValueError, match=r"method Splitting must split.*" + message):
         solve(system, "splitting2", rest, [0.0] * system.size)
@@ -66,7 +66,7 @@ def test_a_mass_matrix_of_q_does_not_split():
         solve(system, "splitting2", *start)
 
 
-def test_constraints_of_partitioned_methods():
+def test_unsupported_constraints_of_partitioned_methods_are_refused():
     system, *start = example(double_pendulum_cartesian)
     with pytest.raises(ValueError, match=r"GaussLegendre must be used without constraints.*'varia"):
         solve(system, "gauss4", *start)
@@ -74,7 +74,7 @@ def test_constraints_of_partitioned_methods():
         solve(system, "variational2", *start, formulation="null_space")
 
 
-def test_damping_of_residuals_is_not_for_steps_without():
+def test_baumgarte_with_variational_methods_is_refused():
     system, *start = example(double_pendulum_cartesian)
     with pytest.raises(
         ValueError, match=r"`stabilization` must be left out for LobattoIIIAB, whose steps"
@@ -82,7 +82,7 @@ def test_damping_of_residuals_is_not_for_steps_without():
         solve(system, "variational2", *start, stabilization=jl.Baumgarte(1.0, 1.0))
 
 
-def test_rolling_is_not_holonomic():
+def test_rolling_with_variational_methods_is_refused():
     system, *start = example(rolling_disk)
     with pytest.raises(ValueError, match=r"LobattoIIIAB must be used with holonomic constraints"):
         solve(system, "variational2", *start, formulation="multipliers")
@@ -90,7 +90,7 @@ def test_rolling_is_not_holonomic():
         solve(system, "variational2", *start)
 
 
-def test_friction_that_depends_on_multipliers():
+def test_variational_methods_refuse_friction_by_multipliers():
     def slide(t, q, v, params, inputs, lam):
         return jnp.stack([-0.2 * jnp.abs(lam["floor"]), jnp.zeros_like(t)])
 

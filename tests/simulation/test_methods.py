@@ -1,4 +1,4 @@
-"""method="auto": by tolerance, structure and stiffness; what a solution says of it."""
+"""method="auto" by tolerance, structure and stiffness, and how a solution reports it."""
 
 import diffrax
 import jax
@@ -52,7 +52,7 @@ OILED = jl.System(two, ("slow", "fast"), forces=(jl.GeneralizedForce(oil, name="
         (0.0, 1e-3, "tsit5"),
     ],
 )
-def test_the_relative_tolerance_decides(rtol, atol, name):
+def test_auto_chooses_the_method_by_relative_tolerance(rtol, atol, name):
     motion = jl.simulate(PLAIN, [1.0], [0.0], TS, {}, rtol=rtol, atol=atol)
     assert motion.method == name
     assert motion.tolerances is not None
@@ -60,7 +60,7 @@ def test_the_relative_tolerance_decides(rtol, atol, name):
     np.testing.assert_array_equal(motion.tolerances, given)
 
 
-def test_a_tolerance_that_is_traced_decides_nothing():
+def test_traced_tolerance_does_not_affect_the_method():
     def solve(tol):
         return jl.simulate(PLAIN, [1.0], [0.0], TS, {}, rtol=tol, atol=tol)
 
@@ -71,7 +71,7 @@ def test_a_tolerance_that_is_traced_decides_nothing():
     ("system", "options", "name"),
     [
         (PLAIN, {}, "splitting8"),
-        (PLAIN, {"save": ("work",)}, "dopri8"),  # splitting8 takes work along with order 4
+        (PLAIN, {"save": ("work",)}, "dopri8"),  # splitting8 integrates work with order 4 only
         (WARPED, {}, "dopri8"),
         (PLAIN, {"method": "dopri8"}, "dopri8"),
         (PLAIN, {"method": diffrax.Dopri8()}, "dopri8"),
@@ -80,7 +80,7 @@ def test_a_tolerance_that_is_traced_decides_nothing():
         (PLAIN, {"method": diffrax.Kvaerno5()}, "Kvaerno5"),  # solves its equations its own way
     ],
 )
-def test_fixed_steps_go_by_structure(system, options, name):
+def test_auto_chooses_fixed_step_methods_by_structure(system, options, name):
     motion = jl.simulate(system, [1.0], [0.0], TS, {}, dt=0.01, **options)
     assert motion.method == name
     assert motion.tolerances is None
@@ -91,7 +91,7 @@ def test_fixed_steps_with_forces_are_not_split():
     assert motion.method == "dopri8"
 
 
-def test_motions_by_different_methods_are_of_one_form():
+def test_motions_by_different_methods_have_equal_structure():
     motions = [jl.simulate(PLAIN, [1.0], [0.0], TS, {}, rtol=x, atol=x) for x in (1e-3, 1e-12)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *motions)
     assert both.q.shape == (2, 3, 1)
@@ -101,8 +101,8 @@ def test_motions_by_different_methods_are_of_one_form():
 
 
 @pytest.mark.full
-def test_tolerances_in_large_units():
-    """An orbit in meters for a day, to 0.1 mm: as order 8 has it."""
+def test_tolerances_in_large_units_choose_a_high_order():
+    """An orbit in meters for a day, to 0.1 mm, by a method of high order."""
 
     def earth(t, q, v, params):
         return 0.5 * (v @ v) + 3.986004418e14 / jnp.sqrt(q @ q)
@@ -113,18 +113,18 @@ def test_tolerances_in_large_units():
     assert motion.method == "prince9"
     assert int(motion.stats["accepted"]) < 1000  # order 5 would need more than 3000
     turned = speed / r * 86400.0
-    # 15 turns of tolerances of 1e-4 m and 1e-4 m/s a step; phase errors grow with time.
+    # 15 revolutions with tolerances of 1e-4 m and 1e-4 m/s a step; phase errors grow with time.
     expected = r * np.array([np.cos(turned), np.sin(turned)])
     np.testing.assert_allclose(motion.q[-1], expected, atol=10.0)
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_knows_its_name(name):
+def test_every_method_has_its_name(name):
     assert name_of(choose(name, name not in FIXED, 1e-6, 1e-6)[0]) == name
 
 
 def run_out(**options):
-    """The fast coordinate decays within 1e-5 s, then slowly: 30 s are 5e5 explicit steps."""
+    """The fast coordinate decays within 1e-5 s, then slowly: 30 s need 5e5 explicit steps."""
     return jl.simulate(
         OILED,
         [1.0, 0.1],
@@ -140,7 +140,7 @@ def run_out(**options):
 
 
 @pytest.mark.full
-def test_stiffness_is_met_by_implicit_steps_where_explicit_ones_run_out():
+def test_auto_uses_implicit_steps_if_explicit_ones_run_out():
     motion = run_out()
     assert motion.status == jl.Status.ok
     assert motion.method == "kvaerno5"
@@ -162,7 +162,7 @@ def test_stiffness_is_met_by_implicit_steps_where_explicit_ones_run_out():
 
 
 @pytest.mark.full
-def test_an_oscillation_is_not_met_by_implicit_steps():
+def test_auto_does_not_use_implicit_steps_for_oscillations():
     motion = jl.simulate(
         OILED,
         [1.0, 0.1],
@@ -183,7 +183,7 @@ def elastic(t, q, v, params):
 
 
 def test_implicit_steps_are_as_long_as_accuracy_allows():
-    """Measured 299 and 27; with the chord iteration of diffrax's default 5659 and 7900."""
+    """Measured 299 and 27 steps; with the chord iteration of diffrax's default 5659 and 7900."""
     motion = jl.simulate(
         jl.System(elastic, ("x", "y")),
         [np.sin(1.0), -np.cos(1.0) - 1e-5],
@@ -229,13 +229,13 @@ def test_implicit_methods_solve_every_kind_of_system(name):
 # ---- Tolerances of coordinates -------------------------------------------------------------------
 
 
-def test_every_coordinate_may_have_a_tolerance_of_its_own():
-    """Of two springs apart only the one that is watched closely sets the step."""
+def test_coordinates_may_have_separate_tolerances():
+    """Of two uncoupled springs only the one with a tight tolerance limits the step."""
 
-    def apart(t, q, v, params):
+    def uncoupled(t, q, v, params):
         return 0.5 * v @ v - 0.5 * (q[0] ** 2 + 100.0 * q[1] ** 2)
 
-    system = jl.System(apart, ("slow", "quick"))
+    system = jl.System(uncoupled, ("slow", "quick"))
 
     def steps(atol, method="tsit5"):
         motion = jl.simulate(

@@ -1,4 +1,4 @@
-"""Bad options of `simulate`: each is refused by name, with what it must be and was."""
+"""Invalid options of `simulate`: refused by name, with the condition and the value."""
 
 import re
 
@@ -82,11 +82,11 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_a_bad_option_is_refused(changes, message):
+def test_invalid_option_is_refused(changes, message):
     refused(message, **changes)
 
 
-def test_an_unknown_method_is_told_the_known_ones():
+def test_unknown_method_gets_a_list_of_known_ones():
     with pytest.raises(ValueError, match=r"^`method` .* but it was 'rk4'\.") as caught:
         run(method="rk4")
     for name in ("dopri8", "tsit5", "kvaerno5", "a diffrax solver or (solver, controller)"):
@@ -104,14 +104,14 @@ def test_an_unknown_method_is_told_the_known_ones():
         ("dopri_8", "'dopri8'"),
     ],
 )
-def test_a_method_by_another_name_is_told_the_nearest(name, nearest):
+def test_unknown_method_gets_the_nearest_known_one(name, nearest):
     message = f"but it was {name!r}. The nearest is {nearest}"
     with pytest.raises(ValueError, match=re.escape(message)):
         run(method=name)
 
 
-def test_arguments_in_another_order_are_told():
-    """Where the names say so: q, v, t, p."""
+def test_arguments_in_another_order_are_refused():
+    """If the names show it: q, v, t, p."""
     message = (
         r"^`lagrangian` must take \(t, q, v, params\) in this order.* 'q' is in the place of 't'"
     )
@@ -122,13 +122,13 @@ def test_arguments_in_another_order_are_told():
     jl.System(lambda time, x, v, p: 0.5 * v @ v, ("x",))
 
 
-def test_a_parameter_of_one_entry_is_told():
+def test_parameter_of_shape_1_is_named():
     params = {"k": 1.0, "m": jnp.ones(1)}
     with pytest.raises(ValueError, match=r"of shape \(1,\)\. params\['m'\] has shape \(1,\)"):
         run(jl.System(lambda t, q, v, params: params["m"] * (v @ v), ("x", "y")), params=params)
 
 
 @pytest.mark.parametrize("parts", ["forces", "constraints"])
-def test_none_is_no_sequence(parts, unchecked):  # noqa: F811
+def test_none_instead_of_a_sequence_is_refused(parts, unchecked):  # noqa: F811
     with pytest.raises(ValueError, match=rf"^`{parts}` must be a sequence .*Leave it out"):
         jl.System(SYSTEM.lagrangian, ("x", "y"), **{parts: None})

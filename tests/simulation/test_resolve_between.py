@@ -1,4 +1,4 @@
-"""States between the rows of a motion, as accurate as the rows."""
+"""States between the saves of a motion, as accurate as the saves."""
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,12 @@ def spring(t, q, v, params):
 SYSTEM = jl.System(spring, ("x",))
 
 
-@pytest.mark.parametrize("sense", [1.0, -1.0])
-def test_states_between_rows_are_as_accurate_as_rows(sense):
-    """cos(2 t), in any order, rows and repeated times among them."""
-    ts = sense * np.array([0.0, 1.0, 4.0])
+@pytest.mark.parametrize("time_direction", [1.0, -1.0])
+def test_states_between_saves_are_as_accurate_as_saves(time_direction):
+    """cos(2 t), in any order, including saves and repeated times."""
+    ts = time_direction * np.array([0.0, 1.0, 4.0])
     motion = jl.simulate(SYSTEM, [1.0], [0.0], ts, 4.0, rtol=1e-10, atol=1e-10, method="tsit5")
-    times = sense * np.array([3.3, 1.0, 2.5, 3.3, 4.0])
+    times = time_direction * np.array([3.3, 1.0, 2.5, 3.3, 4.0])
     found = motion.at(times)
     np.testing.assert_array_equal(found.ts, times)
     np.testing.assert_allclose(found["x"], np.cos(2 * times), atol=1e-8)
@@ -36,12 +36,12 @@ def test_constrained_motions_stay_on_their_constraints():
     motion = jl.simulate(system, [1.0, 0.0], [0.0, 0.0], [0.0, 1.0], rtol=1e-6, atol=1e-6)
     found = motion.at(0.3)
     np.testing.assert_allclose(jnp.sum(found.q**2), 1.0, atol=1e-14)
-    row = jl.simulate(system, [1.0, 0.0], [0.0, 0.0], [0.0, 0.3, 1.0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found.q[0], row.q[1], atol=1e-5)
+    saved = jl.simulate(system, [1.0, 0.0], [0.0, 0.0], [0.0, 0.3, 1.0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.q[0], saved.q[1], atol=1e-5)
 
 
-def test_what_was_saved_is_there_between_rows():
-    """Work counts from the start of the motion: all that the damper took, as the energy tells."""
+def test_saved_quantities_are_available_between_saves():
+    """Work counts from the start of the motion: all that of the damper, as the energy shows."""
     damper = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "damper")
     system = SYSTEM.with_forces(damper)
     motion = jl.simulate(system, [1.0], [0.0], [0.0, 1.0, 4.0], 4.0, save=("work", "energy"))
@@ -74,6 +74,6 @@ def adaptive():
         ),
     ],
 )
-def test_what_cannot_be_told_is_refused(make, t, message):
+def test_unsupported_times_are_refused(make, t, message):
     with pytest.raises(ValueError, match=message):
         make().at(t)

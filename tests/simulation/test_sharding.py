@@ -1,4 +1,4 @@
-"""Motions over several devices: in a process of its own, where the CPU counts as two of them."""
+"""Motions on several devices: in a separate process, where the CPU counts as two devices."""
 
 import json
 import os
@@ -64,12 +64,12 @@ def found():
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_motions_go_along_where_they_can(found):
+def test_supported_shardings_equal_a_single_device(found):
     assert found["auto"] == pytest.approx(found["alone"], rel=1e-14)
     assert found["unchecked"] == pytest.approx(found["alone"], rel=1e-14)
 
 
-def test_what_they_do_not_go_along_with_is_refused(found):
+def test_unsupported_shardings_are_refused(found):
     assert "`simulate` inside shard_map with check_vma=True is not supported" in found["checked"]
     assert "['b']" in found["checked"]
     assert "`simulate` of arrays along explicit axes is not supported" in found["explicit"]

@@ -1,4 +1,4 @@
-"""simulate and Solution as a user meets them: statuses, shapes, caching, saved quantities."""
+"""simulate and Solution in use: statuses, shapes, caching, saved quantities."""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ def test_small_oscillation_has_its_closed_form():
 
 
 @pytest.mark.full
-def test_save_equals_on_demand():
+def test_saved_quantities_equal_those_on_demand():
     names = ("a", "p", "energy", "kinetic", "potential", "Q")
     plain, saved = run(), run(save=names)
     assert set(saved.saved) == set(names)
@@ -45,7 +45,7 @@ def test_save_equals_on_demand():
 
 
 def test_unrequested_quantities_are_not_computed():
-    """The marker in V is evaluated by save=("potential",) on rows; without it there are fewer."""
+    """save=("potential",) evaluates the marker in V at saves; without it there are fewer."""
 
     def count(save):
         jaxpr = jax.make_jaxpr(lambda q0: run(q0=q0, save=save, throw=False).q)(PENDULUM.q0)
@@ -55,7 +55,7 @@ def test_unrequested_quantities_are_not_computed():
 
 
 def test_array_coordinates():
-    """Two masses in the plane on springs to the origin: names give shapes back."""
+    """Two masses in the plane on springs to the origin: names return arrays of their shapes."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * jnp.sum(v**2) - 0.5 * p * jnp.sum(q**2),
         {"x": (2, 2), "theta": ()},
@@ -67,7 +67,7 @@ def test_array_coordinates():
         motion["y"]
 
 
-def test_new_values_never_recompile():
+def test_new_values_do_not_recompile():
     compiled = _simulate._cache_size
 
     def lagrangian(t, q, v, p):
@@ -84,7 +84,7 @@ def test_new_values_never_recompile():
     first = compiled()
     for changes in ({"m": 2.0}, {"q": 0.7}, {"v": 1.0}, {"t0": 0.1}, {"t1": 3.0}):
         go(rtol=1e-6, **changes)
-    go(rtol=1e-8, atol=9e-5)  # from 1e-4 on "auto" is another method
+    go(rtol=1e-8, atol=9e-5)  # from 1e-4 on "auto" chooses another method
     assert compiled() == first
     go(dt=0.1)
     fixed = compiled()
@@ -105,7 +105,7 @@ def test_no_host_callback_in_any_program():
         assert "callback" not in str(jax.make_jaxpr(f)(PENDULUM.q0))
 
 
-def test_max_steps_says_how_far():
+def test_max_steps_reports_the_last_time():
     with pytest.raises(
         SimulationError, match=r"max_steps: last good state at t = 0\.\d+ of 1"
     ) as e:
@@ -117,8 +117,8 @@ def test_max_steps_says_how_far():
     assert np.isnan(motion.q[~reached]).all()
 
 
-def test_force_that_becomes_nan_in_flight():
-    """The last good time is just short of where the force ends, and the coordinate is named."""
+def test_force_that_becomes_nan_ends_the_motion():
+    """The last good time is just before the force ends, and the coordinate is named."""
     force = jl.GeneralizedForce(lambda t, q, v, p: jnp.stack([0.0 * t, jnp.sqrt(p - t)]), "burn")
     system = jl.System(lambda t, q, v, p: 0.5 * jnp.sum(v**2), ("x", "y"), forces=(force,))
     with pytest.raises(
@@ -154,8 +154,8 @@ def ends(t, q, v):
         (ends, {"method": "kvaerno5"}),
     ],
 )
-def test_a_force_that_fails_inside_a_step_is_found_there(law, options):
-    """Of velocity, time or position: neither end of the step needs to be where it fails.
+def test_force_that_fails_inside_a_step_is_named(law, options):
+    """A force of velocity, time or position may fail between the ends of a step.
 
     Another coordinate has the larger acceleration.
     """
@@ -172,8 +172,8 @@ def test_a_force_that_fails_inside_a_step_is_found_there(law, options):
     assert "nonfinite ('y')" in motion.message()
 
 
-def test_what_grows_beyond_all_numbers_names_no_innocent():
-    """The coordinate whose steps are unstable, or none: all that depends on it is lost too."""
+def test_overflow_does_not_name_an_unrelated_coordinate():
+    """The coordinate whose steps are unstable, or none: all that depends on it overflows, too."""
     system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) - 5e5 * q[0] ** 2 - q[0] * q[1], ("x", "y"))
     motion = jl.simulate(
         system, [1.0, 0.0], [0.0, 0.0], [0.0, 9.0], {}, method="tsit5", dt=0.05, throw=False
@@ -182,7 +182,7 @@ def test_what_grows_beyond_all_numbers_names_no_innocent():
     assert motion.where in (-1, 0)
 
 
-def test_mass_that_vanishes_in_flight():
+def test_vanishing_mass_ends_the_motion():
     """A mass m(x) that reaches zero at x = 1, approached at unit rate."""
     system = jl.System(
         lambda t, q, v, p: 0.5 * v[0] ** 2 + 0.5 * (1 - q[0]) * v[1] ** 2, ("x", "y")
@@ -203,7 +203,7 @@ def test_collision_is_a_status_with_a_time():
     assert np.isnan(motion.q[2]).all()
 
 
-def test_traced_bad_values_become_statuses():
+def test_traced_invalid_values_become_statuses():
     def status(q0=PENDULUM.q0, ts=(0.0, 1.0), **options):
         go = jax.jit(lambda q0, ts, o: run(q0=q0, ts=ts, **o).status)
         return go(q0, jnp.asarray(ts), options)
@@ -216,12 +216,12 @@ def test_traced_bad_values_become_statuses():
     assert status(rtol=1e-16) == Status.bad_value
     assert status(rtol=0.0, atol=0.0) == Status.bad_value
     assert status(dt=-0.1) == Status.bad_value
-    bad = jax.jit(lambda q0: run(q0=q0, throw=False))(jnp.array([0.1, jnp.nan]))
-    assert bad.where == 1
-    assert np.isnan(bad.q[1:]).all()
+    invalid = jax.jit(lambda q0: run(q0=q0, throw=False))(jnp.array([0.1, jnp.nan]))
+    assert invalid.where == 1
+    assert np.isnan(invalid.q[1:]).all()
 
 
-def test_input_range():
+def test_times_beyond_tables_are_refused_or_get_a_status():
     arguments = (driven, [0.4], [0.9])
     params = {"J": 0.15, "mgl": 3.0, "c": 0.02, "F": 0.1}
     inputs = {"tau": steps()}
@@ -266,7 +266,7 @@ def test_input_range():
         (0.5, 1.25, 0.5),
     ],
 )
-def test_signals_that_are_no_tables(signal, x, a):
+def test_signals_other_than_tables_are_integrated(signal, x, a):
     """Unit mass from x = 1 at rest over 1 s under cos t, 2 cos t, -x and 1/2."""
     push = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["u"][None], "push")
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(push,))
@@ -283,7 +283,7 @@ def test_signals_that_are_no_tables(signal, x, a):
     assert set(motion.inputs) == {"u"}
 
 
-def test_float32_under_a_force_of_time():
+def test_float32_state_under_a_force_of_time_stays_float32():
     """Time is float64; the force is cast to the state, adaptive and fixed."""
     push = jl.GeneralizedForce(lambda t, q, v, p: jnp.cos(t)[None], "push")
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(push,))
@@ -294,7 +294,7 @@ def test_float32_under_a_force_of_time():
         np.testing.assert_allclose(motion.q[-1], [2 - np.cos(1.0)], rtol=1e-5)
 
 
-def test_wrapped_solver():
+def test_wrapped_solver_agrees():
     import diffrax
 
     motion = run(method=diffrax.HalfSolver(diffrax.Tsit5()), rtol=1e-7, atol=1e-7)
@@ -302,7 +302,7 @@ def test_wrapped_solver():
 
 
 @pytest.mark.full
-def test_solution_after_vmap():
+def test_batched_solution_equals_single_ones():
     starts = PENDULUM.q0 + jnp.linspace(0.0, 0.1, 3)[:, None]
     motions = jax.jit(jax.vmap(lambda q0: run(q0=q0)))(starts)
     assert motions.q.shape == (3, 5, 2)
@@ -314,7 +314,7 @@ def test_solution_after_vmap():
         np.testing.assert_allclose(motions.a[i], one.a, rtol=1e-6, atol=1e-6)
 
 
-def test_explicit_controller():
+def test_explicit_controller_is_used_and_checked():
     import diffrax
 
     controller = diffrax.PIDController(rtol=1e-7, atol=1e-7, pcoeff=0.3, icoeff=0.4)
@@ -335,17 +335,17 @@ def test_explicit_controller():
 
 
 @pytest.mark.full
-def test_tolerance_is_kept_across_solvers():
-    """Five solvers agree within ten times the tolerance over a second."""
+def test_solvers_agree_to_the_tolerance():
+    """Five solvers agree within a hundred times the tolerance over a second."""
     truth = run(rtol=1e-13, atol=1e-13)
     for method in ("bosh3", "tsit5", "dopri5", "dopri8", "kvaerno4"):
         motion = run(method=method, rtol=1e-6, atol=1e-6)
-        # Measured worst 2026-11-21: 2e-5, bosh3.
+        # Measured 2026-11-21: at most 2e-5, bosh3.
         np.testing.assert_allclose(motion.q, truth.q, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
-def test_a_motion_that_fails_under_an_eager_derivative_says_so(mode):
+def test_failure_under_an_eager_derivative_raises_an_error(mode):
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
 
     def end(k):

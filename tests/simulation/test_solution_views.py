@@ -1,4 +1,4 @@
-"""A solution in words, by index, as a dict, as a dataset and as a figure."""
+"""A solution as text, by index, as a dict, as a dataset and as a figure."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def motion():
 
 @pytest.fixture(scope="module")
 def batch():
-    """The third one without a stiffness."""
+    """The third and the fifth have NaN stiffness."""
     return jax.vmap(moved)(jnp.array([1.0, 2.0, jnp.nan, 3.0, jnp.nan]))
 
 
@@ -52,7 +52,7 @@ def test_motions_of_a_batch_are_taken_by_index(batch, motion):
         motion[3]
 
 
-def test_a_batch_says_how_many_ended_how(batch):
+def test_message_of_a_batch_counts_statuses(batch):
     first, second = batch.message().splitlines()
     assert first == "5 motions: 3 ok, 2 nonfinite"
     assert second.startswith("[2]: nonfinite")
@@ -77,7 +77,7 @@ def test_a_dataset_is_labeled(motion, batch):
     many = batch.to_xarray()
     assert many["arm"].dims == ("motion", "t", "arm_0", "arm_1")
     assert many["status"].to_numpy().tolist() == batch.status.tolist()
-    # Times of their own are no common coordinate.
+    # Different times are not a common coordinate.
     own = jax.vmap(
         lambda end: jl.simulate(
             SYSTEM, Q0, 0.0 * Q0, jnp.array([0.0, 0.5, 1.0]) * end, 1.0, dt=0.25, method="heun"
@@ -87,7 +87,7 @@ def test_a_dataset_is_labeled(motion, batch):
 
 
 def test_a_figure_shows_coordinates_energy_and_paths(motion, batch):
-    """What the lines are, not how they look."""
+    """The data of the lines, not their style."""
     pytest.importorskip("matplotlib")
     *panels, plane = motion.plot().axes
     assert [ax.get_ylabel() for ax in panels] == ["x", "y", "arm", "energy [J]"]

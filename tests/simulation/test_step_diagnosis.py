@@ -1,4 +1,4 @@
-"""Solution.explain: what held the steps short."""
+"""Solution.explain: what limits the steps."""
 
 import re
 
@@ -33,8 +33,8 @@ def line(text: str, head: str) -> str:
     return found
 
 
-def test_a_motion_that_goes_well():
-    """At rest below, the rate is sqrt g: its period 2 pi / 3 and the steps in it are told."""
+def test_normal_motion_is_described():
+    """At the bottom the rate is sqrt g: its period 2 pi / 3 and steps per period are stated."""
     motion = jl.simulate(ANGLE, [1e-3], [0.0], TS, {"g": 9.0})
     text = motion.explain()
     h = 2.0 / int(motion.stats["accepted"])
@@ -48,24 +48,25 @@ def test_a_motion_that_goes_well():
 
 
 @pytest.mark.full
-def test_the_projection_is_told():
+def test_projection_is_described():
     text = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}).explain()
     assert line(text, "projection") in (
         "up to 1 iteration per step",
         "up to 2 iterations per step",
     )
-    left = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, stabilization=None)
-    assert "projection" not in left.explain()
+    unprojected = jl.simulate(BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, stabilization=None)
+    assert "projection" not in unprojected.explain()
     far = jl.simulate(
         BOB, [1.0, 0.0], [0.0, 0.0], TS, {"g": 9.0}, method="tsit5", dt=0.6, throw=False
     )
-    text = far.explain()  # a step of half the way round
-    turns = int(line(text, "projection").split()[2])
-    assert turns > 3
-    assert f"onto the constraints takes up to {turns} iterations" in line(text, "advice")
+    text = far.explain()  # a step of half a revolution
+    iterations = int(line(text, "projection").split()[2])
+    assert iterations > 3
+    advice = line(text, "advice")
+    assert f"onto the constraints takes up to {iterations} iterations" in advice
 
 
-def test_a_force_that_jumps_is_advised_a_table():
+def test_jumping_force_gets_advice_on_rejected_steps():
     def push(t, q, v, params, inputs):
         return jnp.sign(jnp.sin(40.0 * t))[None]
 
@@ -76,7 +77,7 @@ def test_a_force_that_jumps_is_advised_a_table():
 
 @pytest.mark.full
 def test_a_mass_matrix_near_singular_names_a_coordinate():
-    """Masses of 1e-10 in units of their own cost no digits; velocities that are nearly one do."""
+    """Masses of 1e-10 in their own units cost no digits; nearly equal velocities do."""
 
     def light(t, q, v, params):
         return 0.5 * v[0] ** 2 + 0.5e-10 * v[1] ** 2 - 0.5 * q[0] ** 2 - 0.5e-10 * q[1] ** 2
@@ -85,8 +86,8 @@ def test_a_mass_matrix_near_singular_names_a_coordinate():
     assert line(motion.explain(), "mass matrix") == "cond(M) up to 1 with its diagonal scaled to 1"
 
     def alike(t, q, v, params):
-        both, apart = v[0] + v[1], v[0] - v[1]
-        return 0.5 * both**2 + 0.5e-10 * apart**2 - 0.5 * q[0] ** 2 - 0.5 * q[1] ** 2
+        both, difference = v[0] + v[1], v[0] - v[1]
+        return 0.5 * both**2 + 0.5e-10 * difference**2 - 0.5 * q[0] ** 2 - 0.5 * q[1] ** 2
 
     motion = jl.simulate(jl.System(alike, ("a", "b")), [1e-3, 1e-3], [0.0, 0.0], TS, {})
     text = motion.explain()
@@ -95,7 +96,7 @@ def test_a_mass_matrix_near_singular_names_a_coordinate():
 
 
 @pytest.mark.full
-def test_a_link_without_mass_is_no_fault():
+def test_massless_link_is_described():
     def lead(t, q, v, params):
         return 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2
 
@@ -105,18 +106,18 @@ def test_a_link_without_mass_is_no_fault():
     assert line(text, "mass matrix") == "no inertia of its own along 'y'"
 
 
-def test_growth_is_no_oscillation():
+def test_growth_is_described_by_its_rate():
     """Upright, the rates are +- sqrt g."""
     text = jl.simulate(ANGLE, [np.pi - 1e-6], [0.0], TS, {"g": 9.0}).explain()
     assert line(text, "rates").startswith("fastest growth e-fold in 0.333 s")
 
 
-def test_implicit_steps_follow_nothing():
-    def apart(t, q, v, params):
+def test_implicit_steps_are_limited_by_accuracy():
+    def uncoupled(t, q, v, params):
         return 0.5 * (v @ v) - 0.5 * q[0] ** 2 - 0.5e8 * q[1] ** 2
 
     motion = jl.simulate(
-        jl.System(apart, ("calm", "quick")), [1.0, 0.0], [0.0, 0.0], TS, {}, method="kvaerno5"
+        jl.System(uncoupled, ("calm", "quick")), [1.0, 0.0], [0.0, 0.0], TS, {}, method="kvaerno5"
     )
     text = motion.explain()
     assert line(text, "advice").startswith("Accuracy limits the step")
@@ -124,31 +125,31 @@ def test_implicit_steps_follow_nothing():
 
 
 def test_the_component_with_the_largest_error_is_named():
-    def apart(t, q, v, params):
+    def uncoupled(t, q, v, params):
         return 0.5 * (v @ v) - 0.5 * q[0] ** 2 - 0.5e4 * q[1] ** 2
 
-    motion = jl.simulate(jl.System(apart, ("calm", "quick")), [1.0, 1.0], [0.0, 0.0], TS, {})
+    motion = jl.simulate(jl.System(uncoupled, ("calm", "quick")), [1.0, 1.0], [0.0, 0.0], TS, {})
     assert line(motion.explain(), "error").startswith(
         "largest, relative to its tolerance, in d(quick)/dt"
     )
 
 
-def test_a_stopped_motion_is_told_how_far_it_came():
+def test_stopped_motion_is_described_by_its_progress():
     motion = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, max_steps=7, throw=False)
     part = float(motion.last_time) / 2.0
     advice = line(motion.explain(), "advice")
     assert f"reached {part:.1%} of ts: the whole of ts takes about {7 / part:.2g} steps" in advice
 
 
-def test_a_motion_without_a_step():
+def test_motion_without_a_step_is_described():
     nowhere = jl.System(lambda t, q, v, params: 0.5 * v[0] ** 2 + jnp.log(q[0]), ("x",))
     motion = jl.simulate(nowhere, [-1.0], [0.0], TS, throw=False)
     assert line(motion.explain(), "steps") == "0 attempted, 0 rejected"
 
 
 @pytest.mark.parametrize("method", ["gauss4", "tsit5"])
-def test_fixed_steps_have_no_tolerance_to_loosen(method):
-    """What decays 3 times in a step keeps explicit steps short, implicit ones not."""
+def test_explanation_of_fixed_steps_mentions_no_tolerance(method):
+    """A decay of 3 per step limits explicit steps, not implicit ones."""
     slow = jl.System(
         lambda t, q, v, params: 0.5 * v[0] ** 2 - 0.5 * q[0] ** 2,
         ("x",),
@@ -161,7 +162,7 @@ def test_fixed_steps_have_no_tolerance_to_loosen(method):
     assert line(calm, "advice").startswith("dt alone sets the number of steps")
 
 
-def test_times_far_from_zero_are_told():
+def test_resolution_of_times_far_from_zero_is_described():
     """1e9 s has digits of 1e-7 s: a force that depends on time is a staircase there."""
     force = jl.GeneralizedForce(lambda t, q, v, p: jnp.cos(1.3 * (t - p))[None], "shaken")
     shaken = jl.System(
@@ -170,9 +171,9 @@ def test_times_far_from_zero_are_told():
     options = {"rtol": 1e-12, "atol": 1e-12, "max_steps": 200, "throw": False}
     late = jl.simulate(shaken, [1.0], [0.0], 1e9 + TS, 1e9, **options)
     assert late.status == jl.Status.max_steps
-    told = "Times near 1e+09 s are 2.2e-07 s apart"
-    assert told in late.message()
-    assert told in late.explain()
+    message = "Times near 1e+09 s are 2.2e-07 s apart"
+    assert message in late.message()
+    assert message in late.explain()
     early = jl.simulate(shaken, [1.0], [0.0], TS, 0.0, **options)
     assert "apart" not in early.explain()
 
@@ -180,7 +181,7 @@ def test_times_far_from_zero_are_told():
 # ---- Advice in messages --------------------------------------------------------------------------
 
 
-def test_fixed_steps_are_advised_no_tolerances():
+def test_messages_for_fixed_steps_mention_no_tolerance():
     stopped = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, dt=1e-3, max_steps=7, throw=False)
     assert "max_steps" in stopped.message()
     assert "lengthen dt" in stopped.message()
@@ -191,8 +192,8 @@ def test_fixed_steps_are_advised_no_tolerances():
     assert "tol" not in stopped.message() + away.message()
 
 
-def test_a_stiff_motion_is_told_so():
-    """Its decay rate, and a method for it: not where steps are many for another reason."""
+def test_stiff_motion_is_described():
+    """Its decay rate and a method are stated, but not if steps are many for another reason."""
 
     def sticky(t, q, v, params):
         return 0.5 * params * v[0] ** 2
@@ -205,13 +206,13 @@ def test_a_stiff_motion_is_told_so():
     stiff = jl.simulate(
         slow, [1.0], [0.0], [0.0, 100.0], 1e4, method="dopri8", max_steps=200, throw=False
     )
-    told = r"stiff: a component decays at 1e\+04 1/s.*method='kvaerno5'"
-    assert re.search(told, stiff.message())
+    message = r"stiff: a component decays at 1e\+04 1/s.*method='kvaerno5'"
+    assert re.search(message, stiff.message())
     quick = jl.simulate(ANGLE, [1.0], [0.0], TS, {"g": 9.0}, max_steps=7, throw=False)
     assert "stiff" not in quick.message()
 
 
-def test_no_absolute_tolerance_where_a_component_is_zero():
+def test_zero_absolute_tolerance_with_a_zero_component_is_named():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v - q[0], ("x", "y"))
     motion = jl.simulate(
         system, [1.0, 0.0], [0.5, 0.0], [0.0, 1.0], rtol=1e-6, atol=0.0, throw=False
@@ -230,12 +231,12 @@ def test_quasi_velocities_are_named():
     )
     quasi = entry.system.quasi
     names = [*entry.coordinates, *(quasi.names[i] for i in quasi.free)]
-    told = line(motion.explain(), "error").split(" in ")[1].split(" (")[0]
-    assert told in names
+    message = line(motion.explain(), "error").split(" in ")[1].split(" (")[0]
+    assert message in names
 
 
 @pytest.mark.full
-def test_only_single_motions_explain_themselves():
+def test_explain_of_batches_and_traces_is_refused():
     def solve(q0):
         return jl.simulate(ANGLE, q0, [0.0], TS, {"g": 9.0})
 

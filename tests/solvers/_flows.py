@@ -1,4 +1,4 @@
-"""What tests of structure-preserving methods share."""
+"""Helpers for tests of structure-preserving methods."""
 
 from itertools import pairwise
 
@@ -12,13 +12,13 @@ EPS = np.finfo(float).eps
 
 
 def end(system, q0, v0, ts, params, **options):
-    """(q, v) at the last of the times, in one row."""
+    """(q, v) at the last time, as one vector."""
     motion = jl.simulate(system, q0, v0, ts, params, **options)
     return jnp.concatenate([motion.q[-1], motion.v[-1]])
 
 
 def slopes(system, q0, v0, span, params, method, steps, inputs=None):
-    """Orders seen between numbers of steps."""
+    """Orders between consecutive numbers of steps."""
     exact = end(system, q0, v0, span, params, inputs=inputs, rtol=1e-13, atol=1e-14)
 
     def error(count):
@@ -34,7 +34,7 @@ def slopes(system, q0, v0, span, params, method, steps, inputs=None):
 
 
 def symplectic_defect(system, q0, v0, params, method, dt, count):
-    """max |S^T J S - J| of the map of (q, p) over `count` steps, and |S|^2, which scales it."""
+    """max |S^T J S - J| of the map of (q, p) over `count` steps, and its scale |S|^2."""
     n = len(q0)
     q0, v0 = jnp.asarray(q0), jnp.asarray(v0)
 

@@ -1,4 +1,4 @@
-"""Solvers of our own: order, error estimate, interpolation, against the same methods of diffrax."""
+"""Solvers of jaxlag against the same methods of diffrax: order, error estimate, interpolation."""
 
 import diffrax
 import jax
@@ -12,7 +12,7 @@ EPS = np.finfo(float).eps
 
 
 def swing(t, y, args):
-    """A pendulum pushed by cos t; y a vector."""
+    """A pendulum with the forcing args cos t; y is a vector."""
     return jnp.stack([y[1], -jnp.sin(y[0]) + args * jnp.cos(t)])
 
 
@@ -39,40 +39,40 @@ LOOPED = pytest.mark.parametrize("looped", [False, True], ids=["written_out", "i
 @LOOPED
 @NAMED
 def test_a_step_is_that_of_the_same_method_of_diffrax(solver, looped):
-    """To roundings of the largest sum: y1, the error estimate, stages and the next first stage."""
+    """To rounding of the largest sum: y1, the error estimate, stages and the next first stage."""
     solver = type(solver)(looped=looped)
     y1, error, dense, last, _ = one_step(solver, 0.2)
     y1_, error_, dense_, (_, last_), _ = one_step(solver.stock, 0.2)
-    most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
+    most = max(np.abs(stage).sum() for stage in solver.stock.tableau.a_lower)
     for a, b in ((y1, y1_), (error, error_), (dense["k"], dense_["k"]), (last, last_)):
         np.testing.assert_allclose(a, b, rtol=0, atol=32 * EPS * max(most, 2))
 
 
 class Halves(diffrax.ODETerm):
-    """Two coupled pendulums with drag, y = (q, v) a vector; time may run backwards."""
+    """Two coupled pendulums with drag, y = (q, v) a vector; also backward in time."""
 
     in_lanes: bool
     second_order: bool
-    sense: float
+    time_direction: float
 
-    def __init__(self, lanes, second_order, sense):
+    def __init__(self, lanes, second_order, time_direction):
         def field(t, y, args):
             q, v = y[:2], y[2:]
-            pull = args * jnp.cos(t) - jnp.sin(q) + 0.4 * q[::-1] - 0.3 * v * jnp.abs(v)
-            return sense * jnp.concatenate([v, pull])
+            acceleration = args * jnp.cos(t) - jnp.sin(q) + 0.4 * q[::-1] - 0.3 * v * jnp.abs(v)
+            return time_direction * jnp.concatenate([v, acceleration])
 
         super().__init__(field)
-        self.in_lanes, self.second_order, self.sense = lanes, second_order, sense
+        self.in_lanes, self.second_order, self.time_direction = lanes, second_order, time_direction
 
     def sections(self, y):
         return y[:2], y[2:], y[4:]
 
     def signed(self, x, args):
-        return jax.tree.map(lambda x: self.sense * x, x)
+        return jax.tree.map(lambda x: self.time_direction * x, x)
 
 
 class Heun(jl.solvers.AbstractExplicit):
-    """A method whose steps share no stage."""
+    """A method whose steps do not share a stage."""
 
     interpolation_cls = diffrax.Heun.interpolation_cls
 
@@ -81,15 +81,15 @@ class Heun(jl.solvers.AbstractExplicit):
         return diffrax.Heun()
 
 
-@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["onwards", "backwards"])
+@pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["onwards", "backwards"])
 @pytest.mark.parametrize("second_order", [True, False], ids=["nystrom", "first_order"])
 @pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "alone"])
 @pytest.mark.parametrize("solver", [*PAIRS, Heun()], ids=lambda solver: type(solver).__name__)
-def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, sense):
-    """To roundings of the largest sum: accelerations alone are added up, or rows of lanes."""
+def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, time_direction):
+    """To rounding of the largest sum: sums of accelerations only, or sums over lanes."""
     y0 = jnp.asarray(np.random.default_rng(2).uniform(-1.5, 1.5, (3, 4)))
     t0, t1 = jnp.array(0.3), jnp.array(0.55)
-    forms = Halves(lanes, second_order, sense), Halves(False, False, sense)
+    forms = Halves(lanes, second_order, time_direction), Halves(False, False, time_direction)
 
     def step(method, terms, y0):
         memory = method.init(terms, t0, t1, y0, PUSH)
@@ -98,7 +98,7 @@ def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, s
 
     found = jax.vmap(lambda y0: step(solver, forms[0], y0))(y0)
     expected = jax.vmap(lambda y0: step(solver.stock, forms[1], y0))(y0)
-    most = max(np.abs(row).sum() for row in solver.stock.tableau.a_lower)
+    most = max(np.abs(stage).sum() for stage in solver.stock.tableau.a_lower)
     rounding = 32 * EPS * max(most, 2)
     for a, b in zip(found[:3], expected[:3], strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=rounding)
@@ -106,7 +106,7 @@ def test_a_step_has_the_same_values_in_every_form(solver, lanes, second_order, s
     if solver.shares_stages:
         np.testing.assert_allclose(found[3], expected[3][1], rtol=0, atol=rounding)
 
-    # The first stage anew where the field jumps, and where only the program's input says so.
+    # The first stage is computed again if the field jumps, also if that is known only at run time.
     def jumping(jumped, y0):
         return solver.step(forms[0], t0, t1, y0, PUSH, jnp.full(4, jnp.nan), made_jump=jumped)[0]
 
@@ -153,8 +153,8 @@ def defect(b, A, order, s=1.0):
 def coefficients(method):
     tableau = method.tableau
     A = np.zeros((len(tableau.c) + 1,) * 2)
-    for i, row in enumerate(tableau.a_lower, 1):
-        A[i, : len(row)] = row
+    for i, stage in enumerate(tableau.a_lower, 1):
+        A[i, : len(stage)] = stage
     return A, np.asarray(tableau.b_sol), np.asarray(tableau.b_sol) - np.asarray(tableau.b_error)
 
 
@@ -226,8 +226,8 @@ def test_order_of_the_step_and_of_its_error_estimate():
 
 
 @pytest.mark.full
-def test_it_is_a_solver_of_diffrax():
-    """Dense output and derivatives in any mode, as from the method with a loop."""
+def test_solver_works_in_diffrax():
+    """Dense output and derivatives in any mode agree with the method of diffrax."""
 
     def solve(solver, push):
         return diffrax.diffeqsolve(
@@ -246,7 +246,7 @@ def test_it_is_a_solver_of_diffrax():
         jax.jit(lambda push, s=s: (solve(s, push), jax.jacrev(lambda p: solve(s, p))(push)))(PUSH)
         for s in (jl.solvers.Dopri8(), diffrax.Dopri8())
     )
-    # Rounding moves the steps a little: both are within the tolerance of the truth.
+    # Rounding changes the steps slightly: both are within the tolerance of the truth.
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-9)
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-8)
 
@@ -254,7 +254,7 @@ def test_it_is_a_solver_of_diffrax():
 @LOOPED
 @pytest.mark.parametrize("made_jump", [False, True])
 def test_steps_share_a_stage_unless_the_field_jumped(made_jump, looped):
-    """Whether that is known while tracing or not, and for each of several lanes."""
+    """Known while tracing or not, and for each of several lanes."""
     solver, term = jl.solvers.Dopri8(looped), diffrax.ODETerm(swing)
     _, _, _, last, _ = one_step(solver, 0.2)
     wrong = last + 1.0
@@ -271,8 +271,8 @@ def test_steps_share_a_stage_unless_the_field_jumped(made_jump, looped):
     np.testing.assert_array_equal(moved < 32 * EPS, [made_jump, not made_jump])
 
 
-def test_the_loop_over_stages_holds_the_field_once():
-    """Written out a step of order 8 holds it 13 times, besides the first stage of the first."""
+def test_loop_over_stages_contains_the_field_once():
+    """Unrolled, a step of order 8 contains it 13 times, plus the first stage of the first step."""
     term = diffrax.ODETerm(swing)
 
     def copies(looped, made_jump):

@@ -1,6 +1,6 @@
 """Gauss and Lobatto methods in canonical variables: coefficients, orders, structure, constraints.
 
-A double pendulum with everything that a Lagrangian may have: M of q, time, damping, a torque.
+A double pendulum with M(q), explicit time, damping and a torque.
 """
 
 import jax
@@ -45,8 +45,8 @@ forced = jl.System(
 
 @pytest.mark.parametrize("kind", [jl.solvers.GaussLegendre, jl.solvers.LobattoIIIAB])
 @pytest.mark.parametrize("stages", [2, 3, 5, 8])
-def test_coefficients(kind, stages):
-    """Symplectic, of full quadrature order, exact on polynomials; errors of a few roundings."""
+def test_coefficients_are_symplectic_and_of_full_order(kind, stages):
+    """Symplectic, of full quadrature order, exact for polynomials; errors of a few roundings."""
     c, b, a, ah = kind(stages).pair
     defect = b[:, None] * ah + b[None] * a.T - np.outer(b, b)
     assert np.max(np.abs(defect)) <= 4 * EPS
@@ -59,7 +59,7 @@ def test_coefficients(kind, stages):
             np.testing.assert_allclose(ah @ c ** (k - 1), c**k / k, rtol=0, atol=64 * EPS)
 
 
-def test_coefficients_in_closed_form():
+def test_coefficients_equal_closed_forms():
     """Hairer, Lubich, Wanner, tables II.1.1 and II.1.8."""
     c, b, a, _ = jl.solvers.GaussLegendre(2).pair
     r = np.sqrt(3) / 6
@@ -75,8 +75,8 @@ def test_coefficients_in_closed_form():
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", METHODS)
-def test_order_with_time_and_forces(method):
-    """Forwards and backwards in time, with damping and a torque."""
+def test_order_with_time_and_forces_is_as_stated(method):
+    """Forward and backward in time, with damping and a torque."""
     order = METHODS[method]
     counts = {2: (100, 200), 4: (40, 80), 6: (20, 40), 8: (16, 24)}[order]
     for span in ([0.1, 1.1], [0.1, -0.5]):
@@ -87,7 +87,7 @@ def test_order_with_time_and_forces(method):
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["gauss4", "variational4"])
 def test_map_is_symplectic(method):
-    """In (q, p), to 100 roundings of products of |S| a step."""
+    """In (q, p), to 100 roundings of products of |S| per step."""
     defect, size = symplectic_defect(free, Q0, V0, PARAMS, method, 0.05, 10)
     assert defect <= 10 * 100 * EPS * size
     if method == "gauss4":
@@ -96,7 +96,7 @@ def test_map_is_symplectic(method):
 
 
 @pytest.mark.full
-def test_velocities_may_enter_by_more_than_squares():
+def test_lagrangians_that_are_not_quadratic_have_full_order():
     """A relativistic particle in a magnetic field, p = v / sqrt(1 - v^2) + A: order 4."""
 
     def relativistic(t, q, v, params):
@@ -110,8 +110,8 @@ def test_velocities_may_enter_by_more_than_squares():
 
 
 @pytest.mark.parametrize("method", ["gauss4", "variational4"])
-def test_momentum_of_a_symmetry_is_kept(method):
-    """A charge in a magnetic field: x p_y - y p_x with its part of the potential."""
+def test_momentum_of_a_symmetry_is_conserved(method):
+    """A charge in a magnetic field: x p_y - y p_x, p with the vector potential."""
 
     def charge(t, q, v, params):
         field = 0.5 * (q[0] * v[1] - q[1] * v[0])
@@ -122,7 +122,7 @@ def test_momentum_of_a_symmetry_is_kept(method):
     motion = jl.simulate(system, [1.0, 0.0], [0.1, 0.8], ts, {}, method=method, dt=0.1)
     q, p = motion.q, motion.v + 0.5 * np.stack([-motion.q[:, 1], motion.q[:, 0]], 1)
     spin = q[:, 0] * p[:, 1] - q[:, 1] * p[:, 0]
-    # A walk of 500 steps of some roundings each.
+    # A random walk of 500 steps of some roundings each.
     np.testing.assert_allclose(spin, spin[0], rtol=0, atol=8 * np.sqrt(500) * EPS)
     error = np.abs(motion.energy - motion.energy[0])
     assert np.max(error[26:]) < 2 * np.max(error[:26])
@@ -133,8 +133,8 @@ bars, BARS = entry.system, entry.example.params
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["variational2", "variational4"])
-def test_constraints_hold_inside_the_step(method):
-    """Order, rows to rounding though nothing is projected, reversal."""
+def test_constraints_hold_without_projection(method):
+    """Order, rows to rounding without projection, reversibility."""
     q0, v0 = entry.start()
     order = METHODS[method]
     found = slopes(bars, q0, v0, [0.0, 0.5], BARS, method, (25, 50))
@@ -148,14 +148,16 @@ def test_constraints_hold_inside_the_step(method):
     size = np.max(np.abs(motion.q)) ** 2
     assert np.max(np.abs(phi)) <= 16 * EPS * size
     assert np.max(np.abs(rate)) <= 16 * EPS * size * np.max(np.abs(motion.v))
-    back = jl.simulate(bars, motion.q[-1], motion.v[-1], [2.0, 0.0], BARS, method=method, dt=0.01)
-    # Roundings of q are those of v times dt; the motion multiplies them by its growth.
-    np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-10)
+    backward = jl.simulate(
+        bars, motion.q[-1], motion.v[-1], [2.0, 0.0], BARS, method=method, dt=0.01
+    )
+    # Rounding of q is that of v times dt; the motion multiplies it by its growth.
+    np.testing.assert_allclose(backward.q[-1], q0, rtol=0, atol=1e-10)
 
 
 @pytest.mark.full
-def test_a_constraint_of_time():
-    """A pendulum whose string is hauled in: order, and the energy that the hauling brings."""
+def test_rheonomic_constraint_has_full_order():
+    """A pendulum with a shortening string: order, and the energy that the shortening adds."""
 
     def string(t, q, params):
         return q @ q - (1.0 - 0.2 * t) ** 2
@@ -176,8 +178,8 @@ def test_a_constraint_of_time():
 
 
 @pytest.mark.full
-def test_rest_is_kept():
-    """Hanging at rest: roundings of the position are all the velocities there are."""
+def test_system_at_rest_stays_at_rest():
+    """Hanging at rest: velocities are only the rounding of the position."""
     q0 = jnp.stack([0.0, -BARS["h1"], 0.0, -BARS["h1"] - BARS["h2"]])
     ts = np.linspace(0.0, 1.0, 3)
     motion = jl.simulate(bars, q0, [0.0] * 4, ts, BARS, method="variational2", dt=0.001)
@@ -185,7 +187,7 @@ def test_rest_is_kept():
 
 
 @pytest.mark.full
-def test_a_row_twice_moves_as_once():
+def test_duplicate_row_does_not_change_the_motion():
     def rod(t, q, p):
         return q @ q - 1.0
 
@@ -203,7 +205,7 @@ def test_a_row_twice_moves_as_once():
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-def test_work_closes_the_books_with_the_order_of_the_method():
+def test_work_is_the_change_of_energy_to_the_order_of_the_method():
     def gap(count):
         motion = jl.simulate(
             forced,
@@ -223,7 +225,7 @@ def test_work_closes_the_books_with_the_order_of_the_method():
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["gauss4", "variational4"])
-def test_derivatives_are_those_of_the_steps(method):
+def test_derivatives_equal_those_of_the_steps(method):
     """Forward, reverse and differences; mixed second order by reverse over forward."""
 
     def last(x):
@@ -239,7 +241,7 @@ def test_derivatives_are_those_of_the_steps(method):
 
 
 @pytest.mark.full
-def test_derivatives_on_the_constraints():
+def test_derivatives_on_the_constraints_agree():
     """Along starts on the constraints: forward, reverse and differences agree."""
     q0, v0 = (jnp.asarray(x) for x in entry.start())
 
@@ -254,29 +256,29 @@ def test_derivatives_on_the_constraints():
     np.testing.assert_allclose(forward, differences, rtol=1e-7, atol=1e-8)
 
 
-def test_steps_that_are_not_solved_are_said():
+def test_unsolved_steps_are_reported():
     motion = jl.simulate(free, Q0, V0, [0.0, 9.0], PARAMS, method="gauss6", dt=3.0, throw=False)
     assert motion.status == jl.Status.implicit_solve_failed
     assert motion.last_time < 9.0
 
 
 @pytest.mark.full
-def test_lanes_are_single_motions():
+def test_lanes_equal_single_motions():
     starts = jnp.array([[1.0, 0.5], [0.2, 0.1], [2.0, -1.0]])
 
     def last(q0):
         return end(free, q0, V0, [0.0, 0.5], PARAMS, method="gauss4", dt=0.05)
 
-    rows = jax.vmap(last)(starts)
-    for q0, row in zip(starts, rows, strict=True):
-        np.testing.assert_allclose(row, last(q0), rtol=0, atol=1e-12)
+    lanes = jax.vmap(last)(starts)
+    for q0, lane in zip(starts, lanes, strict=True):
+        np.testing.assert_allclose(lane, last(q0), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("kind", "stages", "least"),
     [("GaussLegendre", 0, 1), ("LobattoIIIAB", 1, 2), ("GaussLegendre", 2.5, 1)],
 )
-def test_stages_that_there_are_not(kind, stages, least, unchecked):  # noqa: F811
+def test_invalid_numbers_of_stages_are_refused(kind, stages, least, unchecked):  # noqa: F811
     with pytest.raises(
         ValueError, match=rf"{kind}: `stages` must be an integer of at least {least}"
     ):
@@ -284,8 +286,8 @@ def test_stages_that_there_are_not(kind, stages, least, unchecked):  # noqa: F81
 
 
 @pytest.mark.parametrize("method", mostly_full(["gauss4", "variational4"], "gauss4"))
-def test_a_preload_that_cancels_is_no_obstacle(method):
-    """A hanging mass comes to rest: forces cancel, and increments are roundings of them alone."""
+def test_canceling_preload_does_not_prevent_convergence(method):
+    """A hanging mass comes to rest: forces cancel, and increments are only their rounding."""
 
     def hanging(t, q, v, params):
         stretch = q[0] - params["g"] / params["k"]
@@ -301,8 +303,8 @@ def test_a_preload_that_cancels_is_no_obstacle(method):
 pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]), ("a",))
 
 
-def test_slow_iterations_are_renewed():
-    """A step of 1.6 rad: with the derivative of the start alone they gain a digit in three."""
+def test_slow_iterations_get_new_derivatives():
+    """A step of 1.6 rad: with the derivative at the start alone, three iterations gain a digit."""
     motion = jl.simulate(pendulum, [2.0], [0.0], [0.0, 5.0], {}, method="gauss2", dt=0.5)
     start, end = motion.q[0, 0], motion.q[-1, 0]
     assert motion.status == jl.Status.ok
@@ -320,21 +322,21 @@ def test_a_force_that_is_not_finite_is_named():
 
 
 @pytest.mark.parametrize("method", ["gauss4", "variational2"])
-def test_velocities_know_nothing_of_the_origin(method):
-    """Where forces read no q, positions of 1e10 m cost no digit of v (q / h has 1e-5 m/s)."""
+def test_velocities_do_not_depend_on_the_origin(method):
+    """If forces read no q, positions of 1e10 m cost no digit of v (q / h resolves 1e-5 m/s)."""
     drag = jl.GeneralizedForce(lambda t, q, v, p: -v * jnp.abs(v), "drag")
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(drag,))
 
     def last(x0):
         return jl.simulate(system, [x0], [10.0], [0.0, 1.0], {}, method=method, dt=0.1).v[-1, 0]
 
-    # Roundings of v in 10 steps.
+    # Rounding of v in 10 steps.
     np.testing.assert_allclose(last(1e10), last(0.0), rtol=40 * EPS)
 
 
 @pytest.mark.full
-def test_the_start_follows_the_constraint():
-    """A derivative in the length of a rod, q0 and v0 given: as by projection, in every method."""
+def test_derivatives_by_constraints_include_the_start():
+    """A derivative by the length of a rod, for given q0 and v0: as with projection."""
     rod = jl.Holonomic(lambda t, q, params: q @ q - params["l"] ** 2, "rod")
     system = jl.System(
         lambda t, q, v, p: 0.5 * (v @ v) - 9.81 * q[1], ("x", "y"), constraints=(rod,)
@@ -361,8 +363,8 @@ points = jl.System(
 )
 
 
-def test_roundings_that_fall_again_by_chance_are_no_failure():
-    """x2 and y2' are small here: this step failed, and 1 in 3000 of its neighbors' to 1e-15.
+def test_iterations_at_the_level_of_rounding_converge():
+    """x2 and y2' are small here: this step failed, and 1 in 3000 of those within 1e-15 of it.
 
     As many lanes at once have hung in XLA's threads.
     """
@@ -379,13 +381,13 @@ def test_roundings_that_fall_again_by_chance_are_no_failure():
 
     status, q = jax.jit(jax.vmap(step))(np.asarray(y) * (1.0 + roundings))
     assert np.all(status == int(jl.Status.ok))
-    # Starts are up to 4.3 times 2e-15 apart, 39 roundings; the step adds some of its own.
+    # Starts differ by up to 4.3 times 2e-15, 39 roundings; the step adds some more.
     np.testing.assert_allclose(q, np.broadcast_to(q[0], q.shape), rtol=0, atol=64 * EPS)
 
 
 @pytest.mark.full
-def test_second_derivatives_on_the_constraints_in_lanes():
-    """Rows that are chosen at run time are no obstacle; against differences of the gradient."""
+def test_second_derivatives_on_the_constraints_agree_in_lanes():
+    """Rows may be selected at run time; compared with differences of the gradient."""
     q0, v0 = jnp.array([0.6, -0.8, 1.2, -1.6]), jnp.array([0.4, 0.3, 0.8, 0.6])
 
     def last(z, throw=False):
@@ -401,7 +403,7 @@ def test_second_derivatives_on_the_constraints_in_lanes():
 
 
 @pytest.mark.full
-def test_second_derivatives_in_every_order_of_modes():
+def test_second_derivatives_agree_in_every_order_of_modes():
     """Against differences of the gradient; implicit methods of diffrax have no reverse ones."""
 
     def last(q, method="gauss4"):

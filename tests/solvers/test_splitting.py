@@ -1,6 +1,6 @@
-"""Splitting methods: orders, the structure they keep, time, work, derivatives and what they refuse.
+"""Splitting methods: orders, conserved structure, time, work, derivatives, refused systems.
 
-Henon and Heiles's potential, plain or pushed by a force that depends on place and time.
+The Henon-Heiles potential, alone or with a force that depends on position and time.
 """
 
 import diffrax
@@ -22,7 +22,7 @@ def lagrangian(t, q, v, params):
 
 
 def swirl(t, q, v, params, inputs):
-    """A force without potential, in time as well."""
+    """A force without potential that depends on time."""
     return params["c"] * jnp.cos(3.0 * t) * jnp.stack([-q[1], q[0]]) + inputs["pull"]
 
 
@@ -35,8 +35,8 @@ pushed = jl.System(lagrangian, ("x", "y"), forces=(force,))
 
 
 @pytest.mark.parametrize("order", mostly_full(ORDERS, 4))
-def test_order_with_time_and_forces(order):
-    """Forwards and backwards in time; steps long enough for errors above 1e-12."""
+def test_order_with_time_and_forces_is_as_stated(order):
+    """Forward and backward in time; steps are long enough for errors above 1e-12."""
     method, steps = f"splitting{order}", {2: 40, 4: 10, 6: 5, 8: 5}[order]
     counts = (steps, 2 * steps) if order > 4 else (steps, 2 * steps, 4 * steps)
     for span in ([0.2, 1.7], [0.2, -1.3]):
@@ -47,7 +47,7 @@ def test_order_with_time_and_forces(order):
 @pytest.mark.full
 @pytest.mark.parametrize("order", ORDERS)
 def test_map_is_symplectic(order):
-    """To 200 roundings of products of |S| over 20 steps; order 8 of Dormand and Prince is not."""
+    """To 200 roundings of products of |S| over 20 steps; the map of dopri8 is not symplectic."""
     defect, size = symplectic_defect(plain, Q0, V0, PARAMS, f"splitting{order}", 0.3, 20)
     assert defect <= 200 * EPS * size
     if order == 2:
@@ -56,16 +56,18 @@ def test_map_is_symplectic(order):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_motion_reverses(order):
-    """50 steps there and back: a few roundings a step, of numbers below 1."""
+def test_motion_is_reversible(order):
+    """50 steps forward and backward: a few roundings per step, of numbers below 1."""
     method = f"splitting{order}"
-    there = end(pushed, Q0, V0, [0.0, 5.0], PARAMS, inputs=PULL, method=method, dt=0.1)
-    back = end(pushed, *jnp.split(there, 2), [5.0, 0.0], PARAMS, inputs=PULL, method=method, dt=0.1)
-    np.testing.assert_allclose(back, [*Q0, *V0], rtol=0, atol=100 * 4 * order * EPS)
+    forward = end(pushed, Q0, V0, [0.0, 5.0], PARAMS, inputs=PULL, method=method, dt=0.1)
+    backward = end(
+        pushed, *jnp.split(forward, 2), [5.0, 0.0], PARAMS, inputs=PULL, method=method, dt=0.1
+    )
+    np.testing.assert_allclose(backward, [*Q0, *V0], rtol=0, atol=100 * 4 * order * EPS)
 
 
-def test_energy_stays_and_angular_momentum_is_kept():
-    """Kepler, e = 0.5, 50 periods: no drift of the energy beyond its oscillation; L to rounding."""
+def test_energy_has_no_drift_and_angular_momentum_is_conserved():
+    """Kepler, e = 0.5, 50 periods: the energy only oscillates; L is constant to rounding."""
     kepler = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 1.0 / jnp.sqrt(q @ q), ("x", "y"))
     e, period = 0.5, 2 * np.pi
     q0, v0 = [1 - e, 0.0], [0.0, np.sqrt((1 + e) / (1 - e))]
@@ -77,8 +79,8 @@ def test_energy_stays_and_angular_momentum_is_kept():
     assert np.max(error[26:]) < 3 * np.max(error[1:26]) < 1e-7
 
 
-def test_work_is_that_of_the_kicks():
-    """What the swirl and the pull do is what the energy gains, with the order of the method."""
+def test_work_is_the_change_of_energy():
+    """The work of swirl and pull is the change of energy, to the order of the method."""
     method = "splitting4"
 
     def gap(count):
@@ -101,7 +103,7 @@ def test_work_is_that_of_the_kicks():
     np.testing.assert_allclose(q, without[:2], rtol=0, atol=20 * 8 * EPS)
 
 
-def test_arrays_take_the_same_steps():
+def test_array_program_takes_the_same_steps():
     array = jl.System(lagrangian, ("x", "y"), forces=(force,), lowering="array")
     options = {"inputs": PULL, "method": "splitting6", "dt": 0.1}
     a, b = (end(system, Q0, V0, [0.0, 3.0], PARAMS, **options) for system in (pushed, array))
@@ -109,8 +111,8 @@ def test_arrays_take_the_same_steps():
 
 
 @pytest.mark.full
-def test_derivatives_are_those_of_the_steps():
-    """Forward, reverse and differences, in the start and in params, single and in lanes."""
+def test_derivatives_equal_those_of_the_steps():
+    """Forward, reverse and differences, by the start and by params, single and in lanes."""
 
     def last(x):
         params = PARAMS | {"k": x[2]}
@@ -123,11 +125,11 @@ def test_derivatives_are_those_of_the_steps():
     differences = [(last(x + h * e) - last(x - h * e)) / (2 * h) for e in jnp.eye(3)]
     # h^2 |f'''| / 6 and EPS |f| / h are below 1e-9 here.
     np.testing.assert_allclose(forward, jnp.stack(differences, 1), rtol=1e-8, atol=1e-9)
-    rows = jax.vmap(last)(x + 0.01 * jnp.arange(3.0)[:, None])
-    np.testing.assert_allclose(rows[0], last(x), rtol=0, atol=100 * EPS)
+    lanes = jax.vmap(last)(x + 0.01 * jnp.arange(3.0)[:, None])
+    np.testing.assert_allclose(lanes[0], last(x), rtol=0, atol=100 * EPS)
 
 
-def test_a_step_that_does_not_divide_the_span_lands_on_its_end():
+def test_last_step_ends_at_the_end_of_the_span():
     motion = jl.simulate(plain, Q0, V0, [0.0, 1.0], PARAMS, method="splitting2", dt=0.3)
     assert int(motion.stats["accepted"]) == 4
     whole = jl.simulate(plain, Q0, V0, [0.0, 0.9], PARAMS, method="splitting2", dt=0.3)
@@ -137,8 +139,8 @@ def test_a_step_that_does_not_divide_the_span_lands_on_its_end():
     np.testing.assert_allclose(motion.q[-1], rest.q[-1], rtol=0, atol=8 * EPS)
 
 
-def test_as_a_solver_of_diffrax():
-    """y = (q, v) of any form; the same numbers as by `simulate`."""
+def test_solver_works_in_diffrax():
+    """y = (q, v) of any form; the same results as by `simulate`."""
 
     def field(t, y, args):
         (x, z), v = y
@@ -154,7 +156,7 @@ def test_as_a_solver_of_diffrax():
     np.testing.assert_allclose(y, expected, rtol=0, atol=20 * 24 * EPS)
 
 
-def test_an_order_that_there_is_not():
+def test_invalid_order_is_refused():
     with pytest.raises(
         ValueError, match=r"Splitting: `order` must be one of 2, 4, 6, 8, but it was 3"
     ):

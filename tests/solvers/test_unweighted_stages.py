@@ -1,4 +1,4 @@
-"""Stages without weight in a step and its error estimate, and short forces that they alone meet."""
+"""Stages without weight in a step and its error estimate, and short forces only they meet."""
 
 import diffrax
 import jax
@@ -15,7 +15,7 @@ METHODS = [jl.solvers.Dopri8, jl.solvers.Prince9, jl.solvers.Dopri5, jl.solvers.
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_unweighted_stages_change_nothing_of_step_and_estimate(method):
+def test_unweighted_stages_have_no_weight_in_step_and_estimate(method):
     tableau = tableau_of(method)
     assert (
         tableau.unweighted
@@ -30,20 +30,20 @@ def test_unweighted_stages_change_nothing_of_step_and_estimate(method):
         assert (i in tableau.unweighted) == (tableau.b[i] == 0 and tableau.e[i] == 0)
 
 
-def test_what_is_unseen():
-    """By hand: the end apart from the stage before, an early kick, neither."""
-    apart = [1.0, 0.5, 0.5, 0.2, 2.0]  # |2.0 - 0.2| > 0.3 * 2.0
+def test_unseen_error_equals_that_by_hand():
+    """By hand: an end that differs from the stage before, an early kick, neither."""
+    late = [1.0, 0.5, 0.5, 0.2, 2.0]  # |2.0 - 0.2| > 0.3 * 2.0
     kick = [1.0, 0.5, -7.0, 1.0, 1.1]  # 7.0 > 3 * 1.1
     smooth = [1.0, 0.5, 3.2, 1.0, 1.1]  # 3.2 < 3 * 1.1, 0.1 < 0.3 * 1.1
-    k = [jnp.array(stage) for stage in zip(apart, kick, smooth, strict=True)]
+    k = [jnp.array(stage) for stage in zip(late, kick, smooth, strict=True)]
     np.testing.assert_allclose(unseen(k, (1, 2)), [1.8, 7.0, 0.0], rtol=1e-15)
-    np.testing.assert_allclose(unseen(k, (2,)), [0.0, 7.0, 0.0], rtol=1e-15)  # one stage alone
+    np.testing.assert_allclose(unseen(k, (2,)), [0.0, 7.0, 0.0], rtol=1e-15)  # one stage only
 
 
 @pytest.mark.parametrize("looped", [False, True])
 @pytest.mark.parametrize("method", METHODS)
-def test_the_estimate_of_a_smooth_step_is_that_of_the_method(method, looped):
-    """At steps of up to a sixth of a turn of a pendulum."""
+def test_estimate_of_a_smooth_step_equals_that_of_the_method(method, looped):
+    """At steps of up to a sixth of the period of a pendulum."""
 
     def swing(t, y, args):
         return jnp.stack([y[1], -jnp.sin(y[0])])
@@ -71,7 +71,7 @@ def softplus(t, q, v, params):
 
 
 def height(h, k, t):
-    """Of the ball on springs, dropped from h at rest, at t."""
+    """Height at t of a ball on springs that falls from rest at h."""
     fall, w = np.sqrt(2 * h / G), np.sqrt(k)
     contact = 2 * (np.pi - np.arctan(G * fall * w / G)) / w
     r = t % (2 * fall + contact)
@@ -88,7 +88,7 @@ def falls(count):
 
 
 def dropped(lagrangian, **options):
-    """A function of (h, k, t, tolerance), vmapped over all but the last: the motion's end."""
+    """A function (h, k, t, tolerance) -> end of the motion, vmapped over all but the last."""
     system = jl.System(lagrangian, ("x",))
 
     def end(h, k, t, tolerance):
@@ -101,7 +101,7 @@ def dropped(lagrangian, **options):
 
 
 def test_a_ball_does_not_fall_through_a_stiff_floor():
-    """The case that showed it: from 1 m onto 8e4 N/m it ended at 3.15 m, status ok."""
+    """The first known case: from 1 m onto 8e4 N/m the motion ended at 3.15 m, status ok."""
     system = jl.System(spring, ("x",))
     motion = jl.simulate(system, [1.0], [0.0], [0.0, 1.5], {"k": 8e4})
     assert abs(float(motion["x"][-1]) - height(1.0, 8e4, 1.5)) < 1e-6
@@ -114,10 +114,10 @@ def test_a_ball_does_not_fall_through_a_stiff_floor():
     + [pytest.param(jl.solvers.Dopri8(looped=True), marks=pytest.mark.full)],
     ids=str,
 )
-def test_energies_of_bounces(method):
-    """Off by 1 % nowhere: 70 and 105 of 1,000 were, by factors up to 1e6, by the default method.
+def test_energies_after_bounces_are_right(method):
+    """At most 1 % off; 70 and 105 of 1,000 were more, up to 1e6 times, by the default method.
 
-    At 1e-6 the stiffest contacts are 1e-3 off in energy: tolerances of 1e-6 m against depths of
+    At 1e-6 the stiffest contacts have errors of 1e-3 in energy: tolerances of 1e-6 m for depths of
     1e-4 m.
     """
     h, k, t = falls(1000)
@@ -130,8 +130,8 @@ def test_energies_of_bounces(method):
         assert np.sum(off > 0.01) <= few
 
 
-def test_energies_on_a_smooth_wall():
-    """A wall of 2.5 mm: 150 of 400 were wrong, at every tolerance."""
+def test_energies_at_a_smooth_wall_are_right():
+    """A wall of 2.5 mm: 150 of 400 were wrong at every tolerance."""
     rng = np.random.default_rng(1)
     h, k = 10 ** rng.uniform(-1, 2, 400), 10 ** rng.uniform(5, 7, 400)
     run = dropped(softplus)
@@ -142,15 +142,15 @@ def test_energies_on_a_smooth_wall():
         assert np.max(off) < 1e-3
 
 
-def test_steps_of_bounded_length_do_not_either():
+def test_steps_of_bounded_length_resolve_a_stiff_floor():
     h, k, t = falls(200)
     _, _, energy, status = dropped(spring, dt_max=jnp.array(0.05))(h, k, t, 1e-9)
     assert np.all(status == jl.Status.ok)
     np.testing.assert_allclose(energy, G * h, rtol=1e-4)
 
 
-def test_a_barrier_too_steep_for_numbers():
-    """exp(-q/w) overflows at stages far inside: the step is taken again, shorter."""
+def test_overflow_in_a_steep_barrier_shortens_the_step():
+    """exp(-q/w) overflows at stages far inside: the step is repeated with a shorter length."""
 
     def barrier(t, q, v, params):
         return 0.5 * v[0] ** 2 - G * q[0] - jnp.exp(-q[0] / params["k"])
@@ -161,7 +161,7 @@ def test_a_barrier_too_steep_for_numbers():
     np.testing.assert_allclose(energy, G * h, rtol=1e-6)
 
 
-def test_explain_does_not_advise_a_looser_tolerance_there():
+def test_explain_does_not_advise_a_looser_tolerance_for_bounces():
     for lagrangian in (spring, softplus):
         system = jl.System(lagrangian, ("x",))
         motion = jl.simulate(system, [1.0], [0.0], [0.0, 3.0], {"k": 1e5})

@@ -1,4 +1,4 @@
-"""A pendulum in two energies."""
+"""A pendulum given by two energies."""
 
 import jax.numpy as jnp
 

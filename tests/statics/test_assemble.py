@@ -1,4 +1,4 @@
-"""Assembly: the nearest consistent state, what may be held, and what cannot be had."""
+"""Assembly: the nearest consistent state, held coordinates, and impossible requests."""
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ GUESS = (jnp.array([0.5, -0.7, 1.1, -1.0]), jnp.array([0.3, 0.0, 0.0, 0.1]))
 
 
 @pytest.mark.parametrize("weights", [None, [1.0, 2.0, 3.0, 4.0]])
-def test_nearest_state(weights):
-    """W (q* - q) is a combination of rows, and so is W (v* - v): conditions of a minimum."""
+def test_assembled_state_is_the_nearest(weights):
+    """W (q* - q) and W (v* - v) are combinations of rows: the conditions of a minimum."""
     state = jl.assemble(cartesian, *GUESS, BOBS, weights=weights)
     position, velocity = cartesian.residuals(state.q, state.v, BOBS)
     for residual in (*position.values(), *velocity.values()):
@@ -47,7 +47,7 @@ def test_nearest_state(weights):
     assert state.dependent == ()
 
 
-def test_consistent_states_stay():
+def test_consistent_states_are_unchanged():
     q, v = to_cartesian(THETA, jnp.array([0.3, -0.4]))
     state = jl.assemble(cartesian, q, v, BOBS)
     np.testing.assert_allclose(state.q, q, atol=4 * EPS)
@@ -55,8 +55,8 @@ def test_consistent_states_stay():
 
 
 @pytest.mark.parametrize("wrong", [(1.0, 1.2, 0.8), (1.0, 0.8, 1.2), (1.0, 1.2, 1.2)])
-def test_four_bar_from_a_wrong_guess(wrong):
-    """20 % off in two angles, the crank held: the law of cosines."""
+def test_four_bar_is_assembled_from_a_wrong_guess(wrong):
+    """20 % off in two angles, with the crank held; compared with the law of cosines."""
     q = four_bar_start()
     state = jl.assemble(
         four_bar, q * jnp.array(wrong), [1.0, 0, 0], FOUR_BAR, hold=("crank", "crank'")
@@ -67,15 +67,15 @@ def test_four_bar_from_a_wrong_guess(wrong):
     np.testing.assert_allclose(state.v, rate, atol=1e-9)
 
 
-def test_nonholonomic_velocities():
-    """Only v is moved: there is no position residual."""
+def test_nonholonomic_assembly_changes_velocities_only():
+    """Only v changes: there is no position residual."""
     state = jl.assemble(skate, [1.0, 2.0, 0.3], [1.0, 1.0, 0.5], SKATE, hold=("theta'",))
     np.testing.assert_array_equal(state.q, [1.0, 2.0, 0.3])
-    along = np.cos(0.3) + np.sin(0.3)
-    np.testing.assert_allclose(state.v, [along * np.cos(0.3), along * np.sin(0.3), 0.5], rtol=1e-14)
+    speed = np.cos(0.3) + np.sin(0.3)
+    np.testing.assert_allclose(state.v, [speed * np.cos(0.3), speed * np.sin(0.3), 0.5], rtol=1e-14)
 
 
-def test_rheonomic_rows_at_an_instant():
+def test_rheonomic_rows_are_assembled_at_the_given_time():
     led = jl.System(
         lambda t, q, v, params: 0.5 * v @ v,
         ("x", "y"),
@@ -101,8 +101,8 @@ def test_rows_that_follow_from_others_are_named():
     assert "dependent rows" in state.message()
 
 
-def test_derivative_is_that_of_the_implicit_function():
-    """Forward, reverse and central differences, in the guess and in a length."""
+def test_derivative_equals_that_of_the_implicit_function():
+    """Forward, reverse and central differences, by the guess and by a length."""
 
     def assembled(x):
         params = {**BOBS, "l1": x["l1"]}
@@ -122,7 +122,7 @@ def test_derivative_is_that_of_the_implicit_function():
 
 
 @pytest.mark.full
-def test_batches():
+def test_batches_equal_single_assemblies():
     states = jax.vmap(lambda s: jl.assemble(cartesian, s * GUESS[0], GUESS[1], BOBS))(
         jnp.array([0.9, 1.0, 1.1])
     )
@@ -131,11 +131,11 @@ def test_batches():
     np.testing.assert_allclose(states.q[2], one.q, atol=1e-14)
 
 
-# ---- What cannot be had --------------------------------------------------------------------------
+# ---- Impossible requests -------------------------------------------------------------------------
 
 
 @pytest.mark.full
-def test_what_is_held_in_the_way_is_named():
+def test_held_coordinates_that_prevent_assembly_are_named():
     """A crank angle that the four-bar cannot reach: the links are too short."""
     short = {"a": 0.4, "b": 0.5, "c": 0.4, "d": 1.0}
     with pytest.raises(jl.AssemblyError, match="release crank") as caught:
@@ -145,8 +145,8 @@ def test_what_is_held_in_the_way_is_named():
 
 
 @pytest.mark.full
-def test_more_rows_than_coordinates():
-    """A point in the plane on three lines: fixed where they meet, else nowhere."""
+def test_more_rows_than_coordinates_must_be_consistent():
+    """A point in the plane on three lines: fixed at a common intersection, else impossible."""
 
     def lines(t, q, params):
         return jnp.stack([q[0] - 1.0, q[1] - 2.0, q[0] + q[1] - params])
@@ -169,13 +169,13 @@ def test_more_rows_than_coordinates():
 
 
 @pytest.mark.full
-def test_what_cannot_be_closed_with_nothing_held_is_told():
-    apart = {"a": 0.1, "b": 0.1, "c": 0.1, "d": 1.0}
+def test_impossible_assembly_without_held_coordinates_is_reported():
+    short = {"a": 0.1, "b": 0.1, "c": 0.1, "d": 1.0}
     with pytest.raises(jl.AssemblyError, match="contradictory_rows"):
-        jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], apart)
+        jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], short)
     with pytest.raises(jl.AssemblyError, match="Without hold= it cannot"):
-        jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], apart, hold=("crank",))
-    state = jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], apart, throw=False)
+        jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], short, hold=("crank",))
+    state = jl.assemble(four_bar, [0.5, 0.3, -0.5], [0, 0, 0], short, throw=False)
     assert state.status == jl.Status.contradictory_rows
     assert state.where >= 0
 
@@ -186,8 +186,8 @@ def test_a_velocity_that_cannot_be_held_is_named():
 
 
 @pytest.mark.full
-def test_nearer_than_all_consistent_states_around_it():
-    """Four-bars from guesses far off: conditions of first and second order of a local minimum."""
+def test_assembled_state_is_a_local_minimum_of_distance():
+    """Four-bars from distant guesses: first and second order conditions of a local minimum."""
     rng = np.random.default_rng(3)
     guesses = four_bar_start(0.7) + rng.standard_normal((100, 3))
 
@@ -229,12 +229,12 @@ def test_nearer_than_all_consistent_states_around_it():
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_bad_arguments(arguments, options, message):
+def test_invalid_arguments_are_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
         jl.assemble(cartesian, *arguments, BOBS, **options)
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_what_is_no_system():
+def test_other_types_than_systems_are_refused():
     with pytest.raises(ValueError, match=r"assemble: `system` must be a jl\.System"):
         jl.assemble(None, [0.0], [0.0])

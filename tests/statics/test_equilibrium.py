@@ -1,4 +1,4 @@
-"""Equilibrium by virtual work: closed forms, stability, derivatives, and searches that fail."""
+"""Equilibrium by virtual work: closed forms, stability, derivatives, and failed searches."""
 
 import re
 
@@ -34,7 +34,7 @@ BLOWN = jl.System(
 
 
 def hoop(t, q, v, params):
-    """Bead on a hoop of radius r turned about its vertical diameter at Omega."""
+    """Bead on a hoop of radius r that rotates about its vertical diameter at Omega."""
     r, omega = params["r"], params["Omega"]
     T = 0.5 * r**2 * (v[0] ** 2 + (omega * jnp.sin(q[0])) ** 2)
     return T + params["g"] * r * jnp.cos(q[0])
@@ -56,8 +56,8 @@ def test_a_hanging_mass_is_stable_and_an_upright_one_is_not():
     assert up.conservative
 
 
-def test_applied_forces_and_inputs_take_part():
-    """Blown by W the bob hangs at tan(theta) = W/(m g); drag has no say at rest."""
+def test_applied_forces_and_inputs_are_included():
+    """In the wind W the bob hangs at tan(theta) = W/(m g); drag is zero at rest."""
     rest = jl.equilibrium(BLOWN, {"theta": 0.0}, PARAMS, inputs={"wind": 3.0})
     np.testing.assert_allclose(rest.q[0], np.arctan2(3.0, 1.2 * 9.81), rtol=8 * EPS)
     np.testing.assert_allclose(rest.stiffness[0, 0], 0.7 * np.hypot(3.0, 1.2 * 9.81), rtol=8 * EPS)
@@ -67,7 +67,7 @@ def test_applied_forces_and_inputs_take_part():
 
 
 def test_a_rotating_frame_has_relative_equilibria():
-    """Fast hoop: theta = 0 is unstable, cos(theta) = g/(r Omega^2) stable; slow: theta = 0 is."""
+    """Fast hoop: 0 is unstable, cos(theta) = g/(r Omega^2) is stable; slow hoop: 0 is stable."""
     fast = {"r": 0.5, "Omega": 6.0, "g": 9.81}
     off = jl.equilibrium(HOOP, [0.8], fast)
     np.testing.assert_allclose(off.q[0], np.arccos(9.81 / (0.5 * 36)), rtol=8 * EPS)
@@ -77,7 +77,7 @@ def test_a_rotating_frame_has_relative_equilibria():
 
 
 def frame_potential(t, q, params):
-    """Two springs of the plane crossed with a coupling: V with a full Hessian."""
+    """Two springs in the plane with a coupling: V with a full Hessian."""
     x, y = q
     return params["k"] * (x**4 / 4 + x**2 * y + y**2) - params["w"] * (2 * x + y)
 
@@ -100,8 +100,8 @@ def test_the_stiffness_is_the_hessian_of_the_potential():
     assert rest.stable == bool(np.linalg.eigvalsh(hessian)[0] > 0)
 
 
-def test_derivatives_are_those_of_the_implicit_function():
-    """theta = atan(W/(m g)): first and second derivatives, in every mode, by closed form."""
+def test_derivatives_equal_those_of_the_implicit_function():
+    """theta = atan(W/(m g)): first and second derivatives in every mode, by closed form."""
 
     def theta(W, m):
         return jl.equilibrium(BLOWN, [0.1], PARAMS | {"m": m}, inputs={"wind": W})["theta"]
@@ -118,8 +118,8 @@ def test_derivatives_are_those_of_the_implicit_function():
         np.testing.assert_allclose(outer(inner(theta))(W, m), second, rtol=64 * EPS)
 
 
-def test_a_batch_is_one_search_after_another():
-    """Starts, params and failures side by side; a bad lane does not harm another."""
+def test_batch_equals_single_searches():
+    """Starts, params and a failure in one batch; the failed lane does not affect others."""
     starts = jnp.array([[0.4], [3.0], [jnp.nan]])
 
     def search(q0):
@@ -134,14 +134,14 @@ def test_a_batch_is_one_search_after_another():
     assert many["theta"].shape == (3,)
 
 
-def test_single_precision_stays_single():
+def test_float32_searches_stay_float32():
     single = jax.tree.map(jnp.float32, PARAMS)
     rest = jl.equilibrium(PENDULUM, jnp.array([0.4], jnp.float32), single)
     assert rest.q.dtype == jnp.float32
     np.testing.assert_allclose(rest.q, 0, atol=1e-6)
 
 
-def test_no_callback_and_no_new_compilation():
+def test_search_needs_no_callback_and_no_new_compilation():
     def search(q0):
         return jl.equilibrium(PENDULUM, q0, PARAMS).q
 
@@ -160,8 +160,8 @@ def test_no_callback_and_no_new_compilation():
     assert traces == first
 
 
-def test_indifferent_coordinates_stay_where_they_are():
-    """A cyclic coordinate: any value is an equilibrium, none is shown to be stable."""
+def test_cyclic_coordinates_are_unchanged():
+    """A cyclic coordinate: any value is an equilibrium, none counts as stable."""
     system = jl.System(
         coordinates=("x", "y"),
         kinetic=lambda t, q, v, params: 0.5 * v @ v,
@@ -173,8 +173,8 @@ def test_indifferent_coordinates_stay_where_they_are():
 
 
 @pytest.mark.full
-def test_follower_forces_have_no_potential():
-    """A force that turns with the second of two links: K is not symmetric, and says so."""
+def test_follower_forces_are_not_conservative():
+    """A force that rotates with the second of two links: K is reported as not symmetric."""
 
     def tip(t, q, params):
         return jnp.stack([jnp.cumsum(jnp.cos(q))[-1], jnp.cumsum(jnp.sin(q))[-1]])
@@ -195,8 +195,8 @@ def test_follower_forces_have_no_potential():
     np.testing.assert_allclose(rest.stiffness, [[1.5, -0.5], [-1.0, 1.0]], atol=8 * EPS)
 
 
-def test_where_nothing_balances_it_says_how_near_it_came():
-    """A constant force has no equilibrium; sin(x) = 2 has none, its nearest point is pi/2."""
+def test_failed_search_reports_the_nearest_point():
+    """A constant force has no equilibrium, nor has sin(x) = 2, whose nearest point is pi/2."""
     pushed = jl.System(lambda t, q, v, params: 0.5 * v @ v + q[1], ("x", "y"))
     message = (
         r"status implicit_solve_failed: no equilibrium was found\. After \d+ steps the nearest "
@@ -217,12 +217,12 @@ def test_where_nothing_balances_it_says_how_near_it_came():
     assert "no equilibrium was found" in quiet.message()
 
 
-def test_a_search_cut_short_is_not_a_success():
+def test_search_limited_by_max_steps_fails():
     with pytest.raises(jl.EquilibriumError, match="After 1 steps the nearest point was"):
         jl.equilibrium(PENDULUM, [2.0], PARAMS, max_steps=1)
 
 
-def test_what_is_not_finite_is_named():
+def test_nonfinite_forces_are_named():
     broken = jl.System(lambda t, q, v, params: 0.5 * v @ v + jnp.log(q[0]), ("x",))
     with pytest.raises(
         jl.EquilibriumError, match=r"status nonfinite: .* the remaining force on 'x'"
@@ -255,7 +255,7 @@ def test_what_is_not_finite_is_named():
     ],
     ids=str,
 )
-def test_wrong_arguments_are_refused(changes, message):
+def test_invalid_arguments_are_refused(changes, message):
     given = {"system": PENDULUM, "q0": [0.1], "params": PARAMS} | changes
     with pytest.raises(ValueError, match=re.escape(message)):
         jl.equilibrium(**given)

@@ -1,4 +1,4 @@
-"""Inverse dynamics: the forces that a given motion needs."""
+"""Inverse dynamics: the forces that a given motion requires."""
 
 import re
 
@@ -22,8 +22,8 @@ def draw(motion, rng):
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_it_inverts_the_equations_of_motion(name):
-    """M a + h - Q of any a, against the terms one by one; 0 for the a of the free motion."""
+def test_inverse_dynamics_inverts_the_equations_of_motion(name):
+    """M a + h - Q of any a, compared with separate terms; 0 for the free acceleration."""
     motion = MOTIONS[name]
     system, params, inputs = motion.system, motion.params, motion.inputs
     dq, v, a = draw(motion, np.random.default_rng(1))
@@ -40,7 +40,7 @@ def test_it_inverts_the_equations_of_motion(name):
     assert np.all(np.abs(needed) <= 32 * EPS * np.linalg.cond(M) * size)
 
 
-def test_a_general_lagrangian_is_no_exception():
+def test_general_lagrangians_satisfy_the_same_identity():
     """Explicit time, terms linear in v, L not quadratic: the same identity."""
     rng = np.random.default_rng(2)
     for case in GENERAL.values():
@@ -52,25 +52,25 @@ def test_a_general_lagrangian_is_no_exception():
         assert np.all(np.abs(needed - (M @ a + h)) <= 32 * EPS * (np.abs(M) @ np.abs(a) + abs(h)))
 
 
-def test_rows_are_instants():
-    """A row of states with their times is the same as one by one, inputs read at each time."""
+def test_series_of_states_equal_single_instants():
+    """A series of states equals single evaluations; inputs are read at each time."""
     motion = MOTIONS["driven_pendulum"]
     rng = np.random.default_rng(3)
     q, v, a = (rng.uniform(-1, 1, (5, 1)) for _ in range(3))
     ts = np.linspace(0.1, 1.5, 5)
     given = {"inputs": motion.inputs}
-    rows = jl.inverse_dynamics(motion.system, q, v, a, motion.params, t=ts, **given)
-    for i, row in enumerate(rows):
+    series = jl.inverse_dynamics(motion.system, q, v, a, motion.params, t=ts, **given)
+    for i, force in enumerate(series):
         one = jl.inverse_dynamics(motion.system, q[i], v[i], a[i], motion.params, t=ts[i], **given)
-        np.testing.assert_allclose(row, one, rtol=4 * EPS)
-    assert len(np.unique(rows)) == 5
+        np.testing.assert_allclose(force, one, rtol=4 * EPS)
+    assert len(np.unique(series)) == 5
     fixed = jl.inverse_dynamics(motion.system, q, v, a, motion.params, t=0.1, **given)
-    np.testing.assert_allclose(fixed[0], rows[0], rtol=4 * EPS)
-    assert abs(fixed[3] - rows[3]) > 0.1
+    np.testing.assert_allclose(fixed[0], series[0], rtol=4 * EPS)
+    assert abs(fixed[3] - series[3]) > 0.1
 
 
 @pytest.mark.full
-def test_a_simulated_motion_needs_nothing():
+def test_simulated_motion_needs_no_force():
     """Inverse of forward dynamics along a whole motion, to rounding."""
     motion = MOTIONS["cart_pendulum"]
     run = jl.simulate(motion.system, motion.q0, motion.v0, jnp.linspace(0, 1, 6), motion.params)
@@ -102,7 +102,7 @@ def test_a_massless_coordinate_is_allowed():
     np.testing.assert_allclose(needed, [2.2, -0.2], rtol=8 * EPS)
 
 
-def test_derivatives_are_those_of_a_regressor():
+def test_derivatives_by_mass_are_those_of_a_regressor():
     """L is linear in m: so is the force, whose derivative is the force at m = 1."""
     motion = MOTIONS["double_pendulum"]
     q, v, a = draw(motion, np.random.default_rng(4))
@@ -127,8 +127,8 @@ def test_prescribed_motion_differentiates_twice():
     np.testing.assert_allclose(q, np.stack([np.sin(3 * ts), ts**3], -1), rtol=8 * EPS)
     np.testing.assert_allclose(v, np.stack([3 * np.cos(3 * ts), 3 * ts**2], -1), rtol=16 * EPS)
     np.testing.assert_allclose(a, np.stack([-9 * np.sin(3 * ts), 6 * ts], -1), rtol=16 * EPS)
-    for rows, one in zip((q, v, a), jl.prescribed_motion(motion, ts[1]), strict=True):
-        np.testing.assert_allclose(rows[1], one, rtol=4 * EPS)
+    for series, one in zip((q, v, a), jl.prescribed_motion(motion, ts[1]), strict=True):
+        np.testing.assert_allclose(series[1], one, rtol=4 * EPS)
 
 
 def test_a_constant_motion_is_at_rest():
@@ -138,7 +138,7 @@ def test_a_constant_motion_is_at_rest():
     np.testing.assert_array_equal(a, np.zeros((2, 2)))
 
 
-def test_the_carnival_ride():
+def test_carnival_ride_agrees_with_the_book():
     """Book data: torque 1200 N m, Coriolis force 240 N, centripetal acceleration 45 m/s^2."""
 
     def kinetic(t, q, v, params):
@@ -151,39 +151,44 @@ def test_the_carnival_ride():
     q, v, a = jl.prescribed_motion(lambda t: jnp.stack([5.0 + 0.4 * t, 3.0 * t]), 0.0)
     radial, torque = jl.inverse_dynamics(ride, q, v, a)
     np.testing.assert_allclose(torque, 1200, rtol=8 * EPS)
-    np.testing.assert_allclose(torque / q[0], 240, rtol=8 * EPS)  # the Coriolis force's arm is r
+    np.testing.assert_allclose(torque / q[0], 240, rtol=8 * EPS)  # its lever arm is r
     np.testing.assert_allclose(-radial / 100, 45, rtol=8 * EPS)
 
 
 def wrong():
     yield "q", ([0.1], [0.0, 0.0], [0.0, 0.0]), {}, "`q` must have shape (2,) or (s, 2): theta1"
     yield "v", ([0.1, 0.2], [0.0], [0.0, 0.0]), {}, "`v` must have shape (2,) or (s, 2), as q with"
-    rows = np.zeros((3, 2))
+    states = np.zeros((3, 2))
     yield (
         "a",
-        (rows, rows, np.zeros((4, 2))),
+        (states, states, np.zeros((4, 2))),
         {},
         "`a` must have shape (2,) or (s, 2), as q with (3",
     )
     yield (
         "t",
-        (rows, rows, rows),
+        (states, states, states),
         {"t": np.zeros(4)},
         "`t` must have shape () or (3,), but its shape",
     )
-    yield "ndim", (rows[None],) * 3, {}, "`q` must have shape (2,) or (s, 2)"
-    yield "complex", (rows, rows * 1j, rows), {}, "`v` must be real, but its dtype was complex128"
-    yield "text", ("ab", rows, rows), {}, "`q` must be real numbers, but it was 'ab'."
-    yield "none", (rows, rows, None), {}, "`a` must be real numbers, but it was None."
+    yield "ndim", (states[None],) * 3, {}, "`q` must have shape (2,) or (s, 2)"
+    yield (
+        "complex",
+        (states, states * 1j, states),
+        {},
+        "`v` must be real, but its dtype was complex128",
+    )
+    yield "text", ("ab", states, states), {}, "`q` must be real numbers, but it was 'ab'."
+    yield "none", (states, states, None), {}, "`a` must be real numbers, but it was None."
     yield (
         "empty",
-        (rows[:0],) * 3,
+        (states[:0],) * 3,
         {},
         "`q` must hold at least one instant, but its shape was (0, 2)",
     )
     yield (
         "nan",
-        (rows, np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]]), rows),
+        (states, np.array([[0.0, 0.0], [0.0, np.nan], [0.0, 0.0]]), states),
         {},
         "`v` must be finite, but v[1, 1] ('theta2') was nan. States that a motion did not reach",
     )
@@ -193,8 +198,13 @@ def wrong():
         {},
         "`a` must be finite, but a[0] ('theta1",
     )
-    yield "t nan", (rows, rows, rows), {"t": np.nan}, "`t` must be finite, but it was nan"
-    yield "t text", (rows, rows, rows), {"t": "now"}, "`t` must be real numbers, but it was 'now'"
+    yield "t nan", (states, states, states), {"t": np.nan}, "`t` must be finite, but it was nan"
+    yield (
+        "t text",
+        (states, states, states),
+        {"t": "now"},
+        "`t` must be real numbers, but it was 'now'",
+    )
     named = {"theta1": 0.1, "theta3": 0.2}
     yield "names", (named,) * 3, {}, "`q` must name exactly ['theta1', 'theta2'], but it named ['th"
 
@@ -218,7 +228,7 @@ def test_states_may_be_given_by_name():
     np.testing.assert_array_equal(named, plain)
 
 
-def test_precisions_are_brought_to_one():
+def test_mixed_precisions_use_the_wider_one():
     motion = MOTIONS["double_pendulum"]
     single = np.array([0.5, -0.25], np.float32)
     mixed = jl.inverse_dynamics(motion.system, single, [1, 2], np.array([0.5, 1.0]), motion.params)
@@ -229,7 +239,7 @@ def test_precisions_are_brought_to_one():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_what_is_no_system_is_refused():
+def test_other_types_than_systems_are_refused():
     with pytest.raises(
         ValueError, match=r"inverse_dynamics: `system` must be a jl\.System, but it "
     ):
@@ -257,13 +267,13 @@ def test_what_is_no_system_is_refused():
         (lambda t: t * jnp.ones(2), np.ones((2, 2)), "`t` must be an instant or an array of them"),
     ],
 )
-def test_a_motion_that_cannot_be_led_is_refused(motion, t, message):
+def test_invalid_prescribed_motion_is_refused(motion, t, message):
     with pytest.raises(ValueError, match=re.escape(f"prescribed_motion: {message}")):
         jl.prescribed_motion(motion, t)
 
 
 @pytest.mark.parametrize("motion", [lambda t: t, lambda t: jnp.zeros((2, 2)), lambda t: None])
-def test_a_motion_that_is_no_vector_is_refused(motion):
+def test_prescribed_motion_must_return_a_vector(motion):
     message = "prescribed_motion: `motion` must return all coordinates as one vector of shape"
     with pytest.raises(ValueError, match=message):
         jl.prescribed_motion(motion, 0.0)

@@ -1,4 +1,4 @@
-"""Relaxation to rest: closed linkages, forces without potential, derivatives at what it finds."""
+"""Relaxation to rest: closed linkages, forces without potential, derivatives at the rest."""
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,13 @@ GRAVITY = 9.81
 
 
 def ends(q, params):
-    """Ends of crank, coupler and rocker, one after the other from the origin."""
+    """Ends of crank, coupler and rocker, in order from the origin."""
     links = params["l"][:, None] * jnp.stack([jnp.cos(q), jnp.sin(q)], axis=1)
     return jnp.cumsum(links, axis=0)
 
 
 def potential(t, q, params):
-    """Weights at the joints, a spring on the crank."""
+    """Weights at the joints and a spring on the crank."""
     crank = 0.5 * params["k"] * q[0] ** 2
     return GRAVITY * params["m"] @ ends(q, params)[:, 1] + crank
 
@@ -38,7 +38,7 @@ FOUR_BAR = jl.System(
 
 
 def four_bars(count, dtype=float):
-    """(params, q0) of four-bars in random configurations: the pivot is where the rocker ends."""
+    """(params, q0) of four-bars in random configurations: the pivot is at the rocker's end."""
     rng = np.random.default_rng(1)
     params = {
         "l": rng.uniform(0.3, 1.5, (count, 3)),
@@ -57,15 +57,15 @@ def rest_of(params, q0):
 
 
 def unbalanced(q, params):
-    """Largest force along the constraints over the largest of all, and how far these are open."""
+    """Largest force along the constraints over the largest force, and the position residual."""
     F, A = jax.grad(potential, 1)(0.0, q, params), jax.jacobian(opening, 1)(0.0, q, params)
-    along = jnp.cross(A[0], A[1])
-    along = along / jnp.linalg.norm(along)
-    return jnp.abs(along @ F) / jnp.max(jnp.abs(F)), jnp.max(jnp.abs(opening(0.0, q, params)))
+    tangent = jnp.cross(A[0], A[1])
+    tangent = tangent / jnp.linalg.norm(tangent)
+    return jnp.abs(tangent @ F) / jnp.max(jnp.abs(F)), jnp.max(jnp.abs(opening(0.0, q, params)))
 
 
 def test_four_bars_come_to_rest_from_any_configuration():
-    """Of 24 the search for a root of the forces alone fails on 4, in minima of their size."""
+    """The search for a root of the forces alone fails on 4 of 24, in minima of their norm."""
     params, q0 = four_bars(24)
     found = rest_of(params, q0)
     np.testing.assert_array_equal(found.status, 0)
@@ -85,8 +85,8 @@ def test_four_bars_come_to_rest_in_single_precision():
 
 
 @pytest.mark.full
-def test_derivatives_at_a_rest_that_relaxation_found():
-    """Forward, reverse, and central differences from the rest itself, by k and the pivot."""
+def test_derivatives_at_a_relaxed_state_are_right():
+    """Forward, reverse, and central differences that start at the rest, by k and the pivot."""
     params, q0 = four_bars(24)
     found = rest_of(params, q0)
     i = int(np.argmax(found.iterations))  # one whose first search failed
@@ -99,16 +99,16 @@ def test_derivatives_at_a_rest_that_relaxation_found():
         return jl.equilibrium(FOUR_BAR, start, moved, throw=False).q
 
     x = jnp.array([one["k"] + 1.0, *one["g"]])
-    there = q(x, q0[i])
+    rest = q(x, q0[i])
     forward, reverse = jax.jacfwd(q)(x, q0[i]), jax.jacrev(q)(x, q0[i])
     h = 1e-5
-    steps = [(q(x + h * e, there) - q(x - h * e, there)) / (2 * h) for e in np.eye(3)]
+    steps = [(q(x + h * e, rest) - q(x - h * e, rest)) / (2 * h) for e in np.eye(3)]
     np.testing.assert_allclose(reverse, forward, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(forward, np.stack(steps, axis=1), rtol=1e-6, atol=1e-8)
 
 
 def swirl(t, q, v, params):
-    """Towards the origin and around it, of size r exp(-r^2): without a potential."""
+    """Towards the origin and around it, of magnitude r exp(-r^2): without a potential."""
     inwards = -q * jnp.exp(-q @ q)
     return inwards + 1.5 * jnp.stack([-inwards[1], inwards[0]])
 
@@ -121,15 +121,15 @@ SWIRL = jl.System(
 
 
 def test_forces_without_potential_lead_to_rest():
-    """From beyond their largest, where the least |F| lies outwards, the damped motion winds in."""
+    """From beyond the maximum of |F|, least |F| is outwards; the damped motion spirals inwards."""
     rest = jl.equilibrium(SWIRL, [1.2, 0.3])
     np.testing.assert_allclose(rest.q, 0, atol=4 * EPS)
     assert not rest.conservative
     np.testing.assert_allclose(rest.stiffness, [[1.0, -1.5], [1.5, 1.0]], atol=16 * EPS)
 
 
-def test_what_was_tried_is_said_where_nothing_balances():
-    """A bead that is pushed along a hoop, and a mass in V = -x: both never come to rest."""
+def test_failed_search_states_what_was_tried():
+    """A bead that is pushed along a hoop, and a mass in V = -x: neither comes to rest."""
     hoop = jl.System(
         lambda t, q, v, params: 0.5 * v @ v,
         ("x", "y"),
@@ -145,7 +145,7 @@ def test_what_was_tried_is_said_where_nothing_balances():
 
 
 def test_batches_are_searched_in_chunks():
-    """Loops that solve equations of thousands of systems at once could wait for ever on CPU."""
+    """Loops that solve equations of thousands of systems at once could hang on CPU."""
     count = 3 * MOST + 1
     searched = jax.vmap(lambda q: jl.equilibrium(SWIRL, q, throw=False).q)
     program = jax.make_jaxpr(searched)(jnp.zeros((count, 2)))

@@ -1,4 +1,4 @@
-"""Searches for equilibrium where there is none, or one of higher order, edges, rings, any units."""
+"""Root search: no equilibrium, roots of higher order, kinks, rings, any units."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from systems import double_pendulum_static_load
 EPS = np.finfo(float).eps
 
 
-# ---- What is no equilibrium ----------------------------------------------------------------------
+# ---- No equilibrium ------------------------------------------------------------------------------
 
 
 def one(potential, forces=()):
@@ -58,14 +58,14 @@ VALLEY = plane(lambda q, params: jnp.exp(-q[0] - q[1]) + (q[0] - q[1]) ** 2 / 2)
         pytest.param(VALLEY, [5.0, 0.0], None, id="valley", marks=pytest.mark.full),
     ],
 )
-def test_forces_that_only_die_away_are_not_balanced(system, q0, params):
-    """However large the force at the start was, and though it underflows in the end."""
+def test_decaying_forces_have_no_equilibrium(system, q0, params):
+    """For any force at the start, and although it underflows in the end."""
     far = jl.equilibrium(system, jnp.asarray(q0), params, throw=False)
     assert far.status == jl.Status.implicit_solve_failed
     assert not far.stable
 
 
-def test_a_well_is_found_from_outside_of_its_bend():
+def test_well_is_found_from_beyond_its_inflection():
     """V = -1e6 exp(-q^2) from q = 1, where Newton's step and the least |F| lead outwards."""
     rest = jl.equilibrium(GAUSSIAN, [1.0])
     np.testing.assert_allclose(rest.q, 0, atol=EPS)
@@ -73,7 +73,7 @@ def test_a_well_is_found_from_outside_of_its_bend():
 
 
 @pytest.mark.parametrize("start", [0.01, 1e-10])
-def test_a_root_is_found_from_where_the_force_is_immense(start):
+def test_root_is_found_from_immense_forces(start):
     """Lennard-Jones from 0.01 r0, 1e27 times the force unit, and 1e131 times: r0 = 1, K = 72."""
     rest = jl.equilibrium(LENNARD_JONES, [start])
     np.testing.assert_allclose(rest.q, [1.0], rtol=4 * EPS)
@@ -87,7 +87,7 @@ def test_a_root_is_found_from_where_the_force_is_immense(start):
 
 @pytest.mark.full
 def test_a_root_does_not_depend_on_units():
-    """V times E, lengths times l: the same root relative to l, the same verdict."""
+    """V times E, lengths times l: the same root relative to l, the same stability."""
 
     def potential(q, params):
         x, y = q / params["l"]
@@ -104,8 +104,8 @@ def test_a_root_does_not_depend_on_units():
     q, status, stable = search(E.ravel(), lengths.ravel())
     assert np.all(status == 0)
     assert np.all(stable == stable[0])
-    # Rounding of the forces, which cancel from terms 3 times as large, on a K of least
-    # eigenvalue about 3.
+    # Rounding of the forces, which cancel from terms 3 times as large; the least eigenvalue of K is
+    # about 3.
     np.testing.assert_allclose(q, np.broadcast_to(q[0], q.shape), rtol=32 * EPS)
 
 
@@ -133,12 +133,12 @@ def test_weak_gravity_and_wide_orbits_are_resolved():
     np.testing.assert_allclose(jl.equilibrium(wide, [1e10]).q, [1e11], rtol=4 * EPS)
 
 
-# ---- Roots of higher order, edges, rings ---------------------------------------------------------
+# ---- Roots of higher order, kinks, rings ---------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", [3, 4, 6])
-def test_a_higher_order_is_found_and_not_called_stable(order):
-    """V = q^n from 1: Newton's step is q/(n - 1), below tol = 1e-10 of 1 + q in the end."""
+def test_root_of_higher_order_is_found_and_not_stable(order):
+    """V = q^n from 1: Newton's step q/(n - 1) ends below tol = 1e-10 of 1 + q."""
     rest = jl.equilibrium(one(lambda x, params: x**order), [1.0])
     assert abs(rest.q[0]) / (order - 1) <= 1e-10 * (1 + abs(rest.q[0]))
     assert not rest.stable
@@ -150,7 +150,7 @@ def test_a_higher_order_is_found_and_not_called_stable(order):
     [np.arctan2(0.8, 0.6), 0.0, 0.9],
 )
 def test_two_unstressed_springs_in_line_balance(angle):
-    """Across their line V is of order 4, F = 100 y^3, lost in rounding where y^3 < eps."""
+    """Transverse to their line V is of order 4: F = 100 y^3, lost in rounding for y^3 < eps."""
     e = jnp.array([np.cos(angle), np.sin(angle)])
     springs = plane(
         lambda q, params: jl.energy.spring(100.0, q + e, 1.0) + jl.energy.spring(100.0, q - e, 1.0)
@@ -161,16 +161,16 @@ def test_two_unstressed_springs_in_line_balance(angle):
 
 
 @pytest.mark.full
-def test_a_ring_of_equilibria_is_found_and_not_called_stable():
-    """A spring of length 1 about a pivot and nothing else."""
+def test_ring_of_equilibria_is_found_and_not_stable():
+    """A single spring of length 1 about a pivot."""
     ring = plane(lambda q, params: jl.energy.spring(100.0, q, params))
     rest = jl.equilibrium(ring, [2.0, 0.1], 1.0)
     np.testing.assert_allclose(np.linalg.norm(rest.q), 1.0, rtol=4 * EPS)
     assert not rest.stable
 
 
-def test_the_zero_length_of_a_spring_is_stable_without_unstretched_length_only():
-    """Else V is the tip of a cone, where the force points away in all directions."""
+def test_zero_length_is_stable_only_for_springs_without_free_length():
+    """Otherwise V is the tip of a cone: the force points away in all directions."""
     pivot = plane(lambda q, params: jl.energy.spring(100.0, q, params))
     assert jl.equilibrium(pivot, [0.0, 0.0], 0.0).stable
     assert not jl.equilibrium(pivot, [0.0, 0.0], 1.0).stable
@@ -179,7 +179,7 @@ def test_the_zero_length_of_a_spring_is_stable_without_unstretched_length_only()
 @pytest.mark.full
 @pytest.mark.parametrize("factor", [1.0, 30.0, -30.0])
 def test_large_loads_on_a_double_pendulum_lead_to_its_stable_branch(factor):
-    """Each link hangs along the resultant of what pulls at its lower end."""
+    """Each link hangs along the resultant of the forces at its lower end."""
     entry = double_pendulum_static_load.entry
     params = dict(entry.example.params)
     for name in ("Fx", "Fy", "Bx", "By"):
@@ -191,12 +191,12 @@ def test_large_loads_on_a_double_pendulum_lead_to_its_stable_branch(factor):
     assert rest.stable
 
 
-# ---- Constraints that depend on one another ------------------------------------------------------
+# ---- Dependent constraint rows -------------------------------------------------------------------
 
 
 @pytest.mark.full
 def test_multipliers_of_dependent_rows_do_not_depend_on_the_start():
-    """A rod declared twice: of least norm, as in the equations of motion, and so differentiated."""
+    """A rod declared twice: multipliers of least norm, as in the equations of motion."""
 
     def rod(t, q, params):
         r, length = jnp.sqrt(q @ q), params["l"]
@@ -219,20 +219,20 @@ def test_multipliers_of_dependent_rows_do_not_depend_on_the_start():
         return jax.jvp(lam, (params,), (direction,))
 
     starts = [jnp.array(q0) for q0 in ((0.3, -1.2), (0.9, -0.9), (0.5, -0.4))]
-    still = {"k": 0.0, "l": 0.0}
-    (_, q), _ = found(params, starts[0], still)
+    no_change = {"k": 0.0, "l": 0.0}
+    (_, q), _ = found(params, starts[0], no_change)
     expected = system.multipliers(q, jnp.zeros(2), params)["rod"]
     h = 1e-5
     for q0 in starts:
-        np.testing.assert_allclose(found(params, q0, still)[0][0], expected, rtol=1e-13)
+        np.testing.assert_allclose(found(params, q0, no_change)[0][0], expected, rtol=1e-13)
         for name, value in params.items():
-            slope = found(params, q0, {**still, name: 1.0})[1][0]
+            slope = found(params, q0, {**no_change, name: 1.0})[1][0]
             moved = [{**params, name: value + s * h} for s in (1, -1)]
-            ahead, behind = (found(p, q0, still)[0][0] for p in moved)
+            ahead, behind = (found(p, q0, no_change)[0][0] for p in moved)
             np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-7)
 
 
-# ---- Forces of velocity --------------------------------------------------------------------------
+# ---- Forces that depend on velocity --------------------------------------------------------------
 
 
 def velocity_force(t, q, v, params):
@@ -265,11 +265,11 @@ def test_forces_that_feed_energy_in_make_a_minimum_unstable(D, stable):
     assert rest.conservative
 
 
-# ---- Derivatives where K is singular, and where there is no root ---------------------------------
+# ---- Derivatives for a singular K, and without a root --------------------------------------------
 
 
 @pytest.mark.full
-def test_a_cyclic_coordinate_leaves_the_derivatives_of_others_alone():
+def test_cyclic_coordinate_does_not_affect_derivatives_of_others():
     cyclic = plane(lambda q, params: (q[0] - params**2) ** 2 / 2)
 
     def q(p):
@@ -282,7 +282,7 @@ def test_a_cyclic_coordinate_leaves_the_derivatives_of_others_alone():
 
 @pytest.mark.full
 def test_free_carts_on_a_spring_have_the_derivative_of_least_norm():
-    """Only x - y is determined, = p^2: each cart takes half of its change."""
+    """Only x - y = p^2 is determined: each cart takes half of its change."""
     carts = plane(lambda q, params: (q[0] - q[1] - params**2) ** 2 / 2)
 
     def q(p):
@@ -293,7 +293,7 @@ def test_free_carts_on_a_spring_have_the_derivative_of_least_norm():
     np.testing.assert_allclose(jax.hessian(q)(0.7), [1.0, -1.0], rtol=16 * EPS)
 
 
-def test_where_no_equilibrium_was_found_there_is_no_derivative():
+def test_failed_search_has_nan_derivatives():
     def q(p):
         return jl.equilibrium(EXPONENTIAL, [0.3], p, throw=False, max_steps=8).q[0]
 
@@ -302,7 +302,7 @@ def test_where_no_equilibrium_was_found_there_is_no_derivative():
     assert np.isnan(jax.jvp(q, (0.7,), (1.0,))[1])
 
 
-def test_a_failing_lane_does_not_spoil_the_derivative_of_another():
+def test_failed_lane_does_not_affect_derivatives_of_others():
     well = one(lambda x, params: jnp.exp(-x) + params * x)
 
     def q(p):

@@ -1,4 +1,4 @@
-"""Energy bookkeeping: where H comes from and goes to, by name."""
+"""Power and work of all terms, by name, account for the changes of H."""
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ CASES = dict(gathered())
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_terms_add_up_to_the_rate_of_energy(name):
-    """dH/dt along (1, v, a) against sum_k v . Q_k - dL/dt: two routes, at one state."""
+def test_power_terms_add_up_to_the_rate_of_energy(name):
+    """dH/dt along (1, v, a) against sum_k v . Q_k - dL/dt, at one state."""
     system, q, v, params, inputs = CASES[name]
     t = jnp.array(0.25)
     a = system.acceleration(q, v, params, t=t, inputs=inputs)
@@ -38,7 +38,7 @@ def test_the_terms_add_up_to_the_rate_of_energy(name):
 
     rate = jax.jvp(H, (t, q, v), (jnp.ones_like(t), v, a))[1]
     terms = system.power(q, v, params, t=t, inputs=inputs)
-    # Both carry the rounding of M a, h and Q, each times v: 64 roundings of the largest product.
+    # Both have the rounding of M a, h and Q, each times v: 64 roundings of the largest product.
     M, h = system.mass_matrix(q, v, params, t=t), system.bias(q, v, params, t=t)
     size = np.abs(v) @ (np.abs(M) @ np.abs(a) + np.abs(h)) + sum(abs(x) for x in terms.values())
     np.testing.assert_allclose(sum(terms.values()), rate, rtol=0, atol=64 * EPS * size)
@@ -52,7 +52,7 @@ def test_the_terms_add_up_to_the_rate_of_energy(name):
         *(pytest.param(name, marks=pytest.mark.full) for name in ("cart_pendulum", "bead")),
     ],
 )
-def test_the_books_close(name):
+def test_work_of_all_terms_equals_the_change_of_energy(name):
     """H - H(0) = the work of all terms, within some tens of local errors."""
     system, q, v, params, inputs = CASES[name]
     ts = jnp.linspace(0.0, 1.5, 7)
@@ -71,7 +71,7 @@ def test_the_books_close(name):
 
 
 def test_the_work_of_a_damper_is_minus_twice_its_function():
-    """dE/dt = -2 R for linear damping (Pila, sec. 3.7), by quadrature of R over the rows."""
+    """dE/dt = -2 R for linear damping (Pila, sec. 3.7), by quadrature of R over the saves."""
     system, q, v, params, _ = CASES["double_pendulum_rayleigh"]
     ts = jnp.linspace(0.0, 1.5, 2001)
     motion = jl.simulate(system, q, v, ts, params, save=("work", "power"))
@@ -84,7 +84,7 @@ def test_the_work_of_a_damper_is_minus_twice_its_function():
     np.testing.assert_allclose(motion.work[name][-1], -2 * simpson, rtol=1e-8)
 
 
-def test_explicit_time_has_a_term_of_its_own():
+def test_explicit_time_has_a_separate_term():
     system, q, v, params, _ = CASES["driven_pivot"]
     assert list(system.power(q, v, params)) == ["explicit time"]
     system, q, v, params, _ = CASES["chain"]
@@ -94,8 +94,8 @@ def test_explicit_time_has_a_term_of_its_own():
 
 
 @pytest.mark.full
-def test_the_terms_keep_the_order_of_the_forces():
-    """Explicit time last; through jit, vmap and `save`, which hand dicts back alphabetically."""
+def test_power_terms_keep_the_order_of_the_forces():
+    """Explicit time last; also through jit, vmap and `save`, which return dicts alphabetically."""
     forces = tuple(
         jl.GeneralizedForce(lambda t, q, v, params: -v, name) for name in ("wind", "brake", "motor")
     )
@@ -119,7 +119,7 @@ def test_the_terms_keep_the_order_of_the_forces():
 
 
 def test_power_is_the_rate_of_work():
-    """The derivative of a row of work in its own time is the power there.
+    """The derivative of work at a save, by its time, is the power there.
 
     That derivative is the last step's, right to its local error 1e-9 over its length.
     """
@@ -139,8 +139,8 @@ def test_power_is_the_rate_of_work():
         np.testing.assert_allclose(rate[name], expected, rtol=1e-7)
 
 
-def test_work_is_not_integrated_unless_asked_for():
-    """The state has 2 n components without it; the first quantity that wants it says so."""
+def test_work_is_integrated_only_on_request():
+    """Without it the state has 2 n components; reading `work` raises an error with advice."""
     system, q, v, params, _ = CASES["double_pendulum_rayleigh"]
     ts = jnp.array([0.0, 0.3])
 
@@ -177,24 +177,24 @@ def test_work_has_batches_and_derivatives():
 
 
 @pytest.mark.full
-def test_work_done_backwards_is_given_back():
+def test_work_backwards_in_time_has_the_opposite_sign():
     system, q, v, params, _ = CASES["cart_pendulum"]
     ts = jnp.array([0.0, 0.4, 1.0])
-    there = jl.simulate(system, q, v, ts, params, save=("work",))
-    back = jl.simulate(system, there.q[-1], there.v[-1], ts[::-1], params, save=("work",))
-    for name, W in there.work.items():
-        np.testing.assert_allclose(back.work[name][-1], -W[-1], atol=1e-6)
+    forward = jl.simulate(system, q, v, ts, params, save=("work",))
+    backward = jl.simulate(system, forward.q[-1], forward.v[-1], ts[::-1], params, save=("work",))
+    for name, W in forward.work.items():
+        np.testing.assert_allclose(backward.work[name][-1], -W[-1], atol=1e-6)
 
 
-def test_rows_not_reached_have_no_work():
+def test_saves_that_are_not_reached_have_nan_work():
     system, q, v, params, _ = CASES["cart_pendulum"]
     motion = jl.simulate(
         system, q, v, [0.0, 0.1, 5.0], params, save=("work", "power"), max_steps=8, throw=False
     )
     assert motion.status == jl.Status.max_steps
-    for rows in (*motion.work.values(), *motion.power.values()):
-        assert np.isfinite(rows[:2]).all()
-        assert np.isnan(rows[2])
+    for series in (*motion.work.values(), *motion.power.values()):
+        assert np.isfinite(series[:2]).all()
+        assert np.isnan(series[2])
 
 
 DRAG = jl.Rayleigh(lambda t, q, v, params: 0.05 * v @ v, "drag")
@@ -202,12 +202,12 @@ WELL = jl.System(lambda t, q, v, params: 0.5 * v @ v - jnp.log(q[0]), ("x", "y")
 
 
 def into_the_well(v0, save=("work",)):
-    """The forces at x = 0 are without bound; from v0 < 0 the motion ends there."""
+    """The force at x = 0 is unbounded; from v0 < 0 the motion ends there."""
     return jl.simulate(WELL, [1.0, 0.0], [v0, 0.5], [0.0, 0.1, 1.0], save=save, throw=False)
 
 
-def test_how_a_motion_with_work_ended_is_explained():
-    """The state of the failed step has work besides (q, v); that it concerns x is the state's."""
+def test_message_of_a_failed_motion_with_work_names_the_coordinate():
+    """The state of the failed step contains work besides (q, v); the message names x."""
     motion = into_the_well(-3.0)
     assert motion.status == jl.Status.step_below_resolution
     assert motion.message().startswith("step_below_resolution ('x')")
@@ -222,8 +222,8 @@ def test_how_a_motion_with_work_ended_is_explained():
     np.testing.assert_array_equal(where, [0, -1])
 
 
-def test_growth_along_a_motion_with_work_is_that_of_its_state():
-    """Work is no part of what errors grow in; inside jit the status is asked for in full."""
+def test_perturbation_growth_does_not_depend_on_work():
+    """Work is not a perturbed variable; under jit the complete status is needed."""
 
     def growth(save):
         def kappa(v0):
@@ -235,10 +235,10 @@ def test_growth_along_a_motion_with_work_is_that_of_its_state():
 
 
 def test_driven_pivot_agrees_with_the_force_on_the_pivot():
-    """Explicit time does the work of the drive less the change of what H leaves out.
+    """Explicit time does the work of the drive less the change of the terms that H omits.
 
-    H = T2 - T0 + V and T + V differ by T1 + 2 T0; the pivot's horizontal force times its speed is
-    the rate of T + V, Newton's law for the bob.
+    H = T2 - T0 + V and T + V differ by T1 + 2 T0. The horizontal force of the pivot times its speed
+    is the rate of T + V, by Newton's law for the bob.
     """
     params = {"m": 0.7, "l": 0.5, "g": 9.81, "X": 0.2, "Omega": 3.0}
     m, length, X, omega = (params[k] for k in ("m", "l", "X", "Omega"))
@@ -248,15 +248,15 @@ def test_driven_pivot_agrees_with_the_force_on_the_pivot():
     def pivot_rate(t):
         return -X * omega * jnp.sin(omega * t)
 
-    def left_out(t, q, v):  # T + V - H = T1 + 2 T0
+    def omitted_terms(t, q, v):  # T + V - H = T1 + 2 T0
         return m * pivot_rate(t) * length * v[0] * jnp.cos(q[0]) + m * pivot_rate(t) ** 2
 
     def x_rate(t, q, v):
         return pivot_rate(t) + length * v[0] * jnp.cos(q[0])
 
-    along = (t, q, v), (jnp.ones_like(t), v, a)
-    force = m * jax.jvp(x_rate, *along)[1]
+    point_and_rates = (t, q, v), (jnp.ones_like(t), v, a)
+    force = m * jax.jvp(x_rate, *point_and_rates)[1]
     (power,) = DRIVEN.power(q, v, params, t=t).values()
     np.testing.assert_allclose(
-        power + jax.jvp(left_out, *along)[1], force * pivot_rate(t), rtol=64 * EPS
+        power + jax.jvp(omitted_terms, *point_and_rates)[1], force * pivot_rate(t), rtol=64 * EPS
     )

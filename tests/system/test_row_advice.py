@@ -1,4 +1,4 @@
-"""What is said about rows that are singular at a state: squares, lengths, dead points."""
+"""Advice on rows that are singular at a state: squares, lengths, dead points."""
 
 import jax
 import jax.numpy as jnp
@@ -35,19 +35,19 @@ def system(row):
 
 
 @pytest.mark.parametrize("name", VANISHING)
-def test_rows_without_a_gradient_where_they_hold(name):
+def test_rows_without_a_gradient_on_the_constraint_are_named(name):
     row, q = VANISHING[name]
     assert vanishing_rows(system(row), None, 0.0, q) == ["rod"]
 
 
 @pytest.mark.parametrize("name", REGULAR)
-def test_other_rows(name):
+def test_regular_rows_are_not_named(name):
     row, q = REGULAR[name]
     assert vanishing_rows(system(row), None, 0.0, q) == []
 
 
 def folding(t, q, params):
-    """Two links of equal length whose end stands at the origin's height: flat at (0, pi)."""
+    """Two links of equal length whose end is at the origin: folded, as at (0, pi)."""
     return jnp.stack([jnp.sin(q[0]) + jnp.sin(q[1]), jnp.cos(q[0]) + jnp.cos(q[1])])
 
 
@@ -61,26 +61,26 @@ def test_dead_points_are_singular_and_redundant_rows_are_not():
     assert advice_on_rows(twice, None, 0.0, [0.3, 0.0]) == ""
 
 
-SAID = r"'rod' vanishes wherever the row holds, as for y\*\*2.* Write the quantity itself, y"
+ADVICE = r"'rod' vanishes wherever the row holds, as for y\*\*2.* Write the quantity itself, y"
 
 
-def test_whoever_meets_such_a_row_says_so():
+def test_all_errors_advise_on_vanishing_rows():
     row, q = VANISHING["square"]
     given = system(row)
-    with pytest.raises(jl.SimulationError, match=SAID):
+    with pytest.raises(jl.SimulationError, match=ADVICE):
         jl.simulate(given, q, [0.0, 0.0], [0.0, 1.0], dt=0.5, method="bosh3")
-    with pytest.raises(jl.EquilibriumError, match=SAID):
+    with pytest.raises(jl.EquilibriumError, match=ADVICE):
         jl.equilibrium(given, q)
     with pytest.raises(
         ValueError, match=r"constraint 'rod' must have a nonzero gradient .* Write the qu"
     ):
         given.check(q, [0.0, 0.0])
     rooted, q = VANISHING["root of a square"]
-    with pytest.raises(jl.AssemblyError, match=SAID):
+    with pytest.raises(jl.AssemblyError, match=ADVICE):
         jl.assemble(system(rooted), q, [0.0, 0.0])
 
 
-def test_messages_under_derivatives():
+def test_messages_under_derivatives_advise_on_rows():
     row, _ = VANISHING["square"]
 
     def end(x):
@@ -93,8 +93,8 @@ def test_messages_under_derivatives():
     assert jax.jvp(end, (0.3,), (1.0,))[0] == 0.3
 
 
-def test_a_row_that_is_not_known_is_not_left_out():
-    """The gradient of sqrt(y^2) is NaN at 0: so is what follows from it."""
+def test_rows_of_nan_are_not_left_out():
+    """The gradient of sqrt(y^2) is NaN at 0: so are all results."""
     row, q = VANISHING["root of a square"]
     a = system(row).acceleration(q, [0.0, 0.0])
     assert np.isnan(a).all()

@@ -1,7 +1,7 @@
 """The equations of motion: identities at random states, then Lagrangians with known answers.
 
-Every quantity is a sum of products, each rounded to EPS of its size. Two ways of computing one
-number therefore agree to K EPS times the size of what is summed, `size` below; K = 32 roundings.
+Every quantity is a sum of products, each rounded to EPS of its size. Two computations of one number
+therefore agree to K EPS times the size of the summands, `size` below; K = 32 roundings.
 """
 
 from functools import partial
@@ -41,7 +41,7 @@ QUADRATIC = mostly_full([name for name in CASES if name != "relativistic"], *PLA
 def random_states(name):
     """(params, t, q, v, x, b) with a leading axis of STATES; x, b: any acceleration and jerk.
 
-    Under constraints (q, v) are moved onto them.
+    Under constraints (q, v) are projected onto them.
     """
     case = CASES[name]
     rng = np.random.default_rng(sum(map(ord, name)))
@@ -64,19 +64,19 @@ def random_states(name):
 
 
 def quantities(system, quadratic, params, t, q, v, x, b):
-    """All that the identities compare, at one state."""
+    """All quantities of the identities, at one state."""
     L = partial(system.lagrangian, params=params)
     a = system.acceleration(q, v, params, t=t)
 
     def energy(t, q, v):
         return system.energy(q, v, params, t=t)
 
-    def along(s):
+    def curve(s):
         """(t, q, q') on the cubic with velocity v, acceleration x, jerk b at s = 0."""
         return t + s, q + s * v + s**2 * x / 2 + s**3 * b / 6, v + s * x + s**2 * b / 2
 
     momentum = jax.grad(L, argnums=2)
-    _, p_dot = jax.jvp(lambda s: momentum(*along(s)), (0.0,), (1.0,))
+    _, p_dot = jax.jvp(lambda s: momentum(*curve(s)), (0.0,), (1.0,))
     found = {
         "M": system.mass_matrix(q, v, params, t=t),
         "h": system.bias(q, v, params, t=t),
@@ -115,9 +115,9 @@ class Evaluated(NamedTuple):
     def __iter__(self):
         """The quantities of one state after another, with t, q, v, x."""
         _, t, q, v, x, _ = self.states
-        rows = self.found | {"t": t, "q": q, "v": v, "x": x}
+        arrays = self.found | {"t": t, "q": q, "v": v, "x": x}
         for i in range(STATES):
-            yield {key: np.asarray(value[i]) for key, value in rows.items()}
+            yield {key: np.asarray(value[i]) for key, value in arrays.items()}
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def evaluate(lowering):
 
 
 def agree(found, expected, *summed):
-    """Equal up to K roundings of everything summed."""
+    """Equal up to K roundings of all summands."""
     size = sum(np.max(norm(np.atleast_1d(x), axis=-1), initial=0.0) for x in summed)
     np.testing.assert_allclose(found, expected, rtol=0, atol=K * EPS * size)
 
@@ -159,10 +159,10 @@ def test_mass_matrix_is_the_hessian_of_the_lagrangian(name, evaluate):
 
 @pytest.mark.parametrize("name", ALL)
 def test_acceleration_solves_the_equations_of_motion(name, evaluate):
-    """M a + h = Q + A^T lam; the last is zero without constraints."""
+    """M a + h = Q + A^T lam; A^T lam is zero without constraints."""
     for s in evaluate(name):
-        # Backward error: the solve is exact for an M that differs by n roundings.
-        # h = p' - dL/dq may be small where its two parts are not.
+        # Backward error: the solve is exact for an M that differs by n roundings. h = p' - dL/dq
+        # may be small although its two parts are large.
         terms = (norm(s["M"], 2) * s["a"], s["h"], s["Q"], s["R"], s["L_q"])
         agree(s["M"] @ s["a"] + s["h"], s["Q"] + s["R"], *terms)
         assert CASES[name].system.constraints or not np.any(s["R"])
@@ -170,7 +170,7 @@ def test_acceleration_solves_the_equations_of_motion(name, evaluate):
 
 @pytest.mark.parametrize("name", ALL)
 def test_mass_and_bias_are_lagranges_equations_along_any_curve(name, evaluate):
-    """d/dt dL/dv - dL/dq = M x + h for every acceleration x, and whatever the jerk."""
+    """d/dt dL/dv - dL/dq = M x + h for every acceleration x and any jerk."""
     for s in evaluate(name):
         terms = (norm(s["M"], 2) * s["x"], s["h"], s["p_dot"], s["L_q"])
         agree(s["p_dot"] - s["L_q"], s["M"] @ s["x"] + s["h"], *terms)
@@ -209,7 +209,7 @@ def test_mass_rate_less_twice_coriolis_is_skew(name, evaluate):
 
 @pytest.mark.parametrize("name", QUADRATIC)
 def test_coriolis_force_is_the_quadratic_part_of_the_bias(name, evaluate):
-    """Even in v and without its value at rest: [h(v) + h(-v)]/2 - h(0) = C v."""
+    """Even in v, without its value at rest: [h(v) + h(-v)]/2 - h(0) = C v."""
     for s in evaluate(name):
         even = (s["h"] + s["h_back"]) / 2 - s["h_rest"]
         terms = (s["h"], s["h_back"], s["h_rest"], norm(s["M"], 2) * s["v"] @ s["v"])
@@ -225,14 +225,14 @@ def test_momentum_is_mass_times_velocity(name, evaluate):
 @pytest.mark.parametrize("name", OF_BOOK)
 def test_energy_is_the_sum_of_kinetic_and_potential(name, evaluate):
     for s in evaluate(name):
-        # V itself is a sum that may cancel, as in 1 - cos: the 1 J stands for its terms.
+        # V may be a sum that cancels, as in 1 - cos: 1 J represents its terms.
         agree(s["H"], s["T"] + s["V"], norm(s["p"]) * s["v"], s["T"], s["V"], 1.0)
         agree(s["T"], s["v"] @ s["M"] @ s["v"] / 2, norm(s["M"], 2) * s["v"] @ s["v"])
 
 
 @pytest.mark.parametrize("name", OF_BOOK)
-def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evaluate):
-    """h = M' v - d(T - V)/dq where p = M v and M is free of time."""
+def test_bias_is_mass_rate_times_velocity_less_lagrangian_gradient(name, evaluate):
+    """h = M' v - d(T - V)/dq for p = M v and M without time."""
     for s in evaluate(name):
         expected = s["M_q"] @ s["v"] @ s["v"] - s["L_q"]
         agree(s["h"], expected, norm(s["M"], 2) * s["v"] @ s["v"], s["L_q"])
@@ -240,7 +240,7 @@ def test_bias_is_the_change_of_mass_less_the_pull_of_the_lagrangian(name, evalua
 
 @pytest.mark.full
 def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate):
-    """None of them holds only because its terms vanish."""
+    """No identity holds only because its terms vanish."""
     large = {
         key: {
             name
@@ -254,7 +254,7 @@ def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate
     assert {"cart_pendulum", "double_pendulum_rayleigh", "mass_spring_dashpot"} <= large["Q"]
     assert large["R"] == CONSTRAINED
     book = set(BOOK)
-    # No potential, and an M that is constant or, of the ball, about 0.02 kg m^2.
+    # No potential, and an M that is constant or, for the ball, about 0.02 kg m^2.
     free = {"disk_on_shaft", "hockey_puck", "hockey_puck_cord", "rolling_ball_no_spin"}
     without = {name for name in book if not np.any(evaluate(name).found["V"])}
     assert free <= book - large["L_q"] <= without
@@ -267,7 +267,7 @@ def test_the_identities_cover_every_system_and_every_kind_of_lagrangian(evaluate
 # ---- Lagrangians with known answers ----------------------------------------------------------
 
 
-def test_a_charge_circles_in_a_magnetic_field(evaluate):
+def test_charge_in_a_magnetic_field_obeys_its_equation(evaluate):
     """m a = e B (v_y, -v_x); p = m v + e A; H = m v^2/2."""
     params, _, q, v, _, _ = random_states("charged")
     found = evaluate("charged").found
@@ -280,7 +280,7 @@ def test_a_charge_circles_in_a_magnetic_field(evaluate):
     assert np.max(abs(found["C"])) == 0.0  # gyroscopic terms are not Coriolis terms
 
 
-def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
+def test_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
     """l theta'' = -g sin(theta) - x_p'' cos(theta), x_p = X cos(Omega t)."""
     params, t, q, v, _, _ = random_states("driven_pivot")
     found = evaluate("driven_pivot").found
@@ -290,7 +290,7 @@ def test_a_pendulum_on_a_driven_pivot_obeys_its_equation(evaluate):
     agree(found["a"][:, 0], expected, g / length, X * omega**2 / length, v**2)
 
 
-def test_a_relativistic_particle_gets_heavier(evaluate):
+def test_relativistic_particle_obeys_its_equation(evaluate):
     """M = gamma m (1 + gamma^2 v v^T/c^2), gamma m a = F - (v . F) v/c^2, H = gamma m c^2 + V."""
     params, _, q, v, _, _ = random_states("relativistic")
     found = evaluate("relativistic").found
@@ -305,17 +305,17 @@ def test_a_relativistic_particle_gets_heavier(evaluate):
     agree(found["p"], gamma * m * v, gamma * m * v)
     agree(found["a"], a, *(np.linalg.cond(M) * norm(g)))
     agree(found["H"], (gamma * m * c**2 + m * g * q[:, :1])[:, 0], m * c**2)
-    # On one line, as in every text book: M = gamma^3 m, a = -g/gamma^3.
-    along = {key: value[0] for key, value in params.items()}
-    g3 = (1 - (1.5 / along["c"]) ** 2) ** -1.5
+    # On one line, as in textbooks: M = gamma^3 m, a = -g/gamma^3.
+    single = {key: value[0] for key, value in params.items()}
+    g3 = (1 - (1.5 / single["c"]) ** 2) ** -1.5
     q, v = jnp.zeros(2), jnp.array([1.5, 0.0])
-    M = jax.jit(RELATIVISTIC.mass_matrix)(q, v, along)
-    a = jax.jit(RELATIVISTIC.acceleration)(q, v, along)
-    np.testing.assert_allclose(M[0, 0], g3 * along["m"], rtol=K * EPS)
-    np.testing.assert_allclose(a, [-along["g"] / g3, 0.0], rtol=K * EPS)
+    M = jax.jit(RELATIVISTIC.mass_matrix)(q, v, single)
+    a = jax.jit(RELATIVISTIC.acceleration)(q, v, single)
+    np.testing.assert_allclose(M[0, 0], g3 * single["m"], rtol=K * EPS)
+    np.testing.assert_allclose(a, [-single["g"] / g3, 0.0], rtol=K * EPS)
 
 
-def test_where_mass_depends_on_velocity_it_must_be_given():
+def test_velocity_must_be_given_if_mass_depends_on_it():
     params = GENERAL["relativistic"].params
     with pytest.raises(
         ValueError,
@@ -331,25 +331,25 @@ def test_where_mass_depends_on_velocity_it_must_be_given():
         RELATIVISTIC.coriolis_matrix([0.0, 0.0], [1.0, 0.0], params)
 
 
-def test_time_reaches_every_method_and_starts_at_zero():
+def test_time_is_read_by_every_method_and_defaults_to_zero():
     params, q, v = GENERAL["bead"].params, jnp.array([0.3]), jnp.array([0.7])
     names = ("mass_matrix", "coriolis_matrix", "momentum", "energy", "bias", "acceleration")
 
     def values(**t):
         return [jnp.ravel(getattr(BEAD, name)(q, v, params, **t)) for name in names]
 
-    silent, zero, later = jax.jit(lambda: (values(), values(t=0.0), values(t=10.0)))()
-    np.testing.assert_array_equal(silent, zero)
+    default, zero, later = jax.jit(lambda: (values(), values(t=0.0), values(t=10.0)))()
+    np.testing.assert_array_equal(default, zero)
     growth = dict(zip(names, np.divide(later, zero), strict=True))
     for name in names[:4]:
         np.testing.assert_allclose(growth[name], 2.0, rtol=K * EPS)  # all grow as m (1 + t/10)
-    assert abs(growth["bias"] - 2) > 0.01  # m' v stays
+    assert abs(growth["bias"] - 2) > 0.01  # m' v is constant
     assert abs(growth["acceleration"] - 1) > 0.01
 
 
 @pytest.mark.full
 def test_a_long_chain_hangs_at_rest():
-    """n = 12, the library solve: hanging straight and at rest it stays; M_ij = m l^2 (n - max)."""
+    """n = 12, the library solve: a straight chain at rest stays; M_ij = m l^2 (n - max)."""
     n, params, zero = 12, {"m": 0.4, "l": 0.3, "g": 9.81}, np.zeros(12)
     a, M = jax.jit(
         lambda: (

@@ -12,7 +12,7 @@ from _systems.mechanics import GENERAL
 import jaxlag as jl
 from systems.catalogue import ENTRIES
 
-K = 32  # roundings of what is summed
+K = 32  # roundings of the summands
 EPS = np.finfo(float).eps
 
 
@@ -20,7 +20,7 @@ EPS = np.finfo(float).eps
 
 
 def springs(t, q, v, params):
-    """Three bodies in the plane, each on a spring from its own anchor, and a wheel theta."""
+    """Three bodies in the plane, each on a spring from a separate anchor, and a wheel theta."""
     at, rate = NET.unflatten(q), NET.unflatten(v)
     m, k = params["m"], params["k"]
     T = 0.5 * jnp.sum(m[:, None] * rate["x"] ** 2) + 0.5 * params["J"] * rate["theta"] ** 2
@@ -83,8 +83,8 @@ def test_params_may_be_a_module():
         ({"power": 2, "law": None, "exact": True}, -6.0),
     ],
 )
-def test_params_may_hold_what_is_no_real_number(extra, expected):
-    """Integers, lists of them, strings, functions, None: Python sees them as they are."""
+def test_params_may_hold_other_values_than_real_numbers(extra, expected):
+    """Integers, lists of them, strings, functions, None: Python receives them unchanged."""
 
     def potential(t, q, params):
         x, law = q[0], params.get("law")
@@ -112,8 +112,8 @@ def test_params_may_be_none():
 # ---- Use ---------------------------------------------------------------------------------------
 
 
-def test_the_methods_pass_through_every_transform():
-    """d(theta'')/dg = -sin(theta)/l, its derivative in theta, over a batch, compiled."""
+def test_methods_work_under_every_transform():
+    """d(theta'')/dg = -sin(theta)/l and its derivative by theta, batched and compiled."""
     entry = ENTRIES["simple_pendulum"]
     params = dict(entry.example.params)
 
@@ -146,7 +146,7 @@ def test_the_state_keeps_its_precision():
         assert jax.eval_shape(lambda m=method: m([1], [0.0])).dtype == jnp.float64
 
 
-def test_kinetic_and_potential_exist_where_declared():
+def test_kinetic_and_potential_exist_only_if_declared():
     entry = ENTRIES["mass_spring"]
     params = {"m": 2.0, "k": 8.0}
     assert float(entry.system.kinetic([1.0], [3.0], params)) == 9.0
@@ -161,7 +161,7 @@ def test_kinetic_and_potential_exist_where_declared():
             getattr(whole, name)([0.5], [3.0], params)
 
 
-def test_systems_of_the_same_functions_are_one():
+def test_systems_of_the_same_functions_are_equal():
     L, Q = (lambda t, q, v, params: 0.5 * v @ v), (lambda t, q, v, params: q)
 
     def declare(**changes):
@@ -182,6 +182,6 @@ def test_systems_of_the_same_functions_are_one():
     assert all(system != declare() for system in different)
 
 
-def test_check_is_silent_where_all_is_well():
+def test_check_returns_none_for_valid_systems():
     case = GENERAL["bead"]
     assert case.system.check(case.q0, [0.1], case.params, t=0.3) is None

@@ -1,6 +1,6 @@
-"""Motions against closed forms.
+"""Motions compared with closed forms.
 
-Tolerances are relative to 1 + |value|. Local errors of 1e-12 add up over some hundred steps.
+Tolerances are relative to 1 + |value|. Local errors of 1e-12 accumulate over some hundred steps.
 """
 
 import jax
@@ -13,11 +13,11 @@ from systems.catalogue import ENTRIES
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 CLOSE = 1e-11
-"""Worst measured: 2e-12, of the angular momentum of the free top."""
+"""Largest error measured: 2e-12, of the angular momentum of the free top."""
 
 
 def move(name, params, q0, u0, times, **options):
-    """The motion from coordinates q0 and quasi-velocities u0, those that vanish left out."""
+    """The motion from coordinates q0 and quasi-velocities u0 without those that vanish."""
     return jl.simulate(
         ENTRIES[name].system,
         q0,
@@ -40,12 +40,12 @@ def exact_motion(name, times, q0, v0, params):
     """(q, v) of the system's closed form at `times`, each (S, n)."""
     q0, v0 = (jnp.asarray(x, float) for x in (q0, v0))
     params = {key: jnp.asarray(value, float) for key, value in params.items()}
-    along = jax.jit(jax.vmap(lambda t: ENTRIES[name].exact(t, q0, v0, params)))
-    return tuple(map(np.asarray, along(jnp.asarray(times))))
+    exact = jax.jit(jax.vmap(lambda t: ENTRIES[name].exact(t, q0, v0, params)))
+    return tuple(map(np.asarray, exact(jnp.asarray(times))))
 
 
 def close_to_exact(name, motion, params, tolerance=CLOSE):
-    """Compare with the closed form from the same start, which it returns."""
+    """Compare with the closed form from the same start; returns the closed form."""
     q, v = exact_motion(name, motion.ts, motion.q[0], motion.v[0], params)
     close(motion.q, q, tolerance)
     close(motion.v, v, tolerance)

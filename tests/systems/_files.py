@@ -1,4 +1,4 @@
-"""Reference files made on the spot: one from a closed form, one from a replayed motion."""
+"""Reference files for tests: one from a closed form, one from a replayed motion."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2
     entry = find("mass_spring")
     x, v = map(np.asarray, entry.exact(np.asarray(times) - times[0], x0, v0, {"m": m, "k": k}))
     T, V = 0.5 * m * v**2, 0.5 * k * x**2
-    rows = {
+    quantities = {
         "q": x[:, None],
         "v": v[:, None],
         "a": (-k / m * x)[:, None],
@@ -22,19 +22,19 @@ def harmonic(*, m=1.3, k=20.0, x0=0.4, v0=0.5, times=(0.0, 0.4, 0.9, 1.3, 2.0, 2
         "extras.p": (m * v)[:, None],
         "extras.p_dot": (-k * x)[:, None],
     }
-    return _file(entry, {"m": m, "k": k}, times, rows)
+    return _file(entry, {"m": m, "k": k}, times, quantities)
 
 
 def recorded(entry: AbstractEntry, times, motion: Motion):
-    """A file of the entry's example that holds every quantity of an already replayed case."""
-    rows = {name: np.asarray(values) for name, values in motion.values.items()}
+    """A file of the entry's example with every quantity of an already replayed case."""
+    quantities = {name: np.asarray(values) for name, values in motion.values.items()}
     if entry.kind == "static":
-        rows = {name: values[0] for name, values in rows.items()}
+        quantities = {name: values[0] for name, values in quantities.items()}
     params = {name: np.asarray(value).tolist() for name, value in entry.example.params.items()}
-    return _file(entry, params, times, rows)
+    return _file(entry, params, times, quantities)
 
 
-def _file(entry: AbstractEntry, params, times, rows):
+def _file(entry: AbstractEntry, params, times, quantities):
     """A file with one case, with the fields and groups of its kind."""
     kind = entry.kind
     case = {
@@ -48,7 +48,7 @@ def _file(entry: AbstractEntry, params, times, rows):
     if kind == "trajectory":
         case |= {"u": None, "lambda": None, "constraint_force": None}
         case |= {"energy": {}, "invariants": {}}
-    for field, values in rows.items():
+    for field, values in quantities.items():
         group, _, member = field.rpartition(".")
         (case[group] if group else case)[member] = values.tolist()
     return {

@@ -13,13 +13,13 @@ from numpy import cos, sin
 
 
 def bordered(M, forces, A, gamma, B=0.0):
-    """(matrix, terms) from M, rows of forces, A and the rows of the terms of gamma."""
+    """(matrix, terms) from M, the forces, A and the terms of gamma."""
     A = np.asarray(A, float)
     m, n = A.shape
     matrix = np.block([[np.asarray(M, float), -(A.T + B)], [A, np.zeros((m, m))]])
-    still, none = np.zeros(m), np.zeros(n)
-    terms = [np.concatenate([force, still]) for force in forces]
-    return matrix, terms + [np.concatenate([none, np.negative(rate)]) for rate in gamma]
+    no_rows, no_forces = np.zeros(m), np.zeros(n)
+    terms = [np.concatenate([force, no_rows]) for force in forces]
+    return matrix, terms + [np.concatenate([no_forces, np.negative(rate)]) for rate in gamma]
 
 
 def lamina_on_parabola(t, q, v, M, Iz, b, xb, yb, g):
@@ -138,10 +138,10 @@ def falling_stick_multiplier(t, q, v, m, L, g):
 
 def falling_stick_friction(t, q, v, m, L, g, mu):
     c, s, w = cos(q[2]), sin(q[2]), v[2]
-    along = mu * np.array([[1.0], [0.0], [0.5 * L * s]])
+    friction = mu * np.array([[1.0], [0.0], [0.5 * L * s]])
     gamma = [[0.5 * L * s * w**2]]
     mass = np.diag([m, m, m * L**2 / 12])
-    return bordered(mass, [[0.0, -m * g, 0.0]], [[0.0, 1.0, -0.5 * L * c]], gamma, along)
+    return bordered(mass, [[0.0, -m * g, 0.0]], [[0.0, 1.0, -0.5 * L * c]], gamma, friction)
 
 
 def slider_crank(t, q, v, r, l, m1, m2, m3, g):  # noqa: E741

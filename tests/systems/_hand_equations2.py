@@ -5,7 +5,7 @@ from numpy import cos, cross, sin
 
 
 def rotating_body_on_frame(t, q, v, M, A, B, C, xb, yb, zb, theta, g, tau, **points):
-    """Euler's equation about O, projected on the two axes of rotation, vertical and shaft."""
+    """Euler's equation about O, projected on both axes of rotation, vertical and shaft."""
     (_, phi), (_, phi_rate) = q, v
     c = np.array([xb, yb, zb])
     inertia = np.diag([A, B, C]) + M * (c @ c * np.eye(3) - np.outer(c, c))
@@ -36,7 +36,7 @@ def physical_pendulum_three_origins(t, q, v, M, Ic, r, alpha, xb, yb, g):
 
 def _lamina(q, v, M, Iz, xb, yb):
     c, s, w = cos(q[2]), sin(q[2]), v[2]
-    X, Y = xb * c - yb * s, xb * s + yb * c  # mass center from O, along x and y
+    X, Y = xb * c - yb * s, xb * s + yb * c  # mass center relative to O, along x and y
     mass = [[M, 0.0, -M * Y], [0.0, M, M * X], [-M * Y, M * X, Iz]]
     return mass, [M * w**2 * X, M * w**2 * Y, 0.0]
 
@@ -92,7 +92,7 @@ def two_link_robot_arm(t, q, v, mA, m, l1, l2, g, tauO0, tauA0, Omega):
 
 
 def motor_forces(t, tauO0, tauA0, Omega):
-    """(Q_theta1, Q_theta2) of the motor at O and of the one at A."""
+    """(Q_theta1, Q_theta2) of the motors at O and at A."""
     tauO, tauA = tauO0 * cos(Omega * t), tauA0 * sin(Omega * t)
     return [[tauO, 0.0], [-tauA, tauA]]
 

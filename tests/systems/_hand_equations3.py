@@ -1,7 +1,7 @@
 """Equations of motion by hand of chapter 3: mass matrix M and terms with M a = sum(terms).
 
-They are the book's, where it has them; the spherical pendulum's are Lagrange's and the
-quadcopter's Newton's and Euler's, with what the rotors do written out.
+They are the book's if it has them. Those of the spherical pendulum are Lagrange's, those of the
+quadcopter are Newton's and Euler's, with the terms of the rotors written out.
 """
 
 import numpy as np
@@ -81,9 +81,9 @@ def quadcopter(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noqa:
         [-f4 * l, -f1 * l, -b * (w2**2 + w4**2)],
         -np.cross(omega, spin),
     ]
-    still = np.zeros(3)
-    return M, [np.concatenate([x, still]) for x in forces] + [
-        np.concatenate([still, x]) for x in torques
+    zeros = np.zeros(3)
+    return M, [np.concatenate([x, zeros]) for x in forces] + [
+        np.concatenate([zeros, x]) for x in torques
     ]
 
 
@@ -116,7 +116,7 @@ def hockey_puck_cord(t, q, v, M, kappa, R, F1, gamma):
 
 
 def push_on_puck(direction, R, F1):
-    """(Q_theta, Q_x, Q_y) of a force at the arm R about the center."""
+    """(Q_theta, Q_x, Q_y) of a force with the lever arm R about the center."""
     return [F1 * R, F1 * cos(direction), F1 * sin(direction)]
 
 

@@ -1,7 +1,7 @@
 """Equations of motion by hand of chapter 4 and of classics: Newton's and Euler's, or Lagrange's.
 
 Each function returns a matrix and terms as in `_hand_equations3`, under constraints as in
-`_hand_constrained`. Angles (phi, theta, psi) are roll, pitch and yaw where nothing else is said.
+`_hand_constrained`. Angles (phi, theta, psi) are roll, pitch and yaw unless stated otherwise.
 """
 
 import numpy as np
@@ -59,7 +59,7 @@ def space_rates(angles, rates):
 
 
 def turning(angles, rates, inertia, torques):
-    """(M, terms) of Euler's equations, moments of `inertia` and torques in body components."""
+    """(M, terms) of Euler's equations; `inertia` and torques are in body components."""
     W, parts = body_rates(angles, rates)
     w = W @ rates
     forces = [-inertia @ part for part in parts] + [-cross(w, inertia @ w)]
@@ -91,9 +91,9 @@ def rigid_aircraft(t, q, v, m, g, xc, yc, zc, Ix, Iy, Iz, Ixy, Ixz, Iyz, Fx, Fy,
     inertia = np.array([[Ix, -Ixy, -Ixz], [-Ixy, Iy, -Iyz], [-Ixz, -Iyz, Iz]])
     lever = m * np.array([[0.0, -zc, yc], [zc, 0.0, -xc], [-yc, xc, 0.0]])
     mass = np.block([[m * np.eye(3), -lever], [lever, inertia]])
-    still = np.zeros(3)
+    zeros = np.zeros(3)
     wrenches = [
-        *(-mass @ [*still, *part] for part in parts),
+        *(-mass @ [*zeros, *part] for part in parts),
         [*(-m * cross(w, cross(w, rc))), *(-cross(w, inertia @ w))],
         [*(m * g * k), *(m * g * cross(rc, k))],
         [Fx, Fy, Fz, Mx, My, Mz],
@@ -113,10 +113,10 @@ def quadcopter_body_axes(t, q, v, m, g, Ix, Iy, Iz, l, k, b, Jr, omega):  # noqa
     ]
     about, terms = turning(q[3:], v[3:], np.diag([Ix, Iy, Iz]), torques)
     M = np.block([[m * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), about]])
-    still = np.zeros(3)
+    zeros = np.zeros(3)
     thrust = -(f1 + f2 + f3 + f4) * attitude(q[3:])[:, 2]
-    terms = [np.concatenate([still, term]) for term in terms]
-    return M, [*terms, np.array([*thrust, *still]), np.array([0.0, 0.0, m * g, *still])]
+    terms = [np.concatenate([zeros, term]) for term in terms]
+    return M, [*terms, np.array([*thrust, *zeros]), np.array([0.0, 0.0, m * g, *zeros])]
 
 
 def tricycle(t, q, v, m, I_body, I_steer, l, d, F_v, tau):  # noqa: E741

@@ -1,4 +1,4 @@
-"""Where the reference files lie, if they are present."""
+"""The folder of the reference files, if they are present."""
 
 import os
 from pathlib import Path

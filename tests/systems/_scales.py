@@ -1,4 +1,4 @@
-"""Sizes of sums, to which rounding is relative."""
+"""Sizes of sums; rounding is relative to these."""
 
 import numpy as np
 

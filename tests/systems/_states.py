@@ -12,7 +12,7 @@ STATES = 8
 def random_states(entry):
     """(t, q, v, params) around the example: q within 0.4 m or rad, v within 3 per s.
 
-    Under constraints moved onto them.
+    Under constraints (q, v) are projected onto them.
     """
     rng = np.random.default_rng(sum(map(ord, entry.name)))
     n = len(entry.coordinates)

@@ -30,14 +30,14 @@ def free_rates(times, moments, w0):
     rate = np.sqrt((C - B) * (square - twice * A) / (A * B * C))
     m = (B - A) * (twice * C - square) / ((C - B) * (square - twice * A))
     even = np.linalg.det(np.eye(3)[[a, b, c]])
-    sense_c = np.sign(w0[c])
-    sense_b = sense_c * np.sign(C - A) * even  # by B wB' = (C - A) wC wA where even
-    sine, cosine = sense_b * w0[b] / np.sqrt(about_b), w0[a] / np.sqrt(about_a)
+    sign_c = np.sign(w0[c])
+    sign_b = sign_c * np.sign(C - A) * even  # by B wB' = (C - A) wC wA if even
+    sine, cosine = sign_b * w0[b] / np.sqrt(about_b), w0[a] / np.sqrt(about_a)
     tau = ellipkinc(np.arctan2(sine, cosine), m) + rate * times
     sn, cn, dn, _ = ellipj(tau, m)
     w = np.empty((len(times), 3))
-    w[:, a], w[:, b] = np.sqrt(about_a) * cn, sense_b * np.sqrt(about_b) * sn
-    w[:, c] = sense_c * np.sqrt(about_c) * dn
+    w[:, a], w[:, b] = np.sqrt(about_a) * cn, sign_b * np.sqrt(about_b) * sn
+    w[:, c] = sign_c * np.sqrt(about_c) * dn
     return w
 
 
@@ -51,7 +51,7 @@ TOPS = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", TOPS)
-def test_the_free_top_turns_by_elliptic_functions(name):
+def test_free_top_agrees_with_elliptic_functions(name):
     moments, w0 = TOPS[name]
     params = dict(zip(("I1", "I2", "I3"), moments, strict=True))
     times, start = np.linspace(0.0, 8.0, 13), (0.3, -0.1, 0.4)
@@ -59,7 +59,7 @@ def test_the_free_top_turns_by_elliptic_functions(name):
     expected = free_rates(times, moments, w0)
     close(motion.u, expected)
     if name == "flip":
-        assert expected[:, 0].min() < -1.4  # turned over
+        assert expected[:, 0].min() < -1.4  # it flipped
     K = [
         space_axes(q) @ (moments * u)
         for q, u in zip(*map(np.asarray, (motion.q, motion.u)), strict=True)
@@ -68,8 +68,8 @@ def test_the_free_top_turns_by_elliptic_functions(name):
 
 
 @pytest.mark.full
-def test_a_torque_free_body_of_the_book_is_the_free_top():
-    """The same declaration under another name, without its torques."""
+def test_torque_free_body_of_the_book_equals_the_free_top():
+    """The same system under another name, without its torques."""
     moments, w0 = TOPS["largest"]
     params = dict(zip(("Ix", "Iy", "Iz"), moments, strict=True))
     params |= dict.fromkeys(("tau1", "tau2", "tau3"), 0.0)
@@ -87,7 +87,7 @@ LAGRANGE = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", LAGRANGE)
-def test_the_heavy_top_nutates_by_elliptic_functions(name):
+def test_heavy_top_agrees_with_elliptic_functions(name):
     """cos(theta) by sn^2 between its turning points, and phi', psi' by the momenta."""
     theta0, (w1, w2, w3) = LAGRANGE[name]
     m, g, l, I1, I3 = 0.5, 9.81, 0.1, 0.008, 0.002  # noqa: E741
@@ -126,8 +126,8 @@ def accelerations(name):
     @jax.jit
     def at(t, q, v, params):
         a = entry.system.acceleration(q, v, params, t=t)
-        along = (jnp.ones_like(t), v, a)
-        return jax.jvp(partial(velocities, entry.system, params), (t, q, v), along)
+        arguments = (jnp.ones_like(t), v, a)
+        return jax.jvp(partial(velocities, entry.system, params), (t, q, v), arguments)
 
     for t, q, v, params in random_states(entry):
         u, u_rate = at(jnp.asarray(t), jnp.asarray(q), jnp.asarray(v), params)
@@ -139,7 +139,7 @@ def velocities(system, params, t, q, v):
 
 
 ROUNDING = 1e-13
-"""Of equations of motion at one state. Worst measured: 1.2e-14, of the aircraft."""
+"""Tolerance of equations of motion at one state. Largest error: 1.2e-14, of the aircraft."""
 
 
 def test_the_tricycle_obeys_the_reduced_equations():
@@ -153,7 +153,7 @@ def test_the_tricycle_obeys_the_reduced_equations():
 
 
 def test_the_printed_tricycle_obeys_its_own_equations():
-    """With the steering torque m v^2 tan(phi), which the consistent one has not."""
+    """With the steering torque m v^2 tan(phi), which the consistent tricycle does not have."""
     for _, q, _, p, u, u_rate in accelerations("tricycle_book_lagrangian"):
         (v, _, _, steer), c, s = u, cos(q[3]), sin(q[3])
         m, l, inertia = p["m"], p["l"], p["I_theta"]  # noqa: E741
@@ -215,14 +215,14 @@ def test_the_quadcopter_obeys_the_body_axis_equations():
     ],
 )
 def test_the_body_obeys_eulers_equations_at_every_angle(name, torques):
-    """Not at small ones alone."""
+    """Not only at small angles."""
     for t, _, _, p, w, w_rate in accelerations(name):
         moments = np.array([p["Ix"], p["Iy"], p["Iz"]])
         left = moments * w_rate + np.cross(w, moments * w)
         close(left, torques(t, w, p), ROUNDING)
 
 
-def test_the_particle_obeys_newton_in_turning_axes():
+def test_particle_obeys_newton_in_rotating_axes():
     """m (V' + w x V) = F, with w of the prescribed attitude."""
     for t, _, _, p, V, V_rate in accelerations("body_axis_translation"):
         angles = p["phi0"] + p["phi1"] * t, p["theta0"] + p["theta1"] * sin(p["nu"] * t)
@@ -267,8 +267,8 @@ MOMENTS, PRODUCTS = ("Ix", "Iy", "Iz"), ("Ixy", "Ixz", "Iyz")
 
 
 @pytest.mark.full
-def test_the_aircraft_moves_alike_from_its_mass_center():
-    """Positions of one point of the body, turns and energies."""
+def test_motion_of_the_aircraft_does_not_depend_on_the_origin():
+    """Positions of one point of the body, attitudes and energies are equal."""
     from_G, rc = about_center(FROM_O)
     angles, V, w = np.array([0.1, 0.2, 0.4]), np.array([18.0, 1.0, 2.0]), np.array([0.3, 0.2, -0.2])
     times, at_O = np.linspace(0.0, 2.0, 6), np.array([10.0, -5.0, -100.0])
@@ -288,32 +288,39 @@ def test_the_aircraft_moves_alike_from_its_mass_center():
 
 @pytest.mark.full
 def test_the_mass_center_of_the_aircraft_falls_freely():
-    """Without forces on a parabola, though O does not."""
+    """Without forces it moves on a parabola, although O does not."""
     p = FROM_O | dict.fromkeys((*FORCE, *TORQUE), 0.0)
     rc, times = np.array([p[name] for name in CENTER]), np.linspace(0.0, 1.5, 6)
     motion = move("rigid_aircraft", p, [0.0] * 6, (5.0, 0.5, -0.4, 0.6, -0.8, 0.5), times)
     fallen = np.array([q[:3] + space_axes(q[3:]) @ rc for q in np.asarray(motion.q)])
     rate = np.array([5.0, 0.5, -0.4]) + np.cross([0.6, -0.8, 0.5], rc)
-    pull = np.array([0.0, 0.0, p["g"]])
-    close(fallen, rc + times[:, None] * rate + 0.5 * times[:, None] ** 2 * pull)
+    gravity = np.array([0.0, 0.0, p["g"]])
+    close(fallen, rc + times[:, None] * rate + 0.5 * times[:, None] ** 2 * gravity)
     close(motion.energy, np.full(6, motion.energy[0]))
 
 
 @pytest.mark.full
-def test_the_force_that_turns_with_yaw_has_its_closed_form():
+def test_motion_under_a_yawing_force_has_its_closed_form():
     """X'' + i Y'' = (Fx + i Fy)/m e^(i psi), psi = psi0 + psi1 t."""
     entry = ENTRIES["body_axis_translation"]
     p = dict.fromkeys(entry.example.params, 0.0)
     p |= {"m": 2.0, "Fx": 1.0, "Fy": -0.5, "Fz": 0.3, "nu": 1.0, "psi0": 0.2, "psi1": 0.9}
     times = np.linspace(0.0, 4.0, 6)
     motion = move("body_axis_translation", p, (0.0, 1.0, -2.0), (3.0, 0.5, -0.2), times)
-    push, turn = (p["Fx"] + 1j * p["Fy"]) / p["m"], np.exp(1j * (p["psi0"] + p["psi1"] * times))
-    rate0 = (3.0 + 0.5j) * turn[0]
-    rate = rate0 + push * (turn - turn[0]) / (1j * p["psi1"])
+    force, rotation = (
+        (p["Fx"] + 1j * p["Fy"]) / p["m"],
+        np.exp(1j * (p["psi0"] + p["psi1"] * times)),
+    )
+    rate0 = (3.0 + 0.5j) * rotation[0]
+    rate = rate0 + force * (rotation - rotation[0]) / (1j * p["psi1"])
     z = 1j + rate0 * times
-    z += push * ((turn - turn[0]) / (1j * p["psi1"]) - turn[0] * times) / (1j * p["psi1"])
+    z += (
+        force
+        * ((rotation - rotation[0]) / (1j * p["psi1"]) - rotation[0] * times)
+        / (1j * p["psi1"])
+    )
     Z = -2.0 - 0.2 * times + 0.5 * p["Fz"] / p["m"] * times**2
     close(motion.q, np.column_stack([z.real, z.imag, Z]))
-    body = rate / turn
+    body = rate / rotation
     w = -0.2 + p["Fz"] / p["m"] * times
     close(motion.u, np.column_stack([body.real, body.imag, w]))

@@ -1,4 +1,4 @@
-"""The catalogue itself: every system collected, described, and running."""
+"""The catalogue itself: every system is collected, is described, and runs."""
 
 import re
 import sys
@@ -32,19 +32,19 @@ def test_every_module_is_collected_under_its_own_name():
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_the_docstring_says_what_the_system_is(name):
+def test_docstring_describes_the_system(name):
     entry = ENTRIES[name]
     doc = MODULES[name].__doc__
     assert 'Pila, "Introduction to Lagrangian Dynamics", ch. ' in doc
     assert "\nParameters" in doc
-    for word in (*entry.coordinates, *entry.quasi_velocities, *entry.parameter_units):
-        assert re.search(rf"\b{word}\b", doc), word
+    for name_in_doc in (*entry.coordinates, *entry.quasi_velocities, *entry.parameter_units):
+        assert re.search(rf"\b{name_in_doc}\b", doc), name_in_doc
     head, _ = doc.split("\n\nCoordinate")
     assert sum(line.startswith("    ") for line in head.splitlines()) >= 4  # the sketch
 
 
 @pytest.mark.parametrize("name", ENTRIES)
-def test_the_book_place_is_that_of_the_docstring(name):
+def test_docstring_contains_the_place_in_the_book(name):
     doc = " ".join(MODULES[name].__doc__.split())
     entry = ENTRIES[name]
     for figure in re.findall(r"\d\.\d+[a-c]?", entry.book):
@@ -74,7 +74,7 @@ def test_list_names_every_system_once(capsys):
 
 
 @pytest.mark.full
-def test_quasi_velocities_that_vanish_stand_among_the_constraints_alone(capsys):
+def test_vanishing_quasi_velocities_are_listed_only_as_constraints(capsys):
     assert main(["run", "chaplygin_sleigh"]) == 0
     head, *others = capsys.readouterr().out.split("\n\n")[1].splitlines()
     units = ("m", "m", "rad", "m/s", "rad/s", "J")
@@ -89,7 +89,7 @@ def test_a_parameter_may_be_an_array(capsys):
     assert "omega = (516, 512, 511, 515) rad/s" in capsys.readouterr().out
 
 
-def test_an_unknown_name_gets_its_neighbors(capsys):
+def test_unknown_name_gets_the_nearest_names(capsys):
     with pytest.raises(UnknownSystem, match=r"'duble_pendulum'\. Did you mean double_pendulum"):
         find("duble_pendulum")
     with pytest.raises(UnknownSystem, match=r"'zzz'\. Known: rotating_body_on_frame, disk_"):
@@ -98,7 +98,7 @@ def test_an_unknown_name_gets_its_neighbors(capsys):
     assert "Did you mean central_motion" in capsys.readouterr().err
 
 
-def test_a_name_of_no_system_is_no_attribute():
+def test_unknown_system_is_not_an_attribute():
     with pytest.raises(AttributeError, match="'systems' has no attribute 'duble_pendulum'"):
         systems.duble_pendulum  # noqa: B018
     with pytest.raises(ImportError):
@@ -120,7 +120,7 @@ def declare(**changes):
     return Entry(**(fields | changes))
 
 
-def test_an_entry_speaks_of_one_system():
+def test_inconsistent_entry_is_refused():
     assert declare().coordinates == ("x",)
     with pytest.raises(ValueError, match=r"free: coordinate_units must have one value for each"):
         declare(coordinate_units=("m", "rad"))
@@ -144,7 +144,7 @@ def test_an_entry_speaks_of_one_system():
 
 
 @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry.chart])
-def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
+def test_chart_satisfies_the_constraints_at_its_coordinates(name):
     entry = ENTRIES[name]
     rng = np.random.default_rng(5)
     params = dict(entry.example.params)
@@ -167,9 +167,9 @@ def test_a_chart_keeps_its_own_coordinates_and_the_constraints(name):
     ),
 )
 def test_plot_writes_a_figure(name, suffix, tmp_path, capsys):
-    """A motion, a state of rest, a prescribed motion; the first two under constraints, too.
+    """A motion, an equilibrium, a prescribed motion; the first two also under constraints.
 
-    And a motion by quasi-velocities.
+    Also a motion in quasi-velocities.
     """
     path = tmp_path / f"figure{suffix}"
     assert main(["run", name, "--plot", str(path)]) == 0
@@ -177,7 +177,7 @@ def test_plot_writes_a_figure(name, suffix, tmp_path, capsys):
     assert str(path) in capsys.readouterr().out
 
 
-def test_plot_says_why_it_cannot(tmp_path, capsys, monkeypatch):
+def test_plot_gives_the_reason_for_a_failure(tmp_path, capsys, monkeypatch):
     assert main(["run", "mass_spring", "--plot", str(tmp_path / "no" / "figure.png")]) == 1
     assert "--plot must name a file that can be written, but" in capsys.readouterr().err
     assert main(["run", "mass_spring", "--plot", str(tmp_path / "figure.abc")]) == 1
@@ -191,4 +191,4 @@ def test_invariants_are_constant_within_the_tolerance_of_the_run():
     entry = ENTRIES["central_motion"]
     found = dict(drifts(entry, simulate_example(entry)))
     assert set(found) == {"p_phi"}
-    assert found["p_phi"] < 100 * TOLERANCE  # 100: the local errors of some tens of steps add up
+    assert found["p_phi"] < 100 * TOLERANCE  # 100: local errors of some tens of steps accumulate

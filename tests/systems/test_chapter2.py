@@ -1,8 +1,8 @@
-"""Chapter 2: kinetic energies and forces by two routes, by hand and by points and poses.
+"""Chapter 2: kinetic energies and forces by two derivations, by hand and by points and poses.
 
-With J_i = dr/dq_i, a velocity sum(J_i v_i) carries errors of a few eps in each J_i v_i, so T, the
-sum of m |velocity|^2/2, carries a few eps of (sum sqrt(M_ii) |v_i|)^2/2 (Minkowski's inequality,
-M_ii = sum(m |J_i|^2)). With K = 32 roundings allowed, two routes agree to K eps times that.
+With J_i = dr/dq_i, a velocity sum(J_i v_i) has errors of a few eps in each J_i v_i, so that T, the
+sum of m |velocity|^2/2, has an error of a few eps of (sum sqrt(M_ii) |v_i|)^2/2 (Minkowski's
+inequality, M_ii = sum(m |J_i|^2)). With K = 32 roundings allowed, both agree to K eps times that.
 """
 
 from math import atan2
@@ -38,7 +38,7 @@ def rotating_body_on_frame(t, q, v, M, A, B, C, xb, yb, zb, theta, **others):
 
 
 def disk_pose(t, q, params):
-    """The disk's axes and its center, which moves with them on the tilted shaft."""
+    """The axes of the disk, and its center, which is fixed to them on the tilted shaft."""
     R = jl.rotation.zxz.matrix((q[0] + jnp.pi / 2, params["theta"], q[1]))
     return R, R @ jnp.array([0.0, 0.0, params["s"]])
 
@@ -62,7 +62,7 @@ def lamina_double_pendulum(t, q, v, M, Iz, r, xb, yb, g):
 
 
 def rotating_slender_rod(t, q, v, rho, L, R, **others):
-    """The rod about the pin O: its own axis is body Y, radially outward at theta2 = pi/2."""
+    """The rod about the pin O: its axis is body Y, radially outward at theta2 = pi/2."""
     M, about_O = rho * L, rho * L**3 / 3
     rod = jl.energy.RigidBody(M, (about_O, 0.0, about_O), (0.0, L / 2, 0.0))
 
@@ -100,7 +100,7 @@ KINETIC = {
 
 
 @pytest.mark.parametrize("name", mostly_full(KINETIC, "lamina_two_forces", "two_link_robot_arm"))
-def test_T_is_the_same_by_another_route(name):
+def test_kinetic_energy_agrees_with_another_derivation(name):
     entry = ENTRIES[name]
 
     @jax.jit
@@ -119,12 +119,12 @@ def from_pivot(p):
     return third, third + np.array([p["xb"], p["yb"], 0.0])
 
 
-def test_the_pendulum_has_one_energy_from_three_origins():
-    """The errors are those of the parts of l^2, which add up to (r + |c|)^2, c = (xb, yb)."""
+def test_energy_of_the_pendulum_is_equal_from_three_origins():
+    """The errors are those of the parts of l^2, whose sum is (r + |c|)^2, c = (xb, yb)."""
     entry = ENTRIES["physical_pendulum_three_origins"]
     for t, q, v, p in random_states(entry):
         third, center = from_pivot(p)
-        hang = -np.pi / 2 - atan2(center[1], center[0])  # turns the center to below the pivot
+        hang = -np.pi / 2 - atan2(center[1], center[0])  # rotates the center to below the pivot
         l2_parts = (p["r"] + np.hypot(p["xb"], p["yb"])) ** 2
         inertia, lever = p["Ic"] + p["M"] * l2_parts, l2_parts / np.linalg.norm(center)
         for origin in (np.zeros(3), center, third):
@@ -167,7 +167,7 @@ def potential_of_the_arm(t, q, mA, m, l1, l2, g, **others):
         ("two_link_robot_arm", potential_of_the_arm),
     ],
 )
-def test_V_is_the_weight_by_hand(name, by_hand):
+def test_potential_equals_the_weight_by_hand(name, by_hand):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         V, scale = by_hand(t, q, **params)
@@ -195,8 +195,8 @@ def motors(t, q, tauO0, tauA0, Omega, **others):
         ("two_link_robot_arm", motors),
     ],
 )
-def test_generalized_forces_are_those_by_hand(name, by_hand):
-    """To K eps times the forces themselves: no lever here is as long as 1 m."""
+def test_generalized_forces_equal_those_by_hand(name, by_hand):
+    """To K eps times the forces: no lever arm here is as long as 1 m."""
     entry = ENTRIES[name]
     for t, q, v, params in random_states(entry):
         terms = by_hand(t, q, **params)
@@ -206,7 +206,7 @@ def test_generalized_forces_are_those_by_hand(name, by_hand):
 
 
 def velocity_in_body_axes(pose, r, t, q, v, params):
-    """Velocity of R r by its derivative, turned back, and the size of its terms."""
+    """Velocity of R r by its derivative, in body axes, and the size of its terms."""
 
     def position(t, q, params):
         return pose(t, q, params)[0] @ r
@@ -216,8 +216,8 @@ def velocity_in_body_axes(pose, r, t, q, v, params):
     return R.T @ jl.energy.velocity(position, t, q, v, params), size
 
 
-def test_the_particle_on_the_frame_moves_as_the_book_says():
-    """2.6 and 2.7."""
+def test_velocity_of_the_particle_on_the_frame_agrees_with_the_book():
+    """Equations 2.6 and 2.7."""
     for t, q, v, p in random_states(FRAME):
         r2 = np.array([p["x2"], p["y2"], p["z2"]])
         origin, size2 = velocity_in_body_axes(frame_pose, r2, t, q, v, p)
@@ -230,8 +230,8 @@ def test_the_particle_on_the_frame_moves_as_the_book_says():
         np.testing.assert_allclose(found, origin + relative, rtol=0, atol=tolerance)
 
 
-def test_the_disk_turns_and_its_particle_moves_as_the_book_says():
-    """2.8 to 2.10 and 2.14."""
+def test_rates_of_the_disk_and_its_particle_agree_with_the_book():
+    """Equations 2.8 to 2.10 and 2.14."""
     for t, q, v, p in random_states(DISK):
         from_bend = np.array([p["x"], p["y"], p["z"] + p["s"]])
         expected, size = velocity_in_body_axes(disk_pose, from_bend, t, q, v, p)
@@ -251,7 +251,7 @@ def test_the_disk_turns_and_its_particle_moves_as_the_book_says():
         np.testing.assert_allclose(found, size, rtol=0, atol=tolerance)
 
 
-def test_the_moment_on_the_load_is_the_closed_form():
+def test_moment_on_the_load_equals_the_closed_form():
     """m l2 [l2 theta2'' + l1 (theta1'' cos(d) + theta1'^2 sin(d))] with d = theta2 - theta1."""
     entry = ENTRIES["two_link_robot_arm"]
     for t, q, v, p in random_states(entry):

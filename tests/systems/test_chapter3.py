@@ -1,6 +1,6 @@
-"""Chapter 3: energies, forces and reactions by two routes, by hand and by points and poses.
+"""Chapter 3: energies, forces and reactions by two derivations, by hand and by points and poses.
 
-Whichever of the two stands in the system's file, the other stands here.
+If the system's file has one of the two, this file has the other.
 """
 
 import jax
@@ -31,7 +31,7 @@ def straight(t, q, v, *masses):
 
 
 def planar(mass, about_origin, pose, t, q, v, center=(0.0, 0.0, 0.0)):
-    """T of a body in the plane; `pose(q)` gives its turn and the x, y of its origin."""
+    """T of a body in the plane; `pose(q)` gives its angle and the x, y of its origin."""
 
     def in_space(t, q, _):
         angle, x, y = pose(q)
@@ -42,7 +42,7 @@ def planar(mass, about_origin, pose, t, q, v, center=(0.0, 0.0, 0.0)):
 
 
 def on_strings(lengths, q):
-    """Positions of bobs, each hung from the one before, angles q from the downward vertical."""
+    """Positions of bobs, each suspended from the one before; q from the downward vertical."""
     links = jnp.stack(lengths)[:, None] * jnp.stack([sin(q), -cos(q)], axis=1)
     return jnp.cumsum(links, axis=0)
 
@@ -170,7 +170,7 @@ KINETIC = {
 @pytest.mark.parametrize(
     "name", mostly_full(KINETIC, "cart_pendulum", "spherical_pendulum_elastic", "quadcopter")
 )
-def test_T_is_the_same_by_another_route(name):
+def test_kinetic_energy_agrees_with_another_derivation(name):
     entry = ENTRIES[name]
 
     @jax.jit
@@ -190,11 +190,11 @@ POTENTIAL = {
     ],
     "falling_stick": lambda q, m, L, g: [0.5 * m * g * L * np.sin(q[1])],
 }
-"""Name -> terms of V by hand, where points stand in the file."""
+"""Name -> terms of V by hand, if the file has points."""
 
 
 @pytest.mark.parametrize("name", POTENTIAL)
-def test_V_by_points_is_that_by_hand(name):
+def test_potential_by_points_equals_that_by_hand(name):
     entry = ENTRIES[name]
     for t, q, _, params in random_states(entry):
         terms = POTENTIAL[name](q, **params)
@@ -203,7 +203,7 @@ def test_V_by_points_is_that_by_hand(name):
 
 
 def rotor_forces(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noqa: E741
-    """Q of thrust and torques; those of the angles are W^T times torques on the body axes."""
+    """Q of thrust and torques; those of the angles are W^T times the torques in body axes."""
     psi, theta, phi = q[3:]
     psi_rate, theta_rate, phi_rate = v[3:]
     c_th, s_th, c_ph, s_ph = np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi)
@@ -224,8 +224,8 @@ def rotor_forces(t, q, v, m, Ix, Iy, Iz, l, g, k, b, Im, w1, w2, w3, w4):  # noq
         *(b * w**2 * about_z for w in (w1, w3)),
         *(-b * w**2 * about_z for w in (w2, w4)),
     ]
-    still = np.zeros(3)
-    return [np.append(x, still) for x in forces] + [np.append(still, x) for x in torques]
+    zeros = np.zeros(3)
+    return [np.append(x, zeros) for x in forces] + [np.append(zeros, x) for x in torques]
 
 
 FORCES = {
@@ -239,11 +239,11 @@ FORCES = {
     "hockey_puck": lambda t, q, v, R, F1, **others: [push_on_puck(q[0], R, F1)],
     "hockey_puck_cord": lambda t, q, v, R, F1, gamma, **others: [push_on_puck(gamma, R, F1)],
 }
-"""Name -> terms of Q by hand, dampers left out, where forces at points stand in the file."""
+"""Name -> terms of Q by hand without dampers, if the file has forces at points."""
 
 
 @pytest.mark.parametrize("name", FORCES)
-def test_forces_at_points_have_the_hand_generalized_forces(name):
+def test_forces_at_points_equal_generalized_forces_by_hand(name):
     entry = ENTRIES[name]
     drives = [force.name for force in entry.system.forces if not isinstance(force, jl.Rayleigh)]
     for t, q, v, params in random_states(entry):
@@ -278,7 +278,7 @@ def sleeve_end_force(t, q, v, params):
         ("sleeve_pendulum", "drive", jl.PointForce(sleeve_end, sleeve_end_force, "end")),
     ],
 )
-def test_hand_generalized_forces_are_those_of_points(name, by_hand, by_point):
+def test_generalized_forces_by_hand_equal_those_of_points(name, by_hand, by_point):
     system = ENTRIES[name].system
     for t, q, v, params in random_states(ENTRIES[name]):
         Q = system.generalized_force(q, v, params, t=t, names=[by_hand])
@@ -313,8 +313,10 @@ def along_string(force, q, params):
         ("falling_stick", normal_force, "m", stick_center, lambda force, q, params: force[1]),
     ],
 )
-def test_reactions_are_what_mass_times_acceleration_lacks(name, reaction, mass, center, component):
-    """m (a_G - g) of the mass center, whatever the accelerations are."""
+def test_reactions_equal_mass_times_acceleration_less_gravity(
+    name, reaction, mass, center, component
+):
+    """m (a_G - g) of the mass center, for any accelerations."""
     rng = np.random.default_rng(3)
     for t, q, v, params in random_states(ENTRIES[name]):
         a = rng.uniform(-5.0, 5.0, len(q))

@@ -1,4 +1,4 @@
-"""The check: right files pass, and no number of a file can be wrong unnoticed."""
+"""The check: right files pass, and every wrong number of a file is detected."""
 
 import json
 import re
@@ -34,7 +34,7 @@ def places(raw, path=()):
 
 
 def nudged(raw, path):
-    """A copy of the file with one number moved by 1e-6, relative and absolute."""
+    """A copy of the file with one number changed by 1e-6, relative and absolute."""
     raw = json.loads(json.dumps(raw), parse_int=float)
     *parents, last = path
     target = raw
@@ -45,13 +45,13 @@ def nudged(raw, path):
 
 
 PLAIN = "cart_pendulum", "atwood_multipliers", "chaplygin_sleigh"
-"""With a force of time, multipliers, quasi-velocities."""
+"""With a time-dependent force, multipliers, quasi-velocities."""
 
 KINDS = (
     *("spherical_pendulum_elastic", "falling_stick_friction", "heavy_symmetric_top"),
     *("carnival_ride", "sleeve_pendulum_equilibrium", "link_spring_mass_equilibrium"),
 )
-"""One each with cyclic coordinates, reactions, L in u, a motion given, a state of rest or two."""
+"""Cyclic coordinates, reactions, L in u, a prescribed motion, one and several equilibria."""
 
 
 @pytest.mark.full
@@ -79,7 +79,7 @@ def test_the_reference_file_is_reproduced(name):
 
 
 def replayed(entry, times):
-    """The entry's example, replayed as a case of its kind would be."""
+    """The entry's example, replayed as a case of its kind."""
     params = {name: np.asarray(value) for name, value in entry.example.params.items()}
     if entry.kind == "static":
         return replay_rest(entry, params)
@@ -90,8 +90,8 @@ def replayed(entry, times):
 
 
 @pytest.mark.parametrize("name", mostly_full([*PLAIN, *KINDS], *PLAIN))
-def test_every_wrong_number_is_found(name):
-    """Each number of each compared field in turn, the first rows of derived fields included."""
+def test_every_wrong_number_is_detected(name):
+    """Each number of each compared field in turn, including the first saves of derived fields."""
     entry = ENTRIES[name]
     times = np.linspace(0.0, min(2.0, getattr(entry.example, "duration", 2.0)), 6)
     motion = replayed(entry, times)
@@ -102,18 +102,20 @@ def test_every_wrong_number_is_found(name):
     compared = [
         path for path in places(raw) if path[2] not in ("params", "times", "error_estimate")
     ]
-    assert len(compared) == sum(rows.size for rows in motion.values.values())
+    assert len(compared) == sum(values.size for values in motion.values.values())
     for path in compared:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
-        row = next((key for key in path[2:] if isinstance(key, int)), 0)
-        row = 0 if entry.kind == "static" else row
+        index = next((key for key in path[2:] if isinstance(key, int)), 0)
+        index = 0 if entry.kind == "static" else index
         (case,) = read(nudged(raw, path)).cases
         outside = [deviation for deviation in compare(case, motion.values) if not deviation.ok]
-        assert [(deviation.field, deviation.time_index) for deviation in outside] == [(field, row)]
+        assert [(deviation.field, deviation.time_index) for deviation in outside] == [
+            (field, index)
+        ]
 
 
-def test_a_prescribed_motion_is_the_input():
-    """The forces are those of the file's own q, v, a; the file's motion must be the system's."""
+def test_prescribed_motion_of_the_file_is_the_input():
+    """The forces are those of the file's q, v, a; the motion in the file must be the system's."""
     entry = ENTRIES["carnival_ride"]
     times = np.linspace(0.0, 2.0, 6)
     raw = json.loads(json.dumps(recorded(entry, times, replayed(entry, times))), parse_int=float)
@@ -129,7 +131,7 @@ def test_a_prescribed_motion_is_the_input():
     )
 
 
-def test_a_state_of_rest_that_is_not_found_is_a_failure(tmp_path, capsys):
+def test_missing_equilibrium_fails_the_check(tmp_path, capsys):
     """Without a spring the sleeve falls: the file cannot be right."""
     entry = ENTRIES["sleeve_pendulum_equilibrium"]
     raw = recorded(entry, None, replayed(entry, None))
@@ -153,7 +155,7 @@ def test_a_right_file_passes(tmp_path, capsys):
     "path", list(places(harmonic())), ids=lambda path: ".".join(map(str, path[2:]))
 )
 def test_a_wrong_number_fails_the_command(path, tmp_path, capsys):
-    """Each number of a file that is right in turn, the start and the parameters included."""
+    """Each number of a right file in turn, including the start and the parameters."""
     status = main(["check", written(tmp_path / "wrong.json", nudged(harmonic(), path))])
     out = capsys.readouterr().out
     if path[2] == "error_estimate":
@@ -165,12 +167,12 @@ def test_a_wrong_number_fails_the_command(path, tmp_path, capsys):
     is_input = path[2] in ("params", "times") or path[2:4] in (("q", 0), ("v", 0))
     if not is_input:
         field = ".".join(key for key in path[2:] if isinstance(key, str))
-        row = next(key for key in path[2:] if isinstance(key, int))
-        assert f"in {field}, row {row}; out of tolerance: {field}\n" in out
+        index = next(key for key in path[2:] if isinstance(key, int))
+        assert f"in {field}, row {index}; out of tolerance: {field}\n" in out
 
 
 def test_other_cases_of_a_known_system_pass(tmp_path):
-    """Any parameters, start, times and number of rows: a late start, backwards, a single row."""
+    """Any parameters, start, times and number of saves: a late start, backward, a single save."""
     variants = [
         harmonic(m=0.2, k=55.0, x0=-1.5, v0=3.0, times=(0.0, 0.5, 0.6, 2.0, 4.0, 6.0)),
         harmonic(times=(7.5, 7.75, 9.0, 11.0, 11.5, 12.0)),
@@ -182,7 +184,7 @@ def test_other_cases_of_a_known_system_pass(tmp_path):
 
 
 def test_new_numbers_do_not_compile_again():
-    """One compilation per system and number of rows."""
+    """One compilation per system and number of saves."""
     entry = ENTRIES["mass_spring"]
     (first,) = read(harmonic()).cases
     (second,) = read(harmonic(m=2.0, x0=-0.1, times=(0.0, 0.1, 0.2, 0.5, 0.7, 1.0))).cases
@@ -193,8 +195,8 @@ def test_new_numbers_do_not_compile_again():
     assert [program._cache_size() for program in compiled] == counts
 
 
-def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
-    """A negative stiffness explodes: the file is right at its start and nowhere else."""
+def test_failed_motion_fails_the_check(tmp_path, capsys):
+    """A negative stiffness diverges: the file is right only at its start."""
     raw = harmonic()
     raw["cases"][0]["params"]["k"] = -1e9
     assert main(["check", written(tmp_path / "wrong.json", raw)]) == 1
@@ -202,10 +204,10 @@ def test_a_motion_that_fails_is_a_failure(tmp_path, capsys):
 
 
 def test_a_refused_file_does_not_hide_the_others(tmp_path, capsys):
-    bad, nameless = harmonic(), harmonic() | {"system": None}
-    bad["cases"][0]["energy"]["W"] = [0.0] * 6
+    wrong, nameless = harmonic(), harmonic() | {"system": None}
+    wrong["cases"][0]["energy"]["W"] = [0.0] * 6
     files = [
-        written(tmp_path / "bad.json", bad),
+        written(tmp_path / "bad.json", wrong),
         written(tmp_path / "right.json", harmonic()),
         str(tmp_path / "none.json"),
         written(tmp_path / "nameless.json", nameless),

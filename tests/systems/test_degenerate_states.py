@@ -1,4 +1,4 @@
-"""Rest, zero and equal coordinates: derivatives are right, or a status says what is singular."""
+"""Rest, zero and equal coordinates: derivatives are right, or a status names the singularity."""
 
 from functools import cache
 
@@ -12,8 +12,8 @@ from systems.catalogue import ENTRIES, Entry
 
 HALF = np.pi / 2
 
-# Where the coordinates of a system say nothing: what is singular there, and how a motion ends
-# that starts there. Everywhere else its equations are regular.
+# States at which the coordinates of a system are singular: the reason, and the status of a motion
+# that starts there. Everywhere else the equations are regular.
 SINGULAR = {
     ("central_motion", "r = 0: phi has no inertia"): ([0.0, 0.3], [0.2, 0.1], "mass_singular"),
     ("spherical_pendulum_fixed", "vertical string: theta has no inertia"): (
@@ -70,7 +70,7 @@ def test_a_singular_start_is_named(name, place):
 
 
 def singular(name, q):
-    """Whether the coordinates are at a place of the table."""
+    """Whether the coordinates are at a state of the table."""
     at_zero = {
         "central_motion": [0],
         "spherical_pendulum_fixed": [1],
@@ -81,7 +81,7 @@ def singular(name, q):
 
 
 def states(name):
-    """Degenerate (q, v); on the constraints, where there are any."""
+    """Degenerate (q, v), on the constraints if there are any."""
     q0, v0 = (jnp.asarray(x, float) for x in ENTRIES[name].start())
     zero = jnp.zeros_like(q0)
     found = {"rest": (q0, zero)}
@@ -111,7 +111,7 @@ def derivatives(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_derivatives_at_degenerate_states(name):
+def test_derivatives_at_degenerate_states_are_right(name):
     """Gradient and Hessian of the accelerations: both modes, and differences."""
     of = derivatives(name)
     for place, (q, v) in states(name).items():
@@ -131,6 +131,6 @@ def test_derivatives_at_degenerate_states(name):
         h = 1e-3
         for k, expected in ((0, gradient @ d), (1, hessian @ d)):
             once, twice = difference(h, k), difference(h / 2, k)
-            # h^2 error: that of the extrapolation is below its last correction; rounding eps / h.
+            # Error h^2: that of the extrapolation is below its last correction; rounding eps / h.
             allowed = np.abs(twice - once).max() + 1e-9 * (1.0 + np.abs(expected).max())
             np.testing.assert_allclose((4 * twice - once) / 3, expected, rtol=0, atol=allowed)

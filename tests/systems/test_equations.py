@@ -1,10 +1,10 @@
-"""Accelerations and multipliers against the equations of motion derived by hand.
+"""Accelerations and multipliers against equations of motion derived by hand.
 
-Each function returns the book's mass matrix and the terms on the right-hand side, so that
-M a = sum(terms); under constraints M is bordered by their rows and the solution is (a, lam). The
-hand solution and the engine's both carry rounding of relative size eps cond(M) in the solve, and
-of a few eps in every term; with K = 32 roundings allowed, they agree to
-K eps cond(M) |M^-1| sum(|terms|).
+Each function returns the book's mass matrix and the terms of the right-hand side, so that M a =
+sum(terms). Under constraints M is bordered by their rows and the solution is (a, lam). The
+solutions by hand and by jaxlag have rounding of relative size eps cond(M) from the solve, and of a
+few eps in every term. With K = 32 roundings allowed, they agree to K eps cond(M) |M^-1|
+sum(|terms|).
 """
 
 from functools import partial
@@ -55,7 +55,7 @@ def double_pendulum_rayleigh(t, q, v, m1, m2, h1, h2, g, c1x, c1y, c2x, c2y):
     dx1, dy1 = np.array([h1 * cos(q[0]), 0.0]), np.array([h1 * sin(q[0]), 0.0])
     dx2, dy2 = np.array([dx1[0], h2 * cos(q[1])]), np.array([dy1[0], h2 * sin(q[1])])
     drag = ((c1x, dx1), (c1y, dy1), (c2x, dx2), (c2y, dy2))
-    return M, terms + [-c * (row @ v) * row for c, row in drag]
+    return M, terms + [-c * (direction @ v) * direction for c, direction in drag]
 
 
 def mass_spring_dashpot(t, q, v, m, k, b, g, F0, Omega):
@@ -134,15 +134,15 @@ MOVING = [name for name, entry in ENTRIES.items() if entry.kind == "trajectory"]
 
 def evaluate(entry, params, t, q, v):
     """Every quantity, dL/dq, Q, and dH/dt along the motion."""
-    rows = quantities(entry, params, t, q, v)
+    values = quantities(entry, params, t, q, v)
 
     def energy(t, q, v):
         return entry.system.energy(q, v, params, t=t)
 
-    return rows | {
+    return values | {
         "dL_dq": jax.grad(entry.system.lagrangian, argnums=1)(t, q, v, params),
         "Q": entry.system.generalized_force(q, v, params, t=t),
-        "H_dot": jax.jvp(energy, (t, q, v), (1.0, v, rows["a"]))[1],
+        "H_dot": jax.jvp(energy, (t, q, v), (1.0, v, values["a"]))[1],
     }
 
 
@@ -154,11 +154,11 @@ PLAIN = (
 
 @pytest.fixture(scope="module", params=mostly_full(MOVING, *PLAIN))
 def evaluated(request, lowering):
-    """An entry with its quantities at random states: (entry, [((t, q, v, params), rows), ...])."""
+    """An entry with its values at random states: (entry, [((t, q, v, params), values), ...])."""
     entry = ENTRIES[request.param]
-    rows = jax.jit(partial(evaluate, entry))
+    values = jax.jit(partial(evaluate, entry))
     states = random_states(entry)
-    return entry, [((t, q, v, params), rows(params, t, q, v)) for t, q, v, params in states]
+    return entry, [((t, q, v, params), values(params, t, q, v)) for t, q, v, params in states]
 
 
 def test_every_system_has_its_hand_equations():
@@ -169,58 +169,58 @@ def test_random_states_are_on_the_constraints(evaluated):
     entry, pairs = evaluated
     for (t, q, v, params), _ in pairs if entry.constraints else []:
         positions, rates = entry.system.residuals(q, v, params, t=t)
-        for rows, size in ((positions, 1 + norm(q)), (rates, 1 + norm(v))):
-            for residual in rows.values():
+        for residuals, size in ((positions, 1 + norm(q)), (rates, 1 + norm(v))):
+            for residual in residuals.values():
                 np.testing.assert_allclose(residual, 0.0, rtol=0, atol=K * EPS * size**2)
 
 
-def test_accelerations_are_those_of_the_book(evaluated):
-    """And the multipliers, where there are any."""
+def test_accelerations_equal_those_of_the_book(evaluated):
+    """The multipliers, too, if there are any."""
     entry, pairs = evaluated
-    for (t, q, v, params), rows in pairs:
+    for (t, q, v, params), values in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
         expected = np.linalg.solve(M, np.sum(terms, axis=0))
         size = norm(np.linalg.inv(M), 2) * np.sum(norm(terms, axis=1))
         tolerance = K * EPS * np.linalg.cond(M) * size
-        found = np.concatenate([rows["a"], rows.get("lambda", [])])
+        found = np.concatenate([values["a"], values.get("lambda", [])])
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
 
 
-def test_momenta_change_by_lagrange_equations(evaluated):
-    """dp/dt along the motion, a derivative of p, is dL/dq + Q + A^T lam: two routes to one number.
+def test_momenta_obey_lagrange_equations(evaluated):
+    """dp/dt along the motion, a derivative of p, equals dL/dq + Q + A^T lam.
 
-    The route through a multiplies its error by M, hence the condition number.
+    The derivation through a multiplies its error by M, hence the condition number.
     """
     entry, pairs = evaluated
-    for (t, q, v, params), rows in pairs:
+    for (t, q, v, params), values in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
         size = 1 + np.sum(norm(terms, axis=1))
         tolerance = K * EPS * np.linalg.cond(M) * size
-        expected = rows["dL_dq"] + rows["Q"] + rows.get("constraint_force", 0.0)
-        np.testing.assert_allclose(rows["extras.p_dot"], expected, rtol=0, atol=tolerance)
+        expected = values["dL_dq"] + values["Q"] + values.get("constraint_force", 0.0)
+        np.testing.assert_allclose(values["extras.p_dot"], expected, rtol=0, atol=tolerance)
 
 
 def test_energy_changes_by_the_power_of_the_forces(evaluated):
-    """dH/dt = v . (Q + A^T lam), for no Lagrangian here contains the time."""
+    """dH/dt = v . (Q + A^T lam), because no Lagrangian here contains the time."""
     entry, pairs = evaluated
-    for (t, q, v, params), rows in pairs:
+    for (t, q, v, params), values in pairs:
         M, terms = HAND_EQUATIONS[entry.name](t, q, v, **params)
-        power = v @ (rows["Q"] + rows.get("constraint_force", 0.0))
+        power = v @ (values["Q"] + values.get("constraint_force", 0.0))
         size = norm(v) * (1 + np.sum(norm(terms, axis=1)))
         tolerance = K * EPS * np.linalg.cond(M) * size
-        np.testing.assert_allclose(rows["H_dot"], power, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(values["H_dot"], power, rtol=0, atol=tolerance)
 
 
 MOVED = ("spherical_pendulum_varying", "particle_on_surface", "rolling_ball_turntable")
-"""Systems with constraints that move by themselves."""
+"""Systems with constraints that depend on time."""
 
 
 def test_constraints_at_rest_do_no_work(evaluated):
-    """v . A^T lam = 0 where no row contains the time; otherwise it is not."""
+    """v . A^T lam = 0 if no row contains the time; otherwise it is not zero."""
     entry, pairs = evaluated
-    led = entry.name in MOVED
-    for (_, _, v, _), rows in pairs if entry.constraints else []:
-        force = rows["constraint_force"]
+    moving = entry.name in MOVED
+    for (_, _, v, _), values in pairs if entry.constraints else []:
+        force = values["constraint_force"]
         rounding = K * EPS * norm(v) * norm(force)
-        assert (abs(v @ force) > 1e6 * rounding) == led
-        assert led or abs(v @ force) <= rounding
+        assert (abs(v @ force) > 1e6 * rounding) == moving
+        assert moving or abs(v @ force) <= rounding

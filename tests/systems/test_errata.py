@@ -1,4 +1,4 @@
-"""The errata: what is printed is wrong and what is said to be right is what the engine finds."""
+"""The errata: printed formulas are wrong, and the corrected ones agree with jaxlag."""
 
 import re
 from dataclasses import replace
@@ -20,7 +20,7 @@ by_place = pytest.mark.parametrize(
 
 
 @by_place
-def test_the_right_formula_is_the_engine_s_and_the_printed_one_is_not(erratum):
+def test_corrected_formula_agrees_with_jaxlag_and_the_printed_one_does_not(erratum):
     errors = examine(erratum)
     assert errors.right <= TOLERANCE
     assert errors.printed > WRONG
@@ -77,8 +77,8 @@ def test_the_command_prints_one_line_for_each(capsys):
 
 
 @pytest.mark.parametrize("field", ["right", "printed"])
-def test_what_is_not_confirmed_fails_the_command(field, monkeypatch, capsys):
-    """A right formula that is as wrong as the printed one; a printed one that is right."""
+def test_unconfirmed_erratum_fails_the_command(field, monkeypatch, capsys):
+    """A corrected formula that is as wrong as the printed one; a printed one that is right."""
     first, second, *_ = ERRATA
     other = {"right": second.printed, "printed": second.right}[field]
     monkeypatch.setattr(errata, "ERRATA", (first, replace(second, **{field: other})))
@@ -95,14 +95,14 @@ def test_a_right_formula_without_a_value_is_not_confirmed(value):
     assert not confirmed(errors)
 
 
-def test_a_formula_of_another_shape_than_the_engine_s_is_refused():
+def test_formula_of_another_shape_is_refused():
     with pytest.raises(
         ValueError, match=r"1\.15.* what the engine does, shape \(\), but it .*\(3,"
     ):
         examine(replace(ERRATA[0], right=lambda s: s.q))
 
 
-def test_states_are_drawn_around_what_is_given():
+def test_states_are_drawn_around_the_given_one():
     draw = around({"m": 2.0}, (1.0, -1.0), (0.5, 0.0), dq=(0.1, 0.0), dv=0.2, da=0.0)
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -132,16 +132,16 @@ def test_rows_of_the_tricycle_need_no_approximation():
     rng = np.random.default_rng(2)
     for theta, phi, v, phi_rate in rng.uniform(-1.2, 1.2, (5, 4)):
         q = jnp.array([0.3, -0.2, theta, phi])
-        along, turn = v * np.cos(phi), v * np.sin(phi) / 1.2
-        rates = jnp.array([along * np.cos(theta), along * np.sin(theta), turn, phi_rate])
+        speed, turn_rate = v * np.cos(phi), v * np.sin(phi) / 1.2
+        rates = jnp.array([speed * np.cos(theta), speed * np.sin(theta), turn_rate, phi_rate])
         speeds = tricycle_as_printed(q, rates)
         np.testing.assert_allclose(speeds, [v, 0.0, 0.0, phi_rate], rtol=1e-14, atol=1e-15)
         Theta_rate = jax.jvp(tricycle_Theta, (q,), (rates,))[1]
         eta = jax.jacfwd(tricycle_as_printed)(q, rates).T
-        rows = np.linalg.solve(tricycle_Theta(q), Theta_rate - eta)[[0, 3]]
+        found = np.linalg.solve(tricycle_Theta(q), Theta_rate - eta)[[0, 3]]
         slope, cT = np.tan(phi), np.cos(theta)
         exact = [[phi_rate * slope, 0, -phi_rate * cT, 0], [-v * slope, 0, v * cT, 0]]
-        np.testing.assert_allclose(rows, exact, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(found, exact, rtol=1e-13, atol=1e-14)
 
 
 def test_matrix_of_the_tricycle_is_singular_across_the_x_axis():

@@ -1,4 +1,4 @@
-"""Motions in closed form: the equations hold along them; solvers and derivatives arrive there."""
+"""Motions in closed form: the equations hold along them; solvers and derivatives agree."""
 
 import diffrax
 import jax
@@ -14,7 +14,7 @@ from systems.catalogue import ENTRIES
 
 EXACT = [name for name, entry in ENTRIES.items() if getattr(entry, "exact", None) is not None]
 TIED = {"atwood_multipliers": {"R"}, "vertical_rolling_disk": {"R"}}
-"""Parameters to which the rates of the start are tied by a constraint."""
+"""Parameters that a constraint couples to the rates of the start."""
 
 
 def example(name):
@@ -41,11 +41,11 @@ def test_the_equations_hold_along_the_exact_motion(name):
     close(q[0], q0, 1e-14)
     close(v[0], v0, 1e-14)
     close(q_rate, v, 1e-13)
-    close(v_rate, a, 1e-13)  # worst measured: 3e-14, of the mass with spring and dashpot
+    close(v_rate, a, 1e-13)  # largest error: 3e-14, of the mass with spring and dashpot
 
 
 @pytest.mark.parametrize("name", mostly_full(EXACT, "simple_pendulum"))
-def test_the_motion_is_the_exact_one(name):
+def test_motion_agrees_with_the_exact_one(name):
     entry, params, q0, v0 = example(name)
     times = np.linspace(0.0, entry.example.duration, 7)
     motion = jl.simulate(entry.system, q0, v0, times, params, **TIGHT)
@@ -53,7 +53,7 @@ def test_the_motion_is_the_exact_one(name):
 
 
 def steps(method):
-    """(options of `method`, the error of the pendulum in 2 s that they may leave)."""
+    """(options of `method`, allowed error of the pendulum after 2 s)."""
     solver = METHODS[method]()
     order = solver.order(None)
     if order <= 2:
@@ -101,21 +101,21 @@ def flat(tree):
 
 @pytest.mark.parametrize("derivative", mostly_full((jax.jacrev, jax.jacfwd), jax.jacrev))
 @pytest.mark.parametrize("name", mostly_full(EXACT, "simple_pendulum"))
-def test_gradients_are_those_of_the_exact_motion(name, derivative):
+def test_gradients_equal_those_of_the_exact_motion(name, derivative):
     end, exact, x = ends(name)
     close(flat(jax.jit(derivative(end))(x)), flat(jax.jit(jax.jacfwd(exact))(x)), 1e-9)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("mode", ["recorded", "checkpoints", "forward"])
-def test_gradients_in_every_mode(mode):
-    """Damped and driven, so that params enter the forces, too."""
+def test_gradients_of_every_mode_equal_the_exact_ones(mode):
+    """Damped and driven, so that params also enter the forces."""
     end, exact, x = ends("disk_on_moving_cart", gradient=mode)
     close(flat(jax.jit(jax.jacrev(end))(x)), flat(jax.jit(jax.jacfwd(exact))(x)), 1e-9)
 
 
 @pytest.mark.full
-def test_second_derivatives_are_those_of_the_exact_motion():
+def test_second_derivatives_equal_those_of_the_exact_motion():
     end, exact, x = ends("simple_pendulum")
     found = jax.jit(jax.jacfwd(jax.jacrev(end)))(x)
     close(flat(found), flat(jax.jit(jax.jacfwd(jax.jacfwd(exact)))(x)), 1e-8)

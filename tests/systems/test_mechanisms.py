@@ -15,11 +15,11 @@ from systems import four_bar, n_link_loop, slider_crank
 from systems.catalogue import Chart
 
 TIGHT = {"method": "tsit5", "rtol": 1e-12, "atol": 1e-12}
-"""Of low order, for which less is compiled."""
+"""Of low order, which compiles less."""
 
 TIMES = np.linspace(0.0, 1.0, 6)
 AGREEMENT = 1e-9
-"""Between two motions, whose local errors of 1e-12 add up over some hundred steps."""
+"""Between two motions whose local errors of 1e-12 accumulate over some hundred steps."""
 
 
 # ---- In one coordinate, with the loop closed by hand ---------------------------------------------
@@ -55,8 +55,8 @@ CLOSED = {
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", CLOSED)
-def test_the_motion_is_that_in_one_coordinate(name):
-    """L of the crank alone; turns of the crank, q and v of all links, and the reactions."""
+def test_motion_equals_that_in_one_coordinate(name):
+    """L of the crank alone; angle of the crank, q and v of all links, and the reactions."""
     module, chart = CLOSED[name]
     entry = module.entry
     params, (q0, v0) = dict(entry.example.params), entry.start()
@@ -81,8 +81,8 @@ def test_the_motion_is_that_in_one_coordinate(name):
 
     a = jax.vmap(accelerations)(jnp.asarray(TIMES), alone.q, alone.v, alone.a)
     lam = np.stack([whole.lam[row] for row in entry.constraints], axis=1)
-    for row, found in enumerate(lam):
-        force = force_on_last_head(module, params, *(np.asarray(x[row]) for x in (q, v, a)))
+    for i, found in enumerate(lam):
+        force = force_on_last_head(module, params, *(np.asarray(x[i]) for x in (q, v, a)))
         np.testing.assert_allclose(found, force, rtol=0, atol=AGREEMENT * np.max(np.abs(lam)))
     if name == "slider_crank":
         size = AGREEMENT * np.max(np.abs(lam))
@@ -90,7 +90,7 @@ def test_the_motion_is_that_in_one_coordinate(name):
 
 
 def force_on_last_head(module, params, q, v, a):
-    """By the moments of all links about the first tail, and of the last link about its own."""
+    """By the moments of all links about the first tail, and of the last link about its tail."""
     if module is n_link_loop:
         masses, lengths = np.full(q.shape, params["m"]), np.full(q.shape, params["l"])
     else:
@@ -101,8 +101,8 @@ def force_on_last_head(module, params, q, v, a):
 def pin_force(masses, lengths, g, q, v, a):
     q, v, a = (x[: len(masses)] for x in (q, v, a))
     links = (lengths * np.array([cos(q), sin(q)])).T
-    turned = (lengths * np.array([-sin(q), cos(q)])).T
-    pulls = turned * a[:, None] - links * v[:, None] ** 2  # second derivatives of the links
+    normals = (lengths * np.array([-sin(q), cos(q)])).T
+    pulls = normals * a[:, None] - links * v[:, None] ** 2  # second derivatives of the links
     heads, accelerations = np.cumsum(links, axis=0), np.cumsum(pulls, axis=0)
     forces = masses[:, None] * (accelerations - 0.5 * pulls + [0.0, g])
     spins = masses * lengths**2 / 12 * a
@@ -120,11 +120,11 @@ def cross(r, F):
     return r[:, 0] * F[:, 1] - r[:, 1] * F[:, 0]
 
 
-# ---- Assembled -----------------------------------------------------------------------------------
+# ---- Assembly ------------------------------------------------------------------------------------
 
 
 def test_the_four_bar_is_assembled_from_a_guess_that_is_20_percent_wrong():
-    """To the law of cosines, the crank held, whichever way the guess is wrong."""
+    """Compared with the law of cosines; the crank is held; errors of either sign."""
     module, chart = CLOSED["four_bar"]
     entry = module.entry
     params = dict(entry.example.params)
@@ -156,14 +156,14 @@ def nodes(q, ends):
 
 def rods(t, q, v, params):
     """Slender rods by the rates of their ends: T = m (v1^2 + v1 . v2 + v2^2)/6 each."""
-    still = jnp.zeros((2, 2))
-    r, rate = nodes(q, still), nodes(v, still)
+    zeros = jnp.zeros((2, 2))
+    r, rate = nodes(q, zeros), nodes(v, zeros)
     T = params["m"] / 6 * jnp.sum(rate[1:] ** 2 + rate[1:] * rate[:-1] + rate[:-1] ** 2)
     return T - params["m"] * params["g"] * jnp.sum(r[:, 1])  # each rod is half at either end
 
 
 def stretches(t, q, params):
-    """Squares of the distances between joints, less those of the lengths [m^2]."""
+    """Squared distances between joints less squared lengths [m^2]."""
     pins = jnp.stack([jnp.zeros(2), params["d"] * jnp.array([1.0, 0.0])])
     between = jnp.diff(nodes(q, pins), axis=0)
     return jnp.sum(between**2, axis=1) - params["l"] ** 2
@@ -197,8 +197,8 @@ def loop_states(count):
 
 
 @pytest.mark.full
-def test_the_loop_accelerates_as_in_cartesian_coordinates():
-    """And its pin is pulled as Newton's law for the links asks."""
+def test_acceleration_of_the_loop_equals_the_cartesian_one():
+    """The force on its pin is that of Newton's law for the links."""
 
     @jax.jit
     def both(q, v):
@@ -217,8 +217,8 @@ def test_the_loop_accelerates_as_in_cartesian_coordinates():
 
 
 @pytest.mark.full
-def test_the_loop_hangs_as_a_catenary_of_links():
-    """tan(theta_k) = (k - (n + 1)/2) m g/H with the tension H; each pin bears half the weight."""
+def test_equilibrium_of_the_loop_is_a_catenary_of_links():
+    """tan(theta_k) = (k - (n + 1)/2) m g/H with tension H; each pin carries half the weight."""
     guess = np.linspace(-0.9, 1.0, LINKS)
     rest = jl.equilibrium(ANGLES, guess, LOOP)
     weight, H = LOOP["m"] * LOOP["g"], rest.multipliers["pin_x"]
@@ -229,7 +229,7 @@ def test_the_loop_hangs_as_a_catenary_of_links():
 
 
 @pytest.mark.full
-def test_the_loop_moves_as_in_cartesian_coordinates():
+def test_motion_of_the_loop_equals_the_cartesian_one():
     (q, v), times = next(loop_states(1)), np.linspace(0.0, 2.0, 9)
     angles = jl.simulate(ANGLES, q, v, times, LOOP, **TIGHT)
     start = TO_JOINTS.state(0.0, q, v, LOOP)

@@ -1,7 +1,7 @@
-"""One motion, whichever way it is found: by multipliers, on the tangent space, by quasi-velocities.
+"""One motion by all formulations: multipliers, null space and quasi-velocities.
 
-Every system of the catalogue that has constraints and quasi-velocities, from the start of its
-example; deviations are relative to 1 + |value|.
+Every system of the catalogue with constraints and quasi-velocities, from the start of its example;
+deviations are relative to 1 + |value|.
 """
 
 import jax
@@ -15,7 +15,7 @@ from systems.catalogue import ENTRIES
 
 TIGHT = {"method": "tsit5", "rtol": 1e-12, "atol": 1e-12}
 FEW_STAGES = TIGHT | {"method": "bosh3", "max_steps": 32768}
-"""Of low order: less is compiled, more so with derivatives; the steps are many."""
+"""Of low order: less is compiled, especially with derivatives; the steps are many."""
 
 STATE, REACTION, GRADIENT = 1e-10, 1e-9, 1e-8
 """Largest deviation of q, v and u, of lambda, and of derivatives."""
@@ -34,7 +34,7 @@ def simulate(entry, formulation, q0, params, **options):
 
 
 def free_start(entry):
-    """(q0, u0 of those that do not vanish) of the example."""
+    """(q0, u0 without those that vanish) of the example."""
     q0, v0 = entry.start()
     u0 = entry.system.quasi_velocities(q0, v0, entry.example.params)
     vanish = [entry.quasi_velocities.index(name) for name in entry.constraints]
@@ -62,20 +62,20 @@ def same_motion(entry, one, other):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
-def test_quasi_velocities_move_as_velocities_do(name):
-    """From u0 or from v0; multipliers of the dropped rows are those of the bordered equations."""
+def test_quasi_velocities_give_the_motion_of_multipliers(name):
+    """From u0 or from v0; multipliers of the omitted rows equal those of the bordered equations."""
     entry = ENTRIES[name]
     params, (q0, v0) = dict(entry.example.params), entry.start()
     by_v = simulate(entry, "multipliers", q0, params, v0=v0)
     by_u = simulate(entry, "auto", q0, params, u0=by_name(entry, free_start(entry)[1]))
     same_motion(entry, by_u, by_v)
-    for row in entry.constraints:  # kept by construction, not by projection
+    for row in entry.constraints:  # by construction, not by projection
         close(by_u[row], np.zeros(5), 1e-14)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", FEW)
-def test_quasi_velocities_move_as_on_the_tangent_space(name):
+def test_quasi_velocities_give_the_motion_of_the_null_space(name):
     entry = ENTRIES[name]
     params, (q0, v0) = dict(entry.example.params), entry.start()
     by_null_space = simulate(entry, "null_space", q0, params, v0=v0)
@@ -84,7 +84,7 @@ def test_quasi_velocities_move_as_on_the_tangent_space(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", FEW)
-def test_rows_written_out_are_those_of_quasi_velocities(name):
+def test_explicit_rows_give_the_motion_of_quasi_velocities(name):
     """The same system declared without them, its constraints by `jl.Pfaffian`."""
     entry = ENTRIES[name]
     system, (q0, v0) = entry.system, entry.start()
@@ -110,10 +110,11 @@ def test_rows_written_out_are_those_of_quasi_velocities(name):
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
-def test_derivatives_are_the_same_in_both_forms(name):
-    """Of an end quantity, by start and parameters, along starts that obey the constraints.
+def test_derivatives_are_equal_in_both_formulations(name):
+    """Of an end quantity, by start and parameters, along starts that satisfy the constraints.
 
-    Every component backwards of a few systems; of all of them forwards, in a random direction.
+    A few systems in reverse mode, every component; all others in forward mode, in a random
+    direction.
     """
     entry = ENTRIES[name]
     (q0, u0), system = free_start(entry), entry.system
@@ -132,8 +133,8 @@ def test_derivatives_are_the_same_in_both_forms(name):
 
     params = {key: jnp.asarray(value, float) for key, value in entry.example.params.items()}
     values = params, q0, u0
-    flat, back = ravel_pytree(values)
-    direction = back(jnp.asarray(np.random.default_rng(3).normal(size=flat.size)))
+    flat, unravel = ravel_pytree(values)
+    direction = unravel(jnp.asarray(np.random.default_rng(3).normal(size=flat.size)))
 
     def derivative(form):
         if name in FEW:

@@ -1,4 +1,4 @@
-"""What rolls and slides, moved by quasi-velocities: closed forms, reduced equations by hand."""
+"""Rolling and sliding bodies in quasi-velocities: closed forms, reduced equations by hand."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ SLEIGH = {"m": 2.0, "I": 0.9, "a": 0.5}
 
 @pytest.mark.full
 @pytest.mark.parametrize(("v0", "omega0"), [(-1.2, 0.3), (0.5, -1.5)])
-def test_the_sleigh_moves_by_hyperbolic_functions(v0, omega0):
+def test_sleigh_agrees_with_hyperbolic_functions(v0, omega0):
     times, start = np.linspace(0.0, 6.0, 7), (1.0, -0.5, -0.2)
     motion = move("chaplygin_sleigh", SLEIGH, start, {"v": v0, "omega": omega0}, times)
     close_to_exact("chaplygin_sleigh", motion, SLEIGH)
@@ -29,8 +29,8 @@ def test_the_sleigh_moves_by_hyperbolic_functions(v0, omega0):
 
 
 @pytest.mark.full
-def test_the_sleigh_ends_forwards_from_every_start():
-    """At v = sqrt(2 T/m); from backwards it has turned by pi sqrt(J/m)/a then."""
+def test_sleigh_ends_in_forward_motion_from_every_start():
+    """At v = sqrt(2 T/m); after backward motion it has rotated by pi sqrt(J/m)/a."""
     m, a, J = SLEIGH["m"], SLEIGH["a"], SLEIGH["I"] + SLEIGH["m"] * SLEIGH["a"] ** 2
     starts = np.array([[-1.0, 1e-6], [-1.0, -1e-6], [-0.3, 0.9], [0.0, -1.1], [0.7, 0.2]])
     ends = [0.0, 90.0]  # e^(-kappa t) of the slowest is below 1e-16 then
@@ -61,20 +61,20 @@ def suslov(times, I1, I2, I3, I13, I23, wx, wy):
     size, delta = np.hypot(*D), np.arctan2(D[1], D[0])
     s0 = np.arctan2(wy / ay, wx / ax) - delta
     tau = size * times + np.arctanh(sin(s0))
-    up, along = np.tanh(tau), np.sign(cos(s0)) / np.cosh(tau)
+    up, parallel = np.tanh(tau), np.sign(cos(s0)) / np.cosh(tau)
     wx, wy = (
-        ax * (along * cos(delta) - up * sin(delta)),
-        ay * (up * cos(delta) + along * sin(delta)),
+        ax * (parallel * cos(delta) - up * sin(delta)),
+        ay * (up * cos(delta) + parallel * sin(delta)),
     )
-    push = I13 * wx + I23 * wy
-    lam = -I13 * push * wy / I1 + I23 * push * wx / I2 + (I2 - I1) * wx * wy
+    force = I13 * wx + I23 * wy
+    lam = -I13 * force * wy / I1 + I23 * force * wx / I2 + (I2 - I1) * wx * wy
     return np.column_stack([wx, wy, lam])
 
 
 @pytest.mark.full
 @pytest.mark.parametrize(("wx", "wy"), [(0.8, -0.5), (-0.9, 0.1)])
-def test_the_suslov_body_turns_by_hyperbolic_functions(wx, wy):
-    """On either way from one direction to its opposite; the angles stay off gimbal lock."""
+def test_suslov_body_agrees_with_hyperbolic_functions(wx, wy):
+    """In both ways from one direction to its opposite; the angles avoid gimbal lock."""
     times = np.linspace(0.0, 2.0, 6)
     motion = move("suslov", SUSLOV, (0.1, 0.2, 0.0), {"wx": wx, "wy": wy}, times)
     found = np.column_stack([motion["wx"], motion["wy"], motion.lam["wz"]])
@@ -85,7 +85,7 @@ def test_the_suslov_body_turns_by_hyperbolic_functions(wx, wy):
 
 @pytest.mark.full
 def test_the_suslov_body_ends_about_one_fixed_direction():
-    """I13 wx + I23 wy = 0, whose sense is that of s = delta + pi/2, whatever the start."""
+    """I13 wx + I23 wy = 0, in the direction of s = delta + pi/2, for any start."""
     starts = np.array([[0.02, 0.05], [-0.04, 0.03], [0.05, -0.02], [-0.05, 0.001]])
     params = SUSLOV | {"I13": 1.1, "I23": -0.9}  # fast enough to be there before gimbal lock
 
@@ -108,8 +108,8 @@ def test_the_suslov_body_ends_about_one_fixed_direction():
 def turntable(times, m, a, I, Omega, g, alpha, z0, rate0):  # noqa: E741
     """(z, z', z'') of z = x + i y from (1 + k) z'' = i k Omega z' + g sin(alpha)."""
     k = I / (m * a**2)
-    w, push = k * Omega / (1 + k), g * sin(alpha) / (1 + k)
-    drift = 1j * push / w
+    w, acceleration = k * Omega / (1 + k), g * sin(alpha) / (1 + k)
+    drift = 1j * acceleration / w
     turn = np.exp(1j * w * times)
     z = z0 + drift * times + (rate0 - drift) * (turn - 1) / (1j * w)
     return z, drift + (rate0 - drift) * turn, 1j * w * (rate0 - drift) * turn
@@ -117,10 +117,10 @@ def turntable(times, m, a, I, Omega, g, alpha, z0, rate0):  # noqa: E741
 
 @pytest.mark.full
 @pytest.mark.parametrize(("k", "alpha"), [(2 / 5, 0.0), (2 / 3, 0.002)], ids=["level", "tilted"])
-def test_the_ball_goes_round_the_turntable(k, alpha):
-    """At 2/7 (solid) and 2/5 (hollow) of the table's rate, once; on the tilt it drifts, too.
+def test_ball_on_a_turntable_agrees_with_its_closed_form(k, alpha):
+    """At 2/7 (solid) and 2/5 (hollow) of the table's rate, once; on the tilt it also drifts.
 
-    A ball so large that it does not come to gimbal lock.
+    The ball is so large that it does not reach gimbal lock.
     """
     params = {"m": 0.3, "a": 1.0, "I": 0.3 * k, "Omega": 3.0, "g": 9.81, "alpha": alpha}
     rate = {2 / 5: 2 / 7, 2 / 3: 2 / 5}[k] * params["Omega"]
@@ -140,15 +140,15 @@ def test_the_ball_goes_round_the_turntable(k, alpha):
     close(motion.lam["s_y"], force.imag)
     drift = 1j * params["g"] * sin(alpha) / (k * params["Omega"]) * times[-1]
     close(motion.q[-1, :2], [(z0 + drift).real, (z0 + drift).imag])
-    assert np.ptp(motion.energy) > 1e-3 * motion.energy[0]  # the table works
+    assert np.ptp(motion.energy) > 1e-3 * motion.energy[0]  # the table does work
 
 
 # ---- Disks and edges -----------------------------------------------------------------------------
 
 
 @pytest.mark.full
-def test_the_upright_disk_goes_round_a_circle():
-    """Of radius R theta'/phi', once."""
+def test_upright_disk_rolls_on_a_circle():
+    """One circle of radius R theta'/phi'."""
     params = {"m": 1.2, "R": 0.4, "I": 0.1, "J": 0.05, "tau_theta": 0.0, "tau_phi": 0.0}
     roll, turn, phi0 = 3.0, -0.8, 0.3
     times = np.linspace(0.0, 2 * np.pi / abs(turn), 7)
@@ -158,9 +158,9 @@ def test_the_upright_disk_goes_round_a_circle():
     phi, radius = phi0 + turn * times, params["R"] * roll / turn
     x, y = 0.1 + radius * (sin(phi) - sin(phi0)), -0.2 - radius * (cos(phi) - cos(phi0))
     close(motion.q, np.column_stack([x, y, 0.5 + roll * times, phi]))
-    push = params["m"] * params["R"] * roll * turn
+    force = params["m"] * params["R"] * roll * turn
     lam = np.column_stack([motion.lam["s_x"], motion.lam["s_y"]])
-    close(lam, push * np.column_stack([-sin(phi), cos(phi)]))
+    close(lam, force * np.column_stack([-sin(phi), cos(phi)]))
 
 
 @pytest.mark.full
@@ -181,21 +181,21 @@ def test_the_upright_disk_is_driven_along_a_spiral():
 def test_the_knife_edge_does_not_slide_down_the_slope(v0, turn, phi0):
     """From rest x stays below g sin(alpha)/(2 phi'^2): a cycloid across the slope."""
     params = {"m": 1.5, "J": 0.2, "g": 9.81, "alpha": 0.3}
-    times, pull = np.linspace(0.0, 6.0, 7), params["g"] * sin(params["alpha"])
+    times, gravity = np.linspace(0.0, 6.0, 7), params["g"] * sin(params["alpha"])
     u0 = {"v": v0, "phidot": turn}
     motion = move("knife_edge_incline", params, (0.0, 0.0, phi0), u0, times)
     q, _ = close_to_exact("knife_edge_incline", motion, params)
     phi = phi0 + turn * times
-    v = v0 + pull / turn * (sin(phi) - sin(phi0))
+    v = v0 + gravity / turn * (sin(phi) - sin(phi0))
     close(motion["v"], v)
-    close(motion.lam["v_n"], -params["m"] * (v * turn + pull * sin(phi)))
+    close(motion.lam["v_n"], -params["m"] * (v * turn + gravity * sin(phi)))
     if v0 == 0:
-        close(q[:, 0], pull / (2 * turn**2) * sin(turn * times) ** 2, 1e-15)
+        close(q[:, 0], gravity / (2 * turn**2) * sin(turn * times) ** 2, 1e-15)
 
 
 @pytest.mark.full
 def test_the_nonholonomic_particle_slows_by_its_constraint():
-    """Not by the L into which the constraint is put: that has another motion."""
+    """Not by the L with the constraint inserted: that has another motion."""
     m, start, (x_rate, y_rate) = 2.5, (1.0, -1.3, -0.5), (-0.7, 1.1)
     times = np.linspace(0.0, 3.0, 6)
     u0 = {"xdot": x_rate, "ydot": y_rate}
@@ -204,17 +204,17 @@ def test_the_nonholonomic_particle_slows_by_its_constraint():
     y, c = q[:, 1], x_rate * np.sqrt(1 + start[1] ** 2)
     close(motion.lam["s"], m * c * y_rate / (1 + y**2) ** 1.5)  # m z'' of z' = c y/root
 
-    def too_early(t, q, v, params):
+    def inserted_constraint(t, q, v, params):
         return 0.5 * m * (v[0] ** 2 * (1 + q[1] ** 2) + v[1] ** 2)
 
-    wrong = jl.System(too_early, ("x", "y"))
+    wrong = jl.System(inserted_constraint, ("x", "y"))
     other = jl.simulate(wrong, start[:2], (x_rate, y_rate), times, **TIGHT)
     assert np.max(np.abs(other["y"] - y)) > 0.1
 
 
 @pytest.mark.full
-def test_the_disk_rolls_steadily():
-    """Where w1' = 0 by hand: inclined, its center on a circle about a point at rest."""
+def test_steady_rolling_of_the_disk_has_its_closed_form():
+    """By hand for w1' = 0: inclined, its center on a circle about a point at rest."""
     m, R, I_d, I_a, g = 1.0, 0.5, 0.0625, 0.125, 9.81
     theta, w2, psi0 = 1.1, 1.4, 0.3
     c, s = cos(theta), sin(theta)
@@ -228,13 +228,13 @@ def test_the_disk_rolls_steadily():
     x, y = 0.2 + radius * (sin(psi) - sin(psi0)), 0.1 - radius * (cos(psi) - cos(psi0))
     phi = (w3 - turn * c) * times
     close(motion.q, np.column_stack([x, y, psi, np.full(7, theta), phi]))
-    push = m * radius * turn**2
+    force = m * radius * turn**2
     lam = np.column_stack([motion.lam["s_x"], motion.lam["s_y"]])
-    close(lam, push * np.column_stack([-sin(psi), cos(psi)]))
+    close(lam, force * np.column_stack([-sin(psi), cos(psi)]))
 
 
 @pytest.mark.full
-def test_the_disk_wobbles_by_the_reduced_equations():
+def test_disk_obeys_the_reduced_equations():
     m, R, I_d, I_a, g = 0.8, 0.4, 0.03, 0.07, 9.81
     times = np.linspace(0.0, 2.0, 7)
 
@@ -263,7 +263,7 @@ def test_the_disk_wobbles_by_the_reduced_equations():
 
 
 def by_dop853(rates, start, times):
-    """The solution at `times` of the reduced equations."""
+    """The solution of the reduced equations at `times`."""
     span, method = (times[0], times[-1]), "DOP853"
     found = solve_ivp(rates, span, start, method, t_eval=times, rtol=1e-13, atol=1e-14)
     return found.y.T
@@ -273,7 +273,7 @@ def by_dop853(rates, start, times):
 
 
 @pytest.mark.full
-def test_the_ball_keeps_energy_and_momentum_about_the_contact():
+def test_ball_conserves_energy_and_momentum_about_the_contact():
     """By hand, not by the file: I omega + a n x m r', with n from contact to center."""
     params = {"m": 1.3, "a": 0.3, "I1": 0.02, "I2": 0.03, "I3": 0.045}
     u0 = {"wx": 0.9, "wy": 0.6, "wz": -0.7}
@@ -312,7 +312,7 @@ def board_rates(t, state, m, r, J, J_r, J_w, a_psi, w_psi, a_phi, w_phi):
 
 @pytest.mark.full
 @pytest.mark.parametrize("torques", [NO_TORQUE, GAIT], ids=["coasting", "gait"])
-def test_the_snakeboard_moves_by_the_reduced_equations(torques):
+def test_snakeboard_obeys_the_reduced_equations(torques):
     params, times = BOARD | torques, np.linspace(0.0, 6.0, 7)
     start = [0.0, 0.0, 0.1, 0.2, 0.1, 0.0 if torques is GAIT else 1.5, 0.4, 0.25]
     start[7] = 0.833 if torques is GAIT else 0.1
@@ -322,7 +322,7 @@ def test_the_snakeboard_moves_by_the_reduced_equations(torques):
     close(np.column_stack([motion.q, motion.u[:, :3]]), expected)
     momentum = BOARD["J_r"] * (motion.rate("theta") + motion.rate("psi"))
     if torques is GAIT:
-        assert np.hypot(*(motion.q[-1, :2] - motion.q[0, :2])) > 1.0  # driven from inside alone
+        assert np.hypot(*(motion.q[-1, :2] - motion.q[0, :2])) > 1.0  # by internal torques alone
         assert np.ptp(momentum) > 0.1
     else:
         close(momentum, np.full(7, momentum[0]))

@@ -1,4 +1,4 @@
-"""Reference files are read strictly: every departure from the format is a named error."""
+"""Reference files are read strictly: every deviation from the format is a named error."""
 
 import copy
 import json
@@ -42,7 +42,7 @@ def as_parsed(raw):
     return json.loads(json.dumps(raw), parse_int=float)
 
 
-def test_a_good_file_is_read_as_it_stands():
+def test_valid_file_is_read_unchanged():
     raw = as_parsed(harmonic())
     reference = read(copy.deepcopy(raw))
     (case,) = reference.cases
@@ -56,7 +56,7 @@ def test_a_good_file_is_read_as_it_stands():
     }
 
 
-def test_optional_fields_may_stand_and_may_be_absent():
+def test_optional_fields_may_be_present_or_absent():
     for place in [
         (*CASE, "extras"),
         (*CASE, "extras", "H"),
@@ -79,14 +79,14 @@ def test_optional_fields_may_stand_and_may_be_absent():
         read(changed(place, value))
 
 
-def test_a_vector_of_one_component_may_stand_as_plain_numbers():
+def test_vector_of_one_component_may_be_plain_numbers():
     raw = as_parsed(harmonic())
     column = read(raw).cases[0].fields["extras.p_dot"]
-    raw["cases"][0]["extras"]["p_dot"] = [row[0] for row in column.tolist()]
+    raw["cases"][0]["extras"]["p_dot"] = [value[0] for value in column.tolist()]
     np.testing.assert_array_equal(read(raw).cases[0].fields["extras.p_dot"], column)
 
 
-ROW = [0.5] * 6
+NUMBERS = [0.5] * 6
 COLUMN = [[0.5]] * 6
 
 REFUSED = [
@@ -137,15 +137,27 @@ REFUSED = [
     ((*CASE, "a"), None, "case 'base': a must be a finite number, but it was None."),
     ((*CASE, "q", 3, 0), np.nan, "case 'base': q[3][0] must be a finite number, but it was nan."),
     ((*CASE, "energy", "T", 2), np.inf, "energy.T[2] must be a finite number, but it was inf."),
-    ((*CASE, "energy", "W"), ROW, "energy must hold known fields only (T, V, E), but it held 'W'."),
-    ((*CASE, "energy"), ROW, "case 'base': energy must be an object, but it was [0.5, "),
+    (
+        (*CASE, "energy", "W"),
+        NUMBERS,
+        "energy must hold known fields only (T, V, E), but it held 'W'.",
+    ),
+    ((*CASE, "energy"), NUMBERS, "case 'base': energy must be an object, but it was [0.5, "),
     ((*CASE, "energy", "E"), COLUMN, "energy.E must have shape (6,), one row for each of 6 times"),
-    ((*CASE, "extras", "F"), ROW, "extras must hold known fields only (H, p, p_dot), but it held"),
-    ((*CASE, "invariants", "E"), ROW, "invariants must hold known fields only (nothing), but it"),
+    (
+        (*CASE, "extras", "F"),
+        NUMBERS,
+        "extras must hold known fields only (H, p, p_dot), but it held",
+    ),
+    (
+        (*CASE, "invariants", "E"),
+        NUMBERS,
+        "invariants must hold known fields only (nothing), but it",
+    ),
 ]
 
 
-def test_names_that_occur_again_are_numbered():
+def test_repeated_names_are_numbered():
     raw = as_parsed(harmonic())
     raw["cases"] *= 3
     raw["cases"][1] = raw["cases"][1] | {"name": "other"}
@@ -153,7 +165,7 @@ def test_names_that_occur_again_are_numbered():
 
 
 @pytest.mark.parametrize(("place", "value", "message"), REFUSED)
-def test_a_departure_is_refused_by_name(place, value, message):
+def test_deviation_is_refused_by_name(place, value, message):
     with pytest.raises(InvalidReference, match=re.escape(message)):
         read(changed(place, value))
 
@@ -201,7 +213,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def of(name):
-    """A file of the entry's example with a single row, as parsed."""
+    """A file of the entry's example with a single save, as parsed."""
     entry = ENTRIES[name]
     start = [x[entry.file_columns] for x in entry.start()] if entry.kind == "trajectory" else []
     params = {name: np.asarray(x) for name, x in entry.example.params.items()}
@@ -220,7 +232,7 @@ def files(lowering):
 
 
 @pytest.mark.full
-def test_multipliers_and_reactions_stand_in_the_order_of_the_rows(files):
+def test_multipliers_and_reactions_have_the_order_of_the_rows(files):
     raw = files["double_pendulum_cartesian"]
     assert raw["constraints"] == ["string1", "string2"]
     (case,) = read(raw).cases
@@ -228,7 +240,7 @@ def test_multipliers_and_reactions_stand_in_the_order_of_the_rows(files):
     assert case.fields["constraint_force"].shape == (1, 4)
 
 
-def test_quasi_velocities_stand_in_their_order_those_that_vanish_included(files):
+def test_quasi_velocities_include_vanishing_ones_in_order(files):
     raw = files["chaplygin_sleigh"]
     assert raw["quasi_velocities"] == ["v", "v_n", "omega"]
     assert raw["constraints"] == ["v_n"]
@@ -241,19 +253,19 @@ def test_quasi_velocities_stand_in_their_order_those_that_vanish_included(files)
 
 
 def test_a_file_may_be_written_in_independent_coordinates(files):
-    """It says nothing of constraints then, nor of what belongs to all coordinates."""
+    """It then contains no constraints, and no fields of all coordinates."""
     raw = files["falling_stick_friction"]
     assert raw["coordinates"] == ["x_c", "theta"]
     assert raw["constraints"] == []
     (case,) = read(raw).cases
-    assert {name: rows.shape for name, rows in case.fields.items()} == {
+    assert {name: values.shape for name, values in case.fields.items()} == {
         **dict.fromkeys("qva", (1, 2)),
         **dict.fromkeys(("energy.T", "energy.V", "energy.E"), (1,)),
         **dict.fromkeys(("extras.N", "extras.friction", "extras.contact_point_velocity_x"), (1,)),
     }
 
 
-def test_a_state_of_rest_may_name_its_coordinates(files):
+def test_equilibrium_may_name_its_coordinates(files):
     raw = files["link_spring_mass_equilibrium"]
     assert raw["coordinates"] == ["theta"]
     for more in ({}, {"coordinates_redundant": ["x", "y", "theta"]}):
@@ -345,7 +357,7 @@ LINK = "link_spring_mass_equilibrium"
         (LINK, (*CASE, "lambda2"), None, "lambda2[0] must be a finite number, but it was None."),
     ],
 )
-def test_a_departure_under_constraints_is_refused_by_name(name, place, value, message, files):
+def test_deviation_under_constraints_is_refused_by_name(name, place, value, message, files):
     raw = copy.deepcopy(files[name])
     *parents, last = place
     target = raw

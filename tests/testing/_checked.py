@@ -1,4 +1,4 @@
-"""Checks of derivatives of L = v^2/2 - potential(q, params), and what they should name."""
+"""Checks of derivatives of L = v^2/2 - potential(q, params), and the expected findings."""
 
 import inspect
 from functools import cache
@@ -18,7 +18,7 @@ Q, V = [0.8, 0.6], [0.3, -0.4]
 
 @cache
 def checked(potential):
-    """Reports that several tests read."""
+    """Reports that several tests share."""
     return check(potential)
 
 
@@ -35,7 +35,7 @@ def system_of(potential, **rest):
 
 
 def line_of(function, text):
-    """The one line of a function's source that holds a text."""
+    """The only line of a function's source that contains a text."""
     lines, start = inspect.getsourcelines(inspect.unwrap(function))
     (line,) = [start + i for i, line in enumerate(lines) if text in line]
     return line
@@ -51,7 +51,7 @@ def here(primitive, function, text):
 
 
 def file_of(function):
-    """Name of the file that a function is written in."""
+    """Name of the file that contains a function."""
     return Path(inspect.getfile(inspect.unwrap(function))).name
 
 
@@ -60,18 +60,18 @@ def length(q, params):
     return stretched + jnp.sqrt(q[0] ** 2 + q[1] ** 2)  # wrong
 
 
-def turn(total, x):
+def scan_body(total, x):
     y = jnp.cos(x)
     return total + y * jnp.sqrt(x * x), y  # wrong
 
 
 def scanned(q, params):
-    total, rows = lax.scan(turn, jnp.zeros(()), q)
-    return total + jnp.sum(rows)
+    total, entries = lax.scan(scan_body, jnp.zeros(()), q)
+    return total + jnp.sum(entries)
 
 
 def rule_of(derivative):
-    """q0 sin(q0) with a rule that says what its derivative is."""
+    """q0 sin(q0) with a rule for the given derivative."""
 
     @jax.custom_jvp
     def function(x):

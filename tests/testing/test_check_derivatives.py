@@ -1,4 +1,4 @@
-"""The check of derivatives: what is looked at, the report, what is refused."""
+"""The check of derivatives: states and functions, the report, invalid arguments."""
 
 import dataclasses
 from pathlib import Path
@@ -21,9 +21,9 @@ from _checked import (
     places,
     right,
     rule_of,
+    scan_body,
     scanned,
     system_of,
-    turn,
 )
 from _families import mostly_full
 
@@ -33,10 +33,10 @@ from jaxlag._model._forces import AbstractForce
 from systems.catalogue import ENTRIES
 from tests._user import unchecked  # noqa: F401
 
-# ---- What is looked at ------------------------------------------------------------------------
+# ---- States and functions ---------------------------------------------------------------------
 
 
-def test_states():
+def test_default_states_are_special_and_random():
     report = check(lambda q, params: q[0], q=[0.5, -2.0], v=[0.0, 0.0])
     states = report.states
     assert list(states) == ["given", "zero", "equal", "one", "random 1", "random 2", "random 3"]
@@ -106,7 +106,7 @@ FORCES = {
 
 
 @pytest.mark.parametrize("function", FORCES, ids=lambda f: f.__name__)
-def test_functions_of_forces(function):
+def test_functions_of_forces_are_checked(function):
     name, primitive, order, force = FORCES[function]
     system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(force,))
     report = testing.check_derivatives(system, Q, V, {}, inputs={"u": 2.0})
@@ -118,7 +118,7 @@ def test_functions_of_forces(function):
     assert "zero" in {f.state for f in found}
 
 
-def test_inputs_that_depend_on_the_state():
+def test_inputs_that_depend_on_the_state_are_checked():
     def push(t, q, v, params, inputs):
         return jnp.stack([inputs["u"], v[0]])
 
@@ -133,7 +133,7 @@ def test_inputs_that_depend_on_the_state():
 
 
 class Springs(AbstractForce):
-    """A force of a class of its own, whose derivative is not finite at q = 0."""
+    """A force of a user class whose derivative is not finite at q = 0."""
 
     name: str = eqx.field(static=True, default="springs")
 
@@ -141,14 +141,14 @@ class Springs(AbstractForce):
         return -jnp.sqrt(q * q)  # wrong
 
 
-def test_a_force_of_another_class_is_looked_at_as_a_whole():
+def test_force_of_a_user_class_is_checked_as_a_whole():
     system = jl.System(lambda t, q, v, params: v @ v, ("x", "y"), forces=(Springs(),))
     report = testing.check_derivatives(system, Q, V, {}, states=("given", "zero"))
     assert dict(report.functions) == {"lagrangian": 3, "force 'springs'": 1}
     assert places(report) == here("sqrt", Springs, "# wrong")
 
 
-def test_constraints_reactions_and_quasi_velocities():
+def test_constraints_reactions_and_quasi_velocities_are_checked():
     friction = jl.GeneralizedForce(bad_friction, "friction", reaction=True)
     system = jl.System(
         lambda t, q, u, params: 0.5 * params["m"] * u @ u,
@@ -178,7 +178,7 @@ def test_constraints_reactions_and_quasi_velocities():
     }
 
 
-def test_kinetic_and_potential_energy_apart():
+def test_kinetic_and_potential_energy_are_checked_separately():
     def kinetic(t, q, v, params):
         return v @ v
 
@@ -193,7 +193,7 @@ def test_kinetic_and_potential_energy_apart():
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.01])
-def test_single_precision(factor):
+def test_float32_functions_are_checked(factor):
     function = rule_of(lambda x: factor * right(x))
 
     def potential(q, params):
@@ -215,14 +215,14 @@ CLEAN = (
 
 @pytest.mark.parametrize("name", mostly_full(CLEAN, *CLEAN[:2]))
 def test_systems_of_the_book_pass(name):
-    """A dissipative one, one with friction by reactions, one in quasi-velocities among them."""
+    """Among them a dissipative one, one with friction by reactions, one in quasi-velocities."""
     entry = ENTRIES[name]
     report = testing.check_derivatives(entry.system, *entry.start(), entry.example.params)
     assert report.ok, report
     assert "all are finite and agree" in str(report)
 
 
-def test_a_potential_that_is_singular_is_said_to_be():
+def test_singular_potential_is_reported():
     entry = ENTRIES["central_motion"]
     report = testing.check_derivatives(entry.system, *entry.start(), entry.example.params)
     (finding,) = report.findings
@@ -235,15 +235,15 @@ def test_a_potential_that_is_singular_is_said_to_be():
 
 
 def test_the_report_is_a_table():
-    """One row for what is the same at several states."""
+    """One line for equal findings at several states."""
     report = checked(scanned)
     text = str(report).splitlines()
     assert text[0] == "derivatives of lagrangian (order 3)"
     assert text[1].startswith("at given, rest, zero, equal, one, random 1")
     assert text[2].split() == ["function", "order", "in", "what", "where", "states"]
-    line = line_of(turn, "# wrong")
-    row = ["lagrangian", "1", "q", "not", "finite", "sqrt", "at", f"{file_of(turn)}:{line}"]
-    assert text[3].split() == [*row, "zero,", "one"]
+    line = line_of(scan_body, "# wrong")
+    cells = ["lagrangian", "1", "q", "not", "finite", "sqrt", "at", f"{file_of(scan_body)}:{line}"]
+    assert text[3].split() == [*cells, "zero,", "one"]
     assert len(text) == 5
     assert "jaxlag.math.norm" in text[4]
 
@@ -254,10 +254,10 @@ def test_reports_are_not_changed():
         report.findings = ()
 
 
-# ---- What is refused --------------------------------------------------------------------------
+# ---- Invalid arguments ------------------------------------------------------------------------
 
 
-def test_what_is_refused():
+def test_invalid_arguments_are_refused():
     system = system_of(length)
     fine = {"params": PARAMS, "q": Q, "v": V}
     for change, message in (
@@ -281,7 +281,7 @@ def test_what_is_refused():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_other_things_than_systems_are_refused():
+def test_other_types_than_systems_are_refused():
     with pytest.raises(ValueError, match=r"`system` must be a jl.System, but it was 3"):
         testing.check_derivatives(3, Q, V, PARAMS)
     with pytest.raises(ValueError, match="`inputs` must be a dict"):
@@ -294,8 +294,8 @@ def test_functions_of_wrong_shapes_are_refused():
         testing.check_derivatives(system, Q, V, {})
 
 
-def test_a_kink_in_one_argument_excuses_no_other():
-    """1/2 (|q| - l)^2 at q = 0 and l = 0: its Hessian is 1, and comes out as 0."""
+def test_kink_in_one_argument_does_not_excuse_others():
+    """1/2 (|q| - l)^2 at q = 0 and l = 0: its Hessian is 1, but it is computed as 0."""
 
     def spring(q, params):
         return 0.5 * (jl.math.norm(q) - params["c"]) ** 2

@@ -1,4 +1,4 @@
-"""Derivatives that are wrong: modes against each other, and differences."""
+"""Wrong derivatives: modes compared with each other and with differences."""
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,8 @@ def right_once_rule(primals, tangents):
     ("derivative", "order"),
     [(right, None), (lambda x: 1.00001 * right(x), 1), (lambda x: -right(x), 1), (right_once, 2)],
 )
-def test_rules_of_the_users_own(derivative, order):
-    """The lowest order that is wrong, be it by one part in 10^5."""
+def test_wrong_custom_rules_are_named(derivative, order):
+    """The lowest wrong order is named, even if it is wrong by one part in 10^5."""
     function = rule_of(derivative)
     report = check(lambda q, params: function(q[0]) + q[1])
     assert report.ok == (order is None)
@@ -40,8 +40,8 @@ def test_rules_of_the_users_own(derivative, order):
         assert {"given", "random 1", "random 2", "random 3"} == {f.state for f in report.findings}
 
 
-def test_one_wrong_rule_among_several():
-    """None is singled out, but all are named."""
+def test_wrong_rule_among_several_names_all():
+    """The wrong one cannot be identified: all are named."""
     fine, wrong = rule_of(right), rule_of(lambda x: 2.0 * right(x))
     (finding, *_) = check(lambda q, params: fine(q[0]) + right_once(q[1]) + wrong(q[1])).findings
     assert (finding.kind, finding.order, finding.primitive) == ("wrong", 1, "")
@@ -64,7 +64,7 @@ def test_a_rule_that_is_not_finite_is_named_where_it_is_used():
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.001])
-def test_rules_for_reverse_derivatives_alone(factor):
+def test_custom_vjp_rules_are_checked(factor):
     @jax.custom_vjp
     def function(x):
         return jnp.sin(x)
@@ -94,7 +94,7 @@ def test_forward_and_reverse_derivatives_disagree(factor):
         assert "forward" in finding.hint
 
 
-def test_kinks_and_jumps_are_no_findings():
+def test_kinks_and_jumps_are_not_findings():
     """At the given state, on the kink; functions of different smoothness."""
 
     def potential(q, params):
@@ -105,18 +105,18 @@ def test_kinks_and_jumps_are_no_findings():
     assert check(potential).ok
 
 
-def test_extrapolated_quotients():
-    """Exact for cubics; doubt covers a jump and a kink, and nearly nothing where f is smooth."""
+def test_extrapolated_quotients_have_an_error_bound():
+    """Exact for cubics; `error_bound` covers a jump and a kink, and is nearly 0 for smooth f."""
 
     def around(f, x):
         h = step(np.finfo(float).eps)
         return _quotient([f(x + s * h) for s in (0, 1, -1, 0.5, -0.5)], h)
 
-    value, doubt = around(lambda x: x**3 - 2 * x, 0.7)
+    value, error_bound = around(lambda x: x**3 - 2 * x, 0.7)
     assert value == pytest.approx(3 * 0.7**2 - 2, rel=1e-11)
-    assert doubt < 1e-4
-    value, doubt = around(lambda x: float(np.sign(x)), 0.0)  # of derivative 0 on either side
-    assert abs(value) < doubt
-    value, doubt = around(abs, 0.0)
-    assert abs(value - 1.0) <= doubt
-    assert abs(value + 1.0) <= doubt
+    assert error_bound < 1e-4
+    value, error_bound = around(lambda x: float(np.sign(x)), 0.0)  # of derivative 0 on each side
+    assert abs(value) < error_bound
+    value, error_bound = around(abs, 0.0)
+    assert abs(value - 1.0) <= error_bound
+    assert abs(value + 1.0) <= error_bound

@@ -1,4 +1,4 @@
-"""Where a derivative that is not finite is born: the operation and the line."""
+"""The origin of a derivative that is not finite: the operation and the line."""
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,8 @@ from _checked import (
     length,
     line_of,
     places,
+    scan_body,
     scanned,
-    turn,
 )
 from _families import mostly_full
 from jax import lax
@@ -88,8 +88,8 @@ NOT_FINITE = {
 @pytest.mark.parametrize(
     "potential", mostly_full(NOT_FINITE, *list(NOT_FINITE)[::2]), ids=lambda f: f.__name__
 )
-def test_where_a_derivative_is_born_that_is_not_finite(potential):
-    """At zero alone; the operation and its line, not another of the same kind."""
+def test_origin_of_a_derivative_that_is_not_finite_is_named(potential):
+    """Only at zero; the operation and its line, not another of the same kind."""
     primitive, order, mode = NOT_FINITE[potential]
     report = checked(potential)
     assert not report.ok
@@ -103,17 +103,17 @@ def test_where_a_derivative_is_born_that_is_not_finite(potential):
         assert finding.where in str(report)
 
 
-@pytest.mark.parametrize(("potential", "inner"), [(jitted, helper), (scanned, turn)])
-def test_inside_jitted_helpers_and_loops(potential, inner):
-    """On the line inside; `scanned` at "one" as well, where its second row is 0."""
+@pytest.mark.parametrize(("potential", "inner"), [(jitted, helper), (scanned, scan_body)])
+def test_origins_inside_jitted_helpers_and_loops_are_named(potential, inner):
+    """On the line inside; `scanned` also at "one", where its second entry is 0."""
     report = checked(potential)
     assert places(report) == here("sqrt", inner, "# wrong")
     assert {f.order for f in report.findings} == {1}
     assert [f.state for f in report.findings] == ["zero", "one"]
 
 
-def test_inside_choices_under_vmap():
-    """Both branches are computed there, in programs of their own."""
+def test_origins_inside_choices_under_vmap_are_named():
+    """Both branches are computed there, in separate programs."""
 
     def chosen(q):
         return lax.cond(q > -1.0, lambda x: jnp.cos(x) + jnp.sqrt(x), lambda x: x / 2.0, q)  # wrong
@@ -126,13 +126,13 @@ def test_inside_choices_under_vmap():
 
 
 def choosing(q):
-    """log(0) is taken, 1/0 is not."""
+    """log(0) is selected, 1/0 is not."""
     taken = jnp.log(q)  # wrong
     return jnp.where(jnp.array([True, False]), taken, 1.0 / q)
 
 
 def entry_by_entry(q):
-    """1/0 in the entry that is taken, log(0) in the other one."""
+    """1/0 in the selected entry, log(0) in the other one."""
     entries = jnp.log(q) + 1.0
     entries = entries + 1.0 / (q - 1.0)  # wrong
     return jnp.where(jnp.array([False, True]), entries, 0.0)
@@ -143,20 +143,20 @@ def before_a_loop(q):
     return lax.scan(lambda total, x: (total + jnp.cos(x), x), start, q)[0]
 
 
-def rows_of_a_loop(q):
-    rows = jnp.log(q)  # wrong
-    return lax.scan(lambda total, x: (jnp.cos(total), total + x), 1.0, rows, reverse=True)[1]
+def entries_of_a_loop(q):
+    entries = jnp.log(q)  # wrong
+    return lax.scan(lambda total, x: (jnp.cos(total), total + x), 1.0, entries, reverse=True)[1]
 
 
-def shared_by_turns(q):
+def shared_by_iterations(q):
     shared = jnp.log(q[0])  # wrong
     return lax.fori_loop(0, 3, lambda k, x: x + shared, q[1])
 
 
 def before_an_open_loop(q):
     start = jnp.log(q[0])  # wrong
-    turns = lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 2.0), (0, start))
-    return turns[1] + q[1] / 3.0
+    result = lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * 2.0), (0, start))
+    return result[1] + q[1] / 3.0
 
 
 @pytest.mark.parametrize(
@@ -165,14 +165,14 @@ def before_an_open_loop(q):
         (choosing, "log"),
         (entry_by_entry, "div"),
         (before_a_loop, "log"),
-        (rows_of_a_loop, "log"),
-        (shared_by_turns, "log"),
+        (entries_of_a_loop, "log"),
+        (shared_by_iterations, "log"),
         (before_an_open_loop, "log"),
     ],
     ids=lambda f: getattr(f, "__name__", f),
 )
-def test_followed_through_choices_and_loops(function, primitive):
-    """Back to the one operation that the result inherits it from."""
+def test_origins_are_followed_through_choices_and_loops(function, primitive):
+    """Back to the one operation from which the result inherits it."""
     q = jnp.array([0.0, 1.0])
     program = TracedProgram(function, q)
     found = program.origins(program.closed, q)
@@ -185,7 +185,7 @@ def test_the_line_that_calls_the_check_is_not_named():
 
 
 def test_every_origin_is_named():
-    """Those of one state in the order of the program."""
+    """Those of one state in program order."""
     report = check(lambda q, params: length(q, params) + angle(q, params))
     assert places(report) == here("sqrt", length, "# wrong") | here("atan2", angle, "# wrong")
     assert [f.primitive for f in report.findings] == ["sqrt", "atan2"]
@@ -204,18 +204,18 @@ def test_hints_name_the_function_to_use():
 
 
 @pytest.mark.full
-def test_what_the_hints_say_helps():
-    def mended(q, params):
+def test_following_the_hints_removes_the_findings():
+    def corrected(q, params):
         x = q[0] ** 2
         safe = jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
         turned = jl.math.atan2(q[1], q[0])
         return jl.math.norm(q) + turned + jl.math.sinc(q[0]) + safe + jl.math.sqrt(x)
 
-    assert check(mended).ok
+    assert check(corrected).ok
 
 
-def test_what_is_left_out_of_the_result_is_no_finding():
-    """Infinite, but masked in every derivative: only the root of `hidden` is named."""
+def test_masked_infinities_are_not_findings():
+    """Infinite, but masked in every derivative: of `hidden` only the root is named."""
 
     def masked(q, params):
         inverse = lax.stop_gradient(1.0 / q[0])
@@ -225,7 +225,7 @@ def test_what_is_left_out_of_the_result_is_no_finding():
 
 
 def test_choices_by_cond_stay_safe_under_vmap():
-    """JAX hands a branch that is not taken an argument without derivatives."""
+    """JAX passes an argument without derivatives to the branch that is not taken."""
 
     def chosen(q, params):
         return lax.cond(q[0] != 0, lambda x: jnp.sin(x) / x, lambda x: 1.0 + 0.0 * x, q[0])
@@ -233,7 +233,7 @@ def test_choices_by_cond_stay_safe_under_vmap():
     assert check(chosen).ok
 
 
-def test_under_vmap_alone():
+def test_findings_only_under_vmap_are_named():
     @jax.custom_batching.custom_vmap
     def ratio(x):
         return lax.cond(x > 0, lambda x: jnp.sin(x) / x, lambda x: 1.0 + 0.0 * x, x)
@@ -258,7 +258,7 @@ def test_under_vmap_alone():
     assert "no reverse derivatives" in str(report)
 
 
-def test_which_arguments_it_takes():
+def test_variables_of_a_finding_are_named():
     def lagrangian(t, q, v, params):
         return v @ v + jnp.sqrt(params["c"]) + jnp.sqrt(t) + jnp.sqrt(q[0] + v[1] ** 2)
 
@@ -273,13 +273,13 @@ def test_which_arguments_it_takes():
     assert {(f.state, f.variables) for f in later.findings} == {("zero", "q or v")}
 
 
-def test_integers_are_left_alone():
+def test_integer_params_are_not_differentiated():
     report = check(lambda q, params: q[0] ** params["n"], {"k": 1.0, "n": 3})
     assert report.ok
 
 
-def test_inside_loops_without_a_fixed_number_of_turns():
-    """Born in the fourth turn, since the third leaves 0: 1.0625^2, 0.75^2, 0.5^2, 0."""
+def test_origins_inside_loops_without_a_fixed_number_of_iterations():
+    """Created in the fourth iteration, as the third gives 0: 1.0625^2, 0.75^2, 0.5^2, 0."""
 
     def shrink(carry):
         k, x = carry

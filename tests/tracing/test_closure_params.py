@@ -1,4 +1,4 @@
-"""Traced values that a declaration closes over are arguments like params."""
+"""Traced values in the closure of a declaration are treated like params."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ TS = jnp.array([0.0, 0.5, 1.0])
 
 
 def swing(k):
-    """The end of a motion whose Lagrangian, force and input close over k."""
+    """End of a motion whose Lagrangian, force and input close over k."""
     drag = jl.GeneralizedForce(
         lambda t, q, v, params, inputs: (inputs["u"] - 0.1 * k) * v + inputs["w"] * params["one"],
         "drag",
@@ -53,12 +53,12 @@ TRANSFORMS = {
 
 
 @pytest.mark.parametrize("transform", TRANSFORMS)
-def test_closing_over_traced_values_is_the_same_as_params(transform):
+def test_traced_closure_values_act_like_params(transform):
     by_closure, expected = (TRANSFORMS[transform](f)(2.0) for f in (swing, by_params))
     np.testing.assert_allclose(by_closure, expected, rtol=1e-9)
 
 
-def test_a_state_of_rest_moves_with_what_its_system_closes_over():
+def test_equilibrium_has_derivatives_by_closure_values():
     def rest(k):
         system = jl.System(lambda t, q, v, p: 0.5 * v @ v - 0.5 * k * (q[0] - k) ** 2, ("x",))
         return jl.equilibrium(system, [0.1], {}).q[0]
@@ -66,7 +66,7 @@ def test_a_state_of_rest_moves_with_what_its_system_closes_over():
     np.testing.assert_allclose(jax.grad(rest)(2.0), 1.0, rtol=1e-9)
 
 
-def test_an_assembled_state_moves_with_what_its_system_closes_over():
+def test_assembled_states_have_derivatives_by_closure_values():
     def height(length):
         rod = jl.Holonomic(lambda t, q, params: q @ q - length**2, "rod")
         system = jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), constraints=(rod,))
@@ -75,16 +75,16 @@ def test_an_assembled_state_moves_with_what_its_system_closes_over():
     np.testing.assert_allclose(jax.grad(height)(1.0), 0.8, rtol=1e-9)
 
 
-def test_forces_of_a_motion_move_with_what_its_system_closes_over():
-    def pull(m):
+def test_inverse_dynamics_has_derivatives_by_closure_values():
+    def force(m):
         system = jl.System(lambda t, q, v, p: 0.5 * m * v @ v, ("x",))
         return jl.inverse_dynamics(system, [0.0], [0.0], [3.0], {})[0]
 
-    np.testing.assert_allclose(jax.jit(jax.grad(pull))(2.0), 3.0, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(force))(2.0), 3.0, rtol=1e-12)
 
 
-def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
-    """Of the values of a table derivatives write what a step reads, which is seen of inputs."""
+def test_traced_values_of_inputs_are_not_closure_values():
+    """Table values stay inputs: their derivatives are written only where a step reads them."""
     force = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["u"] * v, "push")
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), forces=(force,))
 
@@ -97,8 +97,8 @@ def test_traced_values_of_inputs_are_nothing_that_it_closes_over():
 
 
 @pytest.mark.parametrize("formulation", ["multipliers", "quasi"])
-def test_nothing_is_traced_twice_for_the_sake_of_closures(monkeypatch, formulation):
-    """Not even where a declared function has no part in the motion."""
+def test_closures_need_no_second_trace(monkeypatch, formulation):
+    """Not even for a declared function that the motion does not use."""
     quasi = jl.QuasiVelocities(lambda t, q, v, params: 2.0 * v, ("u",))
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",), quasi=quasi)
     run = partial(jl.simulate, system, [0.0], [1.0], TS, {}, formulation=formulation)
@@ -107,7 +107,7 @@ def test_nothing_is_traced_twice_for_the_sake_of_closures(monkeypatch, formulati
     run()
 
 
-def test_what_becomes_traced_after_it_was_traced_is_named():
+def test_closure_value_that_becomes_traced_later_is_named():
     k = 2.0
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v - 0.5 * k * q @ q, ("x",))
 
@@ -130,8 +130,8 @@ def test_a_driven_system_is_assembled_without_its_inputs():
     np.testing.assert_allclose(jl.assemble(system, [1.2, 1.6], [0.0, 0.0], {}).q, [0.6, 0.8])
 
 
-def test_reverse_derivatives_are_written_without_tracing_again():
-    """The values closed over belong to a transform that is over by then."""
+def test_reverse_derivatives_do_not_trace_again():
+    """The closure values belong to a transform that has ended by then."""
     traced = []
 
     def end(k):
@@ -149,8 +149,8 @@ def test_reverse_derivatives_are_written_without_tracing_again():
             -1, 0
         ]
 
-    _, pull = jax.vjp(end, 2.0)
-    # Once to see what they close over, once for the motion.
+    _, vjp_fn = jax.vjp(end, 2.0)
+    # Once to find the closure values, once for the motion.
     assert sorted(traced) == ["lagrangian"] * 2 + ["ramp"] * 2
-    pull(1.0)
+    vjp_fn(1.0)
     assert len(traced) == 4

@@ -1,4 +1,4 @@
-"""Functions with a rule by `jax.custom_vjp`: every derivative is that of the rule."""
+"""Functions with a rule by `jax.custom_vjp`: all derivatives follow the rule."""
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,8 @@ def ruled(x, k):
     return plainly(x, k)
 
 
-def backward(kept, y):
-    x, k = kept
+def backward(residuals, y):
+    x, k = residuals
     first = jnp.cos(x[0]) * k * y[0] + x[1] ** 2 * y[1]
     return jnp.stack([first, 2 * x[0] * x[1] * y[1]]), jnp.sin(x[0]) * y[0]
 
@@ -35,7 +35,7 @@ def system(f):
 
 
 def everything(function):
-    """By all pairs of modes, and in a loop that splits derivatives."""
+    """By all pairs of modes, and through `jax.lax.map`, which splits derivatives."""
     first = jax.jacfwd(function), jax.jacrev(function)
     second = [outer(inner) for inner in first for outer in (jax.jacfwd, jax.jacrev)]
     mapped = jax.jacfwd(jax.jacrev(lambda x: jax.lax.map(function, x[None])))
@@ -54,12 +54,12 @@ def test_functions_have_derivatives_of_every_mode():
         return everything(lambda x: force(0.0, x[1:], x[:2], x[0]))(x)
 
     for found, expected in zip(of(ruled), of(plainly), strict=True):
-        # Of a few products of order one.
+        # Rounding of a few products of order one.
         np.testing.assert_allclose(found.ravel(), expected.ravel(), rtol=0, atol=1e-14)
 
 
 def ended(f, method):
-    """The end of a motion, and its forward derivative: of the equations in implicit steps too."""
+    """End of a motion and its forward derivative; implicit steps differentiate the equations."""
 
     def at(k):
         start = [1.0, 0.0], [0.3, 0.1], jnp.array([0.0, 0.4])
@@ -70,12 +70,12 @@ def ended(f, method):
 
 @pytest.mark.parametrize("method", ["bosh3", pytest.param("gauss2", marks=pytest.mark.full)])
 def test_motions_have_forward_derivatives(method):
-    # Of some hundred operations on numbers of order one.
+    # Rounding of some hundred operations on numbers of order one.
     np.testing.assert_allclose(ended(ruled, method), ended(plainly, method), rtol=0, atol=1e-12)
 
 
-def test_the_rule_counts_and_not_the_body():
-    """In forward derivatives as in reverse ones: here it is twice what the body would give."""
+def test_derivatives_follow_the_rule_not_the_body():
+    """In forward and reverse derivatives; here the rule gives twice the derivative of the body."""
 
     @jax.custom_vjp
     def double(x):

@@ -1,4 +1,4 @@
-"""What declared functions read from outside: a change of it is named, and changes nothing."""
+"""Free variables of declared functions: a change is reported and has no effect."""
 
 from enum import Enum
 from functools import partial, wraps
@@ -249,7 +249,7 @@ class _Rule(Enum):
         return _RULES["k"]
 
 
-class _Row(NamedTuple):
+class _Pair(NamedTuple):
     x: float = 1.0
 
     def stiffness(self):
@@ -292,7 +292,7 @@ def _global_by_its_name():
 
 OUTSIDE = [
     partial(_method_of, _Rule.LINEAR),
-    partial(_method_of, _Row()),
+    partial(_method_of, _Pair()),
     partial(_method_of, _Word("a")),
     _own_attribute,
     _global_by_its_name,
@@ -321,13 +321,13 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize("declared", OUTSIDE)
-def test_what_changes_outside_is_named_and_changes_nothing(declared):
+def test_changed_free_variables_are_named_and_have_no_effect(declared):
     lagrangian, change, name = declared()
     system = jl.System(lagrangian, ("x",))
     at = [0.0], [0.0], {}
     assert system.acceleration(*at) == -2.0
     change()
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
-        assert system.acceleration(*at) == -2.0  # a compiled program says so as well
+        assert system.acceleration(*at) == -2.0  # a compiled program warns, too
     with pytest.warns(UserWarning, match=f"^{name}, which .* reads from outside, was .* now"):
         assert system.energy([1.0], [0.0], {}) == 2.0

@@ -1,4 +1,4 @@
-"""What params may hold besides numbers: a program keyed by what changes would not notice."""
+"""Static leaves of params must be immutable: they are part of the key of compiled programs."""
 
 import enum
 import functools
@@ -173,7 +173,7 @@ FIXED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_can_change_is_refused_by_its_path(name):
+def test_mutable_leaves_are_refused_by_path(name):
     leaf, message = REFUSED[name]
     must = r"^`params\['a'\]\[0\]` must be a number, an array, or an immutable and hashable object"
     with pytest.raises(ValueError, match=f"{must}.*{message}"):
@@ -181,14 +181,14 @@ def test_what_can_change_is_refused_by_its_path(name):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_static_fields_are_no_way_out(name):
+def test_mutable_static_fields_are_refused(name):
     leaf, _ = REFUSED[name]
     with pytest.raises(ValueError, match=r"^`params\['a'\]\.law` must be "):
         check_keys({"a": Static(leaf)})
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_what_cannot_change_is_part_of_the_program(name):
+def test_immutable_leaves_are_accepted(name):
     for _ in range(2):
         check_keys({"a": FIXED[name], "b": Pair(FIXED[name])})
 
@@ -215,13 +215,13 @@ RECORD = jl.Experiment([0.0, 0.1, 0.2], {"x": [1.0, 0.98, 0.93]}, q0=[1.0], v0=[
         lambda params: SYSTEM.explain(params),
     ],
 )
-def test_all_that_compile_refuse_it(ask):
+def test_all_compiled_functions_refuse_mutable_leaves(ask):
     with pytest.raises(ValueError, match=r"^`params\['spring'\]` must be .* a Plain can change"):
         ask({"spring": Plain(1.0)})
 
 
 @pytest.mark.parametrize("make", [Plain, Data, Frozen, lambda k: types.SimpleNamespace(k=k)])
-def test_it_is_refused_under_derivatives_too(make):
+def test_mutable_leaves_are_refused_under_derivatives(make):
     def end(k):
         return jl.simulate(SYSTEM, [1.0], [0.0], [0.0, 1.0], {"spring": make(k)}).q[-1, 0]
 
@@ -232,15 +232,15 @@ def test_it_is_refused_under_derivatives_too(make):
     assert "racer" not in str(it.value)
 
 
-def test_energies_that_need_no_program_are_of_what_is_there_now():
+def test_energies_without_a_program_read_current_values():
     spring = Plain(1.0)
     for k in (1.0, 5.0):
         spring.k = k
         assert SYSTEM.energy([1.0], [0.0], {"spring": spring}) == k
 
 
-def test_a_function_that_reads_another_number_is_refused(monkeypatch):
-    """As a leaf and in a static field; the program would hold the former number."""
+def test_functions_that_read_a_changed_number_are_refused(monkeypatch):
+    """As a leaf and in a static field; otherwise the program would hold the former number."""
     params = {"law": of_number}, {"law": Static(of_number)}, {"law": Frozen(of_number)}
     for each in params:
         check_keys(each)
@@ -251,12 +251,12 @@ def test_a_function_that_reads_another_number_is_refused(monkeypatch):
             check_keys(each)
 
 
-def test_modules_that_are_declared_may_not_change_either():
+def test_declared_modules_must_be_immutable():
     with pytest.raises(ValueError, match=r"^`Static\.law` must be .* a Plain can change"):
         jl.TimeFunction(Static(Plain(1.0)))
 
 
-def test_channels_of_a_fit_may_not_change_either():
+def test_channels_of_a_fit_must_be_immutable():
     with pytest.raises(ValueError, match=r"^`channels\['x'\]` must be .* 'TABLE', which it reads"):
         jl.fit(
             SYSTEM,

@@ -1,6 +1,6 @@
-"""What objects in params read by methods, properties and attributes: one rule for all of them.
+"""Values that objects in params read by methods, properties and attributes: one rule for all.
 
-What can change in place is refused at once, a number when it has changed.
+Mutable values are refused at once, a number only after a change.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from jaxlag._tracing._traced_function import traced_function
 
 TABLE = {"k": 2.0}
 STIFFNESS = 2.0
-ROW = (1.0, 2.0)
+NUMBERS = (1.0, 2.0)
 LOG = logging.getLogger(__name__)
 
 
@@ -52,7 +52,7 @@ class PairOfFields(NamedTuple):
     x: float = 1.0
 
     def k(self):
-        return self.x * ROW[0]
+        return self.x * NUMBERS[0]
 
 
 class Plain:
@@ -274,7 +274,7 @@ class Described(Module):
 
 
 class Named(Module):
-    """Read where it is made, a log, a constant: none of these is the motion's."""
+    """Reads a global when constructed, a log and a constant: none affects the motion."""
 
     def __init__(self, name):
         self.k = TABLE[name]
@@ -285,7 +285,7 @@ class Named(Module):
 
     def __call__(self, x):
         LOG.info("called")
-        return self.k * ROW[0] * jnp.sin(x)
+        return self.k * NUMBERS[0] * jnp.sin(x)
 
     def plot(self):
         from matplotlib import pyplot
@@ -301,7 +301,7 @@ class Frozen:
         object.__setattr__(self, "double", 2.0)
 
     def law(self):
-        return ROW[1]
+        return NUMBERS[1]
 
 
 @dataclass(frozen=True)
@@ -415,7 +415,7 @@ FIXED = {
 }
 PARTIAL = functools.partial(of_own_attribute)
 PARTIAL.k = 2.0  # pyright: ignore[reportAttributeAccessIssue]
-# By what changes: what is given, and the words.
+# By the kind of change: the leaf, the changed place and the message.
 NUMBER = "STIFFNESS, which its methods read from outside, was 2.0 before and is 5.0 now. Make it"
 CHANGED = {
     "named tuple": (PairOfNumber(), "STIFFNESS", NUMBER),
@@ -442,7 +442,7 @@ CHANGED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_can_change_in_place_is_refused_at_once(name):
+def test_mutable_values_are_refused_at_once(name):
     leaf, message = REFUSED[name]
     for _ in range(2):
         with pytest.raises(ValueError, match=rf"^`params\['a'\].*` must be .*{message}"):
@@ -450,7 +450,7 @@ def test_what_can_change_in_place_is_refused_at_once(name):
 
 
 @pytest.mark.parametrize("name", FIXED)
-def test_what_cannot_change_is_accepted(name):
+def test_immutable_values_are_accepted(name):
     for _ in range(2):
         check_keys({"a": FIXED[name]})
     if name == "counting":
@@ -459,7 +459,7 @@ def test_what_cannot_change_is_accepted(name):
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_a_number_is_refused_when_it_has_changed(name, monkeypatch):
+def test_numbers_are_refused_after_a_change(name, monkeypatch):
     leaf, place, message = CHANGED[name]
     for _ in range(2):
         check_keys({"a": leaf})
@@ -472,7 +472,7 @@ def test_a_number_is_refused_when_it_has_changed(name, monkeypatch):
         check_keys({"a": leaf})
 
 
-def test_a_motion_is_never_of_a_former_number(monkeypatch):
+def test_programs_never_use_a_former_number(monkeypatch):
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["x"].k * q[0], ("x",))
     params = {"x": PairOfNumber()}
     assert system.acceleration([0.0], [0.0], params) == -2.0

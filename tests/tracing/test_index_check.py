@@ -19,7 +19,7 @@ import jaxlag as jl
     ],
 )
 def test_an_index_beyond_the_coordinates_is_refused(lowering, read, named):
-    """JAX reads the nearest element instead, which is another system."""
+    """JAX would read the nearest element instead: that is another system."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - read(q) ** 2, ("x",), lowering=lowering)
     match = (
         rf"^`lagrangian` and `forces` must take indices from -1 to 0 of q, .* but {named} was taken"
@@ -35,7 +35,7 @@ def test_an_index_beyond_the_velocities_is_refused():
 
 
 @pytest.mark.parametrize("how", [{"mode": "clip"}, {"mode": "fill", "fill_value": 7.0}])
-def test_a_stated_mode_means_what_it_says(how):
+def test_stated_index_modes_are_accepted(how):
     read = lambda q: jnp.take(q, jnp.array([0, 5]), **how) @ q  # noqa: E731
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - read(q), ("x", "y"))
     assert jl.simulate(system, [1.0, 0.5], [0.0, 0.0], [0.0, 0.1]).ok

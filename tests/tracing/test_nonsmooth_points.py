@@ -1,4 +1,4 @@
-"""Forces that bend: found in the program, and derivatives across them as good as the motion."""
+"""Nonsmooth forces: the program is searched for them, and derivatives across them are accurate."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jaxlag._tracing._nonsmooth_points import outcomes
 
 G = 9.81
 A, B = jnp.array([0.3, -0.2, 0.6]), jnp.array([-0.3, 1.9, 1.7])  # every comparison differs
-BENT = {
+NONSMOOTH = {
     "minimum": lambda x: jnp.minimum(x[0], 0.0),
     "where": lambda x: jnp.where(x[0] > 0, x[0], 2 * x[0]),
     "abs": lambda x: jnp.abs(x[0]),
@@ -40,21 +40,21 @@ def compared(function, x, *fixed):
     return outcomes(program, [x, *fixed], [True] + [False] * len(fixed))
 
 
-@pytest.mark.parametrize("name", BENT)
-def test_a_program_that_bends(name):
-    """Comparisons come out otherwise at the other state, and the same nearby."""
-    here, there, near = (compared(BENT[name], x) for x in (A, B, A + 1e-9))
-    assert np.any(here != there)
-    np.testing.assert_array_equal(here, near)
+@pytest.mark.parametrize("name", NONSMOOTH)
+def test_comparisons_of_nonsmooth_programs_differ(name):
+    """Comparisons differ at the other state and agree nearby."""
+    at_a, at_b, near = (compared(NONSMOOTH[name], x) for x in (A, B, A + 1e-9))
+    assert np.any(at_a != at_b)
+    np.testing.assert_array_equal(at_a, near)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
-def test_a_program_that_does_not(name):
+def test_comparisons_of_smooth_programs_agree(name):
     found = compared(SMOOTH[name], A)
     assert found is None or np.all(found == compared(SMOOTH[name], B))
 
 
-def test_what_does_not_move_is_compared_freely():
+def test_comparisons_of_constants_are_ignored():
     assert compared(lambda x, p: jnp.where(p > 0, x[0], jnp.sin(x[0])), A, jnp.array(1.0)) is None
     assert compared(lambda x, i: x[jnp.where(i > 1, i, 0)], A, jnp.array(2)) is None
 
@@ -64,7 +64,7 @@ def floor(t, q, v, params):
 
 
 def height(h, k, t):
-    """Of a ball on springs of k, dropped from h at rest, at t."""
+    """Height at t of a ball that falls from rest at h onto springs of stiffness k."""
     fall, w = jnp.sqrt(2 * h / G), jnp.sqrt(k)
     contact = 2 * (jnp.pi - jnp.arctan(fall * w)) / w
     r = t % (2 * fall + contact)
@@ -75,7 +75,7 @@ def height(h, k, t):
 
 @pytest.fixture(scope="module")
 def ball():
-    """From (h, k, method) to the height after 1.5 s: two flights from 1 m."""
+    """Function (h, k, method) -> height after 1.5 s: two flights from 1 m."""
     system = jl.System(floor, ("x",))
 
     def end(h, k, method="auto"):
@@ -86,10 +86,10 @@ def ball():
 
 
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
-def test_derivatives_across_a_bend(ball, mode):
-    """In height and stiffness: 1 to 2 % off where the motion was right to 1e-8 m.
+def test_derivatives_across_nonsmooth_points_are_accurate(ball, mode):
+    """By height and stiffness: without extra steps 1 to 2 % off, with a motion right to 1e-8 m.
 
-    Of 300 heights and stiffnesses the worst is 3e-4 off, half of them less than 3e-7.
+    Of 300 heights and stiffnesses the largest error is 3e-4; half of the errors are below 3e-7.
     """
     k = jnp.array([1e3, 1e4, 8e4, 1e6])
     h = jnp.ones(4)
@@ -101,14 +101,14 @@ def test_derivatives_across_a_bend(ball, mode):
 
 @pytest.mark.full
 @pytest.mark.parametrize("method", ["prince9", "tsit5", "dopri5", "bosh3", "kvaerno5"])
-def test_derivatives_across_a_bend_by_other_methods(ball, method):
+def test_derivatives_across_nonsmooth_points_by_other_methods(ball, method):
     slopes = jax.grad(ball, (0, 1))(jnp.array(1.0), jnp.array(1e4), method)
     exact = jax.grad(height, (0, 1))(1.0, 1e4, 1.5)
     np.testing.assert_allclose(slopes, exact, rtol=1e-3 if method == "kvaerno5" else 1e-4)
 
 
-def test_motions_that_cross_no_bend_keep_their_steps():
-    """A norm is compared within, and a switch far away never comes out otherwise."""
+def test_motions_without_nonsmooth_points_have_the_same_steps():
+    """A norm contains a comparison; a distant switch never changes its outcome."""
 
     def lagrangian(t, q, v, params):
         stretch = jl.math.norm(q) - 1.0
@@ -126,7 +126,7 @@ def test_motions_that_cross_no_bend_keep_their_steps():
 
 
 def contact(t, q, v, params):
-    """A damped floor that only presses."""
+    """A damped floor that cannot pull."""
     press = jnp.maximum(-params["k"] * q - params["c"] * v, 0.0)
     return jnp.where(q < 0, press, 0.0)
 
@@ -144,14 +144,14 @@ def friction(t, q, v, params):
     [
         (contact, G, 1.0, 0.0, 1e3, 10.0, 9.81e-6),  # it settles: q = -g/k
         pytest.param(saturated, 0.0, 0.0, 0.0, 20.0, 10.0, 0.0, marks=pytest.mark.full),
-        (friction, 0.0, 1.0, 0.0, 0.05, 0.7, (1 - np.cos(1.4)) / 4),  # a jump where it starts
+        (friction, 0.0, 1.0, 0.0, 0.05, 0.7, (1 - np.cos(1.4)) / 4),  # a jump at the start
         pytest.param(
             *(friction, 0.0, 1.0, -1e-9, 0.05, 0.7, (1 - np.cos(1.4)) / 4), marks=pytest.mark.full
         ),
     ],
 )
-def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, v0, k, t, slope):
-    """At rest no change is left to hold an error to, and a jump leaves the same in any step."""
+def test_derivatives_are_accurate_at_rest_and_after_jumps(force, weight, q0, v0, k, t, slope):
+    """At rest an error has no reference change; a jump gives the same error for any step."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * v[0] ** 2 - weight * q[0]
@@ -169,8 +169,8 @@ def test_a_motion_that_ends_well_has_its_derivative(force, weight, q0, v0, k, t,
 
 
 @pytest.mark.full
-def test_many_bends_do_not_use_up_the_steps():
-    """Twelve thousand attempts of 16,384 are left to the motion, the rest to its derivative."""
+def test_many_nonsmooth_points_stay_within_the_step_limit():
+    """The motion takes over 12,000 of 16,384 attempts; its derivative stays within the rest."""
 
     def lagrangian(t, q, v, params):
         return 0.5 * v[0] ** 2 - 0.5 * params["k"] * jnp.maximum(jnp.abs(q[0]) - 0.1, 0.0) ** 2

@@ -1,4 +1,4 @@
-"""Params split into what is traced and what keys the compiled program, and when that recompiles."""
+"""Params split into traced values and the static key of the program; when this recompiles."""
 
 from collections import Counter
 from functools import partial
@@ -42,7 +42,7 @@ TREE = {
 }
 
 
-def test_real_numbers_are_traced_and_the_rest_is_not():
+def test_split_traces_real_numbers_only():
     traced, static = split(TREE)
     real = {"number": 1.5, "array": [1.0, 2.0], "single": 2.5, "table": [[1, 2], [3, 4]]}
     for name, value in real.items():
@@ -64,7 +64,7 @@ def test_real_numbers_are_traced_and_the_rest_is_not():
     )
 
 
-def test_join_undoes_split():
+def test_join_inverts_split():
     back = join(*split(TREE))
     assert jax.tree.structure(back) == jax.tree.structure(TREE)
     for found, given in zip(jax.tree.leaves(back), jax.tree.leaves(TREE), strict=True):
@@ -79,7 +79,7 @@ def test_join_undoes_split():
 
 
 @pytest.mark.parametrize("tree", [None, (), {}, 2.0, 3, [None, {"a": None}]])
-def test_any_pytree_goes_round(tree):
+def test_join_inverts_split_of_any_pytree(tree):
     assert join(*split(tree)) == tree
     assert hash(Static(split(tree)[1])) == hash(Static(split(tree)[1]))
 
@@ -102,7 +102,7 @@ def key(tree):
     return Static(split(tree)[1])
 
 
-def test_equal_static_halves_are_one_key():
+def test_equal_static_parts_have_equal_keys():
     for make in (
         lambda: {"n": 3, "s": "tube", "f": square, "flag": True},
         lambda: {"mask": np.array([True, False]), "more": (np.int32(3), None)},
@@ -137,13 +137,13 @@ def test_equal_static_halves_are_one_key():
         (Spring(1.0, 2, square), Spring(1.0, 3, square)),
     ],
 )
-def test_different_static_halves_are_different_keys(one, other):
+def test_different_static_parts_have_different_keys(one, other):
     assert key({"x": one}) != key({"x": other})
     assert key({"x": one}) == key({"x": one})
 
 
-def test_a_key_keeps_what_it_was_made_of():
-    """Whatever becomes of the array it was made from: a Solution keeps its params this way."""
+def test_keys_copy_their_arrays():
+    """Later changes of the original array have no effect: a Solution stores its params this way."""
     mask = np.array([True, False])
     static = split({"mask": mask})[1]
     mask[0] = False
@@ -194,17 +194,17 @@ def counted(lowering):
         ({"m": -4.0, "k": 3.0, "n": 2}, None),
     ],
 )
-def test_other_values_never_recompile(counted, params, expected):
+def test_new_values_do_not_recompile(counted, params, expected):
     run = counted.run if expected is not None else partial(counted.run, throw=False)
     found, traced = run(params)
     assert not traced
     if expected is None:
-        assert np.isnan(found)  # M = -4: refused by its status, by the same program
+        assert np.isnan(found)  # M = -4: refused by the status, in the same program
     else:
         assert found == expected
 
 
-def test_other_starts_times_and_steps_never_recompile(counted):
+def test_new_starts_times_and_steps_do_not_recompile(counted):
     params = {"m": 1.0, "k": 3.0, "n": 2}
     assert counted.run(params, q0=1.0) == (-1.5, False)
     assert counted.run(params, v0=1.0) == (-2.0, False)
@@ -213,21 +213,21 @@ def test_other_starts_times_and_steps_never_recompile(counted):
 
 
 def test_an_array_for_a_python_number_compiles_once_more(counted):
-    """A Python float takes the state's precision, a numpy number or array brings its own."""
+    """A Python float takes the state's precision; a numpy number or array has its own."""
     params = {"m": np.array(2.0), "k": np.float64(3.0), "n": 2}
     assert counted.run(params)[0] == -1.5
     assert counted.run({"m": jnp.ones(()) * 4, "k": np.array(3.0), "n": 2}) == (-0.75, False)
     assert counted.run({"m": 4.0, "k": 3.0, "n": 2}) == (-0.75, False)
 
 
-def test_a_new_integer_is_a_new_program_with_its_own_result(counted):
+def test_new_integer_compiles_a_new_program(counted):
     assert counted.run({"m": 1.0, "k": 3.0, "n": 3}) == (-6.0, True)
     assert counted.run({"m": 2.0, "k": 3.0, "n": 3}) == (-3.0, False)
     assert counted.run({"m": 1.0, "k": 3.0, "n": 2}) == (-3.0, False)
 
 
-def test_a_new_text_or_mask_is_a_new_program_with_its_own_result(counted):
-    """A table of integers is none."""
+def test_new_text_or_mask_compiles_a_new_program(counted):
+    """New values of an integer table do not recompile."""
 
     def run(**static):
         return counted.run({"m": 1.0, "k": 3.0, "n": 2} | static)
@@ -276,25 +276,25 @@ def run(params):
         ),
     ],
 )
-def test_a_bad_leaf_is_named_by_its_path(params, message):
+def test_invalid_leaf_is_named_by_its_path(params, message):
     with pytest.raises(ValueError, match=message):
         run(params)
 
 
-def test_a_bad_leaf_is_named_under_derivatives_too():
-    """The one that is differentiated, and the one beside it."""
-    for bad in ("m", "k"):
+def test_invalid_leaf_is_named_under_derivatives():
+    """The differentiated leaf, and another one."""
+    for name in ("m", "k"):
 
-        def end(x, bad=bad):
-            return run({"m": x, "k": [1.0]} if bad == "m" else {"m": x, "k": [NAN]}).q[-1, 0]
+        def end(x, name=name):
+            return run({"m": x, "k": [1.0]} if name == "m" else {"m": x, "k": [NAN]}).q[-1, 0]
 
-        with pytest.raises(ValueError, match=rf"^`params\['{bad}'\].*` must be finite") as caught:
-            jax.grad(end)(NAN if bad == "m" else 1.0)
+        with pytest.raises(ValueError, match=rf"^`params\['{name}'\].*` must be finite") as caught:
+            jax.grad(end)(NAN if name == "m" else 1.0)
         assert "racer" not in str(caught.value)
 
 
 def test_random_keys_are_traced():
-    """Another one compiles nothing anew; whoever reads it gets it."""
+    """A new key does not recompile; functions that read it get its value."""
 
     def noisy(t, q, v, params):
         return 0.5 * v[0] ** 2 - jax.random.uniform(params["key"], dtype=q.dtype) * q[0]
@@ -311,7 +311,7 @@ def test_random_keys_are_traced():
     assert traced["key"] is not None
 
 
-def test_numbers_may_be_ints_where_numbers_are_meant():
+def test_integers_are_accepted_as_real_numbers():
     """States, times and inputs; one coordinate needs no brackets."""
     force = jl.GeneralizedForce(lambda t, q, v, params, inputs: inputs["f"] * jnp.ones(1), "f")
     system = jl.System(pulled, ("x",), forces=(force,))

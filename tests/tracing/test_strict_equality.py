@@ -1,4 +1,4 @@
-"""Static values that compare equal and are not alike: each has a program of its own."""
+"""Static values that compare equal but differ: each has its own program."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -41,7 +41,7 @@ class Second(NamedTuple):
         (lambda law: 2.0 if str(law[0]) == "-0.0" else 5.0, (-0.0,), (0.0,)),
     ],
 )
-def test_what_is_equal_and_not_alike_has_a_program_of_its_own(law, one, other):
+def test_equal_but_different_values_have_separate_programs(law, one, other):
     """Keys that compare equal: named tuples of two classes, True and 1, 0.0 and -0.0."""
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - law(p["x"].law) * q[0], ("x",))
     found = [system.acceleration([0.0], [0.0], {"x": Static(x)})[0] for x in (one, other)]

@@ -1,4 +1,4 @@
-"""Declared functions are traced once: what they read from outside holds as it was then."""
+"""Declared functions are traced once: free variables keep their values at tracing."""
 
 import pickle
 import warnings
@@ -18,7 +18,7 @@ GRAVITY = 2.0
 
 
 def fall(system, ts=TS):
-    """Where it is at the end, its energy and its acceleration there."""
+    """Position at the end, energies, and acceleration at the end."""
     motion = jl.simulate(system, [0.0], [0.0], ts, {})
     return motion.q[-1, 0], motion.energy, system.acceleration(motion.q[-1], motion.v[-1], {})[0]
 
@@ -27,7 +27,7 @@ def changed(name, before, now):
     return pytest.warns(UserWarning, match=f"^{name}, which .* was {before} .* and is {now} now")
 
 
-def test_a_global_holds_as_it_was_when_it_was_traced(monkeypatch):
+def test_globals_keep_their_value_at_tracing(monkeypatch):
     def lagrangian(t, q, v, params):
         return 0.5 * v @ v - GRAVITY * q[0]
 
@@ -45,7 +45,7 @@ def test_a_global_holds_as_it_was_when_it_was_traced(monkeypatch):
     assert acceleration == -2.0
 
 
-def test_a_function_defined_anew_reads_anew(monkeypatch):
+def test_redefined_functions_read_current_values(monkeypatch):
     def declare():
         return jl.System(lambda t, q, v, params: 0.5 * v @ v - GRAVITY * q[0], ("x",))
 
@@ -83,7 +83,7 @@ def test_forces_constraints_and_quasi_velocities_are_traced_once():
         np.testing.assert_array_equal(numbers(), before)
 
 
-def test_nothing_is_said_of_what_stays():
+def test_unchanged_free_variables_give_no_warning():
     k, table = np.array([2.0]), {"a": [1.0, np.nan]}
 
     def lagrangian(t, q, v, params):
@@ -97,7 +97,7 @@ def test_nothing_is_said_of_what_stays():
             k = k.copy()  # another array of the same numbers
 
 
-def test_the_function_is_called_once_for_each_kind_of_arguments():
+def test_functions_are_traced_once_per_kind_of_arguments():
     calls = 0
 
     def lagrangian(t, q, v, params):
@@ -114,11 +114,11 @@ def test_the_function_is_called_once_for_each_kind_of_arguments():
     assert calls == 1
     system.energy([0.0], [1.0], params | {"n": 3})
     assert calls == 2
-    system.check([0.0], [1.0], params)  # on numbers, for functions that look at them
+    system.check([0.0], [1.0], params)  # called with numbers, for functions that test values
     assert calls == 3
 
 
-def test_a_function_of_a_system_is_taken_as_it_is():
+def test_lagrangian_of_a_system_is_reused_unchanged():
     system = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x",))
     again = jl.System(system.lagrangian, ("x",))
     assert again == system
@@ -132,8 +132,8 @@ def _module_level(t, q, v, params):
     return 0.5 * v @ v
 
 
-def test_an_object_keeps_its_attributes_to_itself():
-    """Of whatever names: they are not those of what stands for it."""
+def test_attributes_of_callables_do_not_clash():
+    """Of any name: the wrapper does not take them for its own."""
 
     class Spring:
         def __init__(self):
@@ -150,7 +150,7 @@ def test_an_object_keeps_its_attributes_to_itself():
     inner = jl.System(
         coordinates=("x",), kinetic=kinetic, potential=potential, quasi=quasi, written_in="u"
     )
-    outer = jl.System(inner.lagrangian, ("x",))  # an L of v that is made of one of u
+    outer = jl.System(inner.lagrangian, ("x",))  # an L of v derived from an L of u
     np.testing.assert_allclose(outer.mass_matrix([0.5], params={}), [[9.0]], rtol=1e-15)
 
 
@@ -159,8 +159,8 @@ def test_a_system_of_named_functions_is_pickled():
     assert pickle.loads(pickle.dumps(system)) == system
 
 
-def test_params_that_have_no_hash_are_params_still():
-    """No compiled program is keyed by them; energies need none."""
+def test_unhashable_params_work_for_energies():
+    """They key no compiled program; energies need none."""
     system = jl.System(lambda t, q, v, p: 0.5 * len(p["names"]) * v @ v, ("x",))
     assert system.energy([0.0], [1.0], {"names": {"a", "b"}}) == 1.0
 
@@ -180,7 +180,7 @@ def test_an_input_is_traced_once():
         np.testing.assert_array_equal(forces(TS[:2]), before[:2])
 
 
-def test_constants_are_owned_and_what_has_none_is_shared():
+def test_programs_copy_constants_and_share_the_rest():
     k = np.array([1.0, 2.0])
 
     @jax.jit
@@ -203,11 +203,11 @@ def test_constants_are_owned_and_what_has_none_is_shared():
     assert jaxpr_as_fun(mine)(jnp.ones(2))[0] == expected
 
 
-# ---- Numbers that are ints, functions in loops ---------------------------------------------------
+# ---- Integers as numbers, functions in loops -----------------------------------------------------
 
 
 def test_the_third_int_of_one_leaf_is_warned_about():
-    """Each compiles anew; exponents that stay, and flags, are no matter."""
+    """Each compiles anew; constant exponents and flags give no warning."""
 
     def stiff(t, q, v, params):
         kinetic = 0.5 * params["m"] * v[0] ** 2
@@ -223,15 +223,15 @@ def test_the_third_int_of_one_leaf_is_warned_about():
         for m, on in ((1, True), (2, False), (1.0, True), (2.0, True), (3.0, True), (2, True)):
             of(m, on=on)
     message = r"^params\['m'\] of .*stiff.* is the Python int 3"
-    with pytest.warns(UserWarning, match=message) as said:
+    with pytest.warns(UserWarning, match=message) as warned:
         of(3)
-    assert "Write 3.0 if it is a physical parameter" in str(said[0].message)
+    assert "Write 3.0 if it is a physical parameter" in str(warned[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        of(4)  # once is enough
+        of(4)  # no second warning
 
 
-def test_a_function_made_in_a_loop_is_told_once(caplog):
+def test_functions_defined_in_a_loop_are_logged_once(caplog):
     def made(k):
         return traced_function(lambda t: k * t)
 

@@ -1,4 +1,4 @@
-"""What goes wrong inside functions of the user's, said by name, with the line and what to write."""
+"""Errors inside functions of the user: the message names the function, the line and a fix."""
 
 import equinox as eqx
 import jax
@@ -72,15 +72,15 @@ WRONG = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_a_common_fault_is_named(kind):
+def test_common_mistakes_are_named(kind):
     make, message = WRONG[kind]
     with pytest.raises(ValueError, match=message) as caught:
         make()
-    assert caught.value.__cause__ is not None  # what Python or JAX said stays to be seen
+    assert caught.value.__cause__ is not None  # the original error stays visible
 
 
-def test_other_faults_are_left_as_they_are():
-    """Of the user's own, and what is no key of a dict."""
+def test_other_errors_are_unchanged():
+    """Errors raised by the user, and errors other than missing keys."""
 
     def own(t, q, v, params):
         raise RuntimeError("mine")
@@ -91,8 +91,8 @@ def test_other_faults_are_left_as_they_are():
     assert translate(good, [0.0, [1.0], [0.0], PARAMS], TypeError("other")) is None
 
 
-def test_derivatives_say_the_same():
-    """Without a word of tracers."""
+def test_derivatives_give_the_same_message():
+    """The message does not mention tracers."""
 
     def end(m):
         return run(params={"m": m}).q[-1, 0]
@@ -113,7 +113,7 @@ class Model(eqx.Module):
 
 
 def test_modules_with_arrays_belong_into_params():
-    """Refused as functions, with what to write; so written it works, derivatives included."""
+    """Refused as functions, with advice; as params they work, derivatives included."""
     model = Model(jnp.array(2.0))
     for function in (model, model.energy):
         with pytest.raises(ValueError, match=r"holds arrays\. Put the module into params"):
