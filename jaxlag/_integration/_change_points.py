@@ -183,7 +183,7 @@ class Crossing(NamedTuple):
         slopes = args.slopes
 
         def spread(size: Array) -> Array:  # by sums: a step has no matrix products
-            rows = jnp.sum(slopes * size, axis=1)
+            rows = jnp.sum(slopes * size[None], axis=1)
             return jnp.sum(jnp.abs(columns) * rows[:, None], axis=0)
 
         positions = jnp.abs(q) + spread(jnp.abs(q) + args.units * span)
