@@ -28,7 +28,7 @@ from bench.stability import (
     _singular_states,
     _stiff_forces,
 )
-from bench.stability._rows import Case, Found, verdict
+from bench.stability._cases import Case, Found, verdict
 
 PARTS = (
     _drifts,
@@ -44,7 +44,7 @@ PARTS = (
     _redundant_rows,
     _equilibria,
 )
-CASES = [case for part in PARTS for case in part.rows.cases]
+CASES = [case for part in PARTS for case in part.cases.cases]
 LEAST = 25  # cases that must end within their bounds
 QUICK = {
     "energy over a million steps, splitting4",

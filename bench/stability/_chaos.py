@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
+from bench.stability._cases import Cases, Found, names
 from bench.stability._long_runs import ARMS
-from bench.stability._rows import Found, Rows, names
 
 SPAN, SAVES, COUNT = 22.0, 441, 8
 TOLERANCES = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9)
 LOST = 1e-2  # rad
 
-rows = Rows()
+cases = Cases()
 
 
 def solved_to(tolerance: float, method: str) -> jl.Solution:
@@ -109,13 +109,13 @@ def worst(method: str) -> Found:
 
 # The error of a step is about its estimate, so at most about the tolerance. The errors of a
 # Lyapunov time (ten steps or fewer) may have one sign; earlier errors have grown by the same kappa.
-@rows.row("chaos: errors of order 5 up to the horizon", "error over tolerance and growth", 10.0)
+@cases.add("chaos: errors of order 5 up to the horizon", "error over tolerance and growth", 10.0)
 def fifth_order(quick: bool) -> Found:
     return worst("dopri5")
 
 
 # Steps of order 8 are accepted by an estimate of lower order, at least ten times their error.
-@rows.row("chaos: errors of order 8 up to the horizon", "error over tolerance and growth", 1.0)
+@cases.add("chaos: errors of order 8 up to the horizon", "error over tolerance and growth", 1.0)
 def eighth_order(quick: bool) -> Found:
     return worst("auto")
 
@@ -124,7 +124,7 @@ def eighth_order(quick: bool) -> Found:
 # An exponent from 22 s has an error of a quarter, both horizons one of an e-fold: 30 % for each
 # motion, 10 % for the mean of 8; the bound is three standard errors of that. If a tight tolerance
 # were missed by a factor of 100, the gain would be half as long.
-@rows.row("chaos: horizons against the Lyapunov exponent", "|mean gain over ln(1e4) / l - 1|", 0.3)
+@cases.add("chaos: horizons against the Lyapunov exponent", "|mean gain over ln(1e4) / l - 1|", 0.3)
 def horizons(quick: bool) -> Found:
     motions, true = held("auto"), exact()
     gained = motions.horizons[-1] - motions.horizons[0]

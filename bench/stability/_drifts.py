@@ -20,10 +20,10 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
+from bench.stability._cases import Cases, Found, names
 from bench.stability._long_runs import EPS, solved
-from bench.stability._rows import Found, Rows, names
 
-rows = Rows()
+cases = Cases()
 
 
 def uneven(t: Any, q: Array, v: Array, params: Any) -> Array:
@@ -202,7 +202,7 @@ FIGURE = "|drift| + 4 se, eps per step"
 def _add_drift(method: str) -> None:
     name = f"energy over a million steps, {method}"
 
-    @rows.row(name, FIGURE, most(method, FULL), quick_bound=most(method, BRIEF))
+    @cases.add(name, FIGURE, most(method, FULL), quick_bound=most(method, BRIEF))
     def run(quick: bool) -> Found:
         motions = long_run(method, BRIEF if quick else FULL)
         return drift(motions.energy, motions.every, motions.statuses)
@@ -217,7 +217,7 @@ for _method in SETTINGS:
 def _add_spin(method: str) -> None:
     name = f"angular momentum of spherical pendulums, {method}"
 
-    @rows.row(name, FIGURE, most(method, FULL), quick_bound=most(method, BRIEF))
+    @cases.add(name, FIGURE, most(method, FULL), quick_bound=most(method, BRIEF))
     def run(quick: bool) -> Found:
         motions = long_run(method, BRIEF if quick else FULL)
         assert motions.spin is not None

@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._rows import Found, Rows, names
+from bench.stability._cases import Cases, Found, names
 
 COUNT, QUICK_COUNT = 200, 20
 ROUNDING = 1e-9  # of the largest force, and of lengths in m; the worst observed is 3e-11
 GRAVITY = 9.81
 
-rows = Rows()
+cases = Cases()
 
 
 class Linkage(NamedTuple):
@@ -66,7 +66,7 @@ def row(name: str, size: int, potential: Potential, residual: Residual, draw: Dr
         wrong = float(np.sum(ok & ~(left <= ROUNDING)))
         return Found(wrong, tuple(dict.fromkeys(ended)), details)
 
-    rows.row(f"rest of closed linkages: {name}", "linkages that do not balance", 0.0)(run)
+    cases.add(f"rest of closed linkages: {name}", "linkages that do not balance", 0.0)(run)
 
 
 def direction(angle: Any, xp: Any = jnp) -> Any:

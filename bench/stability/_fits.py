@@ -9,12 +9,12 @@ import optimistix
 from jax import Array
 
 import jaxlag as jl
+from bench.stability._cases import TIGHT, Cases, Found, run
 from bench.stability._extremes import SPRING
-from bench.stability._rows import TIGHT, Found, Rows, run
 
 TIMES = np.linspace(0.0, 6.0, 41)
 
-rows = Rows()
+cases = Cases()
 
 
 # ---- jl.fit ------------------------------------------------------------------------------------
@@ -53,12 +53,12 @@ def ratio(scale: float) -> Found:
 
 
 # Positions are exact to some 1e-12, and so is the frequency determined from them.
-@rows.row("jl.fit: k / m alone", "error of k / m", 1e-11)
+@cases.add("jl.fit: k / m alone", "error of k / m", 1e-11)
 def fit_ratio(quick: bool) -> Found:
     return ratio(1.0)
 
 
-@rows.row("jl.fit: k / m alone, at 1e9 kg", "error of k / m", 1e-11)
+@cases.add("jl.fit: k / m alone, at 1e9 kg", "error of k / m", 1e-11)
 def fit_heavy_ratio(quick: bool) -> Found:
     return ratio(1e9)
 
@@ -77,14 +77,14 @@ def soft_motion() -> np.ndarray:
 
 # c changes the frequency by 3/8e-6. Its effect differs from that of k by 1e-6 / 16 only. So errors
 # of 1e-12 in the positions are errors of 1e-5 in c.
-@rows.row("jl.fit: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
+@cases.add("jl.fit: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
 def fit_weak(quick: bool) -> Found:
     found = searched(SOFT, measured(soft_motion(), 1e-9), {"k": 0.8, "c": 3.0})
     return Found(abs(float(found.params["c"]) - 1.0), ending(found), f"std {found.std['c']:.2g}")
 
 
 # A normal distribution exceeds 4 standard deviations once in 16 000 times.
-@rows.row("jl.fit: the same with noise of 1e-8", "error over its standard deviation", 4.0)
+@cases.add("jl.fit: the same with noise of 1e-8", "error over its standard deviation", 4.0)
 def fit_noisy(quick: bool) -> Found:
     noise = 1e-8 * np.random.default_rng(4).normal(size=len(TIMES))
     found = searched(SOFT, measured(soft_motion() + noise, 1e-8), {"k": 0.8, "c": 3.0})
@@ -98,7 +98,7 @@ def heavy(t: Any, q: Array, v: Array, params: Any) -> Array:
 
 
 # Positions are exact to some 1e-12; relative changes of both params change them by as much.
-@rows.row("jl.fit: parameters 1e9 apart in size", "largest relative error", 1e-11)
+@cases.add("jl.fit: parameters 1e9 apart in size", "largest relative error", 1e-11)
 def fit_apart(quick: bool) -> Found:
     system, true = jl.System(heavy, ("x",)), {"k": 2e9, "g": 0.5}
     x = run(system, [1.0], [0.0], TIMES, true, **TIGHT)["x"]
@@ -128,20 +128,20 @@ def fitted(scale: Array, least: float) -> tuple[Array, bool]:
 
 
 # Positions are exact to some 1e-12, and so is the frequency determined from them.
-@rows.row("optimistix: k / m alone", "error of k / m", 1e-11)
+@cases.add("optimistix: k / m alone", "error of k / m", 1e-11)
 def ratio_alone(quick: bool) -> Found:
     (m, k), ended = fitted(jnp.ones(2), 1e-12)
     return Found(abs(float(k / m) - 1.0), ("ok" if ended else "not converged",))
 
 
-@rows.row("optimistix: k / m alone, at 1e9 kg", "error of k / m", 1e-11)
+@cases.add("optimistix: k / m alone, at 1e9 kg", "error of k / m", 1e-11)
 def heavy_ratio(quick: bool) -> Found:
     (m, k), ended = fitted(jnp.full(2, 1e9), 1e-12)
     return Found(abs(float(k / m) - 1.0), ("ok" if ended else "not converged",))
 
 
 # As with jl.fit.
-@rows.row("optimistix: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
+@cases.add("optimistix: sensitivities 1e6 apart", "relative error of the weak one", 1e-5)
 def weak_parameter(quick: bool) -> Found:
     """Stiffness and cubic stiffness, which is 1e-6 times as large."""
 

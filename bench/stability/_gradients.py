@@ -13,17 +13,17 @@ from jax import Array
 from scipy.linalg import expm_frechet
 
 import jaxlag as jl
+from bench.stability._cases import TIGHT, Cases, Found, names, run
 from bench.stability._extremes import DRIVEN, PUSHED, SPRING, response, tied
 from bench.stability._long_runs import ARMS, BOBS, ORBIT
 from bench.stability._reference_motions import double_pendulum
-from bench.stability._rows import TIGHT, Found, Rows, names, run
 from bench.stability._singular_states import ANGLES, QUATERNION, UNEQUAL, G, rod, springs
 from systems import spherical_pendulum_cartesian
 
 EPS = float(np.finfo(float).eps)
 Motion = Callable[[Any], tuple[Array, jl.Solution]]
 
-rows = Rows()
+cases = Cases()
 
 
 def reverse(last: Motion, x: Any) -> tuple[Any, tuple[str, ...]]:
@@ -61,7 +61,7 @@ def against_differences(last: Motion, x: float, h: float) -> Found:
 # At a pericenter v is 14 and its derivative by e is 700. An error of a tenth of 1e-12 of it per
 # step changes the derivative of the energy, v dv, by 1e-9, and that of the phase by 3/2 t = 100
 # times as much. The squares of ten such errors add up.
-@rows.row("gradient of Kepler, e = 0.99", "relative error", 5e-7)
+@cases.add("gradient of Kepler, e = 0.99", "relative error", 5e-7)
 def eccentric(quick: bool) -> Found:
     e0, t = 0.99, (2 if quick else 10) * 2 * np.pi + 2.0
 
@@ -95,21 +95,21 @@ def unequal(t: float, mass: float, **options: Any) -> Found:
 
 # A tenth of 1e-12 per step, squares of 100 steps added, growth 110: the error of the state is
 # 1e-10, and the relative error of its derivative is about the same.
-@rows.row("gradient of masses 1 : 1e-8", "relative error", 2e-10)
+@cases.add("gradient of masses 1 : 1e-8", "relative error", 2e-10)
 def light_end(quick: bool) -> Found:
     return unequal(5.0, 1e-8, **TIGHT)
 
 
 # A tenth of 1e-9 per step, squares of 20 steps added, growth 5: 2e-9. Within 1e-2 rad of the
 # straight position rates double, and so do derivatives: a hundred times that.
-@rows.row("gradient of masses 1 : 1e8, rods not yet straight", "relative error", 2e-7)
+@cases.add("gradient of masses 1 : 1e8, rods not yet straight", "relative error", 2e-7)
 def heavy_end(quick: bool) -> Found:
     return unequal(0.13, 1e8)
 
 
 # The light bob passes the straight line in 1e-4 s. The error of q is a tenth of 1e-9, that of its
 # first derivative 1e4 times that, that of its second 1e8 times that.
-@rows.row("gradient of masses 1 : 1e8, past the straight line", "relative error", 1e-2)
+@cases.add("gradient of masses 1 : 1e8, past the straight line", "relative error", 1e-2)
 def thrown(quick: bool) -> Found:
     return unequal(0.14, 1e8)
 
@@ -117,7 +117,7 @@ def thrown(quick: bool) -> Found:
 # The derivative of cos(w t) by ln k is -w t / 2 sin(w t), 3000 for the stiff spring. The error of
 # the phase after a thousand periods is 1e-5, that of its derivative by ln k is half of that times w
 # t.
-@rows.row("gradient of springs over 12 decades", "relative error", 1e-5)
+@cases.add("gradient of springs over 12 decades", "relative error", 1e-5)
 def decades(quick: bool) -> Found:
     k, t = np.array([1e-6, 1.0, 1e6]), 6.0
     system = jl.System(springs, ("a", "b", "c"))
@@ -158,20 +158,20 @@ def turning(system: jl.System, start: Any, rates: Any, map_: Any) -> Found:
 
 # The angles change by pi within 1e-3 s: rates of 1e3 rad/s, derivatives of the rates 1e6, errors a
 # tenth of 1e-11.
-@rows.row("gradient past gimbal lock by 1e-3 rad, angles", "error of dR", 1e-6)
+@cases.add("gradient past gimbal lock by 1e-3 rad, angles", "error of dR", 1e-6)
 def past_lock(quick: bool) -> Found:
     return turning(ANGLES, [0.0] * 3, np.array([1e-3, 1.0, 1e-3]), jl.rotation.yaw_pitch_roll)
 
 
 # 1e-11 per step over some dozen steps.
-@rows.row("gradient through gimbal lock, quaternions", "error of dR", 1e-9)
+@cases.add("gradient through gimbal lock, quaternions", "error of dR", 1e-9)
 def quaternions(quick: bool) -> Found:
     identity = [1.0, 0.0, 0.0, 0.0]
     return turning(QUATERNION, identity, np.array([0.0, 1.0, 0.0]), jl.rotation.quaternion)
 
 
 # Errors of the difference, h^4 and 1e-12 / h: 1e-8 each.
-@rows.row("gradient through the pole, Cartesian", "relative error", 1e-6)
+@cases.add("gradient through the pole, Cartesian", "relative error", 1e-6)
 def pole(quick: bool) -> Found:
     entry = spherical_pendulum_cartesian.entry
     params = entry.example.params
@@ -188,7 +188,7 @@ def pole(quick: bool) -> Found:
 
 
 # 1e-9 per step over some dozen steps, growth 5, and the same again for the derivatives.
-@rows.row("gradient of a straight chain, Cartesian", "relative error", 1e-6)
+@cases.add("gradient of a straight chain, Cartesian", "relative error", 1e-6)
 def taut(quick: bool) -> Found:
     """Derivative of the lower bob of a horizontal chain by the initial angle of both links."""
     t = 1.0
@@ -203,7 +203,7 @@ def taut(quick: bool) -> Found:
     return off(slope, np.cos(angles) @ moved, statuses)
 
 
-@rows.row("gradient with a rod declared twice", "relative error", 1e-6)
+@cases.add("gradient with a rod declared twice", "relative error", 1e-6)
 def twice(quick: bool) -> Found:
     both = (jl.Holonomic(rod, "rod"), jl.Holonomic(rod, "again"))
 
@@ -224,7 +224,7 @@ def twice(quick: bool) -> Found:
 
 # The derivative of the force by w has rounding errors of 6e-8 (1 + w t) instead of the force's
 # 8e-8: 6 times as much.
-@rows.row("gradient at t0 = 1e9 s", "relative error", 2.4e-7)
+@cases.add("gradient at t0 = 1e9 s", "relative error", 2.4e-7)
 def late(quick: bool) -> Found:
     t0, w0, t = 1e9, 1.3, 5.0
 
@@ -237,7 +237,7 @@ def late(quick: bool) -> Found:
 
 
 # Parabolas between knots: every step is exact.
-@rows.row("gradient of a force that jumps", "relative error", 100 * EPS)
+@cases.add("gradient of a force that jumps", "relative error", 100 * EPS)
 def jumps(quick: bool) -> Found:
     """Derivative of x(1) by the times of the jumps, and by the values of the force."""
     knots, f = np.array([0.0, 0.3, 0.7, 1.0]), np.array([1.0, -2.0, 3.0, 0.0])
@@ -256,7 +256,7 @@ def jumps(quick: bool) -> Found:
 
 
 # By k: -(x t^2 / 2 + v t^3 / 6); by m: 0. Polynomials of degree 3: every step is exact.
-@rows.row("gradient at stiffness 0", "relative error", 100 * EPS)
+@cases.add("gradient at stiffness 0", "relative error", 100 * EPS)
 def no_spring(quick: bool) -> Found:
     def last(params: Any) -> tuple[Array, jl.Solution]:
         motion = run(SPRING, [1.0], [2.0], [0.0, 3.0], params)
@@ -267,7 +267,7 @@ def no_spring(quick: bool) -> Found:
 
 
 # 1e-9 per step over some dozen steps, times t / 2.
-@rows.row("gradient at mass and stiffness 1e12", "relative error", 1e-7)
+@cases.add("gradient at mass and stiffness 1e12", "relative error", 1e-7)
 def huge(quick: bool) -> Found:
     t = 5.0
 
@@ -283,7 +283,7 @@ def huge(quick: bool) -> Found:
 
 
 # The linearized motion about the lowest position, at rest: 1e-9 per step, dozens of steps.
-@rows.row("gradient of a double pendulum at rest", "relative error", 1e-7)
+@cases.add("gradient of a double pendulum at rest", "relative error", 1e-7)
 def hanging(quick: bool) -> Found:
     t = 5.0
 
@@ -298,7 +298,7 @@ def hanging(quick: bool) -> Found:
     return off(slope, np.array([1.0, 2.0]) @ swung, statuses)
 
 
-@rows.row("gradient of a start balanced upright", "relative error", 1e-6)
+@cases.add("gradient of a start balanced upright", "relative error", 1e-6)
 def upright(quick: bool) -> Found:
     """d q(T) / d q0 = cosh(sqrt(g / l) T) at q0 = pi."""
     rigid = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + G * jnp.cos(q[0]), ("a",))
@@ -311,7 +311,7 @@ def upright(quick: bool) -> Found:
     return off(slope, np.cosh(np.sqrt(G) * 2.0), statuses)
 
 
-@rows.row("gradient at rest at zero length", "error", 1e-7)
+@cases.add("gradient at rest at zero length", "error", 1e-7)
 def zero_length(quick: bool) -> Found:
     """d q(T) / d q0 = cos(T) at the origin, at rest."""
     system = jl.System(tied, ("x", "y"))
@@ -329,7 +329,7 @@ def zero_length(quick: bool) -> Found:
 
 # A tenth of 1e-12 per step, squares of 700 steps added, growth 7000: the error of the state is
 # 2e-8, and the relative error of its derivative is about the same.
-@rows.row("gradient of chaos", "relative error", 2e-8)
+@cases.add("gradient of chaos", "relative error", 2e-8)
 def chaos(quick: bool) -> Found:
     t, along = 10.0, (1.0, 0.0)
 

@@ -16,12 +16,12 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._rows import Found, Rows, names
+from bench.stability._cases import Cases, Found, names
 
 EPS = np.finfo(float).eps
 LONG = 1_000_000  # steps
 
-rows = Rows()
+cases = Cases()
 
 
 def wells(t: Any, q: Array, v: Array, params: Any) -> Array:
@@ -175,7 +175,7 @@ def power(method: str, quick: bool, what: str, expected: float) -> Found:
 # The rms of 128 walks is known to 1 / sqrt(256), 6 %, at each of 15 numbers of steps over two
 # decades. These share most of their steps, so the exponent is known to some 0.03.
 def _add_power(method: str, what: str, expected: float) -> None:
-    @rows.row(f"Brouwer's law: {what}, {method}", f"|exponent - {expected}|", 0.1)
+    @cases.add(f"Brouwer's law: {what}, {method}", f"|exponent - {expected}|", 0.1)
     def run(quick: bool) -> Found:
         return power(method, quick, what, expected)
 
@@ -204,7 +204,7 @@ def spin_walk(method: str, quick: bool) -> Found:
 # stages: 0.3 sqrt(16) = 1.2. Orbits of e = 0.15 have |q| |v| up to 1.2; a factor 1.3 is for the
 # spread.
 def _add_spin(method: str, bound: float) -> None:
-    @rows.row(f"angular momentum of orbits, {method}", "rms change, eps per root of a step", bound)
+    @cases.add(f"angular momentum of orbits, {method}", "rms change, eps per root of a step", bound)
     def run(quick: bool) -> Found:
         return spin_walk(method, quick)
 
@@ -232,23 +232,23 @@ def reversal(system: jl.System, starts: Callable, method: str, dt: float, steps:
 # A random walk forward and backward: 0.3 eps of the largest coordinate, times the square root of
 # the number of rounding errors per step and of the number of steps; 3 for the largest of 8 motions.
 # |q| up to 0.5, 13 or 35 drifts and kicks, 2000 steps: 3 * 0.3 * 0.5 * sqrt(13 or 35 * 2000).
-@rows.row("there and back, splitting4", "error, eps of the growth", 75.0)
+@cases.add("there and back, splitting4", "error, eps of the growth", 75.0)
 def reverse_fourth(quick: bool) -> Found:
     return reversal(WELLS, well_starts, "splitting4", 0.1, 1000)
 
 
-@rows.row("there and back, splitting8", "error, eps of the growth", 120.0)
+@cases.add("there and back, splitting8", "error, eps of the growth", 120.0)
 def reverse_eighth(quick: bool) -> Found:
     return reversal(WELLS, well_starts, "splitting8", 0.1, 1000)
 
 
 # |v| up to 1.5, 8 rounding errors, 1000 steps: 3 * 0.3 * 1.5 * sqrt(8000).
-@rows.row("there and back, gauss6", "error, eps of the growth", 120.0)
+@cases.add("there and back, gauss6", "error, eps of the growth", 120.0)
 def reverse_gauss(quick: bool) -> Found:
     return reversal(ARMS, small_arm_starts, "gauss6", 0.01, 500)
 
 
 # |q| up to 2, 12 rounding errors, 1000 steps: 3 * 0.3 * 2 * sqrt(12000).
-@rows.row("there and back, variational2", "error, eps of the growth", 200.0)
+@cases.add("there and back, variational2", "error, eps of the growth", 200.0)
 def reverse_held(quick: bool) -> Found:
     return reversal(BOBS, bob_starts, "variational2", 0.01, 500)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._rows import Found, Rows, names
+from bench.stability._cases import Cases, Found, names
 
 STARTS, QUICK_STARTS = 500, 50
 STEP, COARSE = 0.05, 1e-3
@@ -32,7 +32,7 @@ WAYS: tuple[dict[str, Any], ...] = (
 )
 QUICK_WAYS = (WAYS[1], WAYS[5], WAYS[7])
 
-rows = Rows()
+cases = Cases()
 
 
 class Starts(NamedTuple):
@@ -95,7 +95,7 @@ def row(
             return counted(system, exact, starts, params, clear, ways)
 
         what = "silent or refused motions" if clear else "silent motions"
-        rows.row(f"singular quasi-velocities: {name}", what, 0.0)(run)
+        cases.add(f"singular quasi-velocities: {name}", what, 0.0)(run)
         return exact
 
     return added

@@ -14,9 +14,9 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._rows import OK, Found, Rows, names
+from bench.stability._cases import OK, Cases, Found, names
 
-rows = Rows()
+cases = Cases()
 
 
 # ---- Short levers --------------------------------------------------------------------------------
@@ -59,12 +59,12 @@ def imbalance(dtype: Any) -> Found:
     return Found(worst, (OK,), where)
 
 
-@rows.row("reactions beside redundant rows, levers to 10 nm", "imbalance, roundings", 8.0)
+@cases.add("reactions beside redundant rows, levers to 10 nm", "imbalance, roundings", 8.0)
 def double(quick: bool) -> Found:
     return imbalance(jnp.float64)
 
 
-@rows.row("reactions beside redundant rows, levers to 10 nm, float32", "imbalance, roundings", 8.0)
+@cases.add("reactions beside redundant rows, levers to 10 nm, float32", "imbalance, roundings", 8.0)
 def single(quick: bool) -> Found:
     return imbalance(jnp.float32)
 
@@ -117,11 +117,11 @@ def wrong_motions(gap: float, quick: bool) -> Found:
     return Found(float(wrong), (OK,), f"of {count}: {', '.join(sorted(found))}")
 
 
-@rows.row("rows that are 0 = 0 but for rounding", "motions refused or changed", 0.0)
+@cases.add("rows that are 0 = 0 but for rounding", "motions refused or changed", 0.0)
 def empty(quick: bool) -> Found:
     return wrong_motions(0.0, quick)
 
 
-@rows.row("the same with a gap of 1 nm", "contradictions not told", 0.0)
+@cases.add("the same with a gap of 1 nm", "contradictions not told", 0.0)
 def contradictory(quick: bool) -> Found:
     return wrong_motions(1e-9, quick)

@@ -8,10 +8,10 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
+from bench.stability._cases import Cases, Found, difference, energy_change, names, run
 from bench.stability._drifts import FIGURE, Length, drift, long_run, most
 from bench.stability._long_runs import ARMS, BOBS
 from bench.stability._reference_motions import double_pendulum
-from bench.stability._rows import Found, Rows, difference, energy_change, names, run
 from bench.stability._singular_states import G
 
 EPS = float(np.finfo(np.float32).eps)
@@ -19,7 +19,7 @@ START, TIME = np.array([1.0, 0.5], np.float32), np.array([0.0, 3.0])
 AT_REST = np.zeros(2, np.float32)
 LENGTH = Length(50_000, 2_500, 20)
 
-rows = Rows()
+cases = Cases()
 
 
 def single(motion: jl.Solution, found: Found) -> Found:
@@ -28,7 +28,7 @@ def single(motion: jl.Solution, found: Found) -> Found:
 
 
 # 1e-5 per step in float32, with an energy of some 10 J, over some hundred steps.
-@rows.row("float32: energy of two pendulums", "change of H over g", 1e-3)
+@cases.add("float32: energy of two pendulums", "change of H over g", 1e-3)
 def energy(quick: bool) -> Found:
     pair = jl.System(
         lambda t, q, v, p: 0.5 * (v @ v) + np.float32(G) * jnp.sum(jnp.cos(q)), ("a", "b")
@@ -39,7 +39,7 @@ def energy(quick: bool) -> Found:
 
 # A tenth of 1.1e-5 per step, squares of 30 steps added, growth 1.4: 8e-6. Rounding errors are a
 # tenth of that.
-@rows.row("float32: double pendulum", "error of q, rad", 1e-5)
+@cases.add("float32: double pendulum", "error of q, rad", 1e-5)
 def double(quick: bool) -> Found:
     motion = run(ARMS, START, AT_REST, TIME, {})
     return single(motion, difference(motion, double_pendulum(START.astype(float), TIME[-1])[0]))
@@ -52,7 +52,7 @@ def points(angles: Any) -> Any:
 
 
 # The same; the position of the lower bob depends on both angles.
-@rows.row("float32: bobs on rods", "error of q, m", 2e-5)
+@cases.add("float32: bobs on rods", "error of q, m", 2e-5)
 def bobs(quick: bool) -> Found:
     expected = points(double_pendulum(START.astype(float), TIME[-1])[0])
     motion = run(BOBS, points(START).astype(np.float32), np.zeros(4, np.float32), TIME, {})
@@ -60,7 +60,7 @@ def bobs(quick: bool) -> Found:
 
 
 # Rounding errors of |q|^2 = 4, independent of the number of steps.
-@rows.row("float32: constraints after many steps", "residual over |q|^2", 16 * EPS)
+@cases.add("float32: constraints after many steps", "residual over |q|^2", 16 * EPS)
 def residual(quick: bool) -> Found:
     start, steps = np.array([0.6, -0.8, 1.6, -0.8], np.float32), 5_000
     options: dict[str, Any] = {"method": "dopri5", "dt": 0.01, "max_steps": 2 * steps}
@@ -73,7 +73,7 @@ def residual(quick: bool) -> Found:
 def _add_drift(method: str) -> None:
     name = f"float32: energy over {LENGTH.steps} steps, {method}"
 
-    @rows.row(name, FIGURE, most(method, LENGTH))
+    @cases.add(name, FIGURE, most(method, LENGTH))
     def energies(quick: bool) -> Found:
         motions = long_run(method, LENGTH, np.float32)
         return drift(motions.energy, motions.every, motions.statuses, EPS)
@@ -84,7 +84,7 @@ for _method in ("splitting4", "gauss4", "variational2"):
 
 
 # An error of q, 1e-5, changes the derivative by this error times w t, at most 20.
-@rows.row("float32: gradient by the start", "relative error", 2e-4)
+@cases.add("float32: gradient by the start", "relative error", 2e-4)
 def gradient(quick: bool) -> Found:
     def last(angle: Array) -> tuple[Array, jl.Solution]:
         motion = run(ARMS, jnp.stack([jnp.asarray(START[0]), angle]), AT_REST, TIME, {})

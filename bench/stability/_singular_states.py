@@ -7,32 +7,32 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._long_runs import ARMS, BOBS, ORBIT, kepler
-from bench.stability._reference_motions import double_pendulum
-from bench.stability._rows import (
+from bench.stability._cases import (
     TIGHT,
+    Cases,
     Found,
-    Rows,
     difference,
     energy_change,
     must_end,
     names,
     run,
 )
+from bench.stability._long_runs import ARMS, BOBS, ORBIT, kepler
+from bench.stability._reference_motions import double_pendulum
 from systems import four_bar, rigid_aircraft, spherical_pendulum_cartesian, spherical_pendulum_fixed
 
 EPS = np.finfo(float).eps
 G = 9.81
 LOCK = ("mass_singular", "kinematics_singular", "nonfinite", "step_below_resolution", "max_steps")
 
-rows = Rows()
+cases = Cases()
 
 
 # ---- Unstable, unequal, stiff ------------------------------------------------------------------
 
 
 # Errors of 1e-12 per step grow with t and, by the period, with (1 - e)^-2: 1e-12 * 60 * 1e4.
-@rows.row("Kepler, e = 0.99", "error of q", 1e-6)
+@cases.add("Kepler, e = 0.99", "error of q", 1e-6)
 def eccentric(quick: bool) -> Found:
     e, revolutions = 0.99, 2 if quick else 10
     q0, v0 = np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
@@ -43,7 +43,7 @@ def eccentric(quick: bool) -> Found:
 
 # The linearized solution. The cubic terms are of 1e-9; the rounding error of pi is 1e-16, that is
 # 1e-7 of the deviation.
-@rows.row("falling from upright, 1e-9 rad", "error over the deviation", 1e-5)
+@cases.add("falling from upright, 1e-9 rad", "error over the deviation", 1e-5)
 def upright(quick: bool) -> Found:
     M, K = np.array([[2.0, 1.0], [1.0, 1.0]]), -G * np.array([[2.0, 0.0], [0.0, 1.0]])
     values, modes = np.linalg.eig(np.linalg.solve(M, -K))
@@ -67,7 +67,7 @@ UNEQUAL = jl.System(unequal, ("a", "b"))
 # errors add up, and the errors grow as perturbations of the start do. Light bob: 70 steps, growth
 # 110, 1e-10 * sqrt(70) * 110. Heavy bob, with a tension of 1e8 times the weight of the upper bob:
 # 950 steps, growth 5, 1e-10 * sqrt(950) * 5.
-@rows.row("masses 1 : 1e-8, both bobs", "error of q, rad", 1e-7)
+@cases.add("masses 1 : 1e-8, both bobs", "error of q, rad", 1e-7)
 def light_end(quick: bool) -> Found:
     start, t, m = [1.0, 0.5], 5.0, 1e-8
     return difference(
@@ -75,7 +75,7 @@ def light_end(quick: bool) -> Found:
     )
 
 
-@rows.row("masses 1 : 1e8, both bobs", "error of q, rad", 2e-8)
+@cases.add("masses 1 : 1e8, both bobs", "error of q, rad", 2e-8)
 def heavy_end(quick: bool) -> Found:
     start, t, m = [1.0, 0.5], 1.0, 1e8
     return difference(
@@ -84,7 +84,7 @@ def heavy_end(quick: bool) -> Found:
 
 
 # 1e-9 of 1e8 g per step, over 2000 steps.
-@rows.row("masses 1 : 1e8, energy", "change of H over that of the large mass", 2e-6)
+@cases.add("masses 1 : 1e8, energy", "change of H over that of the large mass", 2e-6)
 def heavy_energy(quick: bool) -> Found:
     ts = np.linspace(0.0, 2.0, 21)
     return energy_change(run(UNEQUAL, [1.0, 0.5], [0.0, 0.0], ts, {"m": 1e8}), 1e8 * G)
@@ -96,7 +96,7 @@ def springs(t: Any, q: Array, v: Array, params: Any) -> Array:
 
 
 # A thousand periods of the stiff spring, ten steps each with 1e-9.
-@rows.row("springs over 12 decades", "error of q", 1e-5)
+@cases.add("springs over 12 decades", "error of q", 1e-5)
 def decades(quick: bool) -> Found:
     k, t = np.array([1e-6, 1.0, 1e6]), 2 * np.pi
     system = jl.System(springs, ("a", "b", "c"))
@@ -111,7 +111,7 @@ def elastic(t: Any, q: Array, v: Array, params: Any) -> Array:
 
 
 # Explicit steps resolve the spring's vibration; implicit steps of order 5 have 1e-8 per step.
-@rows.row("stiff spring, implicit steps", "difference from explicit steps, m", 1e-4)
+@cases.add("stiff spring, implicit steps", "difference from explicit steps, m", 1e-4)
 def stiff(quick: bool) -> Found:
     system, start = jl.System(elastic, ("x", "y")), ([1.0, 0.0], [0.0, 0.0])
     t, params = [0.0, 0.5 if quick else 2.0], {"k": 1e6}
@@ -123,7 +123,7 @@ def stiff(quick: bool) -> Found:
 # ---- Singular coordinates ----------------------------------------------------------------------
 
 
-@rows.row("gimbal lock at the start", "-", 0.0, LOCK)
+@cases.add("gimbal lock at the start", "-", 0.0, LOCK)
 def locked(quick: bool) -> Found:
     entry = rigid_aircraft.entry
     q0, v0 = [0.0, 0.0, 0.0, 0.1, np.pi / 2, 0.2], [1.0, 0.0, 0.0, 0.1, 0.2, 0.3]
@@ -174,13 +174,13 @@ def attitude(map_: Any, motion: jl.Solution) -> np.ndarray:
 
 # A uniform rotation about the pitch axis. Steps may end at gimbal lock or on either side of it. The
 # angle is t, so every method is exact with any steps.
-@rows.row("through gimbal lock, angles", "error of R", 1e-6, LOCK)
+@cases.add("through gimbal lock, angles", "error of R", 1e-6, LOCK)
 def through_lock(quick: bool) -> Found:
     return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0))
 
 
 # The tenth step ends at gimbal lock, where the rates of the angles are undefined.
-@rows.row("a step that ends in gimbal lock, angles", "error of R", 1e-6, LOCK)
+@cases.add("a step that ends in gimbal lock, angles", "error of R", 1e-6, LOCK)
 def into_lock(quick: bool) -> Found:
     options = {"method": "dopri8", "dt": np.pi / 20}
     return pitch_error(tumble(ANGLES, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2.0, **options))
@@ -194,7 +194,7 @@ def pitch_error(motion: jl.Solution) -> Found:
 
 
 # The angles change by pi within 1e-3 s: rates of 1e3 rad/s, errors of 1e-11 times that.
-@rows.row("past gimbal lock by 1e-3 rad, angles", "difference from quaternions", 1e-7)
+@cases.add("past gimbal lock by 1e-3 rad, angles", "difference from quaternions", 1e-7)
 def past_lock(quick: bool) -> Found:
     w = [1e-3, 1.0, 1e-3]
     by_angles = tumble(ANGLES, [0.0, 0.0, 0.0], w, 2.0)
@@ -205,14 +205,14 @@ def past_lock(quick: bool) -> Found:
     return Found(error, names(by_angles.status) + names(straight.status))
 
 
-@rows.row("through gimbal lock, quaternions", "error of R", 1e-9)
+@cases.add("through gimbal lock, quaternions", "error of R", 1e-9)
 def quaternions(quick: bool) -> Found:
     motion = tumble(QUATERNION, [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0], np.pi)
     error = np.abs(attitude(jl.rotation.quaternion, motion) - np.diag([-1.0, 1.0, -1.0]))
     return Found(float(np.max(error)), names(motion.status))
 
 
-@rows.row("spherical pendulum through its pole, angles", "error of q, rad", 1e-6, LOCK)
+@cases.add("spherical pendulum through its pole, angles", "error of q, rad", 1e-6, LOCK)
 def pole(quick: bool) -> Found:
     """Motion in a plane, as of a plane pendulum: from 1 rad to the other side."""
     entry = spherical_pendulum_fixed.entry
@@ -226,14 +226,14 @@ def pole(quick: bool) -> Found:
 
 
 # 1e-9 per step; the azimuth changes by pi within 1e-6 s near the pole.
-@rows.row("spherical pendulum past its pole, angles", "change of H, J", 1e-5)
+@cases.add("spherical pendulum past its pole, angles", "change of H, J", 1e-5)
 def past_pole(quick: bool) -> Found:
     entry = spherical_pendulum_fixed.entry
     ts = np.linspace(0.0, 2.0, 41)
     return energy_change(run(entry.system, [0.3, 1.0], [1e-4, 0.0], ts, entry.example.params), 1.0)
 
 
-@rows.row("spherical pendulum through its pole, Cartesian", "error of x, m", 1e-6)
+@cases.add("spherical pendulum through its pole, Cartesian", "error of x, m", 1e-6)
 def pole_cartesian(quick: bool) -> Found:
     """Released at (0.96, 0, -0.28), it is below the pivot after a quarter of the period."""
     entry = spherical_pendulum_cartesian.entry
@@ -250,7 +250,7 @@ def pole_cartesian(quick: bool) -> Found:
 # ---- Constraints -------------------------------------------------------------------------------
 
 
-@rows.row("straight chain let go, Cartesian", "difference from angles, m", 1e-6)
+@cases.add("straight chain let go, Cartesian", "difference from angles, m", 1e-6)
 def taut(quick: bool) -> Found:
     """Both bobs on a horizontal line with the pivot: the constraint rows are partly parallel."""
     angles = run(ARMS, [np.pi / 2] * 2, [0.0, 0.0], [0.0, 1.0], {}, **TIGHT).q[-1]
@@ -259,7 +259,7 @@ def taut(quick: bool) -> Found:
     return difference(motion, [x[0], y[0], x[0] + x[1], y[0] + y[1]])
 
 
-@rows.row("chain hanging at rest", "displacement, m", 1e-12)
+@cases.add("chain hanging at rest", "displacement, m", 1e-12)
 def hanging(quick: bool) -> Found:
     q0 = [0.0, -1.0, 0.0, -2.0]
     return difference(run(BOBS, q0, [0.0] * 4, [0.0, 100.0], {}), q0)
@@ -273,7 +273,7 @@ def rod(t: Any, q: Array, params: Any) -> Array:
     return q @ q - 1.0
 
 
-@rows.row("a rod declared twice", "difference from once, m", 1e-8)
+@cases.add("a rod declared twice", "difference from once, m", 1e-8)
 def twice(quick: bool) -> Found:
     start = [0.6, -0.8], [0.8, 0.6]
     once = (jl.Holonomic(rod, "rod"),)
@@ -283,7 +283,7 @@ def twice(quick: bool) -> Found:
     return difference(double, single.q[-1])
 
 
-@rows.row("rows that contradict each other", "-", 0.0, ("contradictory_rows", "rank_change"))
+@cases.add("rows that contradict each other", "-", 0.0, ("contradictory_rows", "rank_change"))
 def contradictory(quick: bool) -> Found:
     """x = 0 and x = t^2 / 2 agree in position and velocity at t = 0, but not in acceleration."""
     held = jl.Holonomic(lambda t, q, p: q[0], "held")
@@ -292,7 +292,7 @@ def contradictory(quick: bool) -> Found:
     return must_end(run(system, [0.0, 0.0], [0.0, 0.0], [0.0, 1.0], {}))
 
 
-@rows.row("parallelogram through its folded position", "change of H, J", 1e-6)
+@cases.add("parallelogram through its folded position", "change of H, J", 1e-6)
 def folded(quick: bool) -> Found:
     """All links on one line, a bifurcation of the mechanism, with a save time near it."""
     entry = four_bar.entry
@@ -304,7 +304,7 @@ def folded(quick: bool) -> Found:
 
 
 # Rounding errors of |q|^2 = 4 in one step, independent of the number of steps.
-@rows.row("constraints after many steps", "residual over |q|^2", 16 * EPS)
+@cases.add("constraints after many steps", "residual over |q|^2", 16 * EPS)
 def residual(quick: bool) -> Found:
     steps = 5_000 if quick else 100_000
     motion = run(

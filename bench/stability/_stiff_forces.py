@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 
 import jaxlag as jl
-from bench.stability._rows import Found, Rows, names
+from bench.stability._cases import Cases, Found, names
 
 STARTS, QUICK_STARTS = 1000, 100
 TOLERANCES = (1e-9, 1e-7, 1e-5)
 GRAVITY = 9.81
 
-rows = Rows()
+cases = Cases()
 
 
 class Starts(NamedTuple):
@@ -88,7 +88,7 @@ def row(name: str, draw: Draw) -> Callable[[Callable], Callable]:
             rng = np.random.default_rng(len(name))
             return silent(potential, draw(rng, QUICK_STARTS if quick else STARTS))
 
-        rows.row(f"sharp: {name}", "silent motions", 0.0)(run)
+        cases.add(f"sharp: {name}", "silent motions", 0.0)(run)
         return potential
 
     return added

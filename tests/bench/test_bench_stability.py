@@ -7,14 +7,14 @@ import pytest
 
 import jaxlag as jl
 from bench import stability
-from bench.stability import _drifts, _long_runs, _reference_motions, _rows
+from bench.stability import _cases, _drifts, _long_runs, _reference_motions
 
 
 def stressed(bound=1.0, statuses=(), figure=0.5, found=("ok",)):
     def run(quick):
-        return _rows.Found(figure, found)
+        return _cases.Found(figure, found)
 
-    return _rows.Case("row", "figure", bound, statuses, run)
+    return _cases.Case("row", "figure", bound, statuses, run)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_stress_case_that_raises_an_error_fails_alone():
     def run(quick):
         raise ValueError("`q0` must be finite")
 
-    row = stability.judged(_rows.Case("row", "figure", 1.0, (), run), quick=True)
+    row = stability.judged(_cases.Case("row", "figure", 1.0, (), run), quick=True)
     assert row["verdict"] == "failed"
     assert row["statuses"] == "raised ValueError: `q0` must be finite"
 

@@ -122,9 +122,9 @@ def test_a_solver_has_its_order(added, monkeypatch):
 
 
 def test_benchmark_case_runs_within_its_bound():
-    rows = _extremes.Rows()
-    follow(example("A row of a benchmark"), vars(_extremes) | {"rows": rows})
-    (case,) = rows.cases
+    cases = _extremes.Cases()
+    follow(example("A case of a benchmark"), vars(_extremes) | {"cases": cases})
+    (case,) = cases.cases
     assert case.name not in {other.name for other in stability.CASES}
     assert stability.judged(case, quick=True)["verdict"] == "within"
 

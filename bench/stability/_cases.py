@@ -48,13 +48,13 @@ class Case(NamedTuple):
         return self._replace(bound=self.quick_bound) if loose else self
 
 
-class Rows:
+class Cases:
     """A list of cases, filled by a decorator."""
 
     def __init__(self) -> None:
         self.cases: list[Case] = []
 
-    def row(
+    def add(
         self,
         name: str,
         figure: str,
