@@ -6,11 +6,12 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array
 
+from jaxlag._core._result import AbstractResult
 from jaxlag._simulation._failure import MotionKey
 from jaxlag._system._system import System
 
 
-class AbstractSolution(eqx.Module):
+class AbstractSolution(AbstractResult):
     """The attributes of a `Solution` that do not depend on how it was computed; see there."""
 
     system: eqx.AbstractVar[System]

@@ -1,17 +1,19 @@
 """Growth of perturbations along a motion: exponent, condition number, horizon."""
 
-import equinox as eqx
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._errors import unsupported
+from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 
 SURE = 3.0  # standard errors by which an exponent must exceed zero
 
 
-class PerturbationGrowth(eqx.Module):
+class PerturbationGrowth(AbstractResult):
     """Growth of perturbations of a motion y = (q, v), Phi' = df/dy Phi along y' = f(t, y).
 
     Shapes are those of one motion of n coordinates at s times; after `jax.vmap` every array has
@@ -42,6 +44,15 @@ class PerturbationGrowth(eqx.Module):
     rtol: Float[Array, "*batch"]
     atol: Float[Array, "*batch"]
     status: Int[Array, "*batch"]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the leading axes, () for a single motion."""
+        return self.ts.shape[:-1]
+
+    def __getitem__(self, index: Any) -> "PerturbationGrowth":
+        """Results of a batch."""
+        return self._select(index)
 
     @property
     def kappa(self) -> Float[Array, "*batch s"]:

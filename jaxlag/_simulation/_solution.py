@@ -142,13 +142,20 @@ class Solution(AbstractSolution):
         """The inputs of this motion, by name."""
         return eqx.combine(self._inputs_traced, self._inputs_static.tree)
 
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the leading axes, () for a single motion."""
+        return self.ts.shape[:-1]
+
     def __getitem__(self, name: Any) -> Any:
         """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
 
-        For a batch, an index, a slice or an array of indices selects motions.
+        For a batch, an index, a slice or an array of indices selects motions. A batch is a
+        sequence of its motions: `len(motions)`, `for motion in motions`.
 
         Raises:
             ValueError: no such name; an index into a single motion.
+            IndexError: an index beyond the axes of the batch.
         """
         if not isinstance(name, str):
             if self.ts.ndim == 1:
@@ -156,7 +163,7 @@ class Solution(AbstractSolution):
                 raise invalid(
                     "name", must, was, "For a save time index motion.ts, motion.q, motion.v."
                 )
-            return jax.tree.map(lambda x: x[name], self)
+            return self._select(name)
         quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]

@@ -1,16 +1,19 @@
 """Assembly: a consistent state, its residuals and its independent rows."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._errors import shortened, unsupported
+from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._system._system import System
 
 
-class Assembly(eqx.Module):
+class Assembly(AbstractResult):
     """A state (q, v) near a guess, and its constraint residuals.
 
     Attributes:
@@ -35,6 +38,15 @@ class Assembly(eqx.Module):
     _rows: ConstraintRows = eqx.field(static=True)
 
     @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the leading axes, () for a single assembly."""
+        return self.q.shape[:-1]
+
+    def __getitem__(self, index: Any) -> "Assembly":
+        """Assemblies of a batch."""
+        return self._select(index)
+
+    @property
     def rank(self) -> Int[Array, "*batch"]:
         """Number of independent rows."""
         return jnp.sum(self.independent, axis=-1, dtype=jnp.int32)
@@ -44,7 +56,9 @@ class Assembly(eqx.Module):
         """Names of the rows that depend on the others, for a single assembly."""
         if self.independent.ndim != 1:
             raise unsupported(
-                "`dependent` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
+                "`dependent` of a batch",
+                f"its shape is {self.q.shape[:-1]}",
+                "Take one of them, as batch[3].",
             )
         return tuple(
             name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
@@ -54,7 +68,9 @@ class Assembly(eqx.Module):
         """How a single assembly ended, as text."""
         if self.q.ndim != 1:
             raise unsupported(
-                "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
+                "`message` of a batch",
+                f"its shape is {self.q.shape[:-1]}",
+                "Take one of them, as batch[3].",
             )
         status = Status(int(self.status))
         if status is Status.ok:

@@ -15,6 +15,7 @@ from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import EquilibriumError, invalid, shortened, unsupported
+from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm
 from jaxlag._linalg._row_residuals import row_sizes, without_rounding
@@ -32,7 +33,7 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
 
 
-class Equilibrium(eqx.Module):
+class Equilibrium(AbstractResult):
     """A state of rest q in which all generalized forces balance, with its stability.
 
     Shapes are those of one search; after `jax.vmap` every array has the batch axes in front.
@@ -80,8 +81,15 @@ class Equilibrium(eqx.Module):
             raise AttributeError("Equilibrium.lam is Equilibrium.multipliers now")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
-    def __getitem__(self, name: str) -> Array:
-        """A coordinate by its name, in its declared shape."""
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the leading axes, () for a single equilibrium."""
+        return self.q.shape[:-1]
+
+    def __getitem__(self, name: Any) -> Any:
+        """A coordinate by its name, in its declared shape; equilibria of a batch by an index."""
+        if not isinstance(name, str):
+            return self._select(name)
         return self.system.coordinates.part(self.q, name)
 
     @property
@@ -143,7 +151,9 @@ class Equilibrium(eqx.Module):
         """How a single search ended, as text."""
         if self.q.ndim != 1:
             raise unsupported(
-                "`message` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
+                "`message` of a batch",
+                f"its shape is {self.q.shape[:-1]}",
+                "Take one of them, as batch[3].",
             )
         labels = self.system.coordinates.labels
         status = Status(int(self.status))

@@ -1,0 +1,70 @@
+"""Results of single problems and of batches: a batch is a sequence of results."""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid, requirement
+
+
+class AbstractResult(eqx.Module):
+    """A result whose arrays may have leading axes, as under `jax.vmap`: then it is a batch."""
+
+    @property
+    @abstractmethod
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the leading axes, () for a single result."""
+
+    def __len__(self) -> int:
+        """Number of results along the first axis of a batch.
+
+        Raises:
+            TypeError: it is a single result.
+        """
+        if not self.batch_shape:
+            raise TypeError(f"a single {type(self).__name__} has no length: it is no batch")
+        return self.batch_shape[0]
+
+    def __bool__(self) -> bool:
+        return True  # as objects without a length
+
+    def __iter__(self) -> Iterator[Any]:
+        """The results of a batch, one after the other.
+
+        Raises:
+            TypeError: it is a single result.
+        """
+        return (self._select(i) for i in range(len(self)))
+
+    def _select(self, index: Any) -> Any:
+        """Results of a batch, by an index of its leading axes as for arrays.
+
+        Raises:
+            IndexError: an index beyond its axes.
+            ValueError: it is a single result.
+        """
+        batch, kind = self.batch_shape, type(self).__name__
+        if not batch:
+            raise invalid("index", "belong to a batch", f"this is a single {kind}")
+        key = index if isinstance(index, tuple) else (index,)
+        if concrete(*key):
+            key = tuple(np.asarray(x) if isinstance(x, jax.Array) else x for x in key)
+            try:
+                np.broadcast_to(0, batch)[key]
+            except IndexError as error:
+                must, was = f"select from a batch of shape {batch}", f"it was {index!r}"
+                raise IndexError(requirement("index", must, was, f"{error}.")) from None
+
+        spread = any(x is Ellipsis for x in key)
+
+        def selected(x: Any) -> Any:
+            """With an ellipsis, which stands for axes of the batch alone."""
+            rest = (slice(None),) * (x.ndim - len(batch)) if spread else ()
+            return x[(*key, *rest)]
+
+        return jax.tree.map(selected, self)
