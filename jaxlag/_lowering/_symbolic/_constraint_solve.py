@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 from jax import Array
 
 from jaxlag._linalg._kkt import TangentSpace, row_weights, tangent_space, units_of
@@ -231,10 +230,10 @@ def _null_space(
     space = read(_tangent_space, M, A, kept, crossing=crossing)
     found = [read(TangentSpace.loads, space, *side) for side in right]
     inertia, sides = read(TangentSpace.inertia, space), [(load, ()) for _, load in found]
-    symmetric = np.where(np.tri(len(M), dtype=bool), inertia.T, inertia)
+    symmetric = [[inertia[min(i, j)][max(i, j)] for j in range(len(M))] for i in range(len(M))]
     solved = bordered(graph, symmetric, [], sides, eps)
     return [
-        list(read(TangentSpace.acceleration, space, y, across))
+        read(TangentSpace.acceleration, space, y, across)
         for y, (across, _) in zip(solved, found, strict=True)
     ]
 
