@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
-from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
+from jaxlag._linalg._kkt import (
+    augmented,
+    factor_kkt,
+    masked,
+    row_weights,
+    solve_kkt,
+    solve_reactions,
+    units_of,
+)
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._linalg._row_residuals import redundant_rows_hold, row_sizes
 from jaxlag._lowering._row_layout import layout
@@ -385,7 +393,8 @@ class ArrayTerms(eqx.Module):
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
         """The same, and the diagonal of (A M^-1 A^T)^-1.
 
-        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular.
+        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular: rows
+        without inertia would have no effective mass.
         """
         M = (
             self.mass(t, q, v, params)
@@ -393,16 +402,21 @@ class ArrayTerms(eqx.Module):
             else constants.mass
         )
         A, b = self.rows(t, q, v, params)
+        weights = None
         if chosen is not None:
             if not self.regular:
                 M, _ = augmented(M, masked(A, kept))
             rows = np.array(chosen)
             A, b, kept = A[rows], b[rows], None if kept is None else kept[rows]
+        elif self.crossing and not self.regular:
+            A = masked(A, kept)
+            weights = jax.lax.stop_gradient(row_weights(M, A))
         how = kept, self.formulation
         factor = factor_kkt(*jax.lax.stop_gradient((M, A)), *how, self.crossing)
 
         def column(c: Array) -> tuple[Array, Array]:
-            x, lam = solve_kkt(M, A, jnp.zeros_like(q), c, *how, factor)
+            load = jnp.zeros_like(q) if weights is None else (weights * c) @ A
+            x, lam = solve_kkt(M, A, load, c, *how, factor)
             return -x, -lam
 
         K, masses = jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
