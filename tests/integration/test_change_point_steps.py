@@ -47,7 +47,7 @@ def test_no_stage_is_near_the_place(method):
 
 def ahead_of(t, left, apart):
     """Known of a place `left` ahead of t."""
-    return no_crossing(t, 1, float)._replace(time=t + left, apart=jnp.array(apart))
+    return no_crossing(t, 1, float)._replace(time=t + left, independence=jnp.array(apart))
 
 
 def test_what_is_saved_across_shortens_the_step():
@@ -77,7 +77,7 @@ def test_a_motion_that_ends_at_the_place_or_beyond_it():
     np.testing.assert_allclose(far.step(t, h, gap, at), 0.1 * (1 - NARROW / SHORT), rtol=1e-12)
     assert float(near.step(t, h, gap, jnp.array(2.1))) == 0.3  # cut where the motion ends
     beyond = jnp.array(2.11)
-    lead = float(far._replace(apart=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
+    lead = float(far._replace(independence=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
     np.testing.assert_allclose((0.1 - lead) / (0.11 - lead), gap, rtol=1e-9)
 
 
@@ -93,8 +93,8 @@ def test_where_the_place_is_to_be_expected():
     assert second.is_near
     assert jnp.isinf(second.onwards(t2, jnp.array(2.5), jnp.array(0.08), moved).time)
     assert jnp.isinf(begin.onwards(t0, t1, jnp.array(1.1 * AHEAD), moved).time)
-    assert second._replace(apart=jnp.array(BESIDE * 0.03)).is_beside(second)
-    assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
+    assert second._replace(independence=jnp.array(BESIDE * 0.03)).is_beside(second)
+    assert not second._replace(independence=jnp.array(0.03)).is_beside(second)
 
 
 def test_for_how_long_rows_may_depend():

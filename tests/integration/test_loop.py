@@ -96,7 +96,7 @@ def step_ends(options):
 
     kept = record(values)
     # A turn that was not accepted ends where the last one did; a negative one at the stop.
-    ends = np.asarray(kept.offsets)[: int(kept.turns)]
+    ends = np.asarray(kept.offsets)[: int(kept.steps)]
     return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
 
 

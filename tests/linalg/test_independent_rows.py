@@ -121,10 +121,10 @@ def on_the_graph(A, units, kept, lam):
     rows = [
         [graph.input("A", i * n + j) if A[i, j] else graph.zero for j in range(n)] for i in range(m)
     ]
-    given = {"A": A.ravel(), "units": units, "kept": kept, "there": np.ones(m)}
+    given = {"A": A.ravel(), "units": units, "active_rows": kept, "nonzero": np.ones(m)}
     units, kept, there = (
         [graph.input(name, i) for i in range(given[name].size)]
-        for name in ("units", "kept", "there")
+        for name in ("units", "active_rows", "nonzero")
     )
     sharing = Sharing(list(range(m)), there)
     found = shared(graph, rows, units, kept, sharing, float(np.finfo(float).eps))
