@@ -123,9 +123,8 @@ class Crossing(NamedTuple):
         lost = self.independence - independence
         falls = lost > 0
         nearer = (independence > 0) & (independence < AHEAD) & falls
-        left = jnp.where(nearer, independence / jnp.where(nearer, lost, 1.0), jnp.inf).astype(
-            t1.dtype
-        )
+        left = jnp.where(nearer, independence / jnp.where(nearer, lost, 1.0), jnp.inf)
+        left = left.astype(t1.dtype)
         fresh = jnp.where(falls, jnp.abs(moved) / jnp.where(falls, lost, 1.0), jnp.inf)
         # Row lengths that vanish as a higher power of the distance decrease ever more slowly.
         stays = self.depends | (self.is_near & (jnp.sum(self.span) < jnp.sum(fresh)))

@@ -147,11 +147,9 @@ class StepEnd(eqx.Module):
         assert velocity is not None
         assert kick is not None
         moved = self._joined(q, v - kick(velocity(q, v)), y)
-        return (
-            jnp.where(independence > unknown_below(independence.dtype), moved, jnp.nan)
-            if refuses
-            else moved
-        )
+        if not refuses:
+            return moved
+        return jnp.where(independence > unknown_below(independence.dtype), moved, jnp.nan)
 
     def independence(self, tau: Array, y: Array, args: Arguments) -> Array:
         """The least row length over its length at the start of the motion."""
@@ -176,10 +174,8 @@ class StepEnd(eqx.Module):
         masses = (surface if frozen is None else frozen).masses
         assert masses is not None
         lengths = lengths_of(masses, args.active_rows)
-        alone, holonomic = (
-            lengths > LOST * args.lengths,
-            np.flatnonzero(self.dynamics.rows.holonomic),
-        )
+        alone = lengths > LOST * args.lengths
+        holonomic = np.flatnonzero(self.dynamics.rows.holonomic)
 
         def without(surface: ConstraintProjector) -> ConstraintProjector:
             shift, kick = surface.shift, surface.kick

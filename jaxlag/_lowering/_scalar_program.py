@@ -124,10 +124,8 @@ class ScalarProgram(AccelerationProgram):
         active_rows, solving = choices.active_rows, choices.multiplier_rows or (None, None)
         first = before(equations.program, *solving)
         assert first is not None
-        rates, determinants = (
-            before(equations.velocity, active_rows),
-            before(equations.determinants, None),
-        )
+        rates = before(equations.velocity, active_rows)
+        determinants = before(equations.determinants, None)
         if equations.surface is None:
             return ScalarSolveConstants(first, rates=rates, determinants=determinants)
         *moving, lam = equations.surface

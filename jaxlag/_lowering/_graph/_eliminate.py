@@ -136,13 +136,8 @@ class _Elimination:
         active_rows: Sequence[Node] | None,
         crossing: bool,
     ) -> None:
-        self.graph, self.block, self.coordinates, self.active_rows = (
-            graph,
-            block,
-            coordinates,
-            active_rows,
-        )
-        self.crossing = crossing
+        self.graph, self.block, self.coordinates = graph, block, coordinates
+        self.active_rows, self.crossing = active_rows, crossing
         self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
         # Products of two entries of M overflow single precision in usual units.
         self.cramer = eps < DOUBLE
