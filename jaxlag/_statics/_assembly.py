@@ -47,7 +47,9 @@ class Assembly(eqx.Module):
                 "`dependent` of a batch", f"its shape is {self.q.shape[:-1]}", "Take one of them."
             )
         return tuple(
-            name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
+            name
+            for name, independent in zip(self._rows.labels, self.independent, strict=True)
+            if not independent
         )
 
     def message(self) -> str:
