@@ -232,7 +232,7 @@ def geared(**options):
 def test_rows_without_inertia_have_an_effective_mass(formulation):
     """That of M + A^T W A, W = (1/5, 1): otherwise their distance from dependence is 0/0."""
     terms = replace(geared()._terms, formulation=formulation, crossing=True)
-    K, masses = terms.corrections(0.0, jnp.zeros(3), jnp.zeros(3), 0.5)
+    K, masses = terms.corrections(jnp.zeros(()), jnp.zeros(3), jnp.zeros(3), 0.5)
     np.testing.assert_allclose(K, [[0, 0], [0, -2], [0.5, 1]], atol=1e-15)
     np.testing.assert_allclose(masses, [0.2, 1.0], rtol=1e-14)
 
