@@ -250,7 +250,7 @@ def _in_quasi(mechanism: Mechanism, choice: RowChoice) -> dict[str, Any]:
         """v' = B u' + s, from the rates (v, u') of the scalar program."""
         w = speeds(t, q, v, params)
         prepared: Any = scalars.precompute(
-            q, params, {}, Choices(kept=choice.kept, reacting=choice)
+            q, params, {}, Choices(active_rows=choice.active_rows, multiplier_rows=choice)
         )
         rates = scalars.quasi_rates(StateOfProgram(t, q, w, params, {}), prepared)
         du = rates[q.shape[0] :]

@@ -43,19 +43,19 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def renamed(**words: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def renamed(**names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorator that refuses former keywords with a message that shows the new ones.
 
     Args:
-        **words: by the former name, its replacement.
+        **names: by the former name, its replacement.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            for old in words.keys() & kwargs.keys():
+            for old in names.keys() & kwargs.keys():
                 must, was = "be called with its current keywords", f"it got {old}="
-                raise invalid(function.__name__, must, was, f"Write {words[old]}.")
+                raise invalid(function.__name__, must, was, f"Write {names[old]}.")
             return function(*args, **kwargs)
 
         return checked

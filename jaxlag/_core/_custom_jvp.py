@@ -164,12 +164,12 @@ def with_rules_kept(program: ClosedJaxpr) -> ClosedJaxpr:
 def keeping_rules(function: Callable) -> Callable:
     """The function with `with_rules_kept` applied to its program; traced by every call."""
 
-    def kept(*args: Any) -> Any:
+    def wrapped(*args: Any) -> Any:
         program, like = jax.make_jaxpr(function, return_shape=True)(*args)
         found = jaxpr_as_fun(with_rules_kept(program))(*jax.tree.leaves(args))
         return jax.tree.unflatten(jax.tree.structure(like), found)
 
-    return kept
+    return wrapped
 
 
 def with_rule_kept(eqn: Any) -> Any:

@@ -86,7 +86,7 @@ def _flat(form: LinearMap, r_tree: Any, x_tree: Any, y_tree: Any) -> LinearMap:
     )
 
 
-def _turned(form: LinearMap, like: Leaves) -> LinearMap:
+def _transposed(form: LinearMap, like: Leaves) -> LinearMap:
     """The transposed map; `like` are the shapes of x."""
 
     def plain(r: Leaves, y: Leaves) -> list:
@@ -98,7 +98,7 @@ def _turned(form: LinearMap, like: Leaves) -> LinearMap:
         form.forward,
         form.plain_backward or plain,
         form.plain,
-        None if form.in_lanes is None else _turned(form.in_lanes, like),
+        None if form.in_lanes is None else _transposed(form.in_lanes, like),
         form.at_once,
     )
 
@@ -228,7 +228,7 @@ def _transpose(cotangents: Leaves, *args: Any, form: LinearMap, count: int) -> l
     r, x = args[:count], args[count:]
     like = [leaf.aval for leaf in x]
     y = [ad.instantiate_zeros(ct) for ct in cotangents]
-    return [None] * count + _bind(_turned(form, like), r, y)
+    return [None] * count + _bind(_transposed(form, like), r, y)
 
 
 ad.primitive_transposes[_linear_map] = _transpose

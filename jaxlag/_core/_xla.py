@@ -67,8 +67,8 @@ def in_force() -> bool:
     """Whether loops beyond the old bound compile to one function, tested by a compilation."""
 
     def loop(x: jax.Array) -> jax.Array:
-        turn = lambda c: (c[0] + 1, c[1] * c[1][::-1])  # noqa: E731
-        return jax.lax.while_loop(lambda c: c[0] < 3, turn, (0, x))[1]
+        body_fun = lambda c: (c[0] + 1, c[1] * c[1][::-1])  # noqa: E731
+        return jax.lax.while_loop(lambda c: c[0] < 3, body_fun, (0, x))[1]
 
     compiled = jax.jit(loop).lower(jax.ShapeDtypeStruct((1000,), jnp.float32)).compile()
     return "small_call" in (compiled.as_text() or "")

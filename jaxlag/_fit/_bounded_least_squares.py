@@ -52,8 +52,8 @@ def box_least_squares(
         known = at_limits(side)
         rows = jnp.concatenate([jnp.where(held, 0.0, R), jnp.diag(jnp.where(held, 1.0, 0.0))])
         right = jnp.append(c - R @ known, jnp.zeros(p, R.dtype))
-        turned = jnp.linalg.qr(jnp.concatenate([rows, right[:, None]], axis=1), mode="r")
-        return jnp.where(held, known, solve_triangular(turned[:p, :p], turned[:p, -1]))
+        triangle = jnp.linalg.qr(jnp.concatenate([rows, right[:, None]], axis=1), mode="r")
+        return jnp.where(held, known, solve_triangular(triangle[:p, :p], triangle[:p, -1]))
 
     def wrong(side: Array, z: Array) -> Array:
         """The new side (-1, 0, 1) of infeasible unknowns; 2 for those that stay."""
@@ -62,12 +62,12 @@ def box_least_squares(
         held = jnp.where(-side * slope < -size, 0, 2)
         return jnp.where(given, 2, jnp.where(side == 0, free, held))
 
-    def go_on(carry: tuple[Array, Array, Array, Array, Array]) -> Array:
-        *_, goal, _, turn = carry
-        return jnp.any(goal != 2) & (turn < ROUNDS * p)
+    def cond_fun(carry: tuple[Array, Array, Array, Array, Array]) -> Array:
+        *_, goal, _, iteration = carry
+        return jnp.any(goal != 2) & (iteration < ROUNDS * p)
 
     def exchanged(carry: tuple[Array, Array, Array, Array, Array]) -> Any:
-        side, _, goal, (best, patience), turn = carry
+        side, _, goal, (best, patience), iteration = carry
         count = jnp.sum(goal != 2)
         better = count < best
         patience = jnp.where(better, PATIENCE, patience - 1)
@@ -76,10 +76,10 @@ def box_least_squares(
         side = jnp.where(moves, goal, side)
         z = solved(side)
         left = jnp.stack([jnp.minimum(best, count), patience])
-        return side, z, wrong(side, z), left, turn + 1
+        return side, z, wrong(side, z), left, iteration + 1
 
     side = jnp.where(given, -1, 0)
     first = jax.lax.cond(jnp.any(given), solved, lambda _: solve_triangular(R, c), side)
-    begin = side, first, wrong(side, first), jnp.array([p + 1, PATIENCE]), jnp.array(0)
-    _, z, *_ = jax.lax.while_loop(go_on, exchanged, begin)
+    init = side, first, wrong(side, first), jnp.array([p + 1, PATIENCE]), jnp.array(0)
+    _, z, *_ = jax.lax.while_loop(cond_fun, exchanged, init)
     return jnp.clip(z, low, high)

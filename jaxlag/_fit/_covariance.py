@@ -129,19 +129,19 @@ class Spectrum:
         self._vanish = self._sizes <= NEGLIGIBLE * max(self._sizes, default=0.0)
         null = self._directions[self._vanish] / (self._norms * relative(values))
         self.null = np.linalg.qr(null.T).Q.T
-        self.unidentifiable, self.determined = _in_words(names, self.null)
+        self.unidentifiable, self.determined = _as_text(names, self.null)
 
     def covariance(self) -> np.ndarray:
         """(R^T R)^-1; inf for numbers in a null direction."""
-        kept = self._directions[~self._vanish] / self._sizes[~self._vanish, None] / self._norms
-        found = kept.T @ kept
+        root = self._directions[~self._vanish] / self._sizes[~self._vanish, None] / self._norms
+        covariance = root.T @ root
         open_ended = np.any(np.abs(self.null) > 1e-3, axis=0)
-        found[open_ended] = found[:, open_ended] = np.nan
-        found[open_ended, open_ended] = np.inf
-        return found
+        covariance[open_ended] = covariance[:, open_ended] = np.nan
+        covariance[open_ended, open_ended] = np.inf
+        return covariance
 
 
-def _in_words(names: tuple[str, ...], null: np.ndarray) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _as_text(names: tuple[str, ...], null: np.ndarray) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """(numbers that change together, identifiable combinations of them)."""
     columns = np.flatnonzero(np.any(np.abs(null) > 1e-3, axis=0))
     if not len(columns):
@@ -193,12 +193,14 @@ def distance(found: SearchResult, moves: Bool[Array, " p"]) -> Float[Array, ""]:
     assert found.rows is not None
     p, rows = moves.shape[0], _without_failed(found.rows, found)
 
-    def kept(x: Array) -> Array:
+    def moving_columns(x: Array) -> Array:
         """Columns of unknowns that may move."""
         return x.at[..., -p - 1 : -1].multiply(jnp.where(moves, 1.0, 0.0))
 
-    joined = None if rows.joined is None else kept(rows.joined)
-    moving = LinearRows(kept(rows.measured), joined, rows.next, kept(rows.prior))
+    joined = None if rows.joined is None else moving_columns(rows.joined)
+    moving = LinearRows(
+        moving_columns(rows.measured), joined, rows.next, moving_columns(rows.prior)
+    )
     left = eliminate(moving, jnp.asarray(REGULARIZATION))
     return jnp.linalg.norm(left.params[:-1, -1])
 
@@ -229,7 +231,7 @@ def effective_parameters(problem: MultipleShooting, found: SearchResult) -> floa
         return float(plain)
     rows = jax.tree.map(np.asarray, _without_failed(found.rows, found))
     p = len(problem.free.u0)
-    count = _told(factor, rows.prior[:, :p])
+    count = _determined(factor, rows.prior[:, :p])
     d = problem.states.shape[0]
     held = np.asarray(problem.segments.held)
     known = np.where(
@@ -239,13 +241,13 @@ def effective_parameters(problem: MultipleShooting, found: SearchResult) -> floa
         own = rows.measured[k, :, :d]
         if rows.joined is not None:
             own = np.concatenate([own, rows.joined[k, :, :d]])
-        count += _told(own, np.diag(known[k]))
+        count += _determined(own, np.diag(known[k]))
     return count
 
 
-def _told(rows: np.ndarray, prior: np.ndarray) -> float:
+def _determined(rows: np.ndarray, prior: np.ndarray) -> float:
     """Number of unknowns determined by rows, minus the part that the rows `prior` determine."""
     _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
-    kept = sizes > NOTHING * max(np.max(sizes, initial=0.0), np.finfo(float).tiny)
-    share = prior @ (directions[kept] / sizes[kept, None]).T
-    return float(np.count_nonzero(kept) - np.sum(share**2))
+    determined = sizes > NOTHING * max(np.max(sizes, initial=0.0), np.finfo(float).tiny)
+    share = prior @ (directions[determined] / sizes[determined, None]).T
+    return float(np.count_nonzero(determined) - np.sum(share**2))

@@ -115,8 +115,8 @@ def descend(
         return carry, (jnp.mean(costs), jnp.sum(unsound))
 
     keys = jax.random.split(jax.random.key(descent.seed), descent.epochs)
-    begin = guess, descent.optimizer.init(guess)
-    (guess, _), (costs, unsound) = jax.lax.scan(epoch, begin, keys)
+    init = guess, descent.optimizer.init(guess)
+    (guess, _), (costs, unsound) = jax.lax.scan(epoch, init, keys)
     return guess, costs, jnp.sum(unsound)
 
 

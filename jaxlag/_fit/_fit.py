@@ -165,11 +165,11 @@ def fit(
     )
     costs = np.zeros(0)
     if optimizer is None:
-        problem, found, turns = _stages(problem, (rtol, atol), max_steps)
+        problem, found, iterations = _stages(problem, (rtol, atol), max_steps)
         problem, noise, found, more = _with_its_noise(
             problem, noise, found, where, (rtol, atol), max_steps
         )
-        solves = (turns + more) * len(where.owner)
+        solves = (iterations + more) * len(where.owner)
     else:
         guess, costs, solves = _downhill(problem, optimizer, max_steps)
         if noise:
@@ -178,8 +178,8 @@ def fit(
             problem = with_noise(problem, where, noise)
         linear = len(unknown.u0) <= LARGEST_COVARIANCE
         found = _judged(problem, guess, optimizer, costs, linear)
-    told = (where, noise, own, costs, solves, compared)
-    result = summarized(problem, found, experiments, *told)
+    details = (where, noise, own, costs, solves, compared)
+    result = summarized(problem, found, experiments, *details)
     _warn_after(result)
     return result
 
@@ -220,15 +220,15 @@ def _warn_before(experiments: Sequence[Experiment], free: Unknowns) -> None:
 def _compared(system: System, experiments: Sequence[Experiment], free: Unknowns) -> dict[str, str]:
     """Names of leaves that jumps depend on, and their lines; warns of jumps in time."""
     names = dict(zip(names_of(free.params0), paths(free.params0), strict=True))
-    moving = {name for name, own in names.items() if own in {leaf.name for leaf in free.leaves}}
+    moving = {name for name, path in names.items() if path in {leaf.name for leaf in free.leaves}}
     found: dict[str, str] = {}
-    told: set[Jump] = set()
+    to_warn_of: set[Jump] = set()
     for each in {jax.tree.structure(x.inputs_at(free.params0)): x for x in experiments}.values():
         inputs = each.inputs_at(free.params0)
         jumps = Jumps(system, free.params0, jnp.zeros(system.size), inputs)
         found |= {names[x.leaf]: x.line for x in jumps.of_leaves() if x.leaf in names}
-        told |= set(jumps.in_time(moving, jnp.asarray(each.ts)))
-    warn(sorted(told))
+        to_warn_of |= set(jumps.in_time(moving, jnp.asarray(each.ts)))
+    warn(sorted(to_warn_of))
     return found
 
 
@@ -240,7 +240,7 @@ def _stages(
     Always by squares first: losses with less weight for outliers have minima where all residuals
     are outliers.
     """
-    turns = 0
+    iterations = 0
     guess = FitVariables(jnp.zeros(len(problem.free.u0)), jnp.zeros(problem.segments.guess.shape))
     by_squares, loss = replace(problem, loss=squares), problem.loss
     last = last_gap(problem)
@@ -250,7 +250,7 @@ def _stages(
         rough = jnp.asarray([x if final else max(x, LOOSE) for x in tolerances])
         for again in range(UNITS):
             found = search(by_squares, guess, jnp.asarray(gap), rough, max_steps)
-            guess, turns = found.guess, turns + int(found.steps)
+            guess, iterations = found.guess, iterations + int(found.steps)
             scale = _units(by_squares, found)
             if np.array_equal(scale, by_squares.free.scale) or again == UNITS - 1:
                 break
@@ -259,8 +259,8 @@ def _stages(
     problem = replace(by_squares, loss=loss)
     if loss is not squares:
         found = search(problem, guess, jnp.asarray(last), jnp.asarray(tolerances), max_steps)
-        turns += int(found.steps)
-    return problem, found, turns
+        iterations += int(found.steps)
+    return problem, found, iterations
 
 
 def _units(problem: MultipleShooting, found: SearchResult) -> Float[np.ndarray, " p"]:
@@ -306,17 +306,17 @@ def _with_its_noise(
     max_steps: int,
 ) -> tuple[MultipleShooting, dict[str, float], SearchResult, int]:
     """The problem weighted by the noise estimated from its residuals, the noise, result, steps."""
-    turns = 0
+    iterations = 0
     for _ in range(NOISE_ROUNDS if noise else 0):
         changed = estimated_noise(found, problem, where, noise)
         settled = all(abs(changed[name] / noise[name] - 1) < 0.02 for name in noise)
         noise, problem = changed, with_noise(problem, where, changed)
-        join, own = jnp.asarray(last_gap(problem)), jnp.asarray(tolerances)
-        found = search(problem, found.guess, join, own, max_steps)
-        turns += int(found.steps)
+        join, limits = jnp.asarray(last_gap(problem)), jnp.asarray(tolerances)
+        found = search(problem, found.guess, join, limits, max_steps)
+        iterations += int(found.steps)
         if settled:
             break
-    return problem, noise, found, turns
+    return problem, noise, found, iterations
 
 
 def _downhill(

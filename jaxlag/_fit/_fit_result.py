@@ -184,9 +184,9 @@ class FitResult(eqx.Module):
         for name in self.channels:
             lines.append(f"rms of {name}: " + ", ".join(f"{x:.3g}" for x in self.rms(name)))
         lines += list(self.failed)
-        turns = "epochs" if self.costs.size else "iterations"
+        unit = "epochs" if self.costs.size else "iterations"
         ended = "converged" if self.converged else "not converged"
-        lines.append(f"{ended} in {self.iterations} {turns}")
+        lines.append(f"{ended} in {self.iterations} {unit}")
         return "\n".join(lines)
 
 
@@ -304,21 +304,21 @@ def _uncertainty(
     factor, by_z, at_first = map(np.asarray, linearized(problem.free, found))
     if not np.all(np.isfinite(factor)) or not np.all(np.isfinite(by_z)):
         return nothing
-    told = np.linalg.norm(factor, axis=0) > INSENSITIVE * np.linalg.norm(factor)
-    held = problem.free.at_limit(found.guess.z) & told
+    sensitive = np.linalg.norm(factor, axis=0) > INSENSITIVE * np.linalg.norm(factor)
+    held = problem.free.at_limit(found.guess.z) & sensitive
     moves = ~(saturated(factor, by_z, at_first) | held)
-    own = np.ix_(moves, moves)
-    by_value = np.linalg.solve(by_z[own].T, np.where(told, factor, 0.0)[:, moves].T).T
+    block = np.ix_(moves, moves)
+    by_value = np.linalg.solve(by_z[block].T, np.where(sensitive, factor, 0.0)[:, moves].T).T
     spectrum = Spectrum(tuple(names[moves].tolist()), values[moves], by_value)
-    unknown[own] = spectrum.covariance()
+    unknown[block] = spectrum.covariance()
     return _Uncertainty(
         unknown,
         spectrum.singular_values,
         spectrum.unidentifiable,
         spectrum.determined,
-        tuple(names[moves & ~told].tolist()),
+        tuple(names[moves & ~sensitive].tolist()),
         tuple(names[~moves].tolist()),
-        float(distance(found, jnp.asarray(moves & told))),
+        float(distance(found, jnp.asarray(moves & sensitive))),
     )
 
 
@@ -343,6 +343,6 @@ def _how_it_ended(problem: MultipleShooting, z: Any, found: SearchResult, k: int
 
 def _gaps(found: SearchResult, problem: MultipleShooting) -> np.ndarray:
     """Ends minus the following starts, over the range of the states."""
-    apart = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states[None]
+    gaps = np.abs(found.seen.ends - np.roll(found.starts, -1, axis=0)) / problem.states[None]
     ok = np.asarray(found.seen.status == Status.ok)[:, None]
-    return np.where(problem.segments.follows[:, None], np.where(ok, apart, np.nan), 0.0)
+    return np.where(problem.segments.follows[:, None], np.where(ok, gaps, np.nan), 0.0)

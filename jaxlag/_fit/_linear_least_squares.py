@@ -90,9 +90,9 @@ def eliminate(
     about = jnp.concatenate([rows.prior, weak])
     if rows.joined is None or rows.next is None:
         both = jnp.concatenate([rows.measured, jnp.broadcast_to(held, (count, d, columns))], 1)
-        turned = _triangle(both)
-        states = jnp.insert(turned[:, :d], jnp.full(d, d), 0.0, axis=2)
-        rest = turned[:, d:, d:].reshape(-1, size)
+        triangle = _triangle(both)
+        states = jnp.insert(triangle[:, :d], jnp.full(d, d), 0.0, axis=2)
+        rest = triangle[:, d:, d:].reshape(-1, size)
         return ReducedRows(states, _triangle(jnp.concatenate([about, rest])))
 
     def spread(x: Array) -> Array:
@@ -103,8 +103,8 @@ def eliminate(
         known, params = carry
         measured, joined, following = row
         join = spread(joined).at[:, d : 2 * d].set(-jnp.diag(following))
-        turned = _triangle(jnp.concatenate([join, *map(spread, (known, measured, held))]))
-        state, later, rest = turned[:d], turned[d : 2 * d], turned[2 * d :, 2 * d :]
+        triangle = _triangle(jnp.concatenate([join, *map(spread, (known, measured, held))]))
+        state, later, rest = triangle[:d], triangle[d : 2 * d], triangle[2 * d :, 2 * d :]
         return (later[:, d:], _triangle(jnp.concatenate([params, rest]))), state
 
     start = jnp.zeros((d, columns), dtype), _triangle(about)

@@ -51,14 +51,14 @@ def capacity_for(
     if not isinstance(saves, int):
         was = f"it was {memory} for {saves} times"
         raise invalid("gradient_memory", "be left out if the number of times is symbolic", was)
-    turns = max_steps + saves - 2  # upper bound, for all lanes
+    steps = max_steps + saves - 2  # upper bound, for all lanes
     needs = {
-        name: needed(turns if name == "recorded" else room, turns, state, itemsize, knots)
+        name: needed(steps if name == "recorded" else room, steps, state, itemsize, knots)
         for name, room in sorted(rooms.items(), key=lambda item: -item[1])
     }
     if mode == "auto":
         room = min(ROOM, rooms["recorded"])
-        if needed(room, turns, state, itemsize, knots) <= memory:
+        if needed(room, steps, state, itemsize, knots) <= memory:
             return room
         fitting = [name for name, need in needs.items() if need <= memory]
         if fitting:
@@ -73,10 +73,10 @@ def capacity_for(
     return rooms[mode]
 
 
-def needed(room: int, turns: int, state: int, itemsize: int, knots: bool = False) -> int:
-    """Bytes kept for one trajectory: times of all turns, states at points and between two points.
+def needed(room: int, steps: int, state: int, itemsize: int, knots: bool = False) -> int:
+    """Bytes stored for one trajectory: times of all steps, states at points and between two points.
 
-    With knots also, for every turn, its anchor and whether it begins with a jump.
+    With knots also, for every step, its anchor and whether it begins with a jump.
     """
-    states = room + 1 + math.ceil(turns / room) if room else 0
-    return turns * (8 + 5 * knots) + states * state * itemsize
+    states = room + 1 + math.ceil(steps / room) if room else 0
+    return steps * (8 + 5 * knots) + states * state * itemsize

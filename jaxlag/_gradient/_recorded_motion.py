@@ -45,13 +45,13 @@ class InputTangents(NamedTuple):
 
 
 class StepTimes(NamedTuple):
-    """End times of the turns of a recorded motion; turn -1 ends at the start."""
+    """End times of the recorded steps of a motion; step -1 ends at the start."""
 
     times: Times
     record: Record
 
     def time(self, k: Array, anchors: Array) -> Array:
-        """Time after turn k."""
+        """Time after step k."""
         offset, anchor = at(self.record.offsets, k), self.anchor(k)
         if self.record.anchors is None:
             offset = jnp.maximum(offset, 0.0)
@@ -64,16 +64,16 @@ class StepTimes(NamedTuple):
         return ((k >= 0) & (at(self.record.offsets, k) < 0)).astype(jnp.int32)
 
     def jump(self, k: Array) -> Array | None:
-        """Whether the vector field jumps at the start of turn k."""
+        """Whether the vector field jumps at the start of step k."""
         return None if self.record.jumps is None else at(self.record.jumps, k)
 
     def reach(
         self, end: Array, anchors: Array, save: Array | None = None, r: Array | None = None
     ) -> Array | None:
-        """How the end of a turn, or save time r between the first and the last, is reached.
+        """How the end of a step, or save time r between the first and the last, is reached.
 
         Args:
-            end: time after the turn.
+            end: time after the step.
             anchors: of `Times.anchors`.
             save: whether it is a save time.
             r: its index.
@@ -88,8 +88,8 @@ class StepTimes(NamedTuple):
 
     @property
     def last(self) -> Array:
-        """The last turn."""
-        return self.record.turns - 1
+        """Index of the last step."""
+        return self.record.steps - 1
 
 
 class RecordedMotion(NamedTuple):
@@ -139,17 +139,17 @@ class RecordedMotion(NamedTuple):
         jump: Array | None,
         state: PyTree,
         reach: Array | None = None,
-        turn_end: Array | None = None,
+        step_end: Array | None = None,
     ) -> PyTree:
-        """The state at `end`, by a step from t, or within the step that ends at `turn_end`."""
+        """The state at `end`, by a step from t, or within the step that ends at `step_end`."""
         jump = jnp.array(False) if jump is None else jump
         if reach is None:
             return self.step(args, t, end, state, jump, end)
-        assert turn_end is not None
-        return self.step(args, t, reached_time(reach, t, end, turn_end), state, jump, end)
+        assert step_end is not None
+        return self.step(args, t, reached_time(reach, t, end, step_end), state, jump, end)
 
     def recompute(self, k: Array, anchors: Array, state: PyTree) -> PyTree:
-        """The state after turn k, with unchanged arguments."""
+        """The state after step k, with unchanged arguments."""
         t, end = self.clock.time(k - 1, anchors), self.clock.time(k, anchors)
         reach = self.clock.reach(end, anchors)
         args = self.with_args(self.moved())

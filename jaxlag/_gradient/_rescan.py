@@ -28,36 +28,36 @@ class _Slots(NamedTuple):
     to_save: Array
     jumps: Array | None
     reaches: Array | None
-    turn_ends: Array | None
+    step_ends: Array | None
 
 
 def _slots(
     path: RecordedMotion, anchors: Array, saves: Array
 ) -> tuple[_Slots, Array, Array | None]:
-    """The sequence, and the places of turns and of save times in it."""
+    """The sequence, and the places of steps and of save times in it."""
     clock, record = path.clock, path.clock.record
     index = jnp.arange(record.offsets.shape[0], dtype=jnp.int32)
     ends = jax.vmap(lambda k: clock.time(k, anchors))(index)
     begins = jnp.concatenate([anchors[:1], ends[:-1]])
-    used, reaches = (index < record.turns) & (ends > begins), clock.reach(ends, anchors)
-    if record.save_turn is None:
-        still = jnp.zeros_like(used)
+    used, reaches = (index < record.steps) & (ends > begins), clock.reach(ends, anchors)
+    if record.save_step is None:
+        no_saves = jnp.zeros_like(used)
         whole = (None, None) if reaches is None else (reaches, ends)
-        return _Slots(begins, ends, used, still, record.jumps, *whole), index, None
-    turn = record.save_turn[:-1]
-    count = turn.shape[0]
-    reached = turn < record.turns
-    before = jnp.searchsorted(turn, index, side="right").astype(jnp.int32)
-    of_turn = index + before
-    of_save = jnp.where(reached, turn + jnp.arange(count, dtype=jnp.int32), 0)
+        return _Slots(begins, ends, used, no_saves, record.jumps, *whole), index, None
+    save_step = record.save_step[:-1]
+    count = save_step.shape[0]
+    reached = save_step < record.steps
+    before = jnp.searchsorted(save_step, index, side="right").astype(jnp.int32)
+    of_step = index + before
+    of_save = jnp.where(reached, save_step + jnp.arange(count, dtype=jnp.int32), 0)
     size = -(-(index.shape[0] + count) // CHUNK) * CHUNK
 
     def merged(steps: Array, saved: Array) -> Array:
         place = jnp.where(reached, of_save, size)
-        out = jnp.zeros((size,), steps.dtype).at[of_turn].set(steps)
+        out = jnp.zeros((size,), steps.dtype).at[of_step].set(steps)
         return out.at[place].set(saved, mode="drop")
 
-    safe = jnp.where(reached, turn, 0)
+    safe = jnp.where(reached, save_step, 0)
     whole = (None, None)
     if reaches is not None:
         assert record.save_reach is not None
@@ -70,7 +70,7 @@ def _slots(
         None if record.jumps is None else merged(record.jumps, record.jumps[safe]),
         *whole,
     )
-    return slots, of_turn, of_save
+    return slots, of_step, of_save
 
 
 def again(
@@ -83,22 +83,22 @@ def again(
 ) -> SolveTangents:
     """The motion repeated by a scan, which JAX differentiates in any mode and to any order.
 
-    The scan skips whole chunks that no lane of a vmapped solve needs. Unused turns
+    The scan skips whole chunks that no lane of a vmapped solve needs. Unused slots
     repeat the first step and discard its result, so that derivatives avoid unreachable states.
     """
     clock, record = path.clock, path.clock.record
-    slots, of_turn, of_save = _slots(path, anchors, saves)
+    slots, of_step, of_save = _slots(path, anchors, saves)
     first = jnp.argmax(slots.used)
     begins = jnp.where(slots.used, slots.begins, slots.begins[first])
     ends = jnp.where(slots.used, slots.ends, slots.ends[first])
     slots = slots._replace(begins=begins, ends=ends)
-    if slots.turn_ends is not None:
-        turn_ends = jnp.where(slots.used, slots.turn_ends, slots.turn_ends[first])
-        slots = slots._replace(turn_ends=turn_ends)
+    if slots.step_ends is not None:
+        step_ends = jnp.where(slots.used, slots.step_ends, slots.step_ends[first])
+        slots = slots._replace(step_ends=step_ends)
 
     @partial(jax.checkpoint, prevent_cse=False)
     def step(slot: _Slots, y: PyTree) -> PyTree:
-        args, jump, rest = path.with_args(moved), slot.jumps, (slot.reaches, slot.turn_ends)
+        args, jump, rest = path.with_args(moved), slot.jumps, (slot.reaches, slot.step_ends)
         return path.ahead(args, slot.begins, slot.ends, jump, y, *rest)
 
     def one(y: PyTree, slot: _Slots) -> tuple[PyTree, tuple[PyTree, PyTree]]:
@@ -120,8 +120,8 @@ def again(
     befores, afters = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
     saved = point_states = None
     if of_save is not None:
-        assert record.save_turn is not None
-        reached = record.save_turn[:-1] < record.turns
+        assert record.save_step is not None
+        reached = record.save_step[:-1] < record.steps
 
         def gathered(x: Array) -> Array:
             wide = reached.reshape(reached.shape + (1,) * (x.ndim - 1))
@@ -132,14 +132,14 @@ def again(
     if points:
         count = jax.tree.leaves(record.points)[0].shape[0]
         at = jnp.arange(count, dtype=jnp.int32) * record.stride
-        inside = (at < record.turns) & (at // record.stride < count - 1)
-        at = of_turn[jnp.where(inside, at, 0)]
+        inside = (at < record.steps) & (at // record.stride < count - 1)
+        at = of_step[jnp.where(inside, at, 0)]
 
-        def kept(x: Array) -> Array:
+        def at_points(x: Array) -> Array:
             wide = inside.reshape(inside.shape + (1,) * (x.ndim - 1))
             return jnp.where(wide, x[at], 0.0)
 
-        point_states = jax.tree.map(kept, befores)
+        point_states = jax.tree.map(at_points, befores)
     time = clock.time(clock.last, anchors)
     return SolveTangents(
         last, time, all_saved(start, saved, last, arrived(path, anchors)), point_states

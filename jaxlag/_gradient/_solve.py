@@ -81,9 +81,9 @@ def _mode(outcome: Outcome, problem: SplitProblem) -> Array:
     assert outcome.record is not None
     if problem.static.capacity == 0 and not remembers(problem.stepper.solver):
         return jnp.full_like(outcome.gradient, int(GradientMode.forward))
-    apart = outcome.record.stride > 1
+    checkpointed = outcome.record.stride > 1
     modes = int(GradientMode.checkpoints), int(GradientMode.recorded)
-    return jnp.where(apart, *modes).astype(jnp.int32) + jnp.zeros_like(outcome.gradient)
+    return jnp.where(checkpointed, *modes).astype(jnp.int32) + jnp.zeros_like(outcome.gradient)
 
 
 def _recorded(problem: SplitProblem) -> Outcome:
@@ -103,8 +103,8 @@ def _recorded(problem: SplitProblem) -> Outcome:
             change = changes(tangents[0], outcome)
             record = outcome.record
             assert record is not None
-            kept = record.points is not None  # none for forward derivatives
-            walk = changed(problem, record, change, points=kept)
+            with_points = record.points is not None  # none for forward derivatives
+            walk = changed(problem, record, change, points=with_points)
             record = dots.record._replace(points=walk.points)
             dots = dots._replace(
                 state=walk.last[0], time=walk.time, saved=walk.saved[0], record=record
@@ -114,8 +114,8 @@ def _recorded(problem: SplitProblem) -> Outcome:
     outcome = run(*problem.traced)
     assert outcome.record is not None
     # Times are constant, or move with their anchors.
-    still = outcome.record._replace(offsets=jax.lax.stop_gradient(outcome.record.offsets))
-    return outcome._replace(record=still)
+    record = outcome.record._replace(offsets=jax.lax.stop_gradient(outcome.record.offsets))
+    return outcome._replace(record=record)
 
 
 def _integrated(problem: SplitProblem, record: bool) -> Outcome:

@@ -46,10 +46,10 @@ def _zeros(state: PyTree, size: Any) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), state)
 
 
-def _turn_of_save_time(record: Record, r: Array) -> Array:
-    """The turn of save time r between the first and the last; beyond all turns for later ones."""
-    assert record.save_turn is not None
-    return jnp.where(r < 0, -1, at(record.save_turn, r))
+def _step_of_save_time(record: Record, r: Array) -> Array:
+    """The step that save time r precedes; save times after the last are beyond all steps."""
+    assert record.save_step is not None
+    return jnp.where(r < 0, -1, at(record.save_step, r))
 
 
 def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> SolveTangents:
@@ -63,30 +63,30 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
     dy0 = jax.tree.map(jnp.zeros_like, start) if change.y0 is None else (change.y0, None)
     count = 0 if record.points is None else jax.tree.leaves(record.points)[0].shape[0]
     zero = jnp.zeros((), jnp.int32)
-    saved = None if record.save_turn is None else _zeros(start, record.save_turn.shape[0])
+    saved = None if record.save_step is None else _zeros(start, record.save_step.shape[0])
     # Save times are reached from the state before the last step, with its dy.
     base = None if saved is None else (start, dy0)
-    begin = (zero, zero, start, dy0, base, saved, _zeros(start, count) if points else None)
+    init = (zero, zero, start, dy0, base, saved, _zeros(start, count) if points else None)
 
-    def turn(carry: tuple) -> tuple:
+    def body_fun(carry: tuple) -> tuple:
         """One step, or one to a save time if a lane takes none or must first reach it."""
-        k, r, y, dy, base, saved, kept = carry
-        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
-        use, end = (k < record.turns) & (turn_end > t), turn_end
+        k, r, y, dy, base, saved, stored = carry
+        t, step_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, end = (k < record.steps) & (step_end > t), step_end
         to_save, save, i = jnp.array(False), jnp.array(False), k
         if points:
-            at_point = (k < record.turns) & (k % record.stride == 0)
-            kept = set_entry(kept, jnp.where(at_point, k // record.stride, count - 1), dy)
+            at_point = (k < record.steps) & (k % record.stride == 0)
+            stored = set_entry(stored, jnp.where(at_point, k // record.stride, count - 1), dy)
         before = (y, dy)
         if saved is not None:
-            j = _turn_of_save_time(record, r)
-            left = (j < k) & (j < record.turns)
+            j = _step_of_save_time(record, r)
+            left = (j < k) & (j < record.steps)
             to_save = eqxi.unvmap_any(left & use)
             use, save = use & ~to_save, left & (~use | to_save)
             i, before = jnp.where(save, j, k), pick(save, base, before)
-            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
-            end = jnp.where(save, dues[r], turn_end)
-        reach = clock.reach(turn_end, anchors, *(() if saved is None else (save, r)))
+            t, step_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            end = jnp.where(save, dues[r], step_end)
+        reach = clock.reach(step_end, anchors, *(() if saved is None else (save, r)))
         jump, end_dot = clock.jump(i), None
         if change.anchors is not None:
             end_dot = change.anchors[clock.anchor(i)]
@@ -95,39 +95,39 @@ def tangent_sweep(path: RecordedMotion, change: InputTangents, points: bool) -> 
                 end_dot = jnp.where(save, dues_dot[r], end_dot)
         if end_dot is None:
             step = lambda y, moved: path.ahead(  # noqa: E731
-                path.with_args(moved), t, end, jump, y, reach, turn_end
+                path.with_args(moved), t, end, jump, y, reach, step_end
             )
             y1, dy1 = jax.jvp(step, (before[0], path.moved()), (before[1], change.args))
         else:
             assert change.anchors is not None
-            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
-                path.with_args(moved), t, end, jump, y, reach, *turn_end
+            step = lambda y, moved, t, end, *step_end: path.ahead(  # noqa: E731
+                path.with_args(moved), t, end, jump, y, reach, *step_end
             )
             given = (before[0], path.moved(), t, end)
             dots = (before[1], change.args, change.anchors[clock.anchor(i - 1)], end_dot)
             if reach is not None:
-                given, dots = (*given, turn_end), (*dots, change.anchors[clock.anchor(i)])
+                given, dots = (*given, step_end), (*dots, change.anchors[clock.anchor(i)])
             y1, dy1 = jax.jvp(step, given, dots)
         if saved is not None:
-            assert record.save_turn is not None
-            saved = set_entry(saved, jnp.where(save, r, record.save_turn.shape[0] - 1), dy1)
+            assert record.save_step is not None
+            saved = set_entry(saved, jnp.where(save, r, record.save_step.shape[0] - 1), dy1)
             r, base = r + save.astype(jnp.int32), pick(use, (y, dy), base)
         y, dy = pick(use, (y1, dy1), (y, dy))
-        return k + (~to_save).astype(jnp.int32), r, y, dy, base, saved, kept
+        return k + (~to_save).astype(jnp.int32), r, y, dy, base, saved, stored
 
     def cond_fun(carry: tuple) -> Array:
         k, r, *_ = carry
-        left = k < record.turns
+        left = k < record.steps
         if saved is not None:
-            left = left | (_turn_of_save_time(record, r) < record.turns)
+            left = left | (_step_of_save_time(record, r) < record.steps)
         return eqxi.unvmap_any(left)
 
-    loop = partial(jax.lax.while_loop, cond_fun, turn)
-    *_, dy, _, saved, kept = path.native(loop, begin)
+    loop = partial(jax.lax.while_loop, cond_fun, body_fun)
+    *_, dy, _, saved, stored = path.native(loop, init)
     time = jnp.zeros_like(clock.times.stop)
     if change.anchors is not None:
         time = change.anchors[clock.anchor(clock.last)]
-    return SolveTangents(dy, time, all_saved(dy0, saved, dy, arrived(path, anchors)), kept)
+    return SolveTangents(dy, time, all_saved(dy0, saved, dy, arrived(path, anchors)), stored)
 
 
 def adjoint_sweep(
@@ -143,7 +143,7 @@ def adjoint_sweep(
     clock, record = path.clock, path.clock.record
     anchors, dues = clock.times.anchors(), clock.times.dues()
     assert record.points is not None
-    between = None if record.save_turn is None else jax.tree.map(lambda x: x[1:], wanted.saved)
+    between = None if record.save_step is None else jax.tree.map(lambda x: x[1:], wanted.saved)
     moves = change.anchors is not None
     zero = jnp.zeros((), jnp.int32)
     reached = arrived(path, anchors)
@@ -157,13 +157,13 @@ def adjoint_sweep(
     )
 
     def save_left(r: Array) -> Array:
-        """The turn of the last remaining save time."""
-        return jnp.array(-1) if between is None else _turn_of_save_time(record, r - 1)
+        """The step of the last remaining save time."""
+        return jnp.array(-1) if between is None else _step_of_save_time(record, r - 1)
 
-    def turn(first: Array, state_before: Callable, carry: tuple) -> tuple:
-        """One turn back: turn k - 1, or save times reached from the state before turn k.
+    def body_fun(first: Array, state_before: Callable, carry: tuple) -> tuple:
+        """One iteration back: step k - 1, or save times reached from the state before step k.
 
-        The cotangent belongs to the state before turn k. A lane without a step in turn k - 1 takes
+        The cotangent belongs to the state before step k. A lane that does not take step k - 1 takes
         a save time reached from the state before its last step; `pending` is its contribution
         there.
         """
@@ -172,33 +172,35 @@ def adjoint_sweep(
         here = j == k
         to_save = eqxi.unvmap_any(here)
         k = jnp.where(to_save, k, k - 1)
-        t, turn_end = clock.time(k - 1, anchors), clock.time(k, anchors)
-        use, save, i, given = (k < record.turns) & (turn_end > t) & ~to_save, here, k, bar
-        end, reached = turn_end, clock.reach(turn_end, anchors)
+        t, step_end = clock.time(k - 1, anchors), clock.time(k, anchors)
+        use, save, i, given = (k < record.steps) & (step_end > t) & ~to_save, here, k, bar
+        end, reached = step_end, clock.reach(step_end, anchors)
         if between is not None:
             save = here | (~use & (j >= first) & (clock.time(j, anchors) == now))
             i = jnp.where(save, j, k)
-            t, turn_end = clock.time(i - 1, anchors), clock.time(i, anchors)
+            t, step_end = clock.time(i - 1, anchors), clock.time(i, anchors)
             end = jnp.where(save, dues[r - 1], end)
-            reached = clock.reach(turn_end, anchors, save, r - 1)
+            reached = clock.reach(step_end, anchors, save, r - 1)
             given = pick(save, at(between, r - 1), bar)
         y, jump, takes = state_before(i), clock.jump(i), use | save
         with_moved, moved, starts = path.local(t)
         if not moves:
             step = lambda y, moved: path.ahead(  # noqa: E731
-                with_moved(moved), t, end, jump, y, reached, turn_end
+                with_moved(moved), t, end, jump, y, reached, step_end
             )
             before, more = jax.vjp(step, y, moved)[1](given)
         else:
-            step = lambda y, moved, t, end, *turn_end: path.ahead(  # noqa: E731
-                with_moved(moved), t, end, jump, y, reached, *turn_end
+            step = lambda y, moved, t, end, *step_end: path.ahead(  # noqa: E731
+                with_moved(moved), t, end, jump, y, reached, *step_end
             )
-            times = (t, end) if reached is None else (t, end, turn_end)
+            times = (t, end) if reached is None else (t, end, step_end)
             before, more, *times_bar = jax.vjp(step, y, moved, *times)[1](given)
-            t_bar, end_bar, *turn_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
+            t_bar, end_bar, *step_end_bar = (jnp.where(takes, x, 0.0) for x in times_bar)
             at_save = jnp.where(save, end_bar, 0.0)
             anchors_bar = _added_at(anchors_bar, clock.anchor(i - 1), t_bar)
-            anchors_bar = _added_at(anchors_bar, clock.anchor(i), sum(turn_bar, end_bar - at_save))
+            anchors_bar = _added_at(
+                anchors_bar, clock.anchor(i), sum(step_end_bar, end_bar - at_save)
+            )
             if between is not None:
                 dues_bar = _added_at(dues_bar, r - 1, at_save)
         more = [jnp.where(takes, x, 0.0) for x in more]
@@ -212,29 +214,29 @@ def adjoint_sweep(
             pending = pick(use, zeros, pick(save & ~here, summed, pending))
             r = r - save.astype(jnp.int32)
         if wanted.points is not None:
-            at_point = ~to_save & (k % record.stride == 0) & (k < record.turns)
+            at_point = ~to_save & (k % record.stride == 0) & (k < record.steps)
             bar = pick(at_point, _add(bar, at(wanted.points, k // record.stride)), bar)
         return k, r, bar, pending, (args_bar, anchors_bar, dues_bar)
 
     def back(first: Array, state_before: Callable, carry: tuple) -> tuple:
-        """All turns after the first, and the save times of the first."""
+        """All steps after the first, and the save times of the first."""
 
         def left(carry: tuple) -> Array:
             k, r, *_ = carry
             return (k > first) | eqxi.unvmap_any(save_left(r) == k)
 
-        return jax.lax.while_loop(left, partial(turn, first, state_before), carry)
+        return jax.lax.while_loop(left, partial(body_fun, first, state_before), carry)
 
     # Lanes that were recorded together have one stride; all have points at the longest stride.
     stride = eqxi.unvmap_max(record.stride)
     room = jax.tree.leaves(record.points)[0].shape[0] - 1
-    turns = record.offsets.shape[0]
-    longest = 2 * -(-turns // room)  # an upper bound, for a symbol of jax.export
-    if isinstance(turns, int):
-        longest = 2 ** ceil(log2(turns / room))
+    slots = record.offsets.shape[0]
+    longest = 2 * -(-slots // room)  # an upper bound, for a symbol of jax.export
+    if isinstance(slots, int):
+        longest = 2 ** ceil(log2(slots / room))
 
     def segment(carry: tuple) -> tuple:
-        """All turns since the last point before turn k; all turns if each has a point."""
+        """All steps since the last point before step k; all steps if each has a point."""
         k = carry[0]
         first = jnp.where(stride == 1, 0, (k - 1) // stride * stride)
         y = at(record.points, first // record.stride)
@@ -243,13 +245,13 @@ def adjoint_sweep(
         def ahead(carry: tuple) -> tuple:
             j, y, states = carry
             t, end = clock.time(j - 1, anchors), clock.time(j, anchors)
-            use = (j < record.turns) & (end > t)
+            use = (j < record.steps) & (end > t)
             y = pick(use, path.recompute(j, anchors, y), y)
             return j + 1, y, set_entry(states, j + 1 - first, y)
 
-        begin = (first, y, states)
+        init = (first, y, states)
         missing = lambda c: (stride > 1) & (c[0] < k - 1)  # noqa: E731
-        states = jax.lax.while_loop(missing, ahead, begin)[2]
+        states = jax.lax.while_loop(missing, ahead, init)[2]
 
         def state_before(j: Array) -> PyTree:
             return pick(stride == 1, at(record.points, j), at(states, j - first))
@@ -261,10 +263,10 @@ def adjoint_sweep(
             return back(zero, partial(at, record.points), carry)
         return jax.lax.while_loop(lambda c: c[0] > 0, segment, carry)
 
-    most = eqxi.unvmap_max(record.turns)  # common to all lanes
+    most = eqxi.unvmap_max(record.steps)  # common to all lanes
     saves_left = zero
-    if record.save_turn is not None:
-        saves_left = jnp.sum(record.save_turn < record.turns, dtype=jnp.int32)
+    if record.save_step is not None:
+        saves_left = jnp.sum(record.save_step < record.steps, dtype=jnp.int32)
     bar = _add(wanted.last, end_bar)
     pending = None if between is None else jax.tree.map(jnp.zeros_like, bar)
     ended = path.native(all_back, (most, saves_left, bar, pending, bars))

@@ -167,7 +167,7 @@ def path_of(
     leaves, tree = jax.tree.flatten(args, is_leaf=lambda x: x is None)
     stages = getattr(getattr(stepper.solver, "tableau", None), "num_stages", 0)
     clock, start = StepTimes(times, record), (y0, memory)
-    plain = not (lanes and record.save_turn is not None)
+    plain = not (lanes and record.save_step is not None)
     return RecordedMotion(step, start, leaves, tree, moving, stepper.windows, clock, stages, plain)
 
 

@@ -57,7 +57,7 @@ class Canonical(eqx.Module):
         M = form.dynamics.terms.mass(t, q, v, params)
         if form.rows:
             A, _ = form.dynamics.terms.rows(t, q, v, params)
-            M, _ = augmented(M, masked(A, form.args.kept))
+            M, _ = augmented(M, masked(A, form.args.active_rows))
         return jnp.all(factor_mass(M).healthy)
 
     def position(
@@ -102,5 +102,5 @@ class Canonical(eqx.Module):
     def _given(self, tau: Array, q: Array, v: Array) -> tuple[Array, Any, Any]:
         return *self._at(tau), self.dynamics.inputs_at(tau, q, v, self.args)
 
-    def _of_rows(self, kept: Array, other: Array) -> Array:
-        return kept if self.args.kept is None else jnp.where(self.args.kept, kept, other)
+    def _of_rows(self, x: Array, other: Array) -> Array:
+        return x if self.args.active_rows is None else jnp.where(self.args.active_rows, x, other)

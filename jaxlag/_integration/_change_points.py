@@ -93,14 +93,14 @@ class Crossing(NamedTuple):
     """Detection of change points: its state at the start of a step.
 
     Attributes:
-        apart: least row length over its length at the start of the motion.
+        independence: least row length over its length at the start of the motion.
         within: distance covered while rows are dependent; as `span`, in kg^1/2 m.
         span: change of coordinates over which the row length goes to 0, extrapolated from a step;
             infinite if it does not decrease.
         time: predicted time of the next change point; infinite if there is none.
     """
 
-    apart: Float[Array, ""]
+    independence: Float[Array, ""]
     within: Float[Array, ""]
     span: Float[Array, " n"]
     time: Float[Array, ""]
@@ -109,7 +109,7 @@ class Crossing(NamedTuple):
         self,
         t0: Float[Array, ""],
         t1: Float[Array, ""],
-        apart: Float[Array, ""],
+        independence: Float[Array, ""],
         moved: Float[Array, " n"],
     ) -> "Crossing":
         """The state of the detection at the end of a step.
@@ -117,30 +117,33 @@ class Crossing(NamedTuple):
         Args:
             t0: start of the step.
             t1: its end.
-            apart: as in `Crossing`, at the end of the step.
+            independence: as in `Crossing`, at the end of the step.
             moved: change of coordinates, in units in which their inertias are 1.
         """
-        lost = self.apart - apart
+        lost = self.independence - independence
         falls = lost > 0
-        nearer = (apart > 0) & (apart < AHEAD) & falls
-        left = jnp.where(nearer, apart / jnp.where(nearer, lost, 1.0), jnp.inf).astype(t1.dtype)
+        nearer = (independence > 0) & (independence < AHEAD) & falls
+        left = jnp.where(nearer, independence / jnp.where(nearer, lost, 1.0), jnp.inf)
+        left = left.astype(t1.dtype)
         fresh = jnp.where(falls, jnp.abs(moved) / jnp.where(falls, lost, 1.0), jnp.inf)
         # Row lengths that vanish as a higher power of the distance decrease ever more slowly.
         stays = self.depends | (self.is_near & (jnp.sum(self.span) < jnp.sum(fresh)))
         span = jnp.where(stays, self.span, fresh)
-        part = jnp.where(apart > 2 * LOST, 2 * LOST / jnp.where(apart > 0, apart, 1.0), 1.0)
+        part = jnp.where(
+            independence > 2 * LOST, 2 * LOST / jnp.where(independence > 0, independence, 1.0), 1.0
+        )
         within = jnp.where(self.depends, self.within + part * jnp.linalg.norm(moved), 0.0)
-        return Crossing(apart, within, span, t1 + (t1 - t0) * left)
+        return Crossing(independence, within, span, t1 + (t1 - t0) * left)
 
     @property
     def depends(self) -> Bool[Array, ""]:
         """Whether rows are dependent: the row length is below LOST."""
-        return self.apart <= LOST
+        return self.independence <= LOST
 
     @property
     def stands(self) -> Bool[Array, ""]:
         """Whether the state is at the change point, to the accuracy of accelerations."""
-        return self.apart <= unknown_below(self.apart.dtype)
+        return self.independence <= unknown_below(self.independence.dtype)
 
     @property
     def passes(self) -> Bool[Array, ""]:
@@ -150,11 +153,11 @@ class Crossing(NamedTuple):
     @property
     def is_near(self) -> Bool[Array, ""]:
         """Whether a row is almost dependent on the others."""
-        return self.apart < SHORT
+        return self.independence < SHORT
 
     def is_beside(self, before: "Crossing") -> Bool[Array, ""]:
         """Whether a step from outside the change point ends very close to it."""
-        return (self.apart < BESIDE * before.apart) & ~before.depends
+        return (self.independence < BESIDE * before.independence) & ~before.depends
 
     def rounding(
         self,
@@ -176,7 +179,7 @@ class Crossing(NamedTuple):
         """
         assert args.units is not None
         assert args.slopes is not None
-        least = ROUNDINGS * float(jnp.finfo(self.apart.dtype).eps)
+        least = ROUNDINGS * float(jnp.finfo(self.independence.dtype).eps)
         span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
         length = jnp.linalg.norm(span)
         rate = jnp.linalg.norm(v / args.units) / jnp.where(length > 0, length, 1.0)
@@ -187,7 +190,9 @@ class Crossing(NamedTuple):
             return jnp.sum(jnp.abs(columns) * rows[:, None], axis=0)
 
         positions = jnp.abs(q) + spread(jnp.abs(q) + args.units * span)
-        soon = rate / jnp.maximum(self.apart, float(jnp.finfo(self.apart.dtype).eps) ** (1 / 3))
+        soon = rate / jnp.maximum(
+            self.independence, float(jnp.finfo(self.independence.dtype).eps) ** (1 / 3)
+        )
         velocities = jnp.abs(v) + spread(jnp.abs(v)) + soon * positions
         near = jnp.where(self.is_near, least, 0.0)
         return near * positions, near * velocities
@@ -204,7 +209,9 @@ class Crossing(NamedTuple):
             args: arguments of the step.
         """
         assert args.units is not None
-        part = jnp.where(self.is_near, float(jnp.finfo(self.apart.dtype).eps) ** (1 / 3), 0.0)
+        part = jnp.where(
+            self.is_near, float(jnp.finfo(self.independence.dtype).eps) ** (1 / 3), 0.0
+        )
         span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
         speed = jnp.linalg.norm(v / args.units)
         return part * args.units * jnp.linalg.norm(span), part * args.units * speed
@@ -240,11 +247,13 @@ class Crossing(NamedTuple):
         lead = left - gap / (1 - gap) * jnp.asarray(stop - self.time, h.dtype)
         cut = near & (stop > self.time) & (stop < t + across) & (lead > AT_HAND * left)
         found = jnp.where(cut, lead, found)
-        least, ends = narrow(self.apart.dtype), self.is_at(t, stop)
+        least, ends = narrow(self.independence.dtype), self.is_at(t, stop)
         # Not in float32, where shorter steps would add rounding.
         saved = ahead & (due < t + jnp.maximum(across, h)) & (least < SHORT)
         found = jnp.where(ends, h, jnp.where(saved & ~cut, across, found))
-        part = 1.0 - jnp.maximum(least / jnp.where(ahead, self.apart.astype(h.dtype), 1.0), 0.1)
+        part = 1.0 - jnp.maximum(
+            least / jnp.where(ahead, self.independence.astype(h.dtype), 1.0), 0.1
+        )
         found = jnp.where((saved | ends) & (part > AT_HAND), part * left, found)
         return jnp.minimum(found, h)
 
@@ -255,8 +264,8 @@ class Crossing(NamedTuple):
             t: the current time.
             time: the time to compare.
         """
-        pace = (self.time - t) / self.apart.astype(self.time.dtype)
-        close = narrow(self.apart.dtype) / 3
+        pace = (self.time - t) / self.independence.astype(self.time.dtype)
+        close = narrow(self.independence.dtype) / 3
         return jnp.isfinite(self.time) & (pace > 0) & (jnp.abs(self.time - time) <= close * pace)
 
 
@@ -293,9 +302,13 @@ def is_across(
         saved: at the saved state.
         sound: whether the step to the saved state succeeded.
     """
-    at_it = saved.stands | (saved.depends & (begin.apart < 2 * narrow(begin.apart.dtype)))
-    apart = jnp.minimum(jnp.minimum(begin.apart, end.apart), saved.apart)
-    return at_it | (~sound & (apart < AHEAD))
+    at_it = saved.stands | (
+        saved.depends & (begin.independence < 2 * narrow(begin.independence.dtype))
+    )
+    independence = jnp.minimum(
+        jnp.minimum(begin.independence, end.independence), saved.independence
+    )
+    return at_it | (~sound & (independence < AHEAD))
 
 
 def widest_gap(nodes: Sequence[float]) -> float:
@@ -305,15 +318,17 @@ def widest_gap(nodes: Sequence[float]) -> float:
     return float(middles[np.argmax(np.where(middles >= GAP, widths, 0.0))])
 
 
-def lengths_of(masses: Float[Array, " m"], kept: Bool[Array, " m"] | None) -> Float[Array, " m"]:
+def lengths_of(
+    masses: Float[Array, " m"], active_rows: Bool[Array, " m"] | None
+) -> Float[Array, " m"]:
     """1 / sqrt of effective masses: row lengths orthogonal to all others, in the metric of M^-1.
 
-    0 for rows that are dependent here, 1 for rows that are not in `kept`.
+    0 for rows that are dependent here, 1 for rows that are not active.
     """
     masses = jax.lax.stop_gradient(masses)
     lengths = jnp.where(masses > 0, jax.lax.rsqrt(jnp.where(masses > 0, masses, 1.0)), 0.0)
     lengths = jnp.where(jnp.isnan(masses), jnp.nan, lengths)
-    return lengths if kept is None else jnp.where(kept, lengths, 1.0)
+    return lengths if active_rows is None else jnp.where(active_rows, lengths, 1.0)
 
 
 def scales_at(
@@ -347,7 +362,7 @@ def same_sense(
     y0: Array,
     y1: Array,
     args: Arguments,
-    turn: Array | None,
+    slope_drop: Array | None,
 ) -> Bool[Array, ""]:
     """Whether a step passes no change point: pivots of A(t) M^-1 A(t0)^T keep their signs.
 
@@ -361,17 +376,17 @@ def same_sense(
         y0: state at its start.
         y1: state at its end.
         args: arguments of the step.
-        turn: h dy/dt at the start minus that at the end; None if it is unknown.
+        slope_drop: h dy/dt at the start minus that at the end; None if it is unknown.
     """
     columns, m = dynamics.projector(t0, y0, args).columns, dynamics.rows.size
     assert columns is not None
     fine = jnp.array(True)
-    for tau, y in (midway(t0, t1, y0, y1, turn), (t1, y1)):
+    for tau, y in (midway(t0, t1, y0, y1, slope_drop), (t1, y1)):
         t, (q, v), (params, _) = dynamics.clock(tau, args), dynamics.parts(y), dynamics.given(args)
         A, _ = dynamics.terms.rows(t, q, v, params)
         turned = A @ columns.T
-        if args.kept is not None:
-            both = args.kept[:, None] & args.kept[None]
+        if args.active_rows is not None:
+            both = args.active_rows[:, None] & args.active_rows[None]
             turned = jnp.where(both, turned, jnp.eye(m, dtype=A.dtype))
         fine = fine & solve_general(turned, jnp.zeros((m,), A.dtype), 0.0)[1]
     return fine

@@ -18,7 +18,7 @@ def slope_and_step(
     """
     size = partial(_scaled_norm, controller, y0)
 
-    def turn(i: Array, carry: tuple) -> tuple:
+    def body_fun(i: Array, carry: tuple) -> tuple:
         f0, h, t, y = carry
         f = field(t, y)
         f0 = jnp.where(i == 0, f, f0)
@@ -32,8 +32,8 @@ def slope_and_step(
         h = jnp.minimum(100.0 * trial, allowed)
         return f0, h, t0 + trial.astype(t0.dtype), y0 + trial * f0
 
-    begin = (jnp.zeros_like(y0), jnp.zeros((), y0.dtype), t0, y0)
-    f0, h, _, _ = jax.lax.fori_loop(0, 2, turn, begin)
+    init = (jnp.zeros_like(y0), jnp.zeros((), y0.dtype), t0, y0)
+    f0, h, _, _ = jax.lax.fori_loop(0, 2, body_fun, init)
     return f0, h
 
 

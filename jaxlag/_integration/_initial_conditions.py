@@ -137,7 +137,7 @@ def _rows_consistent(
         bad = jnp.where(near, bad / floor, 0.0)
         found = _consistency(off, bad, near, phi, rate)
         return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
-    K = terms.correction(t, q, v, params, args.constants, args.kept)
+    K = terms.correction(t, q, v, params, args.constants, args.active_rows)
 
     def left(c: Array) -> Array:
         return jnp.abs(c - A @ (K @ c)) / unit
@@ -150,14 +150,14 @@ def _rows_consistent(
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
-    turn = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
-    bent = left(gamma)
+    scale = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
+    gamma_left = left(gamma)
     if dynamics.rows.size > 1:  # terms of gamma that cancel leave rounding, no contradiction
         _, rounding = with_rounding(lambda t, q, v: terms.gamma(t, q, v, params), t, q, v)
         rounding = ROUNDINGS * jnp.nan_to_num(rounding)
-        bent = jnp.maximum(bent - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
-    bent = bent / (floor * jnp.where(turn > 0, turn, 1.0))
-    bad = jnp.where(near, jnp.maximum(bent, bad), bad)
+        gamma_left = jnp.maximum(gamma_left - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
+    gamma_left = gamma_left / (floor * jnp.where(scale > 0, scale, 1.0))
+    bad = jnp.where(near, jnp.maximum(gamma_left, bad), bad)
     return _consistency(off, bad, near, phi, rate)
 
 

@@ -1,7 +1,7 @@
 """One iteration of the loop: one attempted step, or one step to a save time.
 
 The phases, in the order of `iterate`: `aimed`, where the step is to end; `attempt`, the step itself
-and its checks; `accept`, whether it is kept and how long the next one is; `beside_change_points`,
+and its checks; `accept`, whether it counts and how long the next one is; `beside_change_points`,
 states near a change point; `advance`, the new state of the loop, with the states saved.
 """
 
@@ -22,7 +22,7 @@ from jaxlag._integration._loop_state import (
     SaveProgress,
     StepStart,
     select,
-    write_turn,
+    write_step,
 )
 from jaxlag._integration._record import Reach, Times, reached_time
 from jaxlag._integration._step_arguments import StepChecks
@@ -138,8 +138,8 @@ def aimed(loop: Loop, c: LoopState) -> Aim:
     if c.reach is not None:
         # The motion may end at a change point: saves of its last step are treated in the same way.
         assert start.crossing is not None
-        there = (tnext >= times.stop) & start.crossing.is_at(start.t, tnext)
-        beyond = jnp.where(to_save, c.reach == Reach.beyond, there)
+        ends_at_crossing = (tnext >= times.stop) & start.crossing.is_at(start.t, tnext)
+        beyond = jnp.where(to_save, c.reach == Reach.beyond, ends_at_crossing)
         reach = jnp.where(beyond, int(Reach.beyond), int(Reach.step))
         end = reached_time(reach, start.t, tnext, tnext)
     on_grid = tnext >= goal - slack
@@ -171,7 +171,7 @@ def attempt(loop: Loop, c: LoopState, aim: Aim) -> Attempt:
     finite = all_finite(y1)
     ends = (start.t, end, start.y, y1, args, estimate, start.crossing, aim.lands | aim.to_save)
     settled, checks, estimate, crossing = stepper.settled_with_error(*ends)
-    step = (start.t, end, start.y, settled, args, estimate.turn)
+    step = (start.t, end, start.y, settled, args, estimate.slope_drop)
     passage = stepper.passage(*step, start.determinants)
     regular, share, determinants = (jnp.array(True), None, None) if passage is None else passage
     crossable = independent = stepper.same_sense(*step)
@@ -321,25 +321,25 @@ def saved_on(
     if saved is None:
         return None
     assert aim.due is not None
-    if saved.turns is None:  # for derivatives a save must move with its own time
+    if saved.steps is None:  # for derivatives a save must move with its own time
         to_save = to_save | (take & (jnp.abs(aim.due - tnext) <= resolution(tnext)))
     known = (step.good & smooth) | across
     slot = jnp.where(to_save, saved.next, loop.times.saves.shape[0] - 2)
     value = jax.tree.map(lambda y: jnp.where(known, y, jnp.nan), step.settled)
-    turns, reaches = saved.turns, saved.reaches
+    steps, reaches = saved.steps, saved.reaches
     if reaches is not None:
         assert aim.reach is not None
         reaches = set_entry(reaches, slot, jnp.where(to_save, aim.reach, 0))
-    if turns is not None:
-        # The slot after the last save is unused: it stays beyond all turns.
-        beyond = turns[-1]
-        turns = set_entry(turns, slot, jnp.where(to_save, saved.turn, beyond))
+    if steps is not None:
+        # The slot after the last save is unused: it stays beyond all steps.
+        beyond = steps[-1]
+        steps = set_entry(steps, slot, jnp.where(to_save, saved.step, beyond))
     return SaveProgress(
         base=select(take, c.at, saved.base),
-        turn=jnp.where(take, c.turn, saved.turn),
+        step=jnp.where(take, c.recorded, saved.step),
         next=saved.next + to_save.astype(jnp.int32),
         values=set_entry(saved.values, slot, value),
-        turns=turns,
+        steps=steps,
         reaches=reaches,
         missed=jnp.where(to_save & ~known, failure, saved.missed).astype(jnp.int32),
     )
@@ -378,7 +378,7 @@ def advance(
     made_jump = None if c.at.jump is None else jump | aim.lands
     end = StepStart(tnext, step.settled, step.memory, made_jump, step.determinants, step.crossing)
     at = select(take, end, c.at)
-    kept = None if c.kept is None else write_turn(loop, c, c.kept, at.t, anchor)
+    buffers = None if c.buffers is None else write_step(loop, c, c.buffers, at.t, anchor)
     return LoopState(
         at=at,
         h=jnp.where(active, h, c.h),
@@ -390,8 +390,8 @@ def advance(
         tried=jnp.where(active, tnext, c.tried),
         accepted=c.accepted + take.astype(jnp.int32),
         attempted=attempted,
-        turn=c.turn + eqxi.unvmap_any(take).astype(jnp.int32),
+        recorded=c.recorded + eqxi.unvmap_any(take).astype(jnp.int32),
         saved=saved,
-        kept=kept,
+        buffers=buffers,
         reach=None if aim.reach is None else select(take, aim.reach, c.reach),
     )

@@ -35,7 +35,7 @@ from jaxlag._integration._record import Outcome, Record, Times
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers
 
-# The record is a whole number of chunks of this many turns.
+# The record is a whole number of chunks of this many steps.
 CHUNK = 64
 
 
@@ -63,13 +63,12 @@ def integrate(
         max_steps: bound on attempted steps.
         record: whether to record the steps so that they can be repeated.
         room: capacity for states on the way, an even number. When it is full, every second state is
-            dropped, and from then on half as many are kept.
+            dropped, and from then on half as many are stored.
         native: function that calls the loop with its initial state.
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
-    # Turns in which any lane takes a step: at most the attempts and the steps to save times of one
-    # lane.
+    # Steps that any lane takes: at most the attempts and the steps to save times of one lane.
     size = -(-(max_steps + count - 2) // CHUNK) * CHUNK
     room = (room if room < max_steps else size) if record and not remembers(stepper.solver) else 0
     if stepper.controller is not None:
@@ -88,14 +87,14 @@ def integrate(
     start = StepStart(t0, y0, memory, jnp.array(False) if jumps else None, determinants, crossing)
     zero = jnp.zeros((), jnp.int32)
     status = jnp.where(sound, int(Status.ok), int(Status.nonfinite))
-    saved = kept = None
+    saved = buffers = None
     if not at_most(count, 2):
         places = jnp.full((count - 1,), size, jnp.int32) if record else None
         values = buffer(count - 1, y0, jnp.nan)
         reaches = jnp.zeros_like(places) if reaches_beyond and places is not None else None
         saved = SaveProgress(start, zero, zero, values, places, reaches, zero)
     if record:
-        kept = RecordBuffers(
+        buffers = RecordBuffers(
             offsets=buffer(size, t0, 0.0),
             anchors=None if times.knots is None else buffer(size, zero, 0),
             jumps=buffer(size, zero > 0, 0) if jumps else None,
@@ -113,9 +112,9 @@ def integrate(
         tried=t0,
         accepted=zero,
         attempted=zero,
-        turn=zero,
+        recorded=zero,
         saved=saved,
-        kept=kept,
+        buffers=buffers,
         reach=zero if reaches_beyond else None,
     )
     carry = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, carry)
@@ -123,21 +122,21 @@ def integrate(
     fixed = (times, times.anchors(), times.dues(), jnp.asarray(h, t0.dtype), max_steps)
     loop = Loop(stepper, args, *fixed)
 
-    def turn(dynamic: Any) -> Any:
+    def body_fun(dynamic: Any) -> Any:
         c = iterate(loop, eqx.combine(dynamic, static))
         return eqx.partition(c, eqx.is_array)[0]
 
     def cond_fun(c: Any) -> Array:
         return eqxi.unvmap_any(~c.done | is_due(loop, c))
 
-    def turns(dynamic: Any) -> Any:
+    def run(dynamic: Any) -> Any:
         if room in (0, size):
-            return jax.lax.while_loop(cond_fun, turn, dynamic)
+            return jax.lax.while_loop(cond_fun, body_fun, dynamic)
         until_full = lambda c: cond_fun(c) & ~eqxi.unvmap_any(is_full(c, room))  # noqa: E731
-        fill = lambda c: jax.lax.while_loop(until_full, turn, c)  # noqa: E731
+        fill = lambda c: jax.lax.while_loop(until_full, body_fun, c)  # noqa: E731
         return jax.lax.while_loop(cond_fun, lambda c: fill(thin(c, room)), dynamic)
 
-    final = turns(dynamic) if native is None else native(turns, dynamic)
+    final = run(dynamic) if native is None else native(run, dynamic)
     return _outcome(eqx.combine(final, static), times, y0, allowed)
 
 
@@ -150,10 +149,10 @@ def _outcome(c: LoopState, times: Times, y0: PyTree, allowed: Array) -> Outcome:
     parts.append(jax.tree.map(lambda y: y[None], last))
     saved = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     record = None
-    if c.kept is not None:
-        save_turn = None if c.saved is None else c.saved.turns
+    if c.buffers is not None:
+        save_step = None if c.saved is None else c.saved.steps
         save_reach = None if c.saved is None else c.saved.reaches
-        record = Record(*c.kept, c.turn, save_turn, save_reach, c.reach)
+        record = Record(*c.buffers, c.recorded, save_step, save_reach, c.reach)
     ends = (c.status, c.at.t, c.at.y, c.tried, c.accepted, c.attempted)
     missed = jnp.zeros((), jnp.int32) if c.saved is None else c.saved.missed
     return Outcome(*ends, saved, missed, record, jnp.zeros((), jnp.int32))

@@ -28,10 +28,10 @@ class SaveProgress(NamedTuple):
     """States at the save times between the first and the last."""
 
     base: StepStart  # where the last accepted step started
-    turn: Array  # in which that step was taken
+    step: Array  # index of that step in the record
     next: Array  # index of the next save time
     values: PyTree  # with one more entry for values that are discarded
-    turns: Array | None  # `Record.save_turn`
+    steps: Array | None  # `Record.save_step`
     reaches: Array | None  # `Record.save_reach`
     missed: Array
 
@@ -57,9 +57,9 @@ class LoopState(NamedTuple):
     tried: Array
     accepted: Array
     attempted: Array
-    turn: Array  # number of turns in which any lane took a step
+    recorded: Array  # number of recorded steps: those that any lane took
     saved: SaveProgress | None
-    kept: RecordBuffers | None
+    buffers: RecordBuffers | None
     reach: Array | None  # of the last step, see `Reach`; None if no change points are passed
 
 
@@ -85,7 +85,7 @@ def buffer(size: Any, like: PyTree, fill: float | int) -> PyTree:
 
 def is_full(c: Any, room: int) -> Array:
     """Whether the buffer of points is full before the next step."""
-    return (c.turn >= room * c.kept.stride) & ~c.done
+    return (c.recorded >= room * c.buffers.stride) & ~c.done
 
 
 def thin(c: Any, room: int) -> Any:
@@ -94,26 +94,30 @@ def thin(c: Any, room: int) -> Any:
     def halved(leaf: Array) -> Array:
         return leaf.at[: room // 2].set(leaf[:room:2])
 
-    def thin(kept: Any) -> Any:
-        return kept._replace(points=jax.tree.map(halved, kept.points), stride=2 * kept.stride)
+    def thin(buffers: Any) -> Any:
+        return buffers._replace(
+            points=jax.tree.map(halved, buffers.points), stride=2 * buffers.stride
+        )
 
-    return c._replace(kept=jax.lax.cond(is_full(c, room), thin, lambda kept: kept, c.kept))
+    return c._replace(
+        buffers=jax.lax.cond(is_full(c, room), thin, lambda buffers: buffers, c.buffers)
+    )
 
 
-def write_turn(
-    loop: Loop, c: LoopState, kept: RecordBuffers, t: Array, anchor: Array
+def write_step(
+    loop: Loop, c: LoopState, buffers: RecordBuffers, t: Array, anchor: Array
 ) -> RecordBuffers:
-    """Write this turn to the record."""
-    anchors, jumps, points = kept.anchors, kept.jumps, kept.points
+    """Write this step to the record."""
+    anchors, jumps, points = buffers.anchors, buffers.jumps, buffers.points
     if anchors is None:
         offset = jnp.where(anchor == 1, -1.0, t)
     else:
-        anchors = set_entry(anchors, c.turn, anchor)
+        anchors = set_entry(anchors, c.recorded, anchor)
         offset = t - loop.anchors[anchor]
-    offsets = set_entry(kept.offsets, c.turn, offset)
-    jumps = None if jumps is None else set_entry(jumps, c.turn, c.at.jump)
+    offsets = set_entry(buffers.offsets, c.recorded, offset)
+    jumps = None if jumps is None else set_entry(jumps, c.recorded, c.at.jump)
     if points is not None:
         spare = jax.tree.leaves(points)[0].shape[0] - 1
-        slot = jnp.where(c.turn % kept.stride == 0, c.turn // kept.stride, spare)
+        slot = jnp.where(c.recorded % buffers.stride == 0, c.recorded // buffers.stride, spare)
         points = set_entry(points, slot, (c.at.y, None))
-    return kept._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)
+    return buffers._replace(offsets=offsets, anchors=anchors, jumps=jumps, points=points)

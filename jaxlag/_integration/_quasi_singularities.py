@@ -41,7 +41,7 @@ def passage(
     y0: Float[Array, " m"],
     y1: Float[Array, " m"],
     args: Arguments,
-    turn: Float[Array, " m"] | None,
+    slope_drop: Float[Array, " m"] | None,
     first: Float[Array, " b"],
 ) -> Passage:
     """Check whether quasi-velocities become singular along a step.
@@ -64,11 +64,11 @@ def passage(
         y0: state at its start.
         y1: state at its end.
         args: arguments of the step.
-        turn: h dy/dt at the start minus that at the end; None if it is unknown.
+        slope_drop: h dy/dt at the start minus that at the end; None if it is unknown.
         first: determinants at its start.
     """
     assert args.usual is not None
-    states = (midway(t0, t1, y0, y1, turn), (t1, y1))
+    states = (midway(t0, t1, y0, y1, slope_drop), (t1, y1))
     between, last = (determinants(dynamics, tau, dynamics.parts(y)[0], args) for tau, y in states)
     left = jnp.min(opening(dynamics, last) / args.usual)
     eps = float(jnp.finfo(y1.dtype).eps)
@@ -117,10 +117,10 @@ def usual(
         return None
     at = np.arange(q.shape[0])
     ways = float(jnp.finfo(q.dtype).eps) ** 0.25 * np.array([(-1.0) ** at, (-1.0) ** (at // 2)])
-    size = own = opening(dynamics, here)
+    size = at_q = opening(dynamics, here)
     for way in ways:
         beside = determinants(dynamics, tau, q + jnp.asarray(way, q.dtype), args)
-        grown = jnp.abs(opening(dynamics, beside) - own) / float(np.abs(way[0]))
+        grown = jnp.abs(opening(dynamics, beside) - at_q) / float(np.abs(way[0]))
         size = jnp.maximum(size, jnp.where(jnp.isfinite(grown), NEAR * grown, 0.0))
     return size
 

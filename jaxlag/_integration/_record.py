@@ -56,23 +56,24 @@ def reached_time(reach: Array, t0: Array, t1: Array, end: Array) -> Array:
 
 
 class Record(NamedTuple):
-    """The record of a loop, turn by turn, from which its steps are repeated without control.
+    """The steps of a loop, recorded so that they are repeated without control.
 
-    Lanes share turns. If a turn takes no step in a lane, its end equals that of the turn before.
+    A step is recorded if any lane takes it. In a lane that does not take it, its end equals that of
+    the step before.
 
     Attributes:
-        offsets: time after every turn, from its anchor; the time moves with the anchor.
+        offsets: time after every step, from its anchor; the time moves with the anchor.
         anchors: index of the anchor in `Times.anchors`. None without knots: the anchor is the start
-            or, for a negative offset, the stop, and the turn ends there.
-        jumps: whether the vector field jumps at the start of the turn; None if it never does.
-        points: states before turn 0, `stride`, 2 `stride`, ...; None if they are not needed.
+            or, for a negative offset, the stop, and the step ends there.
+        jumps: whether the vector field jumps at the start of the step; None if it never does.
+        points: states before step 0, `stride`, 2 `stride`, ...; None if they are not needed.
         stride: a power of 2.
-        turns: number of turns.
-        save_turn: save time i + 1 is reached from the state before this turn; beyond all turns
+        steps: number of recorded steps.
+        save_step: save time i + 1 is reached from the state before this step; beyond all steps
             if it was not reached, and after the last. None if there are no save times between
             the first and the last.
         save_reach: how it is reached, see `Reach`; None if no change points are passed.
-        last_reach: the same for the last turn.
+        last_reach: the same for the last step.
     """
 
     offsets: Float[Array, " N"]
@@ -80,8 +81,8 @@ class Record(NamedTuple):
     jumps: Bool[Array, " N"] | None
     points: PyTree | None
     stride: Int[Array, ""]
-    turns: Int[Array, ""]
-    save_turn: Int[Array, " r"] | None
+    steps: Int[Array, ""]
+    save_step: Int[Array, " r"] | None
     save_reach: Int[Array, " r"] | None = None
     last_reach: Int[Array, ""] | None = None
 

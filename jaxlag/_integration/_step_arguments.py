@@ -11,18 +11,18 @@ class RowSelection(NamedTuple):
     """The constraint rows used in solves: a largest independent set at the start.
 
     Attributes:
-        kept: these rows, holonomic ones first; the others follow from them as long as the rank does
-            not change.
+        active_rows: these rows, holonomic ones first; the others follow from them as long as the
+            rank does not change.
         size: size of every row at the start and nearby.
         void: rows that are 0 = 0 up to rounding.
-        reacting: an independent set with as many as possible of the rows whose multipliers are read
-            by forces.
+        multiplier_rows: an independent set with as many as possible of the rows whose multipliers
+            are read by forces.
     """
 
-    kept: Bool[Array, " m"]
+    active_rows: Bool[Array, " m"]
     size: Float[Array, " m"]
     void: Bool[Array, " m"]
-    reacting: RowChoice
+    multiplier_rows: RowChoice
 
 
 class KnotIntervals(NamedTuple):
@@ -45,14 +45,14 @@ class StepChecks(NamedTuple):
         projected: Newton's method of the projection converged.
         redundant_rows_hold: rows that were left out as dependent are satisfied.
         contacts_valid: multipliers of contacts are not negative, and sliding has not reversed.
-        apart: see `_change_points.Crossing`; None if it is not needed.
+        independence: see `_change_points.Crossing`; None if it is not needed.
         columns: columns of the matrix of the projection; None likewise.
     """
 
     projected: Bool[Array, ""]
     redundant_rows_hold: Bool[Array, ""]
     contacts_valid: Bool[Array, ""]
-    apart: Float[Array, ""] | None = None
+    independence: Float[Array, ""] | None = None
     columns: Float[Array, "m n"] | None = None
 
     @property
@@ -79,17 +79,19 @@ class Arguments(NamedTuple):
     slopes: Float[Array, "m n"] | None = None  # |A| at the start
 
     @property
-    def kept(self) -> Bool[Array, " m"] | None:
+    def active_rows(self) -> Bool[Array, " m"] | None:
         """Rows for the projection; None for all."""
-        return None if self.rows is None else self.rows.kept
+        return None if self.rows is None else self.rows.active_rows
 
     @property
-    def reacting(self) -> RowChoice | None:
+    def multiplier_rows(self) -> RowChoice | None:
         """Rows for the accelerations; None for all."""
-        return None if self.rows is None else self.rows.reacting
+        return None if self.rows is None else self.rows.multiplier_rows
 
 
-def midway(t0: Array, t1: Array, y0: Array, y1: Array, turn: Array | None) -> tuple[Array, Array]:
+def midway(
+    t0: Array, t1: Array, y0: Array, y1: Array, slope_drop: Array | None
+) -> tuple[Array, Array]:
     """(time, state) in the middle of a step, by its parabola if that is known.
 
     Args:
@@ -97,7 +99,7 @@ def midway(t0: Array, t1: Array, y0: Array, y1: Array, turn: Array | None) -> tu
         t1: its end.
         y0: state at its start.
         y1: state at its end.
-        turn: h dy/dt at the start minus that at the end; None if it is unknown.
+        slope_drop: h dy/dt at the start minus that at the end; None if it is unknown.
     """
     middle = 0.5 * (y0 + y1)
-    return t0 + 0.5 * (t1 - t0), middle if turn is None else middle + 0.125 * turn
+    return t0 + 0.5 * (t1 - t0), middle if slope_drop is None else middle + 0.125 * slope_drop

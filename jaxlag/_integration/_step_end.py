@@ -72,7 +72,7 @@ class StepEnd(eqx.Module):
                 return self._closed(surface, *self.dynamics.parts(stop_gradient(y)), args)
 
             one = self.dynamics.rows.size == 1
-            hold = jax.lax.cond(args.rows.kept[0], lambda: true, look) if one else look()
+            hold = jax.lax.cond(args.rows.active_rows[0], lambda: true, look) if one else look()
             checks = StepChecks(true, hold, true)
         return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args))
 
@@ -85,7 +85,7 @@ class StepEnd(eqx.Module):
         right = []
         if self._contacts:
             state = State(t, q, v, params, values)
-            lam = self.dynamics.program.multipliers(state, args.constants, args.reacting)
+            lam = self.dynamics.program.multipliers(state, args.constants, args.multiplier_rows)
             right += [lam[row] >= 0 for row in self._contacts]
         for k, slide in enumerate(self._slides):
             assert args.senses is not None
@@ -115,13 +115,13 @@ class StepEnd(eqx.Module):
         """
         around = self._near(tau, y, args)
         y, checks = self._projected(around, y, args)
-        assert checks.apart is not None
+        assert checks.independence is not None
 
         def left() -> Array:
             parts = self.dynamics.parts
             return self._joined(*tangential(around.surface, *parts(y), *parts(error)), error)
 
-        error = jax.lax.cond(near | (checks.apart < SHORT), left, lambda: error)
+        error = jax.lax.cond(near | (checks.independence < SHORT), left, lambda: error)
         return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args)), error
 
     def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
@@ -138,8 +138,8 @@ class StepEnd(eqx.Module):
                 steps without an error estimate.
         """
         around = self._near(*stop_gradient((tau, y, args)))
-        near, apart = around.surface, around.apart
-        assert apart is not None
+        near, independence = around.surface, around.independence
+        assert independence is not None
         surface = self.dynamics.projector(tau, y, args)
         (q, v), velocity, kick = self.dynamics.parts(y), surface.velocity, near.kick
         if surface.position is not None:
@@ -147,19 +147,21 @@ class StepEnd(eqx.Module):
         assert velocity is not None
         assert kick is not None
         moved = self._joined(q, v - kick(velocity(q, v)), y)
-        return jnp.where(apart > unknown_below(apart.dtype), moved, jnp.nan) if refuses else moved
+        if not refuses:
+            return moved
+        return jnp.where(independence > unknown_below(independence.dtype), moved, jnp.nan)
 
-    def apart(self, tau: Array, y: Array, args: Arguments) -> Array:
+    def independence(self, tau: Array, y: Array, args: Arguments) -> Array:
         """The least row length over its length at the start of the motion."""
-        found = self._near(*stop_gradient((tau, y, args))).apart
+        found = self._near(*stop_gradient((tau, y, args))).independence
         assert found is not None
         return found
 
     def _projected(self, near: "_Near", y: Array, args: Arguments) -> tuple[Array, StepChecks]:
-        q, v, found = project(near.surface, *self.dynamics.parts(y), near.frozen)
+        q, v, converged = project(near.surface, *self.dynamics.parts(y), near.frozen)
         closed = self._closed(near.surface, q, v, args)
         return self._joined(q, v, y), StepChecks(
-            found, closed, jnp.array(True), near.apart, near.surface.columns
+            converged, closed, jnp.array(True), near.independence, near.surface.columns
         )
 
     def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
@@ -171,14 +173,15 @@ class StepEnd(eqx.Module):
             return _Near(surface, frozen, None)
         masses = (surface if frozen is None else frozen).masses
         assert masses is not None
-        lengths = lengths_of(masses, args.kept)
-        alone, own = lengths > LOST * args.lengths, np.flatnonzero(self.dynamics.rows.holonomic)
+        lengths = lengths_of(masses, args.active_rows)
+        alone = lengths > LOST * args.lengths
+        holonomic = np.flatnonzero(self.dynamics.rows.holonomic)
 
         def without(surface: ConstraintProjector) -> ConstraintProjector:
             shift, kick = surface.shift, surface.kick
             assert kick is not None
             return surface._replace(
-                shift=lambda c: shift(jnp.where(alone[own], c, 0.0)),
+                shift=lambda c: shift(jnp.where(alone[holonomic], c, 0.0)),
                 kick=lambda c: kick(jnp.where(alone, c, 0.0)),
             )
 
@@ -194,20 +197,20 @@ class StepEnd(eqx.Module):
     ) -> Bool[Array, ""]:
         """Whether rows that were left out as dependent are satisfied.
 
-        Without stabilization the kept rows drift, and these may drift in proportion.
+        Without stabilization the active rows drift, and these may drift in proportion.
         """
         if args.rows is None:
             return jnp.array(True)
-        kept, size = args.rows.kept, args.rows.size
+        active, size = args.rows.active_rows, args.rows.size
         holonomic = np.flatnonzero(self.dynamics.rows.holonomic).tolist()
         floor = closed_to(q.dtype)
 
         def holds(c: Array, x: Array, rows: list[int]) -> Array:
             largest = jnp.max(jnp.abs(x))
             off = [jnp.abs(c[i]) / size[row] for i, row in enumerate(rows)]
-            drift = [jnp.where(kept[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
+            drift = [jnp.where(active[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
             allowed = floor * (1.0 + largest) + 100.0 * reduce(jnp.maximum, drift)
-            found = [kept[row] | (x <= allowed) for row, x in zip(rows, off, strict=True)]
+            found = [active[row] | (x <= allowed) for row, x in zip(rows, off, strict=True)]
             return jnp.all(jnp.stack(found))
 
         closed = jnp.array(True)
@@ -224,9 +227,9 @@ class _Near(NamedTuple):
     Attributes:
         surface: the constraints.
         frozen: the same without derivatives; None if it is not needed.
-        apart: see `_change_points.Crossing`; None if it is not needed.
+        independence: see `_change_points.Crossing`; None if it is not needed.
     """
 
     surface: ConstraintProjector
     frozen: ConstraintProjector | None
-    apart: Array | None
+    independence: Array | None

@@ -34,12 +34,12 @@ class Estimate(NamedTuple):
     Attributes:
         error: the estimate; None for methods without one.
         unseen: error of stages without weight in it; None if there are none.
-        turn: h dy/dt at the start minus that at the end; None if it is not needed or unknown.
+        slope_drop: h dy/dt at the start minus that at the end; None if it is not needed or unknown.
     """
 
     error: PyTree
     unseen: PyTree | None = None
-    turn: PyTree | None = None
+    slope_drop: PyTree | None = None
     near: Bool[Array, ""] | None = None
 
 
@@ -169,8 +169,10 @@ class Stepper(eqx.Module):
         if args.lengths is None:
             return self._step(*step)
         step_end = cast(StepEnd, self.step_end)
-        apart = step_end.apart(t0, y, args) if crossing is None else crossing.apart
-        near = apart < (AHEAD if self.controller is None else SHORT)
+        independence = (
+            step_end.independence(t0, y, args) if crossing is None else crossing.independence
+        )
+        near = independence < (AHEAD if self.controller is None else SHORT)
         held = self._held(near)
         if not isinstance(self.solver, AbstractExplicit) or self.solver.looped:
             return held._step(*step)
@@ -213,7 +215,7 @@ class Stepper(eqx.Module):
             y1, error, beside, k, memory = self.solver.attempt(
                 self.term, t0, t1, y, args, memory, jump
             )
-            return y1, Estimate(error, beside, self._turn(k)), memory, jnp.array(True)
+            return y1, Estimate(error, beside, self._slope_drop(k)), memory, jnp.array(True)
         y1, error, dense, memory, result = self.solver.step(
             self.term, t0, t1, y, args, memory, jump
         )
@@ -223,9 +225,9 @@ class Stepper(eqx.Module):
             return y1, Estimate(error), memory, solved
         stages = unweighted_stages(tableau.b_sol, tableau.b_error)
         beside = unseen(unstacked(dense["k"]), stages) if stages else None
-        return y1, Estimate(error, beside, self._turn(dense["k"])), memory, solved
+        return y1, Estimate(error, beside, self._slope_drop(dense["k"])), memory, solved
 
-    def _turn(self, k: PyTree) -> PyTree:
+    def _slope_drop(self, k: PyTree) -> PyTree:
         """h dy/dt at the start minus that at the end; None if it is not needed."""
         return k[0] - k[-1] if self.across or self.passes else None
 
@@ -268,14 +270,14 @@ class Stepper(eqx.Module):
         controller: Any = self.controller
         allowed = controller.atol + controller.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1))
         part = _ACROSS * controller.rtol * controller.norm((y1 - y0) / allowed)
-        places = (t0, y0), midway(t0, t1, y0, y1, estimate.turn), (t1, y1)
+        places = (t0, y0), midway(t0, t1, y0, y1, estimate.slope_drop), (t1, y1)
         before, between, after = (self._branches(tau, y, args) for tau, y in places)
         crossed = jnp.any(before != between) | jnp.any(between != after)
         span = jnp.abs(args.end - args.origin)
-        told = (
+        bounded = (
             spare & crossed & (part > 0) & (t1 - t0 > _FINE * (resolution(span) + resolution(t1)))
         )
-        return error / jnp.where(told, jnp.minimum(part, 1.0), 1.0)
+        return error / jnp.where(bounded, jnp.minimum(part, 1.0), 1.0)
 
     def is_small(
         self, y0: PyTree, y1: PyTree, error: PyTree | None, tolerances: float
@@ -321,7 +323,7 @@ class Stepper(eqx.Module):
         """Check of quasi-velocities along a step; None if they are always regular.
 
         Args:
-            step: (t0, t1, y0, y1, args, turn, determinants at its start).
+            step: (t0, t1, y0, y1, args, slope_drop, determinants at its start).
         """
         if not self.passes:
             return None
@@ -337,7 +339,7 @@ class Stepper(eqx.Module):
         """Whether a step passes no change point; True if it may pass one.
 
         Args:
-            step: (t0, t1, y0, y1, args, turn).
+            step: (t0, t1, y0, y1, args, slope_drop).
         """
         return same_sense(cast(Term, self.term).dynamics, *step) if self.stops else jnp.array(True)
 
@@ -383,10 +385,10 @@ class Stepper(eqx.Module):
             y, checks = step_end(t, y, args)
         else:
             y, checks, error = step_end.with_error(t, y, args, cast(Array, error), crossing.is_near)
-        assert checks.apart is not None
+        assert checks.independence is not None
         parts = cast(Term, self.term).dynamics.parts
         (q0, _), (q, v) = parts(y0), parts(y)
-        ends = crossing.onwards(t0, t, checks.apart, (q - q0) / args.units)
+        ends = crossing.onwards(t0, t, checks.independence, (q - q0) / args.units)
         if error is None:
             return y, checks, estimate, ends
         assert checks.columns is not None

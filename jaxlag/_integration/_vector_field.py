@@ -58,7 +58,8 @@ class VectorField(eqx.Module):
         stabilization: "projection", a `Baumgarte`, or None.
         regular: whether M is positive definite without the constraints; None if that is found only
             at the start of a solve.
-        apart: whether rows whose multipliers forces read are known to be independent.
+        contact_rows_independent: whether rows whose multipliers forces read are known to be
+            independent.
         extrapolates: whether the method has stages beyond the end of a step.
         crossing: whether rows that become dependent during the motion are left out there.
     """
@@ -75,7 +76,7 @@ class VectorField(eqx.Module):
     formulation: str = eqx.field(static=True, default="multipliers")
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool | None = eqx.field(static=True, default=False)
-    apart: bool = eqx.field(static=True, default=False)
+    contact_rows_independent: bool = eqx.field(static=True, default=False)
     extrapolates: bool = eqx.field(static=True, default=False)
     crossing: bool = eqx.field(static=True, default=False)
 
@@ -110,7 +111,11 @@ class VectorField(eqx.Module):
         if not self.rows.size:
             return terms
         baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
-        known = {"regular": bool(self.regular), "apart": self.apart, "crossing": self.crossing}
+        known = {
+            "regular": bool(self.regular),
+            "contact_rows_independent": self.contact_rows_independent,
+            "crossing": self.crossing,
+        }
         return replace(terms, formulation=self.formulation, baumgarte=baumgarte, **known)
 
     @property
@@ -154,7 +159,9 @@ class VectorField(eqx.Module):
         definite = None
         if self.regular is None and self.formulation != "null_space":
             definite = partial(self._definite, t, q, v, params)
-        choices = Choices(self.sample, args.kept, args.reacting, time_direction, definite)
+        choices = Choices(
+            self.sample, args.active_rows, args.multiplier_rows, time_direction, definite
+        )
         return args._replace(constants=self.program.precompute(q, params, values, choices))
 
     def _definite(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
@@ -179,16 +186,18 @@ class VectorField(eqx.Module):
         t, q, v, params, values = stop_gradient((t, q, v, params, values))
         M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
         sure = all(self.rows.sure)
-        there, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
+        nonzero, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
         if self.rows.size == 1:  # left out only if it is void
             return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.terms.rows_read(t, q, v, params, values))
-        # If multipliers are read, the kept rows determine which others are left out.
+        # If multipliers are read, the active rows determine which others are left out.
         reads = not np.all(unread)
-        kept = independent_rows(M, A, 2 * velocity + unread, there=there, mobile_first=reads)
+        active_rows = independent_rows(
+            M, A, 2 * velocity + unread, nonzero=nonzero, mobile_first=reads
+        )
         if not np.any(velocity & ~unread):  # then the rows that are read already come first
-            return RowSelection(kept, size, void, RowChoice(kept, there))
+            return RowSelection(active_rows, size, void, RowChoice(active_rows, nonzero))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
             label = self.rows.labels[int(np.argmax(velocity & ~unread))]
             raise invalid(
@@ -197,8 +206,8 @@ class VectorField(eqx.Module):
                 "holonomic rows (phi of a dependent holonomic row would not be damped)",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
-        reacting = independent_rows(M, A, unread, there=there, mobile_first=True)
-        return RowSelection(kept, size, void, RowChoice(reacting, there))
+        for_multipliers = independent_rows(M, A, unread, nonzero=nonzero, mobile_first=True)
+        return RowSelection(active_rows, size, void, RowChoice(for_multipliers, nonzero))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, bounded by the end in spite of rounding."""
@@ -258,7 +267,7 @@ class VectorField(eqx.Module):
         if self.quasi is not None:
             return self._quasi_rates(tau, y, args)[self.system.size :]
         state = State(*self.at(tau, y, args))
-        return self.program.acceleration(state, args.constants, args.reacting)
+        return self.program.acceleration(state, args.constants, args.multiplier_rows)
 
     def _quasi_rates(self, tau: Array, y: Array, args: Arguments) -> Array:
         """(v, w') of a state of quasi-velocities."""
@@ -332,7 +341,7 @@ class VectorField(eqx.Module):
         """The projection onto the constraints near a predicted state."""
         t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
         state = State(t, q, w, params, self.shapes_of_inputs(q, args))
-        return self.program.projector(state, args.constants, self.rows, args.kept)
+        return self.program.projector(state, args.constants, self.rows, args.active_rows)
 
     def shapes_of_inputs(self, q: Array, args: Arguments) -> Any:
         """Values of the inputs anywhere, for programs keyed by their shapes; else none."""

@@ -21,20 +21,20 @@ class RowChoice(NamedTuple):
     """Rows used in solves.
 
     Attributes:
-        kept: a largest independent set; the others follow from it.
-        there: rows that are more than rounding.
+        active_rows: a largest independent set; the others follow from it.
+        nonzero: rows that are more than rounding.
     """
 
-    kept: Bool[Array, " m"]
-    there: Bool[Array, " m"]
+    active_rows: Bool[Array, " m"]
+    nonzero: Bool[Array, " m"]
 
 
 def independent_rows(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],
-    turn: Sequence[int] | np.ndarray | None = None,
+    priority: Sequence[int] | np.ndarray | None = None,
     floor: float | None = None,
-    there: Bool[Array, " m"] | None = None,
+    nonzero: Bool[Array, " m"] | None = None,
     mobile_first: bool = False,
 ) -> Bool[Array, " m"]:
     """A largest independent set of rows, found greedily.
@@ -46,10 +46,9 @@ def independent_rows(
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
-        turn: for every row its priority: rows of a lower number are taken first; None for
-            one priority.
+        priority: of every row: rows of a lower number are taken first; None if all are equal.
         floor: least pivot; by default `rank_floor`.
-        there: rows that do not count as zero; by default the nonzero ones.
+        nonzero: rows that do not count as zero; by default those of positive length.
         mobile_first: of rows with similar pivots take the one along which a force of the same
             size moves most. `least_norm` is then accurate for the others.
 
@@ -58,8 +57,8 @@ def independent_rows(
     m = A.shape[0]
     norms = jnp.sqrt(jnp.sum(A**2, axis=1))
     floor = rank_floor(A.dtype) if floor is None else floor
-    nonzero = norms > 0
-    usable = nonzero if there is None else nonzero & there
+    positive = norms > 0
+    usable = positive if nonzero is None else positive & nonzero
     if m == 1:  # no other rows
         return usable
     A = jnp.where(usable[:, None], A, 0.0) / jnp.where(usable, norms, 1.0)[:, None]
@@ -69,19 +68,19 @@ def independent_rows(
     usable = usable & (pivots > 0)
     scale = jax.lax.rsqrt(jnp.where(usable, pivots, 1.0))
     S = scale[:, None] * S * scale[None]
-    turns = np.zeros(m, int) if turn is None else np.asarray(turn, int)
+    priorities = np.zeros(m, int) if priority is None else np.asarray(priority, int)
 
     def choose(_: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
-        S, kept = state
-        left = jnp.where(kept | ~usable, -1.0, jnp.diagonal(S))
-        now = jnp.min(jnp.where(left > floor, turns, np.max(turns, initial=0)))
-        left = jnp.where(turns > now, -1.0, left)
+        S, active = state
+        left = jnp.where(active | ~usable, -1.0, jnp.diagonal(S))
+        now = jnp.min(jnp.where(left > floor, priorities, np.max(priorities, initial=0)))
+        left = jnp.where(priorities > now, -1.0, left)
         if mobile_first:
             left = jnp.where(left > ALIKE * jnp.max(left), left * pivots, -1.0)
         k = jnp.argmax(left > 0.999 * jnp.max(left))  # the first of nearly equal ones
-        take = ~kept[k] & usable[k] & (S[k, k] > floor)
+        take = ~active[k] & usable[k] & (S[k, k] > floor)
         reduced = S - jnp.outer(S[:, k], S[k]) / jnp.where(take, S[k, k], 1.0)
-        return jnp.where(take, reduced, S), kept.at[k].set(kept[k] | take)
+        return jnp.where(take, reduced, S), active.at[k].set(active[k] | take)
 
     return jax.lax.fori_loop(0, m, choose, (S, jnp.zeros((m,), bool)))[1]
 
@@ -89,60 +88,60 @@ def independent_rows(
 def least_norm(
     A: Float[Array, "m n"],
     lam: Float[Array, " m"],
-    kept: Bool[Array, " m"] | None = None,
-    there: Bool[Array, " m"] | None = None,
+    active_rows: Bool[Array, " m"] | None = None,
+    nonzero: Bool[Array, " m"] | None = None,
     units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
     """The multipliers with the same A^T lam of least norm sum_k (|A_k| lam_k)^2.
 
     |A_k lam_k| is the generalized force of row k alone, so that the result does not depend on
     the scale of a residual. Rows are compared in units of the coordinates, because with short
-    levers different rows look alike. With unit rows a_k, dependent rows are a_j = C_j a_kept. A
-    multiplier z_j of such a row reduces the kept ones to mu_kept - C^T z. The z of least norm is a
-    least-squares problem; A^T lam does not depend on its accuracy. Rows that do
-    not follow from the kept ones have none. Derivatives are those at constant rank of A.
+    levers different rows look alike. With unit rows a_k, dependent rows are a_j = C_j a_active. A
+    multiplier z_j of such a row reduces the active ones to mu_active - C^T z. The z of least norm
+    is a least-squares problem; A^T lam does not depend on its accuracy. Rows that do not follow
+    from the active ones have none. Derivatives are those at constant rank of A.
 
     Args:
         A: rows.
         lam: multipliers with that A^T lam.
-        kept: a largest set of independent rows; by default it is computed.
-        there: rows that are more than rounding, see `row_sizes`; by default the nonzero ones.
+        active_rows: a largest set of independent rows; by default it is computed.
+        nonzero: rows that are more than rounding, see `row_sizes`; by default all rows.
         units: of the coordinates, for the comparison of rows; by default 1.
 
     Source: Golub, Pereyra, SIAM J. Numer. Anal. 10 (1973) 413 (pseudo-inverse at constant rank).
     """
     m, n = A.shape
-    if there is not None:
-        A = jnp.where(there[:, None], A, 0.0)
+    if nonzero is not None:
+        A = jnp.where(nonzero[:, None], A, 0.0)
     if m == 1:
-        return lam if there is None else jnp.where(there, lam, 0.0)
+        return lam if nonzero is None else jnp.where(nonzero, lam, 0.0)
     units = jnp.ones((n,), A.dtype) if units is None else jax.lax.stop_gradient(units)
-    if kept is None:
+    if active_rows is None:
         metric, fixed = jnp.diag(units**-2), jax.lax.stop_gradient(A)
-        kept = independent_rows(metric, fixed, there=there, mobile_first=True)
+        active_rows = independent_rows(metric, fixed, nonzero=nonzero, mobile_first=True)
     norms, sizes = row_lengths(A), row_lengths(A * units[None])
     norms, sizes = (jnp.where(x > 0, x, 1.0) for x in (norms, sizes))
     unit = A * units[None] / sizes[:, None]
-    C = _least_squares(unit.T, unit.T, kept).T
-    apart = jnp.sum((unit - C @ unit) ** 2, axis=1)
-    follows = ~kept & (apart <= float(jnp.finfo(A.dtype).eps))
+    C = _least_squares(unit.T, unit.T, active_rows).T
+    squares = jnp.sum((unit - C @ unit) ** 2, axis=1)
+    follows = ~active_rows & (squares <= float(jnp.finfo(A.dtype).eps))
     # Coefficients that are rounding could be large for a row of smaller weight.
     rounding = jnp.abs(C) <= ROUNDINGS * float(jnp.finfo(A.dtype).eps)
     C = C - jax.lax.stop_gradient(jnp.where(rounding, C, 0.0))
     C = jnp.where(follows[:, None], C, 0.0)
     mu, weights = sizes * lam, norms / sizes
-    of_kept = jnp.where(kept, mu + mu @ C, 0.0)
+    of_active = jnp.where(active_rows, mu + mu @ C, 0.0)
     # Normal equations, in units in which their diagonal is 1: weights may differ as much as forces
-    # and moments of short levers. Rows of small weights are kept, so that accuracy is not lost.
+    # and moments of short levers. Rows of small weights stay, so that accuracy is not lost.
     moved = weights[:, None] * (C.T - jnp.diag(follows.astype(A.dtype)))
     lengths = row_lengths(moved.T)
     lengths = jnp.where(lengths > 0, lengths, 1.0)
     square = (moved.T @ moved) / jnp.outer(lengths, lengths)
     square = square + jnp.diag((~follows).astype(A.dtype))
-    z = jnp.linalg.solve(square, (weights * of_kept) @ moved / lengths) / lengths
-    found = jnp.where(kept, of_kept - z @ C, z)
-    left = (jnp.where(kept | follows, mu, 0.0) - found) @ unit
-    return (found + _least_squares(unit.T, left[:, None], kept)[:, 0]) / sizes
+    z = jnp.linalg.solve(square, (weights * of_active) @ moved / lengths) / lengths
+    found = jnp.where(active_rows, of_active - z @ C, z)
+    left = (jnp.where(active_rows | follows, mu, 0.0) - found) @ unit
+    return (found + _least_squares(unit.T, left[:, None], active_rows)[:, 0]) / sizes
 
 
 def _least_squares(
@@ -159,8 +158,8 @@ def _least_squares(
 def shared(
     A: Float[Array, "m n"],
     lam: Float[Array, " m"],
-    kept: Bool[Array, " m"],
-    there: Bool[Array, " m"],
+    active_rows: Bool[Array, " m"],
+    nonzero: Bool[Array, " m"],
     group: Sequence[bool] | np.ndarray,
     units: Float[Array, " n"] | None = None,
 ) -> Float[Array, " m"]:
@@ -168,14 +167,14 @@ def shared(
 
     Args:
         A: rows.
-        lam: multipliers with that A^T lam, 0 where rows are not kept.
-        kept: a largest set of independent rows, those of the group first.
-        there: rows that are more than rounding.
+        lam: multipliers with that A^T lam, 0 where rows are not active.
+        active_rows: a largest set of independent rows, those of the group first.
+        nonzero: rows that are more than rounding.
         group: for every row, whether it belongs to the group.
         units: of the coordinates, for the comparison of rows.
     """
     chosen = np.flatnonzero(group)
     if len(chosen) < 2:
         return lam
-    found = least_norm(A[chosen], lam[chosen], kept[chosen], there[chosen], units)
+    found = least_norm(A[chosen], lam[chosen], active_rows[chosen], nonzero[chosen], units)
     return lam.at[chosen].set(found)

@@ -1,7 +1,7 @@
 """KKT systems: solves with M bordered by constraint rows, M x - A^T lam = r, A x + c = 0.
 
-M may be singular, but is positive definite on the tangent space A x = 0. A mask `kept` leaves out
-rows that depend on others; their lam is 0.
+M may be singular, but is positive definite on the tangent space A x = 0. A mask `active_rows`
+leaves out rows that depend on others; their lam is 0.
 """
 
 from collections.abc import Callable
@@ -123,7 +123,7 @@ Factor = Multipliers | NullSpace
 def factor_kkt(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],
-    kept: Bool[Array, " m"] | None,
+    active_rows: Bool[Array, " m"] | None,
     formulation: str,
     crossing: bool = False,
 ) -> Factor:
@@ -132,21 +132,21 @@ def factor_kkt(
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
-        kept: rows to solve with; None for all.
+        active_rows: rows to solve with; None for all.
         formulation: "multipliers" or "null_space".
         crossing: whether rows that depend on those before them are left out; otherwise they are
             unhealthy.
     """
-    A = masked(A, kept)
+    A = masked(A, active_rows)
     if formulation == "null_space":
-        space = tangent_space(M, A, kept, crossing)
+        space = tangent_space(M, A, active_rows, crossing)
         return NullSpace(space, factor_mass(space.inertia()))
     bordered, weights = augmented(M, A)
     mass = factor_mass(bordered)
     spread = jax.vmap(lambda row: eliminate(mass, row))(A)
     S = A @ spread.T
-    if kept is not None:
-        S = S + jnp.diag((~kept).astype(S.dtype))
+    if active_rows is not None:
+        S = S + jnp.diag((~active_rows).astype(S.dtype))
     return Multipliers(mass, weights, spread, factor_mass(S, rank_floor(S.dtype), crossing))
 
 
@@ -196,21 +196,24 @@ def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n
 def tangent_space(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],
-    kept: Bool[Array, " m"] | None,
+    active_rows: Bool[Array, " m"] | None,
     crossing: bool,
 ) -> TangentSpace:
     """Units of coordinates in which their inertias are 1, and orthonormal rows in them."""
     units = units_of(M, A)
     M, A = units[:, None] * M * units[None], A * units[None]
-    return TangentSpace(units, M, *orthonormal_rows(A, kept, rank_floor(A.dtype), crossing))
+    return TangentSpace(units, M, *orthonormal_rows(A, active_rows, rank_floor(A.dtype), crossing))
 
 
 def orthonormal_rows(
-    A: Float[Array, "m n"], kept: Bool[Array, " m"] | None, floor: float, crossing: bool = False
+    A: Float[Array, "m n"],
+    active_rows: Bool[Array, " m"] | None,
+    floor: float,
+    crossing: bool = False,
 ) -> tuple[tuple[tuple[Array, ...], ...], Float[Array, "m n"]]:
     """(L, Y), A = L Y, by Gram-Schmidt orthonormalization, each row twice ("twice is enough").
 
-    Rows that are not kept have 0 in Y and 1 in L. A row depends on those before it if the part
+    Rows that are not active have 0 in Y and 1 in L. A row depends on those before it if the part
     that they leave has a square of at most `floor` times that of the row.
     """
     L: list[tuple[Array, ...]] = []
@@ -224,18 +227,18 @@ def orthonormal_rows(
         square = jnp.sum(rest**2)
         independent = square > floor * jnp.sum(A[k] ** 2)
         norm = jnp.sqrt(jnp.where(independent, square, jnp.inf if crossing else jnp.nan))
-        if kept is not None:
-            norm = jnp.where(kept[k], norm, 1.0)
+        if active_rows is not None:
+            norm = jnp.where(active_rows[k], norm, 1.0)
         L.append((*parts, norm))
         Y.append(rest / norm)
     return tuple(L), jnp.stack(Y)
 
 
-def masked(A: Array, kept: Bool[Array, " m"] | None) -> Array:
-    """A, or entries of c, with zeros for rows that are not kept."""
-    if kept is None:
+def masked(A: Array, active_rows: Bool[Array, " m"] | None) -> Array:
+    """A, or entries of c, with zeros for rows that are not active."""
+    if active_rows is None:
         return A
-    return jnp.where(kept if A.ndim == 1 else kept[:, None], A, jnp.zeros_like(A))
+    return jnp.where(active_rows if A.ndim == 1 else active_rows[:, None], A, jnp.zeros_like(A))
 
 
 def solve_kkt(
@@ -243,29 +246,29 @@ def solve_kkt(
     A: Float[Array, "m n"],
     r: Float[Array, " n"],
     c: Float[Array, " m"],
-    kept: Bool[Array, " m"] | None = None,
+    active_rows: Bool[Array, " m"] | None = None,
     formulation: str = "multipliers",
     factor: Factor | None = None,
     crossing: bool = False,
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
     """(x, lam) with M x = r + A^T lam, A x + c = 0; NaN if there is no solution.
 
-    Derivatives reuse the factor; they hold for a constant set of kept rows.
+    Derivatives reuse the factor; they hold for a constant set of active rows.
 
     Args:
         M: symmetric, positive definite where A x = 0.
         A: rows.
         r: right-hand side.
         c: right-hand side of the rows.
-        kept: rows to solve with; None for all.
+        active_rows: rows to solve with; None for all.
         formulation: "multipliers" or "null_space".
         factor: `factor_kkt` of the same, if it exists already.
         crossing: as for `factor_kkt`.
     """
     frozen = jax.lax.stop_gradient((M, A))
-    factor = factor_kkt(*frozen, kept, formulation, crossing) if factor is None else factor
+    factor = factor_kkt(*frozen, active_rows, formulation, crossing) if factor is None else factor
     factor = jax.lax.stop_gradient(factor)
-    A, c = masked(A, kept), masked(c, kept)
+    A, c = masked(A, active_rows), masked(c, active_rows)
     rows = jax.lax.stop_gradient(A)
 
     n = M.shape[0]
@@ -273,7 +276,7 @@ def solve_kkt(
     def bordered(z: Array) -> Array:
         x, lam = z[:n], z[n:]
         below = -(A @ x)
-        below = below if kept is None else jnp.where(kept, below, -lam)
+        below = below if active_rows is None else jnp.where(active_rows, below, -lam)
         return jnp.concatenate([M @ x - lam @ A, below])
 
     def solve(_: object, right: Array) -> Array:
@@ -290,15 +293,15 @@ def solve_reactions(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],
     r: Float[Array, " n"],
-    push: Callable,
+    force: Callable,
     c: Float[Array, " m"],
-    kept: Bool[Array, " m"] | None,
+    active_rows: Bool[Array, " m"] | None,
     affine: bool,
 ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-    """(x, lam) with M x = r + push(lam) + A^T lam, A x + c = 0; NaN if there is no solution.
+    """(x, lam) with M x = r + force(lam) + A^T lam, A x + c = 0; NaN if there is no solution.
 
-    Newton's method on lam, with one step if push is affine. Each step solves with the unsymmetric
-    A (M + A^T W A)^-1 (A^T + d push/d lam), by LU factorization without pivoting. A pivot that is
+    Newton's method on lam, with one step if force is affine. Each step solves with the unsymmetric
+    A (M + A^T W A)^-1 (A^T + d force/d lam), by LU factorization without pivoting. A pivot that is
     not positive means that reaction forces have reversed the sense of rows (Painleve): there is no
     solution, or more than one.
 
@@ -306,22 +309,22 @@ def solve_reactions(
         M: symmetric, positive definite where A x = 0.
         A: rows.
         r: right-hand side.
-        push: lam -> a force, (n,).
+        force: lam -> a force, (n,).
         c: right-hand side of the rows.
-        kept: rows to solve with; None for all.
-        affine: whether push is affine.
+        active_rows: rows to solve with; None for all.
+        affine: whether force is affine.
     """
-    A, c = masked(A, kept), masked(c, kept)
+    A, c = masked(A, active_rows), masked(c, active_rows)
     full, weights = augmented(M, A)
     factor = factor_mass(jax.lax.stop_gradient(full))
     frozen = jax.lax.stop_gradient
-    spare = None if kept is None else jnp.diag((~kept).astype(M.dtype))
+    spare = None if active_rows is None else jnp.diag((~active_rows).astype(M.dtype))
 
     def newton(lam: Array) -> tuple[Array, Array, Array]:
-        G = jax.jacfwd(push)(lam)
-        if kept is not None:
-            G = jnp.where(kept, G, 0.0)
-        rest = r + push(lam) - G @ lam - (weights * c) @ A
+        G = jax.jacfwd(force)(lam)
+        if active_rows is not None:
+            G = jnp.where(active_rows, G, 0.0)
+        rest = r + force(lam) - G @ lam - (weights * c) @ A
         sides = jnp.concatenate([(A.T + G).T, rest[None]])
         found = jax.vmap(lambda b: solve_mass(full, b, factor))(sides)
         spread, free = found[:-1], found[-1]
@@ -366,7 +369,7 @@ def _iterated(newton: Callable, lam: Array) -> Array:
     """The lam at which Newton's method converges, or after MAX_NEWTON steps."""
     eps = float(jnp.finfo(lam.dtype).eps)
 
-    def turn(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def body_fun(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         lam, _, count = state
         found = newton(lam)[1]
         return found, jnp.max(jnp.abs(found - lam) / (1.0 + jnp.abs(found))), count + 1
@@ -374,5 +377,5 @@ def _iterated(newton: Callable, lam: Array) -> Array:
     def cond_fun(state: tuple[Array, Array, Array]) -> Array:
         return (state[1] > 8 * eps) & (state[2] < MAX_NEWTON)
 
-    begin = (lam, jnp.full((), jnp.inf, lam.dtype), jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(cond_fun, turn, begin)[0]
+    init = (lam, jnp.full((), jnp.inf, lam.dtype), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(cond_fun, body_fun, init)[0]

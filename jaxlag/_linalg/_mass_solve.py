@@ -168,8 +168,8 @@ def _substituted(U: Float[Array, "n n"], r: Float[Array, " n"]) -> Float[Array, 
     def down(k: Int[Array, ""], z: Float[Array, " n"]) -> Float[Array, " n"]:
         return jnp.where(at > k, z - U[k] * (z[k] / U[k, k]), z)
 
-    def up(turn: Int[Array, ""], x: Float[Array, " n"]) -> Float[Array, " n"]:
-        i = n - 1 - turn
+    def up(k: Int[Array, ""], x: Float[Array, " n"]) -> Float[Array, " n"]:
+        i = n - 1 - k
         rest = z[i] - jnp.sum(jnp.where(at > i, U[i] * x, 0.0))
         return jnp.where(at == i, rest / U[i, i], x)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-MAX_TURNS = 12
+MAX_ITERATIONS = 12
 SWEEPS = 3
 TARGET = 8.0  # roundings of the state: smaller corrections are not iterated
 ACCEPTED = 0.6  # a state counts as consistent if its correction is below eps^this
@@ -51,17 +51,17 @@ def project(
 
     Source: Hairer, Wanner, Solving Ordinary Differential Equations II, sec. VII.2 (projection).
     """
-    found = jnp.array(True)
+    converged = jnp.array(True)
     if surface.position is not None:
-        still = None if frozen is None else _Equation(frozen.position, frozen.shift)
-        q, found = _solved(_Equation(surface.position, surface.shift), q, still)
+        frozen_equation = None if frozen is None else _Equation(frozen.position, frozen.shift)
+        q, converged = _solved(_Equation(surface.position, surface.shift), q, frozen_equation)
     if surface.velocity is None:
-        return q, v, found
-    at_q, still = _rates_at(surface, q), None
+        return q, v, converged
+    at_q, frozen_equation = _rates_at(surface, q), None
     if frozen is not None:
-        still = _rates_at(frozen, jax.lax.stop_gradient(q))
-    v, also = _solved(at_q, v, still)
-    return q, v, found & also
+        frozen_equation = _rates_at(frozen, jax.lax.stop_gradient(q))
+    v, v_converged = _solved(at_q, v, frozen_equation)
+    return q, v, converged & v_converged
 
 
 def tangential(
@@ -88,7 +88,7 @@ def tangential(
     return dq, dv - surface.kick(surface.velocity(q + dq, v + dv))
 
 
-def turns_needed(surface: ConstraintProjector, q: Array, v: Array) -> Int[Array, ""]:
+def iterations_needed(surface: ConstraintProjector, q: Array, v: Array) -> Int[Array, ""]:
     """The larger of the numbers of iterations of `project` for q and for v."""
     count = jnp.zeros((), jnp.int32)
     if surface.position is not None:
@@ -139,7 +139,7 @@ def _solved(
 
 
 def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
-    """(mu for which the residual is rounding, or after MAX_TURNS; the residual; iterations).
+    """(mu for which the residual is rounding, or after MAX_ITERATIONS; the residual; iterations).
 
     The first iteration, which is sufficient after most steps, is outside the loop.
     """
@@ -147,9 +147,9 @@ def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
 
     def cond_fun(state: Any) -> Array:
         _, _, size, count = state
-        return (size > target) & (count < MAX_TURNS)
+        return (size > target) & (count < MAX_ITERATIONS)
 
-    def turn(state: Any) -> Any:
+    def body_fun(state: Any) -> Any:
         mu, left, _, count = state
         mu = mu + left
         left = equation.left(start, mu)
@@ -158,8 +158,8 @@ def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
     first = equation.residual(start)
     left = equation.left(start, first)
     size = _size(equation.correct(left), start)
-    begin = (first, left, size, jnp.ones((), jnp.int32))
-    mu, _, size, count = jax.lax.while_loop(cond_fun, turn, begin)
+    init = (first, left, size, jnp.ones((), jnp.int32))
+    mu, _, size, count = jax.lax.while_loop(cond_fun, body_fun, init)
     return mu, size, count
 
 

@@ -36,7 +36,7 @@ def nearest(B: Float[Array, "n k"], b: Float[Array, " n"]) -> Float[Array, " k"]
             lambda x: B @ x,
             b,
             lambda product, b: refined(lambda b: inverse @ b, product, b),
-            lambda turned, b: refined(lambda b: b @ inverse, turned, b),
+            lambda transposed, b: refined(lambda b: b @ inverse, transposed, b),
         )
 
     def bordered(z: Array) -> Array:

@@ -35,13 +35,13 @@ class Sizes(NamedTuple):
     """Sizes of the constraint rows.
 
     Attributes:
-        there: rows that are more than rounding.
+        nonzero: rows that are more than rounding.
         void: rows that are rounding here and nearby: 0 = 0 for every motion.
         size: their lengths. For rows that are rounding, their rate of change, or the size of their
             terms if that is larger.
     """
 
-    there: Bool[Array, " m"]
+    nonzero: Bool[Array, " m"]
     void: Bool[Array, " m"]
     size: Float[Array, " m"]
 
@@ -72,18 +72,18 @@ def row_sizes(
         changes = row_lengths(jax.vmap(rows)(places[1:]) - jax.lax.stop_gradient(A)[None])
         growth, rounding = jnp.max(changes[:2], axis=0) / small, jnp.max(changes[2:], axis=0)
         norms = row_lengths(A)
-        there = (norms != 0) & ~(norms <= rounding)
-        size = jnp.where(there, norms, growth)
-        return Sizes(there, norms < 0, jnp.where(size > 0, size, 1.0))
+        nonzero = (norms != 0) & ~(norms <= rounding)
+        size = jnp.where(nonzero, norms, growth)
+        return Sizes(nonzero, norms < 0, jnp.where(size > 0, size, 1.0))
     found, rounding = jax.vmap(partial(with_rounding, rows))(places)
     rounding, norms = row_lengths(rounding), row_lengths(A)
     growth = row_lengths(found[1:] - jax.lax.stop_gradient(A)[None])
     # Unknown rounding, as of derivatives beside the end of a domain, does not exclude the row.
-    there = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
-    void = ~there & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
+    nonzero = (norms != 0) & ~(norms <= ROUNDINGS * rounding[0])
+    void = ~nonzero & jnp.all(growth <= ROUNDINGS * (rounding[:1] + rounding[1:]), axis=0)
     made_of = jnp.max(jnp.nan_to_num(rounding), axis=0) / eps
-    size = jnp.where(there, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
-    return Sizes(there, void, jnp.where(size > 0, size, 1.0))
+    size = jnp.where(nonzero, norms, jnp.maximum(jnp.max(growth, axis=0) / small, made_of))
+    return Sizes(nonzero, void, jnp.where(size > 0, size, 1.0))
 
 
 def without_rounding(
@@ -156,11 +156,11 @@ def redundant_rows_hold(
     eps = float(jnp.finfo(A.dtype).eps)
     c, rounding = with_rounding(gamma, *state)
     lengths = row_lengths(A * units[None])
-    size = jnp.where(sizes.there & (lengths > 0), lengths, sizes.size * jnp.max(units))
+    size = jnp.where(sizes.nonzero & (lengths > 0), lengths, sizes.size * jnp.max(units))
     scale = jnp.max(jnp.abs(x / units)) + jnp.max(jnp.abs(c) / size)
     allowed = rank_floor(A.dtype) ** 0.5 * scale + 1e3 * eps * jnp.max(jnp.abs(units * force))
     # The rounding of x from the solved rows appears in the others.
     rounding = jnp.nan_to_num(rounding)
-    allowed += ROUNDINGS * jnp.max(jnp.where(sizes.there, rounding / size, 0.0))
+    allowed += ROUNDINGS * jnp.max(jnp.where(sizes.nonzero, rounding / size, 0.0))
     allowed = allowed * size + ROUNDINGS * rounding
     return jnp.all(jnp.abs(A @ x + c) <= allowed)

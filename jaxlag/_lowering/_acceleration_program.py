@@ -40,16 +40,16 @@ class Choices(NamedTuple):
 
     Attributes:
         sample: values of the params if these are traced.
-        kept: rows for the projection of states; None for all.
-        reacting: independent rows that imply the others, for accelerations; None for all.
+        active_rows: rows for the projection of states; None for all.
+        multiplier_rows: independent rows that imply the others, for accelerations; None for all.
         time_direction: 1, or -1 backwards in time.
         definite: function that returns whether M is positive definite without the constraints, in
             all lanes; None if that is known while tracing.
     """
 
     sample: _params.Sample = _params.UNKNOWN
-    kept: Bool[Array, " m"] | None = None
-    reacting: RowChoice | None = None
+    active_rows: Bool[Array, " m"] | None = None
+    multiplier_rows: RowChoice | None = None
     time_direction: Array | float = 1.0
     definite: Callable[[], Array] | None = None
 
@@ -82,7 +82,7 @@ class AccelerationProgram(eqx.Module):
 
     @abstractmethod
     def acceleration(
-        self, state: State, constants: Any = None, reacting: RowChoice | None = None
+        self, state: State, constants: Any = None, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """a, with one factorization; NaN if M is not positive definite on A a = 0."""
 
@@ -100,13 +100,17 @@ class AccelerationProgram(eqx.Module):
 
     @abstractmethod
     def multipliers(
-        self, state: State, constants: Any, reacting: RowChoice | None = None
+        self, state: State, constants: Any, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " m"]:
         """The multipliers as forces read them."""
 
     @abstractmethod
     def projector(
-        self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
+        self,
+        state: State,
+        constants: Any,
+        rows: ConstraintRows,
+        active_rows: Bool[Array, " m"] | None,
     ) -> ConstraintProjector:
         """The projection onto the constraints near a state; of positions with quasi-velocities."""
 
@@ -132,10 +136,10 @@ class ArrayProgram(AccelerationProgram):
         return self.array.precompute(q, params, choices.time_direction)
 
     def acceleration(
-        self, state: State, constants: Any = None, reacting: RowChoice | None = None
+        self, state: State, constants: Any = None, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h, with constraints together with their rows."""
-        return self.array.acceleration(*state, constants, reacting)
+        return self.array.acceleration(*state, constants, multiplier_rows)
 
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
         """The equations in quasi-velocities on arrays."""
@@ -156,13 +160,17 @@ class ArrayProgram(AccelerationProgram):
         return quasi.determinant(t, q, params)[None]
 
     def multipliers(
-        self, state: State, constants: Any, reacting: RowChoice | None = None
+        self, state: State, constants: Any, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " m"]:
-        """Solved with the rows in `reacting`."""
-        return self.array.multipliers(*state, constants, reacting)
+        """Solved with the rows in `multiplier_rows`."""
+        return self.array.multipliers(*state, constants, multiplier_rows)
 
     def projector(
-        self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
+        self,
+        state: State,
+        constants: Any,
+        rows: ConstraintRows,
+        active_rows: Bool[Array, " m"] | None,
     ) -> ConstraintProjector:
         """By M^-1 A^T (A M^-1 A^T)^-1 at the state; with holonomic rows alone for q."""
         t, q, _, params, _ = state
@@ -170,7 +178,7 @@ class ArrayProgram(AccelerationProgram):
         holonomic = np.flatnonzero(rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
-            return self.array.corrections(t, q, v, params, constants, kept, chosen)
+            return self.array.corrections(t, q, v, params, constants, active_rows, chosen)
 
         def position(q: Array) -> Array:
             return self.array.position(t, q, params)

@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
-from jaxlag._linalg._kkt import augmented, factor_kkt, masked, solve_kkt, solve_reactions, units_of
+from jaxlag._linalg._kkt import (
+    augmented,
+    factor_kkt,
+    masked,
+    row_weights,
+    solve_kkt,
+    solve_reactions,
+    units_of,
+)
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._linalg._row_residuals import redundant_rows_hold, row_sizes
 from jaxlag._lowering._row_layout import layout
@@ -65,7 +73,8 @@ class ArrayTerms(eqx.Module):
         baumgarte: stabilization added to gamma.
         regular: whether M is known to be positive definite by itself; used by the scalar
             program.
-        apart: whether rows whose multipliers forces read are known to be independent.
+        contact_rows_independent: whether rows whose multipliers forces read are known to be
+            independent.
         quasi: quasi-velocities, if the state is (q, u) with the free ones.
         in_u: L as a function of (t, q, u, params), if it was written so.
         crossing: whether rows that become dependent are left out; otherwise results are NaN.
@@ -77,7 +86,7 @@ class ArrayTerms(eqx.Module):
     formulation: str = eqx.field(static=True, default="multipliers")
     baumgarte: Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool = eqx.field(static=True, default=False)
-    apart: bool = eqx.field(static=True, default=False)
+    contact_rows_independent: bool = eqx.field(static=True, default=False)
     quasi: QuasiVelocities | None = None
     in_u: Callable | None = eqx.field(static=True, default=None)
     crossing: bool = eqx.field(static=True, default=False)
@@ -173,10 +182,10 @@ class ArrayTerms(eqx.Module):
         rows = layout(self.constraints, params, q.shape[0], q.dtype)
         named = rows.unflatten(jnp.zeros((rows.size,), q.dtype))
 
-        def jvp_fn(parts: list[Array]) -> Array:
+        def reaction(parts: list[Array]) -> Array:
             return self._reactive(t, q, v, params, inputs, dict(zip(named, parts, strict=True)))
 
-        program = jax.make_jaxpr(jvp_fn)(list(named.values())).jaxpr
+        program = jax.make_jaxpr(reaction)(list(named.values())).jaxpr
         (reached,) = outputs_depend_on(program, [frozenset({name}) for name in named])
         reached |= {force.contact for force in self.forces if reads_lam(force) and force.contact}
         return tuple(name in reached for name in rows.names)
@@ -263,16 +272,16 @@ class ArrayTerms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         constants: Any = None,
-        reacting: RowChoice | None = None,
+        multiplier_rows: RowChoice | None = None,
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h; constant M and zero h are not recomputed, absent forces skipped."""
         constants = self.precompute(q, params) if constants is None else constants
         M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
             return solve_mass(M, right, constants.factor)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.time_direction)[
-            0
-        ]
+        return self._solved(
+            M, right, t, q, v, params, inputs, multiplier_rows, constants.time_direction
+        )[0]
 
     def reactions(
         self,
@@ -287,28 +296,30 @@ class ArrayTerms(eqx.Module):
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         A, _ = self.rows(t, q, v, params)
-        still = jax.lax.stop_gradient
-        sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *still((q, A)))
-        there, void, _ = sizes
+        stop_gradient = jax.lax.stop_gradient
+        sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *stop_gradient((q, A)))
+        nonzero, void, _ = sizes
         if A.shape[0] == 1:
             choice = RowChoice(~void, ~void)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
             lam = jnp.where(void, 0.0, lam)
-            fine = (there | void)[0]
+            fine = (nonzero | void)[0]
         else:
             read = self.rows_read(t, q, v, params, inputs)
             unread = np.logical_not(read)
-            kept = independent_rows(*still((M, A)), unread, there=there, mobile_first=True)
-            choice = RowChoice(kept, there)
+            active_rows = independent_rows(
+                *stop_gradient((M, A)), unread, nonzero=nonzero, mobile_first=True
+            )
+            choice = RowChoice(active_rows, nonzero)
             a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
-            units = units_of(*still((M, A)))
-            lam = shared(A, lam, kept, there, unread, units)
+            units = units_of(*stop_gradient((M, A)))
+            lam = shared(A, lam, active_rows, nonzero, unread, units)
 
             def gamma(t: Array, q: Array, v: Array) -> Array:
                 return self.gamma(t, q, v, params)
 
             fine = redundant_rows_hold(
-                *still((A, a)), gamma, *still(((t, q, v), sizes, right, units))
+                *stop_gradient((A, a)), gamma, *stop_gradient(((t, q, v), sizes, right, units))
             )
         return jnp.where(fine, a, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
@@ -320,13 +331,13 @@ class ArrayTerms(eqx.Module):
         params: Any,
         inputs: Mapping[str, Any],
         constants: SolveConstants,
-        reacting: RowChoice | None,
+        multiplier_rows: RowChoice | None,
     ) -> Float[Array, " m"]:
         """The multipliers as forces read them, solved with these rows."""
         M, right = self._balance(t, q, v, params, inputs, constants)
-        return self._solved(M, right, t, q, v, params, inputs, reacting, constants.time_direction)[
-            1
-        ]
+        return self._solved(
+            M, right, t, q, v, params, inputs, multiplier_rows, constants.time_direction
+        )[1]
 
     def _solved(
         self,
@@ -337,29 +348,33 @@ class ArrayTerms(eqx.Module):
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        reacting: RowChoice | None,
+        multiplier_rows: RowChoice | None,
         time_direction: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """(a, lam) with constraints; lam as forces read it, if they do."""
         (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, time_direction)
-        kept = None if reacting is None else reacting.kept
+        active_rows = None if multiplier_rows is None else multiplier_rows.active_rows
         if not any(map(reads_lam, self.forces)):
-            return solve_kkt(M, A, right, gamma, kept, self.formulation, crossing=self.crossing)
+            return solve_kkt(
+                M, A, right, gamma, active_rows, self.formulation, crossing=self.crossing
+            )
         read = self.rows_read(t, q, v, params, inputs)
 
-        def seen(lam: Array) -> Array:
-            if reacting is None or self.apart:
+        def as_read(lam: Array) -> Array:
+            if multiplier_rows is None or self.contact_rows_independent:
                 return lam
-            return shared(A, lam, *reacting, read, units_of(M, A))
+            return shared(A, lam, *multiplier_rows, read, units_of(M, A))
 
-        def jvp_fn(lam: Array) -> Array:
+        def reaction(lam: Array) -> Array:
             return self.reactive(t, q, v, params, inputs, lam)
 
-        slopes = jax.make_jaxpr(jax.jacfwd(jvp_fn))(gamma).jaxpr
+        slopes = jax.make_jaxpr(jax.jacfwd(reaction))(gamma).jaxpr
         (reached,) = outputs_depend_on(slopes, [frozenset({"lam"})])
-        felt = lambda lam: jvp_fn(seen(lam))  # noqa: E731
-        a, lam = solve_reactions(M, A, right, felt, gamma, kept, affine=not reached)
-        return a, seen(lam)
+        reaction_as_read = lambda lam: reaction(as_read(lam))  # noqa: E731
+        a, lam = solve_reactions(
+            M, A, right, reaction_as_read, gamma, active_rows, affine=not reached
+        )
+        return a, as_read(lam)
 
     def correction(
         self,
@@ -368,10 +383,10 @@ class ArrayTerms(eqx.Module):
         v: Float[Array, " n"],
         params: Any,
         constants: Any = None,
-        kept: Bool[Array, " m"] | None = None,
+        active_rows: Bool[Array, " m"] | None = None,
     ) -> Float[Array, "n m"]:
-        """M^-1 A^T (A M^-1 A^T)^-1 over the kept rows; the columns of the others are zero."""
-        return self.corrections(t, q, v, params, constants, kept)[0]
+        """M^-1 A^T (A M^-1 A^T)^-1 over the active rows; the columns of the others are zero."""
+        return self.corrections(t, q, v, params, constants, active_rows)[0]
 
     def corrections(
         self,
@@ -380,12 +395,13 @@ class ArrayTerms(eqx.Module):
         v: Float[Array, " n"],
         params: Any,
         constants: Any = None,
-        kept: Bool[Array, " m"] | None = None,
+        active_rows: Bool[Array, " m"] | None = None,
         chosen: Sequence[int] | None = None,
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
         """The same, and the diagonal of (A M^-1 A^T)^-1.
 
-        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular.
+        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular: rows
+        without inertia would have no effective mass.
         """
         M = (
             self.mass(t, q, v, params)
@@ -393,16 +409,22 @@ class ArrayTerms(eqx.Module):
             else constants.mass
         )
         A, b = self.rows(t, q, v, params)
+        weights = None
         if chosen is not None:
             if not self.regular:
-                M, _ = augmented(M, masked(A, kept))
+                M, _ = augmented(M, masked(A, active_rows))
             rows = np.array(chosen)
-            A, b, kept = A[rows], b[rows], None if kept is None else kept[rows]
-        how = kept, self.formulation
+            A, b = A[rows], b[rows]
+            active_rows = None if active_rows is None else active_rows[rows]
+        elif self.crossing and not self.regular:
+            A = masked(A, active_rows)
+            weights = jax.lax.stop_gradient(row_weights(M, A))
+        how = active_rows, self.formulation
         factor = factor_kkt(*jax.lax.stop_gradient((M, A)), *how, self.crossing)
 
         def column(c: Array) -> tuple[Array, Array]:
-            x, lam = solve_kkt(M, A, jnp.zeros_like(q), c, *how, factor)
+            load = jnp.zeros_like(q) if weights is None else (weights * c) @ A
+            x, lam = solve_kkt(M, A, load, c, *how, factor)
             return -x, -lam
 
         K, masses = jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))

@@ -110,18 +110,20 @@ class QuasiState:
         a = self.velocity_rate(self.accelerations())
         left = terms.euler_lagrange(t, q, v, a, params) - self._force()
         A, _ = terms.rows(t, q, v, params)
-        still = jax.lax.stop_gradient
-        there = row_sizes(lambda q: terms.rows(t, q, v, params)[0], *still((q, A))).there
-        units = units_of(*still((terms.mass(t, q, v, params), A)))
+        stop_gradient = jax.lax.stop_gradient
+        nonzero = row_sizes(
+            lambda q: terms.rows(t, q, v, params)[0], *stop_gradient((q, A))
+        ).nonzero
+        units = units_of(*stop_gradient((terms.mass(t, q, v, params), A)))
         metric = jnp.diag(units**-2)
-        kept = independent_rows(metric, still(A), there=there, mobile_first=True)
-        rows = masked(A, kept) * units
-        sizes = jnp.sqrt(jnp.sum(still(rows) ** 2, axis=1))
-        sizes = jnp.where(kept, sizes, 1.0)
+        active_rows = independent_rows(metric, stop_gradient(A), nonzero=nonzero, mobile_first=True)
+        rows = masked(A, active_rows) * units
+        sizes = jnp.sqrt(jnp.sum(stop_gradient(rows) ** 2, axis=1))
+        sizes = jnp.where(active_rows, sizes, 1.0)
         rows = rows / sizes[:, None]
-        gram = rows @ rows.T + jnp.diag((~kept).astype(q.dtype))
-        factor = factor_mass(still(gram))
+        gram = rows @ rows.T + jnp.diag((~active_rows).astype(q.dtype))
+        factor = factor_mass(stop_gradient(gram))
         left = units * left
         lam = solve_mass(gram, rows @ left, factor)
         lam = lam + solve_mass(gram, rows @ (left - lam @ rows), factor)
-        return a, least_norm(A, lam / sizes, kept, there, units)
+        return a, least_norm(A, lam / sizes, active_rows, nonzero, units)

@@ -122,10 +122,10 @@ def _examine(
     """Contents of each row; raises for rows that are not affine in v, or nonzero without v."""
     position = constraint.position if constraint.holonomic else None
     rows = examine(constraint.velocity, position, like, static, n, dtype)
-    bent = [label for label, row in zip(labels, rows, strict=True) if not row.affine]
-    if bent:
+    not_affine = [label for label, row in zip(labels, rows, strict=True) if not row.affine]
+    if not_affine:
         raise invalid(
-            f"constraint {_listed(bent)}: residual",
+            f"constraint {_listed(not_affine)}: residual",
             "be affine in v",
             "its derivative with respect to v contains v in the traced program",
             f"Write A(t, q) v + b(t, q): {_AFFINE.format('v')}",
@@ -169,21 +169,21 @@ def _checked(
     check_indices(closed, _watched(like, speeds), "QuasiVelocities")
     if quasi.U is None:
         rows = examine(quasi.velocities, None, like, static, n, dtype, quasi.size)
-        bent = [str(i) for i, row in enumerate(rows) if not row.affine]
-        if bent:
+        not_affine = [str(i) for i, row in enumerate(rows) if not row.affine]
+        if not_affine:
             raise invalid(
                 "QuasiVelocities: kinematics",
                 "be affine in u",
-                f"the derivative of v[{bent[0]}] with respect to u contains u in the traced "
+                f"the derivative of v[{not_affine[0]}] with respect to u contains u in the traced "
                 "program",
                 f"Write B(t, q) u + c(t, q): {_AFFINE.format('u')}",
             )
         return
     rows = examine(quasi.of, None, like, static, n, dtype)
-    bent = [name for name, row in zip(quasi.names, rows, strict=True) if not row.affine]
-    if bent:
+    not_affine = [name for name, row in zip(quasi.names, rows, strict=True) if not row.affine]
+    if not_affine:
         raise invalid(
-            f"quasi-velocity {_listed(bent)}: U",
+            f"quasi-velocity {_listed(not_affine)}: U",
             "be affine in v",
             "its derivative with respect to v contains v in the traced program",
             f"Write Theta^T v + theta_0: {_AFFINE.format('v')}",

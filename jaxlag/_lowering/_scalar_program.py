@@ -113,23 +113,26 @@ class ScalarProgram(AccelerationProgram):
             return None
 
         def before(
-            code: Program | None, kept: Array | None, there: Array | None = None
+            code: Program | None, active_rows: Array | None, nonzero: Array | None = None
         ) -> Array | None:
             if code is None:
                 return None
-            return _emit.prelude(code, params, q.dtype, kept, there, choices.time_direction)
+            return _emit.prelude(
+                code, params, q.dtype, active_rows, nonzero, choices.time_direction
+            )
 
-        kept, solving = choices.kept, choices.reacting or (None, None)
+        active_rows, solving = choices.active_rows, choices.multiplier_rows or (None, None)
         first = before(equations.program, *solving)
         assert first is not None
-        rates, determinants = before(equations.velocity, kept), before(equations.determinants, None)
+        rates = before(equations.velocity, active_rows)
+        determinants = before(equations.determinants, None)
         if equations.surface is None:
             return ScalarSolveConstants(first, rates=rates, determinants=determinants)
         *moving, lam = equations.surface
-        others = [before(code, kept) for code in moving]
-        reacting_too = before(lam, *solving)
+        others = [before(code, active_rows) for code in moving]
+        of_lam = before(lam, *solving)
         return ScalarSolveConstants(
-            first, *others, lam=reacting_too, rates=rates, determinants=determinants
+            first, *others, lam=of_lam, rates=rates, determinants=determinants
         )
 
     @property
@@ -137,7 +140,7 @@ class ScalarProgram(AccelerationProgram):
         return ArrayProgram(self.array)
 
     def acceleration(
-        self, state: State, constants: Any = None, reacting: RowChoice | None = None
+        self, state: State, constants: Any = None, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """Acceleration a; all NaN if M is not positive definite.
 
@@ -146,11 +149,11 @@ class ScalarProgram(AccelerationProgram):
         """
         given = state.q, state.params, state.inputs
         if self.lowered(*given).equations is None:
-            return self._on_arrays.acceleration(state, constants, reacting)
+            return self._on_arrays.acceleration(state, constants, multiplier_rows)
         if constants is not None:
             return self._run("acceleration", state, constants)
-        own: Any = self.precompute(*given, Choices(reacting=reacting))
-        a = self._run("acceleration", state, own)
+        computed: Any = self.precompute(*given, Choices(multiplier_rows=multiplier_rows))
+        a = self._run("acceleration", state, computed)
         return jnp.where(jnp.any(jnp.isnan(a)), jnp.nan, a)
 
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
@@ -202,11 +205,15 @@ class ScalarProgram(AccelerationProgram):
         return equations
 
     def projector(
-        self, state: State, constants: Any, rows: ConstraintRows, kept: Bool[Array, " m"] | None
+        self,
+        state: State,
+        constants: Any,
+        rows: ConstraintRows,
+        active_rows: Bool[Array, " m"] | None,
     ) -> ConstraintProjector:
         """By the matrices that the program computes at the state."""
         if not isinstance(constants, ScalarSolveConstants):
-            return self._on_arrays.projector(state, constants, rows, kept)
+            return self._on_arrays.projector(state, constants, rows, active_rows)
         code, q, v = self._equations(state).surface, state.q, state.w
         assert code is not None
 
@@ -225,8 +232,8 @@ class ScalarProgram(AccelerationProgram):
         if self.array.quasi is not None:
             return ConstraintProjector(position, None, times(shift.reshape(-1, n)), None)
         kick = shift if code.kick is None else run("kick", q, v)
-        own, every = (len(c.results) for c in (code.position, code.velocity))
-        shift, masses = shift[: own * n], kick[every * n :]
+        holonomic, every = (len(c.results) for c in (code.position, code.velocity))
+        shift, masses = shift[: holonomic * n], kick[every * n :]
         shift, kick = shift.reshape(-1, n), kick[: every * n].reshape(-1, n)
         held = position if code.position.results else None
         return ConstraintProjector(
@@ -234,11 +241,11 @@ class ScalarProgram(AccelerationProgram):
         )
 
     def multipliers(
-        self, state: State, constants: Any, reacting: RowChoice | None = None
+        self, state: State, constants: Any, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " m"]:
         """The multipliers as forces read them."""
         if not isinstance(constants, ScalarSolveConstants):
-            return self._on_arrays.multipliers(state, constants, reacting)
+            return self._on_arrays.multipliers(state, constants, multiplier_rows)
         return self._run("lam", state, constants)
 
     def keyed_by_inputs(self, constants: Any) -> bool:

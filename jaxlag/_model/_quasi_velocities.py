@@ -175,8 +175,8 @@ class QuasiVelocities(eqx.Module):
         v = lax.custom_linear_solve(
             lambda v: v @ theta,
             u - theta_0,
-            lambda turned, b: refined(lambda b: b @ inverse, turned, b),
-            lambda turned, b: refined(lambda b: inverse @ b, turned, b),
+            lambda transposed, b: refined(lambda b: b @ inverse, transposed, b),
+            lambda transposed, b: refined(lambda b: inverse @ b, transposed, b),
         )
         return jnp.where(fine, v, jnp.nan)
 
@@ -198,8 +198,8 @@ class QuasiVelocities(eqx.Module):
             return self._columns(t, q, params, dtype).T
 
         here = rows(q)
-        there = row_sizes(rows, q, here).there
-        return jnp.where(there, jnp.nan_to_num(sines(here.T), nan=0.0), 0.0)
+        nonzero = row_sizes(rows, q, here).nonzero
+        return jnp.where(nonzero, jnp.nan_to_num(sines(here.T), nan=0.0), 0.0)
 
     def pivots(self, t: Float[Array, ""], q: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
         """Distance of the coefficients of every quasi-velocity from the span of those before it.

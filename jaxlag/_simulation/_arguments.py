@@ -136,10 +136,10 @@ def check_start(
         name, x, labels = "u0", quasi.vector("u0", u0), quasi.names
     else:
         name, x, labels = "v0", vector(system.coordinates, "v0", v0), system.coordinates.labels
-    for argument, values, words in (("q0", q0, system.coordinates.labels), (name, x, labels)):
+    for argument, values, names in (("q0", q0, system.coordinates.labels), (name, x, labels)):
         if concrete(values) and not np.all(np.isfinite(values)):
             i = int(np.argmin(np.isfinite(values)))
-            raise invalid(argument, "be finite", f"{argument}[{i}] ({words[i]!r}) was {values[i]}")
+            raise invalid(argument, "be finite", f"{argument}[{i}] ({names[i]!r}) was {values[i]}")
     q0, x = of_state(f"q0 and {name}", q0, x)
     return (q0, None, x) if name == "u0" else (q0, x, None)
 

@@ -38,11 +38,11 @@ def timed(
     results = program(key, values)
     seconds = clock() - start
     if seconds > LONG and compiled() > count:
-        _logger.warning("%s", _words(system, seconds))
+        _logger.warning("%s", _message(system, seconds))
     return results
 
 
-def _words(system: System, seconds: float) -> str:
+def _message(system: System, seconds: float) -> str:
     names = system.coordinates.labels
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
     advice = "Set JAX_COMPILATION_CACHE_DIR to keep compiled programs for the next process"

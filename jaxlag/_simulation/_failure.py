@@ -52,21 +52,21 @@ _OPEN = (
 
 
 def final_status(
-    dynamics: VectorField, times: Times, y0: Array, args: Arguments, outcome: Outcome, begun: Start
+    dynamics: VectorField, times: Times, y0: Array, args: Arguments, outcome: Outcome, checks: Start
 ) -> Ending:
     """The end of a solve without further evaluations."""
-    status = jnp.where(begun.finite, outcome.status, int(Status.nonfinite))
-    status = jnp.where(begun.contacts_valid, status, int(Status.no_reaction_solution))
+    status = jnp.where(checks.finite, outcome.status, int(Status.nonfinite))
+    status = jnp.where(checks.contacts_valid, status, int(Status.no_reaction_solution))
     kind = jnp.where(
-        begun.consistent.contradictory,
+        checks.consistent.contradictory,
         int(Status.contradictory_rows),
         int(Status.inconsistent_start),
     )
-    kind = jnp.where(begun.consistent.complete, kind, int(Status.kinematics_singular))
-    status = jnp.where(begun.consistent.ok, status, kind)
+    kind = jnp.where(checks.consistent.complete, kind, int(Status.kinematics_singular))
+    status = jnp.where(checks.consistent.ok, status, kind)
     short = (status == int(Status.ok)) & (times.stop < times.saves[-1])
-    status = jnp.where(short | ~begun.in_range, int(Status.input_range), status)
-    status = jnp.where(begun.valid, status, int(Status.bad_value))
+    status = jnp.where(short | ~checks.in_range, int(Status.input_range), status)
+    status = jnp.where(checks.valid, status, int(Status.bad_value))
 
     faults, n = ~jnp.isfinite(stop_gradient(y0)), dynamics.system.size
     start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
@@ -78,7 +78,7 @@ def final_status(
         fault = (status == int(Status.inconsistent_start)) | (
             status == int(Status.contradictory_rows)
         )
-        where = jnp.where(fault, begun.consistent.row, where)
+        where = jnp.where(fault, checks.consistent.row, where)
     tried = dynamics.clock(outcome.tried, args)
     found = status.astype(jnp.int32), where.astype(jnp.int32), tried, dynamics.idle(outcome.state)
     return stop_gradient(Ending(*found))
@@ -180,16 +180,16 @@ def _explained(
     if dynamics.rows.size and dynamics.quasi is None:
         begin = jnp.concatenate([q0, w])
         at = jnp.append(taus, start), jnp.vstack([states, begin]), args
-        row = _dependent(dynamics, args.kept, *at)
-        if args.rows is not None and args.rows.reacting.kept is not args.kept:
-            reacting = _dependent(dynamics, args.rows.reacting.kept, *at)
-            row = jnp.where(row >= 0, row, reacting)
+        row = _dependent(dynamics, args.active_rows, *at)
+        if args.rows is not None and args.rows.multiplier_rows.active_rows is not args.active_rows:
+            multiplier_row = _dependent(dynamics, args.rows.multiplier_rows.active_rows, *at)
+            row = jnp.where(row >= 0, row, multiplier_row)
     worst = jnp.where(jnp.all(jnp.isfinite(ahead)), culprits[2][1], culprits[2][0])
 
     if dynamics.rows.size:
         short = status == int(Status.step_below_resolution)
-        apart = status == int(Status.projection_failed)
-        dependent = (unexplained | short | apart) & (row >= 0)
+        unprojected = status == int(Status.projection_failed)
+        dependent = (unexplained | short | unprojected) & (row >= 0)
         status = jnp.where(dependent, int(Status.rank_change), status)
         if any(map(reads_lam, dynamics.system.forces)):
             sound = (mass < 0) & (row < 0) & jnp.all(jnp.isfinite(last))
@@ -258,10 +258,10 @@ def _turned(
         size = jnp.log(quasi.pivots(dynamics.clock(tau, args), q, params))
         return jnp.where(jnp.isnan(size), -jnp.inf, size)
 
-    begin, *there = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
-    found = found | (there[0] - begin < 0.5 * float(np.log(eps)))
+    begin, *later = (parts(*at) for at in ((tau0, q0), *zip(taus, q, strict=True)))
+    found = found | (later[0] - begin < 0.5 * float(np.log(eps)))
     known = jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
-    changed = jnp.max(jnp.abs(jnp.stack(there) - begin), axis=0)
+    changed = jnp.max(jnp.abs(jnp.stack(later) - begin), axis=0)
     turned_back = taus[1] > tau0
     return known, jnp.where(turned_back, jnp.argmax(changed).astype(jnp.int32), known)
 
@@ -296,8 +296,8 @@ def _lost(
             new = jnp.where((k > 0) & jnp.all(jnp.isfinite(new)), rates, new)
         return k + 1, tau, y, new
 
-    begin = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
-    _, tau, y, rates = jax.lax.while_loop(cond_fun, ahead, begin)
+    init = jnp.zeros((), jnp.int32), time, y, jnp.zeros_like(y)
+    _, tau, y, rates = jax.lax.while_loop(cond_fun, ahead, init)
     # If the state itself overflows, all that depends on it does.
     found = wanted & ~jnp.all(jnp.isfinite(rates)) & jnp.all(jnp.isfinite(y))
     return found, tau, y
@@ -314,7 +314,7 @@ def _culprits(
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
         A = jnp.where(jnp.isfinite(A), A, 0.0)  # a nonfinite A is no failure of M
-        M, _ = augmented(M, masked(A, args.kept))
+        M, _ = augmented(M, masked(A, args.active_rows))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
     # A nonfinite component spreads through the solve: it is searched before.
@@ -325,13 +325,13 @@ def _culprits(
 
 
 def _dependent(
-    dynamics: VectorField, kept: Array | None, taus: Array, states: Array, args: Arguments
+    dynamics: VectorField, active_rows: Array | None, taus: Array, states: Array, args: Arguments
 ) -> Int[Array, ""]:
     """The row that vanishes, or depends on those before it, or almost does; -1 for none.
 
     Args:
         dynamics: the vector field.
-        kept: rows used in solves; None for all.
+        active_rows: rows used in solves; None for all.
         taus: of the last good state, of one ahead of it, and of the start.
         states: these three.
         args: arguments.
@@ -342,22 +342,22 @@ def _dependent(
         t, q, v, params = dynamics.state(tau, y, args)
 
         def rows(q: Array) -> Array:
-            return masked(dynamics.terms.rows(t, q, v, params)[0], kept)
+            return masked(dynamics.terms.rows(t, q, v, params)[0], active_rows)
 
         A, M = rows(q), dynamics.mass(tau, y, args)
-        there = row_sizes(rows, q, A).there
-        factor = factor_kkt(M, A, kept, FORMULATIONS[0])
+        nonzero = row_sizes(rows, q, A).nonzero
+        factor = factor_kkt(M, A, active_rows, FORMULATIONS[0])
         assert isinstance(factor, Multipliers)
-        fine = factor.healthy[1] & there
-        return factor.schur.pivots, fine if kept is None else fine | ~kept
+        fine = factor.healthy[1] & nonzero
+        return factor.schur.pivots, fine if active_rows is None else fine | ~active_rows
 
     pivots, fine = jax.vmap(squares)(taus, states)
     eps = float(jnp.finfo(states.dtype).eps)
     # An angle that is always small, as between almost collinear rods, is no failure.
     near = pivots[:2] < eps**0.5 * pivots[2:]
     found = jnp.any((near | ~fine[:2]) & jnp.isfinite(pivots[:2]), axis=0)
-    if kept is not None:
-        found = found & kept
+    if active_rows is not None:
+        found = found & active_rows
     return jnp.where(jnp.any(found), jnp.argmax(found), -1).astype(jnp.int32)
 
 

@@ -108,7 +108,7 @@ class Jumps:
 
     def of_leaves(self) -> tuple[Jump, ...]:
         """All operations, with the numbers that they compare."""
-        return _told(self._found)
+        return _by_number(self._found)
 
     def in_time(self, leaves: set[str], ts: Any) -> tuple[Jump, ...]:
         """The operations that compare one of the leaves with the time and make the equations jump.
@@ -121,7 +121,7 @@ class Jumps:
             with jax.ensure_compile_time_eval(), jax.debug_nans(False), jax.debug_infs(False):
                 jump = self._jump([x.eqn for x in among], ts)
             among = [x for x, does in zip(among, jump, strict=True) if does]
-        return _told(among)
+        return _by_number(among)
 
     def _may_be_run(self) -> bool:
         """Whether the program may be run with random numbers.
@@ -136,10 +136,10 @@ class Jumps:
 
     def _jump(self, eqns: Sequence[Any], ts: Any) -> list[bool]:
         """Whether the equations jump, or may jump, where the operations change their outcome."""
-        leaves, own = self._numbers()
+        leaves, known = self._numbers()
         times = _params.known(ts)
-        own = own and times is not None
-        grid = _grid(times if own else None, leaves[0].dtype)
+        known = known and times is not None
+        grid = _grid(times if known else None, leaves[0].dtype)
         moves = [True] + [False] * (len(leaves) - 1)
 
         def outcome(t: Array) -> list[Array | None]:
@@ -154,7 +154,7 @@ class Jumps:
                 return _jumps_anywhere(terms, grid)
             seen = np.concatenate([np.asarray(span[i]) for span in spans])
             if np.all(seen[1:] == seen[:-1]):
-                return not own
+                return not known
             return _jumps_at_changes(lambda t: np.asarray(along(t)[i]), seen, terms, grid)
 
         try:
@@ -171,17 +171,17 @@ class Jumps:
     def _numbers(self) -> tuple[list[Array], bool]:
         """(arguments of the program, whether all are known); unknown ones are random."""
         draw = np.random.default_rng(0).uniform
-        own, found = not jax.tree.leaves(self._moving[3]), []
+        known, found = not jax.tree.leaves(self._moving[3]), []
         for x in jax.tree.leaves(self._moving):
             found.append(jnp.asarray(draw(0.5, 1.5, x.shape), x.dtype))
         for x in jax.tree.leaves(self._traced):
             value = x if concrete(x) else _params.known(x)
-            own = own and value is not None
+            known = known and value is not None
             if value is None:  # sorted, as tables are
                 value = np.sort(draw(0.5, 1.5, (1, *x.shape)), axis=-1)[0]
                 value = value > 1.0 if x.dtype == bool else value
             found.append(jnp.asarray(value, x.dtype))
-        return found, own
+        return found, known
 
     def _terms(self, leaves: Sequence[Array], t: Array) -> Array:
         """The terms of the equations of motion, as one array of numbers."""
@@ -271,7 +271,7 @@ def _timed(found: _Found) -> bool:
     return _TIME in found.names and _STATE not in found.names
 
 
-def _told(found: Iterable[_Found]) -> tuple[Jump, ...]:
+def _by_number(found: Iterable[_Found]) -> tuple[Jump, ...]:
     """Each operation once per number that it reads."""
     jumps = [Jump(name, x.line) for x in found for name in sorted(x.names - {_TIME, _STATE})]
     return tuple(dict.fromkeys(jumps))
@@ -301,7 +301,7 @@ def _jumps_at_changes(
         same = np.all(outcome(jnp.asarray(middle)) == seen[places], axis=1)
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     _, found = _finite(terms, [low, high, *near])
-    return found is None or _apart(*found)
+    return found is None or _jump_between(*found)
 
 
 def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
@@ -321,7 +321,7 @@ def _jumps_anywhere(terms: Sequence[Callable], grid: np.ndarray) -> bool:
         a, b, c = (np.asarray(sides(jnp.asarray(x))) for x in (low, middle, high))
         left = np.max(np.abs(b - a) / size, axis=1) >= np.max(np.abs(c - b) / size, axis=1)
         low, high = np.where(left, low, middle), np.where(left, middle, high)
-    return _apart(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near)))
+    return _jump_between(*(np.asarray(sides(jnp.asarray(x))) for x in (low, high, *near)))
 
 
 def _finite(
@@ -335,7 +335,7 @@ def _finite(
     return terms[-1], None
 
 
-def _apart(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:
+def _jump_between(before: np.ndarray, after: np.ndarray, *near: np.ndarray) -> bool:
     """Whether terms jump between two times, relative to their size nearby; True if undecided."""
     size = np.max(np.abs([before, after, *near]), axis=(0, 1))
     jump = np.abs(after - before) > np.sqrt(np.finfo(before.dtype).eps) * size

@@ -212,11 +212,11 @@ def _growth(key: Any, traced: Any, status: Array, tolerances: Any) -> Any:
         Phi, statuses = _transitions(rate, ts, y, allowed, knots, of_steps, max_steps)
 
         w = atol + rtol * jnp.abs(y)
-        kept = tangent(ts, y, w)
-        steps = kept[1:] @ (Phi * w[:-1, None, :] / w[1:, :, None]) @ kept[:-1]
+        projectors = tangent(ts, y, w)
+        steps = projectors[1:] @ (Phi * w[:-1, None, :] / w[1:, :, None]) @ projectors[:-1]
         # Constant weights: the exponent is that of the motion alone.
         scale = w / (atol + rtol * jnp.max(jnp.abs(y), axis=0))[None]
-        log_kappa, log_norm, log_size = _products(steps, kept, scale)
+        log_kappa, log_norm, log_size = _products(steps, projectors, scale)
 
         tau = jnp.abs(ts - ts[0]).astype(y.dtype)
         exponent, error = _exponent(tau, log_size)
@@ -320,21 +320,21 @@ def _products(steps: Array, starts: Array, scale: Array) -> tuple[Array, Array, 
     All products steps[j - 1] ... steps[i] starts[i] are updated and rescaled to norm 1.
     """
 
-    def turn(carry: tuple[Array, Array], part: tuple) -> tuple[tuple[Array, Array], Any]:
+    def body_fun(carry: tuple[Array, Array], part: tuple) -> tuple[tuple[Array, Array], Any]:
         (products, logs), (j, step, start, scale) = carry, part
         products = (step @ products).at[j].set(start)
         norms = jnp.linalg.norm(products, ord=2, axis=(-2, -1))
-        begun = jnp.arange(len(norms)) <= j
-        logs = jnp.where(begun, logs + jnp.log(norms), 0.0)
+        started = jnp.arange(len(norms)) <= j
+        logs = jnp.where(started, logs + jnp.log(norms), 0.0)
         products = products / jnp.where(norms > 0, norms, 1.0)[:, None, None]
         size = logs[0] + jnp.log(jnp.linalg.norm(scale[:, None] * products[0], ord=2))
-        return (products, logs), (jnp.max(jnp.where(begun, logs, -jnp.inf)), logs[0], size)
+        return (products, logs), (jnp.max(jnp.where(started, logs, -jnp.inf)), logs[0], size)
 
     count = starts.shape[0]
-    begin = jnp.zeros_like(starts), jnp.zeros((count,), starts.dtype)
+    init = jnp.zeros_like(starts), jnp.zeros((count,), starts.dtype)
     into = jnp.concatenate([starts[:1], steps])  # no product starts before the first save time
     parts = (jnp.arange(count), into, starts, scale)
-    return jax.lax.scan(turn, begin, parts)[1]
+    return jax.lax.scan(body_fun, init, parts)[1]
 
 
 def _exponent(tau: Array, log_size: Array) -> tuple[Array, Array]:

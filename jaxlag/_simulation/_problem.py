@@ -54,7 +54,7 @@ class ProgramKey(NamedTuple):
     stabilization: str | Baumgarte | None
     assemble: bool
     regular: bool | None
-    apart: bool
+    contact_rows_independent: bool
     capacity: int
     change_points: str
     auto: bool  # whether the structure of the system may select the method
@@ -110,10 +110,10 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     if args.lengths is not None:  # rows dependent at the start may be so nearby
         finite = finite & jnp.all(args.lengths > 0)
     contacts = StepEnd(dynamics).contacts_valid(start, y0, args)
-    begun = Start(valid, in_range, finite, consistent, contacts)
-    setup = Setup(values.step, begun.allowed, stepper_traced)
+    checks = Start(valid, in_range, finite, consistent, contacts)
+    setup = Setup(values.step, checks.allowed, stepper_traced)
     problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.capacity)
-    return dynamics, begun, problem
+    return dynamics, checks, problem
 
 
 class _Initial(NamedTuple):
@@ -146,7 +146,7 @@ def _equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments
         formulation=plan.formulation,
         stabilization=plan.stabilization,
         regular=plan.regular,
-        apart=plan.apart,
+        contact_rows_independent=plan.contact_rows_independent,
     )
     args = dynamics.arguments(values.params, values.inputs, values.ts)
     params, inputs = dynamics.given(args)
@@ -209,7 +209,7 @@ def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments
     masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
     assert masses is not None
     units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
-    return args._replace(lengths=lengths_of(masses, args.kept), units=units, slopes=slopes)
+    return args._replace(lengths=lengths_of(masses, args.active_rows), units=units, slopes=slopes)
 
 
 def _stepper(

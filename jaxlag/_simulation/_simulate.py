@@ -271,7 +271,8 @@ def simulate(
         stabilization=stabilization,
         assemble=assemble,
         regular=mass_definite(system, params, ts[0], q0, v0),
-        apart=not assemble and contact_rows_independent(system, params, ts[0], q0, v0, inputs),
+        contact_rows_independent=not assemble
+        and contact_rows_independent(system, params, ts[0], q0, v0, inputs),
         capacity=capacity_for(
             gradient,
             gradient_memory,

@@ -282,8 +282,8 @@ class Solution(AbstractSolution):
             return counted(self)
         status = Status(int(self.status))
         if status is Status.ok:
-            said = f"ok at t = {self.last_time}"
-            return f"{said}, {self.fallback}" if self._singular is not None else said
+            text = f"ok at t = {self.last_time}"
+            return f"{text}, {self.fallback}" if self._singular is not None else text
         index = int(self.where)
         labels, more = self.system.coordinates.labels, ""
         if status is Status.kinematics_singular:

@@ -15,7 +15,7 @@ from jaxlag._core._errors import unsupported
 from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
-from jaxlag._linalg._projection import turns_needed
+from jaxlag._linalg._projection import iterations_needed
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
 from jaxlag._system._row_advice import advice_on_rows
@@ -26,7 +26,7 @@ FOLLOWED = (1.5, 25.0)  # steps per period of an oscillation that they resolve
 OFTEN = 1000  # periods within ts from which on resolving each makes a solve slow
 REJECTED = 0.3  # part of the attempts
 UNEVEN = 0.1  # part of the attempts from which on the sharpest places determine the steps
-TURNS = 3  # iterations of the projection, after one step
+ITERATIONS = 3  # iterations of the projection, after one step
 
 
 class Look(NamedTuple):
@@ -36,13 +36,13 @@ class Look(NamedTuple):
         rates: d(dy/dt)/dy, (m, m).
         mass: M, (n, n).
         error: local error of a step of order 8 over the tolerance, (m,); over 1 without tolerances.
-        turns: iterations of the projection at the end of this step.
+        iterations: of the projection at the end of this step.
     """
 
     rates: Float[Array, "m m"]
     mass: Float[Array, "n n"]
     error: Float[Array, " m"]
-    turns: Int[Array, ""]
+    iterations: Int[Array, ""]
 
 
 class Rates(NamedTuple):
@@ -50,7 +50,7 @@ class Rates(NamedTuple):
 
     Attributes:
         fastest: largest |lambda|, 1/s.
-        kind: its kind: "turns", "grows" or "decays".
+        kind: its kind: "oscillates", "grows" or "decays".
     """
 
     fastest: float
@@ -86,15 +86,15 @@ def advice(motion: AbstractSolution, status: Status) -> str:
     fixed, (accepted, rejected) = motion.tolerances is None, _counts(motion)
     sharp = rejected > UNEVEN * (accepted + rejected)
     special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
-    said = (ADVICE | special).get(status, "")
+    message = (ADVICE | special).get(status, "")
     if fixed:
-        return said
+        return message
     if status in (Status.max_steps, Status.step_below_resolution):
-        said = f"{said} {_about_time(motion)}".strip()
+        message = f"{message} {_about_time(motion)}".strip()
     if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
         return (
             f"The motion is stiff: a component decays at {rates.fastest:.3g} 1/s, and explicit "
-            f"steps must be about as short as its time constant. Take method='kvaerno5'. {said}"
+            f"steps must be about as short as its time constant. Take method='kvaerno5'. {message}"
         )
     assert motion.tolerances is not None
     if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
@@ -108,7 +108,7 @@ def advice(motion: AbstractSolution, status: Status) -> str:
                 f"With atol = 0 no error is small enough where a component is 0, here "
                 f"{', '.join(resting)}: give atol > 0, or start elsewhere."
             )
-    return said
+    return message
 
 
 def explain(motion: AbstractSolution) -> str:
@@ -231,10 +231,10 @@ def _about_rates(
             )
         return [f"rates         fastest decay 1/e in {time:.3g} s, {1 / product:.2g} steps"]
     period = 2 * np.pi * time
-    turns = abs(float(motion.ts[-1] - motion.ts[0])) / period
-    if _within(period / h, FOLLOWED) and turns > OFTEN and not motion.scene.implicit:
+    periods = abs(float(motion.ts[-1] - motion.ts[0])) / period
+    if _within(period / h, FOLLOWED) and periods > OFTEN and not motion.scene.implicit:
         advice.append(
-            f"The steps follow an oscillation of period {period:.3g} s, {turns:.2g} periods in "
+            f"The steps follow an oscillation of period {period:.3g} s, {periods:.2g} periods in "
             "ts: if it does not matter, replace the stiff part with a constraint."
         )
     return [
@@ -284,10 +284,10 @@ def _about_mass(motion: AbstractSolution, looks: Look, advice: list[str]) -> lis
 
 
 def _about_projection(motion: AbstractSolution, looks: Look, advice: list[str]) -> list[str]:
-    most = int(np.max(looks.turns))
+    most = int(np.max(looks.iterations))
     if most == 0:
         return []
-    if most > TURNS:
+    if most > ITERATIONS:
         advice.append(
             f"The projection of a step onto the constraints takes up to {most} iterations: steps "
             "are long for the curvature of the constraints. A tighter tolerance may be faster."
@@ -306,7 +306,7 @@ def _rates(looks: Look) -> Rates | None:
     largest = rates[size > 0.99 * np.max(size)] if np.max(size) > 0 else rates
     kind = "decays"
     if np.any(np.abs(largest.imag) > np.abs(largest.real)):
-        kind = "turns"
+        kind = "oscillates"
     elif np.any(largest.real > 0):
         kind = "grows"
     return Rates(float(np.max(size)), kind)
@@ -340,11 +340,13 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
         _, rates = linearized(lambda y: dynamics(tau, y, here), y)
         memory = solver.init(term, tau, tau + h, y, here)
         y1, error, *_ = solver.step(term, tau, tau + h, y, here, memory, made_jump=False)
-        turns = jnp.zeros((), jnp.int32)
+        iterations = jnp.zeros((), jnp.int32)
         if dynamics.projects:
-            turns = turns_needed(dynamics.projector(tau + h, y1, here), *dynamics.parts(y1))
+            iterations = iterations_needed(
+                dynamics.projector(tau + h, y1, here), *dynamics.parts(y1)
+            )
         allowed = atol if atol.ndim == 0 else jnp.tile(atol, 2)
         scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
-        return Look(rates, dynamics.mass(tau, y, here), scaled, turns)
+        return Look(rates, dynamics.mass(tau, y, here), scaled, iterations)
 
     return jax.lax.map(at, (ts, q, v))

@@ -27,7 +27,7 @@ from jaxlag._system._system import System
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
-MAX_TURNS = 200
+MAX_ITERATIONS = 200
 NEAR_DEPENDENCE = 1e-6  # squared sine below which rows are left out during the search: dependent
 # rows are not quite dependent off the constraints
 FRACTIONS = 2.0 ** -np.arange(12)
@@ -184,9 +184,9 @@ def _assembled(
 
     A, W = all_rows(q), metric(q, rates_fixed)
     if rows.size:
-        kept = _independent(of_free, W, q, rows.velocity)
+        active_rows = _independent(of_free, W, q, rows.velocity)
         residual = terms.velocity(t, q, v, params)
-        v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, kept)[0]
+        v = v + solve_kkt(W, of_free(q), jnp.zeros_like(v), residual, active_rows)[0]
 
     position, velocity = phi(q), terms.velocity(t, q, v, params)
     _, void, size = row_sizes(all_rows, *jax.lax.stop_gradient((q, A)))
@@ -223,14 +223,14 @@ def _independent(
     rows: Callable,
     W: Array,
     q: Array,
-    turn: Sequence[int] | None = None,
+    priority: Sequence[int] | None = None,
     floor: float | None = None,
 ) -> Bool[Array, " m"]:
     """A largest set of independent rows at q, up to rounding."""
     W, q = jax.lax.stop_gradient((W, q))
     A = jax.lax.stop_gradient(rows(q))
-    there = row_sizes(rows, q, A).there
-    return independent_rows(W, A, turn, floor, there)
+    nonzero = row_sizes(rows, q, A).nonzero
+    return independent_rows(W, A, priority, floor, nonzero)
 
 
 def _inertia(terms: ArrayTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
@@ -253,21 +253,21 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
     def rows(q: Array) -> Array:
         return jnp.where(free, jax.jacrev(phi)(q), 0.0)
 
-    def F(z: tuple[Array, Array], kept: Array) -> tuple[Array, Array]:
+    def F(z: tuple[Array, Array], active_rows: Array) -> tuple[Array, Array]:
         q, lam = z
         _, vjp_fn = jax.vjp(phi, q)
         above = W @ (q - start) - jnp.where(free, vjp_fn(lam)[0], 0.0)
-        return above, jnp.where(kept, phi(q), lam)
+        return above, jnp.where(active_rows, phi(q), lam)
 
     frozen = jax.lax.stop_gradient((W, start))
-    constant = partial(_still, phi)
+    constant = partial(_without_derivatives, phi)
     q, lam = jax.lax.stop_gradient(_search(constant, rows, *frozen))
-    kept = _independent(rows, W, q)
-    lam = jnp.where(kept, lam, 0.0)
+    active_rows = _independent(rows, W, q)
+    lam = jnp.where(active_rows, lam, 0.0)
     n = start.shape[0]
 
     def flat(z: Array) -> Array:
-        return jnp.concatenate(F((z[:n], z[n:]), kept))
+        return jnp.concatenate(F((z[:n], z[n:]), active_rows))
 
     def found(flat: Callable, z: Array) -> Array:
         z = _polished(flat, z)
@@ -283,7 +283,7 @@ def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
     return root(jnp.concatenate([q, lam]))[:n]
 
 
-def _still(phi: Callable, q: Array) -> Array:
+def _without_derivatives(phi: Callable, q: Array) -> Array:
     return jax.lax.stop_gradient(phi(q))
 
 
@@ -292,11 +292,11 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
     eps = float(jnp.finfo(start.dtype).eps)
     fractions = jnp.asarray(FRACTIONS, start.dtype)
 
-    def turn(s: _Search) -> _Search:
+    def body_fun(s: _Search) -> _Search:
         A, c = jax.lax.stop_gradient(rows(s.q)), phi(s.q)
         floor = max(NEAR_DEPENDENCE, dependence_floor(start.dtype))
-        kept = _independent(rows, W, s.q, floor=floor)
-        step, lam = solve_kkt(W, A, W @ (start - s.q), c, kept)
+        active_rows = _independent(rows, W, s.q, floor=floor)
+        step, lam = solve_kkt(W, A, W @ (start - s.q), c, active_rows)
         # Decrease the exact penalty |q - start|^2 / 2 + nu |phi|_1, for nu larger than every |lam|.
         nu = 2.0 * jnp.max(jnp.abs(lam)) + jnp.finfo(start.dtype).tiny
 
@@ -313,37 +313,37 @@ def _search(phi: Callable, rows: Callable, W: Array, start: Array) -> tuple[Arra
 
     def cond_fun(s: _Search) -> Array:
         far = jnp.max(jnp.abs(s.step) / (1.0 + jnp.abs(s.q))) > 4 * eps
-        return far & (s.count < MAX_TURNS)
+        return far & (s.count < MAX_ITERATIONS)
 
     lam = jnp.zeros_like(phi(start))
-    begin = _Search(start, lam, jnp.full_like(start, jnp.inf), jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(cond_fun, turn, begin)
+    init = _Search(start, lam, jnp.full_like(start, jnp.inf), jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(cond_fun, body_fun, init)
     return end.q, end.lam
 
 
 def _polished(F: Callable, z: Array) -> Array:
     """Newton's method with the curvature of the rows, as long as F decreases."""
 
-    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def body_fun(state: tuple[Array, Array]) -> tuple[Array, Array]:
         z, _ = state
         further = z - jnp.linalg.solve(jax.jacfwd(F)(z), F(z))
         better = jnp.max(jnp.abs(F(further))) < 0.9 * jnp.max(jnp.abs(F(z)))
         return jnp.where(better, further, z), better
 
-    return jax.lax.while_loop(lambda state: state[1], turn, (z, jnp.array(True)))[0]
+    return jax.lax.while_loop(lambda state: state[1], body_fun, (z, jnp.array(True)))[0]
 
 
 def _closed(phi: Callable, rows: Callable, W: Array, q: Array) -> Array:
     """The shortest steps onto phi = 0, as long as the residual decreases."""
 
-    def turn(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def body_fun(state: tuple[Array, Array]) -> tuple[Array, Array]:
         q, _ = state
         A, c = jax.lax.stop_gradient(rows(q)), phi(q)
         further = q + solve_kkt(W, A, jnp.zeros_like(q), c, _independent(rows, W, q))[0]
         better = jnp.max(jnp.abs(phi(further))) < 0.9 * jnp.max(jnp.abs(c))
         return jnp.where(better, further, q), better
 
-    return jax.lax.while_loop(lambda state: state[1], turn, (q, jnp.array(True)))[0]
+    return jax.lax.while_loop(lambda state: state[1], body_fun, (q, jnp.array(True)))[0]
 
 
 def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]]:

@@ -61,7 +61,9 @@ class Assembly(AbstractResult):
                 "Take one of them, as batch[3].",
             )
         return tuple(
-            name for name, kept in zip(self._rows.labels, self.independent, strict=True) if not kept
+            name
+            for name, independent in zip(self._rows.labels, self.independent, strict=True)
+            if not independent
         )
 
     def message(self) -> str:

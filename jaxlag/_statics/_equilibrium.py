@@ -401,9 +401,9 @@ def _restricted(K: Array, A: Array) -> tuple[Array, Array]:
     in_axes = jnp.swapaxes(axes, -1, -2) @ K @ axes
     above = 2 * jnp.sum(jnp.abs(in_axes), axis=(-2, -1))[..., None] + 1
     free = ~(across[..., :, None] | across[..., None, :])
-    kept = jnp.where(free, in_axes, 0.0)
+    free_block = jnp.where(free, in_axes, 0.0)
     diagonal = jnp.where(across, above, 0.0)[..., None] * jnp.eye(n, dtype=K.dtype)
-    found = jnp.linalg.eigvalsh(kept + diagonal)
+    found = jnp.linalg.eigvalsh(free_block + diagonal)
     return found, found > 0.75 * above
 
 

@@ -123,15 +123,15 @@ def relax(
     eps = float(jnp.finfo(q0.dtype).eps)
 
     def body(s: _State) -> _State:
-        there = _measured(forces, s.trial)
-        done, as_expected, fair = _compared(s, there)
+        at_trial = _measured(forces, s.trial)
+        done, as_expected, fair = _compared(s, at_trial)
         fine = s.closed & (done >= WORK) & (as_expected <= MISS) & fair
         good = fine & (done >= GOOD_WORK) & (as_expected <= GOOD_MISS)
         leads_on = s.count <= 1  # the start, and its projection onto the constraints
         damping = s.damping * jnp.where(good, EASE, jnp.where(fine, 1.0, TIGHTEN))
         damping = jnp.clip(jnp.where(leads_on, 1.0, damping), eps, 1 / eps)
         accepted = leads_on | fine
-        base = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), there, s.base)
+        base = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), at_trial, s.base)
 
         step = _step(base, damping)
         step = step._replace(p=jnp.where(s.count == 0, 0, step.p))
@@ -147,8 +147,8 @@ def relax(
     q, lam = jnp.zeros_like(q0), jnp.zeros_like(phi(q0))
     A, K = jnp.outer(lam, q), jnp.outer(q, q)
     nowhere = Point(q0, q, A, K, jnp.zeros((*A.shape, *q.shape), q.dtype))
-    begin = _State(nowhere, _Step(q, lam, q + 1, zero), q0, no, zero, no, jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(lambda s: ~s.ended & (s.count < max_steps), body, begin)
+    init = _State(nowhere, _Step(q, lam, q + 1, zero), q0, no, zero, no, jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(lambda s: ~s.ended & (s.count < max_steps), body, init)
     return end.base.q, end.count
 
 
@@ -165,21 +165,21 @@ def _measured(forces: Callable, q: Float[Array, " n"]) -> Point:
     return Point(q, F, A, dF, dA)
 
 
-def _compared(s: _State, there: Point) -> tuple[Array, Array, Array]:
+def _compared(s: _State, at_trial: Point) -> tuple[Array, Array, Array]:
     """(work done over work expected, error of predicted forces over forces, all finite).
 
     The work of F + A^T lam at constant lam, by the trapezoidal rule with end corrections. If F
     has a potential V it is the decrease of V - lam . phi, and phi vanishes at both ends. Unlike a
     difference of V it keeps its accuracy near the minimum.
     """
-    lam, c, d = s.step.lam, s.step.c, there.q - s.base.q
-    before, after = s.base.balance(lam), there.balance(lam)
-    K0, K1 = s.base.stiffness(lam), there.stiffness(lam)
+    lam, c, d = s.step.lam, s.step.c, at_trial.q - s.base.q
+    before, after = s.base.balance(lam), at_trial.balance(lam)
+    K0, K1 = s.base.stiffness(lam), at_trial.stiffness(lam)
     work = 0.5 * (before + after) @ d + d @ (K1 - K0) @ d / 12
     expected = jnp.where(s.step.expected > 0, s.step.expected, 1)
     size = jnp.linalg.norm(c * before)
     missed = jnp.linalg.norm(c * (after - before + K0 @ d)) / jnp.where(size > 0, size, 1)
-    return work / expected, missed, jnp.all(jnp.isfinite(there.dF))
+    return work / expected, missed, jnp.all(jnp.isfinite(at_trial.dF))
 
 
 def _step(base: Point, damping: Float[Array, ""]) -> _Step:
@@ -222,7 +222,7 @@ def _closed(
     q0: Float[Array, " n"],
     c: Float[Array, " n"],
     lengths: Float[Array, " m"],
-    pull: Float[Array, ""],
+    displacement: Float[Array, ""],
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """(q0 projected onto phi = 0 by the shortest steps in units c, whether it converged).
 
@@ -234,7 +234,7 @@ def _closed(
         q0: start.
         c: units.
         lengths: lengths of the rows in these units, to compare residuals.
-        pull: displacement by the forces; with q0 it defines the scale of small displacements.
+        displacement: by the forces; with q0 it defines the scale of small displacements.
     """
     if not lengths.shape[0]:
         return q0, jnp.array(True)
@@ -243,16 +243,16 @@ def _closed(
     def body(s: _Closing) -> _Closing:
         q = s.q + s.fraction * c * s.d
         A, y = forces(q)[1] * c[None], phi(q)
-        norms, reach = _lengths(A), jnp.linalg.norm(q / c) + pull
+        norms, reach = _lengths(A), jnp.linalg.norm(q / c) + displacement
         off = jnp.linalg.norm(y / norms)
         floor = jnp.clip(off / jnp.where(reach > 0, reach, 1), eps**0.5, 0.03)
         d = -_rows(A, norms, floor).shortest(y)
         closed = (jnp.linalg.norm(d) <= eps**0.75 * reach) | (off <= 16 * eps * reach)
         residual = jnp.linalg.norm(y / lengths)
         better = (s.count == 0) | (residual < (1 - 0.1 * s.fraction) * s.residual)
-        there = _Closing(q, residual, d, closed, jnp.minimum(1, 2 * s.fraction), s.count)
+        moved = _Closing(q, residual, d, closed, jnp.minimum(1, 2 * s.fraction), s.count)
         chosen = jax.tree.map(
-            lambda x, y: jnp.where(better, x, y), there, s._replace(fraction=s.fraction / 4)
+            lambda x, y: jnp.where(better, x, y), moved, s._replace(fraction=s.fraction / 4)
         )
         return chosen._replace(count=s.count + 1)
 
@@ -260,6 +260,6 @@ def _closed(
         return ~s.closed & (s.fraction > 1e-3) & (s.count < CLOSING_STEPS)
 
     one = jnp.ones((), q0.dtype)
-    begin = _Closing(q0, one, 0 * q0, jnp.array(False), one, jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(cond_fun, body, begin)
+    init = _Closing(q0, one, 0 * q0, jnp.array(False), one, jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(cond_fun, body, init)
     return end.q + c * end.d, end.closed

@@ -88,8 +88,8 @@ def find_rest(
 
     z, no = jnp.zeros((n + m,), q0.dtype), jnp.zeros((), bool)
     none = Rest(z, Balance(no, no, z, jnp.outer(z, z), z), jnp.zeros((), jnp.int32))
-    begin = _State(none, jnp.abs(q0), none.steps, none.steps)
-    return jax.lax.while_loop(cond_fun, body, begin).rest
+    init = _State(none, jnp.abs(q0), none.steps, none.steps)
+    return jax.lax.while_loop(cond_fun, body, init).rest
 
 
 def _directions(n: int) -> np.ndarray:

@@ -294,8 +294,8 @@ def _variation(
     unresolved = jnp.linalg.norm(here.c * rounding) / weakest
     steps = 4 * jnp.linalg.norm(here.step / here.c)
     d = jnp.maximum(eps**0.4 * size, jnp.maximum(steps, unresolved)) * here.c * u
-    there = jax.lax.map(jax.jacfwd(forces), jnp.stack([q + d, q - d]))
-    return jnp.max(jnp.abs(there - here.J[None]), axis=0)
+    neighbors = jax.lax.map(jax.jacfwd(forces), jnp.stack([q + d, q - d]))
+    return jnp.max(jnp.abs(neighbors - here.J[None]), axis=0)
 
 
 @CustomJVP

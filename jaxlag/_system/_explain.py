@@ -62,12 +62,12 @@ def _constraints(rows: ConstraintRows, quasi: bool) -> list[str]:
     if not rows.size:
         return ["constraints   none, so no multipliers are computed"]
     kinds = zip(rows.labels, rows.holonomic, rows.driven, strict=True)
-    words = [
+    descriptions = [
         f"{label} ({'holonomic' if holonomic else 'Pfaffian'}{', driven' if driven else ''})"
         for label, holonomic, driven in kinds
     ]
     return [
-        f"constraints   {rows.size} rows: {', '.join(words)}",
+        f"constraints   {rows.size} rows: {', '.join(descriptions)}",
         "              by formulation='quasi' they hold without multipliers"
         if quasi
         else "              lam eliminated with M; states projected after every step"

@@ -16,7 +16,7 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
 
-APART = 1e-3
+INDEPENDENT = 1e-3
 """Least singular value of clearly independent rows of unit length."""
 
 
@@ -82,7 +82,7 @@ def contact_rows_independent(
     sizes = np.linalg.norm(A, axis=1, keepdims=True)
     if not np.all(np.isfinite(A)) or not np.all(sizes > 0):
         return False
-    return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > APART)
+    return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > INDEPENDENT)
 
 
 def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: Any) -> None:

@@ -18,7 +18,7 @@ from jaxlag._core._linear_map import LinearMap, linear
 
 
 @dataclass(frozen=True, eq=False)
-class _Pulled(AbstractRule):
+class _VjpRule(AbstractRule):
     """The rule of an equation made by `jax.custom_vjp`."""
 
     eqn: Any
@@ -33,7 +33,7 @@ class _Pulled(AbstractRule):
         return results, [next(found) if _is_inexact(x) else None for x in results]
 
     def _backward(self, r: Leaves, y: Leaves) -> list:
-        return list(jaxpr_as_fun(self._pull)(*r, *y))
+        return list(jaxpr_as_fun(self._vjp_jaxpr)(*r, *y))
 
     def _forward(self, r: Leaves, x: Leaves) -> list:
         """By the rows of J, one for each number of the results."""
@@ -53,7 +53,7 @@ class _Pulled(AbstractRule):
         return found
 
     @cached_property
-    def _pull(self) -> ClosedJaxpr:
+    def _vjp_jaxpr(self) -> ClosedJaxpr:
         """(arguments, y) -> J^T y as a jaxpr: the rule itself has no derivative in JAX."""
         given = [x.aval for x in self.eqn.invars]
         moving = [i for i, x in enumerate(given) if _is_inexact(x)]
@@ -81,13 +81,13 @@ class _Pulled(AbstractRule):
 
 def with_forward_derivatives(program: ClosedJaxpr) -> ClosedJaxpr:
     """The same program; functions with a `jax.custom_vjp` rule have forward derivatives."""
-    return rewritten(program, _pulled)
+    return rewritten(program, _with_vjp_rule)
 
 
-def _pulled(eqn: Any) -> Any:
+def _with_vjp_rule(eqn: Any) -> Any:
     if not eqn.primitive.name.startswith("custom_vjp_call"):
         return eqn
-    return with_rule(eqn, eqn.params["call_jaxpr"], _Pulled(eqn))
+    return with_rule(eqn, eqn.params["call_jaxpr"], _VjpRule(eqn))
 
 
 def _is_inexact(x: Any) -> bool:

@@ -92,7 +92,7 @@ def _cond(params: Any, operands: list[Names]) -> list[Names]:
 
 
 def _scan(params: Any, operands: list[Names]) -> list[Names]:
-    """Dependences of the start and of all turns, also through the other carries."""
+    """Dependences of the start and of all iterations, also through the other carries."""
     body, (consts, carries) = _open(params["jaxpr"]), scan_sizes(params)
     fixed, carry, rows = (
         operands[:consts],
@@ -101,11 +101,11 @@ def _scan(params: Any, operands: list[Names]) -> list[Names]:
     )
     outputs: list[Names] = []
 
-    def turn(carry: list[Names]) -> list[Names]:
+    def body_fun(carry: list[Names]) -> list[Names]:
         outputs[:] = outputs_depend_on(body, [*fixed, *carry, *rows])
         return outputs[:carries]
 
-    return _fixpoint(turn, carry) + outputs[carries:]
+    return _fixpoint(body_fun, carry) + outputs[carries:]
 
 
 def _while(params: Any, operands: list[Names]) -> list[Names]:
@@ -116,18 +116,18 @@ def _while(params: Any, operands: list[Names]) -> list[Names]:
     asked, fixed, carry = operands[:first], operands[first:second], operands[second:]
     same = [x is y for x, y in zip(body.invars[second - first :], body.outvars, strict=True)]
 
-    def turn(carry: list[Names]) -> list[Names]:
+    def body_fun(carry: list[Names]) -> list[Names]:
         (cond_fun,) = outputs_depend_on(condition, [*asked, *carry])
         after = outputs_depend_on(body, [*fixed, *carry])
         return [x if is_same else x | cond_fun for x, is_same in zip(after, same, strict=True)]
 
-    return _fixpoint(turn, carry)
+    return _fixpoint(body_fun, carry)
 
 
-def _fixpoint(turn: Callable[[list[Names]], list[Names]], carry: list[Names]) -> list[Names]:
-    """The carries of a loop when further turns add no name; the start is included."""
+def _fixpoint(body_fun: Callable[[list[Names]], list[Names]], carry: list[Names]) -> list[Names]:
+    """The carries of a loop when further iterations add no name; the start is included."""
     while True:
-        grown = [x | y for x, y in zip(carry, turn(carry), strict=True)]
+        grown = [x | y for x, y in zip(carry, body_fun(carry), strict=True)]
         if grown == carry:
             return grown
         carry = grown

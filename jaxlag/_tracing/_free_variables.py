@@ -104,7 +104,7 @@ class _Reader:
         self._stored: set[str] = set()  # attributes that the code writes, such as counters
         self._watching = False  # whether only changes are watched, without sources
         self._making: list[Any] = []
-        self._apart = False  # whether installed packages are skipped: methods plot and save
+        self._skips_installed = False  # True while methods are read: these plot and save
 
     def function(self, x: Any, depth: int) -> None:
         """All values that a callable reads; for library callables, their arguments."""
@@ -142,7 +142,7 @@ class _Reader:
 
     def kind(self, kind: type) -> None:
         """The values read by methods of a class, its attributes, and those of its members."""
-        self._apart = not is_installed(sys.modules.get(kind.__module__))
+        self._skips_installed = not is_installed(sys.modules.get(kind.__module__))
         members = [*kind] if issubclass(kind, Enum) else []
         skipped = {*_GENERATED, *getattr(kind, "__members__", ())}
         for base in kind.__mro__ if self._is_new(kind) else ():
@@ -196,7 +196,7 @@ class _Reader:
         if not of_library(x):  # reloaded modules in notebooks modify functions
             place = id(x), "__code__"
             self._keep(f"{x.__name__}.__code__", place, lambda: x.__code__, x.__code__)
-        if not (installed and self._apart):
+        if not (installed and self._skips_installed):
             self._code(x, depth)
         self._watching = watching
 
@@ -253,7 +253,7 @@ class _Reader:
                 self._attributes(name, place, look, names, depth)
             return
         if isinstance(x, ModuleType | type):
-            if not of_library(x) and not (self._apart and is_installed(x)):
+            if not of_library(x) and not (self._skips_installed and is_installed(x)):
                 self._attributes(name, place, look, names, depth)
                 self._made(x, depth)
             return

@@ -95,7 +95,7 @@ def check_nodes(tree: Any, name: str) -> None:
 
 
 def _refusal(leaf: Any, name: str, fault: _Fault) -> ValueError:
-    return invalid(name, _MUST, f"it was {_words(leaf)}, and {fault.text}", fault.fix)
+    return invalid(name, _MUST, f"it was {_text(leaf)}, and {fault.text}", fault.fix)
 
 
 def _fault(x: Any, data: bool = False) -> _Fault | None:
@@ -357,7 +357,7 @@ def _data(tree: Any, name: str) -> Iterator[tuple[str, Any, _Fault | None]]:
             yield from _data(child, name + jax.tree_util.keystr(path))
 
 
-def _words(x: Any) -> str:
+def _text(x: Any) -> str:
     text = " ".join(_shown.repr(x).split())
     return f"a {type(x).__name__}" if "Traced" in text or "Tracer" in text else text
 

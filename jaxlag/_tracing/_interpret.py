@@ -84,9 +84,9 @@ def _running(function: Callable) -> Callable:
 
 
 def _broadcast(eqn: Any, x: np.ndarray) -> Any:
-    shape, kept = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    shape, dimensions = eqn.params["shape"], eqn.params["broadcast_dimensions"]
     wide = [1] * len(shape)
-    for axis, place in enumerate(kept):
+    for axis, place in enumerate(dimensions):
         wide[place] = x.shape[axis]
     return np.broadcast_to(x.reshape(wide), shape)
 
@@ -120,14 +120,14 @@ def _pad(eqn: Any, x: np.ndarray, filling: np.ndarray) -> list:
     """Entries spaced by `interior`, padded by `low` and `high`, which crop if negative."""
     config = eqn.params["padding_config"]
     sizes = [max(n + (n - 1) * gap, 0) for n, (_, _, gap) in zip(x.shape, config, strict=True)]
-    apart = np.full(sizes, filling, x.dtype)
-    apart[tuple(slice(None, None, gap + 1) for _, _, gap in config)] = x
+    spaced = np.full(sizes, filling, x.dtype)
+    spaced[tuple(slice(None, None, gap + 1) for _, _, gap in config)] = x
     ends = [(low, high) for low, high, _ in config]
-    wide = np.pad(apart, np.maximum(ends, 0).reshape(-1, 2), constant_values=filling)
-    kept = [
+    wide = np.pad(spaced, np.maximum(ends, 0).reshape(-1, 2), constant_values=filling)
+    crop = [
         slice(max(-low, 0), wide.shape[i] - max(-high, 0)) for i, (low, high) in enumerate(ends)
     ]
-    return [wide[tuple(kept)]]
+    return [wide[tuple(crop)]]
 
 
 def _split(eqn: Any, x: np.ndarray) -> list:

@@ -76,8 +76,8 @@ def wants(function: Callable, position: int, name: str) -> bool:
     if any(p.kind is Parameter.VAR_POSITIONAL for p in parameters):
         return True
     kinds = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    there = [p for p in parameters if p.kind in kinds][position : position + 1]
-    return any(p.default is Parameter.empty or p.name == name for p in there)
+    at_position = [p for p in parameters if p.kind in kinds][position : position + 1]
+    return any(p.default is Parameter.empty or p.name == name for p in at_position)
 
 
 def accepts(function: Callable, count: int) -> bool:

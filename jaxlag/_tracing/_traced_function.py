@@ -71,7 +71,7 @@ class TracedFunction:
         self.function = function
         self._programs: dict[Any, _Program] = {}
         self._outside: Outside | None = None
-        self._told: set[str] = set()  # paths of Python ints that were warned about
+        self._warned: set[str] = set()  # paths of Python ints that were warned about
         update_wrapper(self, function, updated=())  # attributes of an object are not copied
 
     def __hash__(self) -> int:
@@ -184,9 +184,9 @@ class TracedFunction:
                 continue
             values = {leaf, *(leaves[i] for leaves in others if type(leaves[i]) is int)}
             name = _leaf(path)
-            if len(values) < MANY_VALUES or name in self._told:
+            if len(values) < MANY_VALUES or name in self._warned:
                 continue
-            self._told.add(name)
+            self._warned.add(name)
             warnings.warn(
                 f"{name} of {_named(self.function)} is the Python int {leaf}, its "
                 f"{len(values)}th value so far: an int is part of the program, which is compiled "

@@ -39,12 +39,12 @@ Outside = dict[str, Read]
 def changes(read: Outside) -> Iterator[tuple[str, str, str]]:
     """(name, old value, new value) of all changed values."""
     for name, (look, before) in read.items():
-        there = look()
-        if there is before:  # the usual case
+        current = look()
+        if current is before:  # the usual case
             continue
-        now = value_of(there)
+        now = value_of(current)
         if not _same(before, now):
-            yield name, _words(before), _words(now)
+            yield name, _text(before), _text(now)
 
 
 def value_of(x: Any) -> Any:
@@ -106,7 +106,7 @@ def _same(before: Any, now: Any) -> bool:
     )
 
 
-def _words(value: Any) -> str:
+def _text(value: Any) -> str:
     if value is GONE:
         return "gone"
     if value is OPAQUE:

@@ -99,21 +99,21 @@ class AbstractPartitioned(AbstractFixedStep):
 
         def residual(z: Array) -> Array:
             V, lam = unpacked(z)
-            Q, P, F, push = stage(V, lam)
-            motion = P - p0[None] - ah @ (h * F + push)
+            Q, P, F, impulses = stage(V, lam)
+            motion = P - p0[None] - ah @ (h * F + impulses)
             if not rows:
                 return motion.reshape(-1)
             held = jax.vmap(form.position)(ts[1:], Q[1:], lam[:-1]) / h
             return jnp.concatenate([motion.reshape(-1), held.reshape(-1)])
 
-        still = jnp.zeros(((s - 1) * rows,), q0.dtype)
+        no_impulses = jnp.zeros(((s - 1) * rows,), q0.dtype)
         # Positions are rounded; over h they define velocities.
         rounded = jax.lax.stop_gradient(jnp.abs(q0 / h) + jnp.abs(v0))
-        guess = jnp.concatenate([jnp.tile(v0, s), still])
+        guess = jnp.concatenate([jnp.tile(v0, s), no_impulses])
         z, found = root(residual, guess, jnp.tile(rounded, s))
         V, lam = unpacked(z)
-        Q, _, F, push = stage(V, lam)
-        q1, p1 = q0 + h * (b @ V), p0 + b @ (h * F + push)
+        Q, _, F, impulses = stage(V, lam)
+        q1, p1 = q0 + h * (b @ V), p0 + b @ (h * F + impulses)
 
         def last(z: Array) -> Array:
             v, lam = z[:n], z[n:]

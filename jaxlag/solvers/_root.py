@@ -70,7 +70,7 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
     def iterate(factor: Any, z: Array) -> tuple[Array, Array, Array]:
         """(z, whether increments stopped decreasing, whether they are small)."""
 
-        def turn(carry: tuple) -> tuple:
+        def body_fun(carry: tuple) -> tuple:
             z, least, stopped, was_small, k = carry
             change = lu_solve(factor, residual(z))
             z, size = z - change, jnp.abs(change[:count])
@@ -85,8 +85,8 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
             return ~jnp.all(carry[2]) & (carry[4] < EACH)
 
         unknown = jnp.full((MEMORY, count), jnp.inf, guess.dtype)
-        begin = (z, unknown, jnp.zeros(count, bool), no, zero)
-        z, _, stopped, small, _ = jax.lax.while_loop(cond_fun, turn, begin)
+        init = (z, unknown, jnp.zeros(count, bool), no, zero)
+        z, _, stopped, small, _ = jax.lax.while_loop(cond_fun, body_fun, init)
         return z, jnp.all(stopped) & jnp.all(jnp.isfinite(z)), small
 
     def anew(carry: tuple) -> tuple:
@@ -103,8 +103,8 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
 
     unknown = jnp.zeros((guess.shape[0], guess.shape[0]), guess.dtype)
     z, _, done, _ = jax.lax.while_loop(cond_fun, anew, (guess, unknown, no, zero))
-    there = jnp.all(jnp.isfinite(residual(guess)))
-    z = jnp.where(done, z, jnp.where(there, guess, jnp.nan))
+    guess_finite = jnp.all(jnp.isfinite(residual(guess)))
+    z = jnp.where(done, z, jnp.where(guess_finite, guess, jnp.nan))
     return z, done.astype(z.dtype)
 
 

@@ -12,7 +12,7 @@ from jax import Array
 # Fractions of the largest rate of three stages. Steps that the estimate accepts in a smooth field
 # stay far below: at tolerances of 1e-6 and less none of 1,800 motions (pendulums, Kepler orbits up
 # to e = 0.97, oscillators of two rates, coupled ones) had a step rejected by either.
-_APART = 0.3
+_DIFFERENCE = 0.3
 _KICK = 3.0
 
 
@@ -52,8 +52,10 @@ def unseen(k: Sequence[Any], stages: tuple[int, ...]) -> Any:
         kick = reduce(jnp.maximum, map(jnp.abs, without))
         found = jnp.where(kick > _KICK * largest, kick, 0.0)
         if len(without) > 1:
-            apart = jnp.abs(end - before)
-            found = jnp.maximum(found, jnp.where(apart > _APART * largest, apart, 0.0))
+            difference = jnp.abs(end - before)
+            found = jnp.maximum(
+                found, jnp.where(difference > _DIFFERENCE * largest, difference, 0.0)
+            )
         return found
 
     return jax.tree.map(of, k[0], k[-2], k[-1], *(k[i] for i in stages))

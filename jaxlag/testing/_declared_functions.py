@@ -162,9 +162,9 @@ def states(names: Sequence[str], q: Array, v: Array, u: Array | None) -> dict[st
     all_states["equal"] = each(q=equal, v=equal)
     all_states["one"] = each(q=one, v=one)
     all_states |= {f"random {k + 1}": each(q=near, v=near) for k in range(_RANDOM)}
-    kept: dict[str, dict] = {}
+    distinct: dict[str, dict] = {}
     for name, x in all_states.items():
-        met = any(all(np.array_equal(x[k], y[k]) for k in x) for y in kept.values())
+        met = any(all(np.array_equal(x[k], y[k]) for k in x) for y in distinct.values())
         if name.split()[0] in names and not met:
-            kept[name] = x
-    return kept
+            distinct[name] = x
+    return distinct

@@ -254,11 +254,13 @@ class _Loop(NamedTuple):
     """An equation that runs a program repeatedly, each time on the results of the last one.
 
     Attributes:
-        body: the program of one turn.
+        body: the program of one iteration.
         operands: operands of the equation: `offset` that the body does not take, `fixed` that all
-            turns share, `carried` from turn to turn, and one row of the rest for each turn.
-        turns: (row, arguments of the body) in the order of execution.
-        results: results of the equation: the carried values at the end, and the rows of the turns.
+            iterations share, `carried` from one iteration to the next, and one row of the rest for
+            each iteration.
+        iterations: (row, arguments of the body) in the order of execution.
+        results: results of the equation: the carried values at the end, and the rows of all
+            iterations.
     """
 
     body: ClosedJaxpr
@@ -266,7 +268,7 @@ class _Loop(NamedTuple):
     offset: int
     fixed: int
     carried: int
-    turns: list[tuple[int, list]]
+    iterations: list[tuple[int, list]]
     results: list[np.ndarray]
 
     def back(self, masks: list) -> tuple[list, list]:
@@ -275,7 +277,7 @@ class _Loop(NamedTuple):
         sources = _nothing(self.operands)
         first = self.offset + self.fixed
         carry, stacked = masks[: self.carried], masks[self.carried :]
-        for row, args in reversed(self.turns):
+        for row, args in reversed(self.iterations):
             wanted = [*carry, *(mask[row] for mask in stacked)]
             inside, found = _back(self.body, _run(self.body, args), wanted)
             births = inside + births
@@ -317,23 +319,23 @@ def _scan(eqn: Any, operands: list) -> _Loop:
     consts, carry = operands[:fixed], operands[fixed : fixed + carried]
     rows = operands[fixed + carried :]
     made = [np.zeros(v.aval.shape, v.aval.dtype) for v in eqn.outvars[carried:]]
-    turns = []
+    iterations = []
     for row in reversed(range(length)) if eqn.params["reverse"] else range(length):
         args = [*consts, *carry, *(x[row] for x in rows)]
-        turns.append((row, args))
+        iterations.append((row, args))
         outs = _results(body, args)
         carry = outs[:carried]
         for x, out in zip(made, outs[carried:], strict=True):
             x[row] = out
-    return _Loop(body, operands, 0, fixed, carried, turns, [*carry, *made])
+    return _Loop(body, operands, 0, fixed, carried, iterations, [*carry, *made])
 
 
 def _while(params: Any, operands: list) -> _Loop:
     offset, fixed = params["cond_nconsts"], params["body_nconsts"]
     asked, consts = operands[:offset], operands[offset : offset + fixed]
-    carry, turns = operands[offset + fixed :], []
+    carry, iterations = operands[offset + fixed :], []
     while bool(_results(params["cond_jaxpr"], [*asked, *carry])[0]):
         args = [*consts, *carry]
-        turns.append((0, args))
+        iterations.append((0, args))
         carry = _results(params["body_jaxpr"], args)
-    return _Loop(params["body_jaxpr"], operands, offset, fixed, len(carry), turns, carry)
+    return _Loop(params["body_jaxpr"], operands, offset, fixed, len(carry), iterations, carry)

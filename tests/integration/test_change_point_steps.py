@@ -47,7 +47,7 @@ def test_stages_are_far_from_the_change_point(method):
 
 def ahead_of(t, left, apart):
     """A known change point, `left` ahead of t."""
-    return no_crossing(t, 1, float)._replace(time=t + left, apart=jnp.array(apart))
+    return no_crossing(t, 1, float)._replace(time=t + left, independence=jnp.array(apart))
 
 
 def test_saves_beyond_the_change_point_shorten_the_step():
@@ -77,7 +77,7 @@ def test_last_step_is_short_or_has_no_stage_at_the_change_point():
     np.testing.assert_allclose(far.step(t, h, gap, at), 0.1 * (1 - NARROW / SHORT), rtol=1e-12)
     assert float(near.step(t, h, gap, jnp.array(2.1))) == 0.3  # cut at the end of the motion
     beyond = jnp.array(2.11)
-    lead = float(far._replace(apart=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
+    lead = float(far._replace(independence=jnp.array(0.9 * SHORT)).step(t, h, gap, beyond))
     np.testing.assert_allclose((0.1 - lead) / (0.11 - lead), gap, rtol=1e-9)
 
 
@@ -93,8 +93,8 @@ def test_time_of_the_change_point_is_extrapolated_linearly():
     assert second.is_near
     assert jnp.isinf(second.onwards(t2, jnp.array(2.5), jnp.array(0.08), moved).time)
     assert jnp.isinf(begin.onwards(t0, t1, jnp.array(1.1 * AHEAD), moved).time)
-    assert second._replace(apart=jnp.array(BESIDE * 0.03)).is_beside(second)
-    assert not second._replace(apart=jnp.array(0.03)).is_beside(second)
+    assert second._replace(independence=jnp.array(BESIDE * 0.03)).is_beside(second)
+    assert not second._replace(independence=jnp.array(0.03)).is_beside(second)
 
 
 def test_dependent_rows_are_accepted_for_a_limited_distance():

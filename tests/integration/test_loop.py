@@ -97,7 +97,7 @@ def step_ends(options):
     recorded = record(values)
     # An iteration that was not accepted ends where the last one did; the stop has a negative
     # offset.
-    ends = np.asarray(recorded.offsets)[: int(recorded.turns)]
+    ends = np.asarray(recorded.offsets)[: int(recorded.steps)]
     return np.unique([0.0, *np.where(ends < 0, 4.0, ends)])
 
 

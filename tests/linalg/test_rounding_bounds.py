@@ -108,24 +108,23 @@ def systems(kind, alone, lowering="auto"):
     return tuple(jl.System(falling, ("x", "y"), constraints=r, lowering=lowering) for r in rows)
 
 
-@pytest.mark.parametrize("dtype", mostly_full([jnp.float64, jnp.float32], jnp.float64))
+OPTIONS = (
+    {},
+    {"formulation": "null_space"},
+    {"assemble": True},
+    {"lowering": "array"},
+    {"stabilization": None},
+)
+DECLARED = [(kind, alone) for kind in VOID for alone in (False, True)]
+
+
 @pytest.mark.parametrize(
-    ("kind", "alone", "options"),
+    ("kind", "alone", "options", "dtype"),
     mostly_full(
-        [
-            (kind, alone, options)
-            for kind in VOID
-            for alone in (False, True)
-            for options in (
-                {},
-                {"formulation": "null_space"},
-                {"assemble": True},
-                {"lowering": "array"},
-                {"stabilization": None},
-            )
-        ],
-        ("holonomic", False, {}),
-        ("Pfaffian", True, {}),
+        [(*d, options, jnp.float64) for d in DECLARED for options in OPTIONS]
+        + [(*d, {}, jnp.float32) for d in DECLARED],
+        ("holonomic", False, {}, jnp.float64),
+        ("Pfaffian", True, {}, jnp.float64),
     ),
 )
 def test_void_rows_change_nothing(kind, alone, options, dtype):

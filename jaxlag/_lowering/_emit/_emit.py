@@ -28,8 +28,8 @@ def prelude(
     program: Program,
     params: Any,
     dtype: Any,
-    kept: Array | None = None,
-    there: Array | None = None,
+    active_rows: Array | None = None,
+    nonzero: Array | None = None,
     time_direction: Array | float = 1.0,
 ) -> Float[Array, " k"]:
     """Values for the body that do not change during a solve, as one array.
@@ -38,14 +38,14 @@ def prelude(
         program: straight-line code.
         params: as the Lagrangian takes them.
         dtype: of the results.
-        kept: for every constraint row whether it is used in solves; None for all.
-        there: for every row whether it is more than rounding; None for all.
+        active_rows: for every constraint row whether it is used in solves; None for all.
+        nonzero: for every row whether it is more than rounding; None for all.
         time_direction: -1 if time runs backwards.
     """
     slots = numbers(program, dtype)
     for given in FIXED:
         wanted = {index: slot for (name, index), slot in program.inputs.items() if name == given}
-        values = {"kept": kept, "there": there, "time_direction": time_direction}
+        values = {"active_rows": active_rows, "nonzero": nonzero, "time_direction": time_direction}
         if given in values and values[given] is None:
             slots |= {slot: jnp.ones((), dtype) for slot in wanted.values()}
         elif wanted:

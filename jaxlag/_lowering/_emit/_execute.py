@@ -16,7 +16,7 @@ from jaxlag._lowering._graph._expression import FIXED
 from jaxlag._lowering._graph._straight_line import Line, Program
 from jaxlag._lowering._jaxpr._from_jaxpr import Rule
 
-# From this many lines on, sines and cosines are kept by a division by 1: XLA's CPU backend would
+# From this many lines on, sines and cosines are divided by 1: XLA's CPU backend would
 # recompute them for every result that depends on them, but never repeats a division. In short
 # code on scalars the compiler finds the repetitions itself.
 KEEP_FROM = 120
@@ -46,8 +46,8 @@ def straight(
     for slot, x in zip(program.carried, carried, strict=False):
         slots[slot] = x != 0 if slot in program.truths else x
     keep_from = KEEP_FROM_IN_LANES if lanes else KEEP_FROM
-    kept = len(program.body) > keep_from and jax.default_backend() == "cpu"
-    one = carried[-1] if kept else None
+    divides = len(program.body) > keep_from and jax.default_backend() == "cpu"
+    one = carried[-1] if divides else None
     read = [slot for (name, _), slot in program.inputs.items() if name not in FIXED]
     slots |= dict(zip(read, given, strict=True))
     run(program.body, slots, program.whole, one, pairs, known)

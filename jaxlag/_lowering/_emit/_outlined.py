@@ -3,7 +3,7 @@
 In a loop of steps every stage evaluates the accelerations. In reverse mode every stage evaluates
 their transposed derivative. If the code were copied into the loop, XLA's fusion would compute
 shared lines again for each use. The derivatives start from the arguments again. Only sines and
-cosines are kept: these are most of the work, and few numbers to store.
+cosines are stored: these are most of the work, and few numbers.
 """
 
 from collections.abc import Callable
@@ -29,12 +29,12 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
     """(constants of a solve, state and inputs) -> results, each as one array."""
     slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
 
-    def both(numbers: Halves, kept: Array | None = None) -> tuple[Array, Array]:
+    def both(numbers: Halves, sincos: Array | None = None) -> tuple[Array, Array]:
         """Results, and their sines and cosines, which may be known already."""
         pairs: Pairs = {}
         known: Pairs | None = None
-        if kept is not None:
-            x = elements(kept)
+        if sincos is not None:
+            x = elements(sincos)
             known = {slot: (x[2 * i], x[2 * i + 1]) for i, slot in enumerate(slots)}
         given = elements(numbers[0]), elements(numbers[1])
         found = jnp.stack(straight(program, dtype, *given, lanes, pairs, known))
@@ -48,25 +48,25 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
 
     @CustomJVP
     def call(carried: Array, given: Array) -> Array:
-        return apart((carried, given))
+        return outlined((carried, given))
 
     @partial(call.defjvp, symbolic_zeros=True)
     def _(primals: Halves, tangents: tuple) -> tuple:
-        found, kept = keeping(*primals)
-        return found, _derivative(of_results, (primals, kept), tangents)
+        found, sincos = with_sincos(*primals)
+        return found, _derivative(of_results, (primals, sincos), tangents)
 
     @CustomJVP
-    def keeping(carried: Array, given: Array) -> tuple[Array, Array]:
-        return both_apart((carried, given))
+    def with_sincos(carried: Array, given: Array) -> tuple[Array, Array]:
+        return both_outlined((carried, given))
 
-    @partial(keeping.defjvp, symbolic_zeros=True)
+    @partial(with_sincos.defjvp, symbolic_zeros=True)
     def _(primals: Halves, tangents: tuple) -> tuple:
-        found, kept = keeping(*primals)
-        return (found, kept), _derivative(of_both, (primals, kept), tangents)
+        found, sincos = with_sincos(*primals)
+        return (found, sincos), _derivative(of_both, (primals, sincos), tangents)
 
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
-    apart, both_apart = boundary(results), boundary(both)
-    of_results, of_both = _maps(lambda numbers, kept: both(numbers, kept)[0]), _maps(both)
+    outlined, both_outlined = boundary(results), boundary(both)
+    of_results, of_both = _maps(lambda numbers, sincos: both(numbers, sincos)[0]), _maps(both)
     return call
 
 
@@ -94,23 +94,23 @@ def _derivative(maps: dict, at: tuple, tangents: tuple) -> Any:
 
 
 def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
-    """The derivative of function(row, kept) in the row, for each choice of varying halves."""
+    """The derivative of function(numbers, sincos) in the numbers, for each set of moving halves."""
 
-    def pushed(at: tuple, dot: tuple) -> Any:
-        numbers, kept = at
+    def jvp_fn(at: tuple, dot: tuple) -> Any:
+        numbers, sincos = at
         pairs = zip(numbers, dot, strict=True)
         filled = tuple(jnp.zeros_like(x) if d is None else d for x, d in pairs)
-        return jax.jvp(lambda x: function(x, kept), (numbers,), (filled,))[1]
+        return jax.jvp(lambda x: function(x, sincos), (numbers,), (filled,))[1]
 
-    def pulled(which: tuple[bool, bool]) -> Callable:
+    def vjp_fn(which: tuple[bool, bool]) -> Callable:
         def of(at: tuple, bar: Any) -> tuple:
-            numbers, kept = at
-            parts = jax.vjp(lambda numbers: function(numbers, kept), numbers)[1](bar)[0]
+            numbers, sincos = at
+            parts = jax.vjp(lambda numbers: function(numbers, sincos), numbers)[1](bar)[0]
             return tuple(x if moves else None for x, moves in zip(parts, which, strict=True))
 
         return of
 
     return {
-        which: LinearMap(not_inlined(pushed), not_inlined(pulled(which)), pushed, at_once=None)
+        which: LinearMap(not_inlined(jvp_fn), not_inlined(vjp_fn(which)), jvp_fn, at_once=None)
         for which in ((True, True), (False, True), (True, False))
     }

@@ -58,7 +58,7 @@ def bordered(
     A: Sequence[Sequence[Node]],
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
-    kept: Sequence[Node] | None = None,
+    active_rows: Sequence[Node] | None = None,
     checked: bool = False,
     crossing: bool = False,
 ) -> list[list[Node]]:
@@ -75,7 +75,7 @@ def bordered(
         A: rows.
         right: right-hand sides.
         eps: of the numbers.
-        kept: for every row 1, or 0 if it is left out; None for all 1.
+        active_rows: for every row 1, or 0 if it is left out; None for all 1.
         checked: whether an x that is 0 for every M, as it has no load, is also NaN if
             a pivot of coordinates is too small.
         crossing: whether a row whose pivot is too small is left out; otherwise x is NaN. With it
@@ -87,7 +87,7 @@ def bordered(
     sides = [[*r, *(graph.scale(x, -1.0) for x in c)] for r, c in right]
     out: list[list[Node]] = [[graph.zero] * (n + m) for _ in right]
     for block in blocks(whole, graph.zero):
-        elimination = _Elimination(graph, whole, sides, block, n, eps, kept, crossing)
+        elimination = _Elimination(graph, whole, sides, block, n, eps, active_rows, crossing)
         found = elimination.solve()
         if checked:
             found = [[elimination.checked(x) for x in values] for values in found]
@@ -133,11 +133,11 @@ class _Elimination:
         block: list[int],
         coordinates: int,
         eps: float,
-        kept: Sequence[Node] | None,
+        active_rows: Sequence[Node] | None,
         crossing: bool,
     ) -> None:
-        self.graph, self.block, self.coordinates, self.kept = graph, block, coordinates, kept
-        self.crossing = crossing
+        self.graph, self.block, self.coordinates = graph, block, coordinates
+        self.active_rows, self.crossing = active_rows, crossing
         self.floor, self.row_floor = 4 * coordinates * eps, eps ** (2 / 3)
         # Products of two entries of M overflow single precision in usual units.
         self.cramer = eps < DOUBLE
@@ -207,10 +207,10 @@ class _Elimination:
             pivot = graph.let(graph.select(dependent, left_out, pivot))
         else:
             pivot = graph.let(graph.select(graph.call(GREATER, bound, pivot), pivot, nan))
-        if self.kept is None:
+        if self.active_rows is None:
             return pivot
-        keep = graph.call(GREATER, self.kept[i - self.coordinates], graph.const(0.5))
-        return graph.let(graph.select(keep, pivot, left_out))
+        active = graph.call(GREATER, self.active_rows[i - self.coordinates], graph.const(0.5))
+        return graph.let(graph.select(active, pivot, left_out))
 
     def _bound(self, i: int) -> Node:
         """Bound on the rounding of a pivot that is zero; 0 for pivots without subtraction."""

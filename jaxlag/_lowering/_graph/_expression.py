@@ -21,9 +21,9 @@ Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
 
-FIXED = ("params", "kept", "there", "time_direction")
-"""Names of the inputs that do not change during a solve: parameters, the rows used in solves, and
-the direction of time (+1 or -1)."""
+FIXED = ("params", "active_rows", "nonzero", "time_direction")
+"""Names of the inputs that do not change during a solve: parameters, the rows used in solves, the
+rows that are more than rounding, and the direction of time (+1 or -1)."""
 
 
 POWERS = 2
@@ -141,9 +141,9 @@ class Graph:
         total: dict[Node, float] = {}
         for node, coefficient in terms:
             constant += _collect(total, node, coefficient)
-        kept = [(node, c) for node, c in total.items() if c != 0.0]
+        remaining = [(node, c) for node, c in total.items() if c != 0.0]
         # A sum inside a sum is opened only if that merges terms: it may be shared.
-        for node, c in kept:
+        for node, c in remaining:
             if node.op == "sum" and _merges(node, constant, total):
                 del total[node]
                 inner_constant, inner = node.data
@@ -151,17 +151,17 @@ class Graph:
                 for term, coefficient in inner:
                     constant += _collect(total, term, c * coefficient)
                 return self.sum(total.items(), constant)
-        if not kept:
+        if not remaining:
             return self.const(constant)
-        if len(kept) == 1 and constant == 0.0:
-            ((node, c),) = kept
+        if len(remaining) == 1 and constant == 0.0:
+            ((node, c),) = remaining
             if node.op == "sum" and c < 0:  # -(a - b) = b - a
                 inner_constant, inner = node.data
-                kept = [(self._sum(-inner_constant, tuple((n, -x) for n, x in inner)), -c)]
-            if kept[0][1] == 1.0:
-                return kept[0][0]
-        kept.sort(key=_by_id)
-        return self._sum(constant, tuple(kept))
+                remaining = [(self._sum(-inner_constant, tuple((n, -x) for n, x in inner)), -c)]
+            if remaining[0][1] == 1.0:
+                return remaining[0][0]
+        remaining.sort(key=_by_id)
+        return self._sum(constant, tuple(remaining))
 
     def _sum(self, constant: float, terms: Terms) -> Node:
         key = ("sum", constant, tuple((node.id, c) for node, c in terms))
@@ -195,15 +195,15 @@ class Graph:
             if whole:
                 powers[node] -= 2 * whole
                 coefficient *= self._multiply(powers, node.args[0], whole)
-        kept = [(node, exponent) for node, exponent in powers.items() if exponent != 0]
+        remaining = [(node, exponent) for node, exponent in powers.items() if exponent != 0]
         if coefficient == 0.0:
             return self.zero
-        if not kept:
+        if not remaining:
             return self.const(coefficient)
-        kept.sort(key=_by_id)
-        if len(kept) == 1 and kept[0][1] == 1:
-            return self.scale(kept[0][0], coefficient)
-        node = self._product(tuple(kept))
+        remaining.sort(key=_by_id)
+        if len(remaining) == 1 and remaining[0][1] == 1:
+            return self.scale(remaining[0][0], coefficient)
+        node = self._product(tuple(remaining))
         return node if coefficient == 1.0 else self.sum([(node, coefficient)])
 
     def _product(self, factors: Factors) -> Node:

@@ -141,8 +141,8 @@ class Expansion:
             groups[speeds][tuple(f for f in monomial if self._is(f[0]) != "speed")] = coefficient
         out: Polynomial = {}
         for speeds, group in groups.items():
-            kept = {tuple(f for f in m if self._is(f[0]) == "kept") for m in group}
-            if len(kept) > 1:
+            unexpanded = {tuple(f for f in m if self._is(f[0]) == "unexpanded") for m in group}
+            if len(unexpanded) > 1:
                 group = self._as_atom(self.build(group))
             for monomial, coefficient in group.items():
                 out[_merged(monomial, speeds)] = coefficient
@@ -158,13 +158,13 @@ class Expansion:
         return {((atom.id, 1),): number}
 
     def _is(self, atom: int) -> str:
-        """The kind of an atom: "speed", "kept" unexpanded, or "plain" for expanded ones."""
+        """The kind of an atom: "speed", "unexpanded", or "plain" for expanded ones."""
         node = self.graph.nodes[atom]
         if node.fixed or atom in self._cosine or atom in self._sine:
             return "plain"
         if node.op == "input" and node.data[0] in SPEEDS:
             return "speed"
-        return "kept"
+        return "unexpanded"
 
     def _paired(self, polynomial: Polynomial) -> Polynomial:
         """Apply m sin^2 + m cos^2 = m."""

@@ -155,10 +155,10 @@ def _reduce(combine: Callable) -> Callable:
     def reduced(graph: Graph, eqn: Any, operands: list) -> np.ndarray:
         (array,) = operands
         axes = tuple(eqn.params["axes"])
-        kept = [i for i in range(array.ndim) if i not in axes]
-        shape = tuple(array.shape[i] for i in kept)
+        remaining = [i for i in range(array.ndim) if i not in axes]
+        shape = tuple(array.shape[i] for i in remaining)
         size = int(np.prod([array.shape[i] for i in axes]))
-        rows = array.transpose(*kept, *axes).reshape(int(np.prod(shape)), size)
+        rows = array.transpose(*remaining, *axes).reshape(int(np.prod(shape)), size)
         return take(
             [combine(graph, list(row)) for row in rows], np.arange(len(rows)).reshape(shape)
         )

@@ -70,21 +70,21 @@ def gradient(graph: Graph, root: Node, inputs: Sequence[Node]) -> list[Node]:
     for node in nodes:
         if node in wanted or (node.op != "stop" and any(arg in active for arg in node.args)):
             active.add(node)
-    pushed: dict[Node, list[tuple[Node, float]]] = {root: [(graph.one, 1.0)]}
+    cotangents: dict[Node, list[tuple[Node, float]]] = {root: [(graph.one, 1.0)]}
     found: dict[Node, Node] = {}
     for node in reversed(nodes):
-        if node not in pushed or node not in active:
+        if node not in cotangents or node not in active:
             continue
-        total = found[node] = graph.sum(pushed.pop(node))
+        total = found[node] = graph.sum(cotangents.pop(node))
         if total is graph.zero:
             continue
-        for arg, term, coefficient in _pull(graph, node, total):
+        for arg, term, coefficient in _cotangents(graph, node, total):
             if arg in active:
-                pushed.setdefault(arg, []).append((term, coefficient))
+                cotangents.setdefault(arg, []).append((term, coefficient))
     return [found.get(node, graph.zero) for node in inputs]
 
 
-def _pull(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node, float]]:
+def _cotangents(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node, float]]:
     """The cotangents of the arguments: (argument, node, coefficient)."""
     if node.op == "sum":
         return [(arg, total, c) for arg, c in node.data[1]]

@@ -24,7 +24,7 @@ from jaxlag._lowering._jaxpr._node_arrays import Missing, broadcast, each, nodes
 from jaxlag._tracing._interpret import NUMPY, equation, held
 
 LIMIT = 50_000  # nodes of a graph: far beyond the useful size of a scalar program
-TURNS = 10_000  # largest number of iterations of an unrolled loop
+MAX_ITERATIONS = 10_000  # largest number of iterations of an unrolled loop
 
 
 class Unsupported(Exception):
@@ -223,7 +223,7 @@ def _scan(graph: Graph, eqn: Any, operands: list) -> list:
     fixed, carried = scan_sizes(params)
     consts, carry = operands[:fixed], operands[fixed : fixed + carried]
     rows, length = operands[fixed + carried :], params["length"]
-    if length > TURNS:
+    if length > MAX_ITERATIONS:
         raise Missing(f"scan of length {length}")
     stacked: list[list] = [[] for _ in eqn.outvars[carried:]]
     for i in reversed(range(length)) if params["reverse"] else range(length):
@@ -252,7 +252,7 @@ def _while(graph: Graph, eqn: Any, operands: list) -> list:
     condition_consts = operands[:of_condition]
     body_consts = operands[of_condition : of_condition + of_body]
     carry = operands[of_condition + of_body :]
-    for _ in range(TURNS):
+    for _ in range(MAX_ITERATIONS):
         (going,) = _read(graph, params["cond_jaxpr"], *condition_consts, *carry)
         if going.dtype == object:
             if going.item().op != "const":
@@ -261,7 +261,7 @@ def _while(graph: Graph, eqn: Any, operands: list) -> list:
         if not going:
             return carry
         carry = _read(graph, params["body_jaxpr"], *body_consts, *carry)
-    raise Missing(f"while of more than {TURNS} iterations")
+    raise Missing(f"while of more than {MAX_ITERATIONS} iterations")
 
 
 def _cond(graph: Graph, eqn: Any, operands: list) -> list:

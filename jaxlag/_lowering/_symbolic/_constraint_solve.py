@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 from jax import Array
 
 from jaxlag._linalg._kkt import TangentSpace, row_weights, tangent_space, units_of
@@ -24,7 +23,7 @@ class Constrained(NamedTuple):
         velocity: A v + b of all rows.
         position: phi of the holonomic rows, in their order.
         holonomic: for every row, whether it is one of them.
-        kept: for every row 1, or 0 if it is left out; None if all are kept.
+        active_rows: for every row 1, or 0 if it is left out; None if all are active.
         formulation: "multipliers" or "null_space".
         damping: Baumgarte's (2 alpha, beta^2), None without; alpha changes its sign with time.
         regular: whether M is known to be positive definite by itself.
@@ -37,7 +36,7 @@ class Constrained(NamedTuple):
     velocity: Sequence[Node]
     position: Sequence[Node]
     holonomic: Sequence[bool]
-    kept: Sequence[Node] | None
+    active_rows: Sequence[Node] | None
     formulation: str
     damping: tuple[float, float] | None
     regular: bool
@@ -85,17 +84,17 @@ def solve_with_rows(
     A: Sequence[Sequence[Node]],
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
-    kept: Sequence[Node] | None,
+    active_rows: Sequence[Node] | None,
     formulation: str,
     regular: bool,
     crossing: bool,
 ) -> list[list[Node]]:
     """For each right-hand side (r, c) the x with M x = r + A^T lam, A x + c = 0."""
     if formulation == "null_space":
-        return _null_space(graph, M, A, right, eps, kept, crossing)
+        return _null_space(graph, M, A, right, eps, active_rows, crossing)
     if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
-        M, right = _augmented(graph, M, A, right, eps, kept)
-    found = bordered(graph, M, A, right, eps, kept, checked=True, crossing=crossing)
+        M, right = _augmented(graph, M, A, right, eps, active_rows)
+    found = bordered(graph, M, A, right, eps, active_rows, checked=True, crossing=crossing)
     return [x[: len(M)] for x in found]
 
 
@@ -128,7 +127,7 @@ def solve_with_reactions(
     r: Sequence[Node],
     found: Reaction,
     eps: float,
-    kept: Sequence[Node] | None,
+    active_rows: Sequence[Node] | None,
     sharing: Sharing | None,
     regular: bool,
 ) -> tuple[list[Node], list[Node]]:
@@ -140,30 +139,30 @@ def solve_with_reactions(
     m = len(rows.A)
     A, gamma, G = rows.A, list(rows.gamma), found.slopes
     seen = None
-    if kept is not None and sharing is not None:
+    if active_rows is not None and sharing is not None:
         roots = [graph.let(graph.div(graph.one, graph.sqrt(M[i][i]))) for i in range(len(M))]
         units = roots if regular else read_function(graph, eps, units_of, M, A)
-        seen = shared(graph, A, units, kept, sharing, eps)
+        seen = shared(graph, A, units, active_rows, sharing, eps)
     if seen is not None:
         of_rows = zip(*seen, strict=True)
         G = [[dot(graph, column, g) for g in zip(*G, strict=True)] for column in of_rows]
-    if kept is not None:
-        A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
-        G = [[graph.mul(kept[k], x) for x in column] for k, column in enumerate(G)]
-        gamma = [graph.mul(kept[k], x) for k, x in enumerate(gamma)]
+    if active_rows is not None:
+        A = [[graph.mul(active_rows[k], x) for x in row] for k, row in enumerate(A)]
+        G = [[graph.mul(active_rows[k], x) for x in column] for k, column in enumerate(G)]
+        gamma = [graph.mul(active_rows[k], x) for k, x in enumerate(gamma)]
     sides = [([graph.add(*pair) for pair in zip(r, found.rest, strict=True)], gamma)]
     if not regular:
         M, sides = _augmented(graph, M, A, sides, eps, None)
-    pushes = [
+    columns = [
         [graph.add(a, g) for a, g in zip(row, column, strict=True)]
         for row, column in zip(A, G, strict=True)
     ]
-    free, *spread = bordered(graph, M, [], [(sides[0][0], []), *((p, []) for p in pushes)], eps)
+    free, *spread = bordered(graph, M, [], [(sides[0][0], []), *((p, []) for p in columns)], eps)
 
     S = [[dot(graph, A[k], spread[j]) for j in range(m)] for k in range(m)]
-    if kept is not None:
+    if active_rows is not None:
         for k in range(m):
-            S[k][k] = graph.sum([(S[k][k], 1.0), (kept[k], -1.0)], 1.0)
+            S[k][k] = graph.sum([(S[k][k], 1.0), (active_rows[k], -1.0)], 1.0)
     right = [
         graph.let(graph.sum([(gamma[k], -1.0), *_less(products(graph, A[k], free))]))
         for k in range(m)
@@ -171,8 +170,8 @@ def solve_with_reactions(
     lam = solve_general(graph, S, right, eps ** (2 / 3))
     a = []
     for i, x in enumerate(free):
-        pushed = [(graph.mul(lam[k], spread[k][i]), 1.0) for k in range(m)]
-        a.append(graph.let(graph.sum([(x, 1.0), *pushed])))
+        terms = [(graph.mul(lam[k], spread[k][i]), 1.0) for k in range(m)]
+        a.append(graph.let(graph.sum([(x, 1.0), *terms])))
     return a, lam if seen is None else [dot(graph, row, lam) for row in seen]
 
 
@@ -186,16 +185,17 @@ def _augmented(
     A: Sequence[Sequence[Node]],
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
-    kept: Sequence[Node] | None,
+    active_rows: Sequence[Node] | None,
 ) -> tuple[list[list[Node]], list[tuple[list[Node], Sequence[Node]]]]:
     """M + A^T W A and r - A^T W c, for an M that may be singular: x does not change."""
     n, m = len(M), len(A)
     weights = read_function(graph, eps, row_weights, M, A)
-    if kept is not None:
+    if active_rows is not None:
         # Selected, not multiplied: the weight of a row that is only rounding may overflow.
         half, zero = graph.const(0.5), graph.zero
         weights = [
-            graph.select(graph.call(GREATER, kept[k], half), w, zero) for k, w in enumerate(weights)
+            graph.select(graph.call(GREATER, active_rows[k], half), w, zero)
+            for k, w in enumerate(weights)
         ]
     full: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
     for i in range(n):
@@ -220,28 +220,30 @@ def _null_space(
     A: Sequence[Sequence[Node]],
     right: Sequence[tuple[Sequence[Node], Sequence[Node]]],
     eps: float,
-    kept: Sequence[Node] | None,
+    active_rows: Sequence[Node] | None,
     crossing: bool,
 ) -> list[list[Node]]:
     """As `_kkt.NullSpace`, whose programs are read; the elimination is that of the graph."""
-    if kept is not None:
-        A = [[graph.mul(kept[k], x) for x in row] for k, row in enumerate(A)]
-        right = [(r, [graph.mul(k, x) for k, x in zip(kept, c, strict=True)]) for r, c in right]
+    if active_rows is not None:
+        A = [[graph.mul(active_rows[k], x) for x in row] for k, row in enumerate(A)]
+        right = [
+            (r, [graph.mul(k, x) for k, x in zip(active_rows, c, strict=True)]) for r, c in right
+        ]
     read = partial(read_function, graph, eps)
-    space = read(_tangent_space, M, A, kept, crossing=crossing)
+    space = read(_tangent_space, M, A, active_rows, crossing=crossing)
     found = [read(TangentSpace.loads, space, *side) for side in right]
     inertia, sides = read(TangentSpace.inertia, space), [(load, ()) for _, load in found]
-    symmetric = np.where(np.tri(len(M), dtype=bool), inertia.T, inertia)
+    symmetric = [[inertia[min(i, j)][max(i, j)] for j in range(len(M))] for i in range(len(M))]
     solved = bordered(graph, symmetric, [], sides, eps)
     return [
-        list(read(TangentSpace.acceleration, space, y, across))
+        read(TangentSpace.acceleration, space, y, across)
         for y, (across, _) in zip(solved, found, strict=True)
     ]
 
 
-def _tangent_space(M: Array, A: Array, kept: Array | None, crossing: bool) -> TangentSpace:
-    """With the kept rows as numbers, 1 or 0."""
-    return tangent_space(M, A, None if kept is None else kept > 0.5, crossing)
+def _tangent_space(M: Array, A: Array, active_rows: Array | None, crossing: bool) -> TangentSpace:
+    """With the active rows as numbers, 1 or 0."""
+    return tangent_space(M, A, None if active_rows is None else active_rows > 0.5, crossing)
 
 
 def correction(
@@ -249,7 +251,7 @@ def correction(
     M: Sequence[Sequence[Node]],
     A: Sequence[Sequence[Node]],
     eps: float,
-    kept: Sequence[Node] | None,
+    active_rows: Sequence[Node] | None,
     regular: bool,
     chosen: Sequence[int],
     crossing: bool,
@@ -262,12 +264,12 @@ def correction(
     positive definite.
     """
     if not regular:
-        M, _ = _augmented(graph, M, A, [], eps, kept)
+        M, _ = _augmented(graph, M, A, [], eps, active_rows)
     A = [A[k] for k in chosen]
-    kept = None if kept is None else [kept[k] for k in chosen]
+    active_rows = None if active_rows is None else [active_rows[k] for k in chosen]
     n, m = len(M), len(A)
     nothing = [graph.zero] * n
     sides = [(nothing, [graph.one if j == k else graph.zero for j in range(m)]) for k in range(m)]
-    found = bordered(graph, M, A, sides, eps, kept, crossing=crossing)
+    found = bordered(graph, M, A, sides, eps, active_rows, crossing=crossing)
     columns = [[graph.scale(x, -1.0) for x in column[:n]] for column in found]
     return columns, [side[n + k] for k, side in enumerate(found)] if crossing else []

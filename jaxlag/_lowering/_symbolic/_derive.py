@@ -63,45 +63,45 @@ def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
             raise Unsupported(f"{alone} operations in the mass matrix alone, more than {limit}")
 
     forms: list[tuple[str, list[Node]]] = []
-    for form, words in zip(written, ("L as written", "L simplified"), strict=False):
+    for form, label in zip(written, ("L as written", "L simplified"), strict=False):
         bias = momentum_form(scene, form)
-        forms.append((f"derivative of the momentum, {words}", bias))
+        forms.append((f"derivative of the momentum, {label}", bias))
     bias = forms[-1][1]
     short = attempt(lambda: expansion.simplified(bias))
     if short is not None:
         forms.append(("derivative of the momentum, expanded", short))
     seen = [form for form in written if degree([form], scene.v) <= 2.0]
     if seen and not varies(mass, scene.v):
-        for words, form in (
+        for label, form in (
             ("Christoffel symbols", christoffel_form),
             ("rates of M and c", rate_form),
         ):
             best = form(scene, seen[-1], mass)
-            forms.append((words, best))
+            forms.append((label, best))
             short = attempt(partial(expansion.simplified, best))
             if short is not None:
-                forms.append((f"{words}, expanded", short))
+                forms.append((f"{label}, expanded", short))
 
     bound = scene.constrained
     found_rows = None if bound is None else rows(graph, scene.t, scene.q, scene.v, bound)
-    felt = None if bound is None else reaction(graph, bound)
+    reactive = None if bound is None else reaction(graph, bound)
     found = []
-    for words, h in forms:
+    for label, h in forms:
         lam = None
         right = [graph.scale(x, -1.0) for x in h]
         if scene.force is not None:
             right = [graph.sub(Q, x) for Q, x in zip(scene.force, h, strict=True)]
         if bound is None or found_rows is None:
             a = solve(graph, mass, right, eps)
-        elif felt is not None:
-            how = bound.kept, bound.sharing, bound.regular
-            a, lam = solve_with_reactions(graph, mass, found_rows, right, felt, eps, *how)
+        elif reactive is not None:
+            how = bound.active_rows, bound.sharing, bound.regular
+            a, lam = solve_with_reactions(graph, mass, found_rows, right, reactive, eps, *how)
         else:
             sides = [(right, found_rows.gamma)]
-            how = bound.kept, bound.formulation, bound.regular, bound.crossing
+            how = bound.active_rows, bound.formulation, bound.regular, bound.crossing
             (a,) = solve_with_rows(graph, mass, found_rows.A, sides, eps, *how)
         program = assemble(graph, a)
-        found.append(Equations(written[-1], mass, h, a, program, words, found_rows, lam=lam))
+        found.append(Equations(written[-1], mass, h, a, program, label, found_rows, lam=lam))
     best = min(found, key=lambda e: e.program.cost)
     if bound is None or found_rows is None:
         return best

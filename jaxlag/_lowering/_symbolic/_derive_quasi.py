@@ -60,32 +60,32 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
     if kinematics.in_u:
         of_u = declared
     else:
-        for words, L in _written(expansion, declared):
-            forms.append((f"projected, {words}", *_projected(scene, moved, L)))
+        for label, L in _written(expansion, declared):
+            forms.append((f"projected, {label}", *_projected(scene, moved, L)))
         if len(kinematics.u) == len(scene.v):
             # With fewer u, momenta of the omitted ones would be lost.
             (of_u,) = substitute(graph, [declared], dict(zip(scene.v, moved.V, strict=True)))
     if of_u is not None:
         U = _quasi(scene, kinematics, expansion)
-        for words, L in _written(expansion, of_u):
-            forms.append((f"Boltzmann-Hamel, {words}", *_hamel(scene, kinematics, moved, U, L)))
+        for label, L in _written(expansion, of_u):
+            forms.append((f"Boltzmann-Hamel, {label}", *_hamel(scene, kinematics, moved, U, L)))
 
     masses = [mass for _, mass, _ in forms]
     masses += [short for mass in masses if (short := _short(expansion, mass)) is not None]
     mass = min(masses, key=lambda M: cost(graph, M))
     v, sides = _guarded(graph, moved.v, moved.healthy), []
-    for words, _, right in forms:
-        sides.append((words, right))
+    for label, _, right in forms:
+        sides.append((label, right))
         short = attempt(partial(expansion.simplified, right))
         if short is not None:
-            sides.append((f"{words}, expanded", short))
+            sides.append((f"{label}, expanded", short))
     # Long forms are not compared: generating their code takes too much time.
     sides.sort(key=lambda side: len(order(side[1])))
     found = []
-    for words, right in sides[:WRITTEN_OUT]:
+    for label, right in sides[:WRITTEN_OUT]:
         rates = [*v, *solve(graph, mass, right, eps)]
         rest = [graph.scale(x, -1.0) for x in right]
-        found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), words))
+        found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), label))
     best = min(found, key=lambda equations: equations.program.cost)
     best = best._replace(velocity=assemble(graph, v))
     if moved.determinants is not None:
@@ -122,8 +122,8 @@ def _moved(
     short = attempt(partial(expansion.simplified, V))
     if short is not None and cost(graph, [short]) <= cost(graph, [V]):
         V = short
-    still = dict.fromkeys(kinematics.bound, graph.zero)
-    v = substitute(graph, V, still)
+    zero_bound = dict.fromkeys(kinematics.bound, graph.zero)
+    v = substitute(graph, V, zero_bound)
     B = [tangents(graph, V, {u: graph.one}) for u in kinematics.free]
     s = tangents(graph, v, dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one})
     return _Moved(V, v, B, s, healthy, determinants)
@@ -226,14 +226,14 @@ def _hamel(
         effort = [graph.add(*pair) for pair in zip(scene.force, effort, strict=True)]
     at = dict(zip(v, moved.v, strict=True)) | dict(zip(frozen, p, strict=True))
     effort = substitute(graph, effort, at)
-    kept = [p[list(u).index(x)] for x in kinematics.free]
-    rate = tangents(graph, kept, dict(zip(q, moved.v, strict=True)) | {scene.t: graph.one})
+    free_momenta = [p[list(u).index(x)] for x in kinematics.free]
+    rate = tangents(graph, free_momenta, dict(zip(q, moved.v, strict=True)) | {scene.t: graph.one})
     right = [
         graph.sub(_dot(graph, column, effort), x) for column, x in zip(moved.B, rate, strict=True)
     ]
     mass = mass_matrix(graph, L, kinematics.free)
-    still = dict.fromkeys(kinematics.bound, graph.zero)
-    flat = iter(substitute(graph, [*(x for row in mass for x in row), *right], still))
+    zero_bound = dict.fromkeys(kinematics.bound, graph.zero)
+    flat = iter(substitute(graph, [*(x for row in mass for x in row), *right], zero_bound))
     k = len(kinematics.free)
     return [[next(flat) for _ in range(k)] for _ in range(k)], [next(flat) for _ in range(k)]
 

@@ -57,8 +57,8 @@ def lower(key: Key, sample: _params.Sample) -> Lowered:
     except OutOfRange:
         raise
     except Exception as error:
-        said = (str(error) or "no message").splitlines()[0]
-        return Lowered(None, f"no scalar program: {type(error).__name__}: {said}", None)
+        message = (str(error) or "no message").splitlines()[0]
+        return Lowered(None, f"no scalar program: {type(error).__name__}: {message}", None)
 
 
 def _lowered(key: Key, sample: _params.Sample) -> Lowered:
@@ -76,7 +76,7 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
         found = f"{operations} operations, {once} more once per solve: more than {key.limit}"
         return Lowered(None, found, scene)
     compared = compare(key, scene, equations, sample.leaves)
-    return Lowered(equations if compared.sound else None, compared.words, scene)
+    return Lowered(equations if compared.sound else None, compared.message, scene)
 
 
 def _written(scene: SymbolicSystem) -> int:

@@ -29,7 +29,7 @@ class Key(NamedTuple):
     formulation: str
     baumgarte: Baumgarte | None
     regular: bool
-    apart: bool
+    contact_rows_independent: bool
     quasi: QuasiVelocities | None
     in_u: Callable | None
     crossing: bool
@@ -55,7 +55,7 @@ def key_of(terms: ArrayTerms, q: Any, params: Any, inputs: Mapping[str, Any], li
         terms.formulation,
         terms.baumgarte,
         terms.regular,
-        terms.apart,
+        terms.contact_rows_independent,
         terms.quasi,
         terms.in_u,
         terms.crossing,

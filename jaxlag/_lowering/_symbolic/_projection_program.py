@@ -36,11 +36,11 @@ def surface(
     lam: Program | None,
 ) -> ProjectionCode:
     """Code for the residuals and their corrections."""
-    own = [k for k, holonomic in enumerate(bound.holonomic) if holonomic]
-    mixed = 0 < len(own) < len(A)
+    holonomic_rows = [k for k, holonomic in enumerate(bound.holonomic) if holonomic]
+    mixed = 0 < len(holonomic_rows) < len(A)
 
     def columns(chosen: Sequence[int]) -> Program:
-        how = bound.kept, bound.regular, chosen, bound.crossing
+        how = bound.active_rows, bound.regular, chosen, bound.crossing
         found, masses = correction(graph, M, A, eps, *how)
         masses = masses if len(chosen) == len(A) else []
         return assemble(graph, [*(x for column in found for x in column), *masses])
@@ -49,7 +49,7 @@ def surface(
     return ProjectionCode(
         assemble(graph, list(bound.position)),
         assemble(graph, list(bound.velocity)),
-        columns(own) if mixed else every,
+        columns(holonomic_rows) if mixed else every,
         every if mixed else None,
         lam,
     )

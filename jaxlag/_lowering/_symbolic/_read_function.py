@@ -20,22 +20,26 @@ ONCE = frozenset({"dot_general", "reduce_sum", "div", "rsqrt", "select_n"})
 
 
 def read_function(graph: Graph, eps: float, function: Callable, *args: Any, **options: Any) -> Any:
-    """The results of a function at arrays of nodes.
+    """The results of a function on arrays, with nested lists of nodes for arrays.
 
     Args:
         graph: of all nodes.
         eps: of the numbers.
         function: of arrays, or of tuples of arrays.
-        args: its arguments, with lists of nodes, or of lists of them, in place of arrays.
+        args: its arguments, with (nested) lists of nodes for arrays.
         options: its keyword arguments without nodes.
     """
-    args = tuple(np.array(x, object) if type(x) in (list, tuple) else x for x in args)
-    leaves, tree = jax.tree.flatten(args)
+    leaves, tree = jax.tree.flatten(args, is_leaf=_is_array)
+    arrays = [np.array(x, object) for x in leaves]
     dtype = np.dtype("float64" if eps < DOUBLE else "float32")
-    shapes = tuple(x.shape for x in leaves)
+    shapes = tuple(x.shape for x in arrays)
     closed, results = _program(function, tuple(options.items()), tree, shapes, dtype)
-    found = [nodes(graph, x) for x in read(graph, closed, *leaves, once=ONCE)]
+    found = [nodes(graph, x).tolist() for x in read(graph, closed, *arrays, once=ONCE)]
     return jax.tree.unflatten(results, found)
+
+
+def _is_array(x: Any) -> bool:
+    return isinstance(x, list)
 
 
 @lru_cache(maxsize=256)

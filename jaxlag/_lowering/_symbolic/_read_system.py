@@ -53,11 +53,11 @@ def read_scene(key: Key) -> SymbolicSystem:
         terms = ArrayTerms(key.lagrangian, key.forces)
         (Q,) = read(graph, traced(key, terms.force, True), *state, *params, *inputs)
         force = [_node(graph, x) for x in Q]
-    bound = _constrained(key, graph, state, params, inputs) if _own(key) else None
+    bound = _constrained(key, graph, state, params, inputs) if _included(key) else None
     return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics)
 
 
-def _own(key: Key) -> tuple[AbstractConstraint, ...]:
+def _included(key: Key) -> tuple[AbstractConstraint, ...]:
     """The constraints in the equations; quasi-velocities satisfy Pfaffian ones by definition."""
     if key.quasi is None:
         return key.constraints
@@ -85,7 +85,7 @@ def _kinematics(key: Key, graph: Graph, state: list, params: list) -> Kinematics
 
 
 def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list) -> Constrained:
-    terms = ArrayTerms(key.lagrangian, key.forces, _own(key))
+    terms = ArrayTerms(key.lagrangian, key.forces, _included(key))
     (rates,) = read(graph, traced(key, terms.velocity, False), *state, *params)
 
     def position(t: Any, q: Any, v: Any, params: Any) -> Any:
@@ -95,15 +95,15 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
     m = rates.size
     layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
     every = layout.holonomic
-    own = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
-    kept = [graph.input("kept", k) for k in own] if layout.chooses else None
-    holonomic = [every[k] for k in own]
+    included = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
+    active_rows = [graph.input("active_rows", k) for k in included] if layout.chooses else None
+    holonomic = [every[k] for k in included]
     lam, reaction = [graph.input("lam", k) for k in range(m)], None
     sharing = None
     if any(map(reads_lam, key.forces)):
         chosen = np.flatnonzero(rows_that_forces_read(key, terms)).tolist()
-        if kept is not None and len(chosen) > 1 and not key.apart:
-            sharing = Sharing(chosen, [graph.input("there", k) for k in own])
+        if active_rows is not None and len(chosen) > 1 and not key.contact_rows_independent:
+            sharing = Sharing(chosen, [graph.input("nonzero", k) for k in included])
         code = traced(key, terms.reactive, True, m)
         (Q,) = read(graph, code, *state, *params, *inputs, _array(lam, (m,)))
         reaction = [_node(graph, x) for x in Q]
@@ -114,7 +114,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         [_node(graph, x) for x in rates],
         [_node(graph, x) for x in phi],
         holonomic,
-        kept,
+        active_rows,
         key.formulation,
         damping,
         key.regular,

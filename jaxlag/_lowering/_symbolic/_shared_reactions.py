@@ -19,33 +19,33 @@ class Sharing(NamedTuple):
 
     Attributes:
         chosen: indices of these rows.
-        there: for every row 1, or 0 if it is only rounding.
+        nonzero: for every row 1, or 0 if it is only rounding.
     """
 
     chosen: Sequence[int]
-    there: Sequence[Node]
+    nonzero: Sequence[Node]
 
 
-def _orthonormal_rows(A: Array, kept: Array) -> Any:
-    """With the kept rows as numbers, 1 or 0."""
-    return orthonormal_rows(jnp.where(kept[:, None] > 0.5, A, 0.0), kept > 0.5, 0.0)
+def _orthonormal_rows(A: Array, active_rows: Array) -> Any:
+    """With the active rows as numbers, 1 or 0."""
+    return orthonormal_rows(jnp.where(active_rows[:, None] > 0.5, A, 0.0), active_rows > 0.5, 0.0)
 
 
 def shared(
     graph: Graph,
     A: Sequence[Sequence[Node]],
     units: Sequence[Node],
-    kept: Sequence[Node],
+    active_rows: Sequence[Node],
     sharing: Sharing,
     eps: float,
 ) -> list[list[Node]]:
-    """The matrix from multipliers of the kept rows to those that forces read, m rows.
+    """The matrix from multipliers of the active rows to those that forces read, m rows.
 
     As `_independent_rows.shared`, with the same a_k, C, z and weights.
     """
     m, chosen = len(A), sharing.chosen
     zero, one, places = graph.zero, graph.one, range(len(chosen))
-    A = [[graph.mul(sharing.there[k], x) for x in A[k]] for k in chosen]
+    A = [[graph.mul(sharing.nonzero[k], x) for x in A[k]] for k in chosen]
     scaled = [[graph.mul(x, s) for x, s in zip(row, units, strict=True)] for row in A]
 
     def length(x: Sequence[Node]) -> Node:
@@ -60,7 +60,7 @@ def shared(
         [graph.let(graph.div(x, size)) for x in row]
         for row, size in zip(scaled, sizes, strict=True)
     ]
-    flags = [kept[k] for k in chosen]
+    flags = [active_rows[k] for k in chosen]
     L, Y = read_function(graph, eps, _orthonormal_rows, unit, flags)
     C, others, rounding = [], [], graph.const((ROUNDINGS * eps) ** 2)
     for row, flag in zip(unit, flags, strict=True):
@@ -94,8 +94,10 @@ def shared(
         shares = []
         for i in places:
             taken = [(graph.mul(C[k][i], z[k]), -1.0) for k in places]
-            own = [(flags[i], 1.0)] if i == j else []
-            shares.append(graph.let(graph.sum([*own, (graph.mul(others[i], z[i]), 1.0), *taken])))
+            diagonal = [(flags[i], 1.0)] if i == j else []
+            shares.append(
+                graph.let(graph.sum([*diagonal, (graph.mul(others[i], z[i]), 1.0), *taken]))
+            )
         # The total generalized force does not change.
         exerted = [graph.mul(flags[j], x) for x in unit[j]]
         left = without(graph, exerted, list(zip(shares, unit, strict=True)))

@@ -39,7 +39,7 @@ class Verification(NamedTuple):
     difference: float
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         """The result as text."""
         if not self.difference <= 1.0:
             if np.isinf(self.difference):
@@ -73,7 +73,7 @@ def compare(
     eps = float(jnp.finfo(key.dtype).eps)
     like, given = jax.tree.leaves(key.params.tree), jax.tree.leaves(key.inputs.tree)
 
-    def drawn(own: bool) -> float | None:
+    def drawn(from_known: bool) -> float | None:
         """The difference at one more state; None if there is nothing to compare."""
         t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
         params = [
@@ -82,7 +82,7 @@ def compare(
             else rng.integers(1, 4, leaf.shape).astype(leaf.dtype)
             for leaf in like
         ]
-        if own and known is not None:
+        if from_known and known is not None:
             params = [
                 np.asarray(x, np.float64 if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype)
                 for x in known
@@ -95,8 +95,8 @@ def compare(
         right = expected(t, q, v, params, inputs)
         if right is None:
             return None
-        values |= {("kept", k): float(x) for k, x in enumerate(right.kept)}
-        values |= {("there", k): 1.0 for k in range(len(right.kept))}
+        values |= {("active_rows", k): float(x) for k, x in enumerate(right.active_rows)}
+        values |= {("nonzero", k): 1.0 for k in range(len(right.active_rows))}
         roots = equations.accelerations
         if right.parts:
             roots = [*(x for row in equations.mass for x in row), *equations.bias]
@@ -122,10 +122,12 @@ def compare(
         return off if np.isfinite(off) else np.inf
 
     compared, worst = 0, 0.0
-    for own, wanted in ((True, STATES), (False, STATES // 2)) if known else ((False, STATES),):
+    for from_known, wanted in (
+        ((True, STATES), (False, STATES // 2)) if known else ((False, STATES),)
+    ):
         states, wanted = 0, max(wanted, LEAST - compared)
         for _ in range(DRAWS):
-            off = drawn(own)
+            off = drawn(from_known)
             if off is not None:
                 worst = max(worst, off)
                 states += bool(np.isfinite(off))
@@ -141,7 +143,7 @@ class _Right(NamedTuple):
     Attributes:
         x: the acceleration, or M, h and Q.
         allowed: allowed difference.
-        kept: rows used in solves.
+        active_rows: rows used in solves.
         defined: whether there is a value.
         parts: whether x is M, h, Q, A and gamma; with quasi-velocities B^T M B, B^T (h + M s - Q)
             and v.
@@ -149,7 +151,7 @@ class _Right(NamedTuple):
 
     x: np.ndarray
     allowed: Any
-    kept: Any = ()
+    active_rows: Any = ()
     defined: bool = True
     parts: bool = False
 
@@ -187,9 +189,9 @@ class _Plain:
         self.bound = []
         if key.constraints:
             self.bound = [traced(key, f, False) for f in (terms.rows, terms.gamma)]
-        self.felt, self.read = None, ()
+        self.reactive, self.read = None, ()
         if any(map(reads_lam, key.forces)):
-            self.felt, self.read = _slopes(key, terms), rows_that_forces_read(key, terms)
+            self.reactive, self.read = _slopes(key, terms), rows_that_forces_read(key, terms)
 
     def __call__(self, t: Any, q: Any, v: Any, params: list, inputs: list) -> _Right | None:
         n = self.key.size
@@ -202,24 +204,24 @@ class _Plain:
             right = Q + right
         if not (np.all(np.isfinite(M)) and np.all(np.isfinite(right))):
             return None if self.bound else _NONE
-        kept: Any = ()
+        active_rows: Any = ()
         if self.bound:
             (A, _), (gamma,) = (interpret(f, t, q, v, *params) for f in self.bound)
-            kept = _independent(A, self.read)
-            if not _definite(M if self.key.regular else _augmented(M, A[kept])):
-                return None if self.felt is not None else self._parts(v, M, h, Q, A, gamma)
+            active_rows = _independent(A, self.read)
+            if not _definite(M if self.key.regular else _augmented(M, A[active_rows])):
+                return None if self.reactive is not None else self._parts(v, M, h, Q, A, gamma)
             G = np.zeros((n, len(A)))
-            if self.felt is not None:
-                rest, G = interpret(self.felt, t, q, v, *params, *inputs, np.zeros(len(A)))
+            if self.reactive is not None:
+                rest, G = interpret(self.reactive, t, q, v, *params, *inputs, np.zeros(len(A)))
                 right = right + rest
-                G = G if np.all(kept) else G @ _as_read(A, kept, self.read)
-            M, right = _bordered(M, A[kept], right, gamma[kept], G[:, kept])
-            if self.felt is not None and not np.linalg.det(_pressing(M, n)) > 0:
+                G = G if np.all(active_rows) else G @ _as_read(A, active_rows, self.read)
+            M, right = _bordered(M, A[active_rows], right, gamma[active_rows], G[:, active_rows])
+            if self.reactive is not None and not np.linalg.det(_pressing(M, n)) > 0:
                 return None
         elif not _definite(M):
             return self._parts(v, M, h, Q)
         found = _solved(self.key, M, right)
-        return None if found is None else _Right(found[0][:n], found[1], kept)
+        return None if found is None else _Right(found[0][:n], found[1], active_rows)
 
     def _parts(self, v: Any, M: Any, *others: Any) -> _Right | None:
         """M, h, Q, A and gamma instead of the accelerations; None if one has no value."""
@@ -258,8 +260,8 @@ class _Quasi:
             if inverted is None:
                 return None
             v, allowed = inverted
-            (turn,) = interpret(self.drift, t, q, v, *params)
-            B, s = np.linalg.inv(theta), np.linalg.solve(theta, -turn)
+            (rate,) = interpret(self.drift, t, q, v, *params)
+            B, s = np.linalg.inv(theta), np.linalg.solve(theta, -rate)
         else:
             B, c = interpret(self.slopes, t, q, np.zeros_like(u), *params)
             v, (s,) = B @ u + c, interpret(self.drift, t, q, u, *params)
@@ -309,10 +311,10 @@ def _slopes(key: Key, terms: ArrayTerms) -> Any:
     """The jaxpr of (Q_0, G) of the forces Q_0 + G lam."""
 
     def affine(t: Any, q: Any, v: Any, params: Any, inputs: Any, lam: Any) -> Any:
-        def jvp_fn(lam: Any) -> Any:
+        def reaction(lam: Any) -> Any:
             return terms.reactive(t, q, v, params, inputs, lam)
 
-        return jvp_fn(lam), jax.jacfwd(jvp_fn)(lam)
+        return reaction(lam), jax.jacfwd(reaction)(lam)
 
     m = layout_of(key.constraints, key.params, key.static, key.size, key.dtype).size
     return traced(key, affine, True, m)
@@ -339,20 +341,20 @@ def _augmented(M: Any, A: Any) -> np.ndarray:
         return np.asarray(augmented(jnp.asarray(M), jnp.asarray(A))[0])
 
 
-def _as_read(A: Any, kept: np.ndarray, read: Sequence[bool]) -> np.ndarray:
-    """The matrix from multipliers of the kept rows to those that forces read, as numbers."""
+def _as_read(A: Any, active_rows: np.ndarray, read: Sequence[bool]) -> np.ndarray:
+    """The matrix from multipliers of the active rows to those that forces read, as numbers."""
     with jax.ensure_compile_time_eval():
-        rows, given = jnp.asarray(A), (jnp.asarray(kept), jnp.asarray(norm(A, axis=1) > 0))
+        rows, given = jnp.asarray(A), (jnp.asarray(active_rows), jnp.asarray(norm(A, axis=1) > 0))
         columns = [shared(rows, e, *given, read) for e in jnp.eye(len(A), dtype=rows.dtype)]
         return np.asarray(jnp.stack(columns, axis=1))
 
 
 def _independent(A: Any, read: Sequence[bool]) -> np.ndarray:
     """A largest set of clearly independent rows; rows that forces read come first."""
-    kept, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
+    active_rows, Y = np.zeros(len(A), bool), np.zeros((0, A.shape[1]))
     for k in sorted(range(len(A)), key=lambda k: bool(read) and not read[k]):
         rest = A[k] - (Y @ A[k]) @ Y
         size = norm(rest)
         if size > 1e-3 * norm(A[k]):
-            kept[k], Y = True, np.vstack([Y, rest / size])
-    return kept
+            active_rows[k], Y = True, np.vstack([Y, rest / size])
+    return active_rows
