@@ -53,7 +53,7 @@ class AbstractResult(eqx.Module):
             raise invalid("index", "belong to a batch", f"this is a single {kind}")
         key = index if isinstance(index, tuple) else (index,)
         if concrete(*key):
-            key = tuple(np.asarray(x) if isinstance(x, jax.Array) else x for x in key)
+            key = tuple(np.asarray(x) if isinstance(x, jax.Array | list) else x for x in key)
             try:
                 np.broadcast_to(0, batch)[key]
             except IndexError as error:

@@ -32,9 +32,9 @@ def test_batch_has_a_length_and_ends():
     assert bool(FOUR[0])
 
 
-@pytest.mark.parametrize("index", [4, -5, (0, 0), np.array([0, 4]), [1, 7], (3, 0), 0.5])
+@pytest.mark.parametrize("index", [4, -5, (3, 0), (0, 0, 0), np.array([0, 4]), [1, 7], 0.5])
 def test_index_beyond_a_batch_is_refused(index):
-    batch = GRID if index == (3, 0) else FOUR
+    batch = GRID if isinstance(index, tuple) else FOUR
     with pytest.raises(IndexError, match=r"`index` must select from a batch of shape \(.*it was"):
         batch[index]
 
@@ -51,6 +51,7 @@ def test_index_beyond_a_batch_is_refused(index):
         (2, 3),
         (None, 1),
         np.array([2, 0]),
+        [2, 0],
         jnp.array([2, 0]),
         (np.array([2, 0]), slice(None, 2)),
         np.array([True, False, True]),
