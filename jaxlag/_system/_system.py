@@ -50,6 +50,12 @@ class _Difference(eqx.Module):
         return self.kinetic(t, q, v, params) - self.potential(t, q, params)
 
 
+_FORMERLY_PUBLIC = {
+    *("terms", "rows", "structure", "power_terms", "in_u", "mass_regular", "contacts_apart"),
+    *("check_traceable", "quasi_reactions"),
+}
+
+
 class System(AbstractReactions):
     """A mechanical system given by its Lagrangian L(t, q, v, params).
 
@@ -296,6 +302,14 @@ class System(AbstractReactions):
         if not bool(jnp.all(jnp.isfinite(a))):
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
             raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _FORMERLY_PUBLIC:
+            raise AttributeError(
+                f"System.{name} is private now. Its results are in mass_matrix, bias, multipliers, "
+                "power and explain"
+            )
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def explain(self, params: Any) -> str:
         """Structure found in M a + h = Q of this system, and operations skipped by it, as text.

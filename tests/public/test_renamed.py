@@ -139,3 +139,10 @@ def test_multipliers_have_one_name():
     assert rest.multipliers == {}
     with pytest.raises(AttributeError, match=r"^Equilibrium\.lam is Equilibrium\.multipliers now$"):
         rest.lam  # noqa: B018
+
+
+def test_private_members_of_a_system_say_so():
+    with pytest.raises(AttributeError, match=r"^System\.terms is private now\. .* mass_matrix"):
+        SYSTEM.terms  # noqa: B018
+    with pytest.raises(AttributeError, match=r"^'System' object has no attribute 'masses'$"):
+        SYSTEM.masses  # noqa: B018
