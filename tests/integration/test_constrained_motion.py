@@ -180,20 +180,13 @@ def test_redundant_rows_change_nothing(motion):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    "system",
-    [
-        pytest.param(cartesian, id="independent"),
-        pytest.param(redundant, id="redundant"),
-    ],
-)
-def test_derivatives_along_consistent_starts_agree(system):
-    """fwd = rev = central differences in the chart of angles, with projection."""
+def test_derivatives_along_consistent_starts_agree():
+    """fwd = rev = central differences in angles, with redundant rows and projection."""
 
     def end(x):
         params = {**BOBS, "l1": x["l1"], "m2": x["m2"]}
         q0, v0 = to_cartesian(x["theta"], x["omega"], params)
-        found = jl.simulate(system, q0, v0, [0.0, 0.3, 0.7], params, dt=0.05, method="heun")
+        found = jl.simulate(redundant, q0, v0, [0.0, 0.3, 0.7], params, dt=0.05, method="heun")
         return jnp.concatenate([found.q[-1], found.v[1]])
 
     x = {"theta": THETA, "omega": OMEGA, "l1": jnp.array(0.9), "m2": jnp.array(0.6)}

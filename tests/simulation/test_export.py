@@ -63,7 +63,7 @@ def test_exported_adaptive_solves_agree(system, method):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("gradient", ["recorded", "checkpoints", "forward"])
+@pytest.mark.parametrize("gradient", ["recorded", "forward"])
 def test_exported_derivatives_agree(gradient):
     motion = end(PENDULUM, gradient=gradient, dt=0.05)
     agree(jax.grad(lambda g, ts: jnp.sum(motion(g, ts)[0])), [(3, 2), (20, 5)], rtol=1e-12)

@@ -244,5 +244,5 @@ def test_explain_of_batches_and_traces_is_refused():
     with pytest.raises(ValueError, match=r"^`explain` of a batch is not supported: its shape is"):
         batch.explain()
     for transform in (jax.jit, jax.grad):
-        with pytest.raises(ValueError, match="outside jit and vmap"):
+        with pytest.raises(ValueError, match="inside jit or vmap is not supported"):
             transform(lambda q0: len(solve(q0).explain()) * 1.0)(jnp.array([0.1]))
