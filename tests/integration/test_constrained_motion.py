@@ -13,7 +13,6 @@ from _systems.mechanisms import (
     SLIDER,
     THETA,
     bobs,
-    cartesian,
     double_pendulum,
     led_pendulum,
     led_start,
