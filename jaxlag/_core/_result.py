@@ -41,6 +41,10 @@ class AbstractResult(eqx.Module):
         """
         return (self._select(i) for i in range(len(self)))
 
+    def __contains__(self, name: object) -> bool:
+        """Names are those of the system."""
+        raise TypeError(f"`in` is not supported by {type(self).__name__}: see system.coordinates")
+
     def _select(self, index: Any) -> Any:
         """Results of a batch, by an index of its leading axes as for arrays.
 
@@ -52,8 +56,8 @@ class AbstractResult(eqx.Module):
         if not batch:
             raise invalid("index", "belong to a batch", f"this is a single {kind}")
         key = index if isinstance(index, tuple) else (index,)
-        if concrete(*key):
-            key = tuple(np.asarray(x) if isinstance(x, jax.Array | list) else x for x in key)
+        if concrete(*key) and all(isinstance(n, int) for n in batch):  # others are symbols
+            key = tuple(_indices(x) if isinstance(x, jax.Array | list) else x for x in key)
             try:
                 np.broadcast_to(0, batch)[key]
             except IndexError as error:
@@ -68,3 +72,8 @@ class AbstractResult(eqx.Module):
             return x[(*key, *rest)]
 
         return jax.tree.map(selected, self)
+
+
+def _indices(x: Any) -> np.ndarray:
+    """As an array of indices, if it is empty, too."""
+    return np.asarray(x) if np.size(x) else np.zeros(np.shape(x), int)

@@ -50,14 +50,14 @@ class TangentSpace(NamedTuple):
     """The tangent space A x = 0 and its complement, A = L Y with orthonormal rows Y.
 
     All in units of coordinates in which their inertias are 1. P = 1 - Y^T Y projects onto the
-    tangent space. A row that depends on others has NaN, or with `crossing` 0 in Y and infinity
-    in L.
+    tangent space. `independent` is False for rows that depend on those before them.
     """
 
     units: Float[Array, " n"]
     M: Float[Array, "n n"]
     L: tuple[tuple[Array, ...], ...]
     Y: Float[Array, "m n"]
+    independent: Bool[Array, " m"]
 
     def inertia(self) -> Float[Array, "n n"]:
         """P M P + s (1 - P), with the mean inertia s of the coordinates."""
@@ -114,7 +114,7 @@ class NullSpace(NamedTuple):
     @property
     def healthy(self) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
         """Pivots of coordinates and of rows that are positive to working precision."""
-        return self.mass.healthy, jnp.stack([row[-1] for row in self.space.L]) > 0
+        return self.mass.healthy, self.space.independent
 
 
 Factor = Multipliers | NullSpace
@@ -165,7 +165,7 @@ def row_weights(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, 
     inertias differ widely.
     """
     inertias = _diagonal(M)
-    inertial = inertias > 0
+    inertial = inertias > float(jnp.finfo(M.dtype).tiny)
     mobilities = jnp.where(inertial, 1.0 / jnp.where(inertial, inertias, 1.0), 0.0)
     mobility = jnp.sum(A**2 * mobilities[None], axis=1)
     square = jnp.sum(A**2, axis=1)
@@ -198,26 +198,42 @@ def tangent_space(
     A: Float[Array, "m n"],
     active_rows: Bool[Array, " m"] | None,
     crossing: bool,
+    rejected: float = 1.0,
 ) -> TangentSpace:
-    """Units of coordinates in which their inertias are 1, and orthonormal rows in them."""
+    """Units of coordinates in which their inertias are 1, and orthonormal rows in them.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        active_rows: rows to solve with; None for all.
+        crossing: whether rows that depend on those before them are left out.
+        rejected: norm of such a row otherwise; NaN makes all results NaN.
+    """
     units = units_of(M, A)
     M, A = units[:, None] * M * units[None], A * units[None]
-    return TangentSpace(units, M, *orthonormal_rows(A, active_rows, rank_floor(A.dtype), crossing))
+    norm = jnp.inf if crossing else rejected
+    L, Y, independent = orthonormal_rows(A, active_rows, rank_floor(A.dtype), norm)
+    return TangentSpace(units, M, L, Y, independent | crossing)
 
 
 def orthonormal_rows(
-    A: Float[Array, "m n"],
-    active_rows: Bool[Array, " m"] | None,
-    floor: float,
-    crossing: bool = False,
-) -> tuple[tuple[tuple[Array, ...], ...], Float[Array, "m n"]]:
-    """(L, Y), A = L Y, by Gram-Schmidt orthonormalization, each row twice ("twice is enough").
+    A: Float[Array, "m n"], active_rows: Bool[Array, " m"] | None, floor: float, rejected: float
+) -> tuple[tuple[tuple[Array, ...], ...], Float[Array, "m n"], Bool[Array, " m"]]:
+    """(L, Y, independent), A = L Y, by Gram-Schmidt orthonormalization.
 
-    Rows that are not active have 0 in Y and 1 in L. A row depends on those before it if the part
-    that they leave has a square of at most `floor` times that of the row.
+    Each row is orthogonalized twice ("twice is enough"). Rows that are not active have 0 in Y and 1
+    in L, and count as independent.
+
+    Args:
+        A: rows, 0 if not active.
+        active_rows: rows to solve with; None for all.
+        floor: a row is dependent if the part that the rows before it leave has a square of at most
+            this times that of the row.
+        rejected: norm of the part that is left of a dependent row.
     """
     L: list[tuple[Array, ...]] = []
     Y: list[Array] = []
+    independent: list[Array] = []
     for k in range(A.shape[0]):
         rest, parts = A[k], jnp.zeros((k,), A.dtype)
         for _ in range(2 if Y else 0):
@@ -225,13 +241,15 @@ def orthonormal_rows(
             part = before @ rest
             rest, parts = rest - part @ before, parts + part
         square = jnp.sum(rest**2)
-        independent = square > floor * jnp.sum(A[k] ** 2)
-        norm = jnp.sqrt(jnp.where(independent, square, jnp.inf if crossing else jnp.nan))
+        fine = square > floor * jnp.sum(A[k] ** 2)
+        norm = jnp.sqrt(jnp.where(fine, square, rejected))
         if active_rows is not None:
             norm = jnp.where(active_rows[k], norm, 1.0)
+            fine = fine | ~active_rows[k]
+        independent.append(fine)
         L.append((*parts, norm))
         Y.append(rest / norm)
-    return tuple(L), jnp.stack(Y)
+    return tuple(L), jnp.stack(Y), jnp.stack(independent)
 
 
 def masked(A: Array, active_rows: Bool[Array, " m"] | None) -> Array:

@@ -125,6 +125,9 @@ class QuasiVelocities(eqx.Module):
     ) -> Float[Array, " k"]:
         """u = U(t, q, v), shape (k,), in m/s or rad/s; without U the u with B u + c nearest to v.
 
+        The nearest u is accurate to rounding for rows of B of units up to 1e12 apart, in float32
+        1e6.
+
         Args:
             t: time, s.
             q: coordinates, shape (n,).

@@ -306,8 +306,8 @@ class System(AbstractReactions):
     def __getattr__(self, name: str) -> Any:
         if name in _FORMERLY_PUBLIC:
             raise AttributeError(
-                f"System.{name} is private now. Its results are in mass_matrix, bias, multipliers, "
-                "power and explain"
+                f"System.{name} is private now. Public are mass_matrix, bias, multipliers, power, "
+                "check and explain"
             )
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 

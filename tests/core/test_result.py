@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
 import jaxlag as jl
 from jaxlag._core._result import AbstractResult
@@ -52,6 +53,7 @@ def test_index_beyond_a_batch_is_refused(index):
         (None, 1),
         np.array([2, 0]),
         [2, 0],
+        [],
         jnp.array([2, 0]),
         (np.array([2, 0]), slice(None, 2)),
         np.array([True, False, True]),
@@ -71,6 +73,18 @@ def test_single_result_is_no_sequence():
         iter(one)
     with pytest.raises(ValueError, match="`index` must belong to a batch, but this is a single"):
         one[0]
+
+
+def test_names_are_not_members():
+    with pytest.raises(TypeError, match="`in` is not supported by Result"):
+        "x" in FOUR  # noqa: B015
+
+
+def test_batch_of_symbolic_size_is_indexed():
+    (k,) = export.symbolic_shape("k")
+    like = jax.ShapeDtypeStruct((k, 2), FOUR.x.dtype)
+    exported = export.export(jax.jit(lambda x: Result(x)[0].x))(like)
+    np.testing.assert_array_equal(exported.call(FOUR.x), FOUR.x[0])
 
 
 def test_traced_index_selects():

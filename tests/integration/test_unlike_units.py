@@ -204,7 +204,7 @@ def off_the_way(t, q, u, params):
 
 
 def test_velocities_outside_the_kinematics_are_projected():
-    """Tall kinematics take the nearest, relative to the lengths of rows; derivatives, too."""
+    """Tall kinematics take the nearest; derivatives, too."""
     quasi = jl.QuasiVelocities(kinematics=off_the_way, names=("a", "b"))
     v = jnp.array([1.0, 1.0, 1e3], jnp.float32)
 
@@ -212,8 +212,7 @@ def test_velocities_outside_the_kinematics_are_projected():
         return quasi.of(jnp.zeros(()), jnp.zeros(3, v.dtype), v, None)
 
     B = np.array([[1.0, 0.0], [2.0, 0.0], [300.0, 1e3]])
-    size = np.linalg.norm(B, axis=1)
-    slopes = np.linalg.pinv(B / size[:, None]) / size
+    slopes = np.linalg.pinv(B)
     np.testing.assert_allclose(of(v), slopes @ np.asarray(v, float), rtol=1e-6)
     for found in (jax.jacfwd(of)(v), jax.jacrev(of)(v)):
         np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-7)

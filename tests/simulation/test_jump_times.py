@@ -209,7 +209,9 @@ def test_jump_times_in_closures_give_a_warning():
         system = jl.System(spring, ("x",), forces=(law,))
         return jl.simulate(system, Q0, [0.1], TS, {"k": 2.0}).q[-1, 0]
 
-    with pytest.warns(UserWarning, match="Derivatives by a number that a declared function closes"):
+    with pytest.warns(
+        UserWarning, match="Derivatives with respect to a number that a declared function closes"
+    ):
         jax.grad(end)(1.0)
 
 

@@ -166,7 +166,8 @@ def _known(eqn: Any, operands: list) -> list:
     if name in SHIFTS:
         return [np.asarray(NUMPY[name](eqn, *operands))]
     if name == "iota" or _exact(eqn):
-        return equation(eqn, operands)
+        with np.errstate(all="ignore"):
+            return equation(eqn, operands)
     params = eqn.primitive.get_bind_params(eqn.params)
     with jax.ensure_compile_time_eval():
         found = eqn.primitive.bind(*operands, **params)
@@ -174,12 +175,19 @@ def _known(eqn: Any, operands: list) -> list:
 
 
 def _exact(eqn: Any) -> bool:
-    """Whether numpy's result is JAX's: integers, truth values, and conversions of them."""
+    """Whether numpy's result is JAX's: arithmetic of integers and truth values, conversions."""
+    name = eqn.primitive.name
+    if name not in _EXACT:
+        return False
     kinds = [v.aval.dtype for v in (*eqn.invars, *eqn.outvars)]
-    whole = [kind == np.bool_ or np.issubdtype(kind, np.integer) for kind in kinds]
-    if eqn.primitive.name == "convert_element_type":
+    whole = [kind == np.bool_ or jax.dtypes.issubdtype(kind, np.integer) for kind in kinds]
+    if name == "convert_element_type":
         return whole[0] or kinds[0] == kinds[1]
-    return all(whole) and eqn.primitive.name in _OF_INTEGERS & NUMPY.keys()
+    return all(whole) and (name != "select_n" or kinds[0] == np.bool_)
+
+
+_EXACT = {"add", "sub", "mul", "neg", "eq", "ne", "lt", "le", "gt", "ge", "max", "min"}
+_EXACT |= {"select_n", "reduce_sum", "cumsum", "convert_element_type"}
 
 
 def _check_kinds(eqn: Any, operands: list) -> None:

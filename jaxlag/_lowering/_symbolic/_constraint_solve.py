@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from jaxlag._linalg._kkt import TangentSpace, row_weights, tangent_space, units_of
@@ -242,8 +243,9 @@ def _null_space(
 
 
 def _tangent_space(M: Array, A: Array, active_rows: Array | None, crossing: bool) -> TangentSpace:
-    """With the active rows as numbers, 1 or 0."""
-    return tangent_space(M, A, None if active_rows is None else active_rows > 0.5, crossing)
+    """With the active rows as numbers, 1 or 0; NaN if a row is dependent."""
+    active_rows = None if active_rows is None else active_rows > 0.5
+    return tangent_space(M, A, active_rows, crossing, jnp.nan)
 
 
 def correction(

@@ -28,7 +28,8 @@ class Sharing(NamedTuple):
 
 def _orthonormal_rows(A: Array, active_rows: Array) -> Any:
     """With the active rows as numbers, 1 or 0."""
-    return orthonormal_rows(jnp.where(active_rows[:, None] > 0.5, A, 0.0), active_rows > 0.5, 0.0)
+    active = active_rows > 0.5
+    return orthonormal_rows(jnp.where(active[:, None], A, 0.0), active, 0.0, jnp.nan)[:2]
 
 
 def shared(
