@@ -137,7 +137,9 @@ def posed(ts: np.ndarray, exact: np.ndarray) -> MultipleShooting:
     data = (jl.Experiment(ts, {"theta": exact}, sigma={"theta": NOISE}),)
     shown = readers_of(PENDULUM, data, {}, TRUE)
     free, where = unknowns(TRUE, FREE, {}), layout(data, SEGMENTS)
-    return build_shooting(PENDULUM, data, where, free, shown, NO_PRIOR, squares, OPTIONS)[0]
+    return build_shooting(
+        PENDULUM, data, where, free, shown, NO_PRIOR, squares, OPTIONS["simulate_options"]
+    )[0]
 
 
 def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
@@ -151,7 +153,7 @@ def coverage(ts: np.ndarray, fits: int, seed: int = 0) -> np.ndarray:
 
     def one(values: Array, guess: FitVariables, join: Array) -> tuple[FitVariables, Array, Array]:
         own = eqx.tree_at(lambda x: x.segments.values, problem, values)
-        found = search(own, guess, join, jnp.asarray(1e-6), 50)
+        found = search(own, guess, join, jnp.full(2, 1e-6), 50)
         factor, by_z, _ = linearized(problem.free, found)
         root = by_z @ jnp.linalg.inv(factor)
         return found.guess, problem.free.numbers(found.guess.z), jnp.linalg.norm(root, axis=1)

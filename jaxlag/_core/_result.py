@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxlag._core._arrays import concrete
-from jaxlag._core._errors import invalid, requirement
+from jaxlag._core._errors import invalid, requirement, unsupported
 
 
 class AbstractResult(eqx.Module):
@@ -44,6 +44,16 @@ class AbstractResult(eqx.Module):
     def __contains__(self, name: object) -> bool:
         """Names are those of the system."""
         raise TypeError(f"`in` is not supported by {type(self).__name__}: see system.coordinates")
+
+    def require_single(self, what: str) -> None:
+        """Refuse `what` for a batch.
+
+        Raises:
+            ValueError: it is a batch.
+        """
+        if self.batch_shape:
+            reason, fix = f"its shape is {self.batch_shape}", "Take one of them, as batch[3]."
+            raise unsupported(f"`{what}` of a batch", reason, fix)
 
     def _select(self, index: Any) -> Any:
         """Results of a batch, by an index of its leading axes as for arrays.

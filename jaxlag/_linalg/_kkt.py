@@ -307,6 +307,36 @@ def solve_kkt(
     return jnp.where(fine, x, jnp.nan), jnp.where(fine, lam, jnp.nan)
 
 
+def correction_matrix(
+    M: Float[Array, "n n"],
+    A: Float[Array, "m n"],
+    active_rows: Bool[Array, " m"] | None,
+    formulation: str,
+    crossing: bool,
+    augment: bool,
+) -> tuple[Float[Array, "n m"], Float[Array, " m"]]:
+    """(M^-1 A^T (A M^-1 A^T)^-1, the diagonal of (A M^-1 A^T)^-1): effective masses of rows.
+
+    Args:
+        M: symmetric, positive definite where A x = 0.
+        A: rows.
+        active_rows: rows to solve with; None for all. The columns of the others are zero.
+        formulation: "multipliers" or "null_space".
+        crossing: as for `factor_kkt`; a row that is left out has mass 0.
+        augment: whether masses are those of M + A^T W A: rows without inertia would have none.
+    """
+    factor = factor_kkt(*jax.lax.stop_gradient((M, A)), active_rows, formulation, crossing)
+    weights = row_weights(*jax.lax.stop_gradient((M, masked(A, active_rows)))) if augment else None
+
+    def column(c: Array) -> tuple[Array, Array]:
+        load = jnp.zeros(A.shape[1:], A.dtype) if weights is None else (weights * c) @ A
+        x, lam = solve_kkt(M, A, load, c, active_rows, formulation, factor)
+        return -x, -lam
+
+    K, masses = jax.vmap(column, out_axes=1)(jnp.eye(A.shape[0], dtype=A.dtype))
+    return K, jnp.diagonal(masses)
+
+
 def solve_reactions(
     M: Float[Array, "n n"],
     A: Float[Array, "m n"],

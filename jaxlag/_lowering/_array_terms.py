@@ -13,9 +13,8 @@ from jaxtyping import Array, Bool, Float
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
 from jaxlag._linalg._kkt import (
     augmented,
-    factor_kkt,
+    correction_matrix,
     masked,
-    row_weights,
     solve_kkt,
     solve_reactions,
     units_of,
@@ -400,35 +399,22 @@ class ArrayTerms(eqx.Module):
     ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
         """The same, and the diagonal of (A M^-1 A^T)^-1.
 
-        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular: rows
-        without inertia would have no effective mass.
+        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular.
         """
         M = (
             self.mass(t, q, v, params)
             if getattr(constants, "mass", None) is None
             else constants.mass
         )
-        A, b = self.rows(t, q, v, params)
-        weights = None
+        A, _ = self.rows(t, q, v, params)
         if chosen is not None:
             if not self.regular:
                 M, _ = augmented(M, masked(A, active_rows))
             rows = np.array(chosen)
-            A, b = A[rows], b[rows]
-            active_rows = None if active_rows is None else active_rows[rows]
-        elif self.crossing and not self.regular:
-            A = masked(A, active_rows)
-            weights = jax.lax.stop_gradient(row_weights(M, A))
-        how = active_rows, self.formulation
-        factor = factor_kkt(*jax.lax.stop_gradient((M, A)), *how, self.crossing)
-
-        def column(c: Array) -> tuple[Array, Array]:
-            load = jnp.zeros_like(q) if weights is None else (weights * c) @ A
-            x, lam = solve_kkt(M, A, load, c, *how, factor)
-            return -x, -lam
-
-        K, masses = jax.vmap(column, out_axes=1)(jnp.eye(b.shape[0], dtype=q.dtype))
-        return K, jnp.diagonal(masses)
+            A, active_rows = A[rows], None if active_rows is None else active_rows[rows]
+        augment = chosen is None and self.crossing and not self.regular
+        how = self.formulation, self.crossing
+        return correction_matrix(M, A, active_rows, *how, augment)
 
     def _balance(
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], constants: Any

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._errors import unsupported
 from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 
@@ -69,12 +68,7 @@ class PerturbationGrowth(AbstractResult):
 
     def message(self) -> str:
         """The kind of growth along a single motion, and a remedy, as text."""
-        if self.ts.ndim != 1:
-            raise unsupported(
-                "`message` of a batch",
-                f"its shape is {self.ts.shape[:-1]}",
-                "Take one of them, as batch[3].",
-            )
+        self.require_single("message")
         status = Status(int(self.status))
         if status is not Status.ok:
             return f"{status.name}: the motion, or a segment of it, could not be computed."

@@ -23,12 +23,7 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         t: times.
         solve: `simulate`.
     """
-    if motion.ts.ndim != 1:
-        raise unsupported(
-            "`at` of a batch",
-            f"its shape is {motion.ts.shape[:-1]}",
-            "Take one of them, as batch[3].",
-        )
+    motion.require_single("at")
     if not concrete(motion.ts, motion.q, t):
         raise unsupported("`at` inside jit, vmap or a derivative", "it needs concrete values", _ASK)
     if motion.tolerances is None:

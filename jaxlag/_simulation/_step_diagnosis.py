@@ -117,12 +117,7 @@ def explain(motion: AbstractSolution) -> str:
     Raises:
         ValueError: a batch of motions, or a traced one.
     """
-    if motion.ts.ndim != 1:
-        raise unsupported(
-            "`explain` of a batch",
-            f"its shape is {motion.ts.shape[:-1]}",
-            "Take one of them, as batch[3].",
-        )
+    motion.require_single("explain")
     if not concrete(motion.status, motion.q, motion.last_time, motion.ts):
         raise unsupported(
             "`explain` inside jit or vmap", "it needs concrete values, and the motion is traced"

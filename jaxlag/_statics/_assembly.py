@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlag._core._errors import shortened, unsupported
+from jaxlag._core._errors import shortened
 from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 from jaxlag._model._constraints import ConstraintRows
@@ -54,12 +54,7 @@ class Assembly(AbstractResult):
     @property
     def dependent(self) -> tuple[str, ...]:
         """Names of the rows that depend on the others, for a single assembly."""
-        if self.independent.ndim != 1:
-            raise unsupported(
-                "`dependent` of a batch",
-                f"its shape is {self.q.shape[:-1]}",
-                "Take one of them, as batch[3].",
-            )
+        self.require_single("dependent")
         return tuple(
             name
             for name, independent in zip(self._rows.labels, self.independent, strict=True)
@@ -68,12 +63,7 @@ class Assembly(AbstractResult):
 
     def message(self) -> str:
         """How a single assembly ended, as text."""
-        if self.q.ndim != 1:
-            raise unsupported(
-                "`message` of a batch",
-                f"its shape is {self.q.shape[:-1]}",
-                "Take one of them, as batch[3].",
-            )
+        self.require_single("message")
         status = Status(int(self.status))
         if status is Status.ok:
             more = f"; dependent rows: {', '.join(self.dependent)}" if self.dependent else ""

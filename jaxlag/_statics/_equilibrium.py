@@ -14,7 +14,7 @@ from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import keeping_rules
-from jaxlag._core._errors import EquilibriumError, invalid, shortened, unsupported
+from jaxlag._core._errors import EquilibriumError, invalid, shortened
 from jaxlag._core._result import AbstractResult
 from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import least_norm
@@ -149,12 +149,7 @@ class Equilibrium(AbstractResult):
 
     def message(self) -> str:
         """How a single search ended, as text."""
-        if self.q.ndim != 1:
-            raise unsupported(
-                "`message` of a batch",
-                f"its shape is {self.q.shape[:-1]}",
-                "Take one of them, as batch[3].",
-            )
+        self.require_single("message")
         labels = self.system.coordinates.labels
         status = Status(int(self.status))
         if status is Status.ok:
