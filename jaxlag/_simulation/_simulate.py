@@ -15,15 +15,20 @@ from jaxlag._core._arguments import renamed, required
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
+from jaxlag._gradient._differentiable_solve import solve
 from jaxlag._gradient._modes import capacity_for
-from jaxlag._gradient._solve import solve
 from jaxlag._integration._initial_conditions import rows_hold_after
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, check_inputs, check_range
-from jaxlag._simulation._arguments import (
+from jaxlag._simulation._compile_log import timed
+from jaxlag._simulation._error_estimate import LEFT, check_estimate, finer, with_error
+from jaxlag._simulation._failure import final_status
+from jaxlag._simulation._jump_times import Jumps, warned
+from jaxlag._simulation._methods import FINER, IMPLICIT, METHODS, choose, name_of
+from jaxlag._simulation._option_checks import (
     check_change_points,
     check_formulation,
     check_longest,
@@ -34,11 +39,6 @@ from jaxlag._simulation._arguments import (
     check_times,
     check_tolerances,
 )
-from jaxlag._simulation._compile_log import timed
-from jaxlag._simulation._error_estimate import LEFT, check_estimate, finer, with_error
-from jaxlag._simulation._failure import final_status
-from jaxlag._simulation._jump_times import Jumps, warned
-from jaxlag._simulation._methods import FINER, IMPLICIT, METHODS, choose, name_of
 from jaxlag._simulation._problem import ProgramKey, Values, build_problem, velocities_at
 from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._sharding import check_placement

@@ -14,7 +14,7 @@ from numpy.polynomial import legendre
 
 from jaxlag._core._errors import invalid
 from jaxlag.solvers._fixed import AbstractFixedStep
-from jaxlag.solvers._root import root
+from jaxlag.solvers._implicit_step import root
 
 
 class Pair(NamedTuple):
