@@ -106,6 +106,21 @@ def name_sequence(argument: str, x: Any, fix: str | None = None) -> tuple[str, .
     return tuple(x)
 
 
+def by_name(argument: str, x: Any, example: str = "") -> dict[str, Any]:
+    """`x`, a dict by name, or None for an empty one; raises with the argument's name otherwise.
+
+    Args:
+        argument: its name in errors.
+        x: anything.
+        example: code of a value, for the error.
+    """
+    if x is None or isinstance(x, Mapping):
+        return dict(x or {})
+    own = argument.rpartition(": ")[2]
+    fix = f"Write {own}={{'name': {example}}}." if example else ""
+    raise invalid(argument, "be a dict by name", f"it was {x!r}", fix)
+
+
 def former_names(module: str, present: Mapping[str, str]) -> Callable[[str], object]:
     """A module's `__getattr__` that refuses former names and says the present ones.
 

@@ -34,7 +34,7 @@ def real(argument: str, x: Any) -> Array:
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
 
 
-def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
+def number(argument: str, must: str, x: Any, dtype: Any, fix: str = "") -> Array:
     """`x` as a scalar of this dtype, finite if its value is known; raises otherwise.
 
     Args:
@@ -42,13 +42,14 @@ def number(argument: str, must: str, x: Any, dtype: Any) -> Array:
         must: the requirement, in words.
         x: anything.
         dtype: of the result.
+        fix: what to do with an array.
     """
     try:
         x = jnp.asarray(x, dtype)
     except (TypeError, ValueError) as error:
         raise invalid(argument, must, f"it was {x!r}") from error
     if x.ndim != 0:
-        raise invalid(argument, must, f"its shape was {x.shape}")
+        raise invalid(argument, must, f"its shape was {x.shape}", fix)
     if concrete(x) and not np.isfinite(x):
         raise invalid(argument, "be finite", f"it was {x}")
     return x
@@ -66,13 +67,13 @@ def of_state(argument: str, *arrays: Array) -> list[Array]:
 
     In half precision the rounding of a motion is several percent, for all steps.
     """
-    state = common(*arrays)
-    dtype = state[0].dtype
-    if jnp.finfo(dtype).bits < 32:
-        was = f"{dtype.name} has {jnp.finfo(dtype).precision} digits at most"
+    kinds = [x.dtype for x in arrays]
+    if all(jnp.finfo(kind).bits < 32 for kind in kinds):
+        digits = max(kinds, key=lambda kind: jnp.finfo(kind).precision)
+        was = f"{digits.name} has {jnp.finfo(digits).precision} digits at most"
         fix = f"Write {argument.replace(',', ' ').split()[0]}.astype(float)."
         raise invalid(argument, "be float32 or float64", was, fix)
-    return state
+    return common(*arrays)
 
 
 def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:

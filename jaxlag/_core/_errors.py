@@ -8,6 +8,8 @@ _MANY = 8
 _EXPRESSION = re.compile(r"[A-Za-z_]\w*(\.\w+|\[[^\]]+\])*(=\S+)?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?j?|nan|inf|True|False")
 _ONLY_NUMBERS = re.compile(r"[-+\d.eEjnaifTruFls,\s\[\]]*")
+_TRACER = re.compile(r"\b\w*Tracer\(")
+_SHAPE = re.compile(r"\b[a-z]+\d*\[[^\]]*\]")
 _QUOTED = re.compile(r"(`[^`\n]*`|'[^'\n]*'|\"[^\"\n]*\")")
 
 
@@ -69,10 +71,23 @@ def unsupported(what: str, why: str, fix: str = "") -> ValueError:
 def shortened(text: Any) -> str:
     """The text; of arrays of more than 8 numbers the first and the last three alone.
 
-    Quoted parts, such as lines of code, stay as they are.
+    Quoted parts, such as lines of code, stay as they are. JAX's names of traced values are replaced
+    by their shapes.
     """
-    parts = _QUOTED.split(str(text))
+    parts = _QUOTED.split(_without_tracers(str(text)))
     return "".join(part if k % 2 else _without_arrays(part) for k, part in enumerate(parts))
+
+
+def _without_tracers(text: str) -> str:
+    """The text with "a traced float64[2]" in the place of "JitTracer(float64[2])"."""
+    while (found := _TRACER.search(text)) is not None:
+        begin, end, depth = found.start(), found.end(), 1
+        while depth and end < len(text):
+            depth += {"(": 1, ")": -1}.get(text[end], 0)
+            end += 1
+        shape = _SHAPE.search(text, begin, end)
+        text = f"{text[:begin]}a traced {shape[0] if shape else 'value'}{text[end:]}"
+    return text
 
 
 def _without_arrays(text: str) -> str:

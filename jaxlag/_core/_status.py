@@ -47,7 +47,9 @@ ADVICE = {
         "input knot at its time, atol = 0 where a component is 0, or a tolerance below the "
         "rounding of the dtype."
     ),
-    Status.nonfinite: "The Lagrangian or a force is not finite there: check its domain.",
+    Status.nonfinite: (
+        "The Lagrangian, a force or a constraint is not finite there: check its domain."
+    ),
     Status.mass_singular: (
         "The mass matrix d2L/dv2 is not positive definite there: give this coordinate inertia, "
         "or drop it."
@@ -91,8 +93,9 @@ ADVICE = {
 ADVICE_FIXED = {
     Status.max_steps: "Raise max_steps, lengthen dt, or shorten ts.",
     Status.nonfinite: (
-        "The Lagrangian or a force is not finite there: check its domain, and whether dt is short "
-        "compared with the fastest motion. If dt is too long, the solution grows without bound."
+        "The Lagrangian, a force or a constraint is not finite there: check its domain, and "
+        "whether dt is short compared with the fastest motion. If dt is too long, the solution "
+        "grows without bound."
     ),
     Status.projection_failed: (
         "The state was too far from this constraint to be projected: reduce dt."

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
+from numbers import Number
 from typing import Any, final
 
 import equinox as eqx
@@ -29,7 +30,8 @@ class Experiment(eqx.Module):
             all computed. `inputs` may also be a function of the params to such a dict, if times or
             values of tables, or knots, depend on them: a delay, the time of a switch.
         sigma: standard deviation of the noise, in the channels' units: name -> number, (s,) or
-            (s, k). For other channels it is estimated from the residuals.
+            (s, k); or one number for all channels. For channels without, it is estimated from the
+            residuals.
         q0: coordinates at ts[0], (n,), or at all of ts, (s, n), m or rad: the initial guess.
             Without it the coordinates must be among the channels.
         v0: velocities, (n,) or (s, n); for systems with quasi-velocities these, one for each
@@ -70,7 +72,7 @@ class Experiment(eqx.Module):
         channels: Mapping[str, Any],
         *,
         inputs: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]] | None = None,
-        sigma: Mapping[str, Any] | None = None,
+        sigma: Mapping[str, Any] | float | int | None = None,
         q0: Any = None,
         v0: Any = None,
         start_sigma: Any = None,
@@ -91,7 +93,7 @@ class Experiment(eqx.Module):
             self.inputs = check_inputs(inputs)
             check_range(self.inputs, self.ts, f"ts of {name}")
         self.sigma = {}
-        for key, x in (sigma or {}).items():
+        for key, x in _by_channel(name, sigma, self.channels).items():
             if key not in self.channels:
                 known = sorted(self.channels)
                 raise invalid(f"{name}: sigma", f"name channels among {known}", f"one was {key!r}")
@@ -191,6 +193,17 @@ def _times(name: str, ts: Any) -> np.ndarray:
             f"{name}: ts", "increase strictly", was, "Sort the samples, drop repeated ones."
         )
     return ts
+
+
+def _by_channel(name: str, sigma: Any, channels: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Sigma by the name of the channel."""
+    if sigma is None or isinstance(sigma, Mapping):
+        return sigma or {}
+    if np.ndim(sigma) or not isinstance(sigma, Number):
+        must = "be one number for all channels, or a dict by their names"
+        fix = f"Write sigma={{{next(iter(channels))!r}: ...}}."
+        raise invalid(f"{name}: sigma", must, f"it was {sigma!r}", fix)
+    return dict.fromkeys(channels, sigma)
 
 
 def _channel(name: str, key: str, x: Any, count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._arguments import positive_integer, renamed
+from jaxlag._core._arguments import by_name, positive_integer, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._descent import Descent, descend
 from jaxlag._fit._experiment import Experiment
@@ -30,6 +30,7 @@ from jaxlag._fit._setup import (
     FORMER,
     NO_OPTIONS,
     build_shooting,
+    check_known_params,
     check_search,
     estimated_noise,
     experiments_of,
@@ -148,14 +149,15 @@ def fit(
     _check(system, segments, loss, optimizer)
     check_search(rtol, atol, max_steps)
     options = plain_options(simulate_options, "jl.fit")
-    unknown = unknowns(params0, free, dict(transforms or {}))
-    own = dict(channels or {})
-    check_keys(params0)
+    own = by_name("channels", channels, "lambda motion: motion['theta']")
+    check_known_params("fit", system, experiments, "params0", params0)
+    transforms = by_name("transforms", transforms, "jl.transforms.Positive()")
+    unknown = unknowns(params0, free, transforms)
     check_keys(own, "channels")
     warn_of_changes(system, *(each.inputs for each in experiments))
     shown = readers_of(system, experiments, own, params0)
     where = layout(experiments, segments)
-    prior = prior_rows(unknown, dict(priors or {}))
+    prior = prior_rows(unknown, by_name("priors", priors, "jl.Prior(mean, sigma)"))
     if optimizer is None:
         _count(experiments, len(unknown.u0), len(prior[0]), start_freedom(system, params0))
     _warn_before(experiments, unknown)

@@ -233,6 +233,8 @@ def unknowns(params0: Any, free: Sequence[str], transforms: Mapping[str, Any]) -
     k = 0
     for i in sorted(chosen):
         value = np.asarray(values[i])
+        if not np.all(np.isfinite(value)):
+            raise invalid(f"params0[{names[i]!r}]", "be finite", f"it was {values[i]}")
         transform = transforms.get(names[i], Free())
         u, bound = transform.start(names[i], value)
         on_bound += [names[i]] * bound

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlag._core._arguments import renamed
+from jaxlag._core._arguments import by_name, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._fit._experiment import Experiment
@@ -23,6 +23,7 @@ from jaxlag._fit._setup import (
     FORMER,
     NO_OPTIONS,
     build_shooting,
+    check_known_params,
     check_search,
     experiments_of,
     plain_options,
@@ -133,8 +134,8 @@ def predict(
     experiments = experiments_of(experiments)
     options = plain_options(simulate_options, "jl.predict")
     check_search(rtol, atol, max_steps)
-    own = dict(channels or {})
-    check_keys(params)
+    own = by_name("channels", channels, "lambda motion: motion['theta']")
+    check_known_params("predict", system, experiments, "params", params)
     check_keys(own, "channels")
     warn_of_changes(system, *(each.inputs for each in experiments))
     fewest = start_freedom(system, params)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxlag._core._arguments import name_sequence, renamed
+from jaxlag._core._arguments import by_name, name_sequence, renamed
 from jaxlag._core._errors import invalid
 from jaxlag._fit._experiment import Experiment
 from jaxlag._fit._fit import fit
@@ -53,7 +53,8 @@ class Candidate(eqx.Module):
             raise invalid("Candidate: forces", "be one force or more", f"they were {forces!r}", fix)
         self.forces = forces
         self.params0 = dict(params0 or {})
-        self.transforms, self.priors = dict(transforms or {}), dict(priors or {})
+        self.transforms = by_name("Candidate: transforms", transforms, "jl.transforms.Positive()")
+        self.priors = by_name("Candidate: priors", priors, "jl.Prior(mean, sigma)")
 
 
 class Ranked(NamedTuple):
@@ -179,11 +180,13 @@ def select_model(
     experiments, held_out = experiments_of(experiments), experiments_of(held_out)
     _check(system, params0, candidates, most, free)
     _check_fit_options(fit_options)
+    given = by_name("transforms", transforms, "jl.transforms.Positive()")
+    known = by_name("priors", priors, "jl.Prior(mean, sigma)")
     models = []
     for count in range(most + 1):
         for names in combinations(candidates, count):
             terms = [candidates[name] for name in names]
-            params, transform, prior = dict(params0), dict(transforms or {}), dict(priors or {})
+            params, transform, prior = dict(params0), dict(given), dict(known)
             for term in terms:
                 params |= term.params0
                 transform |= term.transforms

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._core._arguments import positive_integer
-from jaxlag._core._errors import invalid
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid, unsupported
 from jaxlag._core._status import Status
 from jaxlag._fit._covariance import effective_parameters
 from jaxlag._fit._experiment import Experiment
@@ -22,7 +23,9 @@ from jaxlag._fit._multiple_shooting import MultipleShooting, SearchResult
 from jaxlag._fit._residuals import Reader, readers, squares
 from jaxlag._fit._segments import SegmentLayout, pack
 from jaxlag._simulation._simulate import simulate
+from jaxlag._system._closure_tracers import check_params
 from jaxlag._system._system import System
+from jaxlag._tracing._params import check_keys
 
 OURS = ("save", "throw", "inputs", "q0", "v0", "u0", "ts", "params", "estimate_error")
 """Arguments of `simulate` that a fit sets itself."""
@@ -70,6 +73,24 @@ def check_search(rtol: Any, atol: Any, max_steps: Any) -> None:
         if not isinstance(value, int | float | np.number) or not 0 < value < 1:
             raise invalid(name, "be a number between 0 and 1", f"it was {value!r}")
     positive_integer("max_steps", max_steps)
+
+
+def check_known_params(
+    by: str, system: System, experiments: Sequence[Experiment], argument: str, params: Any
+) -> None:
+    """Raise on params that are traced, or not finite where a declared function reads them.
+
+    Also on objects that cannot be part of a program's key.
+
+    Raises:
+        ValueError: with the path of the leaf.
+    """
+    if not concrete(params):
+        why = "its search runs outside of compiled programs"
+        raise unsupported(f"`{by}` inside jit, vmap and grad", why, "Call it outside of these.")
+    check_keys(params, argument)
+    inputs = experiments[0].inputs_at(params)
+    check_params(system, params, jnp.zeros(system.size), inputs, argument)
 
 
 def plain_options(options: Mapping[str, Any], by: str) -> dict[str, Any]:

@@ -4,6 +4,9 @@ import math
 from enum import IntEnum
 from typing import Any
 
+import numpy as np
+
+from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 
 MODES = ("auto", "forward", "recorded", "checkpoints")
@@ -22,6 +25,28 @@ class GradientMode(IntEnum):
     forward = 1
     recorded = 2
     checkpoints = 3
+
+
+def most_steps(max_steps: int, ts: Any, dt: Any, knots: Any) -> int:
+    """Bound on the steps of a motion, for the size of its record.
+
+    It is `max_steps`, or less if ts and the fixed step dt have values: the steps of this length in
+    the span of ts, one more for each knot, and two for rounding. This is rounded up to a power of
+    2, at least 64, so that few programs serve all steps and times.
+
+    Args:
+        max_steps: bound given by the user.
+        ts: save times, s.
+        dt: fixed step, s; None for adaptive steps.
+        knots: times at which steps must end, s; None for none.
+    """
+    if dt is None or not concrete(ts, dt):
+        return max_steps
+    steps = abs(float(ts[-1]) - float(ts[0])) / float(dt)
+    if not steps < max_steps:
+        return max_steps
+    most = math.ceil(steps) + 2 + (0 if knots is None else np.shape(knots)[0])
+    return min(max_steps, 1 << max(6, (most - 1).bit_length()))
 
 
 def capacity_for(

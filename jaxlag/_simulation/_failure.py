@@ -32,12 +32,15 @@ class Ending(NamedTuple):
         where: index of the coordinate or constraint row concerned; -1 if none is known.
         tried: end of the last attempted step, s.
         state: (q, v), or (q, u), of the last good state.
+        lost: (time, (q, v)) where the equations are not finite; None unless `diagnose_failure` has
+            examined the ending. If they are finite everywhere, the last good time and state.
     """
 
     status: Int[Array, "*batch"]
     where: Int[Array, "*batch"]
     tried: Float[Array, "*batch"]
     state: Float[Array, "*batch m"]
+    lost: tuple[Float[Array, "*batch"], Float[Array, "*batch k"]] | None = None
 
 
 _PARTS = np.array([0.0, *[1.0] * 32, *2.0 ** np.arange(1, 7)]) / 32
@@ -170,6 +173,8 @@ def _explained(
     last = ending.state[: ahead.shape[0]]
     args = dynamics.within(args, time)
     found, tau, y = _lost(dynamics, time, tried, ending.state, args, unexplained, scene.implicit)
+    place = jnp.where(found, tau, time), jnp.where(found, y, ending.state)
+    t_lost, q_lost, v_lost, _ = dynamics.state(*place, args)
     tried = jnp.where(found, tau, tried)
     ahead = jnp.where(found, y[: ahead.shape[0]], ahead)
     # Both states in one batch: the terms are traced and compiled once.
@@ -220,7 +225,8 @@ def _explained(
     where = ending.where
     for kind, index in concerns.items():
         where = jnp.where(status == int(kind), index.astype(jnp.int32), where)
-    return ending._replace(status=status.astype(jnp.int32), where=where)
+    at = t_lost, jnp.concatenate([q_lost, v_lost])
+    return ending._replace(status=status.astype(jnp.int32), where=where, lost=at)
 
 
 def _turned(
@@ -306,22 +312,24 @@ def _lost(
 def _culprits(
     dynamics: VectorField, tau: Array, y: Array, args: Arguments
 ) -> tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """Coordinates (without inertia, with nonfinite Q - h, with the largest |a|).
+    """Coordinates (without inertia, with nonfinite M or Q - h, with the largest |a|).
 
-    -1 if there is none.
+    -1 if there is none. If M or the constraint rows are not finite, none is without inertia.
     """
     M, effort = dynamics.mass(tau, y, args), dynamics.effort(tau, y, args)
+    # A nonfinite component spreads through the solve: it is searched before.
+    finite = jnp.isfinite(effort) & jnp.all(jnp.isfinite(M), axis=0)
+    known = jnp.all(jnp.isfinite(M))
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
-        A = jnp.where(jnp.isfinite(A), A, 0.0)  # a nonfinite A is no failure of M
+        known = known & jnp.all(jnp.isfinite(A))
         M, _ = augmented(M, masked(A, args.active_rows))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
-    # A nonfinite component spreads through the solve: it is searched before.
-    finite = jnp.isfinite(effort)
     lost = jnp.where(jnp.all(finite), -1, jnp.argmin(finite))
     worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
-    return first_unhealthy(M, factor), lost.astype(jnp.int32), worst.astype(jnp.int32)
+    massless = jnp.where(known, first_unhealthy(M, factor), -1)
+    return massless.astype(jnp.int32), lost.astype(jnp.int32), worst.astype(jnp.int32)
 
 
 def _dependent(

@@ -1,5 +1,6 @@
 """Checks of the arguments of `simulate`, before compilation."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -256,6 +257,16 @@ def check_step(dt: Any, dt0: Any) -> Any:
         raise invalid("dt and dt0", "not both be given", "both were given")
     name, step = ("dt", dt) if dt is not None else ("dt0", dt0)
     return None if step is None else _positive(name, step)
+
+
+def warn_of_long_step(dt: Any, ts: Any) -> None:
+    """Warn if a fixed step is longer than the motion."""
+    if dt is None or not concrete(dt, ts):
+        return
+    dt, span = float(dt), abs(float(ts[-1]) - float(ts[0]))
+    if dt > span * (1 + 1e-6):
+        text = f"`dt` = {dt:g} s is longer than ts, {span:g} s: the motion is one shorter step."
+        warnings.warn(text, UserWarning, stacklevel=5)  # below simulate and its two decorators
 
 
 def _positive(name: str, step: Any) -> Any:

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxlag._core._by_name import ByName
+from jaxlag._model._inputs import evaluate
 from jaxlag._system._system import System
 
 Quantity = Callable[..., Any]
@@ -20,6 +22,10 @@ def _without_inputs(method: Quantity) -> Quantity:
     return quantity
 
 
+def _input_values(system: System, q: Any, v: Any, params: Any, *, t: Any, inputs: Any) -> ByName:
+    return ByName(evaluate(inputs, t, q, v, params).peek())
+
+
 QUANTITIES: dict[str, Quantity] = {
     "a": System.acceleration,
     "u": _without_inputs(System.quasi_velocities),
@@ -31,6 +37,7 @@ QUANTITIES: dict[str, Quantity] = {
     "multipliers": System.multipliers,
     "constraint_force": System.constraint_force,
     "Q": System.generalized_force,
+    "input_values": _input_values,
 }
 """Quantities of one state, by their names in `save=` and the Solution."""
 

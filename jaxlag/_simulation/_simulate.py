@@ -16,7 +16,7 @@ from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._gradient._differentiable_solve import solve
-from jaxlag._gradient._modes import capacity_for
+from jaxlag._gradient._modes import capacity_for, most_steps
 from jaxlag._integration._initial_conditions import rows_hold_after
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers
@@ -38,6 +38,7 @@ from jaxlag._simulation._option_checks import (
     check_step,
     check_times,
     check_tolerances,
+    warn_of_long_step,
 )
 from jaxlag._simulation._problem import ProgramKey, Values, build_problem, velocities_at
 from jaxlag._simulation._quantities import at_saves
@@ -158,12 +159,14 @@ def simulate(
             `TimeFunction` or of explicit time) that is shorter than a step may lie between two of
             its stages and be missed: set dt_max to its length, or make its begin and end knots
             (`TimeFunction(f, knots=)`).
-        max_steps: bound on attempted steps. Derivatives keep a record of this many steps.
+        max_steps: bound on attempted steps. Derivatives keep a record of this many steps, 8 bytes
+            each; of as many as there are in ts if dt and ts have values. In a loop over many short
+            motions set it near the number of steps that one of them takes.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
-            "potential", "Q", "power", "multipliers", "constraint_force". The Solution also computes
-            these on demand. "work", the integral of each term of dH/dt since ts[0], exists only
-            here. It is integrated with the motion, and its local error is bounded like that of q
-            and v.
+            "potential", "Q", "power", "multipliers", "constraint_force", "input_values". The
+            Solution also computes these on demand. "work", the integral of each term of dH/dt since
+            ts[0], exists only here. It is integrated with the motion, and its local error is
+            bounded like that of q and v.
         gradient: a hint on the cost of reverse derivatives, never on their value.
             "recorded" keeps the state at the start of every step. "checkpoints" keeps about the
             square root as many and repeats the steps between two of them: one more solve. "forward"
@@ -230,6 +233,7 @@ def simulate(
     check_range(inputs, ts)
     rtol, atol = check_tolerances(system, method, rtol, atol, q0.dtype)
     step, longest = check_step(dt, dt0), check_longest(dt, dt_max)
+    warn_of_long_step(dt, ts)
     check_params(system, params, q0, inputs)
     check_placement("simulate", (q0, v0, u0, ts, params, inputs))
     asked = formulation
@@ -257,6 +261,9 @@ def simulate(
     size = 2 * system.size
     if gradient_memory is not None and "work" in save:
         size += len(system._power_terms(params, q0.dtype).names)
+    knots = all_knots(inputs)
+    if not concrete(q0, v0, u0, params_traced, inputs_traced):  # there may be derivatives
+        max_steps = most_steps(max_steps, ts, dt, knots)
     stepper_traced, stepper_static = eqx.partition(stepper, _params.is_array)
     plan = ProgramKey(
         system=system,
@@ -280,7 +287,7 @@ def simulate(
             ts.shape[0],
             size,
             q0.dtype.itemsize,
-            all_knots(inputs) is not None,
+            knots is not None,
         ),
         change_points=change_points,
         auto=method == "auto" and "work" not in save,

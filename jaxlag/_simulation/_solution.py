@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arrays import concrete, stop_gradient
+from jaxlag._core._by_name import ByName, no_attribute
 from jaxlag._core._errors import SimulationError, invalid, shortened, unsupported
 from jaxlag._core._status import CONCERNS_ROW, Status
 from jaxlag._model._constraints import Baumgarte
@@ -17,8 +18,15 @@ from jaxlag._simulation._failure import Ending, MotionKey, diagnose_failure, is_
 from jaxlag._simulation._methods import METHODS
 from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._resolve_between import states_at
-from jaxlag._simulation._solution_views import as_dataset, as_dict, counted, described, plotted
-from jaxlag._simulation._step_diagnosis import advice, explain
+from jaxlag._simulation._solution_views import (
+    ELSEWHERE,
+    as_dataset,
+    as_dict,
+    counted,
+    described,
+    plotted,
+)
+from jaxlag._simulation._step_diagnosis import advice, explain, not_finite
 from jaxlag._system._power import in_order
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -139,8 +147,16 @@ class Solution(AbstractSolution):
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """The inputs of this motion, by name."""
+        """The inputs of this motion, by name: tables, functions, constants as arrays."""
         return eqx.combine(self._inputs_traced, self._inputs_static.tree)
+
+    @property
+    def input_values(self) -> dict[str, Any]:
+        """Values of the inputs at the save times, by name, each (s, *its shape).
+
+        They are those that forces read, `Feedback` included; at a knot of a table those after it.
+        """
+        return ByName(self._quantity("input_values"))
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -150,6 +166,8 @@ class Solution(AbstractSolution):
     def __getitem__(self, name: Any) -> Any:
         """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
 
+        "x'" is the velocity of "x", as in `to_dict`.
+
         For a batch, an index, a slice or an array of indices selects motions. A batch is a
         sequence of its motions: `len(motions)`, `for motion in motions`.
 
@@ -157,6 +175,9 @@ class Solution(AbstractSolution):
             ValueError: no such name; an index into a single motion.
             IndexError: an index beyond the axes of the batch.
         """
+        names = self.system.coordinates.names
+        if isinstance(name, str) and name.endswith("'") and name not in names:
+            return self.rate(name[:-1])
         if not isinstance(name, str):
             if self.ts.ndim == 1:
                 must, was = "be a name, for a single motion", f"it was {name!r}"
@@ -167,10 +188,13 @@ class Solution(AbstractSolution):
         quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]
-        if quasi is not None and name not in self.system.coordinates.names:
-            known = [*self.system.coordinates.names, *quasi.names]
+        if quasi is not None and name not in names:
+            known = [*names, *quasi.names]
             raise invalid("name", f"be one of {known}", f"it was {name!r}")
         return self.system.coordinates.part(self.q, name)
+
+    def __getattr__(self, name: str) -> Any:
+        return no_attribute(self, name, ELSEWHERE)
 
     def rate(self, name: str) -> Array:
         """The velocity of a coordinate by its name, shape (s, *its shape)."""
@@ -223,7 +247,7 @@ class Solution(AbstractSolution):
         """
         found = self._quantity("multipliers")
         names = [name for c in self.system.constraints for name in c.all_names]
-        return {name: found[name] for name in names}
+        return ByName({name: found[name] for name in names})
 
     @property
     def lam(self) -> dict[str, Float[Array, "..."]]:
@@ -301,6 +325,8 @@ class Solution(AbstractSolution):
                 if self.formulation == "quasi":
                     more = " The kinematics v = B u + c do not satisfy it."
         about = f" ({labels[index]!r})" if index >= 0 else ""
+        if status is Status.nonfinite:
+            more = not_finite(self, self._explained().lost)
         q, v = self.last_state
         return shortened(
             f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "

@@ -13,6 +13,20 @@ from jaxlag._simulation._abstract_solution import AbstractSolution
 LINES = 16
 """Largest number of motions of a batch in a figure."""
 
+ELSEWHERE = {
+    **dict.fromkeys(("ys", "y"), "motion.q and motion.v"),
+    **dict.fromkeys(("qpos", "positions"), "motion.q"),
+    **dict.fromkeys(("qvel", "velocities", "qdot", "qd"), "motion.v"),
+    **dict.fromkeys(("qacc", "accelerations"), "motion.a"),
+    **dict.fromkeys(("t", "time", "times"), "motion.ts"),
+    **dict.fromkeys(("evaluate", "sol", "interpolation", "interp"), "motion.at(t)"),
+    **dict.fromkeys(("result", "retcode"), "motion.status"),
+    "derivative": "motion.at(t).v",
+    "success": "motion.ok",
+    "lagrange_multipliers": "motion.multipliers",
+}
+"""Attributes of solutions in other tools -> the same here."""
+
 
 def described(motion: AbstractSolution) -> str:
     """A motion, or a batch of them, in one line."""

@@ -18,6 +18,7 @@ from jaxlag._integration._term import term_of
 from jaxlag._linalg._projection import iterations_needed
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
+from jaxlag._system._nonfinite import nonfinite
 from jaxlag._system._row_advice import advice_on_rows
 
 LOOKED_AT = 8  # states examined, evenly along the motion
@@ -345,3 +346,20 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
         return Look(rates, dynamics.mass(tau, y, here), scaled, iterations)
 
     return jax.lax.map(at, (ts, q, v))
+
+
+def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> str:
+    """The declared function that is not finite, with its line, as text; "" if it is unknown.
+
+    Args:
+        motion: one that ended as nonfinite.
+        lost: (time, (q, v)) where the equations are not finite, if it is known.
+    """
+    places = [(motion.last_time, *motion.last_state)]
+    if lost is not None:
+        places.append((lost[0], *jnp.split(lost[1], 2)))
+    for t, q, v in places:
+        found = nonfinite(motion.system, motion._given, motion.inputs, t, q, v)
+        if found is not None:
+            return f" {found}"
+    return ""

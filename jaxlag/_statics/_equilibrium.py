@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._batching import at_once_implicit, in_lanes
+from jaxlag._core._by_name import no_attribute
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import EquilibriumError, invalid, shortened
 from jaxlag._core._result import AbstractResult
@@ -79,7 +80,7 @@ class Equilibrium(AbstractResult):
     def __getattr__(self, name: str) -> Any:
         if name == "lam":
             raise AttributeError("Equilibrium.lam is Equilibrium.multipliers now")
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return no_attribute(self, name)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -62,7 +62,13 @@ def declared(
     return L, u, rows, slides, terms.force(t, q, v, params, values, lam)
 
 
-def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> None:
+def check_params(
+    system: System,
+    params: Any,
+    q: Array,
+    inputs: Mapping[str, Any] | None,
+    argument: str = "params",
+) -> None:
     """Raise on nonfinite numbers that a declared function reads.
 
     Also on objects that cannot be part of a program's key. Without inputs the forces are ignored.
@@ -80,7 +86,7 @@ def check_params(system: System, params: Any, q: Array, inputs: Mapping[str, Any
     read = nothing.union(*outputs_depend_on(program.jaxpr, given))
     for path, name, was in faults:
         if path in read:
-            raise invalid(name, "be finite", f"it was {was}")
+            raise invalid(argument + name.removeprefix("params"), "be finite", f"it was {was}")
 
 
 def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:

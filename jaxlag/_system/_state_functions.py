@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxlag._core._arguments import state_first
-from jaxlag._core._arrays import common
+from jaxlag._core._arrays import common, number
 from jaxlag._core._errors import invalid, unsupported
 from jaxlag._lowering import AccelerationProgram, ArrayTerms, Structure
 from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
@@ -272,7 +272,9 @@ class AbstractQuantities(eqx.Module):
         warn_of_changes(self)
         traced, static = _params.halves(params)
         q, v = state_vectors(self.coordinates, q, v)
-        return jnp.asarray(t, jnp.result_type(float)), q, v, _params.join(traced, static)
+        dtype = jnp.result_type(float)
+        t = number("t", "be a number", t, dtype, "Use jax.vmap for several times.")
+        return t, q, v, _params.join(traced, static)
 
     def _inputs_at(self, inputs: Any, t: Array, q: Array, v: Array, params: Any) -> InputValues:
         inputs = check_inputs(inputs)

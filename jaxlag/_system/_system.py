@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxlag._core._arguments import state_first
+from jaxlag._core._by_name import no_attribute
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._kkt import augmented
 from jaxlag._linalg._mass_solve import first_unhealthy
@@ -30,9 +31,11 @@ from jaxlag._model._constraints import (
 )
 from jaxlag._model._coordinates import Coordinates
 from jaxlag._model._forces import AbstractForce, check_forces
+from jaxlag._model._inputs import check_inputs
 from jaxlag._model._quasi_velocities import InQuasiVelocities, QuasiVelocities, check_quasi
 from jaxlag._system._explain import explain
 from jaxlag._system._inspection import check_traceable
+from jaxlag._system._nonfinite import nonfinite
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._system._row_advice import vanishing_rows
 from jaxlag._tracing import _params
@@ -271,19 +274,24 @@ class System(AbstractReactions):
         Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
 
         Raises:
-            ValueError: L not a real scalar or not finite, a force of wrong shape, missing
-                inputs, a coordinate without inertia (named).
+            ValueError: L not a real scalar, a force of wrong shape, missing inputs, a coordinate
+                without inertia (named); a function of which a value, or a derivative in the
+                equations, is not finite (named, with the line of the operation).
         """
         t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         check_traceable(self, params, q.dtype, values)
         L = as_written(self.lagrangian)(t, q, v, params)
-        if not bool(jnp.isfinite(L)):
-            raise invalid("lagrangian", "be finite at the given state", f"it was {L}")
         M = self._terms.mass(t, q, v, params)
+        terms = [L, M]
         if self.constraints:
             self._rows(params, q.dtype)
-            M, _ = augmented(M, self._terms.rows(t, q, v, params)[0])
+            terms += self._terms.rows(t, q, v, params)
+        if not all(bool(jnp.all(jnp.isfinite(x))) for x in terms):
+            self._refuse_nonfinite(params, inputs, t, q, v)
+            raise invalid("lagrangian", "be finite at the given state", f"it was {L}, M = {M}")
+        if self.constraints:
+            M, _ = augmented(M, terms[2])
         vanishing = vanishing_rows(self, params, t, q)
         if vanishing:
             must = "have a nonzero gradient where it holds"
@@ -300,8 +308,15 @@ class System(AbstractReactions):
             )
         a = self.acceleration(q, v, params, t=t, inputs=inputs)
         if not bool(jnp.all(jnp.isfinite(a))):
+            self._refuse_nonfinite(params, inputs, t, q, v)
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
             raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")
+
+    def _refuse_nonfinite(self, params: Any, inputs: Any, t: Array, q: Array, v: Array) -> None:
+        """Raise for the first declared function that is not finite, if there is one."""
+        found = nonfinite(self, params, check_inputs(inputs), t, q, v)
+        if found is not None:
+            raise found.error()
 
     def __getattr__(self, name: str) -> Any:
         if name in _FORMERLY_PUBLIC:
@@ -309,7 +324,7 @@ class System(AbstractReactions):
                 f"System.{name} is private now. Public are mass_matrix, bias, multipliers, power, "
                 "check and explain"
             )
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return no_attribute(self, name)
 
     def explain(self, params: Any) -> str:
         """Structure found in M a + h = Q of this system, and operations skipped by it, as text.

@@ -1,6 +1,7 @@
 """Params: a pytree, split into traced leaves and the static part of the program's key."""
 
 import math
+from numbers import Number
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid
 from jaxlag._tracing._closure_params import plain
 from jaxlag._tracing._immutable import check_nodes, is_fixed, refusal
 from jaxlag._tracing._strict_equality import types_in, types_of
@@ -80,10 +82,18 @@ def check_keys(params: Any, name: str = "params") -> None:
         ValueError: with the leaf, or the static field, by its path.
     """
     params = plain(params)
+    try:
+        leaves = jax.tree.leaves(params)
+    except ValueError as error:  # JAX sorts the keys of a dict
+        must, was = "have keys of one type in each dict", f"it was {params!r}"
+        raise invalid(name, must, was, "Use strings.") from error
     check_nodes(params, name)
-    if all(map(_is_fine, jax.tree.leaves(params))):
+    if all(map(_is_fine, leaves)):
         return
     for path, leaf in jax.tree_util.tree_flatten_with_path(params)[0]:
+        if _is_other_number(leaf):
+            where, was = f"{name}{jax.tree_util.keystr(path)}", f"it was {leaf!r}"
+            raise invalid(where, "be a float, an int or an array", was, f"Write {float(leaf)}.")
         if not _is_fine(leaf):
             raise refusal(leaf, f"{name}{jax.tree_util.keystr(path)}")
 
@@ -102,7 +112,14 @@ def _is_finite(leaf: Any) -> bool:
     return bool(np.all(np.isfinite(value)))
 
 
+def _is_other_number(leaf: Any) -> bool:
+    """Whether it is a number of a class that JAX does not know: a Decimal, a Fraction."""
+    return isinstance(leaf, Number) and not eqx.is_array_like(leaf)
+
+
 def _is_fine(leaf: Any) -> bool:
+    if _is_other_number(leaf):
+        return False
     # Numbers with a fraction are traced, for all classes.
     return is_array(leaf) or isinstance(leaf, float | complex | _Frozen) or is_fixed(leaf)
 

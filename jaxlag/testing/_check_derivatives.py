@@ -15,13 +15,15 @@ from jaxlag._core._arrays import concrete, number
 from jaxlag._core._errors import invalid
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
+from jaxlag._system._declared_functions import Declared, Params, declared
 from jaxlag._system._inspection import check_traceable
+from jaxlag._system._nan_origins import Origin
+from jaxlag._system._nonfinite import HINTS
 from jaxlag._system._system import System
 from jaxlag.testing import _compare_modes as _check
-from jaxlag.testing import _declared_functions
-from jaxlag.testing._nan_origins import Origin
+from jaxlag.testing import _states
 
-STATES = _declared_functions.STATES
+STATES = _states.STATES
 """States examined by `check_derivatives`."""
 
 _MASKED = (
@@ -32,22 +34,6 @@ _BATCHED = (
     "Under vmap only: it computes both branches of a choice, and uses the batching rules of "
     "custom_vmap. Make the branch that is not chosen, or those rules, finite as well."
 )
-_HINTS = {
-    "sqrt": "Use jaxlag.math.norm for a length, jaxlag.math.sqrt otherwise; or x @ x if the "
-    "square is enough.",
-    "rsqrt": "Use jaxlag.math.unit for a direction, jaxlag.math.norm for a length.",
-    "cbrt": "Its derivatives are infinite at 0: keep the argument away from it.",
-    "atan2": "Use jaxlag.math.atan2.",
-    "acos": "Use jaxlag.math.acos, or jaxlag.math.angle_between for two vectors.",
-    "asin": "Use jaxlag.math.asin.",
-    "div": "Use jaxlag.math.sinc or cosc for sin(x)/x and (1 - cos(x))/x^2 (sinc_sqrt or "
-    "cosc_sqrt of a square), jaxlag.math.unit for x/|x|; or keep the divisor away from 0.",
-    "pow": "At x = 0 a power x**p has finite derivatives only up to order p, unless p is an "
-    "integer: use jaxlag.math.norm for a length; or smooth it, as in (x**2 + e**2)**(p/2).",
-    "log": "Its derivatives are infinite at 0: keep the argument away from it.",
-    "custom_jvp_call": "Its derivative rule must be finite there, too.",
-    "custom_vjp_call": "Its derivative rule must be finite there, too.",
-}
 
 
 @dataclass(frozen=True)
@@ -218,7 +204,7 @@ def check_derivatives(
         raise invalid("check_derivatives: system", "be a jl.System", f"it was {system!r}")
     q, v = state_vectors(system.coordinates, q, v)
     t = number("t", "be a number", t, jnp.result_type(float))
-    own = _declared_functions.Params(params)
+    own = Params(params)
     for name, values in (("q", q), ("v", v), ("params", own.leaves)):
         _require_numbers(name, values)
     whole, inputs = own.join(own.leaves), check_inputs(inputs)
@@ -232,8 +218,8 @@ def check_derivatives(
     }
     u = None if system.quasi is None else system.quasi.of(t, q, v, whole)
     _require_numbers("u", u)
-    at = _declared_functions.states(states, q, v, u)
-    functions = _declared_functions.declared(system, own, inputs)
+    at = _states.states(states, q, v, u)
+    functions = declared(system, own, inputs)
     findings: list[Finding] = []
     omitted: dict[str, str] = {}
     for function in functions:
@@ -244,7 +230,7 @@ def check_derivatives(
             omitted[function.name] = ladder.omitted
     return Report(
         tuple(findings),
-        tuple((f.name, f.order) for f in functions),
+        tuple((f.name, f.role.order + 1) for f in functions),
         {name: (_floats(x["q"]), _floats(x["v"])) for name, x in at.items()},
         omitted,
     )
@@ -269,9 +255,7 @@ class _Search:
         at: name of a state -> all arguments that the function may take.
     """
 
-    def __init__(
-        self, function: _declared_functions.Declared, ladder: _check.Ladder, at: Mapping[str, dict]
-    ) -> None:
+    def __init__(self, function: Declared, ladder: _check.Ladder, at: Mapping[str, dict]) -> None:
         self.function, self.ladder, self.at = function, ladder, at
         rng = np.random.default_rng(1)
         self.along = {name: _direction(rng, z) for name, z in at.items()}
@@ -339,7 +323,7 @@ class _Search:
         hint = _BATCHED if vmapped else _MASKED if masked else ""
         return [
             self._finding(
-                name, "not finite", order, names, vmapped, mode, o, hint or _HINTS.get(o[0], "")
+                name, "not finite", order, names, vmapped, mode, o, hint or HINTS.get(o[0], "")
             )
             for o, names in found
         ]

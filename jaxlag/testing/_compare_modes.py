@@ -15,9 +15,9 @@ import numpy as np
 from jax import Array
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from jaxlag.testing import _nan_origins
-from jaxlag.testing._declared_functions import Declared
-from jaxlag.testing._nan_origins import Origin, TracedProgram
+from jaxlag._system import _nan_origins
+from jaxlag._system._declared_functions import Declared
+from jaxlag._system._nan_origins import Origin, TracedProgram
 
 VALUE, FORWARD, REVERSE, TWICE = "value", "forward", "reverse", "reverse twice"
 
@@ -113,7 +113,7 @@ class Ladder:
         modes, self.omitted = [FORWARD, REVERSE, TWICE], ""
         if self.program.contains("while", "custom_vmap_call"):
             modes, self.omitted = [FORWARD], "no reverse derivatives: a while loop or custom_vmap"
-        orders = range(1, function.order + 1)
+        orders = range(1, function.role.order + 2)
         self.steps = [(VALUE, 0)]
         self.steps += [(m, k) for k in orders for m in modes if m != TWICE or k > 1]
 

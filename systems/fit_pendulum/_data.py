@@ -6,6 +6,7 @@ the motor's torque (N m) is recorded with the angle.
 """
 
 import gzip
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ import jaxlag as jl
 ANGLES = {"q": 0.0, "theta1": np.pi}
 # Columns that may exist but are not used: recorded velocities are filtered, angles are not.
 UNUSED = ("v", "omega1")
+LONGEST_STEP = 0.5  # s, median between samples: at 2 Hz a pendulum of 1 m has 4 in a period
 LONGEST_GAP = 1.5  # between samples, over their median spacing
 FEWEST_SAMPLES = 10  # in a window
 SHORTEST = 0.2  # s, of a window
@@ -229,19 +231,30 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
         raise data_error(
             path.name, "have a header and rows", f"it has {len(lines)} lines", "Fill it."
         )
+    header = lines[0].strip()
+    if "," not in header and len(header.replace(";", " ").split()) > 1:
+        was = f"its header was {header!r}"
+        raise data_error(path.name, "separate its columns by commas", was, "Write t,q.")
+    names = [name.strip() for name in header.split(",")]
+    rows = [[field.strip() for field in line.split(",")] for line in lines[1:]]
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(names):
+            raise data_error(
+                path.name,
+                f"have as many columns as its header names, {len(names)}",
+                f"row {number} has {len(row)}",
+                "Mend the header, or that row.",
+            )
     try:
-        samples = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+        samples = np.array(rows, float)
     except ValueError as error:
-        was = str(error).rstrip(".")
-        raise data_error(path.name, "be a table of numbers", was, "Mend that row.") from error
-    names = [name.strip() for name in lines[0].split(",")]
-    if samples.shape[1] != len(names):
+        number, name, was = next(_not_numbers(names, rows))
         raise data_error(
             path.name,
-            f"have as many columns as its header names, {len(names)}",
-            f"its rows have {samples.shape[1]}",
-            "Mend the header.",
-        )
+            "be a table of numbers",
+            f"{name} was {was!r} in row {number}",
+            "Mend that row.",
+        ) from error
     if not np.all(np.isfinite(samples)):
         index, column = np.argwhere(~np.isfinite(samples))[0]
         raise data_error(
@@ -253,6 +266,18 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     return names, samples
 
 
+def _not_numbers(
+    names: Sequence[str], rows: Sequence[Sequence[str]]
+) -> Iterator[tuple[int, str, str]]:
+    """(row, counted from 1 below the header; column; text) of what is no number."""
+    for number, row in enumerate(rows, 1):
+        for name, field in zip(names, row, strict=True):
+            try:
+                float(field)
+            except ValueError:
+                yield number, name, field
+
+
 def _check_times(name: str, number: int, t: np.ndarray) -> None:
     if len(t) < 2:
         raise data_error(
@@ -262,6 +287,13 @@ def _check_times(name: str, number: int, t: np.ndarray) -> None:
             "Drop it.",
         )
     steps = np.diff(t)
+    if np.median(steps) > LONGEST_STEP:
+        raise data_error(
+            f"t of {name}",
+            f"be in s, with a sample each {LONGEST_STEP:g} s or more often",
+            f"samples are {np.median(steps):g} apart",
+            "Divide milliseconds by 1000.",
+        )
     if np.min(steps) <= 0:
         i = int(np.argmax(steps <= 0))
         raise data_error(

@@ -28,11 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
-from systems.fit_pendulum._data import Recording, split
+from systems.fit_pendulum._data import Recording, data_error, split
 
 NAMES: tuple[str, ...] = ("J", "mgl", "c", "f", "k", "u0", "zero")
 V_S = 0.1  # rad/s; 0.01 to 0.5 change the friction of a free swing by at most 2 %
 EARLY = 0.1  # s: the first motion in a window
+NO_BETTER = 0.9  # of the deviations from straight lines: such a prediction is no fit
 OPTIONS = {"method": "tsit5", "rtol": 1e-7, "atol": 1e-7}
 
 
@@ -105,7 +106,8 @@ def try_models(
     """Every model, fitted to `recording` and tested on `other`, or on a third of `recording`.
 
     Raises:
-        DataError: the recordings are too short, or only one of them has a torque.
+        DataError: the recordings are too short, only one of them has a torque, or no model predicts
+            the angle.
     """
     train, test = split(recording.thinned(), other and other.thinned(), seconds)
     params0 = guess(train)
@@ -113,7 +115,33 @@ def try_models(
     for model in MODELS:
         found = fit(train, params0, model)
         trials[model] = Trial(found, found.predict(test), found.predict(test, EARLY))
+    _require_fit((other or recording).name, test, trials)
     return trials
+
+
+def _require_fit(name: str, test: Sequence[jl.Experiment], trials: Mapping[str, Trial]) -> None:
+    """Raise if no model predicts better than a straight line through each window.
+
+    A line has the free start of a window, and no equation of motion.
+    """
+    lines = [_from_line(each.ts, each.channels["q"][:, 0]) for each in test]
+    line = float(np.sqrt(np.mean(np.concatenate(lines) ** 2)))
+    errors = [float(trial.test.rms("q")[0]) for trial in trials.values()]
+    best = min((x for x in errors if np.isfinite(x)), default=np.inf)
+    if not best < NO_BETTER * line:
+        reach = max(float(np.max(np.abs(each.channels["q"]))) for each in test)
+        raise data_error(
+            f"the angle of {name}",
+            "be that of a pendulum, in rad at times in s",
+            f"no model predicts it: the best is off by {best:.3g}, a straight line through each "
+            f"window by {line:.3g}; angles reach {reach:.3g}",
+            "Convert degrees to rad and milliseconds to s.",
+        )
+
+
+def _from_line(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Deviations from the straight line of least squares."""
+    return q - np.polyval(np.polyfit(t - t[0], q, 1), t - t[0])
 
 
 def fit_segments(recording: Recording, trials: Mapping[str, Trial]) -> dict[str, jl.FitResult]:

@@ -50,6 +50,25 @@ def test_long_arrays_are_shortened(text, shown):
     assert shortened(text) == shown
 
 
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("it was JitTracer(float64[])", "it was a traced float64[]"),
+        (
+            "GradTracer(primal=1.0, typeof(tangent)=f64[]), or (1)",
+            "a traced f64[], or (1)",
+        ),
+        (
+            "{'a': JVPTracer(primal=JitTracer(float32[2,3]), tangent=JitTracer(float32[2,3]))}",
+            "{'a': a traced float32[2,3]}",
+        ),
+        ("MyTracer(", "a traced value"),
+    ],
+)
+def test_traced_values_are_shown_by_their_shapes(text, shown):
+    assert shortened(text) == shown
+
+
 @pytest.mark.parametrize("piece", ["[", "[1 ", "[1     ", "1 ", "]"])
 def test_unclosed_brackets_stay_unchanged(piece):
     assert shortened(piece * 10_000) == piece * 10_000

@@ -5,6 +5,7 @@ import pytest
 from _measured import TS, angles, experiment, fit, within
 
 import jaxlag as jl
+from tests._user import unchecked  # noqa: F401
 
 
 @pytest.mark.full
@@ -55,11 +56,22 @@ NAN = np.full(len(TS), np.nan)
             {"sigma": {"x": np.ones(3)}},
             r"a number, 151 numbers, or an array of shape \(151, 1",
         ),
+        (TS, {"x": TS}, {"sigma": [0.1]}, r"be one number for all channels, or a dict by their"),
+        (TS, {"x": TS}, {"sigma": -0.1}, r"`sigma\['x'\]` must be positive"),
         (TS, {"x": TS}, {"sigma": {"y": 1.0}}, r"name channels among \['x'\], but one was 'y'"),
         (TS, {"x": TS}, {"q0": np.ones((3, 1))}, r"`q0` must be \(n,\) numbers at ts\[0\]"),
         (TS, {"x": TS}, {"start_sigma": 0.0}, r"be given together with q0 and v0"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_invalid_experiment_is_named(ts, channels, options, message):
     with pytest.raises(ValueError, match=message):
         jl.Experiment(ts, channels, **options)
+
+
+def test_one_sigma_is_that_of_all_channels():
+    one = jl.Experiment(TS, {"x": TS, "y": np.stack([TS, TS], 1)}, sigma=0.1)
+    each = jl.Experiment(TS, {"x": TS, "y": np.stack([TS, TS], 1)}, sigma={"x": 0.1, "y": 0.1})
+    assert one.sigma.keys() == {"x", "y"}
+    for name, x in each.sigma.items():
+        np.testing.assert_array_equal(one.sigma[name], x)

@@ -199,7 +199,13 @@ def invalid_files():
         "gap": ("t,q", table(late, q), r"sampled evenly.* 1\.99 s is followed by 2\.5 s"),
         "nan": ("t,q", table(t, holes), r"must hold finite numbers, but q was nan in row 8\."),
         "words": ("t,q", [*table(t, q), ("x", 1)], r"must be a table of numbers, but .*'x'"),
-        "ragged": ("t,q,v", table(t, q), r"as many columns as its header names, 3, but .* have 2"),
+        "ragged": (
+            "t,q,v",
+            table(t, q),
+            r"as many columns as its header names, 3, but row 1 has",
+        ),
+        "semicolons": ("t;q", table(t, q), r"must separate its columns by commas, but .* 't;q'"),
+        "milliseconds": ("t,q", table(1e3 * t, q), r"t of .* must be in s, .* are 10 apart"),
         "empty": ("t,q", [], r"must have a header and rows"),
         "half": ("seg,t,q", table(t * 0 + 0.5, t, q), r"seg of .* must hold integers, .* was 0\.5"),
         "one_row": (

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from _directions import direction, dot
+from _jaxprs import largest, operations
 
 import jaxlag as jl
-from jaxlag._gradient._modes import capacity_for, needed
+from jaxlag._gradient._modes import capacity_for, most_steps, needed
 from systems.catalogue import find
 
 # Duration of each motion, s. Starts are assembled if constraints apply.
@@ -246,6 +247,51 @@ def test_capacity_follows_from_the_memory():
     assert capacity_for("auto", times, steps, 2, state, size) == 0
     assert needed(0, steps, state, size, knots=True) == 13 * steps
     assert capacity_for("recorded", None, 1000, 2, state, size) >= 1000
+
+
+@pytest.mark.parametrize(
+    ("ts", "dt", "knots", "most"),
+    [
+        ([0.0, 0.05], 0.05, None, 64),
+        ([0.0, 6.2], 0.1, None, 64),
+        ([6.3, 0.0], 0.1, None, 128),
+        ([0.0, 1.0], 0.1, np.zeros(60), 128),
+        ([0.0, 100.0], 0.1, None, 1024),
+        ([0.0, 1.0], 1e-9, None, 16384),
+        ([0.0, 1.0], None, None, 16384),
+    ],
+)
+def test_fixed_steps_bound_the_record(ts, dt, knots, most):
+    assert most_steps(16384, np.array(ts), dt, knots) == most
+    assert most_steps(50, np.array(ts), dt, knots) == 50
+
+
+@pytest.mark.parametrize("options", [{}, {"gradient_memory": 5000}])
+def test_a_bounded_record_changes_no_digit(options):
+    """The steps end at a knot and at a save time, and the last one is shorter."""
+    push = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["push"][None], name="push")
+    pendulum = jl.System(
+        lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",), forces=(push,)
+    )
+
+    def end(q0, p, ts, **options):
+        inputs = {"push": jl.ZeroOrderHold([0.0, 0.13, 1.0], [1.0, -1.0, 0.0])}
+        motion = jl.simulate(
+            pendulum, q0, [0.0], ts, p, inputs=inputs, dt=0.1, method="heun", **options
+        )
+        return motion.q[-1, 0] + motion.q[1, 0], motion.gradient_mode
+
+    at, ts = (jnp.array([1.0]), 9.81), np.array([0.0, 0.3, 0.95])
+    gradient = jax.value_and_grad(end, argnums=(0, 1), has_aux=True)
+    known = jax.jit(lambda q0, p: gradient(q0, p, ts, **options))
+    traced = jax.jit(gradient)
+    (a, modes), of_a = known(*at)
+    (b, _), of_b = traced(*at, jnp.asarray(ts))
+    assert a == b
+    assert jax.tree.leaves(of_a) == jax.tree.leaves(of_b)
+    assert jl.GradientMode(int(modes)).name == "recorded"
+    assert largest(operations(known, *at, iterations=1)) < 16 * 64
+    assert largest(operations(traced, *at, jnp.asarray(ts), iterations=1)) >= 16384
 
 
 @pytest.mark.parametrize(

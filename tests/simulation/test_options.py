@@ -1,6 +1,9 @@
 """Invalid options of `simulate`: refused by name, with the condition and the value."""
 
 import re
+import warnings
+from decimal import Decimal
+from fractions import Fraction
 
 import diffrax
 import jax.numpy as jnp
@@ -34,7 +37,8 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
         (
             {"save": ("a", "force")},
             "`save` must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
-            "'power', 'multipliers', 'constraint_force', 'Q', 'work'], but one was 'force'.",
+            "'power', 'multipliers', 'constraint_force', 'Q', 'input_values', 'work'], but one was "
+            "'force'.",
         ),
         (
             {"save": "energy"},
@@ -132,3 +136,39 @@ def test_parameter_of_shape_1_is_named():
 def test_none_instead_of_a_sequence_is_refused(parts, unchecked):  # noqa: F811
     with pytest.raises(ValueError, match=rf"^`{parts}` must be a sequence .*Leave it out"):
         jl.System(SYSTEM.lagrangian, ("x", "y"), **{parts: None})
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        (
+            {"k": Decimal("1.5")},
+            r"`params\['k'\]` must be a float, .* Write 1.5\.",
+        ),
+        ({"k": [1.0, Fraction(1, 2)]}, r"`params\['k'\]\[1\]` must be a float, .* Write 0.5\."),
+        ({"k": 1.0, 3: 2.0}, r"`params` must have keys of one type in each dict, .* Use strings\."),
+    ],
+)
+def test_params_of_other_kinds_are_refused(params, message):
+    spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))
+    with pytest.raises(ValueError, match=message):
+        jl.simulate(spring, [1.0], [0.0], [0.0, 1.0], params)
+
+
+def test_a_step_longer_than_the_motion_gets_a_warning():
+    free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
+    with pytest.warns(UserWarning, match="`dt` = 100 s is longer than ts, 2 s"):
+        jl.simulate(free, [0.0], [1.0], [0.0, 2.0], dt=100.0, method="euler")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jl.simulate(free, [0.0], [1.0], [0.0, 2.0], dt=2.0, method="euler")
+
+
+@pytest.mark.parametrize("ask", ["acceleration", "energy", "momentum", "mass_matrix", "power"])
+def test_the_time_of_a_state_is_a_number(ask):
+    free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",))
+    method = getattr(free, ask)
+    with pytest.raises(ValueError, match=r"`t` must be a number, but its shape was \(1,\)"):
+        method([0.0], [1.0], t=jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"`t` must be a number, but it was \{'m': 1.0\}\."):
+        method([0.0], [1.0], t={"m": 1.0})

@@ -98,3 +98,48 @@ def test_a_figure_shows_coordinates_energy_and_paths(motion, batch):
     np.testing.assert_array_equal(paths[1], motion["arm"][:, 0])
     np.testing.assert_array_equal(paths[2], motion["arm"][:, 1])
     assert len(batch.plot().axes[0].lines) == 5
+
+
+def test_a_name_with_a_prime_is_a_velocity(motion, batch):
+    """As in `to_dict`."""
+    np.testing.assert_array_equal(motion["arm'"], motion.rate("arm"))
+    np.testing.assert_array_equal(batch["x'"], batch.rate("x"))
+    with pytest.raises(ValueError, match=r"`name` must be one of .*, but it was 'z'"):
+        motion["z'"]
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [("ys", "motion.q and motion.v"), ("evaluate", r"motion.at\(t\)"), ("qpos", "motion.q")],
+)
+def test_attributes_of_other_tools_are_told_ours(motion, name, ours):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}'. Write {ours}"):
+        getattr(motion, name)
+
+
+def test_input_values_are_those_that_forces_read():
+    """Tables, functions of time and feedback, at the save times; the inputs stay as they were."""
+
+    def torque(t, q, v, params, inputs):
+        return jnp.stack([inputs["table"] + inputs["wave"], inputs["control"] @ jnp.ones(2)])
+
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), forces=(jl.GeneralizedForce(torque, "motor"),)
+    )
+    inputs = {
+        "wave": jl.TimeFunction(lambda t, p: jnp.sin(t)),
+        "table": jl.LinearInterpolation([0.0, 2.0], [1.0, 3.0]),
+        "control": jl.Feedback(lambda t, q, v, p: -q - v),
+    }
+    motion = jl.simulate(
+        system, [1.0, 0.0], [0.0, 0.5], TS, inputs=inputs, dt=0.25, method="heun",
+        save=("input_values",),
+    )  # fmt: skip
+    assert list(motion.input_values) == sorted(inputs)
+    assert isinstance(motion.inputs["table"], jl.LinearInterpolation)
+    found = motion.input_values
+    np.testing.assert_allclose(found["wave"], np.sin(TS), rtol=1e-15)
+    np.testing.assert_allclose(found["table"], 1.0 + TS, rtol=1e-15)
+    np.testing.assert_allclose(found["control"], -motion.q - motion.v, rtol=1e-15)
+    with pytest.raises(KeyError, match=r"one of \['control', 'table', 'wave'\], .* Write 'table'"):
+        found["tables"]

@@ -22,8 +22,8 @@ from jax import lax
 
 import jaxlag as jl
 from jaxlag import testing
+from jaxlag._system._nan_origins import TracedProgram
 from jaxlag.testing import _check_derivatives
-from jaxlag.testing._nan_origins import TracedProgram
 from tests._user import unchecked  # noqa: F401
 
 
