@@ -48,6 +48,7 @@ from jaxlag._simulation._lyapunov import lyapunov as lyapunov
 from jaxlag._simulation._perturbation_growth import PerturbationGrowth as PerturbationGrowth
 from jaxlag._simulation._simulate import simulate as simulate
 from jaxlag._simulation._solution import Solution as Solution
+from jaxlag._simulation._step import step as step
 from jaxlag._statics._assemble import assemble as assemble
 from jaxlag._statics._assembly import Assembly as Assembly
 from jaxlag._statics._equilibrium import Equilibrium as Equilibrium

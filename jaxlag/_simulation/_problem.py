@@ -79,7 +79,7 @@ class Values(NamedTuple):
 def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
     """The initial-value problem that a plan and its values describe."""
     # --- the equations, and their properties that hold for all states
-    dynamics, args, method = _equations(plan, values)
+    dynamics, args, method = equations(plan, values)
     params, inputs = dynamics.given(args)
 
     # --- the initial state: given, from quasi-velocities, or assembled
@@ -100,7 +100,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     if isinstance(method[0], AbstractPartitioned):  # from here on the steps hold the constraints
         dynamics = replace(dynamics, stabilization=None, crossing=False)
         args = args._replace(lengths=None, units=None, slopes=None)
-    stepper = _stepper(dynamics, method, y0, args, values.longest)
+    stepper = stepper_of(dynamics, method, y0, args, values.longest)
     stepper_traced, stepper_static = eqx.partition(stepper, eqx.is_array)
 
     # --- the times, and whether the motion may start
@@ -130,7 +130,7 @@ class _Initial(NamedTuple):
         return self[:3]
 
 
-def _equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments, tuple[Any, Any]]:
+def equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments, tuple[Any, Any]]:
     """The vector field, its arguments, and (solver, controller)."""
     power = None
     if "work" in plan.save:
@@ -212,7 +212,7 @@ def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments
     return args._replace(lengths=lengths_of(masses, args.active_rows), units=units, slopes=slopes)
 
 
-def _stepper(
+def stepper_of(
     dynamics: VectorField, method: tuple[Any, Any], y0: Array, args: Arguments, longest: Any
 ) -> Stepper:
     """The stepper: solver, controller, vector field and post-processing."""
