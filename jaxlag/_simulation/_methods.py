@@ -26,6 +26,7 @@ from jaxlag.solvers import (
     Splitting,
     Tsit5,
 )
+from jaxlag.solvers._stage_chord import StageChord
 
 METHODS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "euler": diffrax.Euler,
@@ -167,7 +168,7 @@ def name_of(solver: diffrax.AbstractSolver) -> str:
                 return name
         elif type(solver) in (type(known), type(getattr(known, "stock", known))):
             finder = getattr(solver, "root_finder", None)
-            ours = finder is None or type(finder) is optimistix.Chord
+            ours = finder is None or type(finder) is StageChord
             return name if ours else default
     return default
 
@@ -223,7 +224,7 @@ def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
         larger(0.1 * x) if larger else jnp.maximum(0.1 * x, least).astype(dtype)
         for x in (rtol, atol)
     ]
-    finder = optimistix.Chord(*bounds, norm=optimistix.rms_norm)
+    finder = StageChord(*bounds)
     return eqx.tree_at(lambda s: s.root_finder, solver, finder)
 
 

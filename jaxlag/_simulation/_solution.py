@@ -26,7 +26,7 @@ from jaxlag._simulation._solution_views import (
     described,
     plotted,
 )
-from jaxlag._simulation._step_diagnosis import advice, explain, not_finite
+from jaxlag._simulation._step_diagnosis import advice, explain, failed_save, not_finite
 from jaxlag._system._power import in_order
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -329,8 +329,8 @@ class Solution(AbstractSolution):
             more = not_finite(self, self._explained().lost)
         q, v = self.last_state
         return shortened(
-            f"{status.name}{about}: last good state at t = {self.last_time} of {self.ts[-1]}, "
-            f"q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
+            f"{status.name}{about}{failed_save(self)}: last good state at t = {self.last_time} of "
+            f"{self.ts[-1]}, q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
             f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
         )
 

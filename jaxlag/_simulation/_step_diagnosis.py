@@ -363,3 +363,15 @@ def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> st
         if found is not None:
             return f" {found}"
     return ""
+
+
+def failed_save(motion: AbstractSolution) -> str:
+    """The first save time before the last time of which the state is NaN, as text; "" if none.
+
+    A state is saved by a step of its own from the start of the accepted step around it, and this
+    step may fail alone.
+    """
+    ts, lost = np.asarray(motion.ts), ~np.isfinite(np.asarray(motion.q)).all(axis=1)
+    k = int(np.argmax(lost))
+    passed = (float(motion.last_time) - ts[k]) * (ts[-1] - ts[0]) >= 0
+    return f" in the step to ts[{k}] = {ts[k]:g}" if lost[k] and passed else ""
