@@ -20,7 +20,8 @@ class ByName(dict[str, Any]):
     def __missing__(self, name: object) -> Any:
         close = get_close_matches(str(name), self, 1)
         fix = f"Write {close[0]!r}." if close else ""
-        raise UnknownName(requirement("name", f"be one of {list(self)}", f"it was {name!r}", fix))
+        message = requirement("name", f"be one of {list(self)}", f"it was {name!r}", fix)
+        raise UnknownName(name, message)
 
     def tree_flatten_with_keys(self) -> tuple[list[tuple[Any, Any]], tuple[str, ...]]:
         """For JAX's pytree registry: in the order of the names, as JAX's own dicts."""
@@ -34,10 +35,14 @@ class ByName(dict[str, Any]):
 
 
 class UnknownName(KeyError):
-    """A KeyError whose message is shown without quotes."""
+    """A KeyError of a name, with a message that is shown without quotes."""
+
+    def __init__(self, name: object, message: str = "") -> None:
+        super().__init__(name)
+        self.message = message
 
     def __str__(self) -> str:
-        return str(self.args[0])
+        return self.message or super().__str__()
 
 
 def no_attribute(owner: object, name: str, instead: Mapping[str, str] = NOTHING) -> Any:

@@ -216,7 +216,7 @@ RECORD = jl.Experiment([0.0, 0.1, 0.2], {"x": [1.0, 0.98, 0.93]}, q0=[1.0], v0=[
     ],
 )
 def test_all_compiled_functions_refuse_mutable_leaves(ask):
-    with pytest.raises(ValueError, match=r"^`params\['spring'\]` must be .* a Plain can change"):
+    with pytest.raises(ValueError, match=r"^`params0?\['spring'\]` must be .* a Plain can change"):
         ask({"spring": Plain(1.0)})
 
 
@@ -226,7 +226,7 @@ def test_mutable_leaves_are_refused_under_derivatives(make):
         return jl.simulate(SYSTEM, [1.0], [0.0], [0.0, 1.0], {"spring": make(k)}).q[-1, 0]
 
     with pytest.raises(
-        ValueError, match=r"^`params\['spring'\]` must be .*eqx.Module|a dict"
+        ValueError, match=r"^`params0?\['spring'\]` must be .*eqx.Module|a dict"
     ) as it:
         jax.grad(end)(1.0)
     assert "racer" not in str(it.value)
