@@ -1,5 +1,6 @@
 """Fits of motions with known parameters; every warning and error by name."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from _measured import (
 from _silence import no_warning
 
 import jaxlag as jl
+from tests._user import unchecked  # noqa: F401
 
 
 @pytest.mark.full
@@ -306,6 +308,12 @@ def test_invalid_priors_are_named(mean, sigma, message):
             {"priors": {"l": jl.Prior(1.0, [1.0, 2.0])}},
             r"shape \(\), but its mean had \(\), its sigma \(2,\)",
         ),
+        ({"params0": TRUE | {"l": np.nan}}, r"`params0\['l'\]` must be finite, but it was nan"),
+        ({"params0": TRUE | {"m": np.inf}}, r"`params0\['m'\]` must be finite, but it was inf"),
+        ({"transforms": ["l"]}, r"`transforms` must be a dict by name, .* jl\.transforms\.Pos"),
+        ({"priors": ["l"]}, r"`priors` must be a dict by name, .* Write priors=\{'name': jl\.Pr"),
+        ({"channels": ["x"]}, r"`channels` must be a dict by name, but it was \['x'\]"),
+        ({"params0": [0.5, 0.1]}, r"`free` must name parameters among \['\[0\]', '\[1\]'\]"),
         ({"rtol": -1.0}, r"`rtol` must be a number between 0 and 1"),
         ({"atol": 1.0}, r"`atol` must be a number between 0 and 1"),
         ({"max_steps": 0}, r"`max_steps` must be a positive integer, but it was 0"),
@@ -335,6 +343,12 @@ def test_invalid_priors_are_named(mean, sigma, message):
         ({"data": jl.Experiment(TS[:2], {"x": TS[:2]})}, r"at least as many numbers as there are"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_invalid_arguments_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         fit(changes.pop("data", experiment()), **changes)
+
+
+def test_a_fit_inside_jit_is_refused():
+    with pytest.raises(ValueError, match=r"`fit` inside jit, .* is not supported: its search runs"):
+        jax.jit(lambda l: fit(experiment(), params0=TRUE | {"l": l}).params["l"])(0.5)

@@ -240,6 +240,25 @@ def test_invalid_files_are_refused_with_the_reason(name, tmp_path, capsys):
     assert captured.err.count("\n") == 1
 
 
+@pytest.mark.full
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of searches that fail
+@pytest.mark.parametrize("kind", ["degrees", "noise"])
+def test_recordings_that_no_model_predicts_end_with_the_reason(kind, tmp_path, capsys):
+    recording = fit_pendulum.synthetic({"J": 1.0, "mgl": 60.0, "c": 0.05}, False, 2e-3, segments=2)
+    pieces = recording.segments.values()
+    t = np.concatenate([each.ts + 10.0 * k for k, each in enumerate(pieces)])
+    seg = np.concatenate([np.full(len(each.ts), k) for k, each in enumerate(pieces)])
+    q = np.concatenate([each.channels["q"][:, 0] for each in pieces])
+    wrong = {
+        "degrees": np.rad2deg(q),
+        "noise": np.random.default_rng(0).standard_normal(len(q)),
+    }[kind]
+    path = write(tmp_path / f"{kind}.csv", "seg,t,q", table(seg, t, wrong))
+    assert fit_pendulum.main([str(path)]) == 1
+    error = capsys.readouterr().err
+    assert re.search("the angle of .* in rad .* no model predicts it: .* Convert degrees", error)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -9,6 +9,7 @@ from _measured import OPTIONS, TRUE, TS, angles
 
 import jaxlag as jl
 from jaxlag._fit._select_model import Ranked, _estimates
+from tests._user import unchecked  # noqa: F401
 
 
 def lagrangian(t, q, v, p):
@@ -139,9 +140,12 @@ def test_forces_are_added_to_a_system():
             r"other names, but candidate 'a' also has 'c'",
         ),
         ({"a": viscous}, {"free": "l"}, r"`free` must be a sequence of names.*Write free=\('l',\)"),
+        ({"a": viscous}, {"transforms": ["c"]}, r"`transforms` must be a dict by name"),
+        ({"a": viscous}, {"priors": ["c"]}, r"`priors` must be a dict by name"),
         ({"a": viscous}, {"most": 2}, r"`most` must be an integer from 1 to the 1 candidates"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_invalid_arguments_are_named(candidates, options, message):
     with pytest.raises(ValueError, match=message):
         compare(candidates, **options)
