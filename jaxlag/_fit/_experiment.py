@@ -8,7 +8,8 @@ from typing import Any, final
 import equinox as eqx
 import numpy as np
 
-from jaxlag._core._errors import invalid
+from jaxlag._core._arrays import concrete
+from jaxlag._core._errors import invalid, unsupported
 from jaxlag._model._inputs import check_inputs, check_range
 from jaxlag._tracing._signature import require_arity
 from jaxlag._tracing._traced_function import TracedFunction, traced_function
@@ -78,6 +79,9 @@ class Experiment(eqx.Module):
         start_sigma: Any = None,
         name: str = "experiment",
     ) -> None:
+        if not concrete(ts, channels, sigma, q0, v0, start_sigma):
+            why = "its measurements are numbers"
+            raise unsupported("An Experiment inside jit, vmap and grad", why, "Make it outside.")
         self.name = name
         self.ts = _times(name, ts)
         count = len(self.ts)

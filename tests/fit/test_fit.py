@@ -350,5 +350,8 @@ def test_invalid_arguments_are_named(changes, message):
 
 
 def test_a_fit_inside_jit_is_refused():
+    data = experiment()
     with pytest.raises(ValueError, match=r"`fit` inside jit, .* is not supported: its search runs"):
-        jax.jit(lambda l: fit(experiment(), params0=TRUE | {"l": l}).params["l"])(0.5)
+        jax.jit(lambda x: fit(data, params0=TRUE | {"l": x}).params["l"])(0.5)
+    with pytest.raises(ValueError, match=r"An Experiment inside jit.* is not supported: its meas"):
+        jax.jit(lambda x: jl.Experiment(TS, {"x": x}).ts)(TS)
