@@ -17,6 +17,15 @@ def concrete(*arrays: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
+def array_of(x: Any) -> Array:
+    """`jnp.asarray(x)`, for lists of numbers in half the time."""
+    if isinstance(x, jax.Array):
+        return x
+    if isinstance(x, list | tuple) and concrete(x):
+        x = np.asarray(x)
+    return jnp.asarray(x)
+
+
 def stop_gradient(tree: Any) -> Any:
     """The same without derivatives, for example for a status, which has none."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
@@ -57,6 +66,8 @@ def number(argument: str, must: str, x: Any, dtype: Any, fix: str = "") -> Array
 
 def common(*arrays: Array) -> list[Array]:
     """Arrays of one dtype, the result type of all, for every promotion setting of JAX."""
+    if all(x.dtype == arrays[0].dtype for x in arrays):
+        return list(arrays)
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*arrays)
     return [x.astype(dtype) for x in arrays]

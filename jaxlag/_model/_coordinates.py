@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxlag._core._arrays import of_state
+from jaxlag._core._arrays import array_of, of_state
 from jaxlag._core._errors import invalid
 
 ORDER = "The order of the arguments is (q, v, params)."
@@ -137,7 +137,7 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     if isinstance(x, Mapping):
         x = coordinates.flatten(x, argument)
     try:
-        x = jnp.asarray(x)
+        x = array_of(x)
     except (TypeError, ValueError) as error:
         if not isinstance(x, str | Sequence):
             fix = ORDER

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from difflib import get_close_matches
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import diffrax
@@ -183,6 +183,12 @@ def _nearest(name: str) -> str:
     return "" if found is None else f"The nearest is {found}."
 
 
+@lru_cache
+def _named(name: str) -> diffrax.AbstractSolver:
+    """The solver of this name."""
+    return with_stages(METHODS[name](), "lax")
+
+
 def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
     if isinstance(method, str):
         name = automatic(tolerance) if method == "auto" else method
@@ -193,7 +199,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
                 f"it was {method!r}",
                 _nearest(method),
             )
-        method = METHODS[name]()
+        return _named(name)
     if not isinstance(method, diffrax.AbstractSolver):
         raise invalid("method", "be a name or a diffrax solver instance", f"it was {method!r}")
     if not (

@@ -132,12 +132,13 @@ def check_start(
             "this system has none",
             "Pass v0= instead.",
         )
-    q0 = vector(system.coordinates, "q0", q0)
+    own = system.coordinates
+    q0 = vector(own, "q0", q0)
     if quasi is not None and u0 is not None:
         name, x, labels = "u0", quasi.vector("u0", u0), quasi.names
     else:
-        name, x, labels = "v0", vector(system.coordinates, "v0", v0), system.coordinates.labels
-    for argument, values, names in (("q0", q0, system.coordinates.labels), (name, x, labels)):
+        name, x, labels = "v0", vector(own, "v0", v0), own.labels
+    for argument, values, names in (("q0", q0, own.labels), (name, x, labels)):
         if concrete(values) and not np.all(np.isfinite(values)):
             i = int(np.argmin(np.isfinite(values)))
             raise invalid(argument, "be finite", f"{argument}[{i}] ({names[i]!r}) was {values[i]}")

@@ -8,15 +8,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arguments import positive_integer
-from jaxlag._core._arrays import concrete, number, stop_gradient
+from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
 from jaxlag._core._errors import invalid
 from jaxlag._integration._quasi_singularities import usual
 from jaxlag._integration._stepper import Stepper, all_finite
 from jaxlag._integration._tableaus import remembers
-from jaxlag._model._coordinates import state_vectors
+from jaxlag._model._coordinates import vector
 from jaxlag._model._inputs import check_inputs, check_range, common_range
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import choose
@@ -119,7 +120,8 @@ def step(
         raise invalid("step: system", "be a jl.System", f"it was {system!r}")
     if v is None:
         raise invalid("step: v", "be given", "it was None", "For u: system.velocities(q, u).")
-    q, v = state_vectors(system.coordinates, q, v)
+    own = system.coordinates
+    q, v = of_state("q and v", vector(own, "q", q), vector(own, "v", v))
     t = number("step: t", "be a number", t, jnp.result_type(float))
     dt = check_step(dt, None)
     if dt is None:
@@ -132,14 +134,15 @@ def step(
         was = f"{type(solver).__name__} remembers earlier steps"
         raise invalid("step: method", "be a one-step method", was, "Use jl.simulate.")
     inputs = check_inputs(inputs)
-    if concrete(t, dt):
-        check_range(inputs, jnp.stack([t, t + _ALMOST * dt]), "t and t + dt")
+    known = concrete(t, dt)
+    if known:
+        check_range(inputs, np.array([t, t + _ALMOST * dt]), "t and t + dt")
     check_params(system, params, q, inputs)
     formulation = check_formulation(system, formulation, stabilization, params, q.dtype)
     params = lift_closure_tracers(system, params, q, inputs)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
-    ts = jnp.stack([t, t + dt])
+    ts: Any = np.array([t, t + dt], dt.dtype) if known else jnp.stack([t, t + dt])
     if not concrete(params_traced, inputs_traced):
         jumps = Jumps(system, params, q, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
@@ -172,9 +175,10 @@ def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
     """The compiled program."""
     dynamics, args, method = equations(plan, values)
     params, inputs = dynamics.given(args)
-    t, q, v, count = values.ts[0], values.q0, values.v0, plan.max_steps
-    assert v is not None
+    assert values.v0 is not None
     assert values.step is not None
+    ts = jnp.asarray(values.ts)  # under jax.disable_jit it is a numpy array
+    t, q, v, count = ts[0], values.q0, values.v0, plan.max_steps
     check_declaration(plan.system, params, inputs, t, q, v)
     zero = jnp.zeros_like(args.origin)
     w = v if dynamics.quasi is None else dynamics.quasi.of(t, q, v, params)[dynamics.quasi.free]
@@ -198,7 +202,7 @@ def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
         defined = (span[0] <= t) & (t + _ALMOST * values.step <= span[1])
         y = jnp.where(defined, y, jnp.nan)
     q, w = dynamics.parts(y)
-    return q, dynamics.velocities_of(values.ts[1].astype(t.dtype), q, w, args)
+    return q, dynamics.velocities_of(ts[1], q, w, args)
 
 
 def _briefly(stepper: Stepper) -> Stepper:

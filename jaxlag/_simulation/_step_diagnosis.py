@@ -355,7 +355,7 @@ def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> st
         motion: one that ended as nonfinite.
         lost: (time, (q, v)) where the equations are not finite, if it is known.
     """
-    places = [(motion.last_time, *motion.last_state)]
+    places: list[tuple[Any, ...]] = [(motion.last_time, *motion.last_state)]
     if lost is not None:
         places.append((lost[0], *jnp.split(lost[1], 2)))
     for t, q, v in places:
@@ -371,7 +371,8 @@ def failed_save(motion: AbstractSolution) -> str:
     A state is saved by a step of its own from the start of the accepted step around it, and this
     step may fail alone.
     """
-    ts, lost = np.asarray(motion.ts), ~np.isfinite(np.asarray(motion.q)).all(axis=1)
-    k = int(np.argmax(lost))
-    passed = (float(motion.last_time) - ts[k]) * (ts[-1] - ts[0]) >= 0
-    return f" in the step to ts[{k}] = {ts[k]:g}" if lost[k] and passed else ""
+    ts, lost = np.asarray(motion.ts), np.isnan(np.asarray(motion.q)).any(axis=1)
+    first = np.flatnonzero(lost)[:1].tolist()
+    if not first or (float(motion.last_time) - ts[first[0]]) * (ts[-1] - ts[0]) < 0:
+        return ""
+    return f" in the step to ts[{first[0]}] = {ts[first[0]]:g}"

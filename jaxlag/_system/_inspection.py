@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
+from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import evaluate
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._tracing import _params
@@ -43,8 +44,9 @@ def mass_definite(
         states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
     floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
     for state in states:
+        kinds = jnp.result_type(float), q.dtype, q.dtype
+        at = [np.asarray(x, kind) for x, kind in zip(state, kinds, strict=True)]
         with jax.ensure_compile_time_eval():
-            at = (jnp.asarray(state[0], float), *(jnp.asarray(x, q.dtype) for x in state[1:]))
             M = _mass((system,), params, None, *at)
         if not concrete(M):
             return None  # the Lagrangian closes over a traced value
@@ -72,6 +74,8 @@ def contact_rows_independent(
     v = jnp.zeros_like(q) if v is None else v
     if not system.constraints or not concrete(params, t, q, v, inputs):
         return False
+    if not any(map(reads_lam, system.forces)):
+        return True
     array = system._terms
     t = jnp.asarray(t, float)
     chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
