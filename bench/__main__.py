@@ -1,5 +1,6 @@
 """Command line: `python -m bench list | NAME [--quick] [options of that benchmark]`."""
 
+import math
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
@@ -13,6 +14,13 @@ import jax
 from bench._harness import results
 from bench._harness.timing import BENCHMARKS
 from bench.fits._data import DataError
+
+_PARTS = {"system", "seconds", "first"}
+"""Options with which a run is a part of a whole one, so that it does not replace its results."""
+_BOUNDS = (
+    ("seconds", lambda x: 0 < x < math.inf, "a positive number of seconds"),
+    ("first", lambda x: x >= 0, "a seed, 0 or more"),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -30,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     names = ("system", "python", "seconds", "first", "data")
     options = {name: vars(arguments)[name] for name in names}
-    options = {name: value for name, value in options.items() if value}
+    options = {name: value for name, value in options.items() if value is not None}
     if arguments.name == "list":
         for name in BENCHMARKS:
             print(f"{name:<14} {_headline(name)}")
@@ -45,6 +53,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if foreign:
         print(f"{arguments.name} has no option --{foreign[0]}.", file=sys.stderr)
         return 2
+    for name, fits, must in _BOUNDS:
+        if name in options and not fits(options[name]):
+            print(f"--{name} must be {must}, but it was {options[name]}.", file=sys.stderr)
+            return 2
     jax.config.update("jax_enable_x64", True)
     circumstances = results.circumstances()
     try:
@@ -52,12 +64,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except DataError as error:
         print(error, file=sys.stderr)
         return 2
+    if not report.rows:
+        print(f"{arguments.name} measured nothing, so that nothing is written.", file=sys.stderr)
+        return 2
     path = results.save(
         arguments.name,
         _headline(arguments.name),
         report,
         circumstances,
-        arguments.quick or "system" in options,  # a part of a run
+        arguments.quick or bool(_PARTS & options.keys()),
         results.FOLDER,
     )
     print(results.text(report))

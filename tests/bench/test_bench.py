@@ -4,6 +4,7 @@ import io
 import json
 import math
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -151,6 +152,41 @@ def test_unknown_name_gets_the_nearest_known_one(capsys):
     assert "'gradeint'. Did you mean gradient?" in capsys.readouterr().err
     assert command.main(["xyz"]) == 2
     assert f"Known: {', '.join(BENCHMARKS)}." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seconds", "-1"], "--seconds must be a positive number of seconds, but it was -1.0."),
+        (["--seconds", "0"], "--seconds must be a positive number of seconds, but it was 0.0."),
+        (["--seconds", "inf"], "--seconds must be a positive number of seconds, but it was inf."),
+        (["--first", "-3"], "--first must be a seed, 0 or more, but it was -3."),
+    ],
+)
+def test_options_out_of_bounds_are_refused_before_the_run(arguments, message, capsys):
+    assert command.main(["fuzz", *arguments]) == 2
+    assert capsys.readouterr().err == message + "\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "arguments", "kept"),
+    [([], [], "no file"), ([{"x": 1}], ["--seconds", "3"], "quick/fuzz.json")],
+)
+def test_a_kept_result_is_not_replaced_by_nothing_or_by_a_part(
+    rows, arguments, kept, tmp_path, monkeypatch, capsys
+):
+    def run(quick, seconds=None, first=0):
+        return Report(rows, [], [])
+
+    monkeypatch.setattr(command, "_module", lambda name: SimpleNamespace(run=run, __doc__="Fuzz."))
+    monkeypatch.setattr(command.results, "FOLDER", tmp_path)
+    status = command.main(["fuzz", *arguments])
+    written = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.json")]
+    if kept == "no file":
+        assert (status, written) == (2, [])
+        assert "measured nothing" in capsys.readouterr().err
+    else:
+        assert (status, written) == (0, [kept])
 
 
 def test_list_names_and_describes_every_benchmark(capsys):
