@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, final
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxlag._core._arguments import by_name, name_sequence, renamed
 from jaxlag._core._errors import invalid
@@ -67,27 +68,44 @@ class Ranked(NamedTuple):
             start failed.
         fit: result of the fit to the experiments.
         prediction: predictions of the held-out experiments.
+        squares: mean square of the error in each block of the held-out data, ten for each
+            experiment; neighboring samples are not independent, blocks nearly are.
     """
 
     name: str
     error: float
     fit: FitResult
     prediction: Prediction
+    squares: Float[np.ndarray, " b"]
+
+    @property
+    def std(self) -> float:
+        """Standard error of `error`, from the scatter of the blocks; nan if it is inf."""
+        if not np.isfinite(self.error) or self.error == 0:
+            return 0.0 if self.error == 0 else float("nan")
+        return _standard_error(self.squares) / (2 * self.error)
 
 
 @final
 class ModelSelection(eqx.Module):
     """Models, the best first, ranked by predictions of held-out experiments.
 
+    Models that predict as well as the one with the smallest error come first, those with the
+    fewest parameters before the others: their mean square exceeds its by at most one standard
+    error of the difference. The others follow by their error.
+
     Attributes:
         models: ranked.
+
+    Source: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., sec. 7.10
+    (the rule of one standard error).
     """
 
     models: tuple[Ranked, ...]
 
     @property
     def best(self) -> Ranked:
-        """The model with the smallest error."""
+        """The smallest of the models that predict best."""
         return self.models[0]
 
     def __getitem__(self, name: str) -> Ranked:
@@ -103,7 +121,8 @@ class ModelSelection(eqx.Module):
         lines = [head]
         for model in self.models:
             shown = [_numbers(model.prediction.rms(name)) for name in channels]
-            lines.append([model.name, str(len(model.fit.names)), f"{model.error:.4g}", *shown])
+            error = f"{model.error:.4g} +- {model.std:.1g}"
+            lines.append([model.name, str(len(model.fit.names)), error, *shown])
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
@@ -150,7 +169,8 @@ def select_model(
 
     Every combination of up to `most` candidates is added to the system and fitted to the
     experiments. The error is that of its predictions of held-out experiments, for which only the
-    starts are fitted (`jl.predict`). More terms always fit better, but may predict worse.
+    starts are fitted (`jl.predict`). More terms always fit better, but may predict worse. Of models
+    that predict as well as the best within the standard error, the smallest is the first.
 
     If candidates share params, or are combined, the search starts from the
     estimates of an earlier model that has most of them: name the simple candidates first.
@@ -201,9 +221,9 @@ def select_model(
                 **fit_options,
             )
             predicted = found.predict(held_out, settle)
-            error = _error(predicted, held_out)
-            models.append(Ranked(" + ".join(names) or "none", error, found, predicted))
-    ranked = tuple(sorted(models, key=lambda model: model.error))
+            judged = _error(predicted, held_out), found, predicted, _squares(predicted, held_out)
+            models.append(Ranked(" + ".join(names) or "none", *judged))
+    ranked = _in_order(models)
     if np.isinf(ranked[0].error):
         text = "No model predicts all of held_out: motions or searches for initial states failed."
         warnings.warn(f"{text} See `prediction.failed` of each model.", stacklevel=2)
@@ -288,6 +308,49 @@ def _check(system: Any, params0: Any, candidates: Any, most: Any, free: Any) -> 
     if isinstance(most, bool) or not isinstance(most, int) or not 1 <= most <= len(candidates):
         must = f"be an integer from 1 to the {len(candidates)} candidates"
         raise invalid("most", must, f"it was {most!r}")
+
+
+def _in_order(models: Sequence[Ranked]) -> tuple[Ranked, ...]:
+    """Those that predict as well as the best, the smallest first; then the others by error."""
+    best = min(models, key=lambda model: model.error)
+
+    def key(model: Ranked) -> tuple[bool, int, float]:
+        more = model.squares - best.squares
+        worse = bool(np.isinf(model.error) or np.mean(more) > _standard_error(more))
+        return worse, 0 if worse else len(model.fit.names), model.error
+
+    return tuple(sorted(models, key=key))
+
+
+def _standard_error(x: np.ndarray) -> float:
+    """Standard error of the mean; 0 of less than two numbers."""
+    return float(np.std(x, ddof=1) / np.sqrt(len(x))) if len(x) > 1 else 0.0
+
+
+BLOCKS = 10
+"""Blocks of consecutive samples of an experiment."""
+
+
+def _squares(predicted: Prediction, experiments: Sequence[Experiment]) -> np.ndarray:
+    """Mean square of the error in each block, over all channels, each over its range.
+
+    Blocks without measurements are left out; of failed motions the mean square is inf.
+    """
+    ranges = {
+        name: spreads(np.concatenate([x.channels[name] for x in experiments if name in x.channels]))
+        for name in predicted.channels
+    }
+    found = []
+    given = predicted.residuals, predicted.predicted, experiments
+    for residuals, samples, each in zip(*given, strict=True):
+        parts = [(residuals[name] / ranges[name]) ** 2 for name in residuals]
+        known = np.hstack([np.isfinite(each.channels[name]) for name in residuals])[samples]
+        squares = np.hstack(parts)[samples]
+        squares = np.where(known & ~np.isfinite(squares), np.inf, squares)
+        for block in np.array_split(np.arange(len(squares)), BLOCKS):
+            if known[block].any():
+                found.append(np.mean(squares[block][known[block]]))
+    return np.array(found)
 
 
 def _error(predicted: Any, experiments: Sequence[Experiment]) -> float:

@@ -8,7 +8,7 @@ import pytest
 from _measured import OPTIONS, TRUE, TS, angles
 
 import jaxlag as jl
-from jaxlag._fit._select_model import Ranked, _estimates
+from jaxlag._fit._select_model import Ranked, _estimates, _in_order, _squares
 from tests._user import unchecked  # noqa: F401
 
 
@@ -91,7 +91,7 @@ def test_search_starts_at_estimates_of_the_best_related_model():
             rms=lambda _: np.array([fitted or error]),
             experiments=(data,),
         )
-        return Ranked("", error, fit, None)
+        return Ranked("", error, fit, None, np.zeros(0))
 
     own = {"l": 1.0, "c": 1.0, "k": np.ones(2)}
     none, unconverged = ranked(3.0, {"l": 2.0}), ranked(1.0, {"l": 9.0, "c": 9.0}, converged=False)
@@ -156,3 +156,43 @@ def test_a_candidate_without_a_force_is_named():
         ValueError, match=r"`forces` must be one force or more.*Write jl\.Candidate"
     ):
         jl.Candidate(params0={"k": 1.0})
+
+
+def ranked(name, params, squares):
+    fit = SimpleNamespace(names=tuple(range(params)))
+    return Ranked(name, float(np.sqrt(np.mean(squares))), fit, None, np.array(squares))
+
+
+def test_the_smaller_of_two_equal_models_is_first():
+    """Equal within the standard error of the difference of their blocks, not of each alone."""
+    rng = np.random.default_rng(0)
+    hard = rng.uniform(0.5, 2.0, 20)  # blocks differ more than models do
+    better = 0.9 * hard
+    equal = better + np.where(np.arange(20) % 2, 0.011, -0.01)
+    failed = ranked("failed", 1, np.full(20, np.inf))
+    models = [
+        failed,
+        ranked("four", 4, better),
+        ranked("two", 2, equal),
+        ranked("three", 3, equal - 0.0002),
+        ranked("one", 1, hard),
+    ]
+    found = _in_order(models)
+    assert [model.name for model in found] == ["two", "three", "four", "one", "failed"]
+    assert found[3].std == pytest.approx(
+        np.std(hard, ddof=1) / np.sqrt(20) / (2 * np.sqrt(np.mean(hard)))
+    )
+    assert np.isnan(failed.std)
+
+
+def test_blocks_of_squares_average_to_the_error():
+    """Missing measurements are left out; a motion that failed is infinitely wrong."""
+    data = jl.Experiment(TS, {"x": np.where(TS < 0.5, np.nan, np.sin(TS))})
+    off = np.full((len(TS), 1), 0.1)
+    prediction = jl.Prediction(({"x": off},), (TS > 0.2,), (TS[:2],), (), True, (data,))
+    found = _squares(prediction, (data,))
+    scale = np.nanstd(data.channels["x"])
+    np.testing.assert_allclose(found, (0.1 / scale) ** 2, rtol=1e-14)
+    assert 8 <= len(found) <= 10
+    prediction.residuals[0]["x"] = np.full_like(off, np.nan)
+    assert np.all(np.isinf(_squares(prediction, (data,))))
