@@ -15,7 +15,11 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 @jax.tree_util.register_pytree_with_keys_class
 class ByName(dict[str, Any]):
-    """A dict by name, whose KeyError says which names there are."""
+    """A dict by name, whose KeyError says which names there are.
+
+    For JAX it is a node of its own: beside plain dicts, as in `jax.tree.map` of both, write
+    `dict(values)`.
+    """
 
     def __missing__(self, name: object) -> Any:
         close = get_close_matches(str(name), self, 1)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from numbers import Number
 from typing import Any, final
 
 import equinox as eqx
@@ -73,7 +72,7 @@ class Experiment(eqx.Module):
         channels: Mapping[str, Any],
         *,
         inputs: Mapping[str, Any] | Callable[[Any], Mapping[str, Any]] | None = None,
-        sigma: Mapping[str, Any] | float | int | None = None,
+        sigma: Any = None,
         q0: Any = None,
         v0: Any = None,
         start_sigma: Any = None,
@@ -203,7 +202,7 @@ def _by_channel(name: str, sigma: Any, channels: Mapping[str, Any]) -> Mapping[s
     """Sigma by the name of the channel."""
     if sigma is None or isinstance(sigma, Mapping):
         return sigma or {}
-    if np.ndim(sigma) or not isinstance(sigma, Number):
+    if np.ndim(sigma) or not np.issubdtype(np.asarray(sigma).dtype, np.number):
         must = "be one number for all channels, or a dict by their names"
         fix = f"Write sigma={{{next(iter(channels))!r}: ...}}."
         raise invalid(f"{name}: sigma", must, f"it was {sigma!r}", fix)

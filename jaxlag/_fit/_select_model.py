@@ -315,8 +315,10 @@ def _in_order(models: Sequence[Ranked]) -> tuple[Ranked, ...]:
     best = min(models, key=lambda model: model.error)
 
     def key(model: Ranked) -> tuple[bool, int, float]:
-        more = model.squares - best.squares
-        worse = bool(np.isinf(model.error) or np.mean(more) > _standard_error(more))
+        worse = bool(np.isinf(model.error))
+        if not worse:
+            more = model.squares - best.squares
+            worse = bool(np.mean(more) > _standard_error(more))
         return worse, 0 if worse else len(model.fit.names), model.error
 
     return tuple(sorted(models, key=key))

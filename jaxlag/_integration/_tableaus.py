@@ -13,8 +13,8 @@ from jaxlag.solvers._explicit import tableau_of
 
 def remembers(solver: diffrax.AbstractSolver) -> bool:
     """Whether the solver's state is more than a function of (t, y), as in multistep methods."""
-    one_step = diffrax.AbstractRungeKutta | AbstractExplicit | AbstractFixedStep
-    return not isinstance(solver, one_step)
+    runge_kutta = diffrax.AbstractRungeKutta | diffrax.Euler | diffrax.ImplicitEuler
+    return not isinstance(solver, runge_kutta | AbstractExplicit | AbstractFixedStep)
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> Any:

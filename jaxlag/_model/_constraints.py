@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlag._core._by_name import ByName
 from jaxlag._core._errors import invalid
 from jaxlag._model._forces import EXPLICIT_TIME, AbstractForce, reads_lam
 from jaxlag._tracing._signature import require_arity
@@ -297,7 +296,7 @@ class ConstraintRows(NamedTuple):
 
     def unflatten(self, lam: Array) -> dict[str, Array]:
         """Parts of the last axis of lam, shape (..., m), by name."""
-        parts, start = ByName(), 0
+        parts, start = {}, 0
         for name, shape in self.shapes:
             stop = start + int(np.prod(shape))
             parts[name] = lam[..., start:stop].reshape(lam.shape[:-1] + shape)

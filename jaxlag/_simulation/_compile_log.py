@@ -53,7 +53,8 @@ def _message(system: System, seconds: float) -> str:
     """
     names = system.coordinates.labels
     shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-    folder = jax.config.jax_compilation_cache_dir
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir if config.jax_enable_compilation_cache else None
     advice = "Set JAX_COMPILATION_CACHE_DIR to a folder: the next process then loads it from there."
     if folder:
         advice = f"It is kept in {folder} for the next process."

@@ -265,7 +265,8 @@ def warn_of_long_step(dt: Any, ts: Any) -> None:
     if dt is None or not concrete(dt, ts):
         return
     dt, span = float(dt), abs(float(ts[-1]) - float(ts[0]))
-    if dt > span * (1 + 1e-6):
+    rounding = 8 * float(np.finfo(ts.dtype).eps) * float(np.max(np.abs(ts)))
+    if dt > span * (1 + 1e-6) + rounding:
         text = f"`dt` = {dt:g} s is longer than ts, {span:g} s: the motion is one shorter step."
         warnings.warn(text, UserWarning, stacklevel=5)  # below simulate and its two decorators
 

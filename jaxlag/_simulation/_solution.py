@@ -154,7 +154,7 @@ class Solution(AbstractSolution):
     def input_values(self) -> dict[str, Any]:
         """Values of the inputs at the save times, by name, each (s, *its shape).
 
-        They are those that forces read, `Feedback` included; at a knot of a table those after it.
+        They are those at these times, `Feedback` included; at a knot of a table the later ones.
         """
         return ByName(self._quantity("input_values"))
 
@@ -175,8 +175,9 @@ class Solution(AbstractSolution):
             ValueError: no such name; an index into a single motion.
             IndexError: an index beyond the axes of the batch.
         """
-        names = self.system.coordinates.names
-        if isinstance(name, str) and name.endswith("'") and name not in names:
+        quasi, names = self.system.quasi, self.system.coordinates.names
+        known = names if quasi is None else (*names, *quasi.names)
+        if isinstance(name, str) and name[:-1] in names and name not in known and name[-1] == "'":
             return self.rate(name[:-1])
         if not isinstance(name, str):
             if self.ts.ndim == 1:
@@ -185,12 +186,10 @@ class Solution(AbstractSolution):
                     "name", must, was, "For a save time index motion.ts, motion.q, motion.v."
                 )
             return self._select(name)
-        quasi = self.system.quasi
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]
-        if quasi is not None and name not in names:
-            known = [*names, *quasi.names]
-            raise invalid("name", f"be one of {known}", f"it was {name!r}")
+        if name not in known:
+            raise invalid("name", f"be one of {list(known)}", f"it was {name!r}")
         return self.system.coordinates.part(self.q, name)
 
     def __getattr__(self, name: str) -> Any:
@@ -262,7 +261,8 @@ class Solution(AbstractSolution):
     @property
     def power(self) -> dict[str, Float[Array, "*batch s"]]:
         """Terms of dH/dt by name, each (s,), W, in the order of `System.power`."""
-        return in_order(self._quantity("power"), self.system.forces, self.system.constraints)
+        terms = self._quantity("power")
+        return ByName(in_order(terms, self.system.forces, self.system.constraints))
 
     @property
     def work(self) -> dict[str, Float[Array, "*batch s"]]:
@@ -279,7 +279,8 @@ class Solution(AbstractSolution):
                 "it is integrated along with the motion",
                 'Write simulate(..., save=("work",)).',
             )
-        return in_order(self.saved["work"], self.system.forces, self.system.constraints)
+        terms = self.saved["work"]
+        return ByName(in_order(terms, self.system.forces, self.system.constraints))
 
     def check(self) -> "Solution":
         """The motion itself if it is ok; raises if it, or one of a batch, is not.

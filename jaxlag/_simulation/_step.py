@@ -18,7 +18,7 @@ from jaxlag._integration._quasi_singularities import usual
 from jaxlag._integration._stepper import Stepper, all_finite
 from jaxlag._integration._tableaus import remembers
 from jaxlag._model._coordinates import vector
-from jaxlag._model._inputs import check_inputs, check_range, common_range
+from jaxlag._model._inputs import check_inputs, check_range, common_range, knots_increase
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import choose
 from jaxlag._simulation._option_checks import (
@@ -42,9 +42,6 @@ from jaxlag.solvers import AbstractExplicit, AbstractPartitioned
 UNROLLED = 200
 """Lines of dy/dt times stages up to which a step is unrolled. Its reverse derivative then takes
 half the time of a loop over stages, and compiles in three times its time."""
-
-_ALMOST = 1.0 - 1e-6
-"""Part of a step: sums of steps may be off from the knots of a table by rounding."""
 
 
 def step(
@@ -136,7 +133,8 @@ def step(
     inputs = check_inputs(inputs)
     known = concrete(t, dt)
     if known:
-        check_range(inputs, np.array([t, t + _ALMOST * dt]), "t and t + dt")
+        slack = _slack(t, dt)
+        check_range(inputs, np.array([t + slack, t + dt - slack]), "t and t + dt")
     check_params(system, params, q, inputs)
     formulation = check_formulation(system, formulation, stabilization, params, q.dtype)
     params = lift_closure_tracers(system, params, q, inputs)
@@ -193,16 +191,23 @@ def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
 
     def one(y: Array, k: Array) -> tuple[Array, None]:
         y1, good = _checked(stepper, k * h, (k + 1) * h, y, args)
-        return jnp.where(good, y1, jnp.nan), None
+        return jnp.where(good & (h > 0), y1, jnp.nan), None
 
     indices = jnp.arange(count).astype(zero.dtype)
     y = one(y, indices[0])[0] if count == 1 else jax.lax.scan(one, y, indices)[0]
     span = common_range(inputs)
     if span is not None:
-        defined = (span[0] <= t) & (t + _ALMOST * values.step <= span[1])
+        first, last = (time.astype(t.dtype) for time in span)
+        slack = _slack(t, values.step)
+        defined = (first <= t + slack) & (ts[1] - slack <= last) & knots_increase(inputs)
         y = jnp.where(defined, y, jnp.nan)
     q, w = dynamics.parts(y)
     return q, dynamics.velocities_of(ts[1], q, w, args)
+
+
+def _slack(t: Any, dt: Any) -> Any:
+    """By what a sum of steps may be off from the ends of a table, s."""
+    return jnp.maximum(1e-6 * dt, 64 * float(jnp.finfo(dt.dtype).eps) * (abs(t) + dt))
 
 
 def _briefly(stepper: Stepper) -> Stepper:
@@ -220,7 +225,7 @@ def _checked(
     stepper: Stepper, t: Array, end: Array, y: Array, args: Any
 ) -> tuple[Array, Bool[Array, ""]]:
     """The state after one step, and whether all its checks hold."""
-    inside = stepper.within(args, end - _ALMOST * (end - t))  # past a knot at its start
+    inside = stepper.within(args, t + 0.5 * (end - t))  # off the knots at its ends
     memory, jump = stepper.afresh(t, end, y, args)
     y1, estimate, _, solved = stepper.step(t, end, y, inside, memory, jump)
     finite = all_finite(y1)

@@ -371,8 +371,9 @@ def failed_save(motion: AbstractSolution) -> str:
     A state is saved by a step of its own from the start of the accepted step around it, and this
     step may fail alone.
     """
-    ts, lost = np.asarray(motion.ts), np.isnan(np.asarray(motion.q)).any(axis=1)
-    first = np.flatnonzero(lost)[:1].tolist()
+    ts: np.ndarray = np.asarray(motion.ts)
+    lost: np.ndarray = np.any(np.isnan(np.asarray(motion.q)), axis=1)
+    first = (1 + np.flatnonzero(lost[1:])[:1]).tolist()
     if not first or (float(motion.last_time) - ts[first[0]]) * (ts[-1] - ts[0]) < 0:
         return ""
     return f" in the step to ts[{first[0]}] = {ts[first[0]]:g}"

@@ -87,7 +87,8 @@ def nonfinite(
     """The first declared function that is not finite, of those that the equations of motion read.
 
     Values and those derivatives that are terms of M a + h = Q + A^T lam are computed operation by
-    operation, without compilation. None if all are finite, or if v does not exist there.
+    operation, without compilation. None if all are finite, if v does not exist there, or if they
+    cannot be computed in this way, as with random keys or traced values.
 
     Args:
         system: the declaration.
@@ -97,6 +98,20 @@ def nonfinite(
         q: coordinates, (n,).
         v: velocities, (n,).
     """
+    try:
+        return _first(system, params, inputs, t, q, v)
+    except Exception:  # it explains another failure, and must not replace it
+        return None
+
+
+def _first(
+    system: AbstractReactions,
+    params: Any,
+    inputs: Mapping[str, AbstractInput | Array],
+    t: Any,
+    q: Array,
+    v: Array,
+) -> NonFinite | None:
     own, kind = Params(params), q.dtype
     z: dict[str, Any] = {"t": jnp.asarray(t, jnp.result_type(float)), "q": q, "v": v}
     whole = own.join(own.leaves)

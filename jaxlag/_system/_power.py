@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlag._core._by_name import ByName
 from jaxlag._lowering import ArrayTerms
 from jaxlag._model._constraints import AbstractConstraint, ConstraintRows
 from jaxlag._model._forces import EXPLICIT_TIME, AbstractForce, components, reads_lam
@@ -72,4 +71,4 @@ def in_order(
     """Terms of dH/dt in the order of declaration, explicit time last: jit sorts dicts by name."""
     rows = [name for constraint in constraints for name in constraint.all_names]
     names = (*(force.name for force in forces), *rows, EXPLICIT_TIME)
-    return ByName({name: terms[name] for name in names if name in terms})
+    return {name: terms[name] for name in names if name in terms}

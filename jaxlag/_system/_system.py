@@ -289,7 +289,8 @@ class System(AbstractReactions):
             terms += self._terms.rows(t, q, v, params)
         if not all(bool(jnp.all(jnp.isfinite(x))) for x in terms):
             self._refuse_nonfinite(params, inputs, t, q, v)
-            raise invalid("lagrangian", "be finite at the given state", f"it was {L}, M = {M}")
+            was = f"L was {L}, M {M}" + (f", A {terms[2]}" if self.constraints else "")
+            raise invalid("lagrangian and constraints", "be finite at the given state", was)
         if self.constraints:
             M, _ = augmented(M, terms[2])
         vanishing = vanishing_rows(self, params, t, q)

@@ -15,10 +15,12 @@ ROUNDINGS = 10.0
 class StageChord(optimistix.AbstractRootFinder):
     """optimistix's chord method with another end: both the increment and the residual are small.
 
-    The unknown of a stage is f = dy/dt, and its equation f - f(t, y + a h f) = 0 is in the same
-    units. With the scale s_i = max(atol_i, 10 eps rms(f)) + rtol |f_i|, iterations end when
-    rms(increment / s) < 1 and rms(residual / s) < 1. `optimistix.Chord` compares the residual with
-    atol alone, which is below its rounding if accelerations are large: 1e-6 of 10 m/s^2 in float32.
+    The unknown of a stage is f = dy/dt (or h f), and its equation f - f(t, y + a h f) = 0 is in the
+    same units. Iterations end when rms(increment / s) < 1 and rms(residual / s) < 1 with the scale
+    s_i = atol_i + rtol |f_i|. If increments no longer decrease, they are rounding: then
+    s_i = max(atol_i, 10 eps rms(f)) + rtol |f_i| suffices. `optimistix.Chord` compares the residual
+    with atol alone, which is below its rounding if accelerations are large: 1e-6 of 10 m/s^2 in
+    float32.
 
     Attributes:
         rtol: relative bound.
@@ -48,8 +50,14 @@ class StageChord(optimistix.AbstractRootFinder):
         """(whether it has converged or failed, optimistix's result)."""
         del fn, args, options, tags
         rounding = ROUNDINGS * jnp.finfo(y.dtype).eps * optimistix.rms_norm(y)
-        scale = jnp.maximum(self.atol, rounding) + self.rtol * jnp.abs(y)
-        ended = (self.norm(state.diff / scale) < 1) & (self.norm(state.f / scale) < 1)
+        relative = self.rtol * jnp.abs(y)
+
+        def small(scale: Array) -> Bool[Array, ""]:
+            return (self.norm(state.diff / scale) < 1) & (self.norm(state.f / scale) < 1)
+
+        stalled = (state.step >= 2) & ~(state.diffsize < state.diffsize_prev)
+        rounded = stalled & small(jnp.maximum(self.atol, rounding) + relative)
+        ended = small(self.atol + relative) | rounded
         return ended | (state.result != optimistix.RESULTS.successful), state.result
 
     def postprocess(self, *args: Any, **kwargs: Any) -> Any:

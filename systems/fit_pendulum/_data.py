@@ -219,7 +219,7 @@ def read(path: Path) -> Recording:
 def _table(path: Path) -> tuple[list[str], np.ndarray]:
     try:
         with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
-            lines = [line for line in file if line.strip() and not line.startswith("#")]
+            lines = [text for text in (line.partition("#")[0].strip() for line in file) if text]
     except (OSError, EOFError, UnicodeDecodeError) as error:
         raise data_error(
             "the recording",

@@ -120,15 +120,14 @@ def try_models(
 
 
 def _require_fit(name: str, test: Sequence[jl.Experiment], trials: Mapping[str, Trial]) -> None:
-    """Raise if no model predicts better than a straight line through each window.
+    """Raise if no model predicts more than the mean and a straight line through each window do.
 
     A line has the free start of a window, and no equation of motion.
     """
-    lines = [_from_line(each.ts, each.channels["q"][:, 0]) for each in test]
-    line = float(np.sqrt(np.mean(np.concatenate(lines) ** 2)))
+    mean, line = (_off(test, degree) for degree in (0, 1))
     errors = [float(trial.test.rms("q")[0]) for trial in trials.values()]
     best = min((x for x in errors if np.isfinite(x)), default=np.inf)
-    if not best < NO_BETTER * line:
+    if not (best < NO_BETTER * line or best < 0.5 * mean):
         reach = max(float(np.max(np.abs(each.channels["q"]))) for each in test)
         raise data_error(
             f"the angle of {name}",
@@ -139,9 +138,13 @@ def _require_fit(name: str, test: Sequence[jl.Experiment], trials: Mapping[str, 
         )
 
 
-def _from_line(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Deviations from the straight line of least squares."""
-    return q - np.polyval(np.polyfit(t - t[0], q, 1), t - t[0])
+def _off(test: Sequence[jl.Experiment], degree: int) -> float:
+    """Root mean square of the deviations from a polynomial of least squares in each window."""
+    found = []
+    for each in test:
+        t, q = each.ts - each.ts[0], each.channels["q"][:, 0]
+        found.append(q - np.polyval(np.polyfit(t, q, degree), t))
+    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
 
 def fit_segments(recording: Recording, trials: Mapping[str, Trial]) -> dict[str, jl.FitResult]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxlag as jl
+from jaxlag._core._arrays import array_of
 
 PARAMS = {"m": 2.0, "k": 8.0}
 Q0, V0, TS = [1.0, 2.0], [0.0, 1.0], [0.0, 1.0]
@@ -59,3 +60,12 @@ def test_mixed_precisions_use_the_wider_one():
     options = {"dt": 0.5, "method": "euler"}
     mixed = run(q0=half, v0=jnp.asarray(V0, jnp.float32), **options)
     assert mixed.q.dtype == jnp.float32
+
+
+def test_lists_keep_the_precision_of_their_numbers():
+    """Python's numbers alone are float64."""
+    single = [jnp.float32(1.0), 2.0]
+    for numbers, kind in (([1.0, 2], jnp.float64), (single, jnp.float32), ((1.0,), jnp.float64)):
+        assert array_of(numbers).dtype == jnp.asarray(numbers).dtype == kind
+    with pytest.raises(TypeError):
+        array_of([{}])

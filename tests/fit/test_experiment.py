@@ -70,7 +70,7 @@ def test_invalid_experiment_is_named(ts, channels, options, message):
 
 
 def test_one_sigma_is_that_of_all_channels():
-    one = jl.Experiment(TS, {"x": TS, "y": np.stack([TS, TS], 1)}, sigma=0.1)
+    one = jl.Experiment(TS, {"x": TS, "y": np.stack([TS, TS], 1)}, sigma=np.array(0.1))
     each = jl.Experiment(TS, {"x": TS, "y": np.stack([TS, TS], 1)}, sigma={"x": 0.1, "y": 0.1})
     assert one.sigma.keys() == {"x", "y"}
     for name, x in each.sigma.items():

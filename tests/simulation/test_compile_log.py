@@ -40,7 +40,7 @@ def test_long_compilation_is_logged_once(monkeypatch, caplog):
 def test_advice_is_the_cache_unless_it_is_used(monkeypatch):
     """The tests use one: see above."""
     monkeypatch.setattr(_compile_log, "jax", SimpleNamespace(config=SimpleNamespace(
-        jax_compilation_cache_dir=None)))  # fmt: skip
+        jax_compilation_cache_dir="x", jax_enable_compilation_cache=False)))  # fmt: skip
     assert "Set JAX_COMPILATION_CACHE_DIR to a folder" in _compile_log._message(PAIR, 7.0)
 
 

@@ -104,7 +104,7 @@ def test_a_name_with_a_prime_is_a_velocity(motion, batch):
     """As in `to_dict`."""
     np.testing.assert_array_equal(motion["arm'"], motion.rate("arm"))
     np.testing.assert_array_equal(batch["x'"], batch.rate("x"))
-    with pytest.raises(ValueError, match=r"`name` must be one of .*, but it was 'z'"):
+    with pytest.raises(ValueError, match=r"`name` must be one of .*, but it was \"z'\""):
         motion["z'"]
 
 
@@ -143,3 +143,17 @@ def test_input_values_are_those_that_forces_read():
     np.testing.assert_allclose(found["control"], -motion.q - motion.v, rtol=1e-15)
     with pytest.raises(KeyError, match=r"one of \['control', 'table', 'wave'\], .* Write 'table'"):
         found["tables"]
+
+
+def test_a_quasi_velocity_may_have_a_prime_in_its_name():
+    def speeds(t, q, v, p):
+        return jnp.stack([2.0 * v[0], v[1]])
+
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), quasi=jl.QuasiVelocities(speeds, ("x'", "w"))
+    )
+    motion = jl.simulate(system, [0.0, 0.0], [1.0, 3.0], [0.0, 1.0], dt=0.5, method="heun")
+    np.testing.assert_allclose(motion["x'"], 2.0)
+    np.testing.assert_allclose(motion["y'"], 3.0)
+    with pytest.raises(ValueError, match=r"one of \['x', 'y', \"x'\", 'w'\], but it was \"w'\""):
+        motion["w'"]

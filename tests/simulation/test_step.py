@@ -27,12 +27,11 @@ spring = jl.System(
 one = partial(jl.step, spring, dt=0.1, params=P, inputs={"torque": 0.5})
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_a_step_is_that_of_simulate(steps):
-    q, v = one([0.3], [0.2], steps=steps)
-    motion = jl.simulate(
-        spring, [0.3], [0.2], [0.0, 0.1], P, inputs={"torque": 0.5}, dt=0.1 / steps, method="tsit5"
-    )
+@pytest.mark.parametrize(("method", "steps"), [("tsit5", 1), ("tsit5", 3), ("euler", 2)])
+def test_a_step_is_that_of_simulate(method, steps):
+    q, v = one([0.3], [0.2], steps=steps, method=method)
+    options = {"inputs": {"torque": 0.5}, "dt": 0.1 / steps, "method": method}
+    motion = jl.simulate(spring, [0.3], [0.2], [0.0, 0.1], P, **options)
     np.testing.assert_allclose(q, motion.q[-1], rtol=4e-16)
     np.testing.assert_allclose(v, motion.v[-1], rtol=4e-16)
 
@@ -85,6 +84,25 @@ def test_a_table_is_read_in_the_interval_of_the_step():
     motion = jl.simulate(spring, [0.3], [0.2], ts, P, inputs=table, dt=0.1, method="tsit5")
     np.testing.assert_allclose(jnp.concatenate([q, v]), [*motion.q[-1], *motion.v[-1]], rtol=1e-14)
     assert not np.any(np.isfinite(step(0.25, q, v)))  # beyond the table
+
+
+@pytest.mark.parametrize("summed", [False, True])
+def test_a_table_in_single_precision_is_read_in_the_right_interval(summed):
+    """500 times of 0.02 s, rounded as products or as sums, on either side of the knots."""
+    count, h = 500, jnp.float32(0.02)
+    times = jnp.arange(count + 1).astype(jnp.float32) * h
+    held = jl.GeneralizedForce(lambda t, q, v, p, inputs: inputs["k"][None], "held")
+    free = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2, ("x",), forces=(held,))
+    table = {"k": jl.ZeroOrderHold(times, jnp.arange(count + 1).astype(jnp.float32))}
+    ts = jnp.cumsum(jnp.full(count, h)) - h if summed else times[:-1]
+    zero = jnp.zeros(1, jnp.float32)
+    steps = jax.jit(jax.vmap(lambda t: jl.step(free, zero, zero, h, t=t, inputs=table)[1][0]))
+    np.testing.assert_allclose(np.asarray(steps(ts)) / 0.02, np.arange(count), atol=1e-3)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1])
+def test_a_traced_step_that_is_not_positive_is_nan(dt):
+    assert np.isnan(jax.jit(lambda dt: one([0.3], [0.2], dt=dt))(dt)).all()
 
 
 def test_a_step_that_fails_is_nan():

@@ -32,6 +32,18 @@ def test_large_rates_converge_to_their_rounding(dtype):
     assert found.result != optimistix.RESULTS.successful
 
 
+def test_small_components_are_not_lost_beside_large_ones():
+    """10 eps of 1e6 is 1 in float32; the equation of the second component is its own."""
+
+    def residual(f, _):
+        return f - jnp.stack([jnp.float32(1e6), jnp.float32(0.9) * jnp.cos(f[1])])
+
+    guess = jnp.array([1e6, 0.0], jnp.float32)
+    found = optimistix.root_find(residual, StageChord(1e-6, 1e-6), guess, max_steps=64)
+    root = found.value[1]
+    np.testing.assert_allclose(root, 0.9 * np.cos(root), rtol=4e-6)
+
+
 def test_roots_near_zero_are_held_to_the_absolute_bound():
     def residual(f, _):
         return 1e-3 * jnp.sin(f) + f - 2e-5

@@ -172,3 +172,20 @@ def test_batches_name_the_coordinate_and_the_status():
     )(jnp.array([[1.0, 0.0], [-1.0, 0.0]]))
     assert batch.status.tolist() == [jl.Status.ok, jl.Status.nonfinite]
     assert batch.where.tolist() == [-1, 0]
+
+
+def test_params_that_cannot_be_examined_hide_no_error():
+    """A random key among the params: the motion still ends with its own message."""
+
+    def noisy(t, q, v, p):
+        return 0.5 * v @ v - jnp.log(q[0]) * jax.random.uniform(p["key"])
+
+    system = jl.System(noisy, PLANE)
+    params = {"key": jax.random.key(0)}
+    at = jnp.array([-1.0, 0.0]), jnp.zeros(2)
+    assert nonfinite(system, params, {}, 0.0, *at) is None
+    options = {"dt": 0.5, "method": "heun", "throw": False}
+    motion = jl.simulate(system, *at, [0.0, 1.0], params, **options)
+    assert motion.message().startswith("nonfinite")
+    with pytest.raises(ValueError, match="must be finite at the given state"):
+        system.check(*at, params)
