@@ -109,12 +109,11 @@ def test_explicit_rows_give_the_motion_of_quasi_velocities(name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*FEW, "chaplygin_ball", "rolling_disk"])
 def test_derivatives_are_equal_in_both_formulations(name):
     """Of an end quantity, by start and parameters, along starts that satisfy the constraints.
 
-    A few systems in reverse mode, every component; all others in forward mode, in a random
-    direction.
+    Three systems in reverse mode, every component; two in forward mode, in a random direction.
     """
     entry = ENTRIES[name]
     (q0, u0), system = free_start(entry), entry.system
