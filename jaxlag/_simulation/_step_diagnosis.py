@@ -359,7 +359,8 @@ def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> st
     if lost is not None:
         places.append((lost[0], *jnp.split(lost[1], 2)))
     for t, q, v in places:
-        found = nonfinite(motion.system, motion._given, motion.inputs, t, q, v)
+        given = stop_gradient((motion._given, motion.inputs, t, q, v))  # with values under grad
+        found = nonfinite(motion.system, *given)
         if found is not None:
             return f" {found}"
     return ""
@@ -371,9 +372,11 @@ def failed_save(motion: AbstractSolution) -> str:
     A state is saved by a step of its own from the start of the accepted step around it, and this
     step may fail alone.
     """
-    ts: np.ndarray = np.asarray(motion.ts)
-    lost: np.ndarray = np.any(np.isnan(np.asarray(motion.q)), axis=1)
+    # Under grad the numbers are traced, but have values.
+    values: Any = stop_gradient((motion.ts, motion.q, motion.last_time))
+    ts, q, last_time = map(np.asarray, values)
+    lost: np.ndarray = np.any(np.isnan(q), axis=1)
     first = (1 + np.flatnonzero(lost[1:])[:1]).tolist()
-    if not first or (float(motion.last_time) - ts[first[0]]) * (ts[-1] - ts[0]) < 0:
+    if not first or (last_time - ts[first[0]]) * (ts[-1] - ts[0]) < 0:
         return ""
     return f" in the step to ts[{first[0]}] = {ts[first[0]]:g}"

@@ -12,7 +12,7 @@ from _systems.problems import MOTIONS, Motion
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
-from jaxlag._gradient import _solve, _tangent_map
+from jaxlag._gradient import _differentiable_solve, _tangent_map
 from jaxlag._simulation import _simulate
 
 NAMES = mostly_full(MOTIONS, "driven_pendulum")
@@ -102,10 +102,10 @@ def recorded(motion: Motion, x):
             params=x["params"],
             inputs=base.inputs if x["inputs"] is None else x["inputs"],
         )
-        problem = _solve.split(_simulate.build_problem(plan, values)[2])
+        problem = _differentiable_solve.split(_simulate.build_problem(plan, values)[2])
         if outcome is None:
-            return _solve._recorded(problem)
-        replayed = _solve._replay(problem, outcome, problem.differentiable)
+            return _differentiable_solve._recorded(problem)
+        replayed = _differentiable_solve._replay(problem, outcome, problem.differentiable)
         n = motion.system.size
         return jnp.concatenate([replayed.saved[-1], replayed.saved[1, :n]])
 
@@ -358,8 +358,10 @@ def test_saves_that_are_not_reached_keep_the_gradient_finite():
 def test_wrong_sign_of_the_tangent_rule_is_detected(derivatives, monkeypatch):
     """The comparisons above fail for a wrong sign of the tangent rule."""
     _, x, dx, (_, dy, _, _) = derivatives("central_motion")
-    right = _solve.changes
-    monkeypatch.setattr(_solve, "changes", lambda *args: jax.tree.map(jnp.negative, right(*args)))
+    right = _differentiable_solve.changes
+    monkeypatch.setattr(
+        _differentiable_solve, "changes", lambda *args: jax.tree.map(jnp.negative, right(*args))
+    )
     state, _ = end(MOTIONS["central_motion"], max_steps=4097)  # another program: no cache is used
     _, wrong = jax.jit(lambda x, dx: jax.jvp(state, (x,), (dx,)))(x, dx)
     np.testing.assert_allclose(wrong, -dy, rtol=1e-9)

@@ -75,7 +75,7 @@ def test_saves_are_as_accurate_as_step_ends(reference, method):
 
 def step_ends(options):
     """Times of the accepted steps of an adaptive solve, from its recorded grid."""
-    from jaxlag._gradient import _solve
+    from jaxlag._gradient import _differentiable_solve
     from jaxlag._simulation import _simulate
 
     caught = []
@@ -91,8 +91,8 @@ def step_ends(options):
 
     @jax.jit
     def record(values):
-        problem = _solve.split(_simulate.build_problem(plan, values)[2])
-        return _solve._recorded(problem).record
+        problem = _differentiable_solve.split(_simulate.build_problem(plan, values)[2])
+        return _differentiable_solve._recorded(problem).record
 
     recorded = record(values)
     # An iteration that was not accepted ends where the last one did; the stop has a negative

@@ -134,7 +134,7 @@ def test_last_step_ends_at_the_end_of_the_span():
     assert int(motion.stats["accepted"]) == 4
     whole = jl.simulate(plain, Q0, V0, [0.0, 0.9], PARAMS, method="splitting2", dt=0.3)
     rest = jl.simulate(
-        plain, whole.q[-1], whole.v[-1], [0.9, 1.0], PARAMS, method="splitting2", dt=1.0
+        plain, whole.q[-1], whole.v[-1], [0.9, 1.0], PARAMS, method="splitting2", dt=0.1
     )
     np.testing.assert_allclose(motion.q[-1], rest.q[-1], rtol=0, atol=8 * EPS)
 
