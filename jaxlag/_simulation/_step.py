@@ -111,7 +111,7 @@ def step(
         >>> start = jnp.array([0.1]), jnp.array([0.0])
         >>> energies = jax.lax.scan(interval, start, None, length=10)[1]
         >>> print(f"{energies[0] + 9.81:.2f} J {energies[-1] + 9.81:.2f} J")
-        0.05 J 0.24 J
+        0.05 J 0.20 J
     """
     if not isinstance(system, System):
         raise invalid("step: system", "be a jl.System", f"it was {system!r}")

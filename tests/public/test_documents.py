@@ -26,7 +26,7 @@ FIRST = 4
 
 
 @pytest.mark.parametrize(
-    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 10)], (FIRST, 2)), ids=["first", "all"]
+    ("count", "outputs"), mostly_full([(FIRST, 2), (None, 11)], (FIRST, 2)), ids=["first", "all"]
 )
 def test_readme_prints_the_stated_output(count, outputs):
     assert run("README.md", blocks(README)[:count], {}) == outputs
