@@ -44,6 +44,7 @@ from jaxlag._model._input_signals import TimeFunction as TimeFunction
 from jaxlag._model._input_signals import ZeroOrderHold as ZeroOrderHold
 from jaxlag._model._named import named as named
 from jaxlag._model._quasi_velocities import QuasiVelocities as QuasiVelocities
+from jaxlag._model._states import States as States
 from jaxlag._simulation._lyapunov import lyapunov as lyapunov
 from jaxlag._simulation._perturbation_growth import PerturbationGrowth as PerturbationGrowth
 from jaxlag._simulation._simulate import simulate as simulate

@@ -85,6 +85,10 @@ def check_known_params(
     Raises:
         ValueError: with the path of the leaf.
     """
+    if system.states is not None:
+        was = f"it had the states {list(system.states.names)}, whose start is in no Experiment"
+        fix = "Minimize a loss of jl.simulate(..., x0=) with optimistix or optax."
+        raise invalid(f"{by}: system", "be without states=", was, fix)
     if not concrete(params):
         why = "its search runs outside of compiled programs"
         raise unsupported(f"`{by}` inside jit, vmap and grad", why, "Call it outside of these.")

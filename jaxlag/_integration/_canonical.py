@@ -100,7 +100,7 @@ class Canonical(eqx.Module):
         return self.dynamics.clock(tau, self.args), self.dynamics.given(self.args)[0]
 
     def _given(self, tau: Array, q: Array, v: Array) -> tuple[Array, Any, Any]:
-        return *self._at(tau), self.dynamics.inputs_at(tau, q, v, self.args)
+        return *self._at(tau), self.dynamics.inputs_at(tau, q, v, q[:0], self.args)
 
     def _of_rows(self, x: Array, other: Array) -> Array:
         return x if self.args.active_rows is None else jnp.where(self.args.active_rows, x, other)

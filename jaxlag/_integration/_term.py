@@ -46,14 +46,14 @@ class Term(diffrax.ODETerm):
     @property
     def second_order(self) -> bool:
         """Whether the state is (q, v): dq/dtau = sigma v, dv/dtau = sigma a."""
-        return self.dynamics.quasi is None and not self.works
+        return self.dynamics.quasi is None and not self.works and not self.dynamics.states
 
     def signed(self, x: Any, args: Arguments) -> Any:
         """Sigma x, of a tree."""
         return jax.tree.map(lambda x: self.dynamics.signed(x, args), x)
 
     def sections(self, y: Any) -> tuple[Any, Any, Any]:
-        """(q, v, work) of a state or of its rates."""
+        """(q, v, the rest) of a state or of its rates."""
         n, rest = self.dynamics.system.size, self.dynamics.system.size + self.dynamics.speeds
         return y[:n], y[n:rest], y[rest:]
 

@@ -30,6 +30,7 @@ from jaxlag._model._inputs import (
     reads_state,
 )
 from jaxlag._model._quasi_velocities import QuasiVelocities
+from jaxlag._model._states import with_states
 from jaxlag._system._power import Power
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -41,7 +42,8 @@ class VectorField(eqx.Module):
     tau = sigma (t - t0) with t0 the start and sigma the direction of time.
 
     In the quasi-velocity formulation y = (q, w) and dy/dtau = sigma (v, w') with w the free
-    quasi-velocities. With work, y has one more component for each term of dH/dt.
+    quasi-velocities. States x of the system follow, y = (q, v, x). With work, y has one more
+    component for each term of dH/dt.
 
     Attributes:
         system: the mechanical system.
@@ -102,6 +104,11 @@ class VectorField(eqx.Module):
     def speeds(self) -> int:
         """Number of velocities, or of quasi-velocities, in the state."""
         return self.system.size if self.quasi is None else len(self.quasi.free)
+
+    @property
+    def states(self) -> int:
+        """Number of states beside the coordinates and velocities."""
+        return 0 if self.system.states is None else self.system.states.size
 
     def _solved(self, terms: ArrayTerms) -> ArrayTerms:
         """The terms with the selected solve for constraints."""
@@ -281,10 +288,10 @@ class VectorField(eqx.Module):
         terms = self.terms
         return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
 
-    def state_of(self, t: Array, q: Array, v: Array, params: Any) -> Array:
-        """The state of a motion from (q, v), with zero work."""
+    def state_of(self, t: Array, q: Array, v: Array, x: Array | None, params: Any) -> Array:
+        """The state of a motion from (q, v, x), with zero work."""
         w = v if self.quasi is None else self.quasi.of(t, q, v, params)[self.quasi.free]
-        return self.start(q, w)
+        return self.start(q, w, x)
 
     def state(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any]:
         """(t, q, v, params) at (tau, y)."""
@@ -307,16 +314,17 @@ class VectorField(eqx.Module):
     def at(self, tau: Array, y: Array, args: Arguments) -> tuple[Array, Array, Array, Any, Any]:
         """(t, q, v, params, values of the inputs) at (tau, y)."""
         t, q, v, params = self.state(tau, y, args)
-        return t, q, v, params, self.inputs_at(tau, q, v, args)
+        return t, q, v, params, self.inputs_at(tau, q, v, self.x(y), args)
 
-    def inputs_at(self, tau: Array, q: Array, v: Array, args: Arguments) -> Any:
-        """Values of the inputs within a step, or in the interval that starts at tau."""
+    def inputs_at(self, tau: Array, q: Array, v: Array, x: Array, args: Arguments) -> Any:
+        """Values of inputs and states within a step, or in the interval that starts at tau."""
         args = self.within(args, tau)
         (params, inputs), since = self.given(args), self.signed(tau, args)
         first, inputs = dict.fromkeys(inputs, 0), counted_from(args.origin, inputs)
-        return evaluate(
+        values = evaluate(
             inputs, self.clock(tau, args), q, v, params, first, since, self.extrapolates
         )
+        return with_states(values, self.system.states, x)
 
     def mass(
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
@@ -332,6 +340,8 @@ class VectorField(eqx.Module):
             rates = [self._quasi_rates(tau, y, args)]
         else:
             rates = [self.parts(y)[1], self.acceleration(tau, y, args)]
+        if self.system.states is not None:
+            rates.append(self.system.states.rates(*self.at(tau, y, args)))
         if self.power is not None and self.power.names:
             t, q, v, params, values = self.at(tau, y, args)
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
@@ -347,7 +357,8 @@ class VectorField(eqx.Module):
         """Values of the inputs anywhere, for programs keyed by their shapes; else none."""
         if not self.program.keyed_by_inputs(args.constants):
             return {}
-        return self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), args)
+        x = jnp.zeros((self.states,), q.dtype)
+        return self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), x, args)
 
     def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
         """The state as programs take it, with quasi-velocities if it has them."""
@@ -355,26 +366,34 @@ class VectorField(eqx.Module):
         v = w
         if self.quasi is not None:
             v = self.velocities_of(t, q, w, args) if reads_state(inputs) else jnp.zeros_like(q)
-        return State(t, q, w, params, self.inputs_at(tau, q, v, args))
+        return State(t, q, w, params, self.inputs_at(tau, q, v, self.x(y), args))
 
     def parts(self, y: Any) -> tuple[Any, Any]:
         """(q, v), or (q, w), of y, (..., m)."""
         n, rest = self.system.size, self.system.size + self.speeds
         return y[..., :n], y[..., n:rest]
 
-    def start(self, q0: Float[Array, " n"], w0: Float[Array, " k"]) -> Float[Array, " m"]:
+    def x(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
+        """The states beside (q, v) in y."""
+        start = self.system.size + self.speeds
+        return y[..., start : start + self.states]
+
+    def start(
+        self, q0: Float[Array, " n"], w0: Float[Array, " k"], x0: Float[Array, " j"] | None
+    ) -> Float[Array, " m"]:
         """y at the start, with zero work."""
         terms = 0 if self.power is None else len(self.power.names)
-        return jnp.concatenate([q0, w0, jnp.zeros((terms,), q0.dtype)])
+        beside = [] if x0 is None else [x0]
+        return jnp.concatenate([q0, w0, *beside, jnp.zeros((terms,), q0.dtype)])
 
     def idle(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
         """y without the work done."""
-        return y[..., : self.system.size + self.speeds]
+        return y[..., : self.system.size + self.speeds + self.states]
 
     def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
         """Work done since the start by every term of dH/dt, by name."""
         assert self.power is not None
-        columns = jnp.moveaxis(y[..., self.system.size + self.speeds :], -1, 0)
+        columns = jnp.moveaxis(y[..., self.system.size + self.speeds + self.states :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:

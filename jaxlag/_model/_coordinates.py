@@ -21,38 +21,40 @@ class Coordinates:
     Args:
         declared: names, or a mapping from name to shape, e.g. `{"x": (8, 3), "theta": ()}`; a
             number n of entries stands for (n,).
+        argument: name of this argument in errors.
 
     Raises:
         ValueError: no names, duplicate or empty names, shapes that are not tuples of sizes.
     """
 
-    def __init__(self, declared: Sequence[str] | Mapping[str, tuple[int, ...] | int]) -> None:
-        fix = 'Write coordinates=("x", "theta") or {"x": (8, 3), "theta": ()}.'
+    def __init__(
+        self,
+        declared: Sequence[str] | Mapping[str, tuple[int, ...] | int],
+        argument: str = "coordinates",
+    ) -> None:
+        fix = f'Write {argument.split()[-1]}=("x", "theta") or {{"x": (8, 3), "theta": ()}}.'
         if isinstance(declared, str) or not isinstance(declared, Sequence | Mapping):
-            raise invalid(
-                "coordinates", "be names, or names with shapes", f"it was {declared!r}", fix
-            )
+            raise invalid(argument, "be names, or names with shapes", f"it was {declared!r}", fix)
         items = (
             list(declared.items())
             if isinstance(declared, Mapping)
             else [(name, ()) for name in declared]
         )
         if not items:
-            raise invalid("coordinates", "name at least one coordinate", "it was empty", fix)
+            raise invalid(argument, "have at least one name", "it was empty", fix)
         items = [(name, (s,) if _is_count(s) else s) for name, s in items]
         for name, shape in items:
             if not isinstance(name, str) or not name:
-                raise invalid("coordinates", "be non-empty strings", f"one was {name!r}", fix)
+                raise invalid(argument, "be non-empty strings", f"one was {name!r}", fix)
             if not isinstance(shape, tuple) or not all(map(_is_count, shape)):
                 raise invalid(
-                    f"coordinates[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix
+                    f"{argument}[{name!r}]", "be a tuple of sizes", f"it was {shape!r}", fix
                 )
         names = [name for name, _ in items]
         for name in names:
             if names.count(name) > 1:
-                raise invalid(
-                    "coordinates", "be distinct", f"{name!r} occurs {names.count(name)} times"
-                )
+                was = f"{name!r} occurs {names.count(name)} times"
+                raise invalid(argument, "be distinct", was)
         shapes: dict[str, Any] = dict(items)
         self.shapes: dict[str, tuple[int, ...]] = shapes
         self.size = sum(math.prod(shape) for shape in self.shapes.values())
@@ -133,7 +135,7 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
     A scalar is accepted for a single coordinate.
     """
     n = coordinates.size
-    fix = f"Give one entry per coordinate, in the order {list(coordinates.labels)}."
+    fix = f"Give one entry for each, in the order {list(coordinates.labels)}."
     if isinstance(x, Mapping):
         x = coordinates.flatten(x, argument)
     try:

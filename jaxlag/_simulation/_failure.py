@@ -31,9 +31,9 @@ class Ending(NamedTuple):
         status: int32, see `Status`; `diagnose_failure` may refine it.
         where: index of the coordinate or constraint row concerned; -1 if none is known.
         tried: end of the last attempted step, s.
-        state: (q, v), or (q, u), of the last good state.
-        lost: (time, (q, v)) where the equations are not finite; None unless `diagnose_failure` has
-            examined the ending. If they are finite everywhere, the last good time and state.
+        state: (q, v, x), or (q, u, x), of the last good state.
+        lost: (time, (q, v, x)) where the equations are not finite; None unless `diagnose_failure`
+            has examined the ending. If they are finite everywhere, the last good time and state.
     """
 
     status: Int[Array, "*batch"]
@@ -73,7 +73,8 @@ def final_status(
 
     faults, n = ~jnp.isfinite(stop_gradient(y0)), dynamics.system.size
     start = jnp.where(jnp.any(faults), jnp.argmax(faults), -1)
-    # For quasi-velocities the index is no coordinate.
+    # Quasi-velocities and states have no index of a coordinate.
+    start = jnp.where(start < 2 * n, start, -1)
     start = jnp.where(start < n, start, start % n if dynamics.quasi is None else -1)
     start = start.astype(jnp.int32)
     where = jnp.where(status == int(Status.bad_value), start, -1)
@@ -107,9 +108,9 @@ class MotionKey(NamedTuple):
 
 
 def dynamics_of(
-    scene: MotionKey, ts: Array, t: Array, q: Array, v: Array, params: Any, inputs: Any
+    scene: MotionKey, ts: Array, place: tuple[Any, Any, Any, Any], params: Any, inputs: Any
 ) -> tuple[VectorField, Arguments]:
-    """The equations of a motion over ts that passes (q, v) at t, and their arguments."""
+    """The equations of a motion over ts that passes `place`, (t, q, v, x), and their arguments."""
     dynamics = VectorField(
         scene.system,
         scene.params,
@@ -122,9 +123,9 @@ def dynamics_of(
     )
     args = dynamics.arguments(params, inputs, ts)
     given, _ = dynamics.given(args)
-    dynamics = replace(dynamics, rows=dynamics.system._rows(given, q.dtype))
-    y = dynamics.state_of(t, q, v, given)
-    return dynamics, dynamics.precompute(dynamics.tau(t, args), y, args)
+    dynamics = replace(dynamics, rows=dynamics.system._rows(given, place[1].dtype))
+    y = dynamics.state_of(*place, given)
+    return dynamics, dynamics.precompute(dynamics.tau(place[0], args), y, args)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -134,14 +135,14 @@ def diagnose_failure(scene: MotionKey, batch: int, given: Any) -> Ending:
     Args:
         scene: key of the motion.
         batch: number of batch axes.
-        given: (ending, last time, ts, q0, v0, traced halves of params and inputs).
+        given: (ending, last time, ts, q0, v0, x0, traced halves of params and inputs).
     """
 
     def one(given: Any) -> Ending:
-        ending, time, ts, q0, v0, params, inputs = stop_gradient(given)
+        ending, time, ts, q0, v0, x0, params, inputs = stop_gradient(given)
         # v0 does not exist if kinematics are singular at the start.
         v0 = jnp.where(jnp.isfinite(v0), v0, 0.0)
-        dynamics, args = dynamics_of(scene, ts, ts[0], q0, v0, params, inputs)
+        dynamics, args = dynamics_of(scene, ts, (ts[0], q0, v0, x0), params, inputs)
         time, tried, start = (dynamics.tau(t, args) for t in (time, ending.tried, ts[0]))
         return _explained(scene, dynamics, ending, time, tried, start, q0, args)
 
@@ -167,23 +168,22 @@ def _explained(
     """
     status = ending.status
     unexplained = status == int(Status.nonfinite)
-    q, w = dynamics.parts(ending.state)
-    _, _, v, _ = dynamics.state(time, ending.state, args)
-    ahead = jnp.concatenate([q + (tried - time).astype(q.dtype) * v, w])
-    last = ending.state[: ahead.shape[0]]
+    last, (q, _) = ending.state, dynamics.parts(ending.state)
+    _, _, v, _ = dynamics.state(time, last, args)
+    ahead = jnp.concatenate([q + (tried - time).astype(q.dtype) * v, last[q.size :]])
     args = dynamics.within(args, time)
-    found, tau, y = _lost(dynamics, time, tried, ending.state, args, unexplained, scene.implicit)
-    place = jnp.where(found, tau, time), jnp.where(found, y, ending.state)
+    found, tau, y = _lost(dynamics, time, tried, last, args, unexplained, scene.implicit)
+    place = jnp.where(found, tau, time), jnp.where(found, y, last)
     t_lost, q_lost, v_lost, _ = dynamics.state(*place, args)
     tried = jnp.where(found, tau, tried)
-    ahead = jnp.where(found, y[: ahead.shape[0]], ahead)
+    ahead = jnp.where(found, y, ahead)
     # Both states in one batch: the terms are traced and compiled once.
     taus, states = jnp.stack([time, tried]), jnp.stack([last, ahead])
     culprits = jax.vmap(lambda tau, y: _culprits(dynamics, tau, y, args))(taus, states)
     mass, lost = (jnp.where(x[0] >= 0, x[0], x[1]) for x in culprits[:2])
     row = jnp.full((), -1, jnp.int32)
     if dynamics.rows.size and dynamics.quasi is None:
-        begin = jnp.concatenate([q0, w])
+        begin = jnp.concatenate([q0, last[q.size :]])
         at = jnp.append(taus, start), jnp.vstack([states, begin]), args
         row = _dependent(dynamics, args.active_rows, *at)
         if args.rows is not None and args.rows.multiplier_rows.active_rows is not args.active_rows:
@@ -225,7 +225,7 @@ def _explained(
     where = ending.where
     for kind, index in concerns.items():
         where = jnp.where(status == int(kind), index.astype(jnp.int32), where)
-    at = t_lost, jnp.concatenate([q_lost, v_lost])
+    at = t_lost, jnp.concatenate([q_lost, v_lost, dynamics.x(place[1])])
     return ending._replace(status=status.astype(jnp.int32), where=where, lost=at)
 
 

@@ -23,6 +23,7 @@ from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._jaxprs import called, equations, within
 from jaxlag._model._input_signals import AbstractInput, AbstractTable
 from jaxlag._model._inputs import evaluate
+from jaxlag._model._states import named_states
 from jaxlag._system._closure_tracers import declared
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -86,8 +87,15 @@ class Jumps:
             return dict(evaluate(outside, t, q, v, params))
 
         values = jax.eval_shape(values_at, t, shape, shape)
+        timed = dict.fromkeys(values, _TIME)
+        if system.states is not None:
+            x = jax.ShapeDtypeStruct((system.states.size,), q.dtype)
+            beside = jax.eval_shape(partial(named_states, system.states), x)
+            values, timed = values | beside, timed | dict.fromkeys(beside, _STATE)
+        self._known = not outside
         self._moving = t, shape, shape, values
-        moving = [_TIME, _STATE, _STATE, *[_TIME] * len(jax.tree.leaves(values))]
+        paths = jax.tree_util.tree_flatten_with_path(values)[0]
+        moving = [_TIME, _STATE, _STATE, *[timed[path[0].key] for path, _ in paths]]
         names = [frozenset({name}) for name in (*moving, *names_of(*self._traced))]
         self._found: list[_Found] = []
         self._line = "an unknown line"
@@ -171,7 +179,7 @@ class Jumps:
     def _numbers(self) -> tuple[list[Array], bool]:
         """(arguments of the program, whether all are known); unknown ones are random."""
         draw = np.random.default_rng(0).uniform
-        known, found = not jax.tree.leaves(self._moving[3]), []
+        known, found = self._known, []
         for x in jax.tree.leaves(self._moving):
             found.append(jnp.asarray(draw(0.5, 1.5, x.shape), x.dtype))
         for x in jax.tree.leaves(self._traced):

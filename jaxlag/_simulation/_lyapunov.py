@@ -120,6 +120,9 @@ def lyapunov(
     if not isinstance(motion, Solution):
         fix = "Pass what jl.simulate returns."
         raise invalid("lyapunov: motion", "be a jl.Solution", f"it was {motion!r}", fix)
+    if motion.system.states is not None:
+        was = f"it had the states {list(motion.system.states.names)}"
+        raise invalid("lyapunov: motion", "be of a system without states=", was)
     if motion.ts.shape[-1] < 3:
         must, was = "have at least 3 save times", f"it had {motion.ts.shape[-1]}"
         fix = "Simulate it with ts=jnp.linspace(t0, t1, 101)."

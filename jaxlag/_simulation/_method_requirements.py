@@ -40,6 +40,10 @@ def check_requirements(
     if not isinstance(solver, Splitting | AbstractPartitioned):
         return
     name = f"method {type(solver).__name__}"
+    if system.states is not None:
+        must, was = "be used without states=", f"there were the states {list(system.states.names)}"
+        fix = "Choose another method: its map keeps the structure of mechanical equations alone."
+        raise invalid(name, must, was, fix)
     if formulation != "multipliers":
         was = f"formulation was {formulation!r}"
         fix = "Pass formulation='multipliers', or another method."
@@ -61,8 +65,8 @@ def check_requirements(
 
 
 def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
-    """Whether L is T(v) - V(t, q), without forces and constraints."""
-    if formulation != "multipliers" or system.constraints or system.forces:
+    """Whether L is T(v) - V(t, q), without forces, constraints and states of its own."""
+    if formulation != "multipliers" or system.constraints or system.forces or system.states:
         return False
     structure = system._structure(params, dtype)
     return not (structure.mass & {"t", "q", "v"} or "v" in structure.bias)

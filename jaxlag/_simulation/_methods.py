@@ -262,7 +262,7 @@ def _with_tolerances(
     )
 
 
-def for_state(solver: Any, controller: Any, n: int, size: int) -> tuple[Any, Any]:
+def for_state(solver: Any, controller: Any, n: int, k: int, size: int) -> tuple[Any, Any]:
     """Solver and controller with one atol for every component of the state.
 
     An atol for every coordinate is also used for its velocity.
@@ -271,15 +271,16 @@ def for_state(solver: Any, controller: Any, n: int, size: int) -> tuple[Any, Any
         solver: of `choose`.
         controller: the same.
         n: number of coordinates.
-        size: of the state (q, v), with the integrals that follow it.
+        k: number of states beside them.
+        size: of the state (q, v, x), with the integrals that follow it.
     """
 
     def of(owner: Any) -> Any:
         atol: Any = getattr(owner, "atol", None)
-        if not eqx.is_array(atol) or atol.shape != (n,):
+        if not eqx.is_array(atol) or atol.shape != (n + k,):
             return owner
-        rest = jnp.full((size - 2 * n,), jnp.max(atol))
-        return eqx.tree_at(lambda x: x.atol, owner, jnp.concatenate([atol, atol, rest]))
+        rest = jnp.full((size - 2 * n - k,), jnp.max(atol))
+        return eqx.tree_at(lambda x: x.atol, owner, jnp.concatenate([atol[:n], atol, rest]))
 
     finder = getattr(solver, "root_finder", None)
     if finder is not None:

@@ -63,6 +63,9 @@ def check_options(
         if name == "u" and system.quasi is None:
             must, was = "name quantities of the system", "one was 'u' without quasi-velocities"
             raise invalid("save", must, was, "Declare the system with quasi=.")
+        if name == "state_rates" and system.states is None:
+            must, was = "name quantities of the system", "one was 'state_rates' without states"
+            raise invalid("save", must, was, "Declare the system with states=.")
         if name in ("kinetic", "potential") and getattr(system, f"_{name}") is None:
             raise invalid(
                 "save",
@@ -214,14 +217,16 @@ def check_tolerances(
         if np.ndim(atol):  # for every component of the state
             atol = jnp.max(jnp.asarray(atol))
     elif isinstance(atol, Mapping):
-        atol = system.coordinates.flatten(atol, "atol")
+        atol = _by_name(system, atol)
     defaults = default_tolerances(dtype)
     rtol = _number("rtol", "be a number", defaults[0] if rtol is None else rtol, dtype)
     atol = _number("atol", "be a number", defaults[1] if atol is None else atol, dtype)
+    states = 0 if system.states is None else system.states.size
     for name, x in (("rtol", rtol), ("atol", atol)):
-        if x.ndim != 0 and (name == "rtol" or x.shape != (system.size,)):
+        if x.ndim != 0 and (name == "rtol" or x.shape != (system.size + states,)):
             or_each = f", or one for each of {system.size} coordinates" * (name == "atol")
-            must = f"be a number{or_each}"
+            beside = f" and {states} states" * (name == "atol" and states > 0)
+            must = f"be a number{or_each}{beside}"
             raise invalid(name, must, f"its shape was {x.shape}")
         if concrete(x) and not np.all(np.isfinite(x) & (x >= 0)):
             raise invalid(name, "be finite and not negative", f"it was {x}")
@@ -243,6 +248,32 @@ def check_tolerances(
                 ),
             )
     return rtol, atol
+
+
+def _by_name(system: System, atol: Mapping[str, Any]) -> Array:
+    """atol as an array, from a dict by the names of coordinates and states."""
+    states = () if system.states is None else system.states.names
+    of_states = {name: x for name, x in atol.items() if name in states}
+    found = system.coordinates.flatten(
+        {name: x for name, x in atol.items() if name not in of_states}, "atol"
+    )
+    if system.states is None:
+        return found
+    return jnp.concatenate([found, system.states.layout.flatten(of_states, "atol")])
+
+
+def check_states_start(system: System, x0: Any, dtype: Any, argument: str = "x0") -> Array | None:
+    """x0 as an array of the dtype of q0; None for a system without states."""
+    states = system.states
+    if states is None:
+        if x0 is not None:
+            fix = "Declare them: System(..., states=jl.States(rate, names))."
+            raise invalid(argument, "be left out for a system without states", "it was given", fix)
+        return None
+    if x0 is None:
+        fix = f"Pass {argument.split()[-1]}= with {list(states.layout.labels)}."
+        raise invalid(argument, "be given for a system with states", "it was left out", fix)
+    return states.vector(argument, x0).astype(dtype)
 
 
 def check_longest(dt: Any, dt_max: Any) -> Any:

@@ -29,6 +29,7 @@ from jaxlag._integration._term import term_of
 from jaxlag._integration._vector_field import VectorField
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, common_range, knots_increase
+from jaxlag._model._states import named_states
 from jaxlag._simulation._method_requirements import check_requirements, splits
 from jaxlag._simulation._methods import for_state
 from jaxlag._statics._assemble import assembled
@@ -69,6 +70,7 @@ class Values(NamedTuple):
     ts: Array
     params: Any
     inputs: Any
+    x0: Array | None  # of the states beside (q, v)
     stepper: Any
     rtol: Array
     atol: Array
@@ -84,7 +86,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
 
     # --- the initial state: given, from quasi-velocities, or assembled
     initial = _initial_state(plan, values, dynamics, params, inputs)
-    y0, args = _started(dynamics, initial, params, args)
+    y0, args = _started(dynamics, initial, values.x0, params, args)
     consistent = start_consistent(dynamics, *initial.at, params, args)
     if dynamics.rows.size:
         y0, args = stop_gradient_unless(consistent.ok, (y0, args))
@@ -168,7 +170,8 @@ def _initial_state(
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
     if v0 is None:
         v0 = plan.system.velocities(q0, u0, params, t=t0)
-    check_declaration(plan.system, params, inputs, t0, q0, v0)
+    signals = inputs | named_states(plan.system.states, values.x0)
+    check_declaration(plan.system, params, signals, t0, q0, v0)
     if plan.assemble and dynamics.rows.size:
         found = assembled(plan.system, q0, v0, params, t0)
         q0, v0, u0 = found.q, found.v, None
@@ -180,7 +183,7 @@ def _initial_state(
 
 
 def _started(
-    dynamics: VectorField, initial: _Initial, params: Any, args: Arguments
+    dynamics: VectorField, initial: _Initial, x0: Array | None, params: Any, args: Arguments
 ) -> tuple[Array, Arguments]:
     """y at the start, and the arguments with the values computed once per solve.
 
@@ -194,7 +197,7 @@ def _started(
         sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
         q0, w0, traced = stop_gradient_unless(sound, (q0, w0, args.params))
         args = args._replace(params=traced)
-    y0 = dynamics.start(q0, w0)
+    y0 = dynamics.start(q0, w0, x0)
     start = jnp.zeros_like(args.origin)
     args = dynamics.precompute(start, y0, args)
     if dynamics.quasi is not None:
@@ -216,7 +219,7 @@ def stepper_of(
     dynamics: VectorField, method: tuple[Any, Any], y0: Array, args: Arguments, longest: Any
 ) -> Stepper:
     """The stepper: solver, controller, vector field and post-processing."""
-    solver, controller = for_state(*method, dynamics.system.size, y0.shape[0])
+    solver, controller = for_state(*method, dynamics.system.size, dynamics.states, y0.shape[0])
     step_end = StepEnd(dynamics)
     term = term_of(dynamics, jnp.zeros_like(args.origin), y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
@@ -232,7 +235,8 @@ def _valid(dynamics: VectorField, values: Values, inputs: Any, args: Arguments) 
     """Whether start, times, tolerances and steps are within their bounds."""
     speeds = values.u0 if values.v0 is None else values.v0
     assert speeds is not None
-    given, saves = jnp.concatenate([values.q0, speeds]), dynamics.signed(values.ts, args)
+    x0 = [] if values.x0 is None else [values.x0]
+    given, saves = jnp.concatenate([values.q0, speeds, *x0]), dynamics.signed(values.ts, args)
     steps = values.step, values.longest
     valid = values_allowed(given, saves, values.rtol, values.atol, *steps)
     return valid & knots_increase(inputs)

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from jaxlag._core._by_name import ByName
 from jaxlag._model._inputs import evaluate
+from jaxlag._model._states import named_states
 from jaxlag._system._system import System
 
 Quantity = Callable[..., Any]
@@ -23,7 +24,9 @@ def _without_inputs(method: Quantity) -> Quantity:
 
 
 def _input_values(system: System, q: Any, v: Any, params: Any, *, t: Any, inputs: Any) -> ByName:
-    return ByName(evaluate(inputs, t, q, v, params).peek())
+    values = evaluate(inputs, t, q, v, params).peek()
+    states = () if system.states is None else system.states.names
+    return ByName({name: value for name, value in values.items() if name not in states})
 
 
 QUANTITIES: dict[str, Quantity] = {
@@ -38,6 +41,7 @@ QUANTITIES: dict[str, Quantity] = {
     "constraint_force": System.constraint_force,
     "Q": System.generalized_force,
     "input_values": _input_values,
+    "state_rates": System.state_rates,
 }
 """Quantities of one state, by their names in `save=` and the Solution."""
 
@@ -60,22 +64,34 @@ def at_saves(
     params: Any,
     inputs: Any,
     ts: Array,
-    q: Array,
-    v: Array,
+    states: tuple[Array, Array, Array | None],
 ) -> Any:
-    """A quantity at every save time of one motion; NaN at times that were not reached."""
+    """A quantity at every save time of one motion; NaN at times that were not reached.
+
+    Args:
+        name: among `QUANTITIES`.
+        system: the mechanical system.
+        formulation: of the motion.
+        params: as the Lagrangian takes them.
+        inputs: by name.
+        ts: save times, (s,).
+        states: (q, v, x), x of the states beside (q, v) if there are any.
+    """
+    q = states[0]
     reached = jnp.isfinite(q[:, 0])
     quantity = QUANTITIES[name]
     if formulation == "quasi":
         quantity = _BY_QUASI.get(name, quantity)
 
-    def at(t: Array, q: Array, v: Array, reached: Array) -> Any:
+    def at(now: Any, reached: Array) -> Any:
         # States not reached are NaN: evaluate at the start instead, so that derivatives stay
         # finite.
-        unknown = q[0]  # NaN there, also in its derivatives
-        q, v, t = (jnp.where(reached, x, x0) for x, x0 in ((q, q0), (v, v0), (t, t0)))
-        value = quantity(system, q, v, params, t=t, inputs=inputs)
-        return jax.tree.map(lambda x: jnp.where(reached, x, unknown.astype(x.dtype)), value)
+        unknown = now[1][0]  # NaN there, also in its derivatives
+        t, q, v, x = jax.tree.map(lambda y, y0: jnp.where(reached, y, y0), now, start)
+        signals = inputs | named_states(system.states, x)
+        value = quantity(system, q, v, params, t=t, inputs=signals)
+        return jax.tree.map(lambda y: jnp.where(reached, y, unknown.astype(y.dtype)), value)
 
-    t0, q0, v0 = ts[0], q[0], v[0]
-    return jax.vmap(at)(ts, q, v, reached)
+    along = ts, *states
+    start = jax.tree.map(lambda y: y[0], along)
+    return jax.vmap(at)(along, reached)

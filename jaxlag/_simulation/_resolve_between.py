@@ -57,6 +57,7 @@ def states_at(motion: AbstractSolution, t: Any, solve: Callable) -> Any:
         np.concatenate([ts[before : before + 1], times]),
         motion.params,
         inputs=motion.inputs,
+        x0=None if motion.x is None else motion.x[before],
         method=motion.method,
         formulation="auto" if plain else motion.formulation,
         rtol=motion.tolerances[0],

@@ -23,6 +23,7 @@ from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, check_inputs, check_range
+from jaxlag._model._states import check_no_states, named_states
 from jaxlag._simulation._compile_log import timed
 from jaxlag._simulation._error_estimate import LEFT, check_estimate, finer, with_error
 from jaxlag._simulation._failure import final_status
@@ -35,6 +36,7 @@ from jaxlag._simulation._option_checks import (
     check_method,
     check_options,
     check_start,
+    check_states_start,
     check_step,
     check_times,
     check_tolerances,
@@ -70,6 +72,7 @@ def simulate(
     params: Any = None,
     *,
     u0: Any = None,
+    x0: Any = None,
     inputs: Mapping[str, Any] | None = None,
     method: Any = "auto",
     formulation: str = "auto",
@@ -120,6 +123,8 @@ def simulate(
         u0: quasi-velocities at ts[0], for systems that declare them: (k,) numbers in the order of
             their names, or a dict by name; constrained ones are zero, and may be left out of a
             dict; m/s or rad/s.
+        x0: states beside (q, v) at ts[0], if the system has some (`jl.States`): (k,) numbers, or a
+            dict by name.
         inputs: dict from names to `ZeroOrderHold`, `LinearInterpolation`, `TimeFunction`,
             `Feedback` or arrays (constant), read by the forces. Steps end on the knots of tables.
         method: "auto", a name such as "tsit5", any diffrax solver, or a pair (solver, step-size
@@ -152,6 +157,7 @@ def simulate(
         rtol: relative bound on the local error; by default 1e-9 in float64, 1e-5 in float32.
         atol: absolute bound on the local error; by default 1e-9 in float64, 1e-6 in float32. A
             number, or one for every coordinate and its velocity: (n,) of them, or a dict by name.
+            Those of states beside (q, v) follow, (n + k,).
         dt: fixed step in s (positive for both directions of time); the last one is shortened to
             end at ts[-1].
         dt0: first step in s of an adaptive solve, positive; by default estimated at the start.
@@ -229,19 +235,21 @@ def simulate(
     check_estimate(estimate_error, method)
     q0, v0, u0 = check_start(system, q0, v0, u0)
     ts, time_direction = check_times(ts)
-    inputs = check_inputs(inputs)
+    inputs, x0 = check_inputs(inputs), check_states_start(system, x0, q0.dtype)
+    check_no_states(inputs, system.states)
+    signals = inputs | named_states(system.states, x0)
     check_range(inputs, ts)
     rtol, atol = check_tolerances(system, method, rtol, atol, q0.dtype)
     step, longest = check_step(dt, dt0), check_longest(dt, dt_max)
     warn_of_long_step(dt, ts)
-    check_params(system, params, q0, inputs)
-    check_placement("simulate", (q0, v0, u0, ts, params, inputs))
+    check_params(system, params, q0, signals)
+    check_placement("simulate", (q0, v0, u0, x0, ts, params, inputs))
     asked = formulation
     formulation = check_formulation(system, formulation, stabilization, params, q0.dtype)
     if np.ndim(atol) and formulation == "quasi":
         must, was = "be one number for a state of quasi-velocities", f"its shape was {atol.shape}"
         raise invalid("atol", must, was, "Give one number, or pass formulation='multipliers'.")
-    params = lift_closure_tracers(system, params, q0, inputs)
+    params = lift_closure_tracers(system, params, q0, signals)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     if not concrete(params_traced, inputs_traced):
@@ -258,11 +266,11 @@ def simulate(
         raise invalid(
             "gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method."
         )
-    size = 2 * system.size
+    size = 2 * system.size + (0 if x0 is None else x0.shape[0])
     if gradient_memory is not None and "work" in save:
         size += len(system._power_terms(params, q0.dtype).names)
     knots = all_knots(inputs)
-    if not concrete(q0, v0, u0, params_traced, inputs_traced):  # there may be derivatives
+    if not concrete(q0, v0, u0, x0, params_traced, inputs_traced):  # there may be derivatives
         max_steps = most_steps(max_steps, ts, dt, knots)
     stepper_traced, stepper_static = eqx.partition(stepper, _params.is_array)
     plan = ProgramKey(
@@ -279,7 +287,7 @@ def simulate(
         assemble=assemble,
         regular=mass_definite(system, params, ts[0], q0, v0),
         contact_rows_independent=not assemble
-        and contact_rows_independent(system, params, ts[0], q0, v0, inputs),
+        and contact_rows_independent(system, params, ts[0], q0, v0, signals),
         capacity=capacity_for(
             gradient,
             gradient_memory,
@@ -292,7 +300,7 @@ def simulate(
         change_points=change_points,
         auto=method == "auto" and "work" not in save,
     )
-    start = q0, v0, u0, ts, params_traced, inputs_traced
+    start = q0, v0, u0, ts, params_traced, inputs_traced, x0
     values = Values(*start, stepper_traced, rtol, atol, step, longest)
     _xla.warn_if_late()
     warn_of_changes(system, inputs)
@@ -385,7 +393,8 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
     at = jnp.concatenate([values.ts, last_time[None].astype(values.ts.dtype)])
     states = jnp.concatenate([solved.saved, solved.state[None]])
     q, v = velocities_at(dynamics, at, states, problem.args, moved)
-    (q, last_q), (v, last_v) = ((x[:-1], x[-1]) for x in (q, v))
+    x = None if values.x0 is None else dynamics.x(states)
+    (q, last_q), (v, last_v) = ((y[:-1], y[-1]) for y in (q, v))
     hold, row = rows_hold_after(dynamics, values.ts, q, v, params)
     broken = ~hold & (ending.status == int(Status.ok))
     ending = ending._replace(
@@ -393,7 +402,15 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         where=jnp.where(broken, row, ending.where),
     )
     saved = {
-        name: at_saves(name, plan.system, plan.formulation, params, inputs, values.ts, q, v)
+        name: at_saves(
+            name,
+            plan.system,
+            plan.formulation,
+            params,
+            inputs,
+            values.ts,
+            (q, v, None if x is None else x[:-1]),
+        )
         for name in plan.save
         if name != "work"
     }
@@ -404,8 +421,10 @@ def _simulate(plan: ProgramKey, values: Values) -> Solution:
         ts=values.ts,
         q=q,
         v=v,
+        x=None if x is None else x[:-1],
         last_time=last_time,
         last_state=(last_q, last_v),
+        last_x=None if x is None else x[-1],
         stats={
             "accepted": outcome.accepted,
             "rejected": outcome.attempted - outcome.accepted,

@@ -46,8 +46,10 @@ class Solution(AbstractSolution):
         ts: (s,), s.
         q: coordinates (s, n), m or rad.
         v: velocities (s, n), m/s or rad/s.
+        x: states beside them, (s, k), if the system has some (`jl.States`); else None.
         last_time: last time reached, s.
         last_state: (q, v) there, each (n,).
+        last_x: x there, (k,); None without states.
         stats: counts of "accepted" and "rejected" steps.
         gradient_mode: a `GradientMode`: how reverse derivatives of this motion are computed.
         saved: quantities named in `save=`, by name.
@@ -65,8 +67,10 @@ class Solution(AbstractSolution):
     ts: Float[Array, "*batch s"]
     q: Float[Array, "*batch s n"]
     v: Float[Array, "*batch s n"]
+    x: Float[Array, "*batch s k"] | None
     last_time: Float[Array, "*batch"]
     last_state: tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]
+    last_x: Float[Array, "*batch k"] | None
     stats: dict[str, Int[Array, "*batch"]]
     gradient_mode: Int[Array, "*batch"]
     saved: dict[str, Any]
@@ -122,7 +126,7 @@ class Solution(AbstractSolution):
     def _explained(self) -> Ending:
         if not is_open(self._ending):
             return self._ending
-        start = self.q[..., 0, :], self.v[..., 0, :]
+        start = self.q[..., 0, :], self.v[..., 0, :], None if self.x is None else self.x[..., 0, :]
         at = self._ending, self.last_time, self.ts, *start
         batch = self.ts.ndim - 1
         return diagnose_failure(self.scene, batch, (*at, self._params_traced, self._inputs_traced))
@@ -164,7 +168,7 @@ class Solution(AbstractSolution):
         return self.ts.shape[:-1]
 
     def __getitem__(self, name: Any) -> Any:
-        """A coordinate by its name, shape (s, *its shape), or a quasi-velocity, (s,).
+        """A coordinate or state by its name, (s, *its shape), or a quasi-velocity, (s,).
 
         "x'" is the velocity of "x", as in `to_dict`.
 
@@ -177,6 +181,10 @@ class Solution(AbstractSolution):
         """
         quasi, names = self.system.quasi, self.system.coordinates.names
         known = names if quasi is None else (*names, *quasi.names)
+        states, x = self.system.states, self.x
+        if states is not None and x is not None and name in states.names:
+            return states.layout.part(x, name)
+        known = known if states is None else (*known, *states.names)
         if isinstance(name, str) and name[:-1] in names and name not in known and name[-1] == "'":
             return self.rate(name[:-1])
         if not isinstance(name, str):
@@ -196,8 +204,20 @@ class Solution(AbstractSolution):
         return no_attribute(self, name, ELSEWHERE)
 
     def rate(self, name: str) -> Array:
-        """The velocity of a coordinate by its name, shape (s, *its shape)."""
+        """The velocity of a coordinate, or the rate of a state, by its name, (s, *its shape)."""
+        states = self.system.states
+        if states is not None and name in states.names:
+            return states.layout.part(self.state_rates, name)
         return self.system.coordinates.part(self.v, name)
+
+    @property
+    def state_rates(self) -> Float[Array, "*batch s k"]:
+        """dx/dt of the states beside (q, v), (s, k), in their units per s.
+
+        Raises:
+            ValueError: the system has none.
+        """
+        return self._quantity("state_rates")
 
     @property
     def a(self) -> Float[Array, "*batch s n"]:
@@ -395,7 +415,7 @@ class Solution(AbstractSolution):
     def _at_saves(self, indices: list[int]) -> "Solution":
         """The same at these save times only, in this order."""
         index = np.array(indices)
-        parts = lambda s: (s.ts, s.q, s.v, s.saved, s.error)  # noqa: E731
+        parts = lambda s: (s.ts, s.q, s.v, s.x, s.saved, s.error)  # noqa: E731
         chosen = jax.tree.map(lambda x: x[index], parts(self))
         return eqx.tree_at(parts, self, chosen, is_leaf=lambda x: x is None)
 
@@ -436,7 +456,8 @@ class Solution(AbstractSolution):
         if name in self.saved:
             return self.saved[name]
         key = (name, self.system, self.formulation), self._params_static, self._inputs_static
-        traced = self._params_traced, self._inputs_traced, self.ts, self.q, self.v
+        states = self.q, self.v, self.x
+        traced = self._params_traced, self._inputs_traced, self.ts, states
         return _derived.program(*key, self.ts.ndim - 1, traced)
 
     def __repr__(self) -> str:

@@ -64,7 +64,7 @@ def counted(motion: AbstractSolution) -> str:
 
 
 def columns(motion: AbstractSolution) -> dict[str, Any]:
-    """Coordinates, their velocities and quasi-velocities by name, without the times."""
+    """Coordinates, their velocities, quasi-velocities and states by name, without the times."""
     system = motion.system
     found = {}
     for name in system.coordinates.names:
@@ -72,6 +72,8 @@ def columns(motion: AbstractSolution) -> dict[str, Any]:
         found[f"{name}'"] = motion.rate(name)
     if system.quasi is not None:
         found |= {name: motion[name] for name in system.quasi.names}
+    if system.states is not None:
+        found |= {name: motion[name] for name in system.states.names}
     return found
 
 
@@ -123,6 +125,7 @@ def plotted(motion: AbstractSolution) -> Any:
     indices = [every[i] for i in np.linspace(0, count - 1, min(count, LINES)).astype(int)]
     shapes = motion.system.coordinates.shapes
     paths = _paths(shapes)
+    shapes = shapes | ({} if motion.system.states is None else motion.system.states.layout.shapes)
     panels = [*shapes, "energy"]
     width, count = 9.0 if paths else 6.0, len(panels)
     figure = Figure(figsize=(width, 0.6 + 1.8 * count), dpi=120, layout="constrained")

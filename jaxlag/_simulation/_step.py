@@ -19,11 +19,13 @@ from jaxlag._integration._stepper import Stepper, all_finite
 from jaxlag._integration._tableaus import remembers
 from jaxlag._model._coordinates import vector
 from jaxlag._model._inputs import check_inputs, check_range, common_range, knots_increase
+from jaxlag._model._states import check_no_states, named_states
 from jaxlag._simulation._jump_times import Jumps, warned
 from jaxlag._simulation._methods import choose
 from jaxlag._simulation._option_checks import (
     check_formulation,
     check_options,
+    check_states_start,
     check_step,
     check_tolerances,
 )
@@ -52,13 +54,14 @@ def step(
     dt: Any,
     params: Any = None,
     *,
+    x: Any = None,
     t: Any = 0.0,
     inputs: Mapping[str, Any] | None = None,
     method: Any = "tsit5",
     steps: int = 1,
     formulation: str = "auto",
     stabilization: str | None = "projection",
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+) -> tuple[Float[Array, "..."], ...]:
     """The state (q, v) of M a + h = Q + A^T lam after a time dt, by `steps` steps of fixed length.
 
     For loops of one's own, such as `jax.lax.scan` over control intervals: it costs the
@@ -73,6 +76,7 @@ def step(
         v: velocities at t, in the same form; m/s or rad/s.
         dt: the control interval, s, positive.
         params: pytree passed to the Lagrangian and the forces.
+        x: states beside (q, v) at t, (k,) numbers or a dict by name, if the system has some.
         t: s.
         inputs: as for `simulate`. Arrays are constant over dt, as the actions of a policy. Each
             step reads a table in the interval in which the step begins: let knots fall on the ends
@@ -84,9 +88,9 @@ def step(
         stabilization: "projection", onto the constraints after each step, or None.
 
     Returns:
-        (q, v) at t + dt, each (n,). NaN where a step fails: values that are not finite, equations
-        that are not solved, a contact that lifts off, a change point, singular quasi-velocities,
-        inputs that are not defined from t to t + dt.
+        (q, v) at t + dt, each (n,); (q, v, x) for a system with states. NaN where a step fails:
+        values that are not finite, equations that are not solved, a contact that lifts off, a
+        change point, singular quasi-velocities, inputs that are not defined from t to t + dt.
 
     Raises:
         ValueError: an argument of wrong form or value, named.
@@ -131,14 +135,16 @@ def step(
     if remembers(solver):
         was = f"{type(solver).__name__} remembers earlier steps"
         raise invalid("step: method", "be a one-step method", was, "Use jl.simulate.")
-    inputs = check_inputs(inputs)
+    inputs, x = check_inputs(inputs), check_states_start(system, x, q.dtype, "step: x")
+    check_no_states(inputs, system.states)
+    signals = inputs | named_states(system.states, x)
     known = concrete(t, dt)
     if known:
         slack = _slack(t, dt)
         check_range(inputs, np.array([t + slack, t + dt - slack]), "t and t + dt")
-    check_params(system, params, q, inputs)
+    check_params(system, params, q, signals)
     formulation = check_formulation(system, formulation, stabilization, params, q.dtype)
-    params = lift_closure_tracers(system, params, q, inputs)
+    params = lift_closure_tracers(system, params, q, signals)
     params_traced, params_static = _params.split(params)
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     ts: Any = np.array([t, t + dt], dt.dtype) if known else jnp.stack([t, t + dt])
@@ -159,18 +165,18 @@ def step(
         stabilization=stabilization,
         assemble=False,
         regular=mass_definite(system, params, t, q, v),
-        contact_rows_independent=contact_rows_independent(system, params, t, q, v, inputs),
+        contact_rows_independent=contact_rows_independent(system, params, t, q, v, signals),
         capacity=0,
         change_points="stop",
         auto=False,
     )
     warn_of_changes(system, inputs)
-    start = q, v, None, ts, params_traced, inputs_traced
+    start = q, v, None, ts, params_traced, inputs_traced, x
     return _steps(plan, Values(*start, stepper_traced, rtol, atol, dt))
 
 
 @partial(jax.jit, static_argnums=0)
-def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
+def _steps(plan: ProgramKey, values: Values) -> tuple[Array, ...]:
     """The compiled program."""
     dynamics, args, method = equations(plan, values)
     params, inputs = dynamics.given(args)
@@ -178,10 +184,10 @@ def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
     assert values.step is not None
     ts = jnp.asarray(values.ts)  # under jax.disable_jit it is a numpy array
     t, q, v, count = ts[0], values.q0, values.v0, plan.max_steps
-    check_declaration(plan.system, params, inputs, t, q, v)
+    signals = inputs | named_states(plan.system.states, values.x0)
+    check_declaration(plan.system, params, signals, t, q, v)
     zero = jnp.zeros_like(args.origin)
-    w = v if dynamics.quasi is None else dynamics.quasi.of(t, q, v, params)[dynamics.quasi.free]
-    y = dynamics.start(q, w)
+    y = dynamics.state_of(t, q, v, values.x0, params)
     args = dynamics.precompute(zero, y, args)
     if dynamics.quasi is not None:
         args = args._replace(usual=usual(dynamics, *stop_gradient((zero, q, args))))
@@ -203,7 +209,8 @@ def _steps(plan: ProgramKey, values: Values) -> tuple[Array, Array]:
         defined = (first <= t + slack) & (ts[1] - slack <= last) & knots_increase(inputs)
         y = jnp.where(defined, y, jnp.nan)
     q, w = dynamics.parts(y)
-    return q, dynamics.velocities_of(ts[1], q, w, args)
+    v = dynamics.velocities_of(ts[1], q, w, args)
+    return (q, v) if values.x0 is None else (q, v, dynamics.x(y))
 
 
 def _slack(t: Any, dt: Any) -> Any:

@@ -16,8 +16,10 @@ from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_RO
 from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
 from jaxlag._linalg._projection import iterations_needed
+from jaxlag._model._states import named_states
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
+from jaxlag._system._inspection import advice_on_mass
 from jaxlag._system._nonfinite import nonfinite
 from jaxlag._system._row_advice import advice_on_rows
 
@@ -88,6 +90,8 @@ def advice(motion: AbstractSolution, status: Status) -> str:
     sharp = rejected > UNEVEN * (accepted + rejected)
     special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
     message = (ADVICE | special).get(status, "")
+    if status is Status.mass_singular:
+        message = f"{message} {advice_on_mass(motion._given)}".rstrip()
     if fixed:
         return message
     if status in (Status.max_steps, Status.step_below_resolution):
@@ -99,10 +103,14 @@ def advice(motion: AbstractSolution, status: Status) -> str:
         )
     assert motion.tolerances is not None
     if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
-        state = np.concatenate([np.ravel(x) for x in motion.last_state])
-        labels = motion.system.coordinates.labels
-        bounds = np.resize(motion.tolerances[1], state.shape)
+        end = jax.tree.leaves((motion.last_state, motion.last_x))
+        state = np.concatenate([np.ravel(x) for x in end])
+        labels, states = motion.system.coordinates.labels, motion.system.states
+        atol = np.asarray(motion.tolerances[1])
+        each = np.broadcast_to(atol, (state.size - len(labels),))
+        bounds = np.concatenate([each[: len(labels)], each])
         names = (*labels, *(f"{label}'" for label in labels))
+        names += () if states is None else states.layout.labels
         resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
         if resting:
             return (
@@ -248,6 +256,7 @@ def _about_errors(motion: AbstractSolution, looks: Look) -> list[str]:
         names = labels + [system.quasi.names[i] for i in system.quasi.free]
     else:
         names = labels + [f"d({label})/dt" for label in labels]
+    names += [] if system.states is None else system.states.layout.labels
     (index, often), *_ = Counter(np.argmax(error[sound], axis=1).tolist()).most_common(1)
     share = f"in {often} of {int(sound.sum())} states"
     return [f"error         largest, relative to its tolerance, in {names[index]} ({share})"]
@@ -311,25 +320,28 @@ def _rates(looks: Look) -> Rates | None:
 def _look(motion: AbstractSolution, h: float, last: bool = False) -> Look:
     reached = np.flatnonzero(np.all(np.isfinite(np.asarray(motion.q)), axis=1))
     chosen = reached[np.unique(np.linspace(0, len(reached) - 1, LOOKED_AT).round().astype(int))]
-    ts, q, v = (np.asarray(x)[chosen] for x in (motion.ts, motion.q, motion.v))
-    end = [np.asarray(x)[None] for x in (motion.last_time, *motion.last_state)]
+    along = motion.ts, motion.q, motion.v, motion.x
+    places = jax.tree.map(lambda y: np.asarray(y)[chosen], along)
+    end = motion.last_time, *motion.last_state, motion.last_x
+    end = jax.tree.map(lambda y: np.asarray(y)[None], end)
     if last:
-        ts, q, v = end
+        places = end
     elif int(motion.status) != Status.ok:
-        ts, q, v = (np.concatenate(pair) for pair in zip((ts, q, v), end, strict=True))
+        places = jax.tree.map(lambda *pair: np.concatenate(pair), places, end)
     tolerances = motion.tolerances or (jnp.ones(()), jnp.ones(()))
     given = motion._params_traced, motion._inputs_traced
-    return _looks(motion.scene, (motion.ts[jnp.array([0, -1])], ts, q, v, h, *given, tolerances))
+    return _looks(motion.scene, (motion.ts[jnp.array([0, -1])], places, h, *given, tolerances))
 
 
 @partial(jax.jit, static_argnums=0)
 def _looks(scene: MotionKey, traced: Any) -> Look:
-    span, ts, q, v, h, params, inputs, (rtol, atol) = traced
-    dynamics, args = dynamics_of(scene, span, ts[0], q[0], v[0], params, inputs)
+    span, places, h, params, inputs, (rtol, atol) = traced
+    first = jax.tree.map(lambda y: y[0], places)
+    dynamics, args = dynamics_of(scene, span, first, params, inputs)
     given, _ = dynamics.given(args)
     solver = diffrax.Dopri8(scan_kind="lax")
 
-    def at(place: tuple[Array, Array, Array]) -> Look:
+    def at(place: tuple[Array, Array, Array, Array | None]) -> Look:
         tau, y = dynamics.tau(place[0], args), dynamics.state_of(*place, given)
         here = dynamics.within(args, tau)
         term = term_of(dynamics, tau, y, here)
@@ -341,11 +353,12 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
             iterations = iterations_needed(
                 dynamics.projector(tau + h, y1, here), *dynamics.parts(y1)
             )
-        allowed = atol if atol.ndim == 0 else jnp.tile(atol, 2)
+        n = dynamics.system.size  # an atol for a coordinate is also that of its velocity
+        allowed = atol if atol.ndim == 0 else jnp.concatenate([atol[:n], atol])
         scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
         return Look(rates, dynamics.mass(tau, y, here), scaled, iterations)
 
-    return jax.lax.map(at, (ts, q, v))
+    return jax.lax.map(at, places)
 
 
 def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> str:
@@ -353,13 +366,15 @@ def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> st
 
     Args:
         motion: one that ended as nonfinite.
-        lost: (time, (q, v)) where the equations are not finite, if it is known.
+        lost: (time, (q, v, x)) where the equations are not finite, if it is known.
     """
-    places: list[tuple[Any, ...]] = [(motion.last_time, *motion.last_state)]
+    n, states = motion.system.size, motion.system.states
+    places: list[tuple[Any, ...]] = [(motion.last_time, *motion.last_state, motion.last_x)]
     if lost is not None:
-        places.append((lost[0], *jnp.split(lost[1], 2)))
-    for t, q, v in places:
-        given = stop_gradient((motion._given, motion.inputs, t, q, v))  # with values under grad
+        places.append((lost[0], *jnp.split(lost[1], [n, 2 * n])))
+    for t, q, v, x in places:
+        signals = motion.inputs | named_states(states, x)
+        given = stop_gradient((motion._given, signals, t, q, v))  # with values under grad
         found = nonfinite(motion.system, *given)
         if found is not None:
             return f" {found}"

@@ -28,7 +28,7 @@ def lift_closure_tracers(
     A Lagrangian defined inside a differentiated function may read the arguments of that function:
     their derivatives are computed like those of params. Without inputs the forces are left out.
     """
-    declared = (system.lagrangian, system.constraints, system.quasi)
+    declared = (system.lagrangian, system.constraints, system.quasi, system.states)
     if all(f.known for f in functions_of(declared if inputs is None else (system, inputs))):
         return params
     tracers = [x for x in _consts(system, params, q, inputs) if not concrete(x)]
@@ -58,8 +58,9 @@ def declared(
     if values is None:
         return L, u, rows
     slides = [slide(t, q, v, params) for slide in sliding(system.forces)]
+    rates = None if system.states is None else system.states.rates(t, q, v, params, values)
     lam = jnp.zeros_like(rows[1]) if lam is None else lam
-    return L, u, rows, slides, terms.force(t, q, v, params, values, lam)
+    return L, u, rows, slides, rates, terms.force(t, q, v, params, values, lam)
 
 
 def check_params(

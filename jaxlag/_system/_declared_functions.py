@@ -127,6 +127,8 @@ def declared(
             add(f"{name}: R", force.R, "t q v params", Role.conjugate)
         else:  # of a class that is not known here: as a whole
             add(name, force, "t q v params", Role.force, True)
+    if system.states is not None:
+        add("states: rate", system.states.rates, "t q v params", Role.force, True)
     for row in system.constraints:
         name = f"constraint {row.names!r}"
         if isinstance(row, Holonomic):

@@ -39,6 +39,7 @@ def explain(
         "bias          "
         + ("zero" if structure.bias_zero else f"depends on {_list(structure.bias)}"),
         f"forces        {', '.join(forces) if forces else 'none, so no force code is compiled'}",
+        *_states(system),
         *_quasi(system),
         *_constraints(rows, system.quasi is not None),
     ]
@@ -47,6 +48,12 @@ def explain(
     else:
         lines += _array(system, structure, "as declared" if lowered is None else lowered.reason)
     return "\n".join([*lines, f"small loops   {_xla.report()}"])
+
+
+def _states(system: AbstractQuantities) -> list[str]:
+    if system.states is None:
+        return []
+    return [f"states        {', '.join(system.states.layout.labels)}, integrated with (q, v)"]
 
 
 def _quasi(system: AbstractQuantities) -> list[str]:

@@ -17,8 +17,21 @@ from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
 
+LEARNED = 64
+"""Numbers in the params from which on a Lagrangian is probably learned."""
 INDEPENDENT = 1e-3
 """Least singular value of clearly independent rows of unit length."""
+
+
+def advice_on_mass(params: Any) -> str:
+    """Advice for a mass matrix that is not positive definite, if L is probably a network; else ""."""
+    traced, _ = _params.split(params)
+    if sum(np.size(x) for x in jax.tree.leaves(traced)) < LEARNED:
+        return ""
+    return (
+        "Networks for L often have such an M. Let one network return a triangular matrix F "
+        "and another one V, and write L = v^T (F F^T + eps I) v / 2 - V."
+    )
 
 
 def mass_definite(
@@ -90,23 +103,26 @@ def contact_rows_independent(
 
 
 def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: Any) -> None:
-    """Trace L and the forces at abstract states; raise if a shape or dtype is wrong.
+    """Trace L, the forces and the rates; raise if a shape or dtype is wrong.
 
     Args:
         system: whose functions are traced.
         params: as the Lagrangian takes them.
         dtype: of the state.
-        values: values of the inputs by name; None to leave the forces out.
+        values: values of the inputs, and of states, by name; None to leave the forces out.
     """
     t = jax.ShapeDtypeStruct((), jnp.result_type(float))
     q = v = jax.ShapeDtypeStruct((system.size,), dtype)
     traced, static = _params.split(params)
     terms = system._terms
 
-    def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Array:
+    def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Any:
         params = _params.join(traced, static)
         p = terms.momentum(t, q, v, params)
-        return p if values is None else p + terms.force(t, q, v, params, values)
+        if values is None:
+            return p
+        rates = None if system.states is None else system.states.rates(t, q, v, params, values)
+        return p + terms.force(t, q, v, params, values), rates
 
     closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
     check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
@@ -125,11 +141,15 @@ def _mass(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v
 def check_declaration(
     system: AbstractReactions, params: Any, inputs: Mapping[str, Any], t: Array, q: Array, v: Array
 ) -> None:
-    """Check L, the forces and the inputs by shapes and names alone; run while tracing."""
+    """Check L, the forces and the inputs by shapes and names alone; run while tracing.
+
+    The inputs contain the values of states, if there are any.
+    """
     values = evaluate(inputs, t, q, v, params)
     check_traceable(system, params, q.dtype, values)
+    states = () if system.states is None else system.states.names
     for name in inputs:
-        if name not in values.read:
+        if name not in values.read and name not in states:
             raise invalid(
                 "inputs",
                 "hold only signals that a force reads",

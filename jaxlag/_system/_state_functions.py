@@ -18,6 +18,7 @@ from jaxlag._model._coordinates import Coordinates, state_vectors
 from jaxlag._model._forces import AbstractForce
 from jaxlag._model._inputs import check_inputs, check_range, evaluate
 from jaxlag._model._quasi_velocities import QuasiVelocities
+from jaxlag._model._states import States
 from jaxlag._system._power import Power
 from jaxlag._tracing import _params
 from jaxlag._tracing._input_values import InputValues
@@ -36,6 +37,7 @@ class AbstractQuantities(eqx.Module):
         forces: applied forces.
         constraints: constraints, those of quasi-velocities first.
         quasi: quasi-velocities, if any.
+        states: states beside the coordinates, if any.
     """
 
     lagrangian: eqx.AbstractVar[Callable]
@@ -43,6 +45,7 @@ class AbstractQuantities(eqx.Module):
     forces: eqx.AbstractVar[tuple[AbstractForce, ...]]
     constraints: eqx.AbstractVar[tuple[AbstractConstraint, ...]]
     quasi: eqx.AbstractVar[QuasiVelocities | None]
+    states: eqx.AbstractVar[States | None]
     _in_u: eqx.AbstractVar[Callable | None]
     _kinetic: eqx.AbstractVar[Callable | None]
     _potential: eqx.AbstractVar[Callable | None]
@@ -227,6 +230,35 @@ class AbstractQuantities(eqx.Module):
         t, q, v, params = self._state(q, v, params, t)
         values = self._inputs_at(inputs, t, q, v, params)
         return self._power_terms(params, q.dtype)(t, q, v, params, values)
+
+    @state_first
+    def state_rates(
+        self,
+        q: Any,
+        v: Any,
+        params: Any = None,
+        *,
+        t: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> Float[Array, " k"]:
+        """dx/dt of the states beside the coordinates, shape (k,), in their units per s.
+
+        Args:
+            q: shape (n,).
+            v: shape (n,).
+            params: as the Lagrangian takes them.
+            t: s.
+            inputs: dict from names to input objects or arrays, with the states by name.
+
+        Raises:
+            ValueError: the system has no states.
+
+        Source: the rate in `States`.
+        """
+        if self.states is None:
+            raise unsupported("`state_rates`", "the system was declared without states=")
+        t, q, v, params = self._state(q, v, params, t)
+        return self.states.rates(t, q, v, params, self._inputs_at(inputs, t, q, v, params))
 
     def _power_terms(self, params: Any, dtype: Any) -> Power:
         """The terms of dH/dt of this system."""

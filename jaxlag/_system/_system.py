@@ -33,8 +33,9 @@ from jaxlag._model._coordinates import Coordinates
 from jaxlag._model._forces import AbstractForce, check_forces
 from jaxlag._model._inputs import check_inputs
 from jaxlag._model._quasi_velocities import InQuasiVelocities, QuasiVelocities, check_quasi
+from jaxlag._model._states import States, check_states
 from jaxlag._system._explain import explain
-from jaxlag._system._inspection import check_traceable
+from jaxlag._system._inspection import advice_on_mass, check_traceable
 from jaxlag._system._nonfinite import nonfinite
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._system._row_advice import vanishing_rows
@@ -89,6 +90,7 @@ class System(AbstractReactions):
         constraints: `Holonomic` and `Pfaffian` constraints, each row with its own name.
         quasi: `QuasiVelocities` for the state in place of v; the constrained ones among them are
             additional rows, beside `constraints`.
+        states: `States` beside the coordinates, as the current of a motor, which forces may read.
         written_in: the velocities in the arguments of L, or T: "v", or "u" for all
             quasi-velocities, as in L(t, q, u, params). L must contain the constrained ones, since
             their momenta enter the equations.
@@ -108,6 +110,7 @@ class System(AbstractReactions):
     forces: tuple[AbstractForce, ...]
     constraints: tuple[AbstractConstraint, ...]
     quasi: QuasiVelocities | None
+    states: States | None
     written_in: str = eqx.field(static=True)
     lowering: str = eqx.field(static=True)
     _in_u: Callable | None = eqx.field(static=True)
@@ -124,6 +127,7 @@ class System(AbstractReactions):
         forces: Sequence[AbstractForce] = (),
         constraints: Sequence[AbstractConstraint] = (),
         quasi: QuasiVelocities | None = None,
+        states: States | None = None,
         written_in: str = "v",
         lowering: str = "auto",
     ) -> None:
@@ -144,6 +148,9 @@ class System(AbstractReactions):
             rows = check_constraints((*quasi.rows, *rows))
         check_reactions(rows, self.forces)
         self.constraints, self.quasi = rows, quasi
+        taken = dict.fromkeys(self.coordinates.names, "a coordinate")
+        taken |= {} if quasi is None else dict.fromkeys(quasi.names, "a quasi-velocity")
+        self.states = check_states(states, taken)
         if written_in not in ("v", "u"):
             raise invalid("written_in", "be 'v' or 'u'", f"it was {written_in!r}")
         if written_in == "u" and quasi is None:
@@ -187,7 +194,7 @@ class System(AbstractReactions):
     @property
     def _key(self) -> tuple:
         parts = (self.lagrangian, self.coordinates, self.forces, self.constraints)
-        return (*parts, self.quasi, self.lowering)
+        return (*parts, self.quasi, self.states, self.lowering)
 
     def _taken(self, rows: Sequence[AbstractConstraint]) -> dict[str, str]:
         """Names that quasi-velocities must not have -> their owners."""
@@ -269,7 +276,8 @@ class System(AbstractReactions):
 
         Traces L and the forces, then checks the numbers: L (J) finite, M = d2L/dv2, shape (n, n),
         positive definite by its pivots (with constraints on their tangent space), the rows of
-        the constraints affine in v, a with M a + h = Q + A^T lam finite.
+        the constraints affine in v, a with M a + h = Q + A^T lam finite. States beside (q, v) are
+        given by name among the inputs.
 
         Source: Golub, Van Loan, Matrix Computations, sec. 4.1 (L D L^T and its pivots).
 
@@ -305,10 +313,12 @@ class System(AbstractReactions):
                 f"coordinate {self.coordinates.label(index)!r}",
                 "have inertia: d2L/dv2 positive definite",
                 f"its pivot was not positive at q = {q}, v = {v}",
-                "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
+                advice_on_mass(params)
+                or "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
             )
         a = self.acceleration(q, v, params, t=t, inputs=inputs)
-        if not bool(jnp.all(jnp.isfinite(a))):
+        beside = () if self.states is None else self.states.rates(t, q, v, params, values)
+        if not all(bool(jnp.all(jnp.isfinite(x))) for x in (a, *beside)):
             self._refuse_nonfinite(params, inputs, t, q, v)
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))
             raise invalid(f"acceleration of {label!r}", "be finite at the given state", f"a = {a}")

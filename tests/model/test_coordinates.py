@@ -67,8 +67,8 @@ def test_equal_declarations_have_equal_hashes():
 @pytest.mark.parametrize(
     ("declared", "message"),
     [
-        ((), "`coordinates` must name at least one coordinate, but it was empty. Write"),
-        ({}, "`coordinates` must name at least one coordinate, but it was empty."),
+        ((), "`coordinates` must have at least one name, but it was empty. Write"),
+        ({}, "`coordinates` must have at least one name, but it was empty."),
         ("theta", "`coordinates` must be names, or names with shapes, but it was 'theta'. Write"),
         (2, "`coordinates` must be names, or names with shapes, but it was 2."),
         ({"x", "y"}, "`coordinates` must be names, or names with shapes, but it was {"),
@@ -112,7 +112,7 @@ def test_invalid_parts_are_refused(parts, message):
     [
         (
             [1.0],
-            "`q` must have shape (2,), but its shape was (1,). Give one entry per coordinate, ",
+            "`q` must have shape (2,), but its shape was (1,). Give one entry for each, ",
         ),
         ([1.0, 2.0, 3.0], "`q` must have shape (2,), but its shape was (3,)."),
         (1.0, "`q` must have shape (2,), but its shape was ()."),

@@ -11,7 +11,8 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks():
-    assert {"measured_pendulum", "neural_residual", "tricycle"} <= {path.stem for path in NOTEBOOKS}
+    names = {"learned_lagrangian", "measured_pendulum", "neural_residual", "tricycle"}
+    assert names <= {path.stem for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

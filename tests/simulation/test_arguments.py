@@ -118,7 +118,7 @@ def test_coordinates_must_have_distinct_names():
         ValueError, match=r"^`coordinates` must be distinct, but 'x' occurs 2 times"
     ):
         jl.System(kinetic, ("x", "y", "x"))
-    with pytest.raises(ValueError, match=r"^`coordinates` must name at least one coordinate, but"):
+    with pytest.raises(ValueError, match=r"^`coordinates` must have at least one name, but"):
         jl.System(kinetic)
 
 
@@ -191,11 +191,11 @@ def test_a_coordinate_without_inertia_is_named_by_simulate(n):
     [
         (
             {"q0": [1.0]},
-            "`q0` must have shape (2,), but its shape was (1,). Give one entry per c",
+            "`q0` must have shape (2,), but its shape was (1,). Give one entry for each, ",
         ),
         (
             {"v0": [0.0] * 3},
-            "`v0` must have shape (2,), but its shape was (3,). Give one entry per",
+            "`v0` must have shape (2,), but its shape was (3,). Give one entry for each, ",
         ),
         ({"q0": [[1.0, 2.0]]}, "`q0` must have shape (2,), but its shape was (1, 2)."),
         ({"q0": {"x": 1.0}}, "`q0` must name exactly ['x', 'y'], but it named ['x']."),
