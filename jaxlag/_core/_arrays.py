@@ -17,12 +17,12 @@ def concrete(*arrays: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
 
 
-def array_of(x: Any) -> Array:
-    """`jnp.asarray(x)`, for lists of Python's numbers in half the time."""
+def array_of(x: Any) -> Any:
+    """`jnp.asarray(x)`; of a list of Python's numbers a numpy array of floats, without dispatch."""
     if isinstance(x, jax.Array):
         return x
     if isinstance(x, list | tuple) and all(type(number) in (float, int) for number in x):
-        x = np.asarray(x)
+        return np.asarray(x, jnp.result_type(float))
     return jnp.asarray(x)
 
 
@@ -64,7 +64,7 @@ def number(argument: str, must: str, x: Any, dtype: Any, fix: str = "") -> Array
     return x
 
 
-def common(*arrays: Array) -> list[Array]:
+def common(*arrays: Any) -> list[Any]:
     """Arrays of one dtype, the result type of all, for every promotion setting of JAX."""
     if all(x.dtype == arrays[0].dtype for x in arrays):
         return list(arrays)
@@ -73,7 +73,7 @@ def common(*arrays: Array) -> list[Array]:
     return [x.astype(dtype) for x in arrays]
 
 
-def of_state(argument: str, *arrays: Array) -> list[Array]:
+def of_state(argument: str, *arrays: Any) -> list[Any]:
     """Arrays of one dtype, that of a state; raises if it has less than 32 bits.
 
     In half precision the rounding of a motion is several percent, for all steps.

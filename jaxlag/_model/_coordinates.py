@@ -134,23 +134,31 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
 
     A scalar is accepted for a single coordinate.
     """
+    return jnp.asarray(numbers(coordinates, argument, x))
+
+
+def numbers(coordinates: Coordinates, argument: str, x: Any) -> Any:
+    """The same as an argument of a compiled program: a list becomes a numpy array."""
     n = coordinates.size
-    fix = f"Give one entry for each, in the order {list(coordinates.labels)}."
     if isinstance(x, Mapping):
         x = coordinates.flatten(x, argument)
     try:
         x = array_of(x)
     except (TypeError, ValueError) as error:
-        if not isinstance(x, str | Sequence):
-            fix = ORDER
+        fix = _in_order(coordinates) if isinstance(x, str | Sequence) else ORDER
         raise invalid(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
     if n == 1 and x.shape == ():
         x = x[None]
     if x.shape != (n,):
+        fix = _in_order(coordinates)
         raise invalid(argument, f"have shape ({n},)", f"its shape was {x.shape}", fix)
     if jnp.issubdtype(x.dtype, jnp.complexfloating):
         raise invalid(argument, "be real", f"its dtype was {x.dtype}")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.result_type(float))
+
+
+def _in_order(coordinates: Coordinates) -> str:
+    return f"Give one entry for each, in the order {list(coordinates.labels)}."
 
 
 def state_vectors(coordinates: Coordinates, q: Any, v: Any) -> tuple[Array, Any]:

@@ -75,7 +75,7 @@ class Jumps:
         inputs: by name. Tables, and functions with knots, jump at ends of steps.
     """
 
-    def __init__(self, system: System, params: Any, q: Array, inputs: Mapping[str, Any]) -> None:
+    def __init__(self, system: System, params: Any, q: Any, inputs: Mapping[str, Any]) -> None:
         self._system = system
         inside = {name: x for name, x in inputs.items() if not _has_knots(x)}
         outside = {name: x for name, x in inputs.items() if name not in inside}

@@ -16,7 +16,7 @@ from jaxlag._gradient._modes import MODES
 from jaxlag._integration._change_points import CHANGE_POINTS
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
-from jaxlag._model._coordinates import vector
+from jaxlag._model._coordinates import numbers
 from jaxlag._model._forces import reads_lam
 from jaxlag._simulation._methods import default_tolerances
 from jaxlag._simulation._quantities import QUANTITIES
@@ -118,10 +118,8 @@ def check_formulation(
     return "quasi" if fitting or quasi.kinematics is None else FORMULATIONS[0]
 
 
-def check_start(
-    system: System, q0: Any, v0: Any, u0: Any
-) -> tuple[Array, Array | None, Array | None]:
-    """(q0, v0, u0) as arrays of one dtype; one of v0 and u0 is None."""
+def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Any, Any, Any]:
+    """(q0, v0, u0) as arrays of one dtype, of numpy for lists; one of v0 and u0 is None."""
     if (v0 is None) == (u0 is None):
         was = "neither was given" if v0 is None else "both were given"
         raise invalid(
@@ -136,15 +134,16 @@ def check_start(
             "Pass v0= instead.",
         )
     own = system.coordinates
-    q0 = vector(own, "q0", q0)
+    q0 = numbers(own, "q0", q0)
     if quasi is not None and u0 is not None:
-        name, x, labels = "u0", quasi.vector("u0", u0), quasi.names
+        name, x = "u0", quasi.vector("u0", u0)
     else:
-        name, x, labels = "v0", vector(own, "v0", v0), own.labels
-    for argument, values, names in (("q0", q0, own.labels), (name, x, labels)):
-        if concrete(values) and not np.all(np.isfinite(values)):
+        name, x = "v0", numbers(own, "v0", v0)
+    for argument, values in (("q0", q0), (name, x)):
+        if concrete(values) and not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
-            raise invalid(argument, "be finite", f"{argument}[{i}] ({names[i]!r}) was {values[i]}")
+            label = quasi.names[i] if quasi is not None and argument == "u0" else own.label(i)
+            raise invalid(argument, "be finite", f"{argument}[{i}] ({label!r}) was {values[i]}")
     q0, x = of_state(f"q0 and {name}", q0, x)
     return (q0, None, x) if name == "u0" else (q0, x, None)
 
@@ -172,11 +171,11 @@ def check_times(ts: Any) -> tuple[Any, int | None]:
         raise invalid("ts", "be an array of at least 2 times", f"its shape was {ts.shape}", fix)
     if not concrete(ts):
         return ts, None
-    if not np.all(np.isfinite(ts)):
+    if not np.isfinite(ts).all():
         raise invalid("ts", "be finite", f"ts[{int(np.argmin(np.isfinite(ts)))}] was not")
-    steps = np.diff(ts)
+    steps = ts[1:] - ts[:-1]
     time_direction = 1 if ts[-1] >= ts[0] else -1
-    if not np.all(steps * time_direction > 0):
+    if not (steps * time_direction > 0).all():
         i = int(np.argmin(steps * time_direction > 0))
         raise invalid(
             "ts",
@@ -212,6 +211,9 @@ def check_tolerances(
     system: System, method: Any, rtol: Any, atol: Any, dtype: Any
 ) -> tuple[Any, Any]:
     """(rtol, atol) of the default controller, or of the one that `method` brings."""
+    if rtol is None and atol is None and not isinstance(method, tuple):
+        rtol, atol = (np.asarray(x, dtype) for x in default_tolerances(dtype))
+        return rtol, atol
     if isinstance(method, tuple):
         rtol, atol = (getattr(method[-1], name, None) for name in ("rtol", "atol"))
         if np.ndim(atol):  # for every component of the state

@@ -78,6 +78,13 @@ class Values(NamedTuple):
     longest: Array | None = None  # dt_max
 
 
+def with_jax_arrays(values: Values) -> Values:
+    """The same with JAX's arrays: under `jax.disable_jit` start and times may be numpy's."""
+    given = values.ts, values.q0, values.v0, values.u0
+    ts, q0, v0, u0 = jax.tree.map(jnp.asarray, given)
+    return values._replace(ts=ts, q0=q0, v0=v0, u0=u0)
+
+
 def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
     """The initial-value problem that a plan and its values describe."""
     # --- the equations, and their properties that hold for all states

@@ -42,7 +42,13 @@ from jaxlag._simulation._option_checks import (
     check_tolerances,
     warn_of_long_step,
 )
-from jaxlag._simulation._problem import ProgramKey, Values, build_problem, velocities_at
+from jaxlag._simulation._problem import (
+    ProgramKey,
+    Values,
+    build_problem,
+    velocities_at,
+    with_jax_arrays,
+)
 from jaxlag._simulation._quantities import at_saves
 from jaxlag._simulation._sharding import check_placement
 from jaxlag._simulation._solution import Solution
@@ -169,7 +175,8 @@ def simulate(
             each; of as many as there are in ts if dt and ts have values. In a loop over many short
             motions set it near the number of steps that one of them takes.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
-            "potential", "Q", "power", "multipliers", "constraint_force", "input_values". The
+            "potential", "Q", "power", "multipliers", "constraint_force", "input_values",
+            "state_rates". The
             Solution also computes these on demand. "work", the integral of each term of dH/dt since
             ts[0], exists only here. It is integrated with the motion, and its local error is
             bounded like that of q and v.
@@ -251,7 +258,7 @@ def simulate(
         raise invalid("atol", must, was, "Give one number, or pass formulation='multipliers'.")
     params = lift_closure_tracers(system, params, q0, signals)
     params_traced, params_static = _params.split(params)
-    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    inputs_traced, inputs_static = _params.arrays_apart(inputs)
     if not concrete(params_traced, inputs_traced):
         jumps = Jumps(system, params, q0, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
@@ -272,7 +279,7 @@ def simulate(
     knots = all_knots(inputs)
     if not concrete(q0, v0, u0, x0, params_traced, inputs_traced):  # there may be derivatives
         max_steps = most_steps(max_steps, ts, dt, knots)
-    stepper_traced, stepper_static = eqx.partition(stepper, _params.is_array)
+    stepper_traced, stepper_static = _params.arrays_apart(stepper)
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -342,7 +349,7 @@ def _with_method(
 ) -> tuple[ProgramKey, Values]:
     """The same motion by another method, or with other tolerances or steps."""
     stepper = choose(method, not fixed, rtol, atol)
-    traced, static = eqx.partition(stepper, _params.is_array)
+    traced, static = _params.arrays_apart(stepper)
     plan = plan._replace(stepper=_params.Static(static))
     return plan, values._replace(stepper=traced, rtol=rtol, atol=atol, step=step)
 
@@ -378,7 +385,7 @@ def _ran_out(motion: Solution) -> bool:
 @partial(jax.jit, static_argnums=0)
 def _simulate(plan: ProgramKey, values: Values) -> Solution:
     """The compiled program: build the problem, solve it, compute the quantities of `save`."""
-    values = values._replace(ts=jnp.asarray(values.ts))  # under jax.disable_jit it is a numpy array
+    values = with_jax_arrays(values)
     dynamics, start, problem = build_problem(plan, values)
     stepper: Stepper = eqx.combine(problem.setup.stepper, problem.stepper)
     name = name_of(stepper.solver)

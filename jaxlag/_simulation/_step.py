@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._integration._quasi_singularities import usual
 from jaxlag._integration._stepper import Stepper, all_finite
 from jaxlag._integration._tableaus import remembers
-from jaxlag._model._coordinates import vector
+from jaxlag._model._coordinates import numbers
 from jaxlag._model._inputs import check_inputs, check_range, common_range, knots_increase
 from jaxlag._model._states import check_no_states, named_states
 from jaxlag._simulation._jump_times import Jumps, warned
@@ -29,7 +28,13 @@ from jaxlag._simulation._option_checks import (
     check_step,
     check_tolerances,
 )
-from jaxlag._simulation._problem import ProgramKey, Values, equations, stepper_of
+from jaxlag._simulation._problem import (
+    ProgramKey,
+    Values,
+    equations,
+    stepper_of,
+    with_jax_arrays,
+)
 from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._inspection import (
     check_declaration,
@@ -123,7 +128,7 @@ def step(
     if v is None:
         raise invalid("step: v", "be given", "it was None", "For u: system.velocities(q, u).")
     own = system.coordinates
-    q, v = of_state("q and v", vector(own, "q", q), vector(own, "v", v))
+    q, v = of_state("q and v", numbers(own, "q", q), numbers(own, "v", v))
     t = number("step: t", "be a number", t, jnp.result_type(float))
     dt = check_step(dt, None)
     if dt is None:
@@ -146,12 +151,12 @@ def step(
     formulation = check_formulation(system, formulation, stabilization, params, q.dtype)
     params = lift_closure_tracers(system, params, q, signals)
     params_traced, params_static = _params.split(params)
-    inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
+    inputs_traced, inputs_static = _params.arrays_apart(inputs)
     ts: Any = np.array([t, t + dt], dt.dtype) if known else jnp.stack([t, t + dt])
     if not concrete(params_traced, inputs_traced):
         jumps = Jumps(system, params, q, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
-    stepper_traced, stepper_static = eqx.partition((solver, None), _params.is_array)
+    stepper_traced, stepper_static = _params.arrays_apart((solver, None))
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -178,11 +183,12 @@ def step(
 @partial(jax.jit, static_argnums=0)
 def _steps(plan: ProgramKey, values: Values) -> tuple[Array, ...]:
     """The compiled program."""
+    values = with_jax_arrays(values)
     dynamics, args, method = equations(plan, values)
     params, inputs = dynamics.given(args)
     assert values.v0 is not None
     assert values.step is not None
-    ts = jnp.asarray(values.ts)  # under jax.disable_jit it is a numpy array
+    ts = values.ts
     t, q, v, count = ts[0], values.q0, values.v0, plan.max_steps
     signals = inputs | named_states(plan.system.states, values.x0)
     check_declaration(plan.system, params, signals, t, q, v)

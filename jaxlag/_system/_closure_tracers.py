@@ -21,7 +21,7 @@ from jaxlag._tracing._traced_function import functions_of
 
 
 def lift_closure_tracers(
-    system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
+    system: System, params: Any, q: Any, inputs: Mapping[str, Any] | None
 ) -> Any:
     """Params, with the traced values in closures of the declared functions, if any.
 
@@ -66,7 +66,7 @@ def declared(
 def check_params(
     system: System,
     params: Any,
-    q: Array,
+    q: Any,
     inputs: Mapping[str, Any] | None,
     argument: str = "params",
 ) -> None:
@@ -90,14 +90,12 @@ def check_params(
             raise invalid(argument + name.removeprefix("params"), "be finite", f"it was {was}")
 
 
-def _consts(system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None) -> list[Any]:
+def _consts(system: System, params: Any, q: Any, inputs: Mapping[str, Any] | None) -> list[Any]:
     """Values in the closures of the declared functions."""
     return _program(system, params, q, inputs).consts
 
 
-def _program(
-    system: System, params: Any, q: Array, inputs: Mapping[str, Any] | None
-) -> ClosedJaxpr:
+def _program(system: System, params: Any, q: Any, inputs: Mapping[str, Any] | None) -> ClosedJaxpr:
     """All declared terms as a program of (t, q, v, params, inputs)."""
     traced, static = _params.halves((params, inputs))
 

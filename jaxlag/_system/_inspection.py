@@ -24,7 +24,7 @@ INDEPENDENT = 1e-3
 
 
 def advice_on_mass(params: Any) -> str:
-    """Advice for a mass matrix that is not positive definite, if L is probably a network; else ""."""
+    """Advice for a mass matrix that is not positive definite, if L is probably learned; or ""."""
     traced, _ = _params.split(params)
     if sum(np.size(x) for x in jax.tree.leaves(traced)) < LEARNED:
         return ""
@@ -34,9 +34,7 @@ def advice_on_mass(params: Any) -> str:
     )
 
 
-def mass_definite(
-    system: AbstractReactions, params: Any, t: Any, q: Array, v: Array | None
-) -> bool | None:
+def mass_definite(system: AbstractReactions, params: Any, t: Any, q: Any, v: Any) -> bool | None:
     """Whether M is positive definite for these params without the constraints.
 
     Tested in the given state, if it is known, and in one other: the mass of a link is zero
@@ -76,8 +74,8 @@ def contact_rows_independent(
     system: AbstractReactions,
     params: Any,
     t: Any,
-    q: Array,
-    v: Array | None,
+    q: Any,
+    v: Any,
     inputs: Mapping[str, Any],
 ) -> bool:
     """Whether rows whose multipliers forces read are clearly independent of one another.
@@ -90,7 +88,7 @@ def contact_rows_independent(
     if not any(map(reads_lam, system.forces)):
         return True
     array = system._terms
-    t = jnp.asarray(t, float)
+    t, q, v = jnp.asarray(t, float), jnp.asarray(q), jnp.asarray(v)
     chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
     if len(chosen) < 2:
         return True

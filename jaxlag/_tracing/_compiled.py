@@ -38,6 +38,6 @@ class Compiled:
 
     def __call__(self, key: tuple, params: Any, inputs: Any, *arrays: Any, batch: int = 0) -> Any:
         params, params_static = _params.split(params)
-        inputs, inputs_static = eqx.partition(inputs, _params.is_array)
+        inputs, inputs_static = _params.arrays_apart(inputs)
         static = _params.Static(params_static), _params.Static(inputs_static)
         return self.program(key, *static, batch, (params, inputs, *arrays))

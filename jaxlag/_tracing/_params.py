@@ -164,6 +164,14 @@ def halves(tree: Any) -> tuple[Any, Any]:
     return jax.tree.unflatten(form, traced), jax.tree.unflatten(form, static)
 
 
+def arrays_apart(tree: Any) -> tuple[Any, Any]:
+    """(arrays, the rest) of any pytree; one without arrays is not rebuilt, unlike by equinox."""
+    leaves, form = jax.tree.flatten(tree)
+    if not any(map(is_array, leaves)):
+        return jax.tree.unflatten(form, [None] * len(leaves)), tree
+    return eqx.partition(tree, is_array)
+
+
 def join(traced: Any, static: Any) -> Any:
     """Inverse of `split`; frozen arrays come back as numpy arrays."""
     thawed = jax.tree.map(lambda x: x.array if isinstance(x, _Frozen) else x, static)

@@ -310,17 +310,19 @@ def warn_of_changes(*declared: Any) -> None:
             _params.check_keys(part, type(part).__name__)
 
 
-def _parts_of(declared: Any) -> Iterator[Any]:
+def _parts_of(declared: Any) -> list[Any]:
     """The functions and the modules."""
     if isinstance(declared, TracedFunction):
-        yield declared
-    elif isinstance(declared, tuple | Mapping):
-        for part in declared.values() if isinstance(declared, Mapping) else declared:
-            yield from _parts_of(part)
-    elif isinstance(declared, eqx.Module):
-        yield declared
-        for part in vars(declared).values():
-            yield from _parts_of(part)
+        return [declared]
+    if declared is None or isinstance(declared, str | bool):  # most fields: an ABC's test is slow
+        return []
+    if isinstance(declared, eqx.Module):
+        return [declared, *(x for part in vars(declared).values() for x in _parts_of(part))]
+    if isinstance(declared, tuple):
+        return [x for part in declared for x in _parts_of(part)]
+    if isinstance(declared, Mapping):
+        return [x for part in declared.values() for x in _parts_of(part)]
+    return []
 
 
 def _config() -> tuple:

@@ -78,5 +78,5 @@ def test_a_dict_of_other_names_is_refused():
     system = jl.System(lagrangian, NAMES, forces=(force,))
     with pytest.raises(ValueError, match=r"the returned dict must name exactly .*'phi'"):
         system.acceleration([0.0] * 3, [0.0] * 3, PARAMS)
-    with pytest.raises(ValueError, match="`coordinates` must name at least one"):
+    with pytest.raises(ValueError, match="`coordinates` must have at least one name"):
         jl.named({})
