@@ -176,10 +176,9 @@ def simulate(
             motions set it near the number of steps that one of them takes.
         save: names of quantities to compute inside the solve: "a", "u", "p", "energy", "kinetic",
             "potential", "Q", "power", "multipliers", "constraint_force", "input_values",
-            "state_rates". The
-            Solution also computes these on demand. "work", the integral of each term of dH/dt since
-            ts[0], exists only here. It is integrated with the motion, and its local error is
-            bounded like that of q and v.
+            "state_rates". The Solution also computes these on demand. "work", the integral of each
+            term of dH/dt since ts[0], exists only here. It is integrated with the motion, and its
+            local error is bounded like that of q and v.
         gradient: a hint on the cost of reverse derivatives, never on their value.
             "recorded" keeps the state at the start of every step. "checkpoints" keeps about the
             square root as many and repeats the steps between two of them: one more solve. "forward"

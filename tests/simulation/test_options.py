@@ -37,8 +37,8 @@ STEPS = diffrax.PIDController(rtol=1e-6, atol=1e-6)
         (
             {"save": ("a", "force")},
             "`save` must name quantities among ['a', 'u', 'p', 'energy', 'kinetic', 'potential', "
-            "'power', 'multipliers', 'constraint_force', 'Q', 'input_values', 'state_rates', 'work'], but one was "
-            "'force'.",
+            "'power', 'multipliers', 'constraint_force', 'Q', 'input_values', 'state_rates', "
+            "'work'], but one was 'force'.",
         ),
         (
             {"save": "energy"},
