@@ -144,7 +144,7 @@ def numbers(coordinates: Coordinates, argument: str, x: Any) -> Any:
         x = coordinates.flatten(x, argument)
     try:
         x = array_of(x)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         fix = _in_order(coordinates) if isinstance(x, str | Sequence) else ORDER
         raise invalid(argument, f"be {n} numbers", f"it was {x!r}", fix) from error
     if n == 1 and x.shape == ():

@@ -45,6 +45,11 @@ class AbstractSolution(AbstractResult):
 
     @property
     @abstractmethod
+    def where(self) -> Array:
+        """The index that a failure concerns."""
+
+    @property
+    @abstractmethod
     def scene(self) -> MotionKey:
         """The key of the compiled program."""
 

@@ -14,6 +14,7 @@ from jaxlag._core._batching import at_most
 from jaxlag._core._errors import invalid
 from jaxlag._gradient._modes import MODES
 from jaxlag._integration._change_points import CHANGE_POINTS
+from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._coordinates import numbers
@@ -21,6 +22,7 @@ from jaxlag._model._forces import reads_lam
 from jaxlag._simulation._methods import default_tolerances
 from jaxlag._simulation._quantities import QUANTITIES
 from jaxlag._system._system import System
+from jaxlag.solvers import AbstractPartitioned
 
 
 def check_options(
@@ -74,6 +76,18 @@ def check_options(
                 "Declare the system with kinetic= and potential=.",
             )
     positive_integer("max_steps", max_steps)
+
+
+def check_solver(solver: Any, stabilization: Any, gradient_memory: Any) -> None:
+    """Raise on options that do not apply to this solver."""
+    name = type(solver).__name__
+    if isinstance(solver, AbstractPartitioned) and isinstance(stabilization, Baumgarte):
+        must = f"be left out for {name}, whose steps satisfy the constraints"
+        raise invalid("stabilization", must, f"it was {stabilization!r}")
+    if gradient_memory is not None and remembers(solver):
+        must = f"be left out for {name}, which stores every step for derivatives"
+        fix = "Take a one-step method."
+        raise invalid("gradient_memory", must, f"it was {gradient_memory}", fix)
 
 
 def check_change_points(change_points: Any) -> None:

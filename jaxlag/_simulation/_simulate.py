@@ -19,7 +19,6 @@ from jaxlag._gradient._differentiable_solve import solve
 from jaxlag._gradient._modes import capacity_for, most_steps
 from jaxlag._integration._initial_conditions import rows_hold_after
 from jaxlag._integration._stepper import Stepper
-from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, check_inputs, check_range
@@ -35,6 +34,7 @@ from jaxlag._simulation._option_checks import (
     check_longest,
     check_method,
     check_options,
+    check_solver,
     check_start,
     check_states_start,
     check_step,
@@ -58,7 +58,6 @@ from jaxlag._system._inspection import contact_rows_independent, mass_definite
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._traced_function import warn_of_changes
-from jaxlag.solvers import AbstractPartitioned
 
 MAX_STEPS = 16384
 _MAY_BE_SINGULAR = (
@@ -262,16 +261,7 @@ def simulate(
         jumps = Jumps(system, params, q0, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     stepper = choose(method, dt is None, rtol, atol)
-    if isinstance(stepper[0], AbstractPartitioned) and isinstance(stabilization, Baumgarte):
-        must = f"be left out for {type(stepper[0]).__name__}, whose steps satisfy the constraints"
-        raise invalid("stabilization", must, f"it was {stabilization!r}")
-    if gradient_memory is not None and remembers(stepper[0]):
-        must = (
-            f"be left out for {type(stepper[0]).__name__}, which stores every step for derivatives"
-        )
-        raise invalid(
-            "gradient_memory", must, f"it was {gradient_memory}", "Take a one-step method."
-        )
+    check_solver(stepper[0], stabilization, gradient_memory)
     size = 2 * system.size + (0 if x0 is None else x0.shape[0])
     if gradient_memory is not None and "work" in save:
         size += len(system._power_terms(params, q0.dtype).names)

@@ -10,10 +10,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arrays import concrete, stop_gradient
 from jaxlag._core._by_name import ByName, no_attribute
-from jaxlag._core._errors import SimulationError, invalid, shortened, unsupported
-from jaxlag._core._status import CONCERNS_ROW, Status
+from jaxlag._core._errors import SimulationError, invalid, unsupported
+from jaxlag._core._status import Status
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._simulation._abstract_solution import AbstractSolution
+from jaxlag._simulation._ending_message import ended
 from jaxlag._simulation._failure import Ending, MotionKey, diagnose_failure, is_open
 from jaxlag._simulation._methods import METHODS
 from jaxlag._simulation._quantities import at_saves
@@ -26,7 +27,7 @@ from jaxlag._simulation._solution_views import (
     described,
     plotted,
 )
-from jaxlag._simulation._step_diagnosis import advice, explain, failed_save, not_finite
+from jaxlag._simulation._step_diagnosis import explain
 from jaxlag._system._power import in_order
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
@@ -325,35 +326,7 @@ class Solution(AbstractSolution):
         """
         if self.ts.ndim != 1:
             return counted(self)
-        status = Status(int(self.status))
-        if status is Status.ok:
-            text = f"ok at t = {self.last_time}"
-            return f"{text}, {self.fallback}" if self._singular is not None else text
-        index = int(self.where)
-        labels, more = self.system.coordinates.labels, ""
-        if status is Status.kinematics_singular:
-            assert self.system.quasi is not None
-            labels = self.system.quasi.names
-            if index < 0:
-                more = " There are fewer quasi-velocities than degrees of freedom."
-            else:
-                more = f" {self._fallen(index)}"
-        if status in CONCERNS_ROW:
-            rows = self.system._rows(self._given, self.q.dtype)
-            labels = rows.labels
-            if status is Status.contradictory_rows:
-                more = rows.contradiction(self.system.size)
-                if self.formulation == "quasi":
-                    more = " The kinematics v = B u + c do not satisfy it."
-        about = f" ({labels[index]!r})" if index >= 0 else ""
-        if status is Status.nonfinite:
-            more = not_finite(self, self._explained().lost)
-        q, v = self.last_state
-        return shortened(
-            f"{status.name}{about}{failed_save(self)}: last good state at t = {self.last_time} of "
-            f"{self.ts[-1]}, q = {q}, v = {v}, after {int(self.stats['accepted'])} accepted and "
-            f"{int(self.stats['rejected'])} rejected steps. {advice(self, status)}{more}".rstrip()
-        )
+        return ended(self, self._explained().lost)
 
     @property
     def fallback(self) -> str:
@@ -363,20 +336,6 @@ class Solution(AbstractSolution):
         time, index = self._singular
         name = self.system.quasi.names[int(index)]
         return f"by multipliers, as dU/dv is singular at t = {float(time):.6g} ({name!r})"
-
-    def _fallen(self, index: int) -> str:
-        """How a quasi-velocity has changed up to its singularity, as text."""
-        quasi, (q, _) = self.system.quasi, self.last_state
-        assert quasi is not None
-        times, states = (self.ts[0], self.last_time), (self.q[0], q)
-        begin, end = (
-            float(quasi.pivots(t, q, self._given)[index])
-            for t, q in zip(times, states, strict=True)
-        )
-        if not (begin > 0 and end > 0) or begin == end:
-            return ""
-        what = "its part that is independent of the quasi-velocities before it"
-        return f"Since the start {what} has changed by a factor of {end / begin:.2g}."
 
     def explain(self) -> str:
         """Why the solve took this number of steps, and what to change; for a single motion.

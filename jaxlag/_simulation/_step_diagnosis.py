@@ -10,18 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlag._core._arrays import concrete, stop_gradient
+from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import unsupported
-from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
+from jaxlag._core._status import Status
 from jaxlag._integration._linearized_rates import linearized
 from jaxlag._integration._term import term_of
 from jaxlag._linalg._projection import iterations_needed
-from jaxlag._model._states import named_states
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
-from jaxlag._system._inspection import advice_on_mass
-from jaxlag._system._nonfinite import nonfinite
-from jaxlag._system._row_advice import advice_on_rows
 
 LOOKED_AT = 8  # states examined, evenly along the motion
 STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
@@ -62,10 +58,10 @@ class Rates(NamedTuple):
 
 def is_stiff(motion: AbstractSolution) -> bool:
     """Whether the stability limit of the fastest decay determines the length of explicit steps."""
-    return _stiffness(motion) is not None
+    return stiffness(motion) is not None
 
 
-def _stiffness(motion: AbstractSolution) -> Rates | None:
+def stiffness(motion: AbstractSolution) -> Rates | None:
     """The decay that limits explicit steps by stability; None if there is none."""
     h = _mean_step(motion)
     if h is None or motion.scene.implicit:
@@ -74,50 +70,6 @@ def _stiffness(motion: AbstractSolution) -> Rates | None:
     if rates is None or rates.kind != "decays" or not _within(h * rates.fastest, STIFF):
         return None
     return rates
-
-
-def advice(motion: AbstractSolution, status: Status) -> str:
-    """Advice on the end of a single motion; on its rows if these are the cause."""
-    of_rows = *CONCERNS_ROW, Status.nonfinite, Status.step_below_resolution
-    if status in of_rows and motion.system.constraints:
-        # Under grad its numbers are traced, but have values.
-        at = stop_gradient((motion._given, motion.last_time, motion.last_state[0]))
-        dependent = status is Status.projection_failed
-        singular = advice_on_rows(motion.system, *at, dependent=dependent)
-        if singular:
-            return singular
-    fixed, (accepted, rejected) = motion.tolerances is None, _counts(motion)
-    sharp = rejected > UNEVEN * (accepted + rejected)
-    special = ADVICE_FIXED if fixed else ADVICE_SHARP if sharp else {}
-    message = (ADVICE | special).get(status, "")
-    if status is Status.mass_singular:
-        message = f"{message} {advice_on_mass(motion._given)}".rstrip()
-    if fixed:
-        return message
-    if status in (Status.max_steps, Status.step_below_resolution):
-        message = f"{message} {_about_time(motion)}".strip()
-    if status is Status.max_steps and (rates := _stiffness(motion)) is not None:
-        return (
-            f"The motion is stiff: a component decays at {rates.fastest:.3g} 1/s, and explicit "
-            f"steps must be about as short as its time constant. Take method='kvaerno5'. {message}"
-        )
-    assert motion.tolerances is not None
-    if status is Status.step_below_resolution and not np.all(motion.tolerances[1]):
-        end = jax.tree.leaves((motion.last_state, motion.last_x))
-        state = np.concatenate([np.ravel(x) for x in end])
-        labels, states = motion.system.coordinates.labels, motion.system.states
-        atol = np.asarray(motion.tolerances[1])
-        each = np.broadcast_to(atol, (state.size - len(labels),))
-        bounds = np.concatenate([each[: len(labels)], each])
-        names = (*labels, *(f"{label}'" for label in labels))
-        names += () if states is None else states.layout.labels
-        resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]
-        if resting:
-            return (
-                f"With atol = 0 no error is small enough where a component is 0, here "
-                f"{', '.join(resting)}: give atol > 0, or start elsewhere."
-            )
-    return message
 
 
 def explain(motion: AbstractSolution) -> str:
@@ -131,7 +83,7 @@ def explain(motion: AbstractSolution) -> str:
         raise unsupported(
             "`explain` inside jit or vmap", "it needs concrete values, and the motion is traced"
         )
-    accepted, rejected = _counts(motion)
+    accepted, rejected = counts(motion)
     how = "fixed steps"
     if motion.tolerances is not None:
         rtol, atol = map(np.asarray, motion.tolerances)
@@ -166,7 +118,7 @@ def explain(motion: AbstractSolution) -> str:
             "steps end there. If it depends on the position, these steps are needed."
         )
     fixed = motion.tolerances is None
-    if coarse := _about_time(motion):
+    if coarse := about_time(motion):
         advice.append(coarse)
     looks = _look(motion, h)
     lines += _about_rates(motion, h, _rates(looks), advice)
@@ -189,7 +141,7 @@ def explain(motion: AbstractSolution) -> str:
     return "\n".join(lines + [head + line for head, line in zip(heads, advice, strict=True)])
 
 
-def _counts(motion: AbstractSolution) -> tuple[int, int]:
+def counts(motion: AbstractSolution) -> tuple[int, int]:
     """Steps (accepted, rejected)."""
     return int(motion.stats["accepted"]), int(motion.stats["rejected"])
 
@@ -200,7 +152,7 @@ def _mean_step(motion: AbstractSolution) -> float | None:
     return elapsed / accepted if accepted and elapsed > 0 else None
 
 
-def _about_time(motion: AbstractSolution) -> str:
+def about_time(motion: AbstractSolution) -> str:
     """Advice on times so far from 0 that their rounding exceeds the tolerance."""
     h = _mean_step(motion)
     if h is None or motion.tolerances is None:
@@ -359,39 +311,3 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
         return Look(rates, dynamics.mass(tau, y, here), scaled, iterations)
 
     return jax.lax.map(at, places)
-
-
-def not_finite(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> str:
-    """The declared function that is not finite, with its line, as text; "" if it is unknown.
-
-    Args:
-        motion: one that ended as nonfinite.
-        lost: (time, (q, v, x)) where the equations are not finite, if it is known.
-    """
-    n, states = motion.system.size, motion.system.states
-    places: list[tuple[Any, ...]] = [(motion.last_time, *motion.last_state, motion.last_x)]
-    if lost is not None:
-        places.append((lost[0], *jnp.split(lost[1], [n, 2 * n])))
-    for t, q, v, x in places:
-        signals = motion.inputs | named_states(states, x)
-        given = stop_gradient((motion._given, signals, t, q, v))  # with values under grad
-        found = nonfinite(motion.system, *given)
-        if found is not None:
-            return f" {found}"
-    return ""
-
-
-def failed_save(motion: AbstractSolution) -> str:
-    """The first save time before the last time of which the state is NaN, as text; "" if none.
-
-    A state is saved by a step of its own from the start of the accepted step around it, and this
-    step may fail alone.
-    """
-    # Under grad the numbers are traced, but have values.
-    values: Any = stop_gradient((motion.ts, motion.q, motion.last_time))
-    ts, q, last_time = map(np.asarray, values)
-    lost: np.ndarray = np.any(np.isnan(q), axis=1)
-    first = (1 + np.flatnonzero(lost[1:])[:1]).tolist()
-    if not first or (last_time - ts[first[0]]) * (ts[-1] - ts[0]) < 0:
-        return ""
-    return f" in the step to ts[{first[0]}] = {ts[first[0]]:g}"
