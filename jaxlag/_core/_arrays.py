@@ -22,7 +22,8 @@ def array_of(x: Any) -> Any:
     if isinstance(x, jax.Array):
         return x
     if isinstance(x, list | tuple) and all(type(number) in (float, int) for number in x):
-        return np.asarray(x, jnp.result_type(float))
+        with np.errstate(over="ignore"):  # then the number is infinite, and refused as such
+            return np.asarray(x, jnp.result_type(float))
     return jnp.asarray(x)
 
 

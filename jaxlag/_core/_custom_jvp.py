@@ -211,6 +211,9 @@ def _evaluate(*args: Any, call_jaxpr: ClosedJaxpr, rule: AbstractRule) -> list:
 
 
 _custom_jvp.def_impl(_evaluate)
+# From jax 0.12 on programs are rewritten in simpler primitives before they are compiled, after all
+# derivatives: the rule is no longer needed.
+_custom_jvp.to_lojax = _evaluate
 mlir.register_lowering(_custom_jvp, mlir.lower_fun(_evaluate, multiple_results=True))
 
 

@@ -47,9 +47,7 @@ ADVICE = {
         "input knot at its time, atol = 0 where a component is 0, or a tolerance below the "
         "rounding of the dtype."
     ),
-    Status.nonfinite: (
-        "The Lagrangian, a force or a constraint is not finite there: check its domain."
-    ),
+    Status.nonfinite: ("A declared function is not finite there: check its domain."),
     Status.mass_singular: (
         "The mass matrix d2L/dv2 is not positive definite there: give this coordinate inertia, "
         "or drop it."
@@ -86,14 +84,14 @@ ADVICE = {
         "first step dt0."
     ),
     Status.input_range: "Extend the input's table to cover ts, or shorten ts.",
-    Status.bad_value: "q0, v0, ts, tolerances and dt must be finite and within their bounds.",
+    Status.bad_value: "Start, ts, tolerances and dt must be finite and within their bounds.",
 }
 
 
 ADVICE_FIXED = {
     Status.max_steps: "Raise max_steps, lengthen dt, or shorten ts.",
     Status.nonfinite: (
-        "The Lagrangian, a force or a constraint is not finite there: check its domain, and "
+        "A declared function is not finite there: check its domain, and "
         "whether dt is short compared with the fastest motion. If dt is too long, the solution "
         "grows without bound."
     ),

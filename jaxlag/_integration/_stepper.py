@@ -299,11 +299,16 @@ class Stepper(eqx.Module):
 
     def through(self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, args: Any) -> Array:
         """The state at t by the Hermite polynomial through two others."""
-        ends = jnp.stack([t0, t1]), jnp.stack([y0, y1])
+        ends, dynamics = (jnp.stack([t0, t1]), jnp.stack([y0, y1])), cast(Term, self.term).dynamics
+
+        def at(end: tuple[Array, Array]) -> tuple[Array, Array | None]:
+            f = cast(Array, self.term.vf(*end, args))
+            return f, dynamics.curvature_of_states(*end, f, args)
+
         # A loop: a second copy of the vector field would take long to compile.
-        f0, f1 = jax.lax.map(lambda end: cast(Array, self.term.vf(end[0], end[1], args)), ends)
-        n = cast(Term, self.term).dynamics.system.size
-        return hermite(t0, y0, f0, t1, y1, f1, t, n)
+        (f0, f1), curved = jax.lax.map(at, ends)
+        curved = None if curved is None else (curved[0], curved[1])
+        return hermite(t0, y0, f0, t1, y1, f1, t, dynamics.system.size, curved)
 
     def reached(
         self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, far: Array, args: Any

@@ -46,7 +46,7 @@ class Term(diffrax.ODETerm):
     @property
     def second_order(self) -> bool:
         """Whether the state is (q, v): dq/dtau = sigma v, dv/dtau = sigma a."""
-        return self.dynamics.quasi is None and not self.works and not self.dynamics.states
+        return self.dynamics.quasi is None and not self.works and not self.dynamics.state_count
 
     def signed(self, x: Any, args: Arguments) -> Any:
         """Sigma x, of a tree."""

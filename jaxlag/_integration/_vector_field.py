@@ -106,7 +106,7 @@ class VectorField(eqx.Module):
         return self.system.size if self.quasi is None else len(self.quasi.free)
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states beside the coordinates and velocities."""
         return 0 if self.system.states is None else self.system.states.size
 
@@ -347,6 +347,17 @@ class VectorField(eqx.Module):
             rates.append(jnp.stack(list(self.power(t, q, v, params, values).values())))
         return self.signed(jnp.concatenate(rates), args)
 
+    def curvature_of_states(self, tau: Array, y: Array, f: Array, args: Arguments) -> Array | None:
+        """d2x/dtau2 of states x beside (q, v), f = dy/dtau; None without states."""
+        states = self.system.states
+        if states is None:
+            return None
+
+        def rates(tau: Array, y: Array) -> Array:
+            return self.signed(states.rates(*self.at(tau, y, args)), args)
+
+        return jax.jvp(rates, (tau, y), (jnp.ones_like(tau), f))[1]
+
     def projector(self, tau: Array, y: Array, args: Arguments) -> ConstraintProjector:
         """The projection onto the constraints near a predicted state."""
         t, (q, w), (params, _) = self.clock(tau, args), self.parts(y), self.given(args)
@@ -357,7 +368,7 @@ class VectorField(eqx.Module):
         """Values of the inputs anywhere, for programs keyed by their shapes; else none."""
         if not self.program.keyed_by_inputs(args.constants):
             return {}
-        x = jnp.zeros((self.states,), q.dtype)
+        x = jnp.zeros((self.state_count,), q.dtype)
         return self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), x, args)
 
     def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
@@ -376,7 +387,7 @@ class VectorField(eqx.Module):
     def x(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
         """The states beside (q, v) in y."""
         start = self.system.size + self.speeds
-        return y[..., start : start + self.states]
+        return y[..., start : start + self.state_count]
 
     def start(
         self, q0: Float[Array, " n"], w0: Float[Array, " k"], x0: Float[Array, " j"] | None
@@ -388,12 +399,12 @@ class VectorField(eqx.Module):
 
     def idle(self, y: Float[Array, "*s m"]) -> Float[Array, "*s k"]:
         """y without the work done."""
-        return y[..., : self.system.size + self.speeds + self.states]
+        return y[..., : self.system.size + self.speeds + self.state_count]
 
     def work(self, y: Float[Array, "*s m"]) -> dict[str, Float[Array, "*s"]]:
         """Work done since the start by every term of dH/dt, by name."""
         assert self.power is not None
-        columns = jnp.moveaxis(y[..., self.system.size + self.speeds + self.states :], -1, 0)
+        columns = jnp.moveaxis(y[..., self.system.size + self.speeds + self.state_count :], -1, 0)
         return dict(zip(self.power.names, columns, strict=True))
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxlag._core._arrays import array_of, of_state
+from jaxlag._core._arrays import array_of, common, of_state
 from jaxlag._core._errors import invalid
 
 ORDER = "The order of the arguments is (q, v, params)."
@@ -32,7 +32,7 @@ class Coordinates:
         declared: Sequence[str] | Mapping[str, tuple[int, ...] | int],
         argument: str = "coordinates",
     ) -> None:
-        fix = f'Write {argument.split()[-1]}=("x", "theta") or {{"x": (8, 3), "theta": ()}}.'
+        fix = 'Write ("x", "theta") or {"x": (8, 3), "theta": ()}.'
         if isinstance(declared, str) or not isinstance(declared, Sequence | Mapping):
             raise invalid(argument, "be names, or names with shapes", f"it was {declared!r}", fix)
         items = (
@@ -73,7 +73,7 @@ class Coordinates:
                 labels.append(f"{name}[{','.join(map(str, index))}]" if shape else name)
         return tuple(labels)
 
-    def unflatten(self, q: Array) -> dict[str, Array]:
+    def unflatten(self, q: Any) -> dict[str, Any]:
         """Split the last axis of q, shape (..., n), into a dict of named arrays."""
         parts, start = {}, 0
         for name, shape in self.shapes.items():
@@ -106,7 +106,7 @@ class Coordinates:
                     f"{argument}[{name!r}]", f"have shape {shape}", f"it was {part.shape}"
                 )
             rows.append(part.reshape(-1))
-        return jnp.concatenate([row.astype(jnp.result_type(*rows)) for row in rows])
+        return jnp.concatenate(common(*rows))
 
     def label(self, index: int) -> str:
         """Label of entry `index` of flat q."""
@@ -134,11 +134,11 @@ def vector(coordinates: Coordinates, argument: str, x: Any) -> Array:
 
     A scalar is accepted for a single coordinate.
     """
-    return jnp.asarray(numbers(coordinates, argument, x))
+    return jnp.asarray(vector_argument(coordinates, argument, x))
 
 
-def numbers(coordinates: Coordinates, argument: str, x: Any) -> Any:
-    """The same as an argument of a compiled program: a list becomes a numpy array."""
+def vector_argument(coordinates: Coordinates, argument: str, x: Any) -> Any:
+    """The same for a compiled program: of a list a numpy array, which costs no dispatch."""
     n = coordinates.size
     if isinstance(x, Mapping):
         x = coordinates.flatten(x, argument)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxlag._core._arguments import required
 from jaxlag._core._errors import invalid
 from jaxlag._tracing._dependence import outputs_depend_on
-from jaxlag._tracing._signature import accepts, gradient, require_arity, wants
+from jaxlag._tracing._signature import accepts, gradient, require_arity, takes_inputs, wants
 from jaxlag._tracing._traced_function import traced_function
 
 EXPLICIT_TIME = "explicit time"
@@ -31,7 +31,7 @@ def _require_name(kind: str, name: object) -> None:
 
 def _takes_inputs(argument: str, function: Callable) -> bool:
     """Whether a function of (t, q, v, params) also takes `inputs`; raises if neither form fits."""
-    takes = not (callable(function) and accepts(function, 4)) or wants(function, 4, "inputs")
+    takes = takes_inputs(function, 4)
     require_arity(argument, function, _ARGUMENTS if takes else _ARGUMENTS[:4])
     return takes
 

@@ -5,13 +5,14 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
-from jaxlag._model._coordinates import Coordinates, vector
+from jaxlag._model._coordinates import Coordinates, vector_argument
 from jaxlag._tracing._input_values import InputValues
-from jaxlag._tracing._signature import accepts, require_arity, wants
+from jaxlag._tracing._signature import require_arity, takes_inputs
 from jaxlag._tracing._traced_function import traced_function
 
 _ARGUMENTS = ("t", "q", "v", "x", "params", "inputs")
@@ -24,6 +25,7 @@ class States(eqx.Module):
     of a battery. They are integrated together with q and v, with the same error control and
     derivatives. Functions of forces read them in `inputs`, by name: `inputs["current"]`. So do the
     methods of `System` and `jl.equilibrium`: they take the values of states among their inputs.
+    `Feedback` functions do not read them: write a controller with an integrator as a force.
     Structure-preserving methods, `jl.fit` and `jl.lyapunov` do not take such systems.
 
     Args:
@@ -70,7 +72,7 @@ class States(eqx.Module):
         self, rate: Callable, names: Sequence[str] | Mapping[str, tuple[int, ...] | int]
     ) -> None:
         self.layout = Coordinates(names, "States: names")
-        takes = not (callable(rate) and accepts(rate, 5)) or wants(rate, 5, "inputs")
+        takes = takes_inputs(rate, 5)
         require_arity("States: rate", rate, _ARGUMENTS if takes else _ARGUMENTS[:5])
         self.rate, self.takes_inputs = traced_function(rate), takes
 
@@ -84,15 +86,15 @@ class States(eqx.Module):
         """Number of entries of x."""
         return self.layout.size
 
-    def vector(self, argument: str, x: Any) -> Array:
-        """x as a flat array, from an array or a dict by name.
+    def vector(self, argument: str, x: Any) -> Any:
+        """x as a flat array, from an array, a list (then of numpy) or a dict by name.
 
         Raises:
             ValueError: a wrong shape, missing names, a concrete value that is not finite.
         """
-        x = vector(self.layout, argument, x)
-        if concrete(x) and not bool(jnp.all(jnp.isfinite(x))):
-            i = int(jnp.argmin(jnp.isfinite(x)))
+        x = vector_argument(self.layout, argument, x)
+        if concrete(x) and not np.isfinite(x).all():
+            i = int(np.argmin(np.isfinite(x)))
             was = f"{argument}[{i}] ({self.layout.labels[i]!r}) was {x[i]}"
             raise invalid(argument, "be finite", was)
         return x
@@ -106,8 +108,22 @@ class States(eqx.Module):
         values: Mapping[str, Any],
     ) -> Float[Array, " k"]:
         """dx/dt; `values` are those of the inputs and of x, by name."""
-        x = self.layout.flatten({name: values[name] for name in self.names}, "inputs")
-        x = x.astype(q.dtype)
+        return self.rates_at(t, q, v, self.flat(values).astype(q.dtype), params, values)
+
+    def flat(self, values: Mapping[str, Any]) -> Float[Array, " k"]:
+        """x from values by name."""
+        return self.layout.flatten({name: values[name] for name in self.names}, "inputs")
+
+    def rates_at(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        x: Float[Array, " k"],
+        params: Any,
+        values: Mapping[str, Any],
+    ) -> Float[Array, " k"]:
+        """The same at x."""
         given = (t, q, v, x, params, values) if self.takes_inputs else (t, q, v, x, params)
         found = self.rate(*given)
         must = f"return an array of shape {x.shape}"
@@ -122,6 +138,13 @@ class States(eqx.Module):
         return found.astype(x.dtype)
 
 
+OUTPUTS = (
+    *("t", "status", "a", "u", "p", "energy", "kinetic", "potential", "power", "work", "Q"),
+    *("multipliers", "constraint_force", "input_values", "state_rates"),
+)
+"""Names of outputs of a motion, which states must not have."""
+
+
 def check_states(states: Any, taken: Mapping[str, str]) -> States | None:
     """`states`, if it is None or has names of its own.
 
@@ -129,6 +152,7 @@ def check_states(states: Any, taken: Mapping[str, str]) -> States | None:
         states: argument of `System`.
         taken: names that states must not have -> their owners.
     """
+    taken = dict.fromkeys(OUTPUTS, "an output of a motion") | dict(taken)
     if states is None:
         return None
     if not isinstance(states, States):
@@ -140,19 +164,24 @@ def check_states(states: Any, taken: Mapping[str, str]) -> States | None:
     return states
 
 
-def named_states(states: States | None, x: Any) -> dict[str, Array]:
+def named_states(states: States | None, x: Any) -> dict[str, Any]:
     """The named parts of x, (..., k); none without states."""
     return {} if states is None else states.layout.unflatten(x)
 
 
+def state_names(states: States | None) -> tuple[str, ...]:
+    """Declared names; none without states."""
+    return () if states is None else states.names
+
+
 def with_states(values: InputValues, states: States | None, x: Float[Array, " k"]) -> InputValues:
     """The values of the inputs and the named parts of x."""
-    return values if states is None else InputValues(values.peek() | named_states(states, x))
+    return values if states is None else values.changed(named_states(states, x))
 
 
 def check_no_states(inputs: Iterable[str], states: States | None) -> None:
     """Raise if one of the inputs is a state."""
-    for name in () if states is None else states.names:
+    for name in state_names(states):
         if name in inputs:
             was = f"there was {name!r}, a state"
             raise invalid("inputs", "name no states", was, "Its value at ts[0] is in x0=.")

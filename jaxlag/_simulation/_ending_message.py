@@ -12,6 +12,7 @@ from jaxlag._core._errors import shortened
 from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
 from jaxlag._model._states import named_states
 from jaxlag._simulation._abstract_solution import AbstractSolution
+from jaxlag._simulation._methods import of_components
 from jaxlag._simulation._step_diagnosis import UNEVEN, about_time, counts, stiffness
 from jaxlag._system._inspection import advice_on_mass
 from jaxlag._system._nonfinite import nonfinite
@@ -31,6 +32,8 @@ def ended(motion: AbstractSolution, lost: tuple[Array, Array] | None) -> str:
         return f"{text}, {motion.fallback}" if motion.fallback else text
     index = int(motion.where)
     labels, more = motion.system.coordinates.labels, ""
+    if motion.system.states is not None:
+        labels += motion.system.states.layout.labels
     if status is Status.kinematics_singular:
         assert motion.system.quasi is not None
         labels = motion.system.quasi.names
@@ -90,7 +93,7 @@ def _advice(motion: AbstractSolution, status: Status) -> str:
         labels, states = motion.system.coordinates.labels, motion.system.states
         atol = np.asarray(motion.tolerances[1])
         each = np.broadcast_to(atol, (state.size - len(labels),))
-        bounds = np.concatenate([each[: len(labels)], each])
+        bounds = of_components(each, len(labels))
         names = (*labels, *(f"{label}'" for label in labels))
         names += () if states is None else states.layout.labels
         resting = [names[i] for i in np.flatnonzero((state == 0) & (bounds == 0))]

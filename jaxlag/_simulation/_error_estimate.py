@@ -59,4 +59,7 @@ def with_error(motion: Solution, beside: Solution, left: float) -> Solution:
         rounding = jnp.where(at_first, 0.0, rounding)
         return jnp.maximum(SHARE * jnp.maximum(difference, left * so_far), rounding)
 
-    return replace(motion, error=(estimate(motion.q, beside.q), estimate(motion.v, beside.v)))
+    error: tuple[Array, ...] = estimate(motion.q, beside.q), estimate(motion.v, beside.v)
+    if motion.x is not None and beside.x is not None:
+        error += (estimate(motion.x, beside.x),)
+    return replace(motion, error=error)

@@ -190,6 +190,8 @@ def _explained(
             multiplier_row = _dependent(dynamics, args.rows.multiplier_rows.active_rows, *at)
             row = jnp.where(row >= 0, row, multiplier_row)
     worst = jnp.where(jnp.all(jnp.isfinite(ahead)), culprits[2][1], culprits[2][0])
+    if dynamics.system.states is not None:
+        worst = _worst_with_states(dynamics, time, last, args, worst)
 
     if dynamics.rows.size:
         short = status == int(Status.step_below_resolution)
@@ -330,6 +332,17 @@ def _culprits(
     worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
     massless = jnp.where(known, first_unhealthy(M, factor), -1)
     return massless.astype(jnp.int32), lost.astype(jnp.int32), worst.astype(jnp.int32)
+
+
+def _worst_with_states(
+    dynamics: VectorField, tau: Array, y: Array, args: Arguments, worst: Array
+) -> Int[Array, ""]:
+    """`worst`, or n + i if state i changes faster than all velocities, each over 1 + its size."""
+    n, k = dynamics.system.size, dynamics.state_count
+    size = jnp.abs(dynamics(tau, y, args)) / (1.0 + jnp.abs(y))
+    w, x = size[n : n + dynamics.speeds], size[n + dynamics.speeds :][:k]
+    fastest = (n + jnp.argmax(x)).astype(jnp.int32)
+    return jnp.where(jnp.max(x) > jnp.max(w), fastest, worst)
 
 
 def _dependent(

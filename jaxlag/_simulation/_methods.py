@@ -262,10 +262,16 @@ def _with_tolerances(
     )
 
 
+def of_components(atol: Any, n: int) -> Array:
+    """atol of every component of (q, v, x), from those of n coordinates and of x.
+
+    That of a coordinate is also used for its velocity.
+    """
+    return jnp.concatenate([atol[:n], atol])
+
+
 def for_state(solver: Any, controller: Any, n: int, k: int, size: int) -> tuple[Any, Any]:
     """Solver and controller with one atol for every component of the state.
-
-    An atol for every coordinate is also used for its velocity.
 
     Args:
         solver: of `choose`.
@@ -280,7 +286,8 @@ def for_state(solver: Any, controller: Any, n: int, k: int, size: int) -> tuple[
         if not eqx.is_array(atol) or atol.shape != (n + k,):
             return owner
         rest = jnp.full((size - 2 * n - k,), jnp.max(atol))
-        return eqx.tree_at(lambda x: x.atol, owner, jnp.concatenate([atol[:n], atol, rest]))
+        each = jnp.concatenate([of_components(atol, n), rest])
+        return eqx.tree_at(lambda x: x.atol, owner, each)
 
     finder = getattr(solver, "root_finder", None)
     if finder is not None:

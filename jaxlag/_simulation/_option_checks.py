@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxlag._core._arguments import name_sequence, positive_integer
-from jaxlag._core._arrays import concrete, of_state
+from jaxlag._core._arrays import common, concrete, of_state
 from jaxlag._core._batching import at_most
 from jaxlag._core._errors import invalid
 from jaxlag._gradient._modes import MODES
@@ -17,7 +17,7 @@ from jaxlag._integration._change_points import CHANGE_POINTS
 from jaxlag._integration._tableaus import remembers
 from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._model._constraints import Baumgarte
-from jaxlag._model._coordinates import numbers
+from jaxlag._model._coordinates import vector_argument
 from jaxlag._model._forces import reads_lam
 from jaxlag._simulation._methods import default_tolerances
 from jaxlag._simulation._quantities import QUANTITIES
@@ -148,11 +148,11 @@ def check_start(system: System, q0: Any, v0: Any, u0: Any) -> tuple[Any, Any, An
             "Pass v0= instead.",
         )
     own = system.coordinates
-    q0 = numbers(own, "q0", q0)
+    q0 = vector_argument(own, "q0", q0)
     if quasi is not None and u0 is not None:
         name, x = "u0", quasi.vector("u0", u0)
     else:
-        name, x = "v0", numbers(own, "v0", v0)
+        name, x = "v0", vector_argument(own, "v0", v0)
     for argument, values in (("q0", q0), (name, x)):
         if concrete(values) and not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values)))
@@ -268,28 +268,33 @@ def check_tolerances(
 
 def _by_name(system: System, atol: Mapping[str, Any]) -> Array:
     """atol as an array, from a dict by the names of coordinates and states."""
-    states = () if system.states is None else system.states.names
-    of_states = {name: x for name, x in atol.items() if name in states}
-    found = system.coordinates.flatten(
-        {name: x for name, x in atol.items() if name not in of_states}, "atol"
-    )
-    if system.states is None:
-        return found
-    return jnp.concatenate([found, system.states.layout.flatten(of_states, "atol")])
+    own, states = system.coordinates, system.states
+    if states is None:
+        return own.flatten(atol, "atol")
+    if set(atol) != {*own.names, *states.names}:
+        must = f"name exactly {[*own.names, *states.names]}"
+        raise invalid("atol", must, f"it named {list(atol)}")
+    parts = [
+        layout.flatten({name: atol[name] for name in layout.names}, "atol")
+        for layout in (own, states.layout)
+    ]
+    return jnp.concatenate(common(*parts))
 
 
-def check_states_start(system: System, x0: Any, dtype: Any, argument: str = "x0") -> Array | None:
-    """x0 as an array of the dtype of q0; None for a system without states."""
+def check_states_start(system: System, argument: str, x0: Any, *start: Any) -> tuple[Any, ...]:
+    """(x0, *start) as arrays of one dtype; x0 is None for a system without states."""
     states = system.states
     if states is None:
         if x0 is not None:
             fix = "Declare them: System(..., states=jl.States(rate, names))."
             raise invalid(argument, "be left out for a system without states", "it was given", fix)
-        return None
+        return None, *start
     if x0 is None:
-        fix = f"Pass {argument.split()[-1]}= with {list(states.layout.labels)}."
+        fix = f"Give {list(states.layout.labels)}."
         raise invalid(argument, "be given for a system with states", "it was left out", fix)
-    return states.vector(argument, x0).astype(dtype)
+    given = [states.vector(argument, x0), *(x for x in start if x is not None)]
+    x0, *found = of_state(f"{argument} and start", *given)
+    return x0, *(None if x is None else found.pop(0) for x in start)
 
 
 def check_longest(dt: Any, dt_max: Any) -> Any:

@@ -80,9 +80,9 @@ class Values(NamedTuple):
 
 def with_jax_arrays(values: Values) -> Values:
     """The same with JAX's arrays: under `jax.disable_jit` start and times may be numpy's."""
-    given = values.ts, values.q0, values.v0, values.u0
-    ts, q0, v0, u0 = jax.tree.map(jnp.asarray, given)
-    return values._replace(ts=ts, q0=q0, v0=v0, u0=u0)
+    given = values.ts, values.q0, values.v0, values.u0, values.x0
+    ts, q0, v0, u0, x0 = jax.tree.map(jnp.asarray, given)
+    return values._replace(ts=ts, q0=q0, v0=v0, u0=u0, x0=x0)
 
 
 def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start, Problem]:
@@ -226,7 +226,7 @@ def stepper_of(
     dynamics: VectorField, method: tuple[Any, Any], y0: Array, args: Arguments, longest: Any
 ) -> Stepper:
     """The stepper: solver, controller, vector field and post-processing."""
-    solver, controller = for_state(*method, dynamics.system.size, dynamics.states, y0.shape[0])
+    solver, controller = for_state(*method, dynamics.system.size, dynamics.state_count, y0.shape[0])
     step_end = StepEnd(dynamics)
     term = term_of(dynamics, jnp.zeros_like(args.origin), y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:

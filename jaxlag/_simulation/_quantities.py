@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from jaxlag._core._by_name import ByName
 from jaxlag._model._inputs import evaluate
-from jaxlag._model._states import named_states
+from jaxlag._model._states import named_states, state_names
 from jaxlag._system._system import System
 
 Quantity = Callable[..., Any]
@@ -25,7 +25,7 @@ def _without_inputs(method: Quantity) -> Quantity:
 
 def _input_values(system: System, q: Any, v: Any, params: Any, *, t: Any, inputs: Any) -> ByName:
     values = evaluate(inputs, t, q, v, params).peek()
-    states = () if system.states is None else system.states.names
+    states = state_names(system.states)
     return ByName({name: value for name, value in values.items() if name not in states})
 
 

@@ -13,6 +13,7 @@ from jaxlag._core._by_name import ByName, no_attribute
 from jaxlag._core._errors import SimulationError, invalid, unsupported
 from jaxlag._core._status import Status
 from jaxlag._model._constraints import Baumgarte
+from jaxlag._model._states import state_names
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._ending_message import ended
 from jaxlag._simulation._failure import Ending, MotionKey, diagnose_failure, is_open
@@ -61,7 +62,7 @@ class Solution(AbstractSolution):
         dt_max: bound on adaptive steps, s; None if none was given.
         change_points: "pass" or "stop", see `simulate`.
         error: with `estimate_error=True` the estimated errors of (q, v) at each save time, each
-            (s, n), in their units; else None.
+            (s, n), in their units, and those of x, (s, k), if there are states; else None.
     """
 
     system: System
@@ -90,7 +91,7 @@ class Solution(AbstractSolution):
     tolerances: tuple[Float[Array, "*batch"], Float[Array, "*batch_and_coordinates"]] | None
     dt_max: Float[Array, "*batch"] | None = None
     change_points: str = eqx.field(static=True, default="pass")
-    error: tuple[Float[Array, "*batch s n"], Float[Array, "*batch s n"]] | None = None
+    error: tuple[Float[Array, "*batch s _"], ...] | None = None
     # (last good time, index of the quasi-velocity) if "auto" continued with multipliers
     _singular: tuple[Float[Array, ""], Int[Array, ""]] | None = None
 
@@ -115,7 +116,10 @@ class Solution(AbstractSolution):
 
     @property
     def where(self) -> Int[Array, "*batch"]:
-        """Index of the coordinate or constraint row that a failure concerns; -1 if none."""
+        """Index of the coordinate or constraint row that a failure concerns; -1 if none.
+
+        n + i for state i beside n coordinates.
+        """
         return self._explained().where
 
     @property
@@ -182,10 +186,7 @@ class Solution(AbstractSolution):
         """
         quasi, names = self.system.quasi, self.system.coordinates.names
         known = names if quasi is None else (*names, *quasi.names)
-        states, x = self.system.states, self.x
-        if states is not None and x is not None and name in states.names:
-            return states.layout.part(x, name)
-        known = known if states is None else (*known, *states.names)
+        known = *known, *state_names(self.system.states)
         if isinstance(name, str) and name[:-1] in names and name not in known and name[-1] == "'":
             return self.rate(name[:-1])
         if not isinstance(name, str):
@@ -195,6 +196,9 @@ class Solution(AbstractSolution):
                     "name", must, was, "For a save time index motion.ts, motion.q, motion.v."
                 )
             return self._select(name)
+        states, x = self.system.states, self.x
+        if states is not None and x is not None and name in states.names:
+            return states.layout.part(x, name)
         if quasi is not None and name in quasi.names:
             return self.u[..., quasi.names.index(name)]
         if name not in known:
@@ -206,10 +210,13 @@ class Solution(AbstractSolution):
 
     def rate(self, name: str) -> Array:
         """The velocity of a coordinate, or the rate of a state, by its name, (s, *its shape)."""
-        states = self.system.states
+        coordinates, states = self.system.coordinates, self.system.states
         if states is not None and name in states.names:
             return states.layout.part(self.state_rates, name)
-        return self.system.coordinates.part(self.v, name)
+        if states is not None and name not in coordinates.names:
+            known = [*coordinates.names, *states.names]
+            raise invalid("name", f"be one of {known}", f"it was {name!r}")
+        return coordinates.part(self.v, name)
 
     @property
     def state_rates(self) -> Float[Array, "*batch s k"]:

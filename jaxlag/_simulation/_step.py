@@ -16,7 +16,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._integration._quasi_singularities import usual
 from jaxlag._integration._stepper import Stepper, all_finite
 from jaxlag._integration._tableaus import remembers
-from jaxlag._model._coordinates import numbers
+from jaxlag._model._coordinates import vector_argument
 from jaxlag._model._inputs import check_inputs, check_range, common_range, knots_increase
 from jaxlag._model._states import check_no_states, named_states
 from jaxlag._simulation._jump_times import Jumps, warned
@@ -128,7 +128,7 @@ def step(
     if v is None:
         raise invalid("step: v", "be given", "it was None", "For u: system.velocities(q, u).")
     own = system.coordinates
-    q, v = of_state("q and v", numbers(own, "q", q), numbers(own, "v", v))
+    q, v = of_state("q and v", vector_argument(own, "q", q), vector_argument(own, "v", v))
     t = number("step: t", "be a number", t, jnp.result_type(float))
     dt = check_step(dt, None)
     if dt is None:
@@ -140,7 +140,8 @@ def step(
     if remembers(solver):
         was = f"{type(solver).__name__} remembers earlier steps"
         raise invalid("step: method", "be a one-step method", was, "Use jl.simulate.")
-    inputs, x = check_inputs(inputs), check_states_start(system, x, q.dtype, "step: x")
+    x, q, v = check_states_start(system, "step: x", x, q, v)
+    inputs = check_inputs(inputs)
     check_no_states(inputs, system.states)
     signals = inputs | named_states(system.states, x)
     known = concrete(t, dt)

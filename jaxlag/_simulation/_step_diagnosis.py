@@ -18,6 +18,7 @@ from jaxlag._integration._term import term_of
 from jaxlag._linalg._projection import iterations_needed
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._failure import MotionKey, dynamics_of
+from jaxlag._simulation._methods import of_components
 
 LOOKED_AT = 8  # states examined, evenly along the motion
 STIFF = (1.5, 10.0)  # products of step and decay rate near the limits of stability (3 to 6)
@@ -305,8 +306,7 @@ def _looks(scene: MotionKey, traced: Any) -> Look:
             iterations = iterations_needed(
                 dynamics.projector(tau + h, y1, here), *dynamics.parts(y1)
             )
-        n = dynamics.system.size  # an atol for a coordinate is also that of its velocity
-        allowed = atol if atol.ndim == 0 else jnp.concatenate([atol[:n], atol])
+        allowed = atol if atol.ndim == 0 else of_components(atol, dynamics.system.size)
         scaled = jnp.abs(jnp.asarray(error)) / (allowed + rtol * jnp.abs(y))
         return Look(rates, dynamics.mass(tau, y, here), scaled, iterations)
 

@@ -267,6 +267,7 @@ def equilibrium(
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     warn_of_changes(system, inputs)
+    system = system._mechanics
     traced, static = _params.split(lift_closure_tracers(system, params, q0, inputs))
     inputs_traced, inputs_static = eqx.partition(inputs, _params.is_array)
     key = (system, _params.Static(static), _params.Static(inputs_static), max_steps)

@@ -82,7 +82,7 @@ def inverse_dynamics(
     inputs = check_inputs(inputs)
     check_range(inputs, t, "t")
     warn_of_changes(system, inputs)
-    return _needed((system,), params, inputs, t, q, v, a)
+    return _needed((system._mechanics,), params, inputs, t, q, v, a)
 
 
 def prescribed_motion(

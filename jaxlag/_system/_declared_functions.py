@@ -13,6 +13,7 @@ from jaxlag._model._forces import GeneralizedForce, PointForce, Rayleigh, Torque
 from jaxlag._model._input_signals import AbstractInput
 from jaxlag._model._inputs import evaluate
 from jaxlag._model._quasi_velocities import InQuasiVelocities, Vanishing
+from jaxlag._model._states import with_states
 from jaxlag._system._state_functions import AbstractQuantities
 from jaxlag._tracing import _params
 
@@ -51,7 +52,7 @@ class Declared(NamedTuple):
     Attributes:
         name: its name in the report.
         function: function of its arguments by name, returning an array of real numbers.
-        arguments: its arguments among t, q, v, u, params and lam.
+        arguments: its arguments among t, q, v, u, params, lam and x, that of `States`.
         role: its role in the equations of motion.
     """
 
@@ -90,16 +91,17 @@ def declared(
 
     def add(name: str, function: Callable, names: str, role: Role, driven: bool = False) -> None:
         arguments = tuple(names.split())
+        beside = ("x",) if driven and system.states is not None else ()
 
         def call(z: Mapping[str, Any]) -> Any:
             whole = params.join(z["params"])
             given = [whole if name == "params" else z[name] for name in arguments]
             if driven:
                 values = evaluate(inputs, z["t"], z["q"], z["v"], whole)
-                given.insert(4, values)
+                given.insert(4, with_states(values, system.states, z["x"]) if beside else values)
             return _numbers(function(*given))
 
-        found.append(Declared(name, call, arguments, role))
+        found.append(Declared(name, call, (*arguments, *beside), role))
 
     speeds = "v" if system._in_u is None else "u"
     if system._kinetic is None:

@@ -1,8 +1,10 @@
 """Inspection of a declaration: shapes by tracing, mass matrix and rows by numbers."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,25 +14,27 @@ from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import evaluate
+from jaxlag._model._states import named_states, state_names
 from jaxlag._system._reactions import AbstractReactions
 from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
 
 LEARNED = 64
-"""Numbers in the params from which on a Lagrangian is probably learned."""
+"""Numbers in matrices of the params from which on a Lagrangian may be learned."""
 INDEPENDENT = 1e-3
 """Least singular value of clearly independent rows of unit length."""
 
 
 def advice_on_mass(params: Any) -> str:
-    """Advice for a mass matrix that is not positive definite, if L is probably learned; or ""."""
+    """Advice for a mass matrix that is not positive definite, if L may be learned; else ""."""
     traced, _ = _params.split(params)
-    if sum(np.size(x) for x in jax.tree.leaves(traced)) < LEARNED:
+    weights = [x for x in jax.tree.leaves(traced) if eqx.is_inexact_array(x) and np.ndim(x) == 2]
+    if sum(np.size(x) for x in weights) < LEARNED:
         return ""
     return (
-        "Networks for L often have such an M. Let one network return a triangular matrix F "
-        "and another one V, and write L = v^T (F F^T + eps I) v / 2 - V."
+        "If L is a network, let one network return a triangular matrix F and another one V, and "
+        "write L = v^T (F F^T + eps I) v / 2 - V."
     )
 
 
@@ -89,6 +93,7 @@ def contact_rows_independent(
         return True
     array = system._terms
     t, q, v = jnp.asarray(t, float), jnp.asarray(q), jnp.asarray(v)
+    inputs = {k: jnp.asarray(x) if isinstance(x, np.ndarray) else x for k, x in inputs.items()}
     chosen = np.flatnonzero(array.rows_read(t, q, v, params, evaluate(inputs, t, q, v, params)))
     if len(chosen) < 2:
         return True
@@ -114,16 +119,31 @@ def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: 
     traced, static = _params.split(params)
     terms = system._terms
 
-    def all_terms(t: Array, q: Array, v: Array, traced: Any) -> Any:
+    def all_terms(t: Array, q: Array, v: Array, traced: Any, beside: Any) -> Any:
         params = _params.join(traced, static)
         p = terms.momentum(t, q, v, params)
         if values is None:
             return p
-        rates = None if system.states is None else system.states.rates(t, q, v, params, values)
-        return p + terms.force(t, q, v, params, values), rates
+        return p + terms.force(t, q, v, params, values.changed(beside))
 
-    closed = jax.make_jaxpr(all_terms)(t, q, v, traced)
-    check_indices(closed, [None, "q", "v", *(None for _ in jax.tree.leaves(traced))])
+    states, rest = system.states, [None for _ in jax.tree.leaves(traced)]
+    if states is None or values is None:
+        closed = jax.make_jaxpr(all_terms)(t, q, v, traced, {})
+        check_indices(closed, [None, "q", "v", *rest])
+        return
+
+    # A fixed index is checked where it is read: of a named part by forces, of x by the rate.
+    x = jax.ShapeDtypeStruct((states.size,), dtype)
+    beside = jax.eval_shape(partial(named_states, states), x)
+    closed = jax.make_jaxpr(all_terms)(t, q, v, traced, beside)
+    names = [f"inputs[{name!r}]" if beside[name].ndim == 1 else None for name in sorted(beside)]
+    check_indices(closed, [None, "q", "v", *rest, *names])
+
+    def rates(t: Array, q: Array, v: Array, x: Array, traced: Any) -> Array:
+        return states.rates_at(t, q, v, x, _params.join(traced, static), values)
+
+    closed = jax.make_jaxpr(rates)(t, q, v, x, traced)
+    check_indices(closed, [None, "q", "v", "x", *rest], "States: rate")
 
 
 @Compiled
@@ -145,12 +165,11 @@ def check_declaration(
     """
     values = evaluate(inputs, t, q, v, params)
     check_traceable(system, params, q.dtype, values)
-    states = () if system.states is None else system.states.names
     for name in inputs:
-        if name not in values.read and name not in states:
+        if name not in values.read and name not in state_names(system.states):
             raise invalid(
                 "inputs",
-                "hold only signals that a force reads",
-                f"no force read {name!r}",
+                "hold only signals that a declared function reads",
+                f"none read {name!r}",
                 "Drop it, or read inputs[name] in a GeneralizedForce.",
             )

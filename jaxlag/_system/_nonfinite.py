@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxlag._core._errors import invalid
 from jaxlag._model._input_signals import AbstractInput
+from jaxlag._model._inputs import evaluate as input_values
 from jaxlag._system._declared_functions import Declared, Params, Role, declared
 from jaxlag._system._nan_origins import Origin, TracedProgram, evaluate
 from jaxlag._system._reactions import AbstractReactions
@@ -103,7 +104,9 @@ def nonfinite(
         z["lam"] = {name: jnp.ones(shape, kind) for name, shape in system._rows(whole, kind).shapes}
         if system.quasi is not None:
             z["u"] = system.quasi.of(z["t"], q, v, whole)
-        lost = {name for name in ("t", "q", "v", "u") if name in z and not _is_finite(z[name])}
+        if system.states is not None:
+            z["x"] = system.states.flat(input_values(inputs, z["t"], q, v, whole))
+        lost = {name for name in ("t", "q", "v", "u", "x") if name in z and not _is_finite(z[name])}
         for function in declared(system, own, inputs):
             names = dict.fromkeys((*_STATE, *function.arguments))
             if lost & names.keys():

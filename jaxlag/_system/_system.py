@@ -148,7 +148,8 @@ class System(AbstractReactions):
             rows = check_constraints((*quasi.rows, *rows))
         check_reactions(rows, self.forces)
         self.constraints, self.quasi = rows, quasi
-        taken = dict.fromkeys(self.coordinates.names, "a coordinate")
+        taken = self._taken(rows)
+        taken |= {f"{name}'": "a velocity" for name in self.coordinates.names}
         taken |= {} if quasi is None else dict.fromkeys(quasi.names, "a quasi-velocity")
         self.states = check_states(states, taken)
         if written_in not in ("v", "u"):
@@ -197,7 +198,7 @@ class System(AbstractReactions):
         return (*parts, self.quasi, self.states, self.lowering)
 
     def _taken(self, rows: Sequence[AbstractConstraint]) -> dict[str, str]:
-        """Names that quasi-velocities must not have -> their owners."""
+        """Names that quasi-velocities and states must not have -> their owners."""
         taken = dict.fromkeys(self.coordinates.names, "a coordinate")
         taken |= {force.name: "a force" for force in self.forces}
         fix = "a constraint (a name in constrained= already declares its row)"
@@ -233,6 +234,13 @@ class System(AbstractReactions):
             taken = dict.fromkeys((force.name for force in both), "a force")
             check_quasi(self.quasi, self.size, taken)
         return eqx.tree_at(lambda s: s.forces, self, both, is_leaf=lambda x: x is self.forces)
+
+    @property
+    def _mechanics(self) -> "System":
+        """The same without states: forces read their values as inputs."""
+        if self.states is None:
+            return self
+        return eqx.tree_at(lambda s: s.states, self, None, is_leaf=lambda x: x is self.states)
 
     def unflatten(self, q: Array) -> dict[str, Array]:
         """Named parts of q (or v, a, p), shape (..., n)."""
@@ -313,11 +321,11 @@ class System(AbstractReactions):
                 f"coordinate {self.coordinates.label(index)!r}",
                 "have inertia: d2L/dv2 positive definite",
                 f"its pivot was not positive at q = {q}, v = {v}",
-                advice_on_mass(params)
-                or "Add its kinetic energy to L, check the sign of T, or drop the coordinate.",
+                "Add its kinetic energy to L, check the sign of T, or drop the coordinate. "
+                + advice_on_mass(params),
             )
         a = self.acceleration(q, v, params, t=t, inputs=inputs)
-        beside = () if self.states is None else self.states.rates(t, q, v, params, values)
+        beside = () if self.states is None else (self.states.rates(t, q, v, params, values),)
         if not all(bool(jnp.all(jnp.isfinite(x))) for x in (a, *beside)):
             self._refuse_nonfinite(params, inputs, t, q, v)
             label = self.coordinates.label(int(jnp.argmin(jnp.isfinite(a))))

@@ -17,7 +17,7 @@ class InputValues(Mapping[str, Any]):
         if name not in self._values:
             raise invalid(
                 "inputs",
-                f"have an entry {name!r}, which a force reads",
+                f"have an entry {name!r}, which a declared function reads",
                 f"its names were {sorted(self)}",
                 "Pass inputs={...} with this name.",
             )
@@ -32,6 +32,12 @@ class InputValues(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len(self._values)
+
+    def changed(self, values: Mapping[str, Any]) -> "InputValues":
+        """The same with these values; both remember what is read of either."""
+        found = InputValues(self._values | dict(values))
+        found.read = self.read
+        return found
 
     def peek(self) -> dict[str, Any]:
         """All values; none of them counts as read."""

@@ -80,6 +80,18 @@ def wants(function: Callable, position: int, name: str) -> bool:
     return any(p.default is Parameter.empty or p.name == name for p in at_position)
 
 
+def takes_inputs(function: Any, place: int) -> bool:
+    """Whether a function of a state also takes `inputs`, at this place behind params.
+
+    Also if `inputs` stands in the place of params, so that the error shows the whole form.
+    """
+    if not callable(function) or not accepts(function, place):
+        return True
+    return wants(function, place, "inputs") or _positional(function)[place - 1 : place] == [
+        "inputs"
+    ]
+
+
 def accepts(function: Callable, count: int) -> bool:
     """Whether `function` can be called with `count` positional arguments."""
     try:

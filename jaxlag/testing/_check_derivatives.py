@@ -154,11 +154,11 @@ def check_derivatives(
     | `phi` of `Holonomic`, functions of `QuasiVelocities`       | 3     |
     | `residual` of `Pfaffian`                                   | 2     |
     | `position`, `angular_velocity`, `R` of `Rayleigh`          | 2     |
-    | `Q`, `force`, `torque`                                     | 1     |
+    | `Q`, `force`, `torque`, `rate` of `States`                 | 1     |
 
-    by t, q, v (or u), the real inexact leaves of params, and lam if a force reads it (taken as
-    1), all at once, along dense random directions: forward only, reverse first, and reverse
-    first and last; without and with `jax.vmap`. The states:
+    by t, q, v (or u), x of `States`, the real inexact leaves of params, and lam if a force reads it
+    (taken as 1), all at once, along dense random directions: forward only, reverse first, and
+    reverse first and last; without and with `jax.vmap`. The states:
 
     | name     | q                                    | v                               |
     |----------|--------------------------------------|---------------------------------|
@@ -187,7 +187,8 @@ def check_derivatives(
         v: generalized velocities, shape (n,), m/s or rad/s.
         params: as its functions take them.
         t: s.
-        inputs: dict from names to input objects or arrays, if forces read them.
+        inputs: dict from names to input objects or arrays, if forces read them, and the values of
+            `States`, which are varied like v.
         states: the states to examine: leave out "zero" if a coordinate cannot be 0.
 
     Returns:
@@ -217,8 +218,10 @@ def check_derivatives(
         "lam": {name: jnp.ones(shape, q.dtype) for name, shape in rows.shapes},
     }
     u = None if system.quasi is None else system.quasi.of(t, q, v, whole)
+    x = None if system.states is None else system.states.flat(evaluate(inputs, t, q, v, whole))
     _require_numbers("u", u)
-    at = _states.states(states, q, v, u)
+    _require_numbers("inputs", x)
+    at = _states.states(states, q, v, u, x)
     functions = declared(system, own, inputs)
     findings: list[Finding] = []
     omitted: dict[str, str] = {}

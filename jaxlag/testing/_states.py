@@ -12,12 +12,18 @@ STATES = ("given", "rest", "zero", "equal", "one", "random")
 _RANDOM = 3  # states of that kind
 
 
-def states(names: Sequence[str], q: Array, v: Array, u: Array | None) -> dict[str, dict]:
-    """Name -> q, v and, unless it is None, u, of the distinct states among those requested."""
+def states(
+    names: Sequence[str], q: Array, v: Array, u: Array | None, x: Array | None = None
+) -> dict[str, dict]:
+    """Name -> q, v and, unless they are None, u and x, of the distinct ones among those requested.
+
+    u and x are changed like v.
+    """
     if isinstance(names, str) or not names or not set(names) <= set(STATES):
         must, was = f"be names among {list(STATES)}", f"it was {names!r}"
         raise invalid("check_derivatives: states", must, was, 'Write states=("given", "rest").')
-    given = {"q": q, "v": v} | ({} if u is None else {"u": u})
+    known = {"q": q, "v": v, "u": u, "x": x}
+    given = {name: value for name, value in known.items() if value is not None}
     rng = np.random.default_rng(0)
 
     def each(**change: Callable[[Array], Array]) -> dict:
@@ -44,8 +50,8 @@ def states(names: Sequence[str], q: Array, v: Array, u: Array | None) -> dict[st
     all_states["one"] = each(q=one, v=one)
     all_states |= {f"random {k + 1}": each(q=near, v=near) for k in range(_RANDOM)}
     distinct: dict[str, dict] = {}
-    for name, x in all_states.items():
-        met = any(all(np.array_equal(x[k], y[k]) for k in x) for y in distinct.values())
+    for name, own in all_states.items():
+        met = any(all(np.array_equal(own[k], y[k]) for k in own) for y in distinct.values())
         if name.split()[0] in names and not met:
-            distinct[name] = x
+            distinct[name] = own
     return distinct

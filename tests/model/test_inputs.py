@@ -243,8 +243,8 @@ PUSHED = pushed(lambda inputs: inputs["u"])
 
 def test_a_missing_input_is_named():
     message = (
-        r"^`inputs` must have an entry 'u', which a force reads, but its names were \['w'\]\. "
-        r"Pass inputs="
+        r"^`inputs` must have an entry 'u', which a declared function reads, but its names were "
+        r"\['w'\]\. Pass inputs="
     )
     other = {"w": jnp.array(1.0)}
     for ask in (
@@ -256,7 +256,7 @@ def test_a_missing_input_is_named():
         with pytest.raises(ValueError, match=message):
             ask()
     with pytest.raises(
-        ValueError, match=r"entry 'u', which a force reads, but its names were \[\]"
+        ValueError, match=r"entry 'u', which a declared function reads, but its names were \[\]"
     ):
         run(PUSHED, None)
 
@@ -264,12 +264,13 @@ def test_a_missing_input_is_named():
 def test_an_input_that_nothing_reads_is_refused():
     signals = {"u": HOLD, "torque": LINE}
     message = (
-        r"^`inputs` must hold only signals that a force reads, but no force read 'torque'\. Drop"
+        r"^`inputs` must hold only signals that a declared function reads, but none read 'torque'"
+        r"\. Drop"
     )
     with pytest.raises(ValueError, match=message):
         run(PUSHED, signals)
     free = jl.System(lambda t, q, v, params: 0.5 * v @ v, ("x", "y"))
-    with pytest.raises(ValueError, match=r"but no force read 'u'\."):
+    with pytest.raises(ValueError, match=r"but none read 'u'\."):
         run(free, {"u": HOLD})
 
 

@@ -39,6 +39,12 @@ def with_rate(function, names=("current",)):
             lambda: with_rate(rate, ("angle",)),
             "States: `names` must differ from other names, but 'angle' is a coordinate",
         ),
+        (lambda: with_rate(rate, ("angle'",)), "must differ from other names.*is a velocity"),
+        (lambda: with_rate(rate, ("energy",)), "must differ .* 'energy' is an output of a motion"),
+        (
+            lambda: jl.States(lambda t, q, v, x, inputs: x, ("x",)),
+            r"States: `rate` must be callable as \(t, q, v, x, params, inputs\)",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -69,7 +75,7 @@ def test_check_names_a_rate_that_is_not_finite():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, r"`x0` must be given for a system with states.*x0= with \['current'\]"),
+        ({}, r"`x0` must be given for a system with states.*Give \['current'\]"),
         ({"x0": [1.0, 2.0]}, r"`x0` must have shape \(1,\).*\['current'\]"),
         ({"x0": {"voltage": 1.0}}, r"`x0` must name exactly \['current'\]"),
         ({"x0": [jnp.nan]}, r"`x0` must be finite, but x0\[0\] \('current'\) was nan"),
@@ -78,6 +84,10 @@ def test_check_names_a_rate_that_is_not_finite():
             "`inputs` must name no states, but there was 'current'",
         ),
         ({"x0": [1.0], "atol": [1e-9] * 3}, "one for each of 1 coordinates and 1 states"),
+        (
+            {"x0": [1.0], "atol": {"angle": 1e-6}},
+            r"`atol` must name exactly \['angle', 'current'\], but it named \['angle'\]",
+        ),
         (
             {"x0": [1.0], "method": "gauss4", "dt": 0.1},
             r"method GaussLegendre must be used without states=.*\['current'\]",
@@ -115,3 +125,47 @@ def test_fit_refuses_states():
 
 def test_a_state_that_no_force_reads_is_allowed_and_shown():
     assert "states        current, integrated with (q, v)" in with_rate(rate).explain(None)
+
+
+def reads(entry):
+    return (jl.GeneralizedForce(lambda t, q, v, p, inputs: entry(inputs)[None], "force"),)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (
+            with_rate(lambda t, q, v, x, p: jnp.stack([x[0], x[2]]), ("i", "j")),
+            r"States: `rate` must take indices from -2 to 1 of x, .* but x\[2\] was taken",
+        ),
+        (
+            with_rate(lambda t, q, v, x, p: jnp.stack([q[3], x[1]]), ("i", "j")),
+            r"States: `rate` must take indices from -1 to 0 of q, .* but q\[3\] was taken",
+        ),
+        (
+            jl.System(
+                lagrangian,
+                ("angle",),
+                forces=reads(lambda inputs: inputs["T"][5]),
+                states=jl.States(rate, {"T": 3}),
+            ),
+            r"indices from -3 to 2 of inputs\['T'\], .* but inputs\['T'\]\[5\] was taken",
+        ),
+    ],
+)
+def test_indices_beyond_the_states_are_refused(system, message):
+    with pytest.raises(ValueError, match=message):
+        jl.simulate(system, [0.0], [0.0], [0.0, 1.0], x0=jnp.ones(system.states.size))
+
+
+def test_derivatives_by_states_are_checked():
+    """The square root of a state that may be 0."""
+    system = jl.System(
+        lagrangian,
+        ("angle",),
+        forces=reads(lambda inputs: jnp.sqrt(jnp.abs(inputs["level"]))),
+        states=jl.States(rate, ("level",)),
+    )
+    report = jl.testing.check_derivatives(system, [0.3], [0.2], inputs={"level": 0.5})
+    assert {finding.function for finding in report.findings} == {"force 'force': Q"}
+    assert {finding.state for finding in report.findings} == {"rest", "zero"}

@@ -133,6 +133,8 @@ def test_a_batch_over_the_start_of_states(right):
     motions = jax.vmap(lambda x0: swing(ARM, x0))(starts)
     np.testing.assert_allclose(whole(motions[1]), whole(swing()), rtol=0, atol=2e-9)
     assert motions["current"].shape == (3, 31)
+    chosen = motions[np.array([True, False, True])]
+    np.testing.assert_array_equal(chosen.x, motions.x[np.array([0, 2])])
     assert motions.last_x.shape == (3, 1)
 
 
@@ -155,6 +157,27 @@ def test_a_rate_that_is_not_finite_is_named():
     assert motion.status == jl.Status.nonfinite
     assert "`rate` of states, by log at test_motions_with_states.py" in motion.message()
     assert 0.9 < motion.last_time <= 1.0
+
+
+def test_a_state_that_grows_beyond_bounds_is_named():
+    """x' = x^2 beside an oscillator that is not concerned."""
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - 4.5 * q[1] ** 2,
+        ("y", "z"),
+        states=jl.States(lambda t, q, v, x, p: x**2, ("level",)),
+    )
+    motion = jl.simulate(system, [0.0, 1.0], [0.0, 0.0], [0.0, 2.0], x0=[1.0], throw=False)
+    assert motion.message().startswith("step_below_resolution ('level'): last good state at t = 1")
+    assert "v = [" in motion.message()
+    assert ", x = [" in motion.message()
+
+
+def test_errors_of_states_are_estimated(right):
+    motion = swing(rtol=1e-6, atol=1e-6, estimate_error=True)
+    error = jnp.abs(motion.x - right[:, 2:])
+    assert motion.error[2].shape == motion.x.shape
+    assert jnp.all(error <= motion.error[2] + 1e-13)
+    assert jnp.max(motion.error[2]) < 100 * jnp.max(error)
 
 
 # A cart on a slope held by a PID controller, whose integrator is a state.
@@ -304,7 +327,33 @@ def test_states_in_float32():
     f32 = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)  # noqa: E731
     params, ts = f32(ARM), jnp.linspace(0.0, 3.0, 4)
     motion = jl.simulate(
-        arm, f32([1.0]), f32([0.0]), ts, params, x0=[0.2], inputs={"voltage": f32(1.0)}
+        arm, f32([1.0]), f32([0.0]), ts, params, x0=f32([0.2]), inputs={"voltage": f32(1.0)}
     )
     assert motion.ok
     assert motion.x.dtype == jnp.float32
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("rate", "most"),  # twice the largest error measured
+    [(5.0, 2e-12), (50.0, 3e-9), (200.0, 2e-7)],
+)
+def test_states_saved_at_a_change_point_are_accurate(rate, most):
+    """A parallelogram that becomes flat, beside x = sin(w t) with w far above its own rates."""
+
+    def closed(t, q, p):
+        a, c, b = q
+        x = jnp.cos(a) + 2 * jnp.cos(c) - 2 - jnp.cos(b)
+        return jnp.stack([x, jnp.sin(a) + 2 * jnp.sin(c) - jnp.sin(b)])
+
+    linkage = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v,
+        ("a", "c", "b"),
+        constraints=(jl.Holonomic(closed, ("x", "y")),),
+        states=jl.States(lambda t, q, v, x, p: p * jnp.cos(p * t) * jnp.ones(1), ("i",)),
+    )
+    flat = np.pi - 0.5
+    ts = jnp.array([0.0, flat - 1e-3, flat, flat + 1e-4, 4.0])
+    motion = jl.simulate(linkage, [0.5, 0.0, 0.5], [1.0, 0.0, 1.0], ts, rate, x0=[0.0])
+    assert motion.ok
+    np.testing.assert_allclose(motion.x[:, 0], jnp.sin(rate * ts), rtol=0, atol=most)

@@ -238,7 +238,7 @@ def test_times_beyond_tables_are_refused_or_get_a_status():
     early = late(jnp.array([-1.0, 1.0, 1.5]))
     assert early.status == Status.input_range
     assert early.last_time == -1.0
-    with pytest.raises(ValueError, match="have an entry 'tau', which a force reads"):
+    with pytest.raises(ValueError, match="have an entry 'tau', which a declared function reads"):
         jl.simulate(*arguments, [0.0, 1.0], params)
 
 

@@ -251,7 +251,10 @@ def test_nonfinite_forces_are_named():
         ({"t": "a"}, "`t` must be a number, but it was 'a'."),
         ({"t": [0.0, 1.0, 2.0]}, "`t` must be a number, but its shape was (3,)."),
         ({"system": "pendulum"}, "`system` must be a jl.System, but it was 'pendulum'."),
-        ({"inputs": {"wind": 1.0}}, "`inputs` must hold only signals that a force reads"),
+        (
+            {"inputs": {"wind": 1.0}},
+            "`inputs` must hold only signals that a declared function reads",
+        ),
     ],
     ids=str,
 )

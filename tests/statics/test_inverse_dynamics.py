@@ -281,7 +281,9 @@ def test_prescribed_motion_must_return_a_vector(motion):
 
 def test_inputs_that_no_force_reads_are_refused():
     motion = MOTIONS["double_pendulum"]
-    with pytest.raises(ValueError, match="`inputs` must hold only signals that a force reads"):
+    with pytest.raises(
+        ValueError, match="`inputs` must hold only signals that a declared function reads"
+    ):
         jl.inverse_dynamics(
             motion.system, motion.q0, motion.v0, motion.v0, motion.params, inputs={"tau": 1.0}
         )

@@ -27,15 +27,15 @@ def weights(size):
 def test_a_learned_lagrangian_without_inertia_is_told_its_form():
     system = jl.System(network, ("a", "b"))
     with pytest.raises(ValueError, match=f"`?coordinate 'a'`? must have inertia.*{FORM}"):
-        system.check([0.1, 0.2], [1.0, 1.0], weights(16))
+        system.check([0.1, 0.2], [1.0, 1.0], weights(20))
     motion = jl.simulate(
-        system, [0.1, 0.2], [1.0, 1.0], [0.0, 0.1], weights(16), throw=False, method="tsit5"
+        system, [0.1, 0.2], [1.0, 1.0], [0.0, 0.1], weights(20), throw=False, method="tsit5"
     )
     assert motion.status == jl.Status.mass_singular
     assert "write L = v^T (F F^T + eps I) v / 2 - V" in motion.message()
 
 
 def test_that_form_is_accepted_and_few_params_are_no_network():
-    jl.System(structured, ("a", "b")).check([0.1, 0.2], [1.0, 1.0], weights(16))
+    jl.System(structured, ("a", "b")).check([0.1, 0.2], [1.0, 1.0], weights(20))
     with pytest.raises(ValueError, match=r"must have inertia.*Add its kinetic energy to L"):
         jl.System(network, ("a", "b")).check([0.1, 0.2], [1.0, 1.0], weights(4))
