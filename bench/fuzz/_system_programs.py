@@ -16,6 +16,7 @@ from bench.fuzz._random_systems import Drawn
 from bench.fuzz._rounding import evaluated
 from jaxlag._lowering import ArrayProgram, ArrayTerms, ScalarProgram, State
 from jaxlag._system._inspection import check_traceable
+from jaxlag._tracing._input_values import InputValues
 
 NUDGES = 4  # runs with other rounding errors
 MORE = 60  # runs if these show a difference: a `floor` may jump at one rounding in ten
@@ -35,7 +36,7 @@ def compared(drawn: Drawn) -> Compared:
     arrays, scalars = ArrayProgram(terms), ScalarProgram(terms, 1500)
     try:
         like = jax.ShapeDtypeStruct((drawn.n,), dtype)
-        check_traceable(system, params, dtype, {})
+        check_traceable(system, params, dtype, InputValues({}))
     except (TypeError, ValueError):
         return Compared("no Lagrangian")
     lowered = scalars.lowered(like, params, {})

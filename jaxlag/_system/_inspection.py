@@ -19,6 +19,7 @@ from jaxlag._system._reactions import AbstractReactions
 from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._index_check import check_indices
+from jaxlag._tracing._input_values import InputValues
 
 LEARNED = 64
 """Numbers in matrices of the params from which on a Lagrangian may be learned."""
@@ -105,7 +106,9 @@ def contact_rows_independent(
     return bool(np.linalg.svd(A / sizes, compute_uv=False)[-1] > INDEPENDENT)
 
 
-def check_traceable(system: AbstractReactions, params: Any, dtype: Any, values: Any) -> None:
+def check_traceable(
+    system: AbstractReactions, params: Any, dtype: Any, values: InputValues | None
+) -> None:
     """Trace L, the forces and the rates; raise if a shape or dtype is wrong.
 
     Args:
