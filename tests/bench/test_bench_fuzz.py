@@ -13,6 +13,7 @@ from bench.fuzz._random_systems import ONE, TWO, Drawn, draw, smaller, text
 from bench.fuzz._rounding import CALLS, NUMPY, evaluated
 from jaxlag._lowering import ScalarProgram
 from jaxlag._system._inspection import check_traceable
+from jaxlag._tracing._input_values import InputValues
 
 SEEDS = range(40)
 SMALL = Drawn(
@@ -57,7 +58,7 @@ def test_smaller_systems_are_valid():
     assert min(len(x.lagrangian) for x in found) < len(drawn.lagrangian)
     for other in found[:5]:
         params = {"a": jnp.ones(3), "b": 1.0, "k": 1.0}
-        check_traceable(other.system, params, jnp.float64, {})
+        check_traceable(other.system, params, jnp.float64, InputValues({}))
 
 
 def test_wrong_program_is_detected_and_reported(monkeypatch):
