@@ -15,7 +15,7 @@ def hermite(
     f1: Float[Array, " m"],
     t: Float[Array, ""],
     n: int,
-    curved: tuple[Float[Array, " k"], Float[Array, " k"]] | None = None,
+    curved: Float[Array, "2 k"] | None = None,
 ) -> Float[Array, " m"]:
     """Hermite interpolation: coordinates by a polynomial of degree 5, velocities by its derivative.
 
@@ -33,7 +33,7 @@ def hermite(
         f1: as f0.
         t: time of the state.
         n: number of coordinates.
-        curved: d2x/dt2 at both ends; None without states.
+        curved: (2, k), d2x/dt2 at both ends; None without states.
     """
     h = (t1 - t0).astype(y0.dtype)
     s = ((t - t0) / (t1 - t0)).astype(y0.dtype)
@@ -50,7 +50,7 @@ def hermite(
     q, hv = quintic([y[:n] for y in ends], [y[n:m] for y in ends], [f[n:m] for f in slopes])
     found = [q, hv / h]
     if curved is not None:
-        m += curved[0].shape[0]
+        m += curved.shape[1]
         own = slice(2 * n, m)
         found.append(quintic([y[own] for y in ends], [f[own] for f in slopes], curved)[0])
     (w0, w1), (s0, s1) = (y[m:] for y in ends), (h * f[m:] for f in slopes)

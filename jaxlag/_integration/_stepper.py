@@ -305,9 +305,7 @@ class Stepper(eqx.Module):
             f = cast(Array, self.term.vf(*end, args))
             return f, dynamics.curvature_of_states(*end, f, args)
 
-        # A loop: a second copy of the vector field would take long to compile.
-        (f0, f1), curved = jax.lax.map(at, ends)
-        curved = None if curved is None else (curved[0], curved[1])
+        (f0, f1), curved = jax.lax.map(at, ends)  # one copy of the vector field to compile
         return hermite(t0, y0, f0, t1, y1, f1, t, dynamics.system.size, curved)
 
     def reached(

@@ -11,7 +11,14 @@ from jaxtyping import Array, Float
 from jaxlag._core._arguments import required
 from jaxlag._core._errors import invalid
 from jaxlag._tracing._dependence import outputs_depend_on
-from jaxlag._tracing._signature import accepts, gradient, require_arity, takes_inputs, wants
+from jaxlag._tracing._signature import (
+    accepts,
+    gradient,
+    real_array,
+    require_arity,
+    takes_inputs,
+    wants,
+)
 from jaxlag._tracing._traced_function import traced_function
 
 EXPLICIT_TIME = "explicit time"
@@ -34,16 +41,6 @@ def _takes_inputs(argument: str, function: Callable) -> bool:
     takes = takes_inputs(function, 4)
     require_arity(argument, function, _ARGUMENTS if takes else _ARGUMENTS[:4])
     return takes
-
-
-def _real(argument: str, value: Any) -> Array:
-    """A real array, or an error with the argument's name while tracing."""
-    if not eqx.is_array_like(value):
-        raise invalid(argument, "return an array", f"it returned {value!r}")
-    value = jnp.asarray(value)
-    if not jnp.issubdtype(value.dtype, jnp.floating):
-        raise invalid(argument, "return real numbers", f"it returned {value.dtype}")
-    return value
 
 
 class AbstractForce(eqx.Module):
@@ -195,7 +192,7 @@ class PointForce(AbstractForce):
     ) -> Float[Array, " n"]:
         """(dr/dq)^T F, shape (n,)."""
         argument = f"force {self.name!r}: position"
-        r, vjp_fn = jax.vjp(lambda q: _real(argument, self.position(t, q, params)), q)
+        r, vjp_fn = jax.vjp(lambda q: real_array(argument, self.position(t, q, params)), q)
         if r.ndim == 0 or r.shape[-1] not in (1, 2, 3):
             raise invalid(
                 argument,
@@ -259,7 +256,7 @@ class Torque(AbstractForce):
         argument = f"torque {self.name!r}: angular_velocity"
 
         def rate(v: Array) -> Array:
-            return _real(argument, self.angular_velocity(t, q, v, params))
+            return real_array(argument, self.angular_velocity(t, q, v, params))
 
         w, vjp_fn = jax.vjp(rate, v)
         if w.ndim > 0 and w.shape[-1] != 3:
@@ -287,7 +284,7 @@ def _affine(function: Callable, v: Array, like: Array) -> bool:
 
 def _like(argument: str, value: Any, conjugate: Array) -> Array:
     """A real array in the shape and precision of its conjugate variable."""
-    value = _real(argument, value)
+    value = real_array(argument, value)
     if value.shape != conjugate.shape:
         raise invalid(argument, f"return shape {conjugate.shape}", f"it returned {value.shape}")
     return value.astype(conjugate.dtype)  # time is float64 with x64, for every q

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -12,7 +11,7 @@ from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._model._coordinates import Coordinates, vector_argument
 from jaxlag._tracing._input_values import InputValues
-from jaxlag._tracing._signature import require_arity, takes_inputs
+from jaxlag._tracing._signature import real_array, require_arity, takes_inputs
 from jaxlag._tracing._traced_function import traced_function
 
 _ARGUMENTS = ("t", "q", "v", "x", "params", "inputs")
@@ -125,16 +124,11 @@ class States(eqx.Module):
     ) -> Float[Array, " k"]:
         """The same at x."""
         given = (t, q, v, x, params, values) if self.takes_inputs else (t, q, v, x, params)
-        found = self.rate(*given)
-        must = f"return an array of shape {x.shape}"
-        if not eqx.is_array_like(found):
-            raise invalid("States: rate", must, f"it returned {found!r}")
-        found = jnp.asarray(found)
+        found = real_array("States: rate", self.rate(*given))
         if found.shape != x.shape:
+            must, was = f"return an array of shape {x.shape}", f"its shape was {found.shape}"
             fix = "Write one entry for each of the states, as jnp.stack([...])."
-            raise invalid("States: rate", must, f"its shape was {found.shape}", fix)
-        if jnp.issubdtype(found.dtype, jnp.complexfloating):
-            raise invalid("States: rate", "be real", f"its dtype was {found.dtype}")
+            raise invalid("States: rate", must, was, fix)
         return found.astype(x.dtype)
 
 

@@ -33,6 +33,16 @@ def real_scalar(argument: str, function: Callable) -> Callable:
     return checked
 
 
+def real_array(argument: str, value: Any) -> jax.Array:
+    """A real array, or an error with the argument's name while tracing."""
+    if not eqx.is_array_like(value):
+        raise invalid(argument, "return an array", f"it returned {value!r}")
+    value = jnp.asarray(value)
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise invalid(argument, "return real numbers", f"it returned {value.dtype}")
+    return value
+
+
 def gradient(argument: str, function: Callable, argnums: int | tuple[int, ...]) -> Callable:
     """The gradient of a real scalar function of (t, q, v, params), as by `jax.grad`.
 
