@@ -60,7 +60,7 @@ class States(eqx.Module):
         ...     x0={"current": 0.0}, inputs={"voltage": 12.0},
         ... )
         >>> print(f"{motion.rate('angle')[-1]:.3f} rad/s, {motion['current'][-1]:.3f} A")
-        120.002 rad/s, -0.004 A
+        120.003 rad/s, -0.001 A
     """
 
     rate: Callable = eqx.field(static=True)
