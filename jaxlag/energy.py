@@ -234,6 +234,9 @@ class RigidBody(eqx.Module):
     def kinetic(self, pose: Pose, t: Any, q: Any, v: Any, params: Any) -> Float[Array, ""]:
         """T, J, of the body in the pose `pose(t, q, params)` with the rates v.
 
+        T = 1/2 m v_G.v_G + 1/2 w.I_G w (König): the velocity of the center of mass is the rate of
+        its position in inertial components, and need not be turned into body axes.
+
         Args:
             pose: function returning (R, r_O), see `body_velocity`.
             t: s.
@@ -241,7 +244,12 @@ class RigidBody(eqx.Module):
             v: generalized velocities, shape (n,).
             params: passed to `pose`.
         """
-        return self.kinetic_from_rates(*body_velocity(pose, t, q, v, params))
+        (R, _), (R_rate, velocity) = _along(_placed(pose), t, q, v, params)
+        inertia = self.inertia
+        if self.center is not None:
+            velocity = velocity + R_rate @ self.center.astype(R.dtype)
+            inertia = _inertia.central(inertia, self.mass, self.center)
+        return _kinetic(self.mass, inertia, velocity, rotation.body_rates(R, R_rate))
 
     def kinetic_from_rates(self, V: Any, w: Any) -> Float[Array, ""]:
         """T = 1/2 m V.V + m V.(w x c) + 1/2 w.I_O w, J.
@@ -254,11 +262,11 @@ class RigidBody(eqx.Module):
             ValueError: V or w not of shape (3,).
         """
         V, w = reals(("V", V, (3,)), ("w", w, (3,)))
-        mass, inertia = self.mass.astype(V.dtype), self.inertia.astype(V.dtype)
-        T = 0.5 * mass * (V @ V) + 0.5 * w @ (inertia @ w)
+        T = _kinetic(self.mass, self.inertia, V, w)
         if self.center is None:
             return T
-        return T + mass * (V @ jnp.cross(w, self.center.astype(V.dtype)))
+        mass, center = self.mass.astype(V.dtype), self.center.astype(V.dtype)
+        return T + mass * (V @ jnp.cross(w, center))
 
     def gravity(self, pose: Pose, t: Any, q: Any, params: Any, g: Any) -> Float[Array, ""]:
         """V = -m g . (r_O + R c), J, zero if the center of mass is at the inertial origin.
@@ -274,6 +282,13 @@ class RigidBody(eqx.Module):
         if self.center is not None:
             r = r + R @ self.center.astype(R.dtype)
         return gravity(self.mass, r, g)
+
+
+def _kinetic(mass: Array, inertia: Array, V: Array, w: Array) -> Array:
+    """m V.V / 2 + w.I w / 2; a traced I is made symmetric, which its use in M and h relies on."""
+    mass, inertia = mass.astype(V.dtype), inertia.astype(V.dtype)
+    inertia = 0.5 * (inertia + inertia.T)
+    return 0.5 * mass * (V @ V) + 0.5 * w @ (inertia @ w)
 
 
 def _along(function: Callable, t: Any, q: Any, v: Any, params: Any) -> tuple[Any, Any]:

@@ -428,3 +428,11 @@ def wrong():
 def test_invalid_arguments_are_refused(call, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         call()
+
+
+def test_kinetic_energy_of_a_pose_is_that_of_its_rates(moving):
+    """About the center of mass in inertial components, and about the origin in body components."""
+    pose, q, v = moving
+    by_pose = BODY.kinetic(pose, T, q, v, None)
+    by_rates = BODY.kinetic_from_rates(*energy.body_velocity(pose, T, q, v, None))
+    assert abs(by_pose - by_rates) < 64 * EPS * by_rates

@@ -21,9 +21,10 @@ Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
 
-FIXED = ("params", "active_rows", "nonzero", "time_direction")
-"""Names of the inputs that do not change during a solve: parameters, the rows used in solves, the
-rows that are more than rounding, and the direction of time (+1 or -1)."""
+FIXED = ("params", "literal", "active_rows", "nonzero", "time_direction")
+"""Names of the inputs that do not change during a solve: parameters, numbers of the declaration,
+the rows used in solves, the rows that are more than rounding, and the direction of time (+1 or
+-1)."""
 
 
 POWERS = 2
@@ -91,6 +92,8 @@ _ACCURACY = {"accuracy": None}
 SQRT, SIN, COS = (named(name, **_ACCURACY) for name in ("sqrt", "sin", "cos"))
 ODD = {"sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "erf", "cbrt"}
 EVEN = {"cos", "cosh", "abs"}
+TRUTHS = frozenset({"eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite"})
+CONSTANT_PIECES = TRUTHS | {"floor", "ceil", "round", "sign"}
 _AND = named("and")
 _ORDER = {"max": "ge", "min": "le", "largest": "ge", "smallest": "le"}
 LARGEST, SMALLEST = Primitive(largest_p, {}), Primitive(smallest_p, {})

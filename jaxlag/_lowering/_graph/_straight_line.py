@@ -9,7 +9,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxlag._lowering._graph._common_pairs import Shared
-from jaxlag._lowering._graph._expression import FIXED, POWERS, Graph, Node, order, rebuilt, scaled
+from jaxlag._lowering._graph._expression import (
+    FIXED,
+    POWERS,
+    TRUTHS,
+    Graph,
+    Node,
+    order,
+    rebuilt,
+    scaled,
+)
 
 
 class Line(NamedTuple):
@@ -66,8 +75,7 @@ class Program(NamedTuple):
 
 
 _FREE = ("stop",)
-_TRUTHS = {"eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite"}
-_CHEAP = _TRUTHS | {"abs", "max", "min", "largest", "sign", "smallest"}
+_CHEAP = TRUTHS | {"abs", "max", "min", "largest", "sign", "smallest"}
 
 
 def _kind(line: Line) -> str:
@@ -84,6 +92,21 @@ def _cost(line: Line) -> float:
     if line.op == "call" and line.data.name not in _CHEAP:
         return 5.0 if line.data.name == "sqrt" else 15.0
     return 1.0
+
+
+def operations(node: Node) -> float:
+    """Cost of one node in additions, without that of its operands; more than 0 but for a "let"."""
+    if node.op == "sum":
+        constant, terms = node.data
+        lines = len(terms) - 1 + sum(abs(c) != 1.0 for _, c in terms) + (constant != 0.0)
+        return float(max(lines, 1))
+    if node.op == "product":
+        over = sum(e for _, e in node.data if e > 0)
+        under = -sum(e for _, e in node.data if e < 0)
+        return max(over + under - 1.0, 0.0) + (5.0 if under else 0.0)
+    if node.op == "call":
+        return _cost(Line("call", 0, (), node.data))
+    return {"let": 0.0, "custom": 30.0}.get(node.op, 1.0)
 
 
 def assemble(graph: Graph, roots: Sequence[Node]) -> Program:
@@ -198,7 +221,7 @@ class _Assembly:
         return Program(prelude, carried, body, results, *slots)
 
     def _truths(self) -> frozenset[int]:
-        truths = {line.to for line in self.lines if getattr(line.data, "name", None) in _TRUTHS}
+        truths = {line.to for line in self.lines if getattr(line.data, "name", None) in TRUTHS}
         truths |= {slot for slot, value in self.numbers.items() if isinstance(value, bool)}
         for line in self.lines:
             if line.op == "select" and line.args[1] in truths:

@@ -5,7 +5,15 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from jaxlag._lowering._graph._expression import COS, SIN, Graph, Node, Primitive, order
+from jaxlag._lowering._graph._expression import (
+    CONSTANT_PIECES,
+    COS,
+    SIN,
+    Graph,
+    Node,
+    Primitive,
+    order,
+)
 from jaxlag._lowering._jaxpr._from_jaxpr import Rule, Unsupported, read
 
 
@@ -15,7 +23,7 @@ def partials(graph: Graph, node: Node) -> list[Node]:
     known = _TABLE.get(primitive.name)
     if known is not None:
         return known(graph, node, *args)
-    if primitive.name in _FLAT:
+    if primitive.name in CONSTANT_PIECES:
         return [graph.zero] * len(args)
     return [_by_jax(graph, primitive, args, i) for i in range(len(args))]
 
@@ -193,6 +201,3 @@ _TABLE = {
     "largest": _extreme,
     "smallest": _extreme,
 }
-# Piecewise constant.
-_FLAT = {"eq", "ne", "lt", "le", "gt", "ge", "and", "or", "not", "xor", "is_finite"}
-_FLAT |= {"floor", "ceil", "round", "sign"}

@@ -99,7 +99,13 @@ def rate_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]) -> li
 
 
 def degree(roots: Sequence[Node], variables: Sequence[Node]) -> float:
-    """Degree of polynomials in the variables with coefficients free of them; else inf.
+    """Degree of polynomials in the variables with coefficients free of them; else inf."""
+    known = degrees(roots, variables)
+    return max((known[root] for root in roots), default=0.0)
+
+
+def degrees(roots: Sequence[Node], variables: Sequence[Node]) -> dict[Node, float]:
+    """Degrees of all nodes below the roots as polynomials in the variables; else inf.
 
     The graph alone decides: a function, a choice or a stopped derivative of a variable counts as
     inf, even if it cancels.
@@ -118,7 +124,7 @@ def degree(roots: Sequence[Node], variables: Sequence[Node]) -> float:
             known[node] = sum(d * e if e > 0 else math.inf for d, e in powers if d)
         else:
             known[node] = math.inf
-    return max((known[root] for root in roots), default=0.0)
+    return known
 
 
 def varies(M: Sequence[Sequence[Node]], inputs: Sequence[Node]) -> bool:

@@ -1,9 +1,13 @@
 """Lagrange's equations on the graph: the cheapest of several forms."""
 
+from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 from jaxlag._lowering._graph._eliminate import least_operations, solve
-from jaxlag._lowering._graph._expression import Node, dependencies
+from jaxlag._lowering._graph._expression import Node, dependencies, order
+from jaxlag._lowering._graph._literals import Literals
+from jaxlag._lowering._graph._residues import Residues
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._differentiate import gradient
@@ -20,14 +24,21 @@ from jaxlag._lowering._symbolic._bias_forms import (
     varies,
 )
 from jaxlag._lowering._symbolic._constraint_solve import (
+    Reaction,
+    SymbolicRows,
     reaction,
     rows,
     solve_with_reactions,
     solve_with_rows,
 )
 from jaxlag._lowering._symbolic._derive_quasi import derive_rates
+from jaxlag._lowering._symbolic._partial_velocities import principle_of_dalembert
 from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
+from jaxlag._lowering._symbolic._value_numbering import merged
+
+LONGER = 2  # forms with so many times the nodes of the shortest are not written out
+SOLVED = 2  # forms of least cost that are solved for a and compared
 
 
 def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
@@ -36,29 +47,96 @@ def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
     Raises:
         Unsupported: the solve or the mass matrix alone takes more operations than the limit.
     """
-    graph, L = scene.graph, scene.lagrangian
+    graph = scene.graph
     if limit is not None:
         least = least_operations(pattern(scene))
         if least > limit:
             raise Unsupported(f"at least {least} operations, more than {limit}")
     if scene.kinematics is not None:
         return derive_rates(scene, eps)
+    residues = Residues()
+    simplified, forms = _forms(scene, residues, limit)
+    sizes = [len(order([x for row in f.M for x in row] + f.h)) for f in forms]
+    short = [f for f, size in zip(forms, sizes, strict=True) if size <= LONGER * min(sizes)]
+    parts = [_Parts.of(scene, form, residues) for form in short]
+    parts.sort(key=lambda each: each.cost)
+    found = [_solved(scene, each, eps) for each in parts[:SOLVED]]
+    best = min(found, key=lambda e: e.program.cost)
+    best = best._replace(lagrangian=simplified)
+    bound = scene.constrained
+    if bound is None or best.rows is None:
+        return best
+    lam = None if best.lam is None else assemble(graph, best.lam)
+    return best._replace(surface=surface(graph, best.mass, best.rows.A, bound, eps, lam))
+
+
+class _Form(NamedTuple):
+    """M and h in one form.
+
+    Attributes:
+        label: the name of the form.
+        M: mass matrix.
+        h: bias.
+        rows: A and gamma; None without constraints.
+        literals: the numbers that stand as inputs in all of them.
+    """
+
+    label: str
+    M: list[list[Node]]
+    h: list[Node]
+    rows: SymbolicRows | None
+    literals: Literals
+
+
+def _exact(scene: SymbolicSystem, literals: Literals) -> SymbolicSystem:
+    """The scene with inputs in place of numbers, in L and the constraints."""
+    bound = scene.constrained
+    (L,) = literals.without([scene.lagrangian])
+    if bound is not None:
+        velocity, position = map(literals.without, (bound.velocity, bound.position))
+        bound = bound._replace(velocity=velocity, position=position)
+    return scene._replace(lagrangian=L, constrained=bound)
+
+
+def _rows(scene: SymbolicSystem) -> SymbolicRows | None:
+    bound = scene.constrained
+    return None if bound is None else rows(scene.graph, scene.t, scene.q, scene.v, bound)
+
+
+def _forms(
+    scene: SymbolicSystem, residues: Residues, limit: int | None
+) -> tuple[Node, list[_Form]]:
+    """L, simplified if possible, and several forms.
+
+    Raises:
+        Unsupported: each M takes more operations than the limit.
+    """
+    graph, L = scene.graph, scene.lagrangian
     expansion = Expansion(graph)
     simplified = attempt(lambda: expansion.simplified([L]))
     written = [L] if simplified is None or simplified[0] is L else [L, simplified[0]]
+
+    def expanded(nodes: Sequence[Node]) -> list[Node] | None:
+        """The same as short polynomials; None if already L is none."""
+        if simplified is None:
+            return None
+        return attempt(partial(expansion.simplified, nodes))
 
     masses = []
     for form in written:
         mass = mass_matrix(graph, form, scene.v)
         masses.append(mass)
-        flat = [x for row in mass for x in row]
-        short = attempt(partial(expansion.simplified, flat))
+        short = expanded([x for row in mass for x in row])
         if short is not None:
             n = len(scene.q)
             masses.append([short[i * n : (i + 1) * n] for i in range(n)])
     mass = min(masses, key=lambda M: (nonzeros(graph, M), cost(graph, M)))
+    literals = Literals(graph)
+    exact = _exact(scene, literals)
+    by_dalembert = principle_of_dalembert(exact, exact.lagrangian, residues)
     if limit is not None:
-        alone = assemble(graph, [x for row in mass for x in row]).operations
+        known = [mass] if by_dalembert is None else [mass, by_dalembert[0]]
+        alone = min(assemble(graph, [x for row in M for x in row]).operations for M in known)
         if alone > limit:  # the bias is then not needed
             raise Unsupported(f"{alone} operations in the mass matrix alone, more than {limit}")
 
@@ -66,47 +144,89 @@ def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
     for form, label in zip(written, ("L as written", "L simplified"), strict=False):
         bias = momentum_form(scene, form)
         forms.append((f"derivative of the momentum, {label}", bias))
-    bias = forms[-1][1]
-    short = attempt(lambda: expansion.simplified(bias))
+    short = expanded(forms[-1][1])
     if short is not None:
         forms.append(("derivative of the momentum, expanded", short))
     seen = [form for form in written if degree([form], scene.v) <= 2.0]
-    if seen and not varies(mass, scene.v):
+    long = simplified is None and by_dalembert is not None
+    if seen and not long and not varies(mass, scene.v):
         for label, form in (
             ("Christoffel symbols", christoffel_form),
             ("rates of M and c", rate_form),
         ):
             best = form(scene, seen[-1], mass)
             forms.append((label, best))
-            short = attempt(partial(expansion.simplified, best))
+            short = expanded(best)
             if short is not None:
                 forms.append((f"{label}, expanded", short))
+    none, of_v = Literals(graph), _rows(scene)
+    found = [_Form(label, mass, h, of_v, none) for label, h in forms]
+    if by_dalembert is not None:
+        found.append(_Form("d'Alembert's principle", *by_dalembert, _rows(exact), literals))
+    return written[-1], found
 
-    bound = scene.constrained
-    found_rows = None if bound is None else rows(graph, scene.t, scene.q, scene.v, bound)
-    reactive = None if bound is None else reaction(graph, bound)
-    found = []
-    for label, h in forms:
-        lam = None
+
+class _Parts(NamedTuple):
+    """The parts of the equations in one form, of equal expressions only one.
+
+    Attributes:
+        label: the name of the form.
+        M: mass matrix.
+        right: Q - h, without forces that depend on multipliers.
+        h: bias.
+        rows: A and gamma; None without constraints.
+        reaction: forces that depend on multipliers; None without.
+        cost: of M, the right side, A and gamma.
+    """
+
+    label: str
+    M: list[list[Node]]
+    right: list[Node]
+    h: list[Node]
+    rows: SymbolicRows | None
+    reaction: Reaction | None
+    cost: float
+
+    @classmethod
+    def of(cls, scene: SymbolicSystem, form: _Form, residues: Residues) -> "_Parts":
+        """The parts of a form."""
+        graph, bound, n = scene.graph, scene.constrained, len(form.h)
+        force, found_rows = scene.force or (), form.rows
+        flat = [*(form.M[i][j] for i in range(n) for j in range(i + 1)), *form.h, *force]
+        if found_rows is not None:
+            flat += [*(x for row in found_rows.A for x in row), *found_rows.gamma]
+        found = iter(form.literals.restored(merged(graph, flat, residues)))
+        lower = [[next(found) for _ in range(i + 1)] for i in range(n)]
+        M = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
+        h = [next(found) for _ in range(n)]
         right = [graph.scale(x, -1.0) for x in h]
-        if scene.force is not None:
-            right = [graph.sub(Q, x) for Q, x in zip(scene.force, h, strict=True)]
-        if bound is None or found_rows is None:
-            a = solve(graph, mass, right, eps)
-        elif reactive is not None:
-            how = bound.active_rows, bound.sharing, bound.regular
-            a, lam = solve_with_reactions(graph, mass, found_rows, right, reactive, eps, *how)
-        else:
-            sides = [(right, found_rows.gamma)]
-            how = bound.active_rows, bound.formulation, bound.regular, bound.crossing
-            (a,) = solve_with_rows(graph, mass, found_rows.A, sides, eps, *how)
-        program = assemble(graph, a)
-        found.append(Equations(written[-1], mass, h, a, program, label, found_rows, lam=lam))
-    best = min(found, key=lambda e: e.program.cost)
+        if force:
+            right = [graph.sub(next(found), x) for x in h]
+        roots = [*(x for row in lower for x in row), *right]
+        if found_rows is not None:
+            A = [[next(found) for _ in row] for row in found_rows.A]
+            found_rows = SymbolicRows(A, list(found))
+            roots += [*(x for row in A for x in row), *found_rows.gamma]
+        reactive = None if bound is None else reaction(graph, bound)
+        cost = assemble(graph, roots).cost
+        return cls(form.label, M, right, h, found_rows, reactive, cost)
+
+
+def _solved(scene: SymbolicSystem, parts: _Parts, eps: float) -> Equations:
+    """The equations of one form, solved for a."""
+    graph, bound, lam = scene.graph, scene.constrained, None
+    label, M, right, h, found_rows, reactive, _ = parts
     if bound is None or found_rows is None:
-        return best
-    lam = None if best.lam is None else assemble(graph, best.lam)
-    return best._replace(surface=surface(graph, mass, found_rows.A, bound, eps, lam))
+        a = solve(graph, M, right, eps)
+    elif reactive is not None:
+        how = bound.active_rows, bound.sharing, bound.regular
+        a, lam = solve_with_reactions(graph, M, found_rows, right, reactive, eps, *how)
+    else:
+        sides = [(right, found_rows.gamma)]
+        how = bound.active_rows, bound.formulation, bound.regular, bound.crossing
+        (a,) = solve_with_rows(graph, M, found_rows.A, sides, eps, *how)
+    program = assemble(graph, a)
+    return Equations(scene.lagrangian, M, h, a, program, label, found_rows, lam=lam)
 
 
 def pattern(scene: SymbolicSystem) -> list[list[bool]]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._residues import Residues
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._graph._vectors import products
@@ -18,6 +19,7 @@ from jaxlag._lowering._symbolic._cofactor_inverse import Inverse
 from jaxlag._lowering._symbolic._constraint_solve import rows
 from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, SymbolicSystem
+from jaxlag._lowering._symbolic._value_numbering import merged
 
 WRITTEN_OUT = 3  # forms of the right side that are compared, shortest first
 
@@ -81,11 +83,14 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
             sides.append((f"{label}, expanded", short))
     # Long forms are not compared: generating their code takes too much time.
     sides.sort(key=lambda side: len(order(side[1])))
-    found = []
+    found, residues = [], Residues()
     for label, right in sides[:WRITTEN_OUT]:
-        rates = [*v, *solve(graph, mass, right, eps)]
+        numbered = iter(merged(graph, [*(x for row in mass for x in row), *right, *v], residues))
+        M = [[next(numbered) for _ in row] for row in mass]
+        right = [next(numbered) for _ in right]
+        rates = [*numbered, *solve(graph, M, right, eps)]
         rest = [graph.scale(x, -1.0) for x in right]
-        found.append(Equations(declared, mass, rest, rates, assemble(graph, rates), label))
+        found.append(Equations(declared, M, rest, rates, assemble(graph, rates), label))
     best = min(found, key=lambda equations: equations.program.cost)
     best = best._replace(velocity=assemble(graph, v))
     if moved.determinants is not None:

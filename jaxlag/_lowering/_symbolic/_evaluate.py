@@ -16,11 +16,12 @@ def evaluate(roots: Sequence[Node], values: Mapping[tuple[str, int], Any]) -> li
     known: dict[Node, Any] = {}
     with np.errstate(all="ignore"):
         for node in order(roots):
-            known[node] = _value(node, [known[arg] for arg in node.args], values)
+            known[node] = value(node, [known[arg] for arg in node.args], values)
     return [known[root] for root in roots]
 
 
-def _value(node: Node, args: list, values: Mapping[tuple[str, int], Any]) -> Any:
+def value(node: Node, args: list, values: Mapping[tuple[str, int], Any]) -> Any:
+    """The value of a node from those of its arguments, or of the inputs."""
     if node.op == "const":
         return np.asarray(node.data)
     if node.op == "input":

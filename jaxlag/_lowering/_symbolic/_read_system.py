@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlag._core._jaxprs import equations
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._graph._expression import Graph, Node
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
@@ -54,7 +55,8 @@ def read_scene(key: Key) -> SymbolicSystem:
         (Q,) = read(graph, traced(key, terms.force, True), *state, *params, *inputs)
         force = [_node(graph, x) for x in Q]
     bound = _constrained(key, graph, state, params, inputs) if _included(key) else None
-    return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics)
+    count = sum(1 for _ in equations(of_L.jaxpr))
+    return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics, count)
 
 
 def _included(key: Key) -> tuple[AbstractConstraint, ...]:
