@@ -73,9 +73,7 @@ def carried(inertia: Array, mass: Array, center: Array) -> Array:
 def central(inertia: Array, mass: Array, center: Array) -> Array:
     """I_G = I_O - m (|c|^2 E - c c^T)."""
     with stated(inertia, mass, center):
-        xp, given = _numbers(*common(inertia, mass, center))
-        inertia, mass, center = given
-        return jnp.asarray(inertia - _offset(xp, mass, center))
+        return carried(inertia, -mass, center)
 
 
 def check_mass(argument: str, mass: Array) -> None:

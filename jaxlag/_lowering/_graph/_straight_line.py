@@ -74,6 +74,7 @@ class Program(NamedTuple):
         return sum(_kind(line) in names for line in self.body)
 
 
+DIVISION, RULE = 5.0, 30.0  # cost of a division, of a function with a rule of its own
 _FREE = ("stop",)
 _CHEAP = TRUTHS | {"abs", "max", "min", "largest", "sign", "smallest"}
 
@@ -86,9 +87,9 @@ def _cost(line: Line) -> float:
     if line.op in _FREE:
         return 0.0
     if line.op == "div":
-        return 5.0
+        return DIVISION
     if line.op == "custom":
-        return 30.0
+        return RULE
     if line.op == "call" and line.data.name not in _CHEAP:
         return 5.0 if line.data.name == "sqrt" else 15.0
     return 1.0
@@ -103,10 +104,10 @@ def operations(node: Node) -> float:
     if node.op == "product":
         over = sum(e for _, e in node.data if e > 0)
         under = -sum(e for _, e in node.data if e < 0)
-        return max(over + under - 1.0, 0.0) + (5.0 if under else 0.0)
+        return max(over + under - 1.0, 0.0) + (DIVISION if under else 0.0)
     if node.op == "call":
         return _cost(Line("call", 0, (), node.data))
-    return {"let": 0.0, "custom": 30.0}.get(node.op, 1.0)
+    return {"let": 0.0, "custom": RULE}.get(node.op, 1.0)
 
 
 def assemble(graph: Graph, roots: Sequence[Node]) -> Program:

@@ -24,7 +24,6 @@ from jaxlag._lowering._symbolic._bias_forms import (
     varies,
 )
 from jaxlag._lowering._symbolic._constraint_solve import (
-    Reaction,
     SymbolicRows,
     reaction,
     rows,
@@ -175,7 +174,6 @@ class _Parts(NamedTuple):
         right: Q - h, without forces that depend on multipliers.
         h: bias.
         rows: A and gamma; None without constraints.
-        reaction: forces that depend on multipliers; None without.
         cost: of M, the right side, A and gamma.
     """
 
@@ -184,13 +182,12 @@ class _Parts(NamedTuple):
     right: list[Node]
     h: list[Node]
     rows: SymbolicRows | None
-    reaction: Reaction | None
     cost: float
 
     @classmethod
     def of(cls, scene: SymbolicSystem, form: _Form, residues: Residues) -> "_Parts":
         """The parts of a form."""
-        graph, bound, n = scene.graph, scene.constrained, len(form.h)
+        graph, n = scene.graph, len(form.h)
         force, found_rows = scene.force or (), form.rows
         flat = [*(form.M[i][j] for i in range(n) for j in range(i + 1)), *form.h, *force]
         if found_rows is not None:
@@ -207,15 +204,14 @@ class _Parts(NamedTuple):
             A = [[next(found) for _ in row] for row in found_rows.A]
             found_rows = SymbolicRows(A, list(found))
             roots += [*(x for row in A for x in row), *found_rows.gamma]
-        reactive = None if bound is None else reaction(graph, bound)
-        cost = assemble(graph, roots).cost
-        return cls(form.label, M, right, h, found_rows, reactive, cost)
+        return cls(form.label, M, right, h, found_rows, assemble(graph, roots).cost)
 
 
 def _solved(scene: SymbolicSystem, parts: _Parts, eps: float) -> Equations:
     """The equations of one form, solved for a."""
     graph, bound, lam = scene.graph, scene.constrained, None
-    label, M, right, h, found_rows, reactive, _ = parts
+    label, M, right, h, found_rows, _ = parts
+    reactive = None if bound is None else reaction(graph, bound)
     if bound is None or found_rows is None:
         a = solve(graph, M, right, eps)
     elif reactive is not None:

@@ -72,7 +72,7 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
         scene = read_scene(key)
         if key.limit is not None and (units := _units(scene)) > UNITS:
             return Lowered(None, f"{units} functions of weighted sums, more than {UNITS}", scene)
-        limit = None if key.limit is None else max(key.limit, OF_ARRAYS * scene.equations)
+        limit = None if key.limit is None else max(key.limit, OF_ARRAYS * scene.array_operations)
         if limit is not None and (written := _written(scene)) > 2 * limit:
             return Lowered(None, f"{written} operations in L and Q alone", scene)
         equations = derive(scene, float(jnp.finfo(key.dtype).eps), limit)

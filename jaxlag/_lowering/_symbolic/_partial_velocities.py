@@ -36,7 +36,7 @@ from jaxlag._lowering._symbolic._bias_forms import degrees
 from jaxlag._lowering._symbolic._symbolic_system import SymbolicSystem
 
 
-class Terms(NamedTuple):
+class QuadraticTerms(NamedTuple):
     """L as a sum of terms; their coefficients depend on params alone.
 
     Attributes:
@@ -50,7 +50,7 @@ class Terms(NamedTuple):
     rest: list[tuple[Node, Node]]
 
 
-def terms_of(graph: Graph, L: Node, v: Sequence[Node]) -> Terms | None:
+def terms_of(graph: Graph, L: Node, v: Sequence[Node]) -> QuadraticTerms | None:
     """The terms of L; None if it is no polynomial of at most degree 2 in v.
 
     Sums are opened from the root downwards. Each node is opened once for each factor that depends
@@ -59,7 +59,7 @@ def terms_of(graph: Graph, L: Node, v: Sequence[Node]) -> Terms | None:
     degree = degrees([L], v)
     if not degree[L] <= 2.0:
         return None
-    found = Terms([], [], [])
+    found = QuadraticTerms([], [], [])
     coefficients: dict[tuple[Node, Node], list[tuple[Node, float]]] = {}
     waiting: list[tuple[int, int]] = []
 
@@ -157,7 +157,7 @@ def principle_of_dalembert(
     _potential(scene, terms, functions, residues, loads, others)
 
     M: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
-    columns = {x: [graph.sum(terms) for terms in of_x] for x, of_x in momenta.items()}
+    columns = {x: [graph.sum(p) for p in of_x] for x, of_x in momenta.items()}
     for i in range(n):
         for j in range(i, n):
             entry = [(graph.mul(functions[x].partial[i], p[j]), 1.0) for x, p in columns.items()]
@@ -170,7 +170,7 @@ def principle_of_dalembert(
     return M, h
 
 
-def _functions(scene: SymbolicSystem, terms: Terms) -> dict[Node, _Function]:
+def _functions(scene: SymbolicSystem, terms: QuadraticTerms) -> dict[Node, _Function]:
     """All functions that are linear in v, with their derivatives."""
     graph, unit = scene.graph, scene.graph.one
     along = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: unit}
@@ -299,7 +299,7 @@ def _ratio(above: Residue, below: Residue) -> float | None:
 
 def _potential(
     scene: SymbolicSystem,
-    terms: Terms,
+    terms: QuadraticTerms,
     functions: dict[Node, _Function],
     residues: Residues,
     loads: dict[Node, list[tuple[Node, float]]],

@@ -32,7 +32,7 @@ class Kinematics(NamedTuple):
 class SymbolicSystem(NamedTuple):
     """A system as scalars: L and Q as functions of the inputs t, q, v.
 
-    `equations` is the number of operations on arrays in L as it is written.
+    `array_operations` is the number of operations on arrays in L as it is written.
     """
 
     graph: Graph
@@ -43,7 +43,7 @@ class SymbolicSystem(NamedTuple):
     force: Sequence[Node] | None
     constrained: Constrained | None = None
     kinematics: Kinematics | None = None
-    equations: int = 0
+    array_operations: int = 0
 
 
 class Equations(NamedTuple):
