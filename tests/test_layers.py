@@ -47,11 +47,16 @@ WITHIN_LOWERING = {
     "_jaxpr": ("_graph",),
     "_emit": ("_graph", "_jaxpr"),
     "_symbolic": ("_graph", "_jaxpr", "_array_terms", "_row_layout"),
+    "_verification": ("_graph", "_symbolic", "_array_terms", "_row_layout"),
     "_structure": (),
+    "_terms": (),
     "_row_layout": ("_graph", "_jaxpr"),
-    "_array_terms": ("_structure", "_row_layout"),
+    "_array_terms": ("_structure", "_terms", "_row_layout"),
     "_quasi_equations": ("_structure", "_row_layout", "_array_terms"),
-    "_acceleration_program": ("_array_terms", "_quasi_equations"),
+    "_acceleration_program": ("_terms", "_array_terms", "_quasi_equations"),
+    "_term_codes": ("_graph",),
+    "_lower": ("_graph", "_jaxpr", "_symbolic", "_verification", "_term_codes"),
+    "_interpreted_terms": ("_emit", "_symbolic", "_terms", "_array_terms", "_term_codes", "_lower"),
 }
 
 

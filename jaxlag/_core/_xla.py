@@ -13,7 +13,7 @@ system. There are two ways to raise that bound:
 import os
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial, update_wrapper
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, find_top_trace, jaxpr_as_fun
 
 from jaxlag._core._jaxprs import equations
 
@@ -111,6 +111,45 @@ def native(function: Callable, *args: Any, stages: int = 0) -> Any:
 
     results, _ = not_inlined(run, ATTRIBUTES)(*given)
     return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+
+# XLA's emitters of fusions take half of the compile time of a program of many small operations:
+# they run a pipeline of passes for each fusion. The arithmetic is the same without them. An option
+# that XLA does not know is an error.
+_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+
+
+class QuickJit:
+    """`jax.jit` with options that shorten compilation, where JAX takes options.
+
+    It takes them only outside of all transforms; they are used on the versions of jaxlib that the
+    tests run on.
+    """
+
+    def __init__(self, function: Callable, static_argnums: Any = ()) -> None:
+        jit = partial(jax.jit, function, static_argnums=static_argnums)
+        self._inside: Any = jit()
+        self._alone: Any = None
+        update_wrapper(self, function)
+        if jaxlib.__version__ in TESTED:
+            self._alone = jit(compiler_options=_OPTIONS)
+
+    def __call__(self, *args: Any) -> Any:
+        """The results of the function."""
+        return self._program(*args)
+
+    @property
+    def _program(self) -> Any:
+        eager = type(find_top_trace(())).__name__ == "EvalTrace"
+        return self._alone if eager and self._alone is not None and _on_cpu() else self._inside
+
+    def programs(self) -> int:
+        """Number of programs compiled."""
+        return sum(jit._cache_size() for jit in (self._inside, self._alone) if jit is not None)
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 def not_inlined(function: Callable, attributes: Any = None) -> Callable:

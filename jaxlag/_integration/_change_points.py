@@ -336,8 +336,9 @@ def scales_at(
 ) -> tuple[Float[Array, " n"], Float[Array, "m n"]]:
     """Units of the coordinates in which their inertias are 1 at this state, and |A| there."""
     t, q, v, params = dynamics.state(tau, y, args)
-    A = dynamics.terms.rows(t, q, v, params)[0]
-    return units_of(dynamics.mass(tau, y, args), A), jnp.abs(A)
+    terms = dynamics.terms_at(q, args)
+    A = terms.rows_of(t, v, params)(q)
+    return units_of(terms.mass(t, q, v, params), A), jnp.abs(A)
 
 
 def may_cross(dynamics: VectorField) -> bool:
@@ -383,7 +384,7 @@ def same_sense(
     fine = jnp.array(True)
     for tau, y in (midway(t0, t1, y0, y1, slope_drop), (t1, y1)):
         t, (q, v), (params, _) = dynamics.clock(tau, args), dynamics.parts(y), dynamics.given(args)
-        A, _ = dynamics.terms.rows(t, q, v, params)
+        A = dynamics.terms_at(q, args).rows_of(t, v, params)(q)
         turned = A @ columns.T
         if args.active_rows is not None:
             both = args.active_rows[:, None] & args.active_rows[None]

@@ -14,11 +14,12 @@ from jaxlag._linalg._mass_solve import closed_to, dependence_floor
 from jaxlag._linalg._rounding_bounds import with_rounding
 from jaxlag._linalg._row_residuals import (
     ROUNDINGS,
-    Sizes,
     relative_residual,
     row_sizes,
     without_rounding,
 )
+from jaxlag._lowering import AbstractTerms
+from jaxlag._model._constraints import ConstraintRows
 
 
 class Start(NamedTuple):
@@ -68,22 +69,24 @@ def values_allowed(
 
 
 def start_finite(dynamics: VectorField, tau: Array, y0: Array, args: Arguments) -> Bool[Array, ""]:
-    """Whether L and the residuals are finite; the first step checks the accelerations."""
+    """Whether L and the residuals are finite as they are written, not as they are simplified.
+
+    The first step checks the accelerations.
+    """
     at = dynamics.state(*stop_gradient((tau, y0, args)))
     finite = jnp.isfinite(dynamics.system.lagrangian(*at))
-    for residual in residuals(dynamics, *at):
+    for residual in residuals(dynamics.terms, dynamics.rows, *at):
         finite = finite & jnp.all(jnp.isfinite(residual))
     return finite
 
 
 def residuals(
-    dynamics: VectorField, t: Array, q: Array, v: Array, params: Any
+    terms: AbstractTerms, rows: ConstraintRows, t: Array, q: Array, v: Array, params: Any
 ) -> tuple[Array, ...]:
     """(phi for every row, A v + b); empty without constraints."""
-    if not dynamics.rows.size:
+    if not rows.size:
         return ()
-    phi = dynamics.rows.of_all(dynamics.terms.position(t, q, params))
-    return phi, dynamics.terms.velocity(t, q, v, params)
+    return rows.of_all(terms.position(t, q, params)), terms.velocity(t, q, v, params)
 
 
 def start_consistent(
@@ -109,8 +112,9 @@ def _rows_consistent(
         true = jnp.array(True)
         return Consistency(true, ~true, jnp.full((), -1, jnp.int32), true)
     t, q, v, params, args = stop_gradient((t, q, v, params, args))
-    terms = dynamics.terms
-    A, _ = terms.rows(t, q, v, params)
+    terms = dynamics.terms_at(q, args)
+    rows, gamma_of = terms.rows_of(t, v, params), terms.gamma_of(params)
+    A = rows(q)
     sure = all(dynamics.rows.sure)
     if args.rows is not None:
         void, unit = args.rows.void, args.rows.size
@@ -118,11 +122,11 @@ def _rows_consistent(
         unit = jnp.sqrt(jnp.sum(A**2, axis=1))
         void, unit = unit < 0, jnp.where(unit > 0, unit, 1.0)
     else:
-        _, void, unit = _sizes(dynamics, t, q, v, params)
+        _, void, unit = row_sizes(rows, q, A)
     floor = dependence_floor(q.dtype)
 
     def everything(q: Array, v: Array) -> tuple[Array, ...]:
-        return *residuals(dynamics, t, q, v, params), terms.gamma(t, q, v, params)
+        return *residuals(terms, dynamics.rows, t, q, v, params), gamma_of(t, q, v)
 
     if sure:
         phi, rate, gamma = everything(q, v)
@@ -153,21 +157,12 @@ def _rows_consistent(
     scale = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
     gamma_left = left(gamma)
     if dynamics.rows.size > 1:  # terms of gamma that cancel leave rounding, no contradiction
-        _, rounding = with_rounding(lambda t, q, v: terms.gamma(t, q, v, params), t, q, v)
+        _, rounding = with_rounding(gamma_of, t, q, v)
         rounding = ROUNDINGS * jnp.nan_to_num(rounding)
         gamma_left = jnp.maximum(gamma_left - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
     gamma_left = gamma_left / (floor * jnp.where(scale > 0, scale, 1.0))
     bad = jnp.where(near, jnp.maximum(gamma_left, bad), bad)
     return _consistency(off, bad, near, phi, rate)
-
-
-def _sizes(dynamics: VectorField, t: Array, q: Array, v: Array, params: Any) -> Sizes:
-    """Sizes of all rows, see `row_sizes`."""
-
-    def rows(q: Array) -> Array:
-        return dynamics.terms.rows(t, q, v, params)[0]
-
-    return row_sizes(rows, q, rows(q))
 
 
 def _fitting(
@@ -210,7 +205,7 @@ def rows_hold_after(
     ts, q, v, params = stop_gradient((ts, q, v, params))
     rates = jax.vmap(lambda t, q, v: dynamics.terms.velocity(t, q, v, params))(ts, q, v)
     A = jax.vmap(lambda t, q, v: dynamics.terms.rows(t, q, v, params)[0])(ts, q, v)
-    first = _sizes(dynamics, ts[0], q[0], v[0], params).size
+    first = row_sizes(dynamics.terms.rows_of(ts[0], v[0], params), q[0], A[0]).size
     unit = jnp.maximum(jnp.sqrt(jnp.sum(A**2, axis=2)), jnp.finfo(q.dtype).eps * first)
     off = jax.vmap(relative_residual)(rates, unit, v) / dependence_floor(q.dtype)
     off = jnp.max(jnp.where(jnp.isfinite(off), off, 0.0), axis=0)

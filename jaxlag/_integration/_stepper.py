@@ -187,7 +187,8 @@ class Stepper(eqx.Module):
 
     def _held(self, near: Array) -> "Stepper":
         """The stepper with stages moved onto the constraints in a step near a change point."""
-        step_end, term = cast(StepEnd, self.step_end), cast(Term, self.term)
+        term = cast(Term, self.term)
+        step_end = StepEnd(term.seldom.dynamics)
         refuses = self.controller is None and not self.implicit
 
         @jax.checkpoint  # residuals of a branch would be stored for all steps
@@ -299,10 +300,11 @@ class Stepper(eqx.Module):
 
     def through(self, t0: Array, y0: Array, t1: Array, y1: Array, t: Array, args: Any) -> Array:
         """The state at t by the Hermite polynomial through two others."""
-        ends, dynamics = (jnp.stack([t0, t1]), jnp.stack([y0, y1])), cast(Term, self.term).dynamics
+        ends, term = (jnp.stack([t0, t1]), jnp.stack([y0, y1])), cast(Term, self.term).seldom
+        dynamics = term.dynamics
 
         def at(end: tuple[Array, Array]) -> tuple[Array, Array | None]:
-            f = cast(Array, self.term.vf(*end, args))
+            f = cast(Array, term.vf(*end, args))
             return f, dynamics.curvature_of_states(*end, f, args)
 
         (f0, f1), curved = jax.lax.map(at, ends)  # one copy of the vector field to compile
@@ -423,9 +425,10 @@ class Stepper(eqx.Module):
                 *first_step(self.solver, controller, self.term, t0, t1, y, inside, guess),
             )
         order = controller.error_order or self.solver.error_order(self.term)
+        term = self.term.seldom if isinstance(self.term, Term) else self.term
 
         def field(t: Array, y: Array) -> Array:
-            return self.term.vf(t, y, inside)
+            return term.vf(t, y, inside)
 
         slope, h = slope_and_step(field, t0, y, controller, float(order))
         at = jnp.asarray(t0, y.dtype)

@@ -34,6 +34,13 @@ class Term(diffrax.ODETerm):
         return Term(field, dynamics, self.lines, self.dtype)
 
     @property
+    def seldom(self) -> "Term":
+        """The same, to be evaluated a few times in a solve."""
+        dynamics = replace(self.dynamics, seldom=True)
+        field: Any = dynamics.__call__
+        return Term(field, dynamics, self.lines, self.dtype)
+
+    @property
     def works(self) -> bool:
         """Whether the state has work besides q and v."""
         return self.dynamics.power is not None and bool(self.dynamics.power.names)

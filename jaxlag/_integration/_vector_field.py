@@ -18,7 +18,14 @@ from jaxlag._linalg._independent_rows import RowChoice, independent_rows
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
 from jaxlag._linalg._row_residuals import row_sizes
-from jaxlag._lowering import AccelerationProgram, ArrayTerms, Choices, ScalarProgram, State
+from jaxlag._lowering import (
+    AbstractTerms,
+    AccelerationProgram,
+    ArrayTerms,
+    Choices,
+    ScalarProgram,
+    State,
+)
 from jaxlag._model._constraints import NO_ROWS, Baumgarte, ConstraintRows
 from jaxlag._model._forces import sliding
 from jaxlag._model._inputs import (
@@ -64,6 +71,7 @@ class VectorField(eqx.Module):
             independent.
         extrapolates: whether the method has stages beyond the end of a step.
         crossing: whether rows that become dependent during the motion are left out there.
+        seldom: whether it is evaluated a few times in a solve.
     """
 
     system: System
@@ -81,6 +89,7 @@ class VectorField(eqx.Module):
     contact_rows_independent: bool = eqx.field(static=True, default=False)
     extrapolates: bool = eqx.field(static=True, default=False)
     crossing: bool = eqx.field(static=True, default=False)
+    seldom: bool = eqx.field(static=True, default=False)
 
     @property
     def terms(self) -> ArrayTerms:
@@ -92,7 +101,8 @@ class VectorField(eqx.Module):
         """The program of the accelerations."""
         program = self.system._program
         if isinstance(program, ScalarProgram):
-            program = replace(program, lanes=self.lanes, in_loop=self.in_loop)
+            where = {"lanes": self.lanes, "in_loop": self.in_loop, "seldom": self.seldom}
+            program = replace(program, **where)
         return replace(program, array=self.terms)
 
     @property
@@ -180,7 +190,7 @@ class VectorField(eqx.Module):
         elsewhere = np.random.default_rng(0).uniform(-1.5, 1.5, (2, self.system.size))
         found = []
         for at, rates in ((q, v), tuple(jnp.asarray(elsewhere, q.dtype))):
-            M = self.terms.mass(t, at, rates, params)
+            M = self.program.terms(q, params, self.sample).mass(t, at, rates, params)
             found.append(clearly_definite(M) | ~jnp.all(jnp.isfinite(M)))
         return eqxi.unvmap_all(jnp.stack(found))
 
@@ -191,9 +201,10 @@ class VectorField(eqx.Module):
         if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = stop_gradient((t, q, v, params, values))
-        M, (A, _) = self.terms.mass(t, q, v, params), self.terms.rows(t, q, v, params)
-        sure = all(self.rows.sure)
-        nonzero, void, size = row_sizes(lambda q: self.terms.rows(t, q, v, params)[0], q, A, sure)
+        terms = self.program.terms(q, params, self.sample)
+        rows = terms.rows_of(t, v, params)
+        M, A, sure = terms.mass(t, q, v, params), rows(q), all(self.rows.sure)
+        nonzero, void, size = row_sizes(rows, q, A, sure)
         if self.rows.size == 1:  # left out only if it is void
             return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
@@ -370,6 +381,11 @@ class VectorField(eqx.Module):
             return {}
         x = jnp.zeros((self.state_count,), q.dtype)
         return self.inputs_at(jnp.zeros_like(args.origin), q, jnp.zeros_like(q), x, args)
+
+    def terms_at(self, q: Array, args: Arguments) -> AbstractTerms:
+        """The terms, without forces, for use a few times in a solve, for such coordinates."""
+        params, _ = self.given(args)
+        return self.program.terms(q, params, self.sample)
 
     def state_at(self, tau: Array, y: Array, args: Arguments) -> State:
         """The state as programs take it, with quasi-velocities if it has them."""

@@ -141,13 +141,14 @@ def _solved(
 def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
     """(mu for which the residual is rounding, or after MAX_ITERATIONS; the residual; iterations).
 
-    The first iteration, which is sufficient after most steps, is outside the loop.
+    One iteration is sufficient after most steps. The loop contains the residual once, which may be
+    long code: at mu = 0, then after every iteration.
     """
     target = TARGET * _eps(start)
 
     def cond_fun(state: Any) -> Array:
         _, _, size, count = state
-        return (size > target) & (count < MAX_ITERATIONS)
+        return (count < 1) | ((size > target) & (count < MAX_ITERATIONS))
 
     def body_fun(state: Any) -> Any:
         mu, left, _, count = state
@@ -155,10 +156,8 @@ def _iterate(equation: _Equation, start: Array) -> tuple[Array, Array, Array]:
         left = equation.left(start, mu)
         return mu, left, _size(equation.correct(left), start), count + 1
 
-    first = equation.residual(start)
-    left = equation.left(start, first)
-    size = _size(equation.correct(left), start)
-    init = (first, left, size, jnp.ones((), jnp.int32))
+    none = jnp.zeros_like(jax.eval_shape(equation.residual, start))
+    init = none, none, jnp.full((), jnp.inf, start.dtype), jnp.full((), -1, jnp.int32)
     mu, _, size, count = jax.lax.while_loop(cond_fun, body_fun, init)
     return mu, size, count
 

@@ -11,7 +11,7 @@ Computers in Simulation 35 (1993) 233.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,21 +76,54 @@ _EXACT = frozenset(
 )
 
 
+class Bounded(NamedTuple):
+    """A function of arrays that computes its own rounding bounds.
+
+    Attributes:
+        value: the function.
+        bounds: its results, and their changes, as of `with_rounding`.
+    """
+
+    value: Callable[..., Array]
+    bounds: Callable[..., tuple[Array, Array]]
+
+    def __call__(self, *args: Array) -> Array:
+        """The results."""
+        return self.value(*args)
+
+    def chosen(self, choose: Callable[[Array], Array]) -> "Bounded":
+        """The same function, of whose results some entries are chosen, and others set to 0."""
+
+        def bounds(*args: Array) -> tuple[Array, Array]:
+            results, changes = self.bounds(*args)
+            return choose(results), choose(changes)
+
+        return Bounded(lambda *args: choose(self.value(*args)), bounds)
+
+
+def chosen(function: Callable, choose: Callable[[Array], Array]) -> Callable:
+    """choose(function(...)), which keeps its rounding bounds if it is `Bounded`."""
+    if isinstance(function, Bounded):
+        return function.chosen(choose)
+    return lambda *args: choose(function(*args))
+
+
 def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
     """(results, their changes by one rounding of every operation and of the arguments).
 
     Args:
-        function: of arrays, with arrays as results.
+        function: of arrays, with arrays as results; or `Bounded`.
         args: its arguments.
 
     Returns:
         Changes are absolute; NaN if unknown, as beside the end of a domain.
     """
     args = jax.lax.stop_gradient(args)
+    if isinstance(function, Bounded):
+        return jax.lax.stop_gradient(function.bounds(*args))
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
     leaves = jax.tree.leaves(args)
-    draw = np.random.default_rng(7)
-    table = draw.uniform(0.5, 1.0, (RUNS, _TABLE)) * draw.choice([-1.0, 1.0], (RUNS, _TABLE))
+    table = random_signs(np.random.default_rng(7), RUNS, _TABLE)
 
     def run(signs: Array) -> tuple[list[Any], list[Any]]:
         changed = _Changed(signs)
@@ -103,6 +136,11 @@ def with_rounding(function: Callable, *args: Array) -> tuple[Any, Any]:
     ]
     tree = jax.tree.structure(shape)
     return jax.lax.stop_gradient((jax.tree.unflatten(tree, exact), jax.tree.unflatten(tree, found)))
+
+
+def random_signs(draw: np.random.Generator, *shape: int) -> np.ndarray:
+    """Random numbers between 1/2 and 1, of both signs: changes in units of the rounding."""
+    return draw.uniform(0.5, 1.0, shape) * draw.choice([-1.0, 1.0], shape)
 
 
 def with_scatter(function: Callable, *args: Array) -> tuple[Any, Any]:

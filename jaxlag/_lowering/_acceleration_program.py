@@ -13,6 +13,7 @@ from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._linalg._projection import ConstraintProjector
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._quasi_equations import QuasiState
+from jaxlag._lowering._terms import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._tracing import _params
 
@@ -85,6 +86,16 @@ class AccelerationProgram(eqx.Module):
         self, state: State, constants: Any = None, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """a, with one factorization; NaN if M is not positive definite on A a = 0."""
+
+    def terms(self, q: Any, params: Any, sample: _params.Sample = _params.UNKNOWN) -> AbstractTerms:
+        """The terms, without forces, for use a few times in a solve.
+
+        Args:
+            q: coordinates; their number and dtype are used.
+            params: as the Lagrangian takes them.
+            sample: values of the params if these are traced.
+        """
+        return self.array
 
     @abstractmethod
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:

@@ -1,20 +1,17 @@
 """The array program: terms by automatic differentiation of L on whole arrays."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Any, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
 from jaxlag._linalg._kkt import (
-    augmented,
-    correction_matrix,
-    masked,
     solve_kkt,
     solve_reactions,
     units_of,
@@ -23,6 +20,7 @@ from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._linalg._row_residuals import redundant_rows_hold, row_sizes
 from jaxlag._lowering._row_layout import layout
 from jaxlag._lowering._structure import Structure, find_structure
+from jaxlag._lowering._terms import AbstractTerms, Solved
 from jaxlag._model._constraints import (
     AbstractConstraint,
     Baumgarte,
@@ -53,7 +51,8 @@ class SolveConstants(eqx.Module):
     time_direction: Array | float = 1.0
 
 
-class ArrayTerms(eqx.Module):
+@final
+class ArrayTerms(AbstractTerms):
     """M(t,q,v) a + h(t,q,v) = Q(t,q,v,inputs) + A(t,q)^T lam,   A v + b = 0,   A a + gamma = 0.
 
     The terms of a system from its Lagrangian, for any L that JAX differentiates twice. Methods take
@@ -89,6 +88,11 @@ class ArrayTerms(eqx.Module):
     quasi: QuasiVelocities | None = None
     in_u: Callable | None = eqx.field(static=True, default=None)
     crossing: bool = eqx.field(static=True, default=False)
+
+    @property
+    def solved(self) -> Solved:
+        """How they are solved."""
+        return Solved(self.formulation, self.regular, self.crossing)
 
     def momentum(
         self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
@@ -212,6 +216,18 @@ class ArrayTerms(eqx.Module):
         rest = jnp.zeros_like(v)
         b, vjp_fn = jax.vjp(along, rest)
         return jax.vmap(lambda e: vjp_fn(e)[0])(jnp.eye(b.shape[0], dtype=q.dtype)), b
+
+    def rows_of(self, t: Float[Array, ""], v: Float[Array, " n"], params: Any) -> Callable:
+        """A as a function of q."""
+        return lambda q: self.rows(t, q, v, params)[0]
+
+    def rows_of_position(self, t: Float[Array, ""], params: Any) -> Callable:
+        """d phi/dq as a function of q, by one reverse derivative per row."""
+        return jax.jacrev(lambda q: self.position(t, q, params))
+
+    def gamma_of(self, params: Any) -> Callable:
+        """Gamma as a function of (t, q, v), with Baumgarte's terms forwards in time."""
+        return lambda t, q, v: self.gamma(t, q, v, params)
 
     def gamma(
         self,
@@ -374,47 +390,6 @@ class ArrayTerms(eqx.Module):
             M, A, right, reaction_as_read, gamma, active_rows, affine=not reached
         )
         return a, as_read(lam)
-
-    def correction(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        constants: Any = None,
-        active_rows: Bool[Array, " m"] | None = None,
-    ) -> Float[Array, "n m"]:
-        """M^-1 A^T (A M^-1 A^T)^-1 over the active rows; the columns of the others are zero."""
-        return self.corrections(t, q, v, params, constants, active_rows)[0]
-
-    def corrections(
-        self,
-        t: Float[Array, ""],
-        q: Float[Array, " n"],
-        v: Float[Array, " n"],
-        params: Any,
-        constants: Any = None,
-        active_rows: Bool[Array, " m"] | None = None,
-        chosen: Sequence[int] | None = None,
-    ) -> tuple[Float[Array, "n k"], Float[Array, " k"]]:
-        """The same, and the diagonal of (A M^-1 A^T)^-1.
-
-        For the chosen rows alone; A^T W A of all rows is added to an M that may be singular.
-        """
-        M = (
-            self.mass(t, q, v, params)
-            if getattr(constants, "mass", None) is None
-            else constants.mass
-        )
-        A, _ = self.rows(t, q, v, params)
-        if chosen is not None:
-            if not self.regular:
-                M, _ = augmented(M, masked(A, active_rows))
-            rows = np.array(chosen)
-            A, active_rows = A[rows], None if active_rows is None else active_rows[rows]
-        augment = chosen is None and self.crossing and not self.regular
-        how = self.formulation, self.crossing
-        return correction_matrix(M, A, active_rows, *how, augment)
 
     def _balance(
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], constants: Any

@@ -22,9 +22,11 @@ from jaxlag._lowering._acceleration_program import (
 from jaxlag._lowering._array_terms import ArrayTerms, SolveConstants
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
-from jaxlag._lowering._symbolic._lower import Lowered, lower
+from jaxlag._lowering._interpreted_terms import interpreted_terms
+from jaxlag._lowering._lower import Lowered, lower
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._symbolic_system import Equations
+from jaxlag._lowering._terms import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._tracing import _params
 
@@ -43,8 +45,7 @@ class ScalarSolveConstants(NamedTuple):
     acceleration: Array
     position: Array | None = None
     velocity: Array | None = None
-    shift: Array | None = None
-    kick: Array | None = None
+    correction: Array | None = None
     lam: Array | None = None
     rates: Array | None = None
     determinants: Array | None = None
@@ -53,7 +54,7 @@ class ScalarSolveConstants(NamedTuple):
 
 
 _WITH_INPUTS = ("acceleration", "lam")
-_BY_MASS = ("acceleration", "lam", "shift", "kick")  # programs that divide by M
+_BY_MASS = ("acceleration", "lam", "correction")  # programs that divide by M
 
 
 @final
@@ -68,12 +69,14 @@ class ScalarProgram(AccelerationProgram):
         limit: largest number of operations of a scalar program; None for no limit.
         lanes: whether terms are vmapped, so that every scalar is a row of numbers.
         in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
+        seldom: whether they are evaluated a few times in a solve.
     """
 
     array: ArrayTerms
     limit: int | None = eqx.field(static=True)
     lanes: bool = eqx.field(static=True, default=False)
     in_loop: bool = eqx.field(static=True, default=False)
+    seldom: bool = eqx.field(static=True, default=False)
 
     def lowered(
         self,
@@ -135,6 +138,13 @@ class ScalarProgram(AccelerationProgram):
             first, *others, lam=of_lam, rates=rates, determinants=determinants
         )
 
+    def terms(self, q: Any, params: Any, sample: _params.Sample = _params.UNKNOWN) -> AbstractTerms:
+        """Interpreted, if that is quicker to compile."""
+        key = key_of(self.array, q, params, {}, self.limit)
+        sample = _params.sample(_params.split(params)[0], sample)
+        found = interpreted_terms(self.array, key, sample, alone=not self.in_loop)
+        return found or self.array
+
     @property
     def _on_arrays(self) -> ArrayProgram:
         return ArrayProgram(self.array)
@@ -186,7 +196,8 @@ class ScalarProgram(AccelerationProgram):
             assert code is not None
             assert carried is not None
             read = state.inputs if name in _WITH_INPUTS else {}
-            return _emit.body(code, carried, *state[:3], read, program.lanes, program.in_loop)
+            where = program.lanes, program.in_loop, program.seldom
+            return _emit.body(code, carried, *state[:3], read, *where)
 
         # Equations in quasi-velocities are projected: only their projection divides by M.
         projected = self.array.quasi is not None and name == "acceleration"
@@ -228,13 +239,13 @@ class ScalarProgram(AccelerationProgram):
         def position(q: Array) -> Array:
             return run("position", q, v)
 
-        shift = run("shift", q, v)
+        found = run("correction", q, v)
         if self.array.quasi is not None:
-            return ConstraintProjector(position, None, times(shift.reshape(-1, n)), None)
-        kick = shift if code.kick is None else run("kick", q, v)
+            return ConstraintProjector(position, None, times(found.reshape(-1, n)), None)
         holonomic, every = (len(c.results) for c in (code.position, code.velocity))
-        shift, masses = shift[: holonomic * n], kick[every * n :]
-        shift, kick = shift.reshape(-1, n), kick[: every * n].reshape(-1, n)
+        shift = found[: holonomic * n].reshape(-1, n)
+        of_velocity = found[holonomic * n :] if 0 < holonomic < every else found
+        kick, masses = of_velocity[: every * n].reshape(-1, n), of_velocity[every * n :]
         held = position if code.position.results else None
         return ConstraintProjector(
             held, partial(run, "velocity"), times(shift), times(kick), kick, masses

@@ -22,24 +22,23 @@ def timed(
     values: Any,
     clock: Callable[[], float] = time.monotonic,
 ) -> Any:
-    """program(key, values), a jitted function, with a log message if its compilation took long.
+    """program(key, values), with a log message if its compilation took long.
 
     Inside a transform nothing is logged, as the program of the transform compiles as a whole.
 
     Args:
-        program: jitted.
+        program: a `QuickJit` of (key, values).
         system: the mechanical system.
         key: static part of the program's arguments.
         values: traced part.
         clock: seconds.
     """
-    compiled = getattr(program, "_cache_size", None)  # JAX's own count
-    if compiled is None or not concrete(values):
+    if not concrete(values):
         return program(key, values)
-    count, start = compiled(), clock()
+    count, start = program.programs(), clock()
     results = program(key, values)
     seconds = clock() - start
-    if seconds > LONG and compiled() > count:
+    if seconds > LONG and program.programs() > count:
         _logger.warning("%s", _message(system, seconds))
     return results
 

@@ -361,12 +361,11 @@ def _dependent(
     def squares(tau: Array, y: Array) -> tuple[Array, Array]:
         """(squared distances of rows from those before them, whether they are independent)."""
         t, q, v, params = dynamics.state(tau, y, args)
-
-        def rows(q: Array) -> Array:
-            return masked(dynamics.terms.rows(t, q, v, params)[0], active_rows)
-
-        A, M = rows(q), dynamics.mass(tau, y, args)
-        nonzero = row_sizes(rows, q, A).nonzero
+        terms = dynamics.terms_at(q, args)
+        rows = terms.rows_of(t, v, params)
+        every, M = rows(q), terms.mass(t, q, v, params)
+        nonzero = row_sizes(rows, q, every).nonzero
+        A = masked(every, active_rows)
         factor = factor_kkt(M, A, active_rows, FORMULATIONS[0])
         assert isinstance(factor, Multipliers)
         fine = factor.healthy[1] & nonzero
@@ -384,9 +383,10 @@ def _dependent(
 
 def _farthest(dynamics: VectorField, tau: Array, y: Array, args: Arguments) -> Int[Array, ""]:
     """The constraint row with the largest residual, in units of its norm."""
-    at = dynamics.state(tau, y, args)
-    A, _ = dynamics.terms.rows(*at)
-    phi, rate = residuals(dynamics, *at)
+    t, q, v, params = dynamics.state(tau, y, args)
+    terms = dynamics.terms_at(q, args)
+    A = terms.rows_of(t, v, params)(q)
+    phi, rate = residuals(terms, dynamics.rows, t, q, v, params)
     size = jnp.abs(phi) + jnp.abs(rate)
     unit = jnp.sqrt(jnp.sum(A**2, axis=1))
     return jnp.argmax(size / jnp.where(unit > 0, unit, 1.0)).astype(jnp.int32)

@@ -92,17 +92,17 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     params, inputs = dynamics.given(args)
 
     # --- the initial state: given, from quasi-velocities, or assembled
-    initial = _initial_state(plan, values, dynamics, params, inputs)
+    initial = _initial_state(plan, values, dynamics, args)
     y0, args = _started(dynamics, initial, values.x0, params, args)
     consistent = start_consistent(dynamics, *initial.at, params, args)
     if dynamics.rows.size:
         y0, args = stop_gradient_unless(consistent.ok, (y0, args))
 
     # --- on the constraints
-    start = jnp.zeros_like(args.origin)
-    args = _with_scales(dynamics, start, y0, args)
+    start, once = jnp.zeros_like(args.origin), replace(dynamics, seldom=True)
+    args = _with_scales(once, start, y0, args)
     if dynamics.projects:
-        moved, _ = StepEnd(dynamics).project(start, y0, args, differentiable=True)
+        moved, _ = StepEnd(once).project(start, y0, args, differentiable=True)
         y0 = jnp.where(consistent.ok & jnp.all(jnp.isfinite(moved)), moved, y0)
 
     # --- the steps
@@ -118,7 +118,7 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     finite = start_finite(dynamics, start, y0, args)
     if args.lengths is not None:  # rows dependent at the start may be so nearby
         finite = finite & jnp.all(args.lengths > 0)
-    contacts = StepEnd(dynamics).contacts_valid(start, y0, args)
+    contacts = StepEnd(once).contacts_valid(start, y0, args)
     checks = Start(valid, in_range, finite, consistent, contacts)
     setup = Setup(values.step, checks.allowed, stepper_traced)
     problem = Problem(y0, args, times, setup, stepper_static, plan.max_steps, plan.capacity)
@@ -171,16 +171,17 @@ def equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments,
 
 
 def _initial_state(
-    plan: ProgramKey, values: Values, dynamics: VectorField, params: Any, inputs: Any
+    plan: ProgramKey, values: Values, dynamics: VectorField, args: Arguments
 ) -> _Initial:
     """The initial state as given, with velocities from quasi-velocities, or assembled."""
+    params, inputs = dynamics.given(args)
     t0, q0, v0, u0 = values.ts[0], values.q0, values.v0, values.u0
     if v0 is None:
         v0 = plan.system.velocities(q0, u0, params, t=t0)
     signals = inputs | named_states(plan.system.states, values.x0)
     check_declaration(plan.system, params, signals, t0, q0, v0)
     if plan.assemble and dynamics.rows.size:
-        found = assembled(plan.system, q0, v0, params, t0)
+        found = assembled(plan.system, dynamics.terms_at(q0, args), q0, v0, params, t0)
         q0, v0, u0 = found.q, found.v, None
     w0 = v0
     if dynamics.quasi is not None:
@@ -200,7 +201,8 @@ def _started(
     t0, q0, v0, w0 = initial
     if dynamics.quasi is not None or dynamics.rows.size:
         known = (q0, dynamics.velocities(t0, q0, w0, params))
-        known = (*known, *residuals(dynamics, t0, q0, v0, params))
+        terms = dynamics.terms_at(q0, args)
+        known = (*known, *residuals(terms, dynamics.rows, t0, q0, v0, params))
         sound = jnp.all(jnp.isfinite(jnp.concatenate(known)))
         q0, w0, traced = stop_gradient_unless(sound, (q0, w0, args.params))
         args = args._replace(params=traced)

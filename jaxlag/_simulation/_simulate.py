@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -270,6 +269,7 @@ def simulate(
     if not concrete(q0, v0, u0, x0, params_traced, inputs_traced):  # there may be derivatives
         max_steps = most_steps(max_steps, ts, dt, knots)
     stepper_traced, stepper_static = _params.arrays_apart(stepper)
+    sample, params = _params.sample(params_traced), _params.join(params_traced, params_static)
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -278,11 +278,11 @@ def simulate(
         time_direction=time_direction,
         max_steps=max_steps,
         save=tuple(save),
-        sample=_params.sample(params_traced),
+        sample=sample,
         formulation=formulation,
         stabilization=stabilization,
         assemble=assemble,
-        regular=mass_definite(system, params, ts[0], q0, v0),
+        regular=mass_definite(system, params, ts[0], q0, v0, sample),
         contact_rows_independent=not assemble
         and contact_rows_independent(system, params, ts[0], q0, v0, signals),
         capacity=capacity_for(
@@ -372,7 +372,7 @@ def _ran_out(motion: Solution) -> bool:
     return single and int(status) == int(Status.max_steps)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(_xla.QuickJit, static_argnums=0)
 def _simulate(plan: ProgramKey, values: Values) -> Solution:
     """The compiled program: build the problem, solve it, compute the quantities of `save`."""
     values = with_jax_arrays(values)

@@ -158,6 +158,7 @@ def step(
         jumps = Jumps(system, params, q, inputs)
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     stepper_traced, stepper_static = _params.arrays_apart((solver, None))
+    sample = _params.sample(params_traced)
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -166,11 +167,11 @@ def step(
         time_direction=1,
         max_steps=steps,
         save=(),
-        sample=_params.sample(params_traced),
+        sample=sample,
         formulation=formulation,
         stabilization=stabilization,
         assemble=False,
-        regular=mass_definite(system, params, t, q, v),
+        regular=mass_definite(system, params, t, q, v, sample),
         contact_rows_independent=contact_rows_independent(system, params, t, q, v, signals),
         capacity=0,
         change_points="stop",

@@ -17,13 +17,15 @@ from jaxlag._core._status import Status
 from jaxlag._linalg._independent_rows import independent_rows
 from jaxlag._linalg._kkt import augmented, solve_kkt
 from jaxlag._linalg._mass_solve import closed_to, dependence_floor, factor_mass
+from jaxlag._linalg._rounding_bounds import chosen
 from jaxlag._linalg._row_residuals import relative_residual, row_sizes, without_rounding
-from jaxlag._lowering import ArrayTerms
+from jaxlag._lowering import AbstractTerms
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._statics._assembly import Assembly
 from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
+from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
@@ -116,7 +118,8 @@ def assemble(
     warn_of_changes(system)
     params = lift_closure_tracers(system, params, q, None)
     t = number("assemble: t", "be a number", t, jnp.result_type(float))
-    found = _run((system, held, rates_held), params, None, q, v, t, diagonal)
+    sample = _params.sample(_params.split(params)[0])
+    found = _run((system, held, rates_held, sample), params, None, q, v, t, diagonal)
     if throw and concrete(found.status) and int(found.status) != int(Status.ok):
         # Under grad the numbers are traced, and have values all the same.
         found = stop_gradient(found)
@@ -130,10 +133,12 @@ def assemble(
     return found
 
 
-def assembled(system: System, q: Array, v: Array, params: Any, t: Array) -> Assembly:
-    """`assemble` without held values, for use while tracing."""
+def assembled(
+    system: System, terms: AbstractTerms, q: Array, v: Array, params: Any, t: Array
+) -> Assembly:
+    """`assemble` without held values, for use while tracing; forces do not matter."""
     free = (False,) * system.size
-    return _assembled(system, q, v, params, t, free, free, None)
+    return _assembled(system, terms, q, v, params, t, free, free, None)
 
 
 @Compiled
@@ -141,6 +146,7 @@ def _run(
     system: System,
     held: tuple[bool, ...],
     rates_held: tuple[bool, ...],
+    sample: _params.Sample,
     params: Any,
     _: None,
     q: Array,
@@ -148,11 +154,13 @@ def _run(
     t: Array,
     diagonal: Array | None,
 ) -> Assembly:
-    return _assembled(system, q, v, params, t, held, rates_held, diagonal)
+    terms = system._program.terms(q, params, sample)
+    return _assembled(system, terms, q, v, params, t, held, rates_held, diagonal)
 
 
 def _assembled(
     system: System,
+    terms: AbstractTerms,
     q: Array,
     v: Array,
     params: Any,
@@ -162,7 +170,7 @@ def _assembled(
     diagonal: Array | None,
 ) -> Assembly:
     rows = system._rows(params, q.dtype)
-    terms = ArrayTerms(system.lagrangian, (), system.constraints)
+    all_rows = terms.rows_of(t, v, params)
     fixed, rates_fixed = np.array(held), np.array(rates_held)
 
     def metric(q: Array, held: np.ndarray) -> Array:
@@ -174,14 +182,10 @@ def _assembled(
         return terms.position(t, q, params)
 
     if any(rows.holonomic):
-        q = _nearest(phi, metric(q, fixed), q, ~fixed)
+        gradients = chosen(terms.rows_of_position(t, params), _columns(~fixed))
+        q = _nearest(phi, gradients, metric(q, fixed), q, ~fixed)
 
-    def all_rows(q: Array) -> Array:
-        return terms.rows(t, q, v, params)[0]
-
-    def of_free(q: Array) -> Array:
-        return jnp.where(rates_fixed, 0.0, all_rows(q))
-
+    of_free = chosen(all_rows, _columns(~rates_fixed))
     A, W = all_rows(q), metric(q, rates_fixed)
     if rows.size:
         active_rows = _independent(of_free, W, q, rows.velocity)
@@ -219,6 +223,11 @@ def _assembled(
     )
 
 
+def _columns(free: np.ndarray) -> Callable[[Array], Array]:
+    """A function of rows that sets the other columns to 0."""
+    return lambda A: jnp.where(free, A, 0.0)
+
+
 def _independent(
     rows: Callable,
     W: Array,
@@ -233,9 +242,9 @@ def _independent(
     return independent_rows(W, A, priority, floor, nonzero)
 
 
-def _inertia(terms: ArrayTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
+def _inertia(terms: AbstractTerms, t: Array, q: Array, v: Array, params: Any) -> Array:
     """M; plus A^T D A if it is not positive definite by itself."""
-    M, (A, _) = terms.mass(t, q, v, params), terms.rows(t, q, v, params)
+    M, A = terms.mass(t, q, v, params), terms.rows_of(t, v, params)(q)
     regular = jnp.all(factor_mass(jax.lax.stop_gradient(M)).healthy)
     return jnp.where(regular, M, augmented(M, A)[0])
 
@@ -247,11 +256,16 @@ class _Search(NamedTuple):
     count: Array
 
 
-def _nearest(phi: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
-    """The q that minimizes (q - start)^T W (q - start) / 2 over phi(q) = 0, as a root of F."""
+def _nearest(phi: Callable, rows: Callable, W: Array, start: Array, free: np.ndarray) -> Array:
+    """The q that minimizes (q - start)^T W (q - start) / 2 over phi(q) = 0, as a root of F.
 
-    def rows(q: Array) -> Array:
-        return jnp.where(free, jax.jacrev(phi)(q), 0.0)
+    Args:
+        phi: of q.
+        rows: d phi/dq, with zeros for coordinates that are held.
+        W: metric.
+        start: guess.
+        free: for every coordinate, whether it is not held.
+    """
 
     def F(z: tuple[Array, Array], active_rows: Array) -> tuple[Array, Array]:
         q, lam = z
@@ -372,16 +386,16 @@ def _what_to_release(
     system: System, held: tuple[tuple[bool, ...], tuple[bool, ...]], params: Any, *state: Any
 ) -> str:
     """Held coordinates or velocities that prevent a solution, as text."""
-    labels = system.coordinates.labels
+    labels, sample = system.coordinates.labels, _params.sample(_params.split(params)[0])
     free = (False,) * system.size
-    if int(_run((system, free, free), params, None, *state).status) != int(Status.ok):
+    if int(_run((system, free, free, sample), params, None, *state).status) != int(Status.ok):
         return " Without hold= it cannot be satisfied either."
     culprits = []
     for rate in (0, 1):
         for i in np.flatnonzero(held[rate]):
             fewer = [list(x) for x in held]
             fewer[rate][i] = False
-            less = (system, tuple(fewer[0]), tuple(fewer[1]))
+            less = (system, tuple(fewer[0]), tuple(fewer[1]), sample)
             if int(_run(less, params, None, *state).status) == int(Status.ok):
                 culprits.append(labels[i] + "'" * rate)
     if culprits:

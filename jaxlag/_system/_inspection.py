@@ -39,13 +39,23 @@ def advice_on_mass(params: Any) -> str:
     )
 
 
-def mass_definite(system: AbstractReactions, params: Any, t: Any, q: Any, v: Any) -> bool | None:
+def mass_definite(
+    system: AbstractReactions, params: Any, t: Any, q: Any, v: Any, sample: _params.Sample
+) -> bool | None:
     """Whether M is positive definite for these params without the constraints.
 
     Tested in the given state, if it is known, and in one other: the mass of a link is zero
     everywhere or nowhere. If the state is traced and M depends on it, it is also tested in states
     where inertias vanish, as in polar coordinates at r = 0. None if the params are traced. Only
     used with constraints.
+
+    Args:
+        system: the mechanical system.
+        params: as the Lagrangian takes them.
+        t: time of the state.
+        q: coordinates.
+        v: velocities, or None.
+        sample: params for the check of code for M.
     """
     if not system.constraints:
         return False
@@ -63,7 +73,7 @@ def mass_definite(system: AbstractReactions, params: Any, t: Any, q: Any, v: Any
         kinds = jnp.result_type(float), q.dtype, q.dtype
         at = [np.asarray(x, kind) for x, kind in zip(state, kinds, strict=True)]
         with jax.ensure_compile_time_eval():
-            M = _mass((system,), params, None, *at)
+            M = _mass((system, sample), params, None, *at)
         if not concrete(M):
             return None  # the Lagrangian closes over a traced value
         M = np.asarray(M, np.float64)
@@ -155,8 +165,16 @@ def _rows(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v
 
 
 @Compiled
-def _mass(system: AbstractReactions, params: Any, _: None, t: Array, q: Array, v: Array) -> Array:
-    return system._terms.mass(t, q, v, params)
+def _mass(
+    system: AbstractReactions,
+    sample: _params.Sample,
+    params: Any,
+    _: None,
+    t: Array,
+    q: Array,
+    v: Array,
+) -> Array:
+    return system._program.terms(q, params, sample).mass(t, q, v, params)
 
 
 def check_declaration(

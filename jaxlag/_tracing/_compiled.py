@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from jaxlag._core._xla import QuickJit
 from jaxlag._tracing import _params
 
 
@@ -34,7 +35,7 @@ class Compiled:
             return one(traced)
 
         program.__name__ = function.__name__
-        self.program = jax.jit(program, static_argnums=(0, 1, 2, 3))
+        self.program = QuickJit(program, static_argnums=(0, 1, 2, 3))
 
     def __call__(self, key: tuple, params: Any, inputs: Any, *arrays: Any, batch: int = 0) -> Any:
         params, params_static = _params.split(params)

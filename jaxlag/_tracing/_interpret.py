@@ -3,21 +3,75 @@
 NUMPY holds primitives as functions of (equation, operands).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxlag._core._jaxprs import called
 
 
+class NumpyProgram:
+    """A program for numpy arrays: one operation after another, nested programs written out.
+
+    Operations whose results nobody reads are left out.
+    """
+
+    def __init__(self, program: ClosedJaxpr) -> None:
+        self._values: list[Any] = []
+        self._lines: list[tuple[Callable, list[int], list[int]]] = []
+        self._given = [self._new() for _ in program.jaxpr.invars]
+        self._results = self._write(program, self._given)
+        needed, lines = set(self._results), []
+        for line in reversed(self._lines):
+            _, operands, results = line
+            if not needed.isdisjoint(results):
+                needed.update(operands)
+                lines.append(line)
+        self._lines = lines[::-1]
+
+    def __call__(self, *args: Any) -> list:
+        """The results at given arrays; overflow gives inf or nan."""
+        values = list(self._values)
+        for slot, x in zip(self._given, args, strict=True):
+            values[slot] = x
+        with np.errstate(all="ignore"):
+            for operation, operands, results in self._lines:
+                found = operation([values[slot] for slot in operands])
+                for slot, x in zip(results, found, strict=True):
+                    values[slot] = x
+        return [values[slot] for slot in self._results]
+
+    def _new(self, value: Any = None) -> int:
+        self._values.append(value)
+        return len(self._values) - 1
+
+    def _write(self, program: ClosedJaxpr, operands: Sequence[int]) -> list[int]:
+        """Append the operations of a program; returns the slots of its results."""
+        jaxpr, known = program.jaxpr, dict(zip(program.jaxpr.invars, operands, strict=True))
+        consts = [self._new(held(x)) for x in program.consts]
+        known |= dict(zip(jaxpr.constvars, consts, strict=True))
+
+        def slots(atoms: Sequence[Any]) -> list[int]:
+            return [self._new(held(a.val)) if isinstance(a, Literal) else known[a] for a in atoms]
+
+        for eqn in jaxpr.eqns:
+            inner, given = called(eqn), slots(eqn.invars)
+            if inner is not None:
+                results = self._write(inner, given)
+            else:
+                results = [self._new() for _ in eqn.outvars]
+                self._lines.append((operation_of(eqn), given, results))
+            known |= dict(zip(eqn.outvars, results, strict=True))
+        return slots(jaxpr.outvars)
+
+
 def interpret(closed: ClosedJaxpr, *args: Any) -> list:
     """The results of a program at given arrays; overflow gives inf or nan."""
-    with np.errstate(all="ignore"):
-        return _run(closed.jaxpr, list(map(held, closed.consts)), list(args))
+    return NumpyProgram(closed)(*args)
 
 
 def held(value: Any) -> Any:
@@ -27,28 +81,30 @@ def held(value: Any) -> Any:
     return value if extended else np.asarray(value)
 
 
-def _run(jaxpr: Jaxpr, consts: list, args: list) -> list:
-    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, args, strict=True))
-    for eqn in jaxpr.eqns:
-        operands = [a.val if isinstance(a, Literal) else known[a] for a in eqn.invars]
-        results = equation(eqn, list(map(held, operands)))
-        known.update(zip(eqn.outvars, results, strict=True))
-    return [held(a.val) if isinstance(a, Literal) else known[a] for a in jaxpr.outvars]
-
-
 def equation(eqn: Any, operands: list) -> list:
     """The results of one equation at given numpy arrays."""
-    name, inner = eqn.primitive.name, called(eqn)
+    inner = called(eqn)
     if inner is not None:
-        return _run(inner.jaxpr, list(map(held, inner.consts)), operands)
+        return interpret(inner, *operands)
+    return operation_of(eqn)(operands)
+
+
+def operation_of(eqn: Any) -> Callable[[list], list]:
+    """One equation as a function from its operands to its results."""
+    name = eqn.primitive.name
     if name in NUMPY:
-        out = np.asarray(NUMPY[name](eqn, *operands))
-        kind = eqn.outvars[0].aval.dtype
-        # Integers keep their width, in which they wrap; real numbers are computed in double.
-        return [out.astype(kind) if np.issubdtype(kind, np.integer) else out]
+        function, kind = NUMPY[name], eqn.outvars[0].aval.dtype
+        if np.issubdtype(kind, np.integer):
+            # Integers keep their width, in which they wrap; real numbers are computed in double.
+            return lambda operands: [np.asarray(function(eqn, *operands)).astype(kind)]
+        return lambda operands: [np.asarray(function(eqn, *operands))]
     if name in _PARTS:
-        return _PARTS[name](eqn, *operands)
+        part = _PARTS[name]
+        return lambda operands: part(eqn, *operands)
+    return partial(_by_jax, eqn)
+
+
+def _by_jax(eqn: Any, operands: list) -> list:
     kinds = [v.aval.dtype for v in eqn.invars]
     with jax.ensure_compile_time_eval():
         given = [

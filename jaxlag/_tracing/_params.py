@@ -1,6 +1,7 @@
 """Params: a pytree, split into traced leaves and the static part of the program's key."""
 
 import math
+from functools import lru_cache
 from numbers import Number
 from typing import Any
 
@@ -132,11 +133,18 @@ def _is_key(x: Any) -> bool:
 def _is_traced(leaf: Any) -> bool:
     if type(leaf) in _TRACED:
         return _TRACED[type(leaf)]
-    if isinstance(leaf, Tracer) or _is_key(leaf):
+    if isinstance(leaf, Tracer):
         return True
-    if isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.integer):
-        return True
+    if isinstance(leaf, jax.Array | np.ndarray):
+        return _of_numbers(leaf.dtype)
     return eqx.is_array_like(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)
+
+
+@lru_cache(maxsize=64)
+def _of_numbers(dtype: Any) -> bool:
+    """Whether it is of numbers other than truth values, or of typed random keys."""
+    kinds = jnp.integer, jnp.inexact, jax.dtypes.prng_key
+    return any(jnp.issubdtype(dtype, kind) for kind in kinds)
 
 
 def split(params: Any) -> tuple[Any, Any]:

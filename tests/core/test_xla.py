@@ -161,6 +161,25 @@ def test_attributes_are_used_only_for_tested_versions(monkeypatch):
     assert not _xla.by_attribute()
 
 
+def test_options_are_used_outside_of_all_transforms(monkeypatch):
+    """Inside them JAX refuses options, and the outermost jit decides."""
+    monkeypatch.setattr(_xla, "TESTED", (jaxlib.__version__,))
+    monkeypatch.setattr(_xla, "_OPTIONS", {"xla_cpu_enable_fast_math": False})
+    program = _xla.QuickJit(jnp.sin)
+    program(1.0)
+    assert (program._alone._cache_size(), program._inside._cache_size()) == (1, 0)
+    transformed = jax.jit, jax.grad, jax.vmap, lambda f: lambda x: jax.jvp(f, (x,), (x,))
+    for transform in transformed:
+        x = jnp.ones(2) if transform is jax.vmap else 1.0
+        transform(lambda x: program(x))(x)
+        assert program._alone._cache_size() == 1
+    monkeypatch.setattr(_xla, "TESTED", ())
+    program = _xla.QuickJit(jnp.sin)
+    program(1.0)
+    assert program.programs() == 1
+    assert program._alone is None
+
+
 def test_only_plain_operations_are_marked():
     """Calls of a library or of the host, nested in a loop, are left to XLA."""
 

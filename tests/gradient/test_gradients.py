@@ -84,6 +84,7 @@ def recorded(motion: Motion, x):
         caught["plan"], caught["values"] = plan, jax.tree.map(jnp.asarray, values)
         raise StopIteration
 
+    catch.programs = lambda: 0
     original = _simulate._simulate
     _simulate._simulate = catch
     try:

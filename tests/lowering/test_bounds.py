@@ -13,7 +13,7 @@ from bench._problems.scenes import SCENES
 from jaxlag._lowering import ArrayTerms
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._symbolic._bias_forms import mass_matrix, momentum_form
-from jaxlag._lowering._symbolic._derive import derive
+from jaxlag._lowering._symbolic._derive import derivation, derive
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._read_system import read_scene
 from systems.catalogue import ENTRIES
@@ -71,7 +71,8 @@ def both(system, params, dtype=np.float64):
     graph = scene.graph
     M = mass_matrix(graph, scene.lagrangian, scene.v)
     right = [graph.scale(x, -1.0) for x in momentum_form(scene, scene.lagrangian)]
-    return solve(graph, M, right, eps), derive(scene, eps, None).accelerations
+    derived, _ = derive(scene, derivation(scene, None), eps)
+    return solve(graph, M, right, eps), derived.accelerations
 
 
 def is_float(x):

@@ -10,8 +10,8 @@ import pytest
 from _lowered import lowered
 
 import jaxlag as jl
+from jaxlag._lowering import _lower
 from jaxlag._lowering._graph._expression import Graph
-from jaxlag._lowering._symbolic import _lower
 from jaxlag._lowering._symbolic._bias_forms import degree
 from jaxlag._lowering._symbolic._evaluate import evaluate
 from jaxlag._tracing._interpret import NUMPY, interpret

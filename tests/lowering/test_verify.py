@@ -9,7 +9,7 @@ from _scenes import case
 
 import jaxlag as jl
 from bench._problems.scenes import SCENES, links
-from jaxlag._lowering._symbolic import _lower
+from jaxlag._lowering import _lower
 from systems import lamina_on_parabola, rigid_aircraft
 
 EPS = np.finfo(float).eps
@@ -31,10 +31,10 @@ def test_program_right_only_for_given_params_is_not_used(monkeypatch):
     """Wrong for k other than 1: random params show it."""
     derive = _lower.derive
 
-    def wrong(scene, eps, limit):
-        right, graph = derive(scene, eps, limit), scene.graph
+    def wrong(scene, *rest):
+        (right, form), graph = derive(scene, *rest), scene.graph
         k = graph.input("params", 0)
-        return right._replace(accelerations=[graph.mul(x, k) for x in right.accelerations])
+        return right._replace(accelerations=[graph.mul(x, k) for x in right.accelerations]), form
 
     monkeypatch.setattr(_lower, "derive", wrong)
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.cos(q[0]), ("x",))
@@ -44,8 +44,9 @@ def test_program_right_only_for_given_params_is_not_used(monkeypatch):
 def test_program_finite_where_the_array_program_is_nan_is_not_used(monkeypatch):
     derive = _lower.derive
 
-    def wrong(scene, eps, limit):
-        return derive(scene, eps, limit)._replace(accelerations=[scene.graph.one])
+    def wrong(scene, *rest):
+        right, form = derive(scene, *rest)
+        return right._replace(accelerations=[scene.graph.one]), form
 
     monkeypatch.setattr(_lower, "derive", wrong)
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - jnp.sqrt(q[0] - 9.0), ("x",))
@@ -85,21 +86,32 @@ SHAPES = {
 }
 
 
-def _wrong(equations, part, graph):
-    """Equations with the last entry of one part off by 1e-9."""
+def _off(entries, graph):
+    """The last entry off by 1e-9."""
+    *others, last = entries
+    if isinstance(last, list):
+        return [*others, _off(last, graph)]
+    return [*others, graph.scale(last, 1.0 + 1e-9)]
 
-    def off(entries):
-        *others, last = entries
-        if isinstance(last, list):
-            return [*others, off(last)]
-        return [*others, graph.scale(last, 1.0 + 1e-9)]
 
+def _wrong_terms(derived, part, graph):
+    """All forms of the terms with an error in one part."""
+
+    def wrong(form):
+        if part == "rows":
+            return form._replace(rows=form.rows._replace(A=_off(form.rows.A, graph)))
+        part_of = {"mass": "M", "bias": "h"}[part]
+        return form._replace(**{part_of: _off(getattr(form, part_of), graph)})
+
+    return derived._replace(forms=[wrong(form) for form in derived.forms])
+
+
+def _wrong_rates(equations, part, graph):
+    """Equations in quasi-velocities with an error in one part."""
     if part == "accelerations":  # the velocities come first
         v, others = equations.accelerations[:2], equations.accelerations[2:]
-        return equations._replace(accelerations=[*off(v), *others])
-    if part == "rows":
-        return equations._replace(rows=equations.rows._replace(A=off(equations.rows.A)))
-    return equations._replace(**{part: off(getattr(equations, part))})
+        return equations._replace(accelerations=[*_off(v, graph), *others])
+    return equations._replace(**{part: _off(getattr(equations, part), graph)})
 
 
 @pytest.mark.parametrize(
@@ -116,14 +128,49 @@ def test_an_indefinite_mass_is_compared_by_its_parts(shape, part, monkeypatch):
     def lagrangian(t, q, v, p):
         return 0.5 * (v[0] ** 2 - p["m"] * (1.0 + q[0] ** 2) * v[1] ** 2) - q @ q
 
-    derive = _lower.derive
-    if part is not None:
-        monkeypatch.setattr(
-            _lower, "derive", lambda scene, *rest: _wrong(derive(scene, *rest), part, scene.graph)
-        )
+    derive, derivation = _lower.derive, _lower.derivation
+
+    def wrong_rates(scene, *rest):
+        equations, form = derive(scene, *rest)
+        return _wrong_rates(equations, part, scene.graph), form
+
+    def wrong_terms(scene, *rest):
+        return _wrong_terms(derivation(scene, *rest), part, scene.graph)
+
+    if part is not None and shape == "quasi-velocities":
+        monkeypatch.setattr(_lower, "derive", wrong_rates)
+    elif part is not None:
+        monkeypatch.setattr(_lower, "derivation", wrong_terms)
     found = lowered(jl.System(lagrangian, ("x", "y"), **SHAPES[shape]), {"m": 2.0})
     assert (found.equations is None) == (part is not None)
     assert found.reason.startswith("equal to" if part is None else "differs from")
+
+
+@pytest.mark.parametrize("part", ["position", "velocity", "force"])
+def test_an_error_of_1e_9_in_a_residual_or_force_is_found(part, monkeypatch):
+    """phi does not enter accelerations, but starts and projections."""
+    read, with_forces = _lower.read_scene, _lower.with_forces
+
+    def wrong_rows(key):
+        scene = read(key)
+        off = _off(getattr(scene.constrained, part), scene.graph)
+        return scene._replace(constrained=scene.constrained._replace(**{part: off}))
+
+    def wrong_force(scene, key):
+        scene = with_forces(scene, key)
+        return scene._replace(force=_off(scene.force, scene.graph))
+
+    if part == "force":
+        monkeypatch.setattr(_lower, "with_forces", wrong_force)
+    else:
+        monkeypatch.setattr(_lower, "read_scene", wrong_rows)
+    drag = jl.GeneralizedForce(lambda t, q, v, p: -0.1 * v * (1.0 + q**2), "drag")
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - q @ q, ("x", "y"), forces=(drag,), **SHAPES["constraint"]
+    )
+    found = lowered(system)
+    assert found.equations is None
+    assert found.reason.startswith("differs from")
 
 
 @pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
@@ -142,10 +189,10 @@ def test_a_program_that_differs_is_not_used(monkeypatch):
     """One sign of h is flipped: the reason states the difference, and the array program is used."""
     derive = _lower.derive
 
-    def wrong(scene, eps, limit):
-        right = derive(scene, eps, limit)
+    def wrong(scene, *rest):
+        right, form = derive(scene, *rest)
         flipped = [scene.graph.scale(x, -1.0) for x in right.accelerations]
-        return right._replace(accelerations=flipped)
+        return right._replace(accelerations=flipped), form
 
     monkeypatch.setattr(_lower, "derive", wrong)
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.cos(q[0]), ("x",))
@@ -158,9 +205,9 @@ def test_a_program_that_gives_nan_is_not_used(monkeypatch):
     """Where the array program is finite; comparisons with nan are False."""
     derive = _lower.derive
 
-    def wrong(scene, eps, limit):
-        right = derive(scene, eps, limit)
-        return right._replace(accelerations=[scene.graph.const(np.nan)])
+    def wrong(scene, *rest):
+        right, form = derive(scene, *rest)
+        return right._replace(accelerations=[scene.graph.const(np.nan)]), form
 
     monkeypatch.setattr(_lower, "derive", wrong)
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v - p["k"] * jnp.sin(q[0]), ("x",))

@@ -68,7 +68,7 @@ def test_array_coordinates():
 
 
 def test_new_values_do_not_recompile():
-    compiled = _simulate._cache_size
+    compiled = _simulate.programs
 
     def lagrangian(t, q, v, p):
         return 0.5 * p["m"] * v[0] ** 2 - p["V"](q[0]) * p["k"]

@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from jaxlag._core._arrays import elements
 from jaxlag._core._xla import opaque_one
+from jaxlag._lowering._emit import _interpreter
+from jaxlag._lowering._emit._code import body_of, prelude_of
 from jaxlag._lowering._emit._execute import leaves, numbers, run, stacked, straight
 from jaxlag._lowering._emit._outlined import called
 from jaxlag._lowering._graph._expression import FIXED
@@ -22,6 +24,11 @@ INLINE_UP_TO = 60
 # In a loop over one trajectory or a few lanes. On wider arrays XLA may split the work of a
 # function among threads, which it cannot do inside a loop that is one native function.
 INLINE_IN_LOOP = 14
+# Fixed inputs that are 1 if they are not given.
+_ONES = "active_rows", "nonzero", "time_direction"
+# Longer code that runs a few times in a solve is interpreted: that compiles in the time of so many
+# lines.
+INTERPRET_FROM = 250
 
 
 def prelude(
@@ -42,18 +49,39 @@ def prelude(
         nonzero: for every row whether it is more than rounding; None for all.
         time_direction: -1 if time runs backwards.
     """
+    values = {"active_rows": active_rows, "nonzero": nonzero, "time_direction": time_direction}
+    given = fixed_inputs(program, params, dtype, values)
+    if len(program.prelude) > INTERPRET_FROM and _may_interpret(program):
+        function = _interpreter.interpreted(prelude_of(program), dtype, alone=True)
+        return jnp.append(function(*given.values()), opaque_one(dtype))
     slots = numbers(program, dtype)
-    for given in FIXED:
-        wanted = {index: slot for (name, index), slot in program.inputs.items() if name == given}
-        values = {"active_rows": active_rows, "nonzero": nonzero, "time_direction": time_direction}
-        if given in values and values[given] is None:
-            slots |= {slot: jnp.ones((), dtype) for slot in wanted.values()}
-        elif wanted:
-            flat = leaves(_params.split(params)[0] if given == "params" else values[given])
-            slots |= {slot: jnp.asarray(flat[index], dtype) for index, slot in wanted.items()}
+    slots |= {program.inputs[key]: x for key, x in given.items()}
     run(program.prelude, slots, program.whole)
     row = [jnp.asarray(slots[slot], dtype) for slot in program.carried]
     return jnp.stack([*row, opaque_one(dtype)])
+
+
+def fixed_inputs(
+    program: Program, params: Any, dtype: Any, values: Mapping[str, Any]
+) -> dict[tuple[str, int], Array]:
+    """Values of the inputs that do not change during a solve, in the order of the program.
+
+    Args:
+        program: straight-line code.
+        params: as the Lagrangian takes them.
+        dtype: of the results.
+        values: arrays of the others by name; None for 1.
+    """
+    one = jnp.ones((), dtype)
+    known: dict[str, Any] = dict.fromkeys(_ONES)
+    known |= {name: leaves(x) for name, x in values.items() if x is not None}
+    keys = [key for key in program.inputs if key[0] in FIXED]
+    if any(name == "params" for name, _ in keys):
+        known["params"] = leaves(_params.split(params)[0])
+    return {
+        (name, index): one if known[name] is None else jnp.asarray(known[name][index], dtype)
+        for name, index in keys
+    }
 
 
 def body(
@@ -65,6 +93,7 @@ def body(
     inputs: Mapping[str, Any],
     lanes: bool = False,
     in_loop: bool = False,
+    seldom: bool = False,
 ) -> Float[Array, " r"]:
     """The results at one state.
 
@@ -77,6 +106,7 @@ def body(
         inputs: values of the inputs by name.
         lanes: whether this is vmapped: every scalar is an array of numbers.
         in_loop: whether this is in a loop over one trajectory or a few lanes.
+        seldom: whether this runs a few times in a solve.
     """
     names, dtype = {name for name, _ in program.inputs}, q.dtype
     flat = leaves(dict(inputs)) if "inputs" in names else []
@@ -89,7 +119,14 @@ def body(
     if short or len(kinds) > 1 or jax.default_backend() != "cpu":
         return jnp.stack(_function(*kind)(carried, given))
     # One flat array in and one out.
+    if seldom and len(program.body) > INTERPRET_FROM and _may_interpret(program):
+        function = _interpreter.interpreted(body_of(program), dtype, alone=not in_loop)
+        return function(*elements(carried[:-1]), *given)
     return called(*kind)(carried, stacked(given, dtype))
+
+
+def _may_interpret(program: Program) -> bool:
+    return _interpreter.available() and not program.has_rules
 
 
 @lru_cache(maxsize=256)

@@ -84,7 +84,7 @@ def run(
                 pairs[argument] = (s, c) if one is None else (s / one, c / one)
             slots[line.to] = pairs[argument][line.data.name == "cos"]
         else:
-            slots[line.to] = _line(line, args)
+            slots[line.to] = executed(line, args)
         if line.to in whole:
             slots[line.to] = lax.optimization_barrier(slots[line.to])
 
@@ -107,7 +107,8 @@ def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Arra
     return z, _quotient(dx - z * dy, y)
 
 
-def _line(line: Line, args: list[Any]) -> Any:
+def executed(line: Line, args: Sequence[Any]) -> Any:
+    """The result of a line without a rule of its own."""
     op = line.op
     if op == "div" and args[1].dtype == jnp.float32:
         return _quotient(jnp.asarray(args[0], args[1].dtype), args[1])

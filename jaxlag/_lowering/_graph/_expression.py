@@ -32,6 +32,10 @@ POWERS = 2
 overflow where q^32 / a^32 does."""
 
 
+CANCELLED = 1e-9
+"""A sum of two numbers that is so much smaller than both may be their rounding."""
+
+
 class Node:
     """One scalar of a graph.
 
@@ -105,13 +109,23 @@ class Graph:
     Attributes:
         nodes: all of them, arguments first.
         once: names of JAX primitives whose results become atoms when a program is read.
+        cancelled: whether coefficients have cancelled up to what may be their rounding, since this
+            was last set to False.
     """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
+        self.cancelled = False
         self.once: Container[str] = ()
         self._known: dict[Any, Node] = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
+
+    def copy(self) -> "Graph":
+        """A graph with the same nodes, to which others are added independently."""
+        other = Graph()
+        other.nodes, other._known = list(self.nodes), dict(self._known)
+        other.zero, other.one, other.once = self.zero, self.one, self.once
+        return other
 
     def _node(self, op: str, data: Any, args: tuple[Node, ...]) -> Node:
         # A Python number equals a node's id and True equals 1.0: the op keeps them apart.
@@ -143,16 +157,17 @@ class Graph:
         """constant + sum of coefficient times node."""
         total: dict[Node, float] = {}
         for node, coefficient in terms:
-            constant += _collect(total, node, coefficient)
+            constant = self._plus(constant, self._collect(total, node, coefficient))
         remaining = [(node, c) for node, c in total.items() if c != 0.0]
         # A sum inside a sum is opened only if that merges terms: it may be shared.
         for node, c in remaining:
             if node.op == "sum" and _merges(node, constant, total):
                 del total[node]
                 inner_constant, inner = node.data
-                constant += c * inner_constant
+                constant = self._plus(constant, c * inner_constant)
                 for term, coefficient in inner:
-                    constant += _collect(total, term, c * coefficient)
+                    more = self._collect(total, term, c * coefficient)
+                    constant = self._plus(constant, more)
                 return self.sum(total.items(), constant)
         if not remaining:
             return self.const(constant)
@@ -165,6 +180,26 @@ class Graph:
                 return remaining[0][0]
         remaining.sort(key=_by_id)
         return self._sum(constant, tuple(remaining))
+
+    def _collect(self, total: dict[Node, float], node: Node, coefficient: float) -> float:
+        """Add coefficient times node to `total`; returns the constant part."""
+        if coefficient == 0.0:
+            return 0.0
+        if node.op == "const":
+            return coefficient * float(node.data)
+        constant = 0.0
+        if node.op == "sum" and len(node.data[1]) == 1:
+            inner_constant, ((node, inner),) = node.data
+            constant, coefficient = coefficient * inner_constant, coefficient * inner
+        before = total.get(node)
+        total[node] = coefficient if before is None else self._plus(before, coefficient)
+        return constant
+
+    def _plus(self, a: float, b: float) -> float:
+        total = a + b
+        if 0.0 < abs(total) < CANCELLED * max(abs(a), abs(b)):
+            self.cancelled = True
+        return total
 
     def _sum(self, constant: float, terms: Terms) -> Node:
         key = ("sum", constant, tuple((node.id, c) for node, c in terms))
@@ -321,20 +356,6 @@ def scaled(node: Node) -> bool:
 
 def _by_id(item: tuple[Node, Any]) -> int:
     return item[0].id
-
-
-def _collect(total: dict[Node, float], node: Node, coefficient: float) -> float:
-    """Add coefficient times node to `total`; returns the constant part."""
-    if coefficient == 0.0:
-        return 0.0
-    if node.op == "const":
-        return coefficient * float(node.data)
-    if node.op == "sum" and len(node.data[1]) == 1:
-        constant, ((term, inner),) = node.data
-        total[term] = total.get(term, 0.0) + coefficient * inner
-        return coefficient * constant
-    total[node] = total.get(node, 0.0) + coefficient
-    return 0.0
 
 
 def _merges(node: Node, constant: float, total: dict[Node, float]) -> bool:

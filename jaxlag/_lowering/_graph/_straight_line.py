@@ -60,6 +60,11 @@ class Program(NamedTuple):
         return self is other
 
     @property
+    def has_rules(self) -> bool:
+        """Whether it calls functions with derivative rules of their own."""
+        return any(line.op == "custom" for line in (*self.prelude, *self.body))
+
+    @property
     def operations(self) -> int:
         """Operations of the body, each function call and division one."""
         return sum(line.op not in _FREE for line in self.body)

@@ -32,6 +32,7 @@ class Constrained(NamedTuple):
         lam: their multipliers.
         sharing: distribution of multipliers among dependent rows; None if forces do not need it.
         crossing: whether rows that become dependent are left out; otherwise results are NaN.
+        cancelled: whether coefficients of the residuals may be rounding.
     """
 
     velocity: Sequence[Node]
@@ -45,6 +46,7 @@ class Constrained(NamedTuple):
     lam: Sequence[Node] = ()
     sharing: Sharing | None = None
     crossing: bool = False
+    cancelled: bool = False
 
 
 class SymbolicRows(NamedTuple):

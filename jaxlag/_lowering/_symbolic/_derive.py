@@ -1,6 +1,6 @@
 """Lagrange's equations on the graph: the cheapest of several forms."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -40,33 +40,65 @@ LONGER = 2  # forms with so many times the nodes of the shortest are not written
 SOLVED = 2  # forms of least cost that are solved for a and compared
 
 
-def derive(scene: SymbolicSystem, eps: float, limit: int | None) -> Equations:
-    """Derive the equations in the cheapest of the available forms.
+class Derivation(NamedTuple):
+    """M, h, A and gamma in several forms, which may be solved in different ways.
+
+    Attributes:
+        lagrangian: L, simplified if possible.
+        forms: the shortest ones, least cost first.
+        cancelled: whether coefficients of A or gamma may be rounding.
+    """
+
+    lagrangian: Node
+    forms: list["TermForm"]
+    cancelled: bool
+
+
+def derivation(scene: SymbolicSystem, limit: int | None) -> Derivation:
+    """Derive the terms in the available forms.
 
     Raises:
-        Unsupported: the solve or the mass matrix alone takes more operations than the limit.
+        Unsupported: the mass matrix alone takes more operations than the limit.
     """
-    graph = scene.graph
-    if limit is not None:
-        least = least_operations(pattern(scene))
-        if least > limit:
-            raise Unsupported(f"at least {least} operations, more than {limit}")
-    if scene.kinematics is not None:
-        return derive_rates(scene, eps)
-    residues = Residues()
-    simplified, forms = _forms(scene, residues, limit)
+    graph, bound, residues = scene.graph, scene.constrained, Residues()
+    graph.cancelled = bound is not None and bound.cancelled
+    of_v = _rows(scene)
+    cancelled = graph.cancelled
+    simplified, forms = _forms(scene, of_v, residues, limit)
     sizes = [len(order([x for row in f.M for x in row] + f.h)) for f in forms]
     short = [f for f, size in zip(forms, sizes, strict=True) if size <= LONGER * min(sizes)]
-    parts = [_Parts.of(scene, form, residues) for form in short]
-    parts.sort(key=lambda each: each.cost)
-    found = [_solved(scene, each, eps) for each in parts[:SOLVED]]
-    best = min(found, key=lambda e: e.program.cost)
-    best = best._replace(lagrangian=simplified)
+    terms = [TermForm.of(scene, form, residues) for form in short]
+    return Derivation(simplified, sorted(terms, key=lambda each: each.cost), cancelled)
+
+
+def derive(scene: SymbolicSystem, terms: Derivation | None, eps: float) -> tuple[Equations, int]:
+    """The equations in the form that is cheapest to solve, and the number of that form.
+
+    Args:
+        scene: the system.
+        terms: of the same system; None if its state has quasi-velocities.
+        eps: rounding of the state.
+    """
+    graph = scene.graph
+    if terms is None:
+        return derive_rates(scene, eps), 0
+    found = [_solved(scene, form, eps) for form in terms.forms[:SOLVED]]
+    form = min(range(len(found)), key=lambda i: found[i].program.cost)
+    best = found[form]._replace(lagrangian=terms.lagrangian)
     bound = scene.constrained
     if bound is None or best.rows is None:
-        return best
+        return best, form
     lam = None if best.lam is None else assemble(graph, best.lam)
-    return best._replace(surface=surface(graph, best.mass, best.rows.A, bound, eps, lam))
+    return best._replace(surface=surface(graph, best.mass, best.rows.A, bound, eps, lam)), form
+
+
+def check_length(scene: SymbolicSystem, limit: int | None) -> None:
+    """Raise `Unsupported` if the solve alone takes more operations than the limit."""
+    if limit is None:
+        return
+    least = least_operations(pattern(scene))
+    if least > limit:
+        raise Unsupported(f"at least {least} operations, more than {limit}")
 
 
 class _Form(NamedTuple):
@@ -103,7 +135,7 @@ def _rows(scene: SymbolicSystem) -> SymbolicRows | None:
 
 
 def _forms(
-    scene: SymbolicSystem, residues: Residues, limit: int | None
+    scene: SymbolicSystem, of_v: SymbolicRows | None, residues: Residues, limit: int | None
 ) -> tuple[Node, list[_Form]]:
     """L, simplified if possible, and several forms.
 
@@ -158,59 +190,70 @@ def _forms(
             short = expanded(best)
             if short is not None:
                 forms.append((f"{label}, expanded", short))
-    none, of_v = Literals(graph), _rows(scene)
+    none = Literals(graph)
     found = [_Form(label, mass, h, of_v, none) for label, h in forms]
     if by_dalembert is not None:
         found.append(_Form("d'Alembert's principle", *by_dalembert, _rows(exact), literals))
     return written[-1], found
 
 
-class _Parts(NamedTuple):
-    """The parts of the equations in one form, of equal expressions only one.
+class TermForm(NamedTuple):
+    """M, h, A and gamma in one form, of equal expressions only one.
 
     Attributes:
         label: the name of the form.
         M: mass matrix.
-        right: Q - h, without forces that depend on multipliers.
         h: bias.
         rows: A and gamma; None without constraints.
-        cost: of M, the right side, A and gamma.
+        cost: of all of them.
     """
 
     label: str
     M: list[list[Node]]
-    right: list[Node]
     h: list[Node]
     rows: SymbolicRows | None
     cost: float
 
     @classmethod
-    def of(cls, scene: SymbolicSystem, form: _Form, residues: Residues) -> "_Parts":
-        """The parts of a form."""
-        graph, n = scene.graph, len(form.h)
-        force, found_rows = scene.force or (), form.rows
-        flat = [*(form.M[i][j] for i in range(n) for j in range(i + 1)), *form.h, *force]
-        if found_rows is not None:
-            flat += [*(x for row in found_rows.A for x in row), *found_rows.gamma]
-        found = iter(form.literals.restored(merged(graph, flat, residues)))
+    def of(cls, scene: SymbolicSystem, form: _Form, residues: Residues) -> "TermForm":
+        """The terms of a form."""
+        restored = form.literals.restored
+        found = cls(form.label, form.M, form.h, form.rows, 0.0)
+        found, _ = found._merged(scene, [], residues, restored)
+        A, gamma = ([], []) if found.rows is None else found.rows
+        lower = [x for i, row in enumerate(found.M) for x in row[: i + 1]]
+        roots = [*lower, *found.h, *(x for row in A for x in row), *gamma]
+        return found._replace(cost=assemble(scene.graph, roots).cost)
+
+    def with_force(self, scene: SymbolicSystem) -> tuple["TermForm", list[Node]]:
+        """(the terms, Q - h), with what they have in common computed once."""
+        if not scene.force:
+            return self, [scene.graph.scale(x, -1.0) for x in self.h]
+        found, force = self._merged(scene, list(scene.force), Residues(), list)
+        return found, [scene.graph.sub(*pair) for pair in zip(force, found.h, strict=True)]
+
+    def _merged(
+        self, scene: SymbolicSystem, force: list[Node], residues: Residues, restored: Callable
+    ) -> tuple["TermForm", list[Node]]:
+        """(the terms, the force), of equal expressions only one, and with restored numbers."""
+        n, rows = len(self.h), self.rows
+        flat = [*(self.M[i][j] for i in range(n) for j in range(i + 1)), *self.h, *force]
+        if rows is not None:
+            flat += [*(x for row in rows.A for x in row), *rows.gamma]
+        found = iter(restored(merged(scene.graph, flat, residues)))
         lower = [[next(found) for _ in range(i + 1)] for i in range(n)]
         M = [[lower[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
-        h = [next(found) for _ in range(n)]
-        right = [graph.scale(x, -1.0) for x in h]
-        if force:
-            right = [graph.sub(next(found), x) for x in h]
-        roots = [*(x for row in lower for x in row), *right]
-        if found_rows is not None:
-            A = [[next(found) for _ in row] for row in found_rows.A]
-            found_rows = SymbolicRows(A, list(found))
-            roots += [*(x for row in A for x in row), *found_rows.gamma]
-        return cls(form.label, M, right, h, found_rows, assemble(graph, roots).cost)
+        h, force = [next(found) for _ in range(n)], [next(found) for _ in force]
+        if rows is not None:
+            A = [[next(found) for _ in row] for row in rows.A]
+            rows = SymbolicRows(A, list(found))
+        return self._replace(M=M, h=h, rows=rows), force
 
 
-def _solved(scene: SymbolicSystem, parts: _Parts, eps: float) -> Equations:
+def _solved(scene: SymbolicSystem, terms: TermForm, eps: float) -> Equations:
     """The equations of one form, solved for a."""
     graph, bound, lam = scene.graph, scene.constrained, None
-    label, M, right, h, found_rows, _ = parts
+    (label, M, h, found_rows, _), right = terms.with_force(scene)
     reactive = None if bound is None else reaction(graph, bound)
     if bound is None or found_rows is None:
         a = solve(graph, M, right, eps)

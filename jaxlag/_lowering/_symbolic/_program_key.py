@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxlag._linalg._kkt import FORMULATIONS
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._quasi_velocities import QuasiVelocities
@@ -33,6 +34,18 @@ class Key(NamedTuple):
     quasi: QuasiVelocities | None
     in_u: Callable | None
     crossing: bool
+
+    @property
+    def of_terms(self) -> "Key":
+        """The key of M, h, A and gamma, without forces and options of the solve for a."""
+        return self._replace(
+            forces=(),
+            inputs=_params.Static({}),
+            formulation=FORMULATIONS[0],
+            regular=False,
+            contact_rows_independent=False,
+            crossing=False,
+        )
 
 
 def key_of(terms: ArrayTerms, q: Any, params: Any, inputs: Mapping[str, Any], limit: Any) -> Key:

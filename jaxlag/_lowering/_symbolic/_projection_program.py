@@ -14,16 +14,15 @@ class ProjectionCode(NamedTuple):
     Attributes:
         position: phi of the holonomic rows.
         velocity: A v + b.
-        shift: columns from phi to a change of q.
-        kick: columns from A v + b to a change of v; None if they equal those of `shift`.
-            Columns of all rows are followed by the diagonal of (A M^-1 A^T)^-1 if requested.
+        correction: columns from phi to a change of q, unless they are some of the next ones; then
+            columns from A v + b to a change of v; then the diagonal of (A M^-1 A^T)^-1 if
+            requested.
         lam: multipliers; None if no force depends on them.
     """
 
     position: Program
     velocity: Program
-    shift: Program
-    kick: Program | None
+    correction: Program
     lam: Program | None
 
 
@@ -37,19 +36,18 @@ def surface(
 ) -> ProjectionCode:
     """Code for the residuals and their corrections."""
     holonomic_rows = [k for k, holonomic in enumerate(bound.holonomic) if holonomic]
-    mixed = 0 < len(holonomic_rows) < len(A)
+    every = list(range(len(A)))
 
-    def columns(chosen: Sequence[int]) -> Program:
+    def columns(chosen: Sequence[int]) -> tuple[list[Node], list[Node]]:
         how = bound.active_rows, bound.regular, chosen, bound.crossing
         found, masses = correction(graph, M, A, eps, *how)
-        masses = masses if len(chosen) == len(A) else []
-        return assemble(graph, [*(x for column in found for x in column), *masses])
+        return [x for column in found for x in column], masses
 
-    every = columns(range(len(A)))
+    of_position = columns(holonomic_rows)[0] if 0 < len(holonomic_rows) < len(A) else []
+    of_velocity, masses = columns(every)
     return ProjectionCode(
         assemble(graph, list(bound.position)),
         assemble(graph, list(bound.velocity)),
-        columns(holonomic_rows) if mixed else every,
-        every if mixed else None,
+        assemble(graph, [*of_position, *of_velocity, *masses]),
         lam,
     )

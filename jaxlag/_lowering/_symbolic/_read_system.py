@@ -28,12 +28,8 @@ def read_scene(key: Key) -> SymbolicSystem:
     Raises:
         Unsupported: a part without scalar form.
     """
-    for name, like in (("params", key.params), ("inputs", key.inputs)):
-        kinds = {leaf.dtype for leaf in jax.tree.leaves(like.tree)}
-        if any(jnp.issubdtype(kind, jnp.integer) for kind in kinds):
-            raise Unsupported(
-                f"integers among the {name}, whose division differs from that of floats"
-            )
+    _check_kinds("params", key.params)
+    _check_kinds("inputs", key.inputs)
     graph, n = Graph(), key.size
     t = graph.input("t", 0)
     # The velocities of a state (q, u) are not inputs of its equations.
@@ -57,6 +53,40 @@ def read_scene(key: Key) -> SymbolicSystem:
     bound = _constrained(key, graph, state, params, inputs) if _included(key) else None
     count = sum(1 for _ in equations(of_L.jaxpr))
     return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics, count)
+
+
+def with_forces(scene: SymbolicSystem, key: Key) -> SymbolicSystem:
+    """The system of a key, from its terms without forces, on a graph of its own.
+
+    Raises:
+        Unsupported: a force without scalar form.
+    """
+    _check_kinds("inputs", key.inputs)
+    graph, bound = scene.graph.copy(), scene.constrained
+    state = [_array([scene.t], ()), *(_array(list(x), (-1,)) for x in (scene.q, scene.v))]
+    given = [*state, *_inputs(graph, "params", key.params), *_inputs(graph, "inputs", key.inputs)]
+    force = None
+    if key.forces:
+        terms = ArrayTerms(key.lagrangian, key.forces)
+        (Q,) = read(graph, traced(key, terms.force, True), *given)
+        force = [_node(graph, x) for x in Q]
+    if bound is not None:
+        bound = bound._replace(
+            formulation=key.formulation, regular=key.regular, crossing=key.crossing
+        )
+        if any(map(reads_lam, key.forces)):
+            bound = _with_reactions(key, graph, bound, given)
+    return scene._replace(graph=graph, force=force, constrained=bound)
+
+
+def _with_reactions(key: Key, graph: Graph, bound: Constrained, given: list) -> Constrained:
+    """The constraints, with the forces that read multipliers."""
+    terms, m = ArrayTerms(key.lagrangian, key.forces, _included(key)), len(bound.velocity)
+    chosen, sharing = np.flatnonzero(rows_that_forces_read(key, terms)).tolist(), None
+    if bound.active_rows is not None and len(chosen) > 1 and not key.contact_rows_independent:
+        sharing = Sharing(chosen, [graph.input("nonzero", x.data[1]) for x in bound.active_rows])
+    (Q,) = read(graph, traced(key, terms.reactive, True, m), *given, _array(list(bound.lam), (m,)))
+    return bound._replace(reaction=[_node(graph, x) for x in Q], sharing=sharing)
 
 
 def _included(key: Key) -> tuple[AbstractConstraint, ...]:
@@ -88,31 +118,24 @@ def _kinematics(key: Key, graph: Graph, state: list, params: list) -> Kinematics
 
 def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list) -> Constrained:
     terms = ArrayTerms(key.lagrangian, key.forces, _included(key))
+    graph.cancelled = False
     (rates,) = read(graph, traced(key, terms.velocity, False), *state, *params)
 
     def position(t: Any, q: Any, v: Any, params: Any) -> Any:
         return terms.position(t, q, params)
 
     (phi,) = read(graph, traced(key, position, False), *state, *params)
-    m = rates.size
+    cancelled, m = graph.cancelled, rates.size
     layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
     every = layout.holonomic
     included = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
     active_rows = [graph.input("active_rows", k) for k in included] if layout.chooses else None
     holonomic = [every[k] for k in included]
-    lam, reaction = [graph.input("lam", k) for k in range(m)], None
-    sharing = None
-    if any(map(reads_lam, key.forces)):
-        chosen = np.flatnonzero(rows_that_forces_read(key, terms)).tolist()
-        if active_rows is not None and len(chosen) > 1 and not key.contact_rows_independent:
-            sharing = Sharing(chosen, [graph.input("nonzero", k) for k in included])
-        code = traced(key, terms.reactive, True, m)
-        (Q,) = read(graph, code, *state, *params, *inputs, _array(lam, (m,)))
-        reaction = [_node(graph, x) for x in Q]
+    lam = [graph.input("lam", k) for k in range(m)]
     damping = None
     if key.baumgarte is not None:
         damping = 2.0 * key.baumgarte.alpha, key.baumgarte.beta**2
-    return Constrained(
+    bound = Constrained(
         [_node(graph, x) for x in rates],
         [_node(graph, x) for x in phi],
         holonomic,
@@ -120,11 +143,13 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         key.formulation,
         damping,
         key.regular,
-        reaction,
-        lam,
-        sharing,
-        key.crossing,
+        lam=lam,
+        crossing=key.crossing,
+        cancelled=cancelled,
     )
+    if any(map(reads_lam, key.forces)):
+        return _with_reactions(key, graph, bound, [*state, *params, *inputs])
+    return bound
 
 
 def rows_that_forces_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
@@ -141,6 +166,12 @@ def rows_that_forces_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
 
 def _node(graph: Graph, x: Any) -> Node:
     return x if isinstance(x, Node) else graph.const(float(x))
+
+
+def _check_kinds(name: str, like: _params.Static) -> None:
+    kinds = {leaf.dtype for leaf in jax.tree.leaves(like.tree)}
+    if any(jnp.issubdtype(kind, jnp.integer) for kind in kinds):
+        raise Unsupported(f"integers among the {name}, whose division differs from that of floats")
 
 
 def _inputs(graph: Graph, name: str, like: _params.Static) -> list[np.ndarray]:

@@ -1,0 +1,1 @@
+"""Verification of scalar programs against the array program."""

@@ -1,0 +1,228 @@
+"""The interpreter of straight-line code: results, derivatives, rounding, and its constant size."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from _families import mostly_full
+from _jaxprs import loop, operations
+from _lowered import lowered
+
+import jaxlag as jl
+from jaxlag._lowering._emit import _emit, _interpreter
+from jaxlag._lowering._emit._code import Code, body_of, prelude_of, whole_of
+from jaxlag._lowering._emit._execute import straight
+from jaxlag._lowering._graph._expression import COS, SIN, Graph, named
+from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+
+EPS = np.finfo(float).eps
+ABS = named("abs")
+P = {"m": 1.2, "l": 0.7}
+
+
+def lagrangian(t, q, v, p):
+    """Every kind of line: functions, roots, choices, divisions, parts that depend on params."""
+    T = 0.5 * p["m"] * v @ v + 0.3 * v[0] * v[1] * jnp.cos(q[0] - q[1] + t)
+    V = jnp.where(q[0] > 0.0, q[0] ** 2, jnp.abs(q[1])) - jnp.maximum(jnp.sin(q[0]), q[1])
+    V = V + jnp.exp(-(q[1] ** 2)) + jnp.sqrt(1.0 + p["l"] ** 2) * jnp.tanh(q[0]) / (2.0 + q[1])
+    return T - V
+
+
+SYSTEM = jl.System(lagrangian, ("x", "y"))
+
+
+def code():
+    """(code of the body, its given numbers, the function of their array by JAX)."""
+    program = lowered(SYSTEM, P).equations.program
+    carried = _emit.prelude(program, P, jnp.zeros(0).dtype)
+    state = {"t": [0.1], "q": [0.3, 0.8], "v": [0.2, -0.4]}
+    read = [state[name][i] for name, i in program.inputs if name not in _emit.FIXED]
+    count, one = len(program.carried), jnp.ones(())
+
+    def by_jax(x):
+        return jnp.stack(straight(program, x.dtype, [*x[:count], one], list(x[count:]), False))
+
+    return body_of(program), jnp.concatenate([carried[:-1], jnp.stack(read)]), by_jax
+
+
+def interpreted(code):
+    """The function of an array of the given numbers."""
+    function = _interpreter.interpreted(code, jnp.zeros(0).dtype, alone=True)
+    return lambda x: function(*x)
+
+
+def test_results_are_those_of_the_lines():
+    body, x, by_jax = code()
+    function = interpreted(body)
+    np.testing.assert_allclose(jax.jit(function)(x), by_jax(x), rtol=4 * EPS)
+    several = jnp.stack([x * (1.0 + 0.01 * i) for i in range(40)])  # more than a chunk of lanes
+    found, expected = (jax.vmap(f)(several) for f in (function, by_jax))
+    np.testing.assert_allclose(found, expected, rtol=4 * EPS)
+
+
+def test_places_are_used_again():
+    body, *_ = code()
+    table = _interpreter.bytecode(body)
+    assert len(table.start) < 0.5 * (len(body.lines) + len(body.given))
+
+
+def test_results_may_be_given_constant_or_repeated():
+    graph = Graph()
+    q, p = graph.input("q", 0), graph.input("params", 0)
+    above = graph.call(named("gt"), q, graph.const(0.5))
+    roots = [q, p, graph.const(2.0), graph.mul(q, q), q, graph.select(above, p, graph.one)]
+    function = interpreted(whole_of(assemble(graph, roots)))
+    expected = [0.7, 0.4, 2.0, 0.7 * 0.7, 0.7, 0.4]
+    np.testing.assert_allclose(function(jnp.array([0.7, 0.4])), expected, rtol=EPS)
+    slopes = [[1, 0], [0, 1], [0, 0], [1.4, 0], [1, 0], [0, 1]]
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(function)(jnp.array([0.7, 0.4])), slopes, rtol=EPS)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_truth_values_may_be_given(mode):
+    """A comparison of params, which the prelude carries into the body."""
+    graph = Graph()
+    q, p = graph.input("q", 0), graph.input("params", 0)
+    above = graph.call(named("gt"), p, graph.const(0.5))
+    program = assemble(graph, [graph.select(above, graph.mul(q, q), q)])
+    assert len(program.prelude) == 1
+    function = interpreted(body_of(program))
+    for carried, slope in ((1.0, 1.4), (0.0, 1.0)):
+        found = mode(lambda q, c=carried: function(jnp.array([c, 0.0]).at[1].set(q))[0])(0.7)
+        np.testing.assert_allclose(found, slope, rtol=EPS)
+
+
+def test_code_without_lines_or_numbers():
+    graph = Graph()
+    assert interpreted(whole_of(assemble(graph, [])))(jnp.zeros(0)).shape == (0,)
+    found = interpreted(whole_of(assemble(graph, [graph.const(3.0)])))(jnp.zeros(0))
+    assert found.tolist() == [3.0]
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_are_those_of_the_lines(mode):
+    body, x, by_jax = code()
+    function, expected = interpreted(body), mode(by_jax)(x)
+    tolerance = 16 * EPS * np.max(np.abs(expected))
+    np.testing.assert_allclose(mode(function)(x), expected, rtol=0, atol=tolerance)
+    lanes = jax.vmap(mode(function))(jnp.stack([x, 1.1 * x]))
+    np.testing.assert_allclose(lanes[0], expected, rtol=0, atol=tolerance)
+
+
+PAIRS = [(a, b) for a in (jax.grad, jax.jacfwd) for b in (jax.grad, jax.jacfwd)]
+
+
+@pytest.mark.parametrize(("outer", "inner"), PAIRS)
+def test_numbers_that_do_not_move_have_no_tangents(outer, inner):
+    """q^2 + q sqrt(p) at p = 0, where the root has an infinite slope."""
+    graph = Graph()
+    q, p = graph.input("q", 0), graph.input("params", 0)
+    program = assemble(graph, [graph.add(graph.mul(q, q), graph.mul(q, graph.sqrt(p)))])
+    function = _interpreter.interpreted(whole_of(program), jnp.zeros(0).dtype, alone=True)
+
+    def of_q(q):
+        given = {"q": q, "params": jnp.zeros(())}
+        return function(*(given[name] for name, _ in program.inputs))[0]
+
+    np.testing.assert_allclose(inner(of_q)(0.7), 1.4, rtol=EPS)
+    np.testing.assert_allclose(outer(inner(of_q))(0.7), 2.0, rtol=EPS)
+
+
+def test_functions_whose_derivatives_have_no_code(monkeypatch):
+    """Their derivatives are JAX's, of the same lines."""
+
+    def without(*_):
+        raise Unsupported("no code")
+
+    monkeypatch.setattr(_interpreter, "tangent", without)
+    body, x, by_jax = code()
+    function = interpreted(Code(*body))  # another object: nothing is known of it
+    for mode in (jax.jacfwd, jax.jacrev):
+        expected = mode(by_jax)(x)
+        tolerance = 16 * EPS * np.max(np.abs(expected))
+        np.testing.assert_allclose(mode(function)(x), expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner"),
+    mostly_full(
+        [(a, b) for a in (jax.jacfwd, jax.jacrev) for b in (jax.jacfwd, jax.jacrev)],
+        [(jax.jacfwd, jax.jacrev)],
+    ),
+)
+def test_second_derivatives_are_those_of_the_lines(outer, inner):
+    body, x, by_jax = code()
+    function, expected = interpreted(body), outer(inner(by_jax))(x)
+    found = jax.jit(outer(inner(function)))(x)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=64 * EPS * np.max(np.abs(expected)))
+
+
+def test_the_prelude_is_a_function_of_params():
+    _, x, _ = code()
+    program = lowered(SYSTEM, P).equations.program
+    given = _emit.fixed_inputs(program, P, x.dtype, {})
+    found = interpreted(prelude_of(program))(jnp.stack(list(given.values())))
+    np.testing.assert_allclose(found, x[: len(program.carried)], rtol=4 * EPS)
+
+
+def test_size_does_not_grow_with_the_code():
+    """The same kinds of lines in chains of 3 and of 6 links."""
+
+    def equations(n):
+        def L(t, q, v, p):
+            x, y = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
+            return 0.5 * p * (x @ x + y @ y) + jnp.sum(jnp.cos(q))
+
+        body = body_of(lowered(jl.System(L, {"q": (n,)}), 2.0).equations.program)
+        function = _interpreter.interpreted(body, jnp.zeros(0).dtype, alone=True)
+        given = [jnp.ones(())] * len(body.given)
+        return len(body.lines), len(loop(operations(function, *given, iterations=1)))
+
+    (short, few), (long, many) = equations(3), equations(6)
+    assert long > 3 * short
+    assert many == few
+
+
+# ---- Rounding --------------------------------------------------------------------------------
+
+
+def bounds(build, x):
+    """(result, rounding) of one expression in q[0], and its value by the plain interpreter."""
+    graph = Graph()
+    program = assemble(graph, [build(graph, graph.input("q", 0))])
+    given, whole = jnp.array([x]), whole_of(program)
+    found = _interpreter.with_changes(whole, np.ones(1, bool), list(given), given.dtype)
+    (exact,), (bound,) = found
+    assert float(exact) == float(interpreted(whole)(given)[0])
+    return float(exact), float(bound)
+
+
+def test_rounding_has_the_size_of_the_terms():
+    """sin^2 + cos^2 - 1 is at most a few roundings of 1."""
+
+    def identity(graph, q):
+        squares = [(graph.power(graph.call(f, q), 2), 1.0) for f in (SIN, COS)]
+        return graph.sum(squares, -1.0)
+
+    exact, bound = bounds(identity, 0.3)
+    assert 0.25 < bound / EPS < 4.0
+    assert abs(exact) < 4.0 * bound
+
+
+def test_exact_lines_add_no_rounding():
+    """Of |-q| only the rounding of q itself is left."""
+    exact, bound = bounds(lambda graph, q: graph.call(ABS, graph.scale(q, -1.0)), 0.3)
+    assert exact == 0.3
+    assert 0.25 < bound / (0.3 * EPS) < 1.5
+
+
+def test_runs_decide_as_the_exact_one():
+    """Beside a jump of 100, changed values are on the other side of it."""
+
+    def jump(graph, q):
+        above = graph.call(named("gt"), q, graph.const(0.5))
+        return graph.select(above, graph.const(100.0), graph.zero)
+
+    assert bounds(jump, 0.5 * (1.0 + 2.0 * EPS)) == (100.0, 0.0)
