@@ -33,6 +33,24 @@ print(pendulum.explain(9.81))
 """
 
 
+INTERPRETED = """
+import jax, jax.numpy as jnp
+import jaxlag as jl
+from jaxlag._lowering import _term_codes
+from jaxlag._lowering._emit import _emit
+_term_codes.LONG = _emit.INTERPRET_FROM = -1
+jax.config.update("jax_enable_x64", True)
+rod = jl.Holonomic(lambda t, q, p: q @ q - 1.0, "rod")
+L = lambda t, q, v, p: 0.5 * v @ v - p * q[1]
+bob = jl.System(L, ("x", "y"), constraints=(rod,))
+run = lambda q0: jl.simulate(bob, q0, [0.0, 0.1], [0.0, 1.0], 9.81).q
+text = jax.jit(run).lower(jnp.array([1.0, 0.0])).compile().as_text()
+entry = text[text.index("ENTRY"):].splitlines()
+print("entry loops left:", sum(" while(" in line for line in entry))
+print("functions chosen by a number:", " conditional(" in text)
+"""
+
+
 def child(before="", first="", code="", **environment):
     code = code or SOLVE.format(before=before, first=first)
     env = {
@@ -56,6 +74,12 @@ def test_solver_loop_is_one_native_function():
     assert done.stdout.splitlines()[:2] == ["entry loops left: 0", "True"]
     assert "solver loops compile to one native function" in done.stdout
     assert "Warning" not in done.stderr
+
+
+def test_loop_with_interpreted_code_is_one_native_function():
+    """With XLA's emitters of fusions, which the tests switch off, a scatter would prevent that."""
+    lines = child(code=INTERPRETED).stdout.splitlines()
+    assert lines == ["entry loops left: 0", "functions chosen by a number: True"]
 
 
 def test_existing_options_stay_set():

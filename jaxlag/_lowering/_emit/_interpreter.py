@@ -40,8 +40,7 @@ class Bytecode(NamedTuple):
         functions: of as many numbers as the longest line has operands.
         exact: for every function whether its results are not rounded.
         truths: for every function whether its results are truth values.
-        start: numbers in the places at the start; 0 for those that are given.
-        given: places of the given numbers.
+        start: numbers in the places at the start; 0 for the given ones, which are the first.
         results: places of the results.
     """
 
@@ -50,7 +49,6 @@ class Bytecode(NamedTuple):
     exact: tuple[bool, ...]
     truths: tuple[bool, ...]
     start: np.ndarray
-    given: np.ndarray
     results: np.ndarray
 
     @property
@@ -74,7 +72,7 @@ def bytecode(code: Code) -> Bytecode:
     last |= dict.fromkeys(code.results, len(code.lines))
     numbers = [slot for slot in last if slot in code.numbers]
     place = {slot: at for at, slot in enumerate([*code.given, *numbers])}
-    count, free = len(place), []
+    count, free = len(code.given) + len(numbers), []
     kinds: dict[Any, int] = {}
     functions: list[Callable] = []
     exact: list[bool] = []
@@ -105,7 +103,6 @@ def bytecode(code: Code) -> Bytecode:
         tuple(exact),
         tuple(truth for *_, truth in kinds),
         start,
-        np.array([place[slot] for slot in code.given], np.int32),
         np.array([place[slot] for slot in code.results], np.int32),
     )
 
@@ -155,8 +152,9 @@ def _entry(array: Array, at: Array) -> Array:
 
 
 def _start(code: Bytecode, given: Sequence[Array], dtype: Any) -> Array:
-    start = jnp.asarray(code.start, dtype)
-    return start.at[code.given].set(jnp.stack(list(given))) if len(given) else start
+    """The numbers at the start; a scatter in a loop would keep XLA from making it one function."""
+    rest = jnp.asarray(code.start[len(given) :], dtype)
+    return jnp.concatenate([jnp.stack(list(given)), rest]) if len(given) else rest
 
 
 @lru_cache(maxsize=512)
@@ -271,8 +269,7 @@ def with_changes(
 
     def single(*given: Array) -> tuple[Array, Array]:
         start = _start(table, given, dtype)
-        start = jnp.broadcast_to(start[:, None], (start.size, RUNS + 1))
-        start = start.at[table.given].multiply(factors(changed))
+        start = start[:, None] * factors(np.pad(changed, (0, start.size - changed.size)))
         found = _xla.native(partial(_loop, table, functions), start, factors(rounded))
         found = found[table.results]
         bounds = jnp.max(jnp.abs(found[:, 1:] - found[:, :1]), axis=1) / STRENGTH
