@@ -11,11 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlag._linalg._independent_rows import RowChoice, independent_rows, shared
-from jaxlag._linalg._kkt import (
-    solve_kkt,
-    solve_reactions,
-    units_of,
-)
+from jaxlag._linalg._kkt import solve_kkt, solve_reactions, units_of
 from jaxlag._linalg._mass_solve import MassFactor, factor_mass, solve_mass
 from jaxlag._linalg._row_residuals import redundant_rows_hold, row_sizes
 from jaxlag._lowering._row_layout import layout

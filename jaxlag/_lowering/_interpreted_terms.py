@@ -42,7 +42,7 @@ def interpreted_terms(
     """
     if not array.constraints or key.quasi is not None or key.dtype != jnp.result_type(float):
         return None
-    codes = lower_terms(key, sample) if _interpreter.available() else None
+    codes = lower_terms(key.of_terms, sample) if _interpreter.available() else None
     if codes is None or not codes.are_long:
         return None
     return InterpretedTerms(array, codes, alone)

@@ -35,7 +35,7 @@ UNITS = 15
 # The same for each operation on arrays in L. The array program has about 7 of them for each one of
 # L, and each takes longer to compile than a line of scalar code. First result, next ones, scalar |
 # array: bicycle of four bodies by poses (2076 in L, 3023 scalar operations) 70 s, 10 ms | 134 s,
-# 667 ms.
+# 667 ms; 11 s, 6.5 ms | not measured since terms that run seldom are interpreted.
 OF_ARRAYS = 2
 
 
@@ -80,14 +80,14 @@ def lower_terms(key: Key, sample: _params.Sample) -> TermCodes | None:
     numbers, whose rounding is unknown.
 
     Args:
-        key: key of a program; the terms do not depend on how it solves for accelerations.
+        key: `of_terms` of the key of a program.
         sample: as for `lower`.
     """
     try:
-        read = _read(key.of_terms)
+        read = _read(key)
         if read.terms is None or read.terms.cancelled:
             return None
-        if not _verified(key.of_terms, 0, sample).sound:
+        if not _verified(key, 0, sample).sound:
             return None
     except OutOfRange:
         raise
