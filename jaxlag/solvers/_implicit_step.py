@@ -22,10 +22,11 @@ def root(residual: Callable[[Array], Array], guess: Array, rounded: Array) -> tu
     The Jacobian is kept between iterations. They stop when the increment of no component decreases,
     or when it is the last digit of the component. Increments are then rounding, so that no
     tolerance adds an error of one sign in every step. Rounding may decrease again by chance: if all
-    increments are small, a component that has stopped stays so. Near an equilibrium z itself is
-    rounding, and increments are not small relative to z. The Jacobian is then recomputed: if it is
-    unchanged, the iteration contracts, and increments that do not decrease are noise. Slow
-    iterations also continue with the new Jacobian.
+    increments are small, a component that has stopped stays so. Near an equilibrium, or where one
+    coordinate rests at 0, z itself is rounding, and increments are not small relative to z. The
+    Jacobian is then recomputed: if it is unchanged, the iteration contracts, and increments that do
+    not decrease are noise; such components stay stopped, too. Slow iterations also continue with
+    the new Jacobian.
 
     The derivative of z is that of the solution, dz = -(dr/dz)^-1 dr: forward, reverse, and forward
     over reverse to any order. JAX refuses reverse over reverse through a loop of steps.
@@ -67,7 +68,7 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
     count, eps = rounded.shape[0], jnp.finfo(guess.dtype).eps
     no, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
 
-    def iterate(factor: Any, z: Array) -> tuple[Array, Array, Array]:
+    def iterate(factor: Any, z: Array, contracts: Array) -> tuple[Array, Array, Array]:
         """(z, whether increments stopped decreasing, whether they are small)."""
 
         def body_fun(carry: tuple) -> tuple:
@@ -77,7 +78,7 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
             scale = jnp.abs(z[:count]) + jnp.abs(guess[:count])
             new = jnp.minimum(least[-1], size)
             small = jnp.all(size <= eps**0.75 * (scale + rounded))
-            stopped = stopped & was_small & small
+            stopped = stopped & (contracts | (was_small & small))
             stopped = stopped | (size <= eps * scale) | ~(new < 0.5 * least[0])
             return z, jnp.stack([*least[1:], new]), stopped, small, k + 1
 
@@ -93,9 +94,9 @@ def _solved(residual: Callable, guess: Array, rounded: Array) -> tuple[Array, Ar
         z, slope, _, k = carry
         new = jax.jacfwd(residual)(z)
         factor = lu_factor(new)
-        unlike = _radius(jnp.eye(z.shape[0], dtype=z.dtype) - lu_solve(factor, slope))
-        z, stopped, small = iterate(factor, z)
-        return z, new, stopped & (small | (unlike < 0.5)), k + 1
+        contracts = _radius(jnp.eye(z.shape[0], dtype=z.dtype) - lu_solve(factor, slope)) < 0.5
+        z, stopped, small = iterate(factor, z, contracts)
+        return z, new, stopped & (small | contracts), k + 1
 
     def cond_fun(carry: tuple) -> Array:
         z, _, done, k = carry
