@@ -4,6 +4,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._straight_line import assemble
@@ -15,6 +16,7 @@ from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSyste
 from jaxlag._lowering._term_codes import TermCodes
 from jaxlag._lowering._verification._compared_accelerations import ComparedAccelerations
 from jaxlag._lowering._verification._compared_rates import ComparedRates
+from jaxlag._lowering._verification._compared_state import is_definite, numbers, random_state
 from jaxlag._lowering._verification._compared_terms import ComparedForces, ComparedTerms, TermNodes
 from jaxlag._lowering._verification._verify import Verification, compare
 from jaxlag._tracing import _params
@@ -110,6 +112,25 @@ def lower_terms(key: Key, sample: _params.Sample) -> TermCodes | None:
     if any(program.has_rules for program in programs.values()):
         return None
     return TermCodes(programs)
+
+
+@lru_cache(maxsize=256)
+def usually_definite(key: Key, sample: _params.Sample) -> bool:
+    """Whether M is positive definite without the constraints, in a random state.
+
+    True if there are no terms by themselves, as with quasi-velocities.
+
+    Args:
+        key: key of a program that exists.
+        sample: params if they are known; otherwise they are random.
+    """
+    if key.quasi is not None:
+        return True
+    terms, n = _read(key.of_terms).terms, key.size
+    assert terms is not None
+    at = random_state(key, np.random.default_rng(0), sample.leaves)
+    M = numbers([x for row in terms.forms[0].M for x in row], at)
+    return is_definite(M.reshape(n, n))
 
 
 def _lowered(key: Key, sample: _params.Sample) -> Lowered:

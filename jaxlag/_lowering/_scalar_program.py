@@ -23,7 +23,7 @@ from jaxlag._lowering._array_terms import ArrayTerms, SolveConstants
 from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._lowering._interpreted_terms import interpreted_terms
-from jaxlag._lowering._lower import Lowered, lower
+from jaxlag._lowering._lower import Lowered, lower, usually_definite
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._symbolic_system import Equations
 from jaxlag._lowering._terms import AbstractTerms
@@ -34,8 +34,8 @@ from jaxlag._tracing import _params
 class ScalarSolveConstants(NamedTuple):
     """Values of each program that do not change during a solve.
 
-    If it is unknown while tracing whether M is positive definite without the constraints, there
-    are programs for both cases.
+    If it is unknown while tracing whether M is positive definite without the constraints, and it
+    usually is, there are programs for both cases. The one for the unusual case is interpreted.
 
     Attributes:
         definite: whether it is, in all lanes.
@@ -101,11 +101,18 @@ class ScalarProgram(AccelerationProgram):
         constants = self._precomputed(*given)
         if constants is None:
             return self._on_arrays.precompute(*given)
-        if choices.definite is not None:
+        if choices.definite is not None and self._usually_definite(*given):
             alone = self.regular()._precomputed(*given)
             if alone is not None:
                 constants = constants._replace(definite=choices.definite(), alone=alone)
         return constants
+
+    def _usually_definite(
+        self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices
+    ) -> bool:
+        key = key_of(self.array, q, params, inputs, self.limit)
+        sample = _params.sample(_params.split(params)[0], choices.sample)
+        return usually_definite(key, sample)
 
     def _precomputed(
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices
@@ -204,7 +211,8 @@ class ScalarProgram(AccelerationProgram):
         if constants.alone is None or name not in _BY_MASS or projected:
             return by(self, constants)
         alone = partial(by, self.regular(), constants.alone)
-        return lax.cond(constants.definite, alone, partial(by, self, constants))
+        general = self if self.array.quasi is not None else replace(self, seldom=True)
+        return lax.cond(constants.definite, alone, partial(by, general, constants))
 
     def regular(self) -> "ScalarProgram":
         """The same for an M that is positive definite without the constraints."""

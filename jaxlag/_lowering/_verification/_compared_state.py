@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.linalg import norm
@@ -80,6 +81,32 @@ def solution(key: Key, M: Any, right: Any) -> tuple[Any, float] | None:
     size = norm(right) + norm(M) * norm(x) + 1.0
     eps = float(jnp.finfo(key.dtype).eps)
     return x, float(SLACK * eps * size * norm(np.linalg.inv(M)))
+
+
+def random_state(key: Key, rng: np.random.Generator, known: list | None) -> State:
+    """A state with numbers of the size of 1, and with the known params or random ones.
+
+    Args:
+        key: key of a program.
+        rng: draws the numbers.
+        known: leaves of the params; None if they are random, too.
+    """
+    n = key.size
+    speeds = n if key.quasi is None else len(key.quasi.free)
+    t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
+    params = [
+        rng.uniform(0.5, 1.5, leaf.shape)
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+        else rng.integers(1, 4, leaf.shape).astype(leaf.dtype)
+        for leaf in jax.tree.leaves(key.params.tree)
+    ]
+    if known is not None:
+        params = [
+            np.asarray(x, np.float64 if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype)
+            for x in known
+        ]
+    inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in jax.tree.leaves(key.inputs.tree)]
+    return State(t, q, v, params, inputs, rng.uniform(-1.5, 1.5, n))
 
 
 def is_definite(M: Any) -> bool:

@@ -3,13 +3,17 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.linalg import norm
 
 from jaxlag._lowering._symbolic._program_key import Key
-from jaxlag._lowering._verification._compared_state import SLACK, Results, State
+from jaxlag._lowering._verification._compared_state import (
+    SLACK,
+    Results,
+    State,
+    random_state,
+)
 
 STATES = 8  # random states at which both programs are compared
 LEAST = 6  # least number of comparable states
@@ -64,27 +68,11 @@ def compare(
         known: leaves of the params; None if they are unknown.
     """
     rng = np.random.default_rng(0)
-    n = key.size
-    speeds = n if key.quasi is None else len(key.quasi.free)
     eps = float(jnp.finfo(key.dtype).eps)
-    like, given = jax.tree.leaves(key.params.tree), jax.tree.leaves(key.inputs.tree)
 
     def drawn(from_known: bool) -> float | None:
         """The difference at one more state; None if there is nothing to compare."""
-        t, q, v = rng.uniform(0, 1), rng.uniform(-1.5, 1.5, n), rng.uniform(-1.5, 1.5, speeds)
-        params = [
-            rng.uniform(0.5, 1.5, leaf.shape)
-            if jnp.issubdtype(leaf.dtype, jnp.floating)
-            else rng.integers(1, 4, leaf.shape).astype(leaf.dtype)
-            for leaf in like
-        ]
-        if from_known and known is not None:
-            params = [
-                np.asarray(x, np.float64 if jnp.issubdtype(x.dtype, jnp.floating) else x.dtype)
-                for x in known
-            ]
-        inputs = [rng.uniform(-1, 1, leaf.shape) for leaf in given]
-        at = State(t, q, v, params, inputs, rng.uniform(-1.5, 1.5, n))
+        at = random_state(key, rng, known if from_known else None)
         right = results(at)
         if right is None:
             return None
@@ -96,8 +84,8 @@ def compare(
             # Sines of a million lose digits in both programs: as many as a nudge changes.
             change = 0.0
             for _ in range(NUDGES):
-                signs = 1.0 + eps * rng.choice([-1.0, 1.0], (2, max(n, speeds)))
-                near = results(at._replace(q=q * signs[0, :n], v=v * signs[1, :speeds]))
+                signs = [1.0 + eps * rng.choice([-1.0, 1.0], x.size) for x in (at.q, at.v)]
+                near = results(at._replace(q=at.q * signs[0], v=at.v * signs[1]))
                 if near is None or near.x.shape != right.x.shape:
                     return None
                 change = max(change, float(np.max(np.abs(near.x - right.x))))

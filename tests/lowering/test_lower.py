@@ -1,0 +1,105 @@
+"""Mass matrices that are known only at run time: the expected program is compiled, not both."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._lowering._acceleration_program import Choices, State
+from jaxlag._lowering._emit._emit import INTERPRET_FROM
+from jaxlag._lowering._lower import usually_definite
+from jaxlag._lowering._scalar_program import ScalarProgram
+from jaxlag._lowering._symbolic._program_key import key_of
+from jaxlag._tracing import _params
+from tests._jaxprs import count, operations
+
+POINTS = 4
+NAMES = ["first", "second", "third", "fourth"]
+Q = jnp.array([1.0, 0.1, 1.9, 0.5, 2.9, 0.4, 3.4, 1.3])
+V = jnp.array([0.1, 0.4, -0.2, 0.3, 0.5, -0.1, 0.2, 0.6])
+
+
+def chain(massless: bool):
+    """Points on rods in Cartesian coordinates; one of them may be declared without mass."""
+
+    def lagrangian(t, q, v, p):
+        m = p["m"].at[1].set(0.0) if massless else p["m"]
+        r, w = q.reshape(-1, 2), v.reshape(-1, 2)
+        return jnp.sum(0.5 * m * jnp.sum(w**2, axis=1) - m * p["g"] * r[:, 1])
+
+    def rods(t, q, p):
+        steps = jnp.diff(q.reshape(-1, 2), axis=0, prepend=jnp.zeros((1, 2)))
+        return 0.5 * jnp.sum(steps**2, axis=1)
+
+    return jl.System(lagrangian, {"r": 2 * POINTS}, constraints=[jl.Holonomic(rods, names=NAMES)])
+
+
+PARAMS = {"m": jnp.array([1.0, 0.7, 1.3, 0.9]), "g": jnp.array(9.81)}
+WITHOUT = PARAMS | {"m": PARAMS["m"].at[1].set(0.0)}
+
+
+def evaluation(system):
+    """a of (m, q) as in a loop, with M definite or not found at run time."""
+    program = system._program
+    assert isinstance(program, ScalarProgram)
+    program = replace(program, in_loop=True)
+
+    def definite(params):
+        return lambda: jnp.all(params["m"] > 0)
+
+    def a(params, q, v):
+        constants = program.precompute(q, params, {}, Choices(definite=definite(params)))
+        return program.acceleration(State(jnp.zeros(()), q, v, params, {}), constants)
+
+    return a
+
+
+@pytest.mark.parametrize(("massless", "sample"), [(False, None), (True, None), (False, WITHOUT)])
+def test_random_state_tells_the_usual_mass_matrix(massless, sample):
+    system = chain(massless)
+    key = key_of(system._terms, Q, PARAMS, {}, None)
+    sample = _params.UNKNOWN if sample is None else _params.sample(sample)
+    assert usually_definite(key, sample) is (not massless and sample is _params.UNKNOWN)
+
+
+@pytest.mark.parametrize("massless", [False, True])
+def test_only_the_usual_program_is_written_out(massless):
+    """The other one is a table for a loop; if masses vanish in every case, there is no other."""
+    system = chain(massless)
+    whole = system._program
+    assert isinstance(whole, ScalarProgram)
+    equations = whole.lowered(Q, PARAMS, {}).equations
+    assert equations is not None
+    general = equations.program
+    assert len(general.body) > INTERPRET_FROM
+    program = whole if massless else whole.regular()
+
+    def alone(params, q, v):
+        state = State(jnp.zeros(()), q, v, params, {})
+        return program.acceleration(state, program.precompute(q, params, {}))
+
+    either = operations(evaluation(system), PARAMS, Q, V)
+    arithmetic = "add", "sub", "mul", "div"
+    expected = count(operations(alone, PARAMS, Q, V), *arithmetic)
+    assert expected > 0
+    found = count(either, *arithmetic, without=("while", "scan"))
+    assert expected <= found <= expected + len(general.prelude)
+    assert any("cond" in o.inside for o in either) is not massless
+
+
+@pytest.mark.parametrize("params", [PARAMS, WITHOUT], ids=["masses", "one without mass"])
+def test_both_programs_give_the_same_accelerations_and_derivatives(params):
+    a = evaluation(chain(False))
+    known = chain(False).acceleration(Q, V, params)
+    np.testing.assert_allclose(jax.jit(a)(params, Q, V), known, rtol=1e-11, atol=1e-11)
+    forward = jax.jacfwd(lambda q: a(params, q, V))(Q)
+    reverse = jax.jacrev(lambda q: a(params, q, V))(Q)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-10)
+    h = 1e-5
+    columns = [
+        (a(params, Q + h * e, V) - a(params, Q - h * e, V)) / (2 * h) for e in np.eye(Q.size)
+    ]
+    np.testing.assert_allclose(forward, jnp.stack(columns, axis=1), rtol=1e-6, atol=1e-6)
