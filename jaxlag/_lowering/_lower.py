@@ -1,6 +1,8 @@
 """Lowering of a declared system to its scalar program, or to the reason why it has none."""
 
+from collections.abc import Sequence
 from functools import lru_cache
+from itertools import compress
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import numpy as np
 from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
+from jaxlag._lowering._row_layout import layout_of
 from jaxlag._lowering._symbolic._derive import Derivation, check_length, derivation, derive
 from jaxlag._lowering._symbolic._program_key import Key
 from jaxlag._lowering._symbolic._read_system import read_scene, with_forces
@@ -39,6 +42,8 @@ UNITS = 15
 # array: bicycle of four bodies by poses (2076 in L, 3023 scalar operations) 70 s, 10 ms | 134 s,
 # 667 ms; 11 s, 6.5 ms | not measured since terms that run seldom are interpreted.
 OF_ARRAYS = 2
+
+SHOWN = 3  # longest parts of code that is too long
 
 
 class Lowered(NamedTuple):
@@ -151,7 +156,7 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
     operations, once = equations.program.operations, len(equations.program.prelude)
     if read.limit is not None and operations + once > read.limit:
         found = f"{operations} operations, {once} more once per solve: more than {read.limit}"
-        return Lowered(None, found, scene)
+        return Lowered(None, f"{found}; {_longest(key, equations)}", scene)
     if read.terms is None:
         verified = compare(key, ComparedRates(key, equations), sample.leaves)
     else:
@@ -220,10 +225,29 @@ def _too_long(scene: SymbolicSystem, key: Key, limit: int | None) -> str | None:
     return None
 
 
+def _longest(key: Key, equations: Equations) -> str:
+    """The longest parts, with their operations before equal ones are computed once."""
+    parts = {"M": [x for row in equations.mass for x in row], "h": equations.bias}
+    if equations.rows is not None:
+        layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
+        included = [h or key.quasi is None for h in layout.holonomic]
+        for name, row, gamma in zip(
+            compress(layout.labels, included), *equations.rows, strict=True
+        ):
+            parts[f"row {name!r}"] = [*row, gamma]
+    sizes = {name: _operations(nodes) for name, nodes in parts.items()}
+    longest = sorted(sizes, key=lambda name: -sizes[name])[:SHOWN]
+    return ", ".join(f"{name} {sizes[name]}" for name in longest)
+
+
 def _written(scene: SymbolicSystem) -> int:
     """Operations of varying parts in L and Q, as they are written."""
-    roots = [scene.lagrangian, *(scene.force or ())]
-    return sum(max(len(node.args) - 1, 1) for node in order(roots) if not node.fixed)
+    return _operations([scene.lagrangian, *(scene.force or ())])
+
+
+def _operations(nodes: Sequence[Node]) -> int:
+    """Operations of varying nodes."""
+    return sum(max(len(node.args) - 1, 1) for node in order(nodes) if node.args and not node.fixed)
 
 
 def _units(scene: SymbolicSystem) -> int:

@@ -275,3 +275,8 @@ class ScalarProgram(AccelerationProgram):
         """Number of lines of the body, which is evaluated at every state."""
         equations = self.lowered(q, params, inputs).equations
         return None if equations is None else len(equations.program.body)
+
+    def without_lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
+        """The reason of the lowering."""
+        lowered = self.lowered(q, params, inputs)
+        return lowered.reason if lowered.equations is None else None

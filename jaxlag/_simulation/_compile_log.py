@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from jaxlag._core._arrays import concrete
+from jaxlag._simulation._problem import fallback
 from jaxlag._system._system import System
 
 LONG = 5.0  # s
@@ -39,12 +40,14 @@ def timed(
     results = program(key, values)
     seconds = clock() - start
     if seconds > LONG and program.programs() > count:
-        _logger.warning("%s", _message(system, seconds))
+        _logger.warning("%s", _message(system, seconds, fallback(key, values)))
     return results
 
 
-def _message(system: System, seconds: float) -> str:
+def _message(system: System, seconds: float, reason: str | None) -> str:
     """The duration, and the one change that shortens it, unless it is made already.
+
+    Where the accelerations are computed on arrays, also why.
 
     With JAX's cache a motion of 6 links in a loop takes 9.9 s in the first process and 2.6 s in
     the second. `lowering="array"` takes between 0.9 and 1.2 of the time of compiling on five
@@ -60,4 +63,5 @@ def _message(system: System, seconds: float) -> str:
     return (
         f"Compiling the motion of {len(names)} coordinates ({shown}) took {seconds:.0f} s, once "
         f"for this program. {advice}"
+        + (f" Its accelerations are computed on arrays: {reason}." if reason else "")
     )

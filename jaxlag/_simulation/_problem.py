@@ -125,6 +125,21 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
     return dynamics, checks, problem
 
 
+def fallback(plan: ProgramKey, values: Values) -> str | None:
+    """Why accelerations are computed on arrays; None on scalars, or if arrays are declared."""
+    found: list[str | None] = []
+
+    def look(values: Values) -> Array:
+        dynamics, args, _ = equations(plan, values)
+        size = dynamics.system.size + dynamics.speeds + dynamics.state_count
+        y = jnp.zeros(size, values.q0.dtype)
+        found.append(dynamics.without_lines(jnp.zeros_like(args.origin), y, args))
+        return y
+
+    jax.eval_shape(look, with_jax_arrays(values))
+    return found[0]
+
+
 class _Initial(NamedTuple):
     """The initial state; w0 are its velocities or free quasi-velocities."""
 

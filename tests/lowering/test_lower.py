@@ -1,5 +1,6 @@
-"""Mass matrices that are known only at run time: the expected program is compiled, not both."""
+"""Programs for usual and unusual mass matrices, and reasons for none, with the part by name."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -103,3 +104,70 @@ def test_both_programs_give_the_same_accelerations_and_derivatives(params):
         (a(params, Q + h * e, V) - a(params, Q - h * e, V)) / (2 * h) for e in np.eye(Q.size)
     ]
     np.testing.assert_allclose(forward, jnp.stack(columns, axis=1), rtol=1e-6, atol=1e-6)
+
+
+# ---- Reasons ------------------------------------------------------------------------------------
+
+
+def first_eigenvalue(t, q, p):
+    return jnp.linalg.eigvalsh(jnp.array([[q[0], q[1]], [q[1], 2.0]]))[0]
+
+
+def pose_of_fork(t, q, p):
+    return jl.rotation.about_x(first_eigenvalue(t, q, p)), jnp.zeros(3)
+
+
+def of_body(t, q, v, p):
+    _, w = jl.energy.body_velocity(pose_of_fork, t, q, v, p)
+    return 0.5 * v @ v + 0.5 * w @ w
+
+
+def free(t, q, v, p):
+    return 0.5 * v @ v
+
+
+UNREADABLE = {
+    "body": ({"lagrangian": of_body}, r"lagrangian: eigh at .*test_lower.py:\d+.*"),
+    "row": (
+        {
+            "constraints": [
+                jl.Holonomic(lambda t, q, p: q[0], names="guide"),
+                jl.Holonomic(first_eigenvalue, names="mode"),
+            ]
+        },
+        r"constraint 'mode': eigh at .*test_lower.py:\d+.*\(first_eigenvalue\)",
+    ),
+    "force": (
+        {
+            "forces": [
+                jl.GeneralizedForce(lambda t, q, v, p: -v, name="drag"),
+                jl.GeneralizedForce(lambda t, q, v, p: -jnp.sort(v), name="order"),
+            ]
+        },
+        r"force 'order': sort at .*test_lower.py:\d+.*",
+    ),
+}
+
+
+@pytest.mark.parametrize("part", UNREADABLE)
+def test_part_without_scalar_form_is_named_with_its_line(part):
+    declaration, reason = UNREADABLE[part]
+    system = jl.System(**{"lagrangian": free, "coordinates": ("x", "y")} | declaration)
+    assert re.search(rf"array program \({reason}\)", system.explain({}))
+
+
+def test_longest_parts_of_long_code_are_named():
+    """Rows of 81 products, M = 1 and h = 0."""
+
+    def waves(t, q, p):
+        return jnp.sum(jnp.sin(jnp.outer(q, q)), axis=0)[:3]
+
+    rows = jl.Holonomic(waves, names=[f"wave {i}" for i in range(3)])
+    system = jl.System(free, {"r": 9}, constraints=[rows])
+    found = re.search(r"array program \((.*)\)", system.explain({}))
+    assert found is not None
+    assert re.fullmatch(
+        r"\d+ operations, \d+ more once per solve: more than 1500; "
+        r"row 'wave \d' \d+, row 'wave \d' \d+, row 'wave \d' \d+",
+        found[1],
+    )

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import re
 from functools import partial
 from types import SimpleNamespace
 
@@ -41,7 +42,41 @@ def test_advice_is_the_cache_unless_it_is_used(monkeypatch):
     """The tests use one: see above."""
     monkeypatch.setattr(_compile_log, "jax", SimpleNamespace(config=SimpleNamespace(
         jax_compilation_cache_dir="x", jax_enable_compilation_cache=False)))  # fmt: skip
-    assert "Set JAX_COMPILATION_CACHE_DIR to a folder" in _compile_log._message(PAIR, 7.0)
+    assert "Set JAX_COMPILATION_CACHE_DIR to a folder" in _compile_log._message(PAIR, 7.0, None)
+
+
+def slowest(t, q, p):
+    return jnp.linalg.eigvalsh(jnp.array([[q[0], q[1]], [q[1], 2.0]]))[0] - 1.0
+
+
+@pytest.mark.parametrize(
+    ("declaration", "reason"),
+    [
+        (
+            {"constraints": [jl.Holonomic(slowest, names="slowest mode")]},
+            r"computed on arrays: constraint 'slowest mode': eigh at .*test_compile_log.py:\d+",
+        ),
+        (
+            {"forces": [jl.GeneralizedForce(lambda t, q, v, p: -jnp.sort(v), name="sorted")]},
+            r"computed on arrays: force 'sorted': sort at .*test_compile_log.py:\d+",
+        ),
+        ({"forces": [jl.GeneralizedForce(lambda t, q, v, p: -v, name="drag")]}, None),
+        (
+            {
+                "forces": [jl.GeneralizedForce(lambda t, q, v, p: -jnp.sort(v), name="sorted")],
+                "lowering": "array",
+            },
+            None,
+        ),
+    ],
+)
+def test_reason_for_arrays_is_logged(monkeypatch, caplog, declaration, reason):
+    caplog.set_level(logging.WARNING, logger="jaxlag")
+    system = jl.System(PAIR.lagrangian, ("x", "y"), **declaration)
+    called(monkeypatch, 12.0, system, dt=0.5, method="heun", throw=False)
+    (record,) = caplog.records
+    found = re.search(reason or "arrays", record.getMessage())
+    assert (found is None) == (reason is None)
 
 
 @pytest.mark.full

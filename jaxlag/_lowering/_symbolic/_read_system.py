@@ -1,5 +1,7 @@
 """Conversion of a declared system to scalar expressions."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import jax
@@ -39,17 +41,15 @@ def read_scene(key: Key) -> SymbolicSystem:
     state = [_array([t], ()), _array(q, (n,)), _array(v, (n,))]
     kinematics, at = None, state
     if key.quasi is not None:
-        kinematics = _kinematics(key, graph, state, params)
+        with _named("quasi"):
+            kinematics = _kinematics(key, graph, state, params)
         at = state if key.in_u is None else [*state[:2], _array(list(kinematics.u), (-1,))]
     lagrangian = real_scalar("lagrangian", key.in_u or key.lagrangian)
     of_L = traced(key, lagrangian, False, speeds=at[2].size)
     check_indices(of_L, [None, "q", "v" if key.in_u is None else "u", *(None for _ in params)])
-    (L,) = read(graph, of_L, *at, *params)
-    force = None
-    if key.forces:
-        terms = ArrayTerms(key.lagrangian, key.forces)
-        (Q,) = read(graph, traced(key, terms.force, True), *state, *params, *inputs)
-        force = [_node(graph, x) for x in Q]
+    with _named("lagrangian"):
+        (L,) = read(graph, of_L, *at, *params)
+    force = _force(key, graph, [*state, *params, *inputs])
     bound = _constrained(key, graph, state, params, inputs) if _included(key) else None
     count = sum(1 for _ in equations(of_L.jaxpr))
     return SymbolicSystem(graph, t, q, v, _node(graph, L.item()), force, bound, kinematics, count)
@@ -65,11 +65,7 @@ def with_forces(scene: SymbolicSystem, key: Key) -> SymbolicSystem:
     graph, bound = scene.graph.copy(), scene.constrained
     state = [_array([scene.t], ()), *(_array(list(x), (-1,)) for x in (scene.q, scene.v))]
     given = [*state, *_inputs(graph, "params", key.params), *_inputs(graph, "inputs", key.inputs)]
-    force = None
-    if key.forces:
-        terms = ArrayTerms(key.lagrangian, key.forces)
-        (Q,) = read(graph, traced(key, terms.force, True), *given)
-        force = [_node(graph, x) for x in Q]
+    force = _force(key, graph, given)
     if bound is not None:
         bound = bound._replace(
             formulation=key.formulation, regular=key.regular, crossing=key.crossing
@@ -77,6 +73,39 @@ def with_forces(scene: SymbolicSystem, key: Key) -> SymbolicSystem:
         if any(map(reads_lam, key.forces)):
             bound = _with_reactions(key, graph, bound, given)
     return scene._replace(graph=graph, force=force, constrained=bound)
+
+
+def _force(key: Key, graph: Graph, given: list) -> list[Node] | None:
+    """Q, if there are forces.
+
+    Raises:
+        Unsupported: a force without scalar form, by its name.
+    """
+    if not key.forces:
+        return None
+
+    def of(forces: tuple, graph: Graph) -> Any:
+        terms = ArrayTerms(key.lagrangian, forces)
+        (Q,) = read(graph, traced(key, terms.force, True), *given)
+        return Q
+
+    try:
+        Q = of(key.forces, graph)
+    except Unsupported:
+        for force in key.forces:
+            with _named(f"force {force.name!r}"):
+                of((force,), graph.copy())
+        raise
+    return [_node(graph, x) for x in Q]
+
+
+@contextmanager
+def _named(part: str) -> Iterator[None]:
+    """Reasons why a part has no scalar form begin with its name."""
+    try:
+        yield
+    except Unsupported as unsupported:
+        raise Unsupported(f"{part}: {unsupported}") from None
 
 
 def _with_reactions(key: Key, graph: Graph, bound: Constrained, given: list) -> Constrained:
@@ -117,20 +146,21 @@ def _kinematics(key: Key, graph: Graph, state: list, params: list) -> Kinematics
 
 
 def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list) -> Constrained:
-    terms = ArrayTerms(key.lagrangian, key.forces, _included(key))
+    included, given = _included(key), [*state, *params]
     graph.cancelled = False
-    (rates,) = read(graph, traced(key, terms.velocity, False), *state, *params)
-
-    def position(t: Any, q: Any, v: Any, params: Any) -> Any:
-        return terms.position(t, q, params)
-
-    (phi,) = read(graph, traced(key, position, False), *state, *params)
+    try:
+        rates, phi = _rows(key, graph, included, given)
+    except Unsupported:
+        for constraint in included:
+            with _named(f"constraint {', '.join(constraint.all_names)!r}"):
+                _rows(key, graph.copy(), (constraint,), given)
+        raise
     cancelled, m = graph.cancelled, rates.size
     layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
     every = layout.holonomic
-    included = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
-    active_rows = [graph.input("active_rows", k) for k in included] if layout.chooses else None
-    holonomic = [every[k] for k in included]
+    chosen = [k for k, holonomic in enumerate(every) if holonomic or key.quasi is None]
+    active_rows = [graph.input("active_rows", k) for k in chosen] if layout.chooses else None
+    holonomic = [every[k] for k in chosen]
     lam = [graph.input("lam", k) for k in range(m)]
     damping = None
     if key.baumgarte is not None:
@@ -148,8 +178,22 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         cancelled=cancelled,
     )
     if any(map(reads_lam, key.forces)):
-        return _with_reactions(key, graph, bound, [*state, *params, *inputs])
+        return _with_reactions(key, graph, bound, [*given, *inputs])
     return bound
+
+
+def _rows(
+    key: Key, graph: Graph, constraints: tuple[AbstractConstraint, ...], given: list
+) -> tuple[np.ndarray, np.ndarray]:
+    """A v + b, and phi of the holonomic rows."""
+    terms = ArrayTerms(key.lagrangian, (), constraints)
+
+    def position(t: Any, q: Any, v: Any, params: Any) -> Any:
+        return terms.position(t, q, params)
+
+    (rates,) = read(graph, traced(key, terms.velocity, False), *given)
+    (phi,) = read(graph, traced(key, position, False), *given)
+    return rates, phi
 
 
 def rows_that_forces_read(key: Key, terms: ArrayTerms) -> tuple[bool, ...]:
