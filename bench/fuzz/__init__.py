@@ -4,12 +4,14 @@ Lagrangians have 1 to 5 coordinates and all kinds of operations. Energies are 1e
 the usual size, units of coordinates 1e-6 to 1e6. The precision is float32 or float64. Of ten
 systems
 
-- four are free. The scalar program is compared with the array program (`_system_programs.py`).
+- three are free. The scalar program is compared with the array program (`_system_programs.py`).
 - three are constrained by random holonomic, rheonomic and Pfaffian rows. Some rows depend on
   others, are identically zero, or lose rank at the state. Units of residuals are 1e-6 to 1e6;
   coordinates may have no inertia. Accelerations, multipliers and their derivatives by arrays,
   scalars and null spaces are compared with Gaussian elimination in extended precision
   (`_mechanism_programs.py`, `_reference_solution.py`).
+- one consists of rigid bodies by poses, in chains, with rows between their points or none. It is
+  compared in the same way.
 - two have quasi-velocities, by U or by kinematics, L in v or in u, with rows or without. Some are
   singular at the state. They are compared with the same equations solved with multipliers.
 - one is differentiated twice through a loop and compared with the unrolled loop (`_loops.py`).
@@ -34,6 +36,7 @@ from bench.fuzz import (
     _loops,
     _mechanism_motions,
     _mechanism_programs,
+    _random_bodies,
     _random_mechanisms,
     _random_quasi,
     _random_systems,
@@ -69,9 +72,13 @@ def _none(_: Any) -> Iterator[Any]:
 
 
 FREE = Kind("free", _random_systems.draw, _system_programs.compared, _random_systems.smaller)
-CONSTRAINED, QUASI = (
+CONSTRAINED, QUASI, BODIES = (
     Kind(name, module.draw, _mechanism_programs.compared, _random_mechanisms.smaller)
-    for name, module in (("constrained", _random_mechanisms), ("quasi", _random_quasi))
+    for name, module in (
+        ("constrained", _random_mechanisms),
+        ("quasi", _random_quasi),
+        ("bodies", _random_bodies),
+    )
 )
 CONSTRAINED_MOTION, QUASI_MOTION = (
     Kind(
@@ -88,6 +95,7 @@ KINDS = (
     FREE,
     CONSTRAINED,
     QUASI,
+    BODIES,
     LOOPS,
     CONSTRAINED_MOTION,
     QUASI_MOTION,
@@ -96,7 +104,7 @@ KINDS = (
 
 
 def kind_of(seed: int) -> Kind:
-    """The kind of a seed: of ten seeds 4 are free, 3 constrained, 2 quasi and 1 loops."""
+    """The kind of a seed: of ten 3 are free, 3 constrained, 2 quasi, 1 bodies and 1 loops."""
     tens, ones = divmod(seed, 10)
     if ones == 5 and tens % 5 == 3:
         return CONSTRAINED_MOTION
@@ -104,7 +112,7 @@ def kind_of(seed: int) -> Kind:
         return QUASI_MOTION
     if ones == 9 and tens % 40 == 6:
         return LOOPED_MOTION
-    kinds = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, FREE, LOOPS)
+    kinds = (FREE, CONSTRAINED, QUASI, FREE, CONSTRAINED, CONSTRAINED, FREE, QUASI, BODIES, LOOPS)
     return kinds[ones]
 
 

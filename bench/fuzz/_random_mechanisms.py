@@ -159,9 +159,11 @@ def values(drawn: Drawn, dtype: Any = None) -> dict[str, Any]:
 class _Drawing:
     """The generator of rows and quasi-velocities of one system."""
 
+    most = 4  # coordinates
+
     def __init__(self, seed: int, reach: float, smooth: bool) -> None:
         self.rng = rng = np.random.default_rng([seed, 38])
-        self.n = n = int(rng.integers(1, 5))
+        self.n = n = int(rng.integers(1, self.most + 1))
         self.single = bool(rng.random() < 0.25)
         self.dtype = "float32" if self.single else "float64"
         reach = min(reach, 4.0) if self.single else reach

@@ -160,7 +160,7 @@ def text(tree: Tree) -> str:
 
 def function(arguments: str, body: str) -> Any:
     """The function with this source code."""
-    space = {"jnp": jnp, "jax": jax, "lax": lax, "smooth": smooth}
+    space = {"jnp": jnp, "jax": jax, "lax": lax, "jl": jl, "smooth": smooth}
     space["MATRIX"] = np.array([[0.5, -1.0], [2.0, 0.25]])
     return eval(f"lambda {arguments}: {body}", space)
 

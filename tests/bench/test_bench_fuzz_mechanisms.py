@@ -5,9 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bench.fuzz import _loops, _mechanism_motions, _random_mechanisms, _random_quasi
+from bench.fuzz import (
+    _loops,
+    _mechanism_motions,
+    _random_bodies,
+    _random_mechanisms,
+    _random_quasi,
+)
 from bench.fuzz._mechanism_programs import compared, prepare
-from bench.fuzz._random_mechanisms import Mechanism, Quasi, Row, smaller
+from bench.fuzz._random_mechanisms import Mechanism, Quasi, Row, smaller, values
 from bench.fuzz._random_systems import Drawn
 from bench.fuzz._reference_solution import Unclear
 from jaxlag._linalg import _row_residuals
@@ -43,7 +49,7 @@ IN_QUASI = mechanism(quasi=TURNED, **AT)
 # ---- Drawn systems -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("module", [_random_mechanisms, _random_quasi])
+@pytest.mark.parametrize("module", [_random_mechanisms, _random_quasi, _random_bodies])
 def test_every_seed_draws_a_different_mechanism(module):
     drawn = [module.draw(seed) for seed in range(40)]
     assert drawn == [module.draw(seed) for seed in range(40)]
@@ -171,6 +177,20 @@ def test_nearly_dependent_rows_are_omitted():
     assert compared(mechanism(ROD, near, **AT)).kind.startswith("not compared: ")
 
 
+def test_bodies_of_every_kind_are_drawn():
+    drawn = [_random_bodies.draw(seed) for seed in range(100)]
+    assert {x.drawn.lagrangian.count("RigidBody") for x in drawn} == {1, 2, 3}
+    assert {x.drawn.n for x in drawn} == set(range(1, 7))
+    assert {len(x.rows) for x in drawn} == set(range(5))
+    assert {row.kind for x in drawn for row in x.rows} == {"holonomic", "Pfaffian"}
+    written = " ".join(x.written for x in drawn)
+    assert all(f"about_{axis}" in written for axis in "xyz")
+    assert "R, r: (R, r" in written  # a slider
+    # Bodies hang on bodies, and rows join two of them.
+    assert any("*(lambda R, r:" in x.drawn.lagrangian for x in drawn)
+    assert any("- (lambda R, r:" in row.text for x in drawn for row in x.rows)
+
+
 # ---- Detected errors -----------------------------------------------------------------------------
 
 
@@ -229,6 +249,21 @@ def test_wrong_scalars_are_detected(monkeypatch):
     )
     for what in found_in(DOUBLED, IN_QUASI):
         assert "scalars" in what
+
+
+@pytest.mark.full
+def test_wrong_scalars_of_rigid_bodies_are_detected(monkeypatch):
+    """By d'Alembert's principle: poses of three bodies with two rows."""
+    bodies = _random_bodies.draw(7)
+    lowered = bodies.system._program.lowered(jnp.asarray(bodies.q), values(bodies.drawn), {})
+    assert lowered.equations.form == "d'Alembert's principle"
+    found = compared(bodies)
+    assert (found.kind, found.worst < 0.5) == ("equal", True)
+    right = ScalarProgram._run
+    monkeypatch.setattr(
+        ScalarProgram, "_run", lambda self, *args: right(self, *args) * (1.0 + 1e-10)
+    )
+    assert "scalars" in found_in(bodies)[0]
 
 
 def test_wrong_rates_of_quasi_velocities_are_detected(monkeypatch):
