@@ -22,6 +22,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxlag._core._arrays import concrete
 from jaxlag._core._custom_jvp import with_rules_kept
 from jaxlag._core._errors import invalid
+from jaxlag._core._max_min import with_sound_extremes
 from jaxlag._tracing import _params
 from jaxlag._tracing._closure_params import ParamsWithClosure, plain
 from jaxlag._tracing._custom_vjp import with_forward_derivatives
@@ -165,6 +166,7 @@ class TracedFunction:
 
         code = jax.make_jaxpr(flat)(*_params.shapes(leaves))
         code = with_rules_kept(with_forward_derivatives(copy_constants(code)))
+        code = with_sound_extremes(code)
         return _Program(code, form, static_part, frozenset(read))
 
     def _warn_of_counts(self, kind: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 import jaxlag as jl
-from jaxlag._lowering._graph._max_min import largest_p, smallest_p
+from jaxlag._core._max_min import largest_p, smallest_p
 
 W = jnp.array([1.0, 2.0, 3.0, 5.0])
 POINTS = np.array(

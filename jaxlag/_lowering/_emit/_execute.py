@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import elements
 from jaxlag._core._custom_jvp import CustomJVP
+from jaxlag._core._max_min import largest_p, smallest_p
 from jaxlag._lowering._emit._sincos import recalled, sincos
 from jaxlag._lowering._graph._expression import FIXED
 from jaxlag._lowering._graph._straight_line import Line, Program
@@ -21,6 +22,8 @@ from jaxlag._lowering._jaxpr._from_jaxpr import Rule
 # code on scalars the compiler finds the repetitions itself.
 KEEP_FROM = 120
 KEEP_FROM_IN_LANES = 14
+
+_EXTREMES = {"max": largest_p, "min": smallest_p}
 
 _BINARY = {"add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div}
 
@@ -120,6 +123,8 @@ def executed(line: Line, args: Sequence[Any]) -> Any:
         return lax.select(*args)
     if op == "stop":
         return lax.stop_gradient(args[0])
+    if op == "call" and line.data.name in _EXTREMES:
+        return _EXTREMES[line.data.name].bind(*args)
     return line.data(*args)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlag._lowering._graph._max_min import largest_p, smallest_p
+from jaxlag._core._max_min import largest_p, smallest_p
 
 Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]

@@ -1,8 +1,13 @@
-"""Maximum and minimum of several scalars, with the derivative that JAX uses for arrays.
+"""Maximum and minimum of pairs of arrays and of several scalars, with sound derivatives.
 
-Nested pairs would give the value. If k of the scalars are equal, the derivative is the mean of
-theirs; nested pairs would weigh the last one as much as all before it. An array of the scalars
-would give the derivative, but XLA does not turn operations on such rows into vector instructions.
+JAX's derivative compares the result with the operands. XLA may compute an operand anew, with
+another rounding. No operand is then equal to the result, and the derivative is zero (jaxlib 0.10.2,
+CPU, inside `jax.jit`). Here operands are compared with one another.
+
+Nested pairs would give the value of several scalars. If k of them are equal, the derivative is the
+mean of theirs; nested pairs would weigh the last one as much as all before it. An array of the
+scalars would give the derivative, but XLA does not turn operations on such rows into vector
+instructions.
 """
 
 from collections.abc import Callable
@@ -12,12 +17,14 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
+
+from jaxlag._core._jaxprs import rewritten
 
 
 def _made(name: str, pair: Callable, order: Callable) -> Primitive:
-    """The primitive; `order` compares two scalars, true for an extreme or a tie."""
+    """The primitive; `order` compares two operands, true for an extreme or a tie."""
     primitive = Primitive(name)
 
     def value(*args: Any) -> Any:
@@ -35,7 +42,7 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         zero, one = jnp.zeros_like(out), jnp.ones_like(out)
         count = reduce(lax.add, [lax.select(ties(x), one, zero) for x in primals])
         total = reduce(lax.add, [lax.select(ties(x), d, zero) for x, d in moved])
-        return out, lax.div(total, count)
+        return out, lax.div(total, lax.max(count, one))  # 0 for NaN, as JAX's
 
     def batched(args: Any, axes: Any) -> tuple[Any, int]:
         fronts = [
@@ -54,3 +61,17 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
 
 largest_p = _made("largest", lax.max, lax.ge)
 smallest_p = _made("smallest", lax.min, lax.le)
+
+# By the names of JAX's primitives, which tables of operations know.
+_PAIRS = {lax.max_p: _made("max", lax.max, lax.ge), lax.min_p: _made("min", lax.min, lax.le)}
+
+
+def with_sound_extremes(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program; maximum and minimum of floats have the derivatives above."""
+    return rewritten(program, _with_sound_extreme)
+
+
+def _with_sound_extreme(eqn: Any) -> Any:
+    if eqn.primitive not in _PAIRS or not jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.floating):
+        return eqn
+    return eqn.replace(primitive=_PAIRS[eqn.primitive], params={})
