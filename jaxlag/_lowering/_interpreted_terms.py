@@ -40,7 +40,7 @@ def interpreted_terms(
         sample: params for its verification.
         alone: whether they are evaluated outside of all loops of a solve.
     """
-    if not array.constraints or key.quasi is not None or key.dtype != jnp.result_type(float):
+    if not array.constraints or key.dtype != jnp.result_type(float):
         return None
     codes = lower_terms(key.of_terms, sample) if _interpreter.available() else None
     if codes is None or not codes.are_long:

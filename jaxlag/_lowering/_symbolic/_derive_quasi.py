@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxlag._lowering._graph._eliminate import solve
 from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._literals import Literals
 from jaxlag._lowering._graph._residues import Residues
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
@@ -17,11 +18,14 @@ from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._bias_forms import attempt, cost, mass_matrix
 from jaxlag._lowering._symbolic._cofactor_inverse import Inverse
 from jaxlag._lowering._symbolic._constraint_solve import rows
+from jaxlag._lowering._symbolic._partial_velocities import principle_of_dalembert
 from jaxlag._lowering._symbolic._projection_program import surface
 from jaxlag._lowering._symbolic._symbolic_system import Equations, Kinematics, SymbolicSystem
 from jaxlag._lowering._symbolic._value_numbering import merged
 
 WRITTEN_OUT = 3  # forms of the right side that are compared, shortest first
+LONGER = 2  # an L of u with so many times the nodes of L is not used,
+LONG = 500  # if it has so many nodes
 
 
 class _Moved(NamedTuple):
@@ -49,7 +53,8 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
     """v and u' of the free quasi-velocities, the bound ones zero, by the cheapest of several forms.
 
     If L is a function of v, these are the projected equations, B^T M B u' = B^T (Q - h - M s) for
-    v = B u + c and s = v' at u' = 0. Others are the Boltzmann-Hamel equations.
+    v = B u + c and s = v' at u' = 0, where M s + h is one derivative, or M and h are those of
+    d'Alembert's principle. Others are the Boltzmann-Hamel equations.
 
     Raises:
         Unsupported: the kinematics have no short inverse on scalars.
@@ -58,15 +63,25 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
     assert scene.kinematics is not None
     kinematics = scene.kinematics
     moved = _moved(scene, kinematics, expansion, eps)
-    declared, forms, of_u, U = scene.lagrangian, [], None, None
+    declared, of_u, U, residues = scene.lagrangian, None, None, Residues()
+    forms: list[tuple[str, list[list[Node]], list[Node]]] = []
     if kinematics.in_u:
         of_u = declared
     else:
         for label, L in _written(expansion, declared):
-            forms.append((f"projected, {label}", *_projected(scene, moved, L)))
+            M, left = _lagrange(scene, moved, L)
+            forms.append((f"projected, {label}", *_projected(scene, moved, M, left)))
+        terms = _by_dalembert(scene, residues)
+        if terms is not None:
+            M, h = terms
+            left = [graph.add(x, _dot(graph, row, moved.s)) for x, row in zip(h, M, strict=True)]
+            label = "projected, d'Alembert's principle"
+            forms.append((label, *_projected(scene, moved, M, left)))
         if len(kinematics.u) == len(scene.v):
             # With fewer u, momenta of the omitted ones would be lost.
             (of_u,) = substitute(graph, [declared], dict(zip(scene.v, moved.V, strict=True)))
+            size = _size([of_u])
+            of_u = None if size > max(LONG, LONGER * _size([declared])) else of_u
     if of_u is not None:
         U = _quasi(scene, kinematics, expansion)
         for label, L in _written(expansion, of_u):
@@ -82,8 +97,8 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
         if short is not None:
             sides.append((f"{label}, expanded", short))
     # Long forms are not compared: generating their code takes too much time.
-    sides.sort(key=lambda side: len(order(side[1])))
-    found, residues = [], Residues()
+    sides.sort(key=lambda side: _size(side[1]))
+    found = []
     for label, right in sides[:WRITTEN_OUT]:
         numbered = iter(merged(graph, [*(x for row in mass for x in row), *right, *v], residues))
         M = [[next(numbered) for _ in row] for row in mass]
@@ -114,7 +129,7 @@ def derive_rates(scene: SymbolicSystem, eps: float) -> Equations:
 def _moved(
     scene: SymbolicSystem, kinematics: Kinematics, expansion: Expansion, eps: float
 ) -> _Moved:
-    graph, healthy = scene.graph, []
+    graph, healthy, inverse = scene.graph, [], None
     if kinematics.V is not None:
         V = list(kinematics.V)
         determinants = _determinants(graph, expansion, affine(graph, V, kinematics.u)[0])
@@ -131,6 +146,13 @@ def _moved(
     v = substitute(graph, V, zero_bound)
     B = [tangents(graph, V, {u: graph.one}) for u in kinematics.free]
     s = tangents(graph, v, dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one})
+    if inverse is not None and kinematics.U is not None:
+        # From 0 = u' = Theta s + the derivative of U at fixed v.
+        along = dict(zip(scene.q, scene.v, strict=True)) | {scene.t: graph.one}
+        turning = tangents(graph, kinematics.U, along)
+        turning = substitute(graph, turning, dict(zip(scene.v, v, strict=True)))
+        solved = inverse([graph.scale(x, -1.0) for x in turning])
+        s = min((s, solved), key=lambda s: cost(graph, [v, *B, s]))
     return _Moved(V, v, B, s, healthy, determinants)
 
 
@@ -179,21 +201,40 @@ def _quasi(scene: SymbolicSystem, kinematics: Kinematics, expansion: Expansion) 
     return Inverse(graph, expansion, gram, 0.0)(right)
 
 
-def _projected(
-    scene: SymbolicSystem, moved: _Moved, L: Node
-) -> tuple[list[list[Node]], list[Node]]:
-    """(B^T M B, B^T (Q - (M s + h))) from L(t, q, v): M s + h is Lagrange's left side at a = s."""
+def _lagrange(scene: SymbolicSystem, moved: _Moved, L: Node) -> tuple[list[list[Node]], list[Node]]:
+    """(M, M s + h) from L(t, q, v): M s + h is Lagrange's left side at a = s."""
     graph, v = scene.graph, scene.v
     momentum = gradient(graph, L, v)
     seeds = dict(zip(scene.q, v, strict=True)) | {scene.t: graph.one}
     rate = tangents(graph, momentum, seeds | dict(zip(v, moved.s, strict=True)))
     dL_dq = gradient(graph, L, scene.q)
     left = [graph.sub(*pair) for pair in zip(rate, dL_dq, strict=True)]
-    M = mass_matrix(graph, L, v)
-    at = dict(zip(v, moved.v, strict=True))
+    return mass_matrix(graph, L, v), left
+
+
+def _by_dalembert(
+    scene: SymbolicSystem, residues: Residues
+) -> tuple[list[list[Node]], list[Node]] | None:
+    """(M, h) by d'Alembert's principle, derived with inputs in place of numbers."""
+    literals = Literals(scene.graph)
+    (L,) = literals.without([scene.lagrangian])
+    found = principle_of_dalembert(scene, L, residues)
+    if found is None:
+        return None
+    M, h = found
+    flat = iter(literals.restored([*(x for row in M for x in row), *h]))
+    return [[next(flat) for _ in row] for row in M], list(flat)
+
+
+def _projected(
+    scene: SymbolicSystem, moved: _Moved, M: list[list[Node]], left: list[Node]
+) -> tuple[list[list[Node]], list[Node]]:
+    """(B^T M B, B^T (Q - (M s + h)))."""
+    graph, v = scene.graph, scene.v
     effort = [graph.scale(x, -1.0) for x in left]
     if scene.force is not None:
         effort = [graph.sub(*pair) for pair in zip(scene.force, left, strict=True)]
+    at = dict(zip(v, moved.v, strict=True))
     effort = substitute(graph, effort, at)
     flat = iter(substitute(graph, [x for row in M for x in row], at))
     M = [[next(flat) for _ in v] for _ in v]
@@ -250,6 +291,10 @@ def _written(expansion: Expansion, L: Node) -> list[tuple[str, Node]]:
     if short is not None and short[0] is not L:
         forms.append(("L simplified", short[0]))
     return forms
+
+
+def _size(nodes: Sequence[Node]) -> int:
+    return len(order(nodes))
 
 
 def _guarded(graph: Graph, v: list[Node], healthy: list[Node]) -> list[Node]:

@@ -37,7 +37,7 @@ class Key(NamedTuple):
 
     @property
     def of_terms(self) -> "Key":
-        """The key of M, h, A and gamma, without forces and options of the solve for a."""
+        """The key of M, h, A and gamma, without forces, quasi-velocities and options of solves."""
         return self._replace(
             forces=(),
             inputs=_params.Static({}),
@@ -45,6 +45,8 @@ class Key(NamedTuple):
             regular=False,
             contact_rows_independent=False,
             crossing=False,
+            quasi=None,
+            in_u=None,
         )
 
 
