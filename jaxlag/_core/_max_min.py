@@ -32,9 +32,12 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
 
     def derivative(primals: Any, tangents: Any) -> tuple[Any, Any]:
         out = primitive.bind(*primals)
-        moved = [(x, d) for x, d in zip(primals, tangents, strict=True) if type(d) is not ad.Zero]
-        if not moved:
+        given = [(x, d) for x, d in zip(primals, tangents, strict=True) if type(d) is not ad.Zero]
+        if not given:
             return out, ad.Zero(ShapedArray(out.shape, out.dtype))
+        # As in JAX's primitives, an operand may have axes of size 1 in place of others.
+        moved = [tuple(jnp.broadcast_to(x, out.shape) for x in pair) for pair in given]
+        primals = [jnp.broadcast_to(x, out.shape) for x in primals]
 
         def ties(x: Any) -> Any:
             return reduce(lax.bitwise_and, [order(x, y) for y in primals])
@@ -44,6 +47,9 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         total = reduce(lax.add, [lax.select(ties(x), d, zero) for x, d in moved])
         return out, lax.div(total, lax.max(count, one))  # 0 for NaN, as JAX's
 
+    def shape(*avals: Any) -> ShapedArray:
+        return ShapedArray(jnp.broadcast_shapes(*(x.shape for x in avals)), avals[0].dtype)
+
     def batched(args: Any, axes: Any) -> tuple[Any, int]:
         fronts = [
             x if axis is None else jnp.moveaxis(x, axis, 0)
@@ -52,7 +58,7 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         return primitive.bind(*jnp.broadcast_arrays(*fronts)), 0
 
     primitive.def_impl(value)
-    primitive.def_abstract_eval(lambda x, *_: ShapedArray(x.shape, x.dtype))
+    primitive.def_abstract_eval(shape)
     mlir.register_lowering(primitive, mlir.lower_fun(value, multiple_results=False))
     ad.primitive_jvps[primitive] = derivative
     batching.primitive_batchers[primitive] = batched

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import compress
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ import numpy as np
 from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
-from jaxlag._lowering._row_layout import layout_of
 from jaxlag._lowering._symbolic._derive import Derivation, check_length, derivation, derive
 from jaxlag._lowering._symbolic._program_key import Key
 from jaxlag._lowering._symbolic._read_system import read_scene, with_forces
@@ -156,7 +154,7 @@ def _lowered(key: Key, sample: _params.Sample) -> Lowered:
     operations, once = equations.program.operations, len(equations.program.prelude)
     if read.limit is not None and operations + once > read.limit:
         found = f"{operations} operations, {once} more once per solve: more than {read.limit}"
-        return Lowered(None, f"{found}; {_longest(key, equations)}", scene)
+        return Lowered(None, f"{found}; {_longest(scene, equations)}", scene)
     if read.terms is None:
         verified = compare(key, ComparedRates(key, equations), sample.leaves)
     else:
@@ -225,15 +223,11 @@ def _too_long(scene: SymbolicSystem, key: Key, limit: int | None) -> str | None:
     return None
 
 
-def _longest(key: Key, equations: Equations) -> str:
+def _longest(scene: SymbolicSystem, equations: Equations) -> str:
     """The longest parts, with their operations before equal ones are computed once."""
     parts = {"M": [x for row in equations.mass for x in row], "h": equations.bias}
-    if equations.rows is not None:
-        layout = layout_of(key.constraints, key.params, key.static, key.size, key.dtype)
-        included = [h or key.quasi is None for h in layout.holonomic]
-        for name, row, gamma in zip(
-            compress(layout.labels, included), *equations.rows, strict=True
-        ):
+    if equations.rows is not None and scene.constrained is not None:
+        for name, row, gamma in zip(scene.constrained.labels, *equations.rows, strict=True):
             parts[f"row {name!r}"] = [*row, gamma]
     sizes = {name: _operations(nodes) for name, nodes in parts.items()}
     longest = sorted(sizes, key=lambda name: -sizes[name])[:SHOWN]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from jax.extend.core import jaxpr_as_fun
 
 import jaxlag as jl
@@ -65,6 +66,19 @@ def test_values_derivatives_and_ties_are_those_of_jax(of):
         xs = x + jnp.arange(4.0)[:, None]
         each = jax.vmap(jax.grad(sound(function)))(xs)
         np.testing.assert_allclose(each, jax.vmap(jax.grad(function))(xs), rtol=1e-14)
+
+
+def test_operands_with_axes_of_size_one_are_broadcast():
+    """As `lax.max` takes them: `jax.random.uniform` uses this."""
+
+    def function(x):
+        return jnp.sum(lax.max(x[:1], x[1:]) ** 2)
+
+    x = jnp.array([0.4, 0.7, 0.1])
+    for f in (lambda f: f, jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(f(sound(function))(x), f(function)(x), rtol=1e-14)
+    each = jax.vmap(sound(function))(x + jnp.arange(2.0)[:, None])
+    np.testing.assert_allclose(each, jax.vmap(function)(x + jnp.arange(2.0)[:, None]), rtol=1e-14)
 
 
 def test_integers_are_unchanged():

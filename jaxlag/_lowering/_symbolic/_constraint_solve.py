@@ -33,6 +33,7 @@ class Constrained(NamedTuple):
         sharing: distribution of multipliers among dependent rows; None if forces do not need it.
         crossing: whether rows that become dependent are left out; otherwise results are NaN.
         cancelled: whether coefficients of the residuals may be rounding.
+        labels: of all rows.
     """
 
     velocity: Sequence[Node]
@@ -47,6 +48,7 @@ class Constrained(NamedTuple):
     sharing: Sharing | None = None
     crossing: bool = False
     cancelled: bool = False
+    labels: Sequence[str] = ()
 
 
 class SymbolicRows(NamedTuple):

@@ -176,6 +176,7 @@ def _constrained(key: Key, graph: Graph, state: list, params: list, inputs: list
         lam=lam,
         crossing=key.crossing,
         cancelled=cancelled,
+        labels=[layout.labels[k] for k in chosen],
     )
     if any(map(reads_lam, key.forces)):
         return _with_reactions(key, graph, bound, [*given, *inputs])
