@@ -36,7 +36,7 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         if not given:
             return out, ad.Zero(ShapedArray(out.shape, out.dtype))
         # As in JAX's primitives, an operand may have axes of size 1 in place of others.
-        moved = [tuple(jnp.broadcast_to(x, out.shape) for x in pair) for pair in given]
+        moved = [tuple(jnp.broadcast_to(y, out.shape) for y in each) for each in given]
         primals = [jnp.broadcast_to(x, out.shape) for x in primals]
 
         def ties(x: Any) -> Any:
@@ -51,11 +51,16 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         return ShapedArray(jnp.broadcast_shapes(*(x.shape for x in avals)), avals[0].dtype)
 
     def batched(args: Any, axes: Any) -> tuple[Any, int]:
-        fronts = [
-            x if axis is None else jnp.moveaxis(x, axis, 0)
-            for x, axis in zip(args, axes, strict=True)
-        ]
-        return primitive.bind(*jnp.broadcast_arrays(*fronts)), 0
+        pairs = list(zip(args, axes, strict=True))
+        rank = max(x.ndim - (axis is not None) for x, axis in pairs)
+
+        def front(x: Any, axis: int | None) -> Any:
+            """Lanes first, then as many axes as the operand with most: a scalar has none."""
+            x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+            missing = rank + 1 - x.ndim
+            return x.reshape(x.shape[0], *(1,) * missing, *x.shape[1:])
+
+        return primitive.bind(*jnp.broadcast_arrays(*(front(*pair) for pair in pairs))), 0
 
     primitive.def_impl(value)
     primitive.def_abstract_eval(shape)

@@ -81,6 +81,40 @@ def test_operands_with_axes_of_size_one_are_broadcast():
     np.testing.assert_allclose(each, jax.vmap(function)(x + jnp.arange(2.0)[:, None]), rtol=1e-14)
 
 
+@pytest.mark.parametrize("lanes", [2, 3])
+@pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None), (1, 0)])
+@pytest.mark.parametrize("of", [jnp.maximum, jnp.minimum])
+def test_lanes_of_a_scalar_are_no_components(of, axes, lanes):
+    """JAX takes a scalar beside an array. Its lanes are as many as components, or not."""
+
+    def function(x, p):
+        return of(x, p) * p
+
+    program = jax.make_jaxpr(function)(jnp.zeros(3), 0.0)
+    assert {x.aval.shape for eqn in program.eqns for x in eqn.invars} == {(3,), ()}
+
+    def other(x, p):
+        return jaxpr_as_fun(with_sound_extremes(program))(x, p)[0]
+
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(lanes, 3) if axes[0] == 0 else (3, lanes) if axes[0] else 3)
+    given = jnp.asarray(x), jnp.asarray(rng.normal(size=() if axes[1] is None else lanes))
+    for f in (lambda f: f, lambda f: jax.jacrev(f, (0, 1)), lambda f: jax.jacfwd(f, (0, 1))):
+        found, expected = (jax.vmap(f(g), axes)(*given) for g in (other, function))
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+@pytest.mark.parametrize("lowering", ["scalar", "array"])
+def test_batches_of_a_param_beside_the_coordinates(lowering):
+    force = jl.GeneralizedForce(lambda t, q, v, p: -jnp.maximum(q, p), "push")
+    free = lambda t, q, v, p: 0.5 * v @ v  # noqa: E731
+    system = jl.System(free, ("x", "y", "z"), forces=[force], lowering=lowering)
+    q, ps = jnp.array([0.1, 0.5, -0.3]), jnp.array([0.0, 0.2, 0.7])
+    a = lambda p: system.acceleration(q, jnp.zeros(3), p)  # noqa: E731
+    np.testing.assert_allclose(jax.vmap(a)(ps), -jnp.maximum(q, ps[:, None]))
+
+
 def test_integers_are_unchanged():
     program = jax.make_jaxpr(lambda x: jnp.maximum(x, 2))(jnp.arange(3))
     assert with_sound_extremes(program) is program
