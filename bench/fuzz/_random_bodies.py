@@ -8,7 +8,7 @@ energies are those of all random mechanisms.
 
 import numpy as np
 
-from bench.fuzz._random_mechanisms import Mechanism, Row, _Drawing
+from bench.fuzz._random_mechanisms import Mechanism, _Drawing
 from bench.fuzz._random_systems import Drawn, text
 
 _JOINTS = "hinge", "hinge", "slider", "screw"
@@ -54,7 +54,7 @@ class _Bodies(_Drawing):
 
     def lagrangian(self, without: int | None = None, name: str = "v") -> Drawn:
         """L of the bodies; some have an inertia of each coordinate, too, as of a motor."""
-        rng, drawn = self.rng, super().lagrangian()
+        rng, drawn = self.rng, super().lagrangian(without, name)
         bodies = []
         for pose in self.poses[1:]:
             a, b, c = (float(f"{x:.3g}") for x in rng.uniform(0.1, 1.0, 3))
@@ -103,11 +103,8 @@ def draw(seed: int, reach: float = 4.0, smooth: bool = False) -> Mechanism:
         smooth: whether L must be smooth.
     """
     by = _Bodies(seed, reach, smooth)
-    rng, base = by.rng, []
-    for _ in range(int(rng.integers(0, min(by.n, 3) + 1))):
-        holonomic = rng.random() < 0.6
-        row = Row("holonomic", by.holonomic()) if holonomic else Row("Pfaffian", by.pfaffian())
-        base.append(row)
+    rng = by.rng
+    base = by.base(int(rng.integers(0, min(by.n, 3) + 1)))
     rows = list(base)
     if base and rng.random() < 0.3:
         rows.append(by.following(base))

@@ -237,6 +237,15 @@ class _Drawing:
             parts.append(f"0.5 * ({text(trees.grow(1))})")
         return f"({' + '.join(parts)})"
 
+    def base(self, count: int) -> list[Row]:
+        """Rows that do not depend on one another by declaration."""
+        rows = []
+        for _ in range(count):
+            holonomic = self.rng.random() < 0.6
+            written = self.holonomic() if holonomic else self.pfaffian()
+            rows.append(Row("holonomic" if holonomic else "Pfaffian", written))
+        return rows
+
     def void(self, kind: str) -> str:
         """A row that is zero except for rounding."""
         i, j, k = (int(x) for x in self.rng.integers(self.n, size=3))
@@ -296,11 +305,7 @@ def draw(seed: int, reach: float = 12.0, smooth: bool = False) -> Mechanism:
     """
     by = _Drawing(seed, reach, smooth)
     rng, n = by.rng, by.n
-    base = []
-    for _ in range(int(rng.integers(1, n + 1))):
-        holonomic = rng.random() < 0.6
-        row = Row("holonomic", by.holonomic()) if holonomic else Row("Pfaffian", by.pfaffian())
-        base.append(row)
+    base = by.base(int(rng.integers(1, n + 1)))
     rows, rest = list(base), None
     for _ in range(int(rng.choice([0, 1, 2], p=[0.45, 0.4, 0.15]))):
         rows.append(by.following(base))

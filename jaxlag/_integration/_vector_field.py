@@ -430,7 +430,7 @@ class VectorField(eqx.Module):
         _, q, _, params, values = self.at(tau, y, args)
         return self.program.lines(q, params, values)
 
-    def without_lines(self, tau: Array, y: Array, args: Arguments) -> str | None:
+    def why_on_arrays(self, tau: Array, y: Array, args: Arguments) -> str | None:
         """Why there is no scalar program; None if there is one, or none is wanted."""
         _, q, _, params, values = self.at(tau, y, args)
-        return self.program.without_lines(q, params, values)
+        return self.program.why_on_arrays(q, params, values)

@@ -1,9 +1,10 @@
 """Solves with the mass matrix: symmetric positive definite, small, factored once."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
 
@@ -124,6 +125,20 @@ def _eliminated(
         return jnp.where((at > k)[:, None], M - ratio[:, None] * M[k][None], M)
 
     return jax.lax.fori_loop(0, n, one, M)
+
+
+def known_definite(M: np.ndarray, dtype: Any) -> bool:
+    """The same of a known matrix, by the eigenvalues of M_ij / sqrt(M_ii M_jj).
+
+    Args:
+        M: symmetric; False if it is not finite.
+        dtype: of the state, whose precision it has.
+    """
+    units = np.sqrt(np.abs(np.diagonal(M)))
+    if not np.all(units > 0) or not np.all(np.isfinite(M)):
+        return False
+    floor = np.sqrt(float(jnp.finfo(dtype).eps))
+    return bool(np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor)
 
 
 def clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:

@@ -133,7 +133,7 @@ class AccelerationProgram(eqx.Module):
         """Number of lines of the scalar program of accelerations; None if there is none."""
         return None
 
-    def without_lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
+    def why_on_arrays(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
         """Why there is no scalar program; None if there is one, or none is wanted."""
         return None
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlag._linalg._mass_solve import known_definite
 from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
@@ -17,7 +18,7 @@ from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSyste
 from jaxlag._lowering._term_codes import TermCodes
 from jaxlag._lowering._verification._compared_accelerations import ComparedAccelerations
 from jaxlag._lowering._verification._compared_rates import ComparedRates
-from jaxlag._lowering._verification._compared_state import is_definite, numbers, random_state
+from jaxlag._lowering._verification._compared_state import numbers, random_state
 from jaxlag._lowering._verification._compared_terms import ComparedForces, ComparedTerms, TermNodes
 from jaxlag._lowering._verification._verify import Verification, compare
 from jaxlag._tracing import _params
@@ -41,6 +42,7 @@ UNITS = 15
 # 667 ms; 11 s, 6.5 ms | not measured since terms that run seldom are interpreted.
 OF_ARRAYS = 2
 
+STATES = 4  # random states for the usual mass matrix
 SHOWN = 3  # longest parts of code that is too long
 
 
@@ -119,9 +121,9 @@ def lower_terms(key: Key, sample: _params.Sample) -> TermCodes | None:
 
 @lru_cache(maxsize=256)
 def usually_definite(key: Key, sample: _params.Sample) -> bool:
-    """Whether M is positive definite without the constraints, in a random state.
+    """Whether M is positive definite without the constraints in one of several random states.
 
-    True if there are no terms by themselves, as with quasi-velocities.
+    True if M is finite in none of them, and if the state has quasi-velocities.
 
     Args:
         key: key of a program that exists.
@@ -131,9 +133,11 @@ def usually_definite(key: Key, sample: _params.Sample) -> bool:
         return True
     terms, n = _read(key.of_terms).terms, key.size
     assert terms is not None
-    at = random_state(key, np.random.default_rng(0), sample.leaves)
-    M = numbers([x for row in terms.forms[0].M for x in row], at)
-    return is_definite(M.reshape(n, n))
+    rng, flat = np.random.default_rng(0), [x for row in terms.forms[0].M for x in row]
+    states = [random_state(key, rng, sample.leaves) for _ in range(STATES)]
+    masses = [numbers(flat, at).reshape(n, n) for at in states]
+    known = [M for M in masses if np.all(np.isfinite(M))]
+    return not known or any(known_definite(M, key.dtype) for M in known)
 
 
 def _lowered(key: Key, sample: _params.Sample) -> Lowered:
@@ -226,11 +230,14 @@ def _too_long(scene: SymbolicSystem, key: Key, limit: int | None) -> str | None:
 def _longest(scene: SymbolicSystem, equations: Equations) -> str:
     """The longest parts, with their operations before equal ones are computed once."""
     parts = {"M": [x for row in equations.mass for x in row], "h": equations.bias}
+    if scene.kinematics is not None:
+        parts = {"B^T M B": parts["M"], "B^T (h - Q)": parts["h"]}
+    parts["Q"] = [*(scene.force or ()), *((scene.constrained and scene.constrained.reaction) or ())]
     if equations.rows is not None and scene.constrained is not None:
         for name, row, gamma in zip(scene.constrained.labels, *equations.rows, strict=True):
             parts[f"row {name!r}"] = [*row, gamma]
     sizes = {name: _operations(nodes) for name, nodes in parts.items()}
-    longest = sorted(sizes, key=lambda name: -sizes[name])[:SHOWN]
+    longest = sorted(filter(sizes.get, sizes), key=lambda name: -sizes[name])[:SHOWN]
     return ", ".join(f"{name} {sizes[name]}" for name in longest)
 
 

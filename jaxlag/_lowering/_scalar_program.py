@@ -69,7 +69,7 @@ class ScalarProgram(AccelerationProgram):
         limit: largest number of operations of a scalar program; None for no limit.
         lanes: whether terms are vmapped, so that every scalar is a row of numbers.
         in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
-        seldom: whether they are evaluated a few times in a solve.
+        seldom: whether they are evaluated a few times in a solve, or not expected to be.
     """
 
     array: ArrayTerms
@@ -276,7 +276,7 @@ class ScalarProgram(AccelerationProgram):
         equations = self.lowered(q, params, inputs).equations
         return None if equations is None else len(equations.program.body)
 
-    def without_lines(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
+    def why_on_arrays(self, q: Any, params: Any, inputs: Mapping[str, Any]) -> str | None:
         """The reason of the lowering."""
         lowered = self.lowered(q, params, inputs)
         return lowered.reason if lowered.equations is None else None

@@ -126,14 +126,18 @@ def build_problem(plan: ProgramKey, values: Values) -> tuple[VectorField, Start,
 
 
 def fallback(plan: ProgramKey, values: Values) -> str | None:
-    """Why accelerations are computed on arrays; None on scalars, or if arrays are declared."""
+    """Why accelerations are computed on arrays.
+
+    None on scalars, if arrays are declared, and for methods that do not use accelerations.
+    """
     found: list[str | None] = []
 
     def look(values: Values) -> Array:
-        dynamics, args, _ = equations(plan, values)
+        dynamics, args, (solver, _) = equations(plan, values)
         size = dynamics.system.size + dynamics.speeds + dynamics.state_count
         y = jnp.zeros(size, values.q0.dtype)
-        found.append(dynamics.without_lines(jnp.zeros_like(args.origin), y, args))
+        reason = dynamics.why_on_arrays(jnp.zeros_like(args.origin), y, args)
+        found.append(None if isinstance(solver, AbstractPartitioned) else reason)
         return y
 
     jax.eval_shape(look, with_jax_arrays(values))

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
+from jaxlag._linalg._mass_solve import known_definite
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import evaluate
 from jaxlag._model._states import named_states, state_names
@@ -68,7 +69,6 @@ def mass_definite(
         states.append((t, q, v))
     elif system._structure(params, q.dtype).mass & {"t", "q", "v"}:
         states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
-    floor = np.sqrt(float(jnp.finfo(q.dtype).eps))
     for state in states:
         kinds = jnp.result_type(float), q.dtype, q.dtype
         at = [np.asarray(x, kind) for x, kind in zip(state, kinds, strict=True)]
@@ -76,11 +76,7 @@ def mass_definite(
             M = _mass((system, sample), params, None, *at)
         if not concrete(M):
             return None  # the Lagrangian closes over a traced value
-        M = np.asarray(M, np.float64)
-        units = np.sqrt(np.abs(np.diagonal(M)))
-        if not np.all(units > 0) or not np.all(np.isfinite(M)):
-            return False
-        if not np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor:
+        if not known_definite(np.asarray(M, np.float64), q.dtype):
             return False
     return True
 

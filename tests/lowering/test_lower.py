@@ -66,6 +66,17 @@ def test_random_state_tells_the_usual_mass_matrix(massless, sample):
     assert usually_definite(key, sample) is (not massless and sample is _params.UNKNOWN)
 
 
+@pytest.mark.parametrize(
+    "mass",
+    [lambda q: jnp.array([1.0, 1e-10]), lambda q: jnp.stack([1.0 + 0.0 * q[0], jnp.sqrt(q[0])])],
+    ids=["units apart", "not finite in half of the states"],
+)
+def test_small_inertias_and_domains_are_usual(mass):
+    system = jl.System(lambda t, q, v, p: 0.5 * mass(q) @ v**2, ("x", "y"))
+    key = key_of(system._terms, jnp.ones(2), {}, {}, None)
+    assert usually_definite(key, _params.UNKNOWN)
+
+
 @pytest.mark.parametrize("massless", [False, True])
 def test_only_the_usual_program_is_written_out(massless):
     """The other one is a table for a loop; if masses vanish in every case, there is no other."""
@@ -146,6 +157,18 @@ UNREADABLE = {
         },
         r"force 'order': sort at .*test_lower.py:\d+.*",
     ),
+    "force that reads multipliers": (
+        {
+            "constraints": [jl.Holonomic(lambda t, q, p: q[0], names="guide")],
+            "forces": [
+                jl.GeneralizedForce(lambda t, q, v, p: -v, name="drag"),
+                jl.GeneralizedForce(
+                    lambda t, q, v, p, lam: -lam["guide"] * jnp.sort(v), "rubbing", reaction=True
+                ),
+            ],
+        },
+        r"force 'rubbing': sort at .*test_lower.py:\d+.*",
+    ),
 }
 
 
@@ -171,3 +194,12 @@ def test_longest_parts_of_long_code_are_named():
         r"row 'wave \d' \d+, row 'wave \d' \d+, row 'wave \d' \d+",
         found[1],
     )
+
+
+def test_a_long_force_is_the_longest_part():
+    def push(t, q, v, p):
+        return jnp.sum(jnp.sin(jnp.outer(q, v) + q[:, None, None]), axis=(0, 1))
+
+    force = jl.GeneralizedForce(push, name="push")
+    text = jl.System(free, {"r": 9}, forces=[force]).explain({})
+    assert re.search(r"array program \(\d+ operations.*: more than 1500; Q \d+\)", text)

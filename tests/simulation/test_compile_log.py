@@ -79,6 +79,15 @@ def test_reason_for_arrays_is_logged(monkeypatch, caplog, declaration, reason):
     assert (found is None) == (reason is None)
 
 
+def test_methods_without_accelerations_have_no_reason(monkeypatch, caplog):
+    caplog.set_level(logging.WARNING, logger="jaxlag")
+    force = jl.GeneralizedForce(lambda t, q, v, p: -jnp.sort(v), name="sorted")
+    system = jl.System(PAIR.lagrangian, ("x", "y"), forces=[force])
+    called(monkeypatch, 12.0, system, dt=0.5, method="variational2")
+    (record,) = caplog.records
+    assert "arrays" not in record.getMessage()
+
+
 @pytest.mark.full
 def test_log_is_empty_under_transforms(monkeypatch, caplog):
     caplog.set_level(logging.WARNING, logger="jaxlag")

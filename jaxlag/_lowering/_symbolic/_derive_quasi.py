@@ -215,7 +215,7 @@ def _lagrange(scene: SymbolicSystem, moved: _Moved, L: Node) -> tuple[list[list[
 def _by_dalembert(
     scene: SymbolicSystem, residues: Residues
 ) -> tuple[list[list[Node]], list[Node]] | None:
-    """(M, h) by d'Alembert's principle, derived with inputs in place of numbers."""
+    """(M, h) by d'Alembert's principle, with `Literals` in place of numbers meanwhile."""
     literals = Literals(scene.graph)
     (L,) = literals.without([scene.lagrangian])
     found = principle_of_dalembert(scene, L, residues)

@@ -1,6 +1,6 @@
 """Conversion of a declared system to scalar expressions."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -76,25 +76,34 @@ def with_forces(scene: SymbolicSystem, key: Key) -> SymbolicSystem:
 
 
 def _force(key: Key, graph: Graph, given: list) -> list[Node] | None:
-    """Q, if there are forces.
+    """Q, if there are forces."""
+    if not key.forces:
+        return None
+
+    def of(forces: tuple) -> Any:
+        return traced(key, ArrayTerms(key.lagrangian, forces).force, True)
+
+    return _sum_of(key.forces, graph, of, given)
+
+
+def _sum_of(forces: tuple, graph: Graph, of: Callable[[tuple], Any], given: list) -> list[Node]:
+    """The generalized force of all forces.
+
+    Args:
+        forces: as declared.
+        graph: of all nodes.
+        of: the program of some forces.
+        given: its arguments.
 
     Raises:
         Unsupported: a force without scalar form, by its name.
     """
-    if not key.forces:
-        return None
-
-    def of(forces: tuple, graph: Graph) -> Any:
-        terms = ArrayTerms(key.lagrangian, forces)
-        (Q,) = read(graph, traced(key, terms.force, True), *given)
-        return Q
-
     try:
-        Q = of(key.forces, graph)
+        (Q,) = read(graph, of(forces), *given)
     except Unsupported:
-        for force in key.forces:
+        for force in forces:
             with _named(f"force {force.name!r}"):
-                of((force,), graph.copy())
+                read(graph.copy(), of((force,)), *given)
         raise
     return [_node(graph, x) for x in Q]
 
@@ -114,8 +123,14 @@ def _with_reactions(key: Key, graph: Graph, bound: Constrained, given: list) -> 
     chosen, sharing = np.flatnonzero(rows_that_forces_read(key, terms)).tolist(), None
     if bound.active_rows is not None and len(chosen) > 1 and not key.contact_rows_independent:
         sharing = Sharing(chosen, [graph.input("nonzero", x.data[1]) for x in bound.active_rows])
-    (Q,) = read(graph, traced(key, terms.reactive, True, m), *given, _array(list(bound.lam), (m,)))
-    return bound._replace(reaction=[_node(graph, x) for x in Q], sharing=sharing)
+
+    def of(forces: tuple) -> Any:
+        terms = ArrayTerms(key.lagrangian, forces, _included(key))
+        return traced(key, terms.reactive, True, m)
+
+    reactive = tuple(filter(reads_lam, key.forces))
+    reaction = _sum_of(reactive, graph, of, [*given, _array(list(bound.lam), (m,))])
+    return bound._replace(reaction=reaction, sharing=sharing)
 
 
 def _included(key: Key) -> tuple[AbstractConstraint, ...]:
