@@ -219,7 +219,7 @@ def _equations(name: str, scene: Scene, tidy: Tidy, last: Tidy) -> Equations:
     lines, entries = sp.cse([*flat, *right], sp.numbered_symbols("x"))
     filled = iter(entries[: len(flat)])
     lower = [[next(filled) for _ in range(i + 1)] for i in range(n)]
-    a = _solve(lower, list(entries[len(flat) :]), lines)
+    a = solve_by_lines(lower, list(entries[len(flat) :]), lines)
     return _printed(lines, a, q, v, p)
 
 
@@ -230,7 +230,7 @@ def _symbols(name: str, value: Any) -> Any:
     return sp.symbols(f"{name}_:{size}", real=True)
 
 
-def _solve(M: list[list[sp.Expr]], r: list[sp.Expr], lines: Lines) -> list[sp.Expr]:
+def solve_by_lines(M: list[list[sp.Expr]], r: list[sp.Expr], lines: Lines) -> list[sp.Expr]:
     """The a with M a = r; each operation is a new line. M is given by its lower triangle."""
     n, names = len(r), sp.numbered_symbols("z")
 
