@@ -290,9 +290,9 @@ class ArrayTerms(AbstractTerms):
         M, right = self._balance(t, q, v, params, inputs, constants)
         if not self.constraints:
             return solve_mass(M, right, constants.factor)
-        return self._solved(
-            M, right, t, q, v, params, inputs, multiplier_rows, constants.time_direction
-        )[0]
+        A, _ = self.rows(t, q, v, params)
+        gamma = self.gamma(t, q, v, params, constants.time_direction)
+        return self._solved(M, right, A, gamma, t, q, v, params, inputs, multiplier_rows)[0]
 
     def reactions(
         self,
@@ -301,18 +301,29 @@ class ArrayTerms(AbstractTerms):
         v: Float[Array, " n"],
         params: Any,
         inputs: Mapping[str, Any],
+        terms: AbstractTerms | None = None,
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """(a, lam), of least norm for dependent rows; NaN for contradictory rows."""
-        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params))
+        """(a, lam), of least norm for dependent rows; NaN for contradictory rows.
+
+        Args:
+            t: time, s.
+            q: coordinates, shape (n,).
+            v: velocities, shape (n,).
+            params: as the Lagrangian takes them.
+            inputs: values of the inputs.
+            terms: the same terms in another form; by default these.
+        """
+        terms = self if terms is None else terms
+        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params), terms)
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
-        A, _ = self.rows(t, q, v, params)
-        stop_gradient = jax.lax.stop_gradient
-        sizes = row_sizes(lambda q: self.rows(t, q, v, params)[0], *stop_gradient((q, A)))
+        rows, gamma = terms.rows_of(t, v, params), terms.gamma_of(params)
+        stop_gradient, A = jax.lax.stop_gradient, rows(q)
+        sizes = row_sizes(rows, *stop_gradient((q, A)))
         nonzero, void, _ = sizes
         if A.shape[0] == 1:
             choice = RowChoice(~void, ~void)
-            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            a, lam = self._solved(M, right, A, gamma(t, q, v), t, q, v, params, inputs, choice)
             lam = jnp.where(void, 0.0, lam)
             fine = (nonzero | void)[0]
         else:
@@ -322,13 +333,9 @@ class ArrayTerms(AbstractTerms):
                 *stop_gradient((M, A)), unread, nonzero=nonzero, mobile_first=True
             )
             choice = RowChoice(active_rows, nonzero)
-            a, lam = self._solved(M, right, t, q, v, params, inputs, choice)
+            a, lam = self._solved(M, right, A, gamma(t, q, v), t, q, v, params, inputs, choice)
             units = units_of(*stop_gradient((M, A)))
             lam = shared(A, lam, active_rows, nonzero, unread, units)
-
-            def gamma(t: Array, q: Array, v: Array) -> Array:
-                return self.gamma(t, q, v, params)
-
             fine = redundant_rows_hold(
                 *stop_gradient((A, a)), gamma, *stop_gradient(((t, q, v), sizes, right, units))
             )
@@ -346,24 +353,24 @@ class ArrayTerms(AbstractTerms):
     ) -> Float[Array, " m"]:
         """The multipliers as forces read them, solved with these rows."""
         M, right = self._balance(t, q, v, params, inputs, constants)
-        return self._solved(
-            M, right, t, q, v, params, inputs, multiplier_rows, constants.time_direction
-        )[1]
+        A, _ = self.rows(t, q, v, params)
+        gamma = self.gamma(t, q, v, params, constants.time_direction)
+        return self._solved(M, right, A, gamma, t, q, v, params, inputs, multiplier_rows)[1]
 
     def _solved(
         self,
         M: Array,
         right: Array,
+        A: Array,
+        gamma: Array,
         t: Array,
         q: Array,
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
         multiplier_rows: RowChoice | None,
-        time_direction: Array | float = 1.0,
     ) -> tuple[Array, Array]:
         """(a, lam) with constraints; lam as forces read it, if they do."""
-        (A, _), gamma = self.rows(t, q, v, params), self.gamma(t, q, v, params, time_direction)
         active_rows = None if multiplier_rows is None else multiplier_rows.active_rows
         if not any(map(reads_lam, self.forces)):
             return solve_kkt(
@@ -388,11 +395,19 @@ class ArrayTerms(AbstractTerms):
         return a, as_read(lam)
 
     def _balance(
-        self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any], constants: Any
+        self,
+        t: Array,
+        q: Array,
+        v: Array,
+        params: Any,
+        inputs: Mapping[str, Any],
+        constants: Any,
+        terms: AbstractTerms | None = None,
     ) -> tuple[Array, Array]:
         """(M, Q - h)."""
-        M = self.mass(t, q, v, params) if constants.mass is None else constants.mass
-        right = jnp.zeros_like(q) if constants.bias_zero else -self.bias(t, q, v, params)
+        terms = self if terms is None else terms
+        M = terms.mass(t, q, v, params) if constants.mass is None else constants.mass
+        right = jnp.zeros_like(q) if constants.bias_zero else -terms.bias(t, q, v, params)
         if self.forces:
             right = self.force(t, q, v, params, inputs) + right
         return M, right

@@ -101,6 +101,12 @@ class InterpretedTerms(AbstractTerms):
         """M."""
         return self._term("mass", params)(t, q, v).reshape(q.shape[0], -1)
 
+    def bias(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """h."""
+        return self._term("bias", params)(t, q, v)
+
     def position(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
     ) -> Float[Array, " k"]:

@@ -107,6 +107,7 @@ def lower_terms(key: Key, sample: _params.Sample) -> TermCodes | None:
     gradients = [row for row, holonomic in zip(A, bound.holonomic, strict=True) if holonomic]
     roots = {
         "mass": [x for row in form.M for x in row],
+        "bias": form.h,
         "rows": [x for row in A for x in row],
         "position_rows": [x for row in gradients for x in row],
         "gamma": gamma,

@@ -10,7 +10,7 @@ LONG = 500
 
 
 class TermCodes(NamedTuple):
-    """Code for M, A, gamma, phi, its rows of A, and A v + b.
+    """Code for M, h, A, gamma, phi, its rows of A, and A v + b.
 
     Attributes:
         programs: by the name of the term.
@@ -27,4 +27,9 @@ class TermCodes(NamedTuple):
     @property
     def are_long(self) -> bool:
         """Whether the interpreter is quicker to compile than the same terms on arrays."""
-        return sum(len(p.body) + len(p.prelude) for p in self.programs.values()) > LONG
+        return sum(len(p.body) + len(p.prelude) for p in self._started) > LONG
+
+    @property
+    def _started(self) -> list[Program]:
+        """The code that starts of motions evaluate."""
+        return [program for name, program in self.programs.items() if name != "bias"]

@@ -44,6 +44,12 @@ class AbstractTerms(eqx.Module):
         """M."""
 
     @abstractmethod
+    def bias(
+        self, t: Float[Array, ""], q: Float[Array, " n"], v: Float[Array, " n"], params: Any
+    ) -> Float[Array, " n"]:
+        """h."""
+
+    @abstractmethod
     def position(
         self, t: Float[Array, ""], q: Float[Array, " n"], params: Any
     ) -> Float[Array, " k"]:

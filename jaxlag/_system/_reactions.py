@@ -11,6 +11,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._lowering import ArrayTerms, QuasiState, State
 from jaxlag._model._forces import reads_lam
 from jaxlag._system._state_functions import AbstractQuantities
+from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._input_values import InputValues
 
@@ -203,21 +204,23 @@ class AbstractReactions(AbstractQuantities):
     ) -> tuple[Array, Array, Array]:
         """(a, lam, A), compiled as one program because of many small operations."""
         self._rows(params, q.dtype)
-        return _reactions((self,), params, dict(values), t, q, v)
+        sample = _params.sample(_params.split(params)[0])
+        return _reactions((self, sample), params, dict(values), t, q, v)
 
 
 @Compiled
 def _reactions(
     system: AbstractReactions,
+    sample: _params.Sample,
     params: Any,
     values: dict[str, Any],
     t: Array,
     q: Array,
     v: Array,
 ) -> tuple[Array, Array, Array]:
-    terms = system._terms
-    a, lam = terms.reactions(t, q, v, params, InputValues(values))
-    return a, lam, terms.rows(t, q, v, params)[0]
+    terms = system._program.terms(q, params, sample)
+    a, lam = system._terms.reactions(t, q, v, params, InputValues(values), terms)
+    return a, lam, terms.rows_of(t, v, params)(q)
 
 
 @Compiled

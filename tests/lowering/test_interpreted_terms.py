@@ -57,6 +57,7 @@ def test_terms_are_those_on_arrays(name, all_interpreted):
         pytest.skip("no scalar program")
     pairs = [
         (terms.mass(t, q, v, params), array.mass(t, q, v, params)),
+        (terms.bias(t, q, v, params), array.bias(t, q, v, params)),
         (terms.position(t, q, params), array.position(t, q, params)),
         (terms.velocity(t, q, v, params), array.velocity(t, q, v, params)),
         (terms.gamma_of(params)(t, q, v), array.gamma(t, q, v, params)),
@@ -65,6 +66,20 @@ def test_terms_are_those_on_arrays(name, all_interpreted):
     for found, expected in pairs:
         size = 1.0 + np.max(np.abs(expected), initial=0.0)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e3 * EPS * size)
+
+
+@pytest.mark.parametrize("name", mostly_full(CONSTRAINED, *CONSTRAINED[:3]))
+def test_accelerations_and_reactions_are_those_on_arrays(name, all_interpreted):
+    terms, array, state, params = both(name)
+    if not isinstance(terms, InterpretedTerms):
+        pytest.skip("no scalar program")
+    found, expected = (
+        jax.jit(lambda t, q, v, p, by=by: array.reactions(t, q, v, p, {}, by))(*state, params)
+        for by in (terms, None)
+    )
+    for x, y in zip(found, expected, strict=True):
+        # Some hundred roundings through M and A M^-1 A^T, each with a condition of up to 1e3.
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e7 * EPS * (1.0 + np.max(np.abs(y))))
 
 
 def closed_chain():
@@ -87,6 +102,39 @@ def closed_chain():
 
 CHAIN = {"m": 1.3, "l": 0.7}
 START = np.array([0.2, 0.5, -0.7 * np.cos(0.5)]), np.array([0.1, 0.3, 0.7 * 0.3 * np.sin(0.5)])
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_accelerations(mode, all_interpreted):
+    """In the state as on arrays, in the mass against differences."""
+    system, (q, v) = fresh(closed_chain()), map(jnp.asarray, START)
+    array = ArrayTerms(system.lagrangian, (), system.constraints)
+
+    def acceleration(q, v, m):
+        return system.acceleration(q, v, CHAIN | {"m": m})
+
+    def on_arrays(q, v):
+        return array.reactions(jnp.zeros(()), q, v, CHAIN, {})[0]
+
+    *found, by_mass = mode(acceleration, (0, 1, 2))(q, v, CHAIN["m"])
+    for x, y in zip(found, jax.jit(mode(on_arrays, (0, 1)))(q, v), strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e6 * EPS * (1.0 + np.max(np.abs(y))))
+    h = 1e-5
+    ahead, back = (acceleration(q, v, CHAIN["m"] + s * h) for s in (1.0, -1.0))
+    # Differences of a second order: h^2 and roundings over h.
+    np.testing.assert_allclose(by_mass, (ahead - back) / (2 * h), rtol=0, atol=1e-8)
+
+
+def test_multipliers_share_the_reaction_of_dependent_rows(all_interpreted):
+    system, (q, v) = fresh(closed_chain()), map(jnp.asarray, START)
+    array = ArrayTerms(system.lagrangian, (), system.constraints)
+    a, lam = array.reactions(jnp.zeros(()), q, v, CHAIN, {})
+    found = jnp.ravel(jnp.concatenate(list(system.multipliers(q, v, CHAIN).values())))
+    assert abs(lam[1] - 0.5 * lam[0]) < 1e6 * EPS  # lengths 1 and 2, equal forces
+    assert lam[2] == 0.0
+    size = float(np.max(np.abs(lam)))
+    np.testing.assert_allclose(found, lam, rtol=0, atol=1e6 * EPS * size)
+    np.testing.assert_allclose(system.acceleration(q, v, CHAIN), a, rtol=0, atol=1e6 * EPS * 10.0)
 
 
 def test_rows_of_rounding_are_void(all_interpreted):
