@@ -204,7 +204,7 @@ class AbstractReactions(AbstractQuantities):
     ) -> tuple[Array, Array, Array]:
         """(a, lam, A), compiled as one program because of many small operations."""
         self._rows(params, q.dtype)
-        sample = _params.sample(_params.split(params)[0])
+        sample = _params.sample(_params.halves(params)[0])
         return _reactions((self, sample), params, dict(values), t, q, v)
 
 
