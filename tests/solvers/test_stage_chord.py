@@ -53,67 +53,6 @@ def test_roots_near_zero_are_held_to_the_absolute_bound():
     np.testing.assert_allclose(found.value, 2e-5 / 1.001, atol=1e-10)
 
 
-def state_at(finder, residual, guess):
-    """The state that diffrax passes to the next stages of a step."""
-    like = jax.eval_shape(lambda: guess)
-    function = lambda y, args: (residual(y, args), None)  # noqa: E731
-    return finder.init(function, guess, None, {}, like, None, frozenset())
-
-
-def test_the_jacobian_is_that_of_the_step_until_it_converges_slowly():
-    """f = 3 cos f near 1.17. The slope at 1.1 serves; that at 0.5 is replaced."""
-    finder, evaluated = StageChord(1e-9, 1e-9), []
-
-    @jax.custom_jvp
-    def cos(f):
-        return jnp.cos(f)
-
-    @cos.defjvp
-    def _(primals, tangents):
-        jax.debug.callback(lambda: evaluated.append(1))
-        return jnp.cos(*primals), -jnp.sin(*primals) * tangents[0]
-
-    def residual(f, _):
-        return f - 3.0 * cos(f)
-
-    guess = jnp.array([1.0])
-    for elsewhere, jacobians in ((1.1, 0), (0.5, 1)):
-        state = state_at(finder, residual, jnp.array([elsewhere]))
-        jax.effects_barrier()
-        evaluated.clear()
-        options = {"init_state": state}
-        found = optimistix.root_find(residual, finder, guess, options=options, max_steps=16)
-        jax.effects_barrier()
-        np.testing.assert_allclose(found.value, 3.0 * np.cos(found.value), rtol=1e-9)
-        assert len(evaluated) == jacobians
-
-
-def test_a_lane_does_not_depend_on_slow_ones_beside_it():
-    finder = StageChord(1e-9, 1e-9)
-
-    def residual(f, _):
-        return f - 3.0 * jnp.cos(f)
-
-    def root(elsewhere):
-        options = {"init_state": state_at(finder, residual, elsewhere)}
-        guess = jnp.array([1.0])
-        found = optimistix.root_find(residual, finder, guess, options=options, max_steps=16)
-        return found.value, found.stats["num_steps"]
-
-    points = jnp.array([[1.1], [0.5], [0.7]])
-    together = jax.vmap(root)(points)
-    for i, point in enumerate(points):
-        jax.tree.map(np.testing.assert_array_equal, [x[i] for x in together], list(root(point)))
-
-
-def test_nonfinite_increments_end_the_iterations():
-    finder, guess = StageChord(1e-9, 1e-9), jnp.array([2.0])
-    residual = lambda f, _: f - jnp.log(1.0 - f)  # noqa: E731
-    found = optimistix.root_find(residual, finder, guess, max_steps=50, throw=False)
-    assert found.result == optimistix.RESULTS.nonlinear_divergence
-    assert found.stats["num_steps"] <= 2
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "method"),

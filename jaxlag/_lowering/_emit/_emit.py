@@ -122,7 +122,7 @@ def body(
     if seldom and len(program.body) > INTERPRET_FROM and _may_interpret(program):
         function = _interpreter.interpreted(body_of(program), dtype, alone=not in_loop)
         return function(*elements(carried[:-1]), *given)
-    return called(*kind, in_loop)(carried, stacked(given, dtype))
+    return called(*kind)(carried, stacked(given, dtype))
 
 
 def _may_interpret(program: Program) -> bool:

@@ -7,7 +7,6 @@ cosines are stored: these are most of the work, and few numbers.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -19,24 +18,14 @@ from jaxlag._core._arrays import elements
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._linear_map import LinearMap, linear
 from jaxlag._core._xla import not_inlined
-from jaxlag._lowering._emit import _interpreter
-from jaxlag._lowering._emit._code import body_of
 from jaxlag._lowering._emit._execute import Pairs, is_trig, stacked, straight
 from jaxlag._lowering._graph._straight_line import Program
 
 Halves = tuple[Array, Array]  # (constants of a solve, state and inputs)
 
 
-# Several tangents of longer code at once are interpreted, as the columns of Jacobians in implicit
-# methods. 10 columns of 2,431 lines: 0.2 s to compile and 0.18 ms to run; compiled 9 s, 0.09 ms.
-# Single ones take 7 times as long interpreted.
-INTERPRET_FROM = 500
-
-
 @lru_cache(maxsize=256)
-def called(
-    program: Program, dtype: Any, lanes: bool, in_loop: bool
-) -> Callable[[Array, Array], Array]:
+def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array], Array]:
     """(constants of a solve, state and inputs) -> results, each as one array."""
     slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
 
@@ -78,12 +67,6 @@ def called(
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
     outlined, both_outlined = boundary(results), boundary(both)
     of_results, of_both = _maps(lambda numbers, sincos: both(numbers, sincos)[0]), _maps(both)
-    long = len(program.body) > INTERPRET_FROM and not (lanes or program.has_rules)
-    if long and _interpreter.available():
-        columns = partial(_columns, program, dtype, not in_loop)
-        of_results = {
-            which: replace(form, of_columns=columns(which)) for which, form in of_results.items()
-        }
     return call
 
 
@@ -131,34 +114,3 @@ def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
         which: LinearMap(not_inlined(jvp_fn), not_inlined(vjp_fn(which)), jvp_fn, at_once=None)
         for which in ((True, True), (False, True), (True, False))
     }
-
-
-def _columns(program: Program, dtype: Any, alone: bool, which: tuple[bool, bool]) -> LinearMap:
-    """The derivative by the interpreter, for several tangents or cotangents at once.
-
-    Args:
-        program: straight-line code.
-        dtype: of the results.
-        alone: whether it is outside of all loops of a solve.
-        which: the halves that move.
-    """
-    code = body_of(program)
-    count = len(program.carried)
-    parts = tuple(zip((count, len(code.given) - count), which, strict=True))
-    inner = _interpreter.derivative(code, dtype, alone, parts)
-
-    def without_one(halves: Any) -> tuple:
-        """Without the 1 at the end of the constants, and without halves that do not move."""
-        carried, given = halves
-        both = None if carried is None else carried[:-1], given
-        return tuple(x for x in both if x is not None)
-
-    def forward(at: tuple, dot: Any) -> Array:
-        return inner.forward(without_one(at[0]), without_one(dot))
-
-    def backward(at: tuple, bar: Any) -> tuple:
-        found = iter(inner.backward(without_one(at[0]), bar))
-        bars = [next(found) if moves else None for moves in which]
-        return None if bars[0] is None else jnp.append(bars[0], 0.0), bars[1]
-
-    return LinearMap(forward, backward, forward, backward, at_once=None)
