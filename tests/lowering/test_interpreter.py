@@ -111,6 +111,33 @@ def test_derivatives_are_those_of_the_lines(mode):
     np.testing.assert_allclose(lanes[0], expected, rtol=0, atol=tolerance)
 
 
+@pytest.mark.parametrize("mode", [jax.jvp, jax.vjp])
+@pytest.mark.parametrize(("times", "m"), [(3, 1e13), (1, 1e25)])
+def test_derivatives_of_divisions_stay_in_range(times, m, mode):
+    """Of ((x / m) / m) / m and x / m in float32, which has no m^3 and no m^2."""
+    graph = Graph()
+    graph.flat = False
+    x, divisor = graph.input("q", 0), graph.input("q", 1)
+    root = x
+    for _ in range(times):
+        root = graph.div(root, divisor)
+    program = assemble(graph, [root])
+    code = _interpreter.interpreted(whole_of(program), jnp.float32, alone=True)
+
+    def function(*given):
+        return code(*(given[i] for _, i in program.inputs))[0]
+
+    size, zero = jnp.float32(m**times * 1e-9), jnp.float32(0.0)
+    given = (size, jnp.float32(m))
+    if mode is jax.jvp:
+        along_x = jax.jvp(function, given, (size, zero))[1]
+        along_m = jax.jvp(function, given, (zero, given[1]))[1]
+    else:
+        bars = jax.vjp(function, *given)[1](size)
+        along_x, along_m = bars[0], bars[1] * given[1] / size
+    np.testing.assert_allclose([along_x, along_m], [1e-9, -times * 1e-9], rtol=1e-6)
+
+
 PAIRS = [(a, b) for a in (jax.grad, jax.jacfwd) for b in (jax.grad, jax.jacfwd)]
 
 

@@ -96,8 +96,12 @@ def adjoint(code: Code, moving: tuple[bool, ...]) -> Code:
 
 
 def _decoded(code: Code) -> tuple[Graph, list[Node], list[Node]]:
-    """The code on a graph of its own: (graph, given numbers, results)."""
+    """The code on a graph of its own: (graph, given numbers, results).
+
+    Its products are not opened: derivatives overflow no sooner than those of the lines, one by one.
+    """
     graph = Graph()
+    graph.flat = False
     known = {slot: graph.const(value) for slot, value in code.numbers.items()}
     given = [graph.input("given", i) for i in range(len(code.given))]
     for slot, node in zip(code.given, given, strict=True):

@@ -109,6 +109,8 @@ class Graph:
     Attributes:
         nodes: all of them, arguments first.
         once: names of JAX primitives whose results become atoms when a program is read.
+        flat: whether a product of products is one product; else its factors stay as they are, and
+            nothing overflows or underflows that does not in their order.
         cancelled: whether coefficients have cancelled up to what may be their rounding, since this
             was last set to False.
     """
@@ -117,6 +119,7 @@ class Graph:
         self.nodes: list[Node] = []
         self.cancelled = False
         self.once: Container[str] = ()
+        self.flat = True
         self._known: dict[Any, Node] = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 
@@ -124,7 +127,8 @@ class Graph:
         """A graph with the same nodes, to which others are added independently."""
         other = Graph()
         other.nodes, other._known = list(self.nodes), dict(self._known)
-        other.zero, other.one, other.once = self.zero, self.one, self.once
+        other.zero, other.one = self.zero, self.one
+        other.once, other.flat = self.once, self.flat
         return other
 
     def _node(self, op: str, data: Any, args: tuple[Node, ...]) -> Node:
@@ -262,7 +266,7 @@ class Graph:
         if abs(exponent) > POWERS and scaled(node):
             powers[node] = powers.get(node, 0) + exponent
             return 1.0
-        if node.op == "product":
+        if node.op == "product" and self.flat:
             for base, inner in node.data:
                 powers[base] = powers.get(base, 0) + inner * exponent
             return 1.0

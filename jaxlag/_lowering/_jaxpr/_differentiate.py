@@ -51,8 +51,8 @@ def _tangent(
     if node.op == "product":
         return graph.sum(
             [
-                (graph.product([*_lowered(node, i), (d, 1)], float(exponent)), 1.0)
-                for i, ((_, exponent), d) in enumerate(zip(node.data, moved, strict=True))
+                (_by_factor(graph, node, i, d), 1.0)
+                for i, d in enumerate(moved)
                 if d is not graph.zero
             ]
         )
@@ -98,8 +98,7 @@ def _cotangents(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node,
         return [(arg, total, c) for arg, c in node.data[1]]
     if node.op == "product":
         return [
-            (base, graph.product([*_lowered(node, i), (total, 1)], float(exponent)), 1.0)
-            for i, (base, exponent) in enumerate(node.data)
+            (base, _by_factor(graph, node, i, total), 1.0) for i, (base, _) in enumerate(node.data)
         ]
     if node.op == "select":
         condition, on_true, on_false = node.args
@@ -123,9 +122,16 @@ def _cotangents(graph: Graph, node: Node, total: Node) -> list[tuple[Node, Node,
     return []
 
 
-def _lowered(node: Node, i: int) -> list[tuple[Node, int]]:
-    """The factors of a product with the i-th exponent reduced by one."""
-    return [(base, e - (k == i)) for k, (base, e) in enumerate(node.data)]
+def _by_factor(graph: Graph, node: Node, i: int, other: Node) -> Node:
+    """The derivative of a product with respect to its i-th factor, times another node.
+
+    d(x / y) / dy is -(x / y) / y, not -x / y^2: the square may overflow.
+    """
+    base, exponent = node.data[i]
+    if exponent < 0:
+        return graph.product([(node, 1), (graph.div(other, base), 1)], float(exponent))
+    lowered = [(base, e - (k == i)) for k, (base, e) in enumerate(node.data)]
+    return graph.product([*lowered, (other, 1)], float(exponent))
 
 
 def _by_rule(graph: Graph, rule: Rule, args: Sequence[Node], moved: Sequence[Node]) -> list[Node]:
