@@ -35,6 +35,7 @@ METHODS = ("null_space", "kvaerno5", "variational4")
 # Ends beside the independent ones: the tolerance holds for a step, and motions amplify errors.
 APART = {"kvaerno5": 1e-2, "variational4": 1e-1, "gradient": 1e-3}
 USUAL_APART, SAME = 1e-6, 1e-8
+FAILED = "failed"
 # Run by its path: as a module of this package it would import jax before the timing starts.
 ONE_PROCESS = str(Path(__file__).with_name("_one_process.py"))
 COLUMNS = ("scene", "n", "rows", "case", "first_s", "run_ms", "solve_ms", "steps", "apart")
@@ -125,7 +126,7 @@ def first(name: str, case: str) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         return {"first_s": LIMIT_S, "note": f"stopped after {LIMIT_S:g} s"}
     if done.returncode != 0:
-        return {"note": f"failed: {done.stderr.strip().splitlines()[-1]}"}
+        return {"note": f"{FAILED}: {done.stderr.strip().splitlines()[-1]}"}
     found = json.loads(done.stdout.splitlines()[-1])
     return found | ({"note": found["refused"]} if "refused" in found else {})
 
@@ -143,6 +144,8 @@ def judged(rows: list[Row]) -> tuple[list[Target], list[Reference]]:
         return max(values, default=float("nan"))
 
     firsts, targets = figures("solve", "first_s"), []
+    failed = sum(str(row["note"]).startswith(FAILED) for row in rows)
+    targets.append(Target("cases that failed", failed, "<=", 0))
     ends = (row["apart"] / APART.get(row["case"], USUAL_APART) for row in rows if row["apart"])
     targets.append(Target("times its bound: an end or a gradient apart", worst(ends), "<=", 1.0))
     found = worst(row["off"] for row in rows if row["off"] is not None)
