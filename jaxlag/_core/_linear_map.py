@@ -17,10 +17,10 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
-from jaxlag._core._batching import LANES, in_batches
+from jaxlag._core._batching import LANES, at_most, in_batches
 
 Leaves = Sequence[Any]
-
+COLUMNS = 4  # smallest number of lanes of x for which `of_columns` is used
 
 _TWICE = (
     "Reverse derivatives of reverse derivatives must use an explicit method or a method of "
@@ -40,6 +40,7 @@ class LinearMap:
         plain: A(r) x by a program that JAX differentiates in any mode and to any order.
         plain_backward: A(r)^T y in the same way; None for the transpose of `plain`.
         in_lanes: the same map in the form to be vmapped over r; None for this one.
+        of_columns: the same map in the form to be vmapped over several x alone; None for this one.
         at_once: lanes of a vmap in one batch; None for all.
     """
 
@@ -48,6 +49,7 @@ class LinearMap:
     plain: Callable[[PyTree, PyTree], PyTree]
     plain_backward: Callable[[PyTree, PyTree], PyTree] | None = None
     in_lanes: "LinearMap | None" = None
+    of_columns: "LinearMap | None" = None
     at_once: int | None = LANES
 
 
@@ -82,6 +84,7 @@ def _flat(form: LinearMap, r_tree: Any, x_tree: Any, y_tree: Any) -> LinearMap:
         between(form.plain, x_tree),
         between(form.plain_backward, y_tree),
         None if form.in_lanes is None else _flat(form.in_lanes, r_tree, x_tree, y_tree),
+        None if form.of_columns is None else _flat(form.of_columns, r_tree, x_tree, y_tree),
         form.at_once,
     )
 
@@ -99,6 +102,7 @@ def _transposed(form: LinearMap, like: Leaves) -> LinearMap:
         form.plain_backward or plain,
         form.plain,
         None if form.in_lanes is None else _transposed(form.in_lanes, like),
+        None if form.of_columns is None else _transposed(form.of_columns, like),
         form.at_once,
     )
 
@@ -144,7 +148,7 @@ def _derived(form: LinearMap, count: int, moving: tuple[int, ...], both: bool) -
         partial(forward, form.plain),
         plain_backward,
         None if form.in_lanes is None else _derived(form.in_lanes, count, moving, both),
-        form.at_once,
+        at_once=form.at_once,
     )
 
 
@@ -153,6 +157,8 @@ def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
     in_lanes = form.in_lanes
     if any(mapped) and in_lanes is not None:
         form, in_lanes = in_lanes, None
+    if not any(mapped) and form.of_columns is not None and not at_most(size, COLUMNS - 1):
+        form, in_lanes = form.of_columns, None
 
     def lanes(function: Callable | None, at_once: Any) -> Any:
         if function is None:
@@ -178,7 +184,7 @@ def _batched(form: LinearMap, size: Any, mapped: tuple[bool, ...]) -> LinearMap:
         lanes(form.plain, size),
         lanes(form.plain_backward, size),
         None if in_lanes is None else _batched(in_lanes, size, mapped),
-        form.at_once,
+        at_once=form.at_once,
     )
 
 

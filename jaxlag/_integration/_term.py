@@ -29,14 +29,19 @@ class Term(diffrax.ODETerm):
 
     def compiled_for(self, lanes: bool, in_loop: bool) -> "Term":
         """The same, compiled for the place where it is evaluated, see `VectorField`."""
-        dynamics = replace(self.dynamics, lanes=lanes, in_loop=in_loop)
-        field: Any = dynamics.__call__
-        return Term(field, dynamics, self.lines, self.dtype)
+        return self._of(replace(self.dynamics, lanes=lanes, in_loop=in_loop))
 
     @property
     def seldom(self) -> "Term":
         """The same, to be evaluated a few times in a solve."""
-        dynamics = replace(self.dynamics, seldom=True)
+        return self._of(replace(self.dynamics, seldom=True))
+
+    @property
+    def with_jacobians(self) -> "Term":
+        """The same, for methods that compute Jacobians of it."""
+        return self._of(replace(self.dynamics, jacobians=True))
+
+    def _of(self, dynamics: VectorField) -> "Term":
         field: Any = dynamics.__call__
         return Term(field, dynamics, self.lines, self.dtype)
 

@@ -72,6 +72,7 @@ class VectorField(eqx.Module):
         extrapolates: whether the method has stages beyond the end of a step.
         crossing: whether rows that become dependent during the motion are left out there.
         seldom: whether it is evaluated a few times in a solve.
+        jacobians: whether its derivatives are Jacobians of implicit methods.
     """
 
     system: System
@@ -90,6 +91,7 @@ class VectorField(eqx.Module):
     extrapolates: bool = eqx.field(static=True, default=False)
     crossing: bool = eqx.field(static=True, default=False)
     seldom: bool = eqx.field(static=True, default=False)
+    jacobians: bool = eqx.field(static=True, default=False)
 
     @property
     def terms(self) -> ArrayTerms:
@@ -101,8 +103,13 @@ class VectorField(eqx.Module):
         """The program of the accelerations."""
         program = self.system._program
         if isinstance(program, ScalarProgram):
-            where = {"lanes": self.lanes, "in_loop": self.in_loop, "seldom": self.seldom}
-            program = replace(program, **where)
+            program = replace(
+                program,
+                lanes=self.lanes,
+                in_loop=self.in_loop,
+                seldom=self.seldom,
+                jacobians=self.jacobians,
+            )
         return replace(program, array=self.terms)
 
     @property
@@ -425,8 +432,10 @@ class VectorField(eqx.Module):
 
     def lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
         """Number of lines of the scalar program for such states; None if there is none."""
-        if self.power is not None:
-            return None
+        return None if self.power is not None else self.acceleration_lines(tau, y, args)
+
+    def acceleration_lines(self, tau: Array, y: Array, args: Arguments) -> int | None:
+        """The same of the accelerations, whatever else is integrated."""
         _, q, _, params, values = self.at(tau, y, args)
         return self.program.lines(q, params, values)
 

@@ -70,6 +70,7 @@ class ScalarProgram(AccelerationProgram):
         lanes: whether terms are vmapped, so that every scalar is a row of numbers.
         in_loop: whether they are evaluated in a loop over one trajectory or a few lanes.
         seldom: whether they are evaluated a few times in a solve, or not expected to be.
+        jacobians: whether their derivatives are Jacobians of implicit methods.
     """
 
     array: ArrayTerms
@@ -77,6 +78,7 @@ class ScalarProgram(AccelerationProgram):
     lanes: bool = eqx.field(static=True, default=False)
     in_loop: bool = eqx.field(static=True, default=False)
     seldom: bool = eqx.field(static=True, default=False)
+    jacobians: bool = eqx.field(static=True, default=False)
 
     def lowered(
         self,
@@ -203,7 +205,7 @@ class ScalarProgram(AccelerationProgram):
             assert code is not None
             assert carried is not None
             read = state.inputs if name in _WITH_INPUTS else {}
-            where = program.lanes, program.in_loop, program.seldom
+            where = program.lanes, program.in_loop, program.seldom, program.jacobians
             return _emit.body(code, carried, *state[:3], read, *where)
 
         # Equations in quasi-velocities are projected: only their projection divides by M.

@@ -215,7 +215,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
 
 
 def _with_chord(solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractSolver:
-    """Solve the equations of an implicit step to a tenth of the tolerance, with one Jacobian each.
+    """Solve the equations of an implicit step to a tenth of the tolerance.
 
     The solver's own root finder gives up if its first iterations converge slowly, and steps shrink
     until they converge: 5 times as many steps on a double pendulum, 20 times on an elastic pendulum

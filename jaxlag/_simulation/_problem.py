@@ -38,6 +38,7 @@ from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages
+from jaxlag.solvers._stage_chord import for_long_code
 
 
 class ProgramKey(NamedTuple):
@@ -252,6 +253,9 @@ def stepper_of(
     term = term_of(dynamics, jnp.zeros_like(args.origin), y0, args)
     if isinstance(solver, AbstractExplicit) and solver.looped is None:
         solver = replace(solver, looped=in_loop_over_stages(term.lines, solver.stages))
+    if hasattr(solver, "root_finder"):
+        lines = dynamics.acceleration_lines(jnp.zeros_like(args.origin), y0, args)
+        solver, term = for_long_code(solver, lines), term.with_jacobians
     after = step_end if step_end.settles else None
     how = (dynamics.windows, after, dynamics.projects, longest)
     passes = args.usual is not None

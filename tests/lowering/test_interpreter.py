@@ -1,5 +1,7 @@
 """The interpreter of straight-line code: results, derivatives, rounding, and its constant size."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from _jaxprs import loop, operations
 from _lowered import lowered
 
 import jaxlag as jl
-from jaxlag._lowering._emit import _emit, _interpreter
+from jaxlag._lowering._emit import _emit, _interpreter, _outlined
 from jaxlag._lowering._emit._code import Code, body_of, prelude_of, whole_of
 from jaxlag._lowering._emit._execute import straight
 from jaxlag._lowering._graph._expression import COS, SIN, Graph, named
@@ -99,6 +101,17 @@ def test_code_without_lines_or_numbers():
     assert interpreted(whole_of(assemble(graph, [])))(jnp.zeros(0)).shape == (0,)
     found = interpreted(whole_of(assemble(graph, [graph.const(3.0)])))(jnp.zeros(0))
     assert found.tolist() == [3.0]
+
+
+def test_rows_of_numbers_are_the_numbers():
+    body, x, _ = code()
+    function = _interpreter.interpreted(body, jnp.zeros(0).dtype, alone=True)
+    parts = [x[:2], x[2], x[3:]]
+    found = jax.jacrev(lambda *parts: function(*parts), (0, 1, 2))(*parts)
+    expected = jax.jacrev(interpreted(body))(x)
+    columns = jnp.concatenate([jnp.reshape(part, (len(expected), -1)) for part in found], axis=1)
+    np.testing.assert_array_equal(columns, expected)
+    np.testing.assert_array_equal(function(*parts), interpreted(body)(x))
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
@@ -253,3 +266,109 @@ def test_runs_decide_as_the_exact_one():
         return graph.select(above, graph.const(100.0), graph.zero)
 
     assert bounds(jump, 0.5 * (1.0 + 2.0 * EPS)) == (100.0, 0.0)
+
+
+# ---- Columns of Jacobians --------------------------------------------------------------------
+
+
+def chain(n):
+    """A chain of n links."""
+
+    def L(t, q, v, p):
+        x, y = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
+        return 0.5 * p["m"] * (x @ x + y @ y) + p["g"] * jnp.sum(jnp.cos(q))
+
+    return jl.System(L, {"q": (n,)})
+
+
+def in_steps(monkeypatch, system, interpreted_from):
+    """Accelerations as the steps of a solve evaluate them: a function of (q, params)."""
+    monkeypatch.setattr(_emit, "INLINE_UP_TO", -1)
+    monkeypatch.setattr(_emit, "COLUMNS_FROM", interpreted_from)
+    program = lowered(system, {"m": 1.2, "g": 9.8}).equations.program
+
+    def accelerations(q, params):
+        carried = _emit.prelude(program, params, q.dtype)
+        return _emit.body(program, carried, jnp.zeros(()), q, 0.3 - q, {}, jacobians=True)
+
+    return accelerations
+
+
+@pytest.mark.parametrize("argument", [0, 1, (0, 1)])
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_columns_are_the_single_tangents(monkeypatch, mode, argument):
+    """Four coordinates, so four columns or rows; one or two params, with and without the state."""
+    function = in_steps(monkeypatch, chain(4), -1)
+    q, params = jnp.array([0.3, -0.4, 0.9, 0.1]), {"m": jnp.array(1.2), "g": jnp.array(9.8)}
+    found = mode(function, argument)(q, params)
+    given = (q, params)
+
+    def along(part, i):
+        """A central difference along the i-th number of an argument, and its size."""
+        flat, unflatten = jax.flatten_util.ravel_pytree(given[part])
+
+        def at(h):
+            moved = list(given)
+            moved[part] = unflatten(flat.at[i].add(h))
+            return np.asarray(function(*moved))
+
+        return (at(1e-6) - at(-1e-6)) / 2e-6
+
+    parts = argument if isinstance(argument, tuple) else (argument,)
+    for part, slopes in zip(parts, found if len(parts) > 1 else (found,), strict=True):
+        columns = jnp.concatenate(
+            [jnp.reshape(x, (4, -1)) for x in jax.tree.leaves(slopes)], axis=1
+        )
+        expected = np.stack([along(part, i) for i in range(columns.shape[1])], axis=1)
+        np.testing.assert_allclose(columns, expected, atol=1e-8 * np.max(np.abs(expected)))
+        singles = [jax.jvp(lambda q: function(q, params), (q,), (e,))[1] for e in np.eye(4)]
+        if part == 0:
+            atol = 64 * EPS * np.max(np.abs(expected))
+            np.testing.assert_allclose(columns, np.stack(singles, 1), rtol=0, atol=atol)
+
+
+def test_second_derivatives_beside_columns(monkeypatch):
+    function = in_steps(monkeypatch, chain(4), -1)
+    q, params = jnp.array([0.3, -0.4, 0.9, 0.1]), {"m": jnp.array(1.2), "g": jnp.array(9.8)}
+    found = jax.jacfwd(jax.jacrev(function))(q, params)
+    other = in_steps(monkeypatch, chain(4), 10**6)
+    expected = jax.jacfwd(jax.jacrev(other))(q, params)
+    atol = 256 * EPS * np.max(np.abs(expected))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+
+
+def test_columns_of_long_code_are_not_compiled_line_by_line(monkeypatch):
+    params = {"m": 1.2, "g": 9.8}
+
+    def products(n, interpreted_from):
+        """Operations of the Jacobian that are not those of the value."""
+        function = in_steps(monkeypatch, chain(n), interpreted_from)
+        q, counts = jnp.linspace(0.1, 0.9, n), []
+        for f in (function, jax.jacfwd(function)):
+            counts.append(jax.jit(f).lower(q, params).as_text().count("stablehlo.multiply"))
+        return counts[1] - counts[0]
+
+    assert products(6, -1) < products(4, -1) + 8
+    assert products(6, 10**6) > 1.5 * products(4, 10**6) > 6 * products(4, -1)
+
+
+def test_single_tangents_and_explicit_methods_use_compiled_derivatives(monkeypatch):
+    """Code for Jacobians is made only where they are computed."""
+
+    def fails(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(_emit, "COLUMNS_FROM", -1)
+    monkeypatch.setattr(_emit, "INLINE_UP_TO", -1)
+    monkeypatch.setattr(_outlined, "_columns", fails)
+
+    def end(q, method):
+        return jl.simulate(
+            chain(4), q, jnp.zeros(4), [0.0, 0.1], {"m": 1.2, "g": 9.8}, method=method, dt=0.1
+        ).q[-1]
+
+    q = jnp.array([0.3, -0.4, 0.9, 0.1])
+    for method in ("tsit5", "euler"):
+        assert jax.jacfwd(partial(end, method=method))(q).shape == (4, 4)
+    with pytest.raises(AssertionError):
+        end(q, "kvaerno3")

@@ -18,12 +18,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlag._core import _xla
+from jaxlag._core._arrays import elements
 from jaxlag._core._batching import in_lanes
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._linear_map import LinearMap, linear
 from jaxlag._linalg._rounding_bounds import RUNS, STRENGTH, random_signs
 from jaxlag._lowering._emit._code import Code, adjoint, tangent
-from jaxlag._lowering._emit._execute import executed, is_trig, run
+from jaxlag._lowering._emit._execute import executed, is_trig, run, stacked
 from jaxlag._lowering._emit._sincos import sincos
 from jaxlag._lowering._graph._straight_line import Line
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
@@ -151,15 +152,30 @@ def _entry(array: Array, at: Array) -> Array:
     return lax.dynamic_index_in_dim(array, at, 0, keepdims=False)
 
 
-def _start(code: Bytecode, given: Sequence[Array], dtype: Any) -> Array:
+def _start(code: Bytecode, row: Array, dtype: Any) -> Array:
     """The numbers at the start; a scatter in a loop would keep XLA from making it one function."""
-    rest = jnp.asarray(code.start[len(given) :], dtype)
-    return jnp.concatenate([jnp.stack(list(given)), rest]) if len(given) else rest
+    return jnp.concatenate([row, jnp.asarray(code.start[row.size :], dtype)])
+
+
+def _row(parts: Sequence[Array], dtype: Any) -> Array:
+    """Numbers, or rows of them, as one row."""
+    if all(x.ndim == 0 for x in parts):
+        return stacked(parts, dtype)
+    return jnp.concatenate([jnp.reshape(x, (-1,)) for x in parts])
+
+
+def _split(row: Array, like: Sequence[Array]) -> tuple[Array, ...]:
+    """The inverse of `_row`."""
+    ends = np.cumsum([x.size for x in like])[:-1].tolist()
+    pairs = zip(jnp.split(row, ends), like, strict=True)
+    return tuple(jnp.reshape(part, x.shape) for part, x in pairs)
 
 
 @lru_cache(maxsize=512)
 def interpreted(code: Code, dtype: Any, alone: bool) -> Callable[..., Float[Array, " r"]]:
     """The results as a function of the given numbers, differentiable in every mode and order.
+
+    The function takes numbers, or rows of consecutive ones.
 
     Args:
         code: straight-line code.
@@ -170,7 +186,7 @@ def interpreted(code: Code, dtype: Any, alone: bool) -> Callable[..., Float[Arra
     around = _xla.native if alone else _inside
 
     def single(*given: Array) -> Array:
-        start = _start(table, given, dtype)
+        start = _start(table, _row(given, dtype), dtype)
         return around(partial(_loop, table, table.functions), start)[table.results]
 
     @CustomJVP
@@ -179,8 +195,8 @@ def interpreted(code: Code, dtype: Any, alone: bool) -> Callable[..., Float[Arra
 
     @partial(call.defjvp, symbolic_zeros=True)
     def _(given: tuple[Array, ...], dots: tuple[Array | None, ...]) -> tuple[Array, Array]:
-        moving = tuple(dot is not None for dot in dots)
-        form = _derivative(code, dtype, alone, moving)
+        parts = tuple((x.size, dot is not None) for x, dot in zip(given, dots, strict=True))
+        form = derivative(code, dtype, alone, parts) or _by_jax(code, dtype, parts)
         return call(*given), linear(form, given, tuple(dot for dot in dots if dot is not None))
 
     return call
@@ -191,24 +207,40 @@ def _inside(function: Callable, *args: Array) -> Array:
 
 
 @lru_cache(maxsize=512)
-def _derivative(code: Code, dtype: Any, alone: bool, moving: tuple[bool, ...]) -> LinearMap:
-    """The derivative of the results along the given numbers that move, as a linear map."""
+def derivative(
+    code: Code, dtype: Any, alone: bool, parts: tuple[tuple[int, bool], ...]
+) -> LinearMap | None:
+    """The derivative of the results along the parts that move, as a linear map.
+
+    None if the derivative of a function has no code.
+
+    Args:
+        code: straight-line code.
+        dtype: of all numbers.
+        alone: whether it is outside of all loops of a solve.
+        parts: the size of every part, and whether it moves.
+    """
+    moving = tuple(moves for size, moves in parts for _ in range(size))
     try:
-        forwards, backwards = tangent(code, moving), adjoint(code, moving)
+        forwards = tangent(code, moving)
     except Unsupported:
-        return _by_jax(code, dtype, moving)
+        return None
 
     def forward(given: tuple, dots: tuple) -> Array:
         return interpreted(forwards, dtype, alone)(*given, *dots)
 
     def backward(given: tuple, bar: Array) -> tuple:
-        return tuple(interpreted(backwards, dtype, alone)(*given, *bar))
+        moved = [x for x, (_, moves) in zip(given, parts, strict=True) if moves]
+        backwards = interpreted(adjoint(code, moving), dtype, alone)
+        return _split(backwards(*given, bar), moved)
 
     return LinearMap(forward, backward, forward, backward, at_once=None)
 
 
-def _by_jax(code: Code, dtype: Any, moving: tuple[bool, ...]) -> LinearMap:
+@lru_cache(maxsize=512)
+def _by_jax(code: Code, dtype: Any, parts: tuple[tuple[int, bool], ...]) -> LinearMap:
     """The same by JAX, for functions whose derivatives have no code."""
+    moving = [moves for _, moves in parts]
 
     def along(given: tuple) -> tuple[Callable, list]:
         def results(*moved: Array) -> Array:
@@ -218,7 +250,7 @@ def _by_jax(code: Code, dtype: Any, moving: tuple[bool, ...]) -> LinearMap:
                 slot: np.asarray(x, np.bool_ if isinstance(x, bool) else dtype)
                 for slot, x in code.numbers.items()
             }
-            slots |= dict(zip(code.given, numbers, strict=True))
+            slots |= dict(zip(code.given, elements(_row(numbers, dtype)), strict=True))
             run(code.lines, slots)
             return jnp.stack([jnp.asarray(slots[slot], dtype) for slot in code.results])
 
@@ -268,7 +300,7 @@ def with_changes(
     rounded = np.logical_not(table.exact)[table.lines[:, 0]]
 
     def single(*given: Array) -> tuple[Array, Array]:
-        start = _start(table, given, dtype)
+        start = _start(table, _row(given, dtype), dtype)
         start = start[:, None] * factors(np.pad(changed, (0, start.size - changed.size)))
         found = _xla.native(partial(_loop, table, functions), start, factors(rounded))
         found = found[table.results]

@@ -7,7 +7,8 @@ cosines are stored: these are most of the work, and few numbers.
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import jax
@@ -18,6 +19,8 @@ from jaxlag._core._arrays import elements
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._linear_map import LinearMap, linear
 from jaxlag._core._xla import not_inlined
+from jaxlag._lowering._emit import _interpreter
+from jaxlag._lowering._emit._code import body_of
 from jaxlag._lowering._emit._execute import Pairs, is_trig, stacked, straight
 from jaxlag._lowering._graph._straight_line import Program
 
@@ -25,8 +28,17 @@ Halves = tuple[Array, Array]  # (constants of a solve, state and inputs)
 
 
 @lru_cache(maxsize=256)
-def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array], Array]:
-    """(constants of a solve, state and inputs) -> results, each as one array."""
+def called(
+    program: Program, dtype: Any, lanes: bool, columns: bool = False
+) -> Callable[[Array, Array], Array]:
+    """(constants of a solve, state and inputs) -> results, each as one array.
+
+    Args:
+        program: straight-line code.
+        dtype: of the results.
+        lanes: whether this is vmapped: every scalar is an array of numbers.
+        columns: whether several tangents at once are interpreted.
+    """
     slots = list(dict.fromkeys(line.args[0] for line in program.body if is_trig(line)))
 
     def both(numbers: Halves, sincos: Array | None = None) -> tuple[Array, Array]:
@@ -53,7 +65,8 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
     @partial(call.defjvp, symbolic_zeros=True)
     def _(primals: Halves, tangents: tuple) -> tuple:
         found, sincos = with_sincos(*primals)
-        return found, _derivative(of_results, (primals, sincos), tangents)
+        which = _moving(tangents)
+        return found, linear(of_results(which), (primals, sincos), tangents)
 
     @CustomJVP
     def with_sincos(carried: Array, given: Array) -> tuple[Array, Array]:
@@ -62,11 +75,18 @@ def called(program: Program, dtype: Any, lanes: bool) -> Callable[[Array, Array]
     @partial(with_sincos.defjvp, symbolic_zeros=True)
     def _(primals: Halves, tangents: tuple) -> tuple:
         found, sincos = with_sincos(*primals)
-        return (found, sincos), _derivative(of_both, (primals, sincos), tangents)
+        which = _moving(tangents)
+        return (found, sincos), linear(of_both[which], (primals, sincos), tangents)
 
     boundary = partial(_by_numbers, dtype=dtype) if lanes else not_inlined
     outlined, both_outlined = boundary(results), boundary(both)
-    of_results, of_both = _maps(lambda numbers, sincos: both(numbers, sincos)[0]), _maps(both)
+    compiled, of_both = _maps(lambda numbers, sincos: both(numbers, sincos)[0]), _maps(both)
+
+    @cache
+    def of_results(which: tuple[bool, bool]) -> LinearMap:
+        form = compiled[which]
+        return replace(form, of_columns=_columns(program, dtype, which)) if columns else form
+
     return call
 
 
@@ -88,9 +108,9 @@ def _by_numbers(function: Callable, dtype: Any) -> Callable:
     return lambda *arrays: whole(inner(*jax.tree.map(elements, arrays)))
 
 
-def _derivative(maps: dict, at: tuple, tangents: tuple) -> Any:
-    which = tuple(x is not None for x in tangents)
-    return linear(maps[which], at, tangents)
+def _moving(tangents: tuple) -> tuple[bool, bool]:
+    carried, given = tangents
+    return carried is not None, given is not None
 
 
 def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
@@ -114,3 +134,37 @@ def _maps(function: Callable) -> dict[tuple[bool, bool], LinearMap]:
         which: LinearMap(not_inlined(jvp_fn), not_inlined(vjp_fn(which)), jvp_fn, at_once=None)
         for which in ((True, True), (False, True), (True, False))
     }
+
+
+def _columns(program: Program, dtype: Any, which: tuple[bool, bool]) -> LinearMap | None:
+    """The derivative by the interpreter, for several tangents or cotangents at once.
+
+    None if the derivative of a function has no code.
+
+    Args:
+        program: straight-line code.
+        dtype: of the results.
+        which: the halves that move.
+    """
+    code = body_of(program)
+    count = len(program.carried)
+    parts = tuple(zip((count, len(code.given) - count), which, strict=True))
+    inner = _interpreter.derivative(code, dtype, True, parts)
+    if inner is None:
+        return None
+
+    def without_one(halves: Any) -> tuple:
+        """Without the 1 at the end of the constants, and without halves that do not move."""
+        carried, given = halves
+        both = None if carried is None else carried[:-1], given
+        return tuple(x for x in both if x is not None)
+
+    def forward(at: tuple, dot: Any) -> Array:
+        return inner.forward(without_one(at[0]), without_one(dot))
+
+    def backward(at: tuple, bar: Any) -> tuple:
+        found = iter(inner.backward(without_one(at[0]), bar))
+        bars = [next(found) if moves else None for moves in which]
+        return None if bars[0] is None else jnp.append(bars[0], 0.0), bars[1]
+
+    return LinearMap(forward, backward, forward, backward, at_once=None)
