@@ -54,7 +54,7 @@ class ScalarSolveConstants(NamedTuple):
 
 
 _WITH_INPUTS = ("acceleration", "lam")
-_BY_MASS = ("acceleration", "lam", "correction")  # programs that divide by M
+_BY_MASS = ("acceleration", "lam")  # programs that divide by M
 
 
 @final
@@ -140,9 +140,10 @@ class ScalarProgram(AccelerationProgram):
         determinants = before(equations.determinants, None)
         if equations.surface is None:
             return ScalarSolveConstants(first, rates=rates, determinants=determinants)
-        *moving, lam = equations.surface
+        surface = equations.surface
+        moving = surface.position, surface.velocity, surface.correction
         others = [before(code, active_rows) for code in moving]
-        of_lam = before(lam, *solving)
+        of_lam = before(surface.lam, *solving)
         return ScalarSolveConstants(
             first, *others, lam=of_lam, rates=rates, determinants=determinants
         )
@@ -199,22 +200,32 @@ class ScalarProgram(AccelerationProgram):
 
     def _run(self, name: str, state: State, constants: ScalarSolveConstants) -> Array:
         """The results of the program whose prelude has this name."""
-
-        def by(program: "ScalarProgram", constants: ScalarSolveConstants) -> Array:
-            code, carried = program._equations(state).code(name), getattr(constants, name)
-            assert code is not None
-            assert carried is not None
-            read = state.inputs if name in _WITH_INPUTS else {}
-            where = program.lanes, program.in_loop, program.seldom, program.jacobians
-            return _emit.body(code, carried, *state[:3], read, *where)
-
         # Equations in quasi-velocities are projected: only their projection divides by M.
         projected = self.array.quasi is not None and name == "acceleration"
-        if constants.alone is None or name not in _BY_MASS or projected:
-            return by(self, constants)
-        alone = partial(by, self.regular(), constants.alone)
+        if name not in _BY_MASS or projected:
+            return self._results(name, state, constants)
+        return self._by_mass(lambda program, c: program._results(name, state, c), constants)
+
+    def _by_mass(
+        self,
+        of: Callable[["ScalarProgram", ScalarSolveConstants], Any],
+        constants: ScalarSolveConstants,
+    ) -> Any:
+        """`of` the shorter program if M is positive definite without the constraints."""
+        if constants.alone is None:
+            return of(self, constants)
+        alone = partial(of, self.regular(), constants.alone)
         general = self if self.array.quasi is not None else replace(self, seldom=True)
-        return lax.cond(constants.definite, alone, partial(by, general, constants))
+        return lax.cond(constants.definite, alone, partial(of, general, constants))
+
+    def _results(self, name: str, state: State, constants: ScalarSolveConstants) -> Array:
+        """The same of this program, whatever M is."""
+        code, carried = self._equations(state).code(name), getattr(constants, name)
+        assert code is not None
+        assert carried is not None
+        read = state.inputs if name in _WITH_INPUTS else {}
+        where = self.lanes, self.in_loop, self.seldom, self.jacobians
+        return _emit.body(code, carried, *state[:3], read, *where)
 
     def regular(self) -> "ScalarProgram":
         """The same for an M that is positive definite without the constraints."""
@@ -235,13 +246,11 @@ class ScalarProgram(AccelerationProgram):
         """By the matrices that the program computes at the state."""
         if not isinstance(constants, ScalarSolveConstants):
             return self._on_arrays.projector(state, constants, rows, active_rows)
-        code, q, v = self._equations(state).surface, state.q, state.w
+        code, v = self._equations(state).surface, state.w
         assert code is not None
 
         def run(name: str, q: Array, v: Array) -> Array:
             return self._run(name, state._replace(q=q, w=v), constants)
-
-        n = q.shape[0]
 
         def times(K: Array) -> Callable:
             return lambda c: jnp.sum(c[:, None] * K, axis=0)
@@ -249,17 +258,40 @@ class ScalarProgram(AccelerationProgram):
         def position(q: Array) -> Array:
             return run("position", q, v)
 
-        found = run("correction", q, v)
+        corrections = self._by_mass(lambda program, c: program._corrections(state, c), constants)
+        shift, kick, masses = corrections
         if self.array.quasi is not None:
-            return ConstraintProjector(position, None, times(found.reshape(-1, n)), None)
-        holonomic, every = (len(c.results) for c in (code.position, code.velocity))
-        shift = found[: holonomic * n].reshape(-1, n)
-        of_velocity = found[holonomic * n :] if 0 < holonomic < every else found
-        kick, masses = of_velocity[: every * n].reshape(-1, n), of_velocity[every * n :]
+            return ConstraintProjector(position, None, times(kick), None)
         held = position if code.position.results else None
         return ConstraintProjector(
             held, partial(run, "velocity"), times(shift), times(kick), kick, masses
         )
+
+    def _corrections(
+        self, state: State, constants: ScalarSolveConstants
+    ) -> tuple[Float[Array, "h n"], Float[Array, "m n"], Float[Array, " d"]]:
+        """(columns from phi, columns from A v + b, diagonal of (A M^-1 A^T)^-1 if requested)."""
+        code, n = self._equations(state).surface, state.q.shape[0]
+        assert code is not None
+        found = self._results("correction", state, constants)
+        holonomic, every = (len(c.results) for c in (code.position, code.velocity))
+        mixed = 0 < holonomic < every
+        if code.solves is None:
+            shift = found[: holonomic * n].reshape(-1, n)
+            of_velocity = found[holonomic * n :] if mixed else found
+            kick, masses = of_velocity[: every * n].reshape(-1, n), of_velocity[every * n :]
+            return shift, kick, masses
+
+        def solved(program: Program, count: int) -> Array:
+            return _emit.solved(program, found, jnp.eye(count, dtype=found.dtype), self.in_loop)
+
+        *of_position, of_velocity = code.solves
+        rows = solved(of_velocity, every)
+        kick, mu = rows[:, :n], rows[:, n:]
+        shift = solved(of_position[0], holonomic)[:, :n] if mixed else kick[:holonomic]
+        # Not `jnp.diagonal`: a gather is not compiled into the loop of a solve.
+        of_own = jnp.eye(*mu.shape, dtype=bool)
+        return shift, kick, jnp.sum(jnp.where(of_own, mu, 0.0), axis=0)
 
     def multipliers(
         self, state: State, constants: Any, multiplier_rows: RowChoice | None = None

@@ -21,10 +21,12 @@ Terms = tuple[tuple["Node", float], ...]
 Factors = tuple[tuple["Node", int], ...]
 
 
-FIXED = ("params", "literal", "active_rows", "nonzero", "time_direction")
-"""Names of the inputs that do not change during a solve: parameters, numbers of the declaration,
-the rows used in solves, the rows that are more than rounding, and the direction of time (+1 or
--1)."""
+KNOWN = "known"
+FIXED = ("params", "literal", "active_rows", "nonzero", "time_direction", KNOWN)
+"""Names of the inputs that are known before the others. During a solve these do not change:
+parameters, numbers of the declaration, the rows used in solves, the rows that are more than
+rounding, and the direction of time (+1 or -1). `KNOWN` are results of another program at the same
+state."""
 
 
 POWERS = 2

@@ -1,7 +1,6 @@
 """Straight-line code from a graph: one operation a line, shared expressions computed once.
 
-Lines that depend on params alone form the prelude, computed once per solve. The others form the
-body.
+Lines of `FIXED` inputs alone form the prelude, computed once per solve. The others form the body.
 """
 
 from collections import Counter, defaultdict
@@ -34,7 +33,7 @@ class Program(NamedTuple):
     """Straight-line code from inputs to results.
 
     Attributes:
-        prelude: lines that depend on params alone.
+        prelude: lines that depend on `FIXED` inputs alone.
         carried: slots of the prelude that the body reads.
         body: lines evaluated at every state.
         results: slots, or numbers, of the results.

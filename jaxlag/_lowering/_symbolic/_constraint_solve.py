@@ -98,7 +98,7 @@ def solve_with_rows(
     if formulation == "null_space":
         return _null_space(graph, M, A, right, eps, active_rows, crossing)
     if not regular or any(M[i][i] is graph.zero for i in range(len(M))):
-        M, right = _augmented(graph, M, A, right, eps, active_rows)
+        M, right = augmented(graph, M, A, right, eps, active_rows)
     found = bordered(graph, M, A, right, eps, active_rows, checked=True, crossing=crossing)
     return [x[: len(M)] for x in found]
 
@@ -157,7 +157,7 @@ def solve_with_reactions(
         gamma = [graph.mul(active_rows[k], x) for k, x in enumerate(gamma)]
     sides = [([graph.add(*pair) for pair in zip(r, found.rest, strict=True)], gamma)]
     if not regular:
-        M, sides = _augmented(graph, M, A, sides, eps, None)
+        M, sides = augmented(graph, M, A, sides, eps, None)
     columns = [
         [graph.add(a, g) for a, g in zip(row, column, strict=True)]
         for row, column in zip(A, G, strict=True)
@@ -184,7 +184,7 @@ def _less(terms: list[tuple[Node, float]]) -> list[tuple[Node, float]]:
     return [(node, -c) for node, c in terms]
 
 
-def _augmented(
+def augmented(
     graph: Graph,
     M: Sequence[Sequence[Node]],
     A: Sequence[Sequence[Node]],
@@ -192,7 +192,10 @@ def _augmented(
     eps: float,
     active_rows: Sequence[Node] | None,
 ) -> tuple[list[list[Node]], list[tuple[list[Node], Sequence[Node]]]]:
-    """M + A^T W A and r - A^T W c, for an M that may be singular: x does not change."""
+    """M + A^T W A and r - A^T W c, for an M that may be singular: x does not change.
+
+    A are all rows: with some alone M may not be positive definite.
+    """
     n, m = len(M), len(A)
     weights = read_function(graph, eps, row_weights, M, A)
     if active_rows is not None:
@@ -258,24 +261,15 @@ def correction(
     A: Sequence[Sequence[Node]],
     eps: float,
     active_rows: Sequence[Node] | None,
-    regular: bool,
-    chosen: Sequence[int],
     crossing: bool,
-) -> tuple[list[list[Node]], list[Node]]:
-    """Columns of M^-1 A^T (A M^-1 A^T)^-1 for the chosen rows, solved without the others.
+    right: Sequence[Sequence[Node]],
+) -> list[tuple[list[Node], list[Node]]]:
+    """For each c the change M^-1 A^T mu of q or v, with mu = (A M^-1 A^T)^-1 c; mu with `crossing`.
 
-    With `crossing` also the diagonal of (A M^-1 A^T)^-1.
-
-    An M that may be singular is augmented by all rows: with the chosen ones alone it may not be
-    positive definite.
+    M must be positive definite: if it may be singular, it is `augmented`.
     """
-    if not regular:
-        M, _ = _augmented(graph, M, A, [], eps, active_rows)
-    A = [A[k] for k in chosen]
-    active_rows = None if active_rows is None else [active_rows[k] for k in chosen]
-    n, m = len(M), len(A)
-    nothing = [graph.zero] * n
-    sides = [(nothing, [graph.one if j == k else graph.zero for j in range(m)]) for k in range(m)]
+    nothing = [graph.zero] * len(M)
+    sides = [(nothing, c) for c in right]
     found = bordered(graph, M, A, sides, eps, active_rows, crossing=crossing)
-    columns = [[graph.scale(x, -1.0) for x in column[:n]] for column in found]
-    return columns, [side[n + k] for k, side in enumerate(found)] if crossing else []
+    n = len(M)
+    return [([graph.scale(x, -1.0) for x in side[:n]], side[n:]) for side in found]
