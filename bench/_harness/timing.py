@@ -15,6 +15,7 @@ BENCHMARKS = (
     "batch",
     "gradient",
     "lowering",
+    "mechanisms",
     "constraints",
     "stability",
     "accuracy",
