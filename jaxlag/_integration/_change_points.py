@@ -41,6 +41,7 @@ Numerica 20 (2011) 469 (where branches of motion meet); Eich, SIAM J. Numer. Ana
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +49,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._integration._step_arguments import Arguments, midway
 from jaxlag._integration._vector_field import VectorField
-from jaxlag._linalg._kkt import solve_general, units_of
+from jaxlag._linalg._kkt import units_of
+from jaxlag._linalg._projection import ConstraintProjector, keeps_sense
 from jaxlag._model._forces import reads_lam
 
 CHANGE_POINTS = ("pass", "stop")
@@ -163,7 +165,7 @@ class Crossing(NamedTuple):
         self,
         q: Float[Array, " n"],
         v: Float[Array, " n"],
-        columns: Float[Array, "m n"],
+        surface: ConstraintProjector,
         args: Arguments,
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Rounding of projected coordinates and velocities near a change point; 0 elsewhere.
@@ -174,19 +176,32 @@ class Crossing(NamedTuple):
         Args:
             q: coordinates.
             v: velocities.
-            columns: columns of the matrix of the projection.
+            surface: the constraints at the end of the step.
             args: arguments of the step.
         """
+        if not surface.sparse:
+            return self._rounding(q, v, surface, args)
+        some = eqxi.unvmap_any(self.is_near)
+        none = jnp.zeros_like(q), jnp.zeros_like(v)
+        return jax.lax.cond(some, lambda: self._rounding(q, v, surface, args), lambda: none)
+
+    def _rounding(
+        self, q: Array, v: Array, surface: ConstraintProjector, args: Arguments
+    ) -> tuple[Array, Array]:
         assert args.units is not None
-        assert args.slopes is not None
+        assert surface.columns is not None
         least = ROUNDINGS * float(jnp.finfo(self.independence.dtype).eps)
         span = jnp.where(jnp.isfinite(self.span), self.span, 0.0)
         length = jnp.linalg.norm(span)
         rate = jnp.linalg.norm(v / args.units) / jnp.where(length > 0, length, 1.0)
-        slopes = args.slopes
+        columns = surface.columns()
 
         def spread(size: Array) -> Array:  # by sums: a step has no matrix products
-            rows = jnp.sum(slopes * size[None], axis=1)
+            if args.slopes is None:
+                assert surface.reach is not None
+                rows = surface.reach(size)
+            else:
+                rows = jnp.sum(args.slopes * size[None], axis=1)
             return jnp.sum(jnp.abs(columns) * rows[:, None], axis=0)
 
         positions = jnp.abs(q) + spread(jnp.abs(q) + args.units * span)
@@ -379,15 +394,15 @@ def same_sense(
         args: arguments of the step.
         slope_drop: h dy/dt at the start minus that at the end; None if it is unknown.
     """
-    columns, m = dynamics.projector(t0, y0, args).columns, dynamics.rows.size
-    assert columns is not None
-    fine = jnp.array(True)
+    surface, fine = dynamics.projector(t0, y0, args), jnp.array(True)
+    assert surface.columns is not None
+    columns, of_surface = surface.columns, surface.keeps_sense
     for tau, y in (midway(t0, t1, y0, y1, slope_drop), (t1, y1)):
         t, (q, v), (params, _) = dynamics.clock(tau, args), dynamics.parts(y), dynamics.given(args)
-        A = dynamics.terms_at(q, args).rows_of(t, v, params)(q)
-        turned = A @ columns.T
-        if args.active_rows is not None:
-            both = args.active_rows[:, None] & args.active_rows[None]
-            turned = jnp.where(both, turned, jnp.eye(m, dtype=A.dtype))
-        fine = fine & solve_general(turned, jnp.zeros((m,), A.dtype), 0.0)[1]
+        if of_surface is None:
+            A = dynamics.terms_at(q, args).rows_of(t, v, params)(q)
+            found = keeps_sense(columns(), A, args.active_rows)
+        else:
+            found = of_surface(t, q, v)
+        fine = fine & found
     return fine

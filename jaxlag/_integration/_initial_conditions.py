@@ -1,5 +1,6 @@
 """Checks of the initial conditions, inside the compiled program."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from jaxlag._linalg._row_residuals import (
     row_sizes,
     without_rounding,
 )
-from jaxlag._lowering import AbstractTerms
+from jaxlag._lowering import AbstractTerms, State
 from jaxlag._model._constraints import ConstraintRows
 
 
@@ -113,16 +114,18 @@ def _rows_consistent(
         return Consistency(true, ~true, jnp.full((), -1, jnp.int32), true)
     t, q, v, params, args = stop_gradient((t, q, v, params, args))
     terms = dynamics.terms_at(q, args)
-    rows, gamma_of = terms.rows_of(t, v, params), terms.gamma_of(params)
-    A = rows(q)
+    gamma_of = terms.gamma_of(params)
+    entries = terms.rows_of(t, v, params)
+    if dynamics.program.is_sparse(args.constants):
+        entries = dynamics.program.row_entries(terms, State(t, q, v, params, {}), args.constants)
     sure = all(dynamics.rows.sure)
     if args.rows is not None:
         void, unit = args.rows.void, args.rows.size
     elif sure:
-        unit = jnp.sqrt(jnp.sum(A**2, axis=1))
+        unit = jnp.sqrt(jnp.sum(entries(q) ** 2, axis=1))
         void, unit = unit < 0, jnp.where(unit > 0, unit, 1.0)
     else:
-        _, void, unit = row_sizes(rows, q, A)
+        _, void, unit = row_sizes(entries, q, entries(q))
     floor = dependence_floor(q.dtype)
 
     def everything(q: Array, v: Array) -> tuple[Array, ...]:
@@ -137,14 +140,15 @@ def _rows_consistent(
         for c, x in ((phi, q), (rate, v)):
             off = jnp.maximum(off, relative_residual(c, unit, x) / floor)
         near = jnp.all(off <= 1.0)
+        A = terms.rows_of(t, v, params)(q)
         bad, complete = _fitting(dynamics, t, q, v, params, A, void, unit)
         bad = jnp.where(near, bad / floor, 0.0)
         found = _consistency(off, bad, near, phi, rate)
         return found._replace(complete=complete | ~found.ok, ok=found.ok & (complete | ~found.ok))
-    K = terms.correction(t, q, v, params, args.constants, args.active_rows)
+    corrected, times, spread = _correction(dynamics, t, q, v, params, args)
 
     def left(c: Array) -> Array:
-        return jnp.abs(c - A @ (K @ c)) / unit
+        return jnp.abs(c - times(corrected(c))) / unit
 
     off, bad = jnp.zeros_like(unit), jnp.zeros_like(unit)
     for c, x in ((phi, q), (rate, v)):
@@ -154,15 +158,43 @@ def _rows_consistent(
         ajar = left(c) > 0.1 * jnp.max(jnp.abs(c) / unit)
         bad = jnp.maximum(bad, jnp.where(ajar, size / closed_to(q.dtype), 0.0))
     near = jnp.all(off <= 1.0)
-    scale = jnp.abs(gamma) / unit + jnp.max(jnp.abs(K @ gamma))
+    scale = jnp.abs(gamma) / unit + jnp.max(jnp.abs(corrected(gamma)))
     gamma_left = left(gamma)
     if dynamics.rows.size > 1:  # terms of gamma that cancel leave rounding, no contradiction
         _, rounding = with_rounding(gamma_of, t, q, v)
         rounding = ROUNDINGS * jnp.nan_to_num(rounding)
-        gamma_left = jnp.maximum(gamma_left - (rounding + jnp.abs(A @ K) @ rounding) / unit, 0.0)
+        gamma_left = jnp.maximum(gamma_left - (rounding + spread(rounding)) / unit, 0.0)
     gamma_left = gamma_left / (floor * jnp.where(scale > 0, scale, 1.0))
     bad = jnp.where(near, jnp.maximum(gamma_left, bad), bad)
     return _consistency(off, bad, near, phi, rate)
+
+
+def _correction(
+    dynamics: VectorField, t: Array, q: Array, v: Array, params: Any, args: Arguments
+) -> tuple[Callable, Callable, Callable]:
+    """(c -> K c, x -> A x, r -> |A K| r) with K = M^-1 A^T (A M^-1 A^T)^-1."""
+    if not dynamics.program.is_sparse(args.constants):
+        terms = dynamics.terms_at(q, args)
+        K = terms.correction(t, q, v, params, args.constants, args.active_rows)
+        A = terms.rows_of(t, v, params)(q)
+        return lambda c: K @ c, lambda x: A @ x, lambda r: jnp.abs(A @ K) @ r
+    state = State(t, q, v, params, {})
+    surface = dynamics.program.projector(state, args.constants, dynamics.rows, args.active_rows)
+    kick, columns, velocity = surface.kick, surface.columns, surface.velocity
+    assert kick is not None
+    assert columns is not None
+    assert velocity is not None
+
+    def times(x: Array) -> Array:
+        return jax.jvp(lambda v: velocity(q, v), (v,), (x,))[1]
+
+    def spread(r: Array) -> Array:
+        """K is the inverse of A if no row is left out."""
+        every = args.active_rows is None or jnp.all(args.active_rows)
+        turned = lambda: jnp.abs(jax.vmap(times)(columns()).T) @ r  # noqa: E731
+        return jax.lax.cond(every, lambda: r, turned)
+
+    return kick, times, spread
 
 
 def _fitting(

@@ -46,14 +46,12 @@ class StepChecks(NamedTuple):
         redundant_rows_hold: rows that were left out as dependent are satisfied.
         contacts_valid: multipliers of contacts are not negative, and sliding has not reversed.
         independence: see `_change_points.Crossing`; None if it is not needed.
-        columns: columns of the matrix of the projection; None likewise.
     """
 
     projected: Bool[Array, ""]
     redundant_rows_hold: Bool[Array, ""]
     contacts_valid: Bool[Array, ""]
     independence: Float[Array, ""] | None = None
-    columns: Float[Array, "m n"] | None = None
 
     @property
     def good(self) -> Bool[Array, ""]:
@@ -76,7 +74,7 @@ class Arguments(NamedTuple):
     usual: Float[Array, " b"] | None = None  # see `_quasi_singularities.usual`
     lengths: Float[Array, " m"] | None = None  # of rows at the start, see `_change_points`
     units: Float[Array, " n"] | None = None  # of coordinates, with inertias of 1 at the start
-    slopes: Float[Array, "m n"] | None = None  # |A| at the start
+    slopes: Float[Array, "m n"] | None = None  # |A| at the start, unless it is sparse
 
     @property
     def active_rows(self) -> Bool[Array, " m"] | None:

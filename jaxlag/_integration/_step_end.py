@@ -1,6 +1,5 @@
 """Post-step processing: project onto the constraints; check contacts and the sliding direction."""
 
-from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -100,8 +99,8 @@ class StepEnd(eqx.Module):
 
     def with_error(
         self, tau: Array, y: Array, args: Arguments, error: Array, near: Bool[Array, ""]
-    ) -> tuple[Array, StepChecks, Array]:
-        """The same as a call, with the error of the accepted state.
+    ) -> tuple[Array, StepChecks, Array, ConstraintProjector]:
+        """The same as a call, with the error of the accepted state and the constraints near it.
 
         It differs from `error` only near change points. Elsewhere errors across the rows, which the
         projection removes, are as small as those along them.
@@ -122,7 +121,8 @@ class StepEnd(eqx.Module):
             return self._joined(*tangential(around.surface, *parts(y), *parts(error)), error)
 
         error = jax.lax.cond(near | (checks.independence < SHORT), left, lambda: error)
-        return y, checks._replace(contacts_valid=self.contacts_valid(tau, y, args)), error
+        checks = checks._replace(contacts_valid=self.contacts_valid(tau, y, args))
+        return y, checks, error, around.surface
 
     def stage(self, tau: Array, y: Array, args: Arguments, refuses: bool) -> Array:
         """A state within a step after one Newton iteration towards the constraints.
@@ -161,7 +161,7 @@ class StepEnd(eqx.Module):
         q, v, converged = project(near.surface, *self.dynamics.parts(y), near.frozen)
         closed = self._closed(near.surface, q, v, args)
         return self._joined(q, v, y), StepChecks(
-            converged, closed, jnp.array(True), near.independence, near.surface.columns
+            converged, closed, jnp.array(True), near.independence
         )
 
     def _near(self, tau: Array, y: Array, args: Arguments, differentiable: bool = False) -> "_Near":
@@ -202,22 +202,22 @@ class StepEnd(eqx.Module):
         if args.rows is None:
             return jnp.array(True)
         active, size = args.rows.active_rows, args.rows.size
-        holonomic = np.flatnonzero(self.dynamics.rows.holonomic).tolist()
         floor = closed_to(q.dtype)
 
-        def holds(c: Array, x: Array, rows: list[int]) -> Array:
-            largest = jnp.max(jnp.abs(x))
-            off = [jnp.abs(c[i]) / size[row] for i, row in enumerate(rows)]
-            drift = [jnp.where(active[row], x, 0.0) for row, x in zip(rows, off, strict=True)]
-            allowed = floor * (1.0 + largest) + 100.0 * reduce(jnp.maximum, drift)
-            found = [active[row] | (x <= allowed) for row, x in zip(rows, off, strict=True)]
-            return jnp.all(jnp.stack(found))
+        def holds(c: Array, x: Array, active: Array, size: Array) -> Array:
+            off = jnp.abs(c) / size
+            drift = jnp.max(jnp.where(active, off, 0.0))
+            allowed = floor * (1.0 + jnp.max(jnp.abs(x))) + 100.0 * drift
+            return jnp.all(active | (off <= allowed))
 
         closed = jnp.array(True)
         if surface.velocity is not None:
-            closed = holds(surface.velocity(q, v), v, list(range(self.dynamics.rows.size)))
+            closed = holds(surface.velocity(q, v), v, active, size)
         if surface.position is not None:
-            closed = closed & holds(surface.position(q), q, holonomic)
+            if not all(self.dynamics.rows.holonomic):
+                holonomic = np.flatnonzero(self.dynamics.rows.holonomic)
+                active, size = active[holonomic], size[holonomic]
+            closed = closed & holds(surface.position(q), q, active, size)
         return closed
 
 

@@ -389,16 +389,17 @@ class Stepper(eqx.Module):
         if error is None:
             y, checks = step_end(t, y, args)
         else:
-            y, checks, error = step_end.with_error(t, y, args, cast(Array, error), crossing.is_near)
+            y, checks, error, surface = step_end.with_error(
+                t, y, args, cast(Array, error), crossing.is_near
+            )
         assert checks.independence is not None
         parts = cast(Term, self.term).dynamics.parts
         (q0, _), (q, v) = parts(y0), parts(y)
         ends = crossing.onwards(t0, t, checks.independence, (q - q0) / args.units)
         if error is None:
             return y, checks, estimate, ends
-        assert checks.columns is not None
         beyond = jnp.zeros_like(y[2 * q.size :])
-        rounding = jnp.concatenate([*ends.rounding(q, v, checks.columns, args), beyond])
+        rounding = jnp.concatenate([*ends.rounding(q, v, surface, args), beyond])
         error = jnp.where(jnp.abs(error) <= rounding, 0.0, error)
         if unseen is not None:
             noise = jnp.concatenate([*ends.noise(v, args), beyond])

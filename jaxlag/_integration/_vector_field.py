@@ -67,6 +67,7 @@ class VectorField(eqx.Module):
         stabilization: "projection", a `Baumgarte`, or None.
         regular: whether M is positive definite without the constraints; None if that is found only
             at the start of a solve.
+        blocks_definite: the same of the blocks of a sparse M, with the rows inside of them.
         contact_rows_independent: whether rows whose multipliers forces read are known to be
             independent.
         extrapolates: whether the method has stages beyond the end of a step.
@@ -87,6 +88,7 @@ class VectorField(eqx.Module):
     formulation: str = eqx.field(static=True, default="multipliers")
     stabilization: str | Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool | None = eqx.field(static=True, default=False)
+    blocks_definite: bool | None = eqx.field(static=True, default=None)
     contact_rows_independent: bool = eqx.field(static=True, default=False)
     extrapolates: bool = eqx.field(static=True, default=False)
     crossing: bool = eqx.field(static=True, default=False)
@@ -137,6 +139,7 @@ class VectorField(eqx.Module):
         baumgarte = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
         known = {
             "regular": bool(self.regular),
+            "blocks_definite": self.blocks_definite,
             "contact_rows_independent": self.contact_rows_independent,
             "crossing": self.crossing,
         }
@@ -184,7 +187,7 @@ class VectorField(eqx.Module):
         if self.regular is None and self.formulation != "null_space":
             definite = partial(self._definite, t, q, v, params)
         choices = Choices(
-            self.sample, args.active_rows, args.multiplier_rows, time_direction, definite
+            self.sample, args.active_rows, args.multiplier_rows, time_direction, definite, (t, q, v)
         )
         return args._replace(constants=self.program.precompute(q, params, values, choices))
 
@@ -208,19 +211,28 @@ class VectorField(eqx.Module):
         if not self.rows.chooses or (self.quasi is not None and not self.projects):
             return None
         t, q, v, params, values = stop_gradient((t, q, v, params, values))
-        terms = self.program.terms(q, params, self.sample)
-        rows = terms.rows_of(t, v, params)
-        M, A, sure = terms.mass(t, q, v, params), rows(q), all(self.rows.sure)
-        nonzero, void, size = row_sizes(rows, q, A, sure)
+        terms, state = self.program.terms(q, params, self.sample), State(t, q, v, params, values)
+        entries = self.program.row_entries(terms, state)
+        nonzero, void, size = row_sizes(entries, q, entries(q), all(self.rows.sure))
         if self.rows.size == 1:  # left out only if it is void
             return RowSelection(~void, size, void, RowChoice(~void, ~void))
         velocity = np.array(self.rows.velocity)
         unread = np.logical_not(self.terms.rows_read(t, q, v, params, values))
         # If multipliers are read, the active rows determine which others are left out.
         reads = not np.all(unread)
-        active_rows = independent_rows(
-            M, A, 2 * velocity + unread, nonzero=nonzero, mobile_first=reads
-        )
+
+        def search(priority: np.ndarray, mobile_first: bool) -> Array:
+            M, A = terms.mass(t, q, v, params), terms.rows_of(t, v, params)(q)
+            return independent_rows(M, A, priority, nonzero=nonzero, mobile_first=mobile_first)
+
+        priority, first = 2 * velocity + unread, self.program.first_rows(state, self.sample)
+        searched = partial(search, priority if first is None else 2 * priority + ~first, reads)
+        clear = self.program.clearly_independent(state, self.sample)
+        if clear is None:
+            active_rows = searched()
+        else:
+            clear = clear & eqxi.unvmap_all(jnp.all(nonzero))
+            active_rows = jax.lax.cond(clear, lambda: nonzero, searched)
         if not np.any(velocity & ~unread):  # then the rows that are read already come first
             return RowSelection(active_rows, size, void, RowChoice(active_rows, nonzero))
         if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
@@ -231,7 +243,7 @@ class VectorField(eqx.Module):
                 "holonomic rows (phi of a dependent holonomic row would not be damped)",
                 f"it was {self.stabilization!r}, and a force reads {label!r}",
             )
-        for_multipliers = independent_rows(M, A, unread, nonzero=nonzero, mobile_first=True)
+        for_multipliers = search(unread, True)
         return RowSelection(active_rows, size, void, RowChoice(for_multipliers, nonzero))
 
     def clock(self, tau: Array, args: Arguments) -> Array:

@@ -189,7 +189,8 @@ def _diagonal(M: Array) -> Array:
 def units_of(M: Float[Array, "n n"], A: Float[Array, "m n"]) -> Float[Array, " n"]:
     """1 / sqrt of the inertia of every coordinate; of A^T W A if M has none."""
     inertias = _diagonal(M)
-    inertias = jnp.where(inertias > 0, inertias, _diagonal(augmented(M, A)[0]))
+    by_rows = inertias + jnp.sum(row_weights(M, A)[:, None] * A**2, axis=0)
+    inertias = jnp.where(inertias > 0, inertias, by_rows)
     return jax.lax.rsqrt(jnp.where(inertias > 0, inertias, 1.0))
 
 

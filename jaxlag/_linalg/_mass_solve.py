@@ -128,17 +128,18 @@ def _eliminated(
 
 
 def known_definite(M: np.ndarray, dtype: Any) -> bool:
-    """The same of a known matrix, by the eigenvalues of M_ij / sqrt(M_ii M_jj).
+    """The same of a known matrix, or of several, by the eigenvalues of M_ij / sqrt(M_ii M_jj).
 
     Args:
         M: symmetric; False if it is not finite.
         dtype: of the state, whose precision it has.
     """
-    units = np.sqrt(np.abs(np.diagonal(M)))
-    if not np.all(units > 0) or not np.all(np.isfinite(M)):
+    diagonal = np.diagonal(M, axis1=-2, axis2=-1)
+    if not np.all(np.isfinite(M)) or not np.all(diagonal > 0):
         return False
-    floor = np.sqrt(float(jnp.finfo(dtype).eps))
-    return bool(np.linalg.eigvalsh(M / np.outer(units, units))[0] > floor)
+    units, floor = np.sqrt(diagonal), np.sqrt(float(jnp.finfo(dtype).eps))
+    scaled = M / (units[..., :, None] * units[..., None, :])
+    return bool(np.min(np.linalg.eigvalsh(scaled)) > floor)
 
 
 def clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:

@@ -1,11 +1,14 @@
 """Projection of a state onto its constraints, in the metric of M with one factorization."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxlag._linalg._kkt import solve_general
 
 MAX_ITERATIONS = 12
 SWEEPS = 3
@@ -21,16 +24,66 @@ class ConstraintProjector(NamedTuple):
         velocity: (q, v) -> A v + b; None if velocities satisfy all rows by definition.
         shift: c -> M^-1 A^T (A M^-1 A^T)^-1 c over the rows of `position`, at the predicted state.
         kick: the same over all rows; None as `velocity`.
-        columns: columns of its matrix, 0 for rows that are left out; None as `velocity`.
-        masses: diagonal of (A M^-1 A^T)^-1, 0 for rows that are left out; None if not needed.
+        columns: function that returns the columns of its matrix, 0 for rows that are left out;
+            None as `velocity`.
+        masses: diagonal of (A M^-1 A^T)^-1, 0 for dependent rows; None if not needed.
+        keeps_sense: (t, q, v) -> whether pivots of A M^-1 A0^T, or of A K, are positive as at the
+            predicted state, whose rows are A0; None if the columns are to be used.
+        reach: x -> |A| x at the predicted state; None if it is not sparse.
+        units: function that returns the units of the coordinates in which their inertias are 1;
+            None likewise.
+        sparse: whether A is sparse, so that the columns take many solves.
     """
 
     position: Callable | None
     velocity: Callable | None
     shift: Callable
     kick: Callable | None
-    columns: Float[Array, "m n"] | None = None
+    columns: Callable[[], Float[Array, "m n"]] | None = None
     masses: Float[Array, " m"] | None = None
+    keeps_sense: Callable | None = None
+    reach: Callable | None = None
+    units: Callable | None = None
+    sparse: bool = False
+
+
+def either(
+    first: Bool[Array, ""], surface: ConstraintProjector, other: Callable[[], ConstraintProjector]
+) -> ConstraintProjector:
+    """One projector or another one, which is made only where it is used.
+
+    Args:
+        first: whether it is the first one.
+        surface: the first one.
+        other: makes the other one, for the same rows.
+    """
+
+    def chosen(name: str) -> Callable:
+        def of(made: Callable[[], ConstraintProjector]) -> Callable:
+            return lambda *args: getattr(made(), name)(*args)
+
+        return partial(jax.lax.cond, first, of(lambda: surface), of(other))
+
+    masses = jax.lax.cond(first, lambda: surface.masses, lambda: other().masses)
+    functions = "shift", "kick", "columns", "keeps_sense", "reach", "units"
+    return surface._replace(masses=masses, **{name: chosen(name) for name in functions})
+
+
+def keeps_sense(
+    columns: Float[Array, "m n"], A: Float[Array, "m n"], active_rows: Bool[Array, " m"] | None
+) -> Bool[Array, ""]:
+    """Whether the pivots of A K are positive, see `ConstraintProjector`.
+
+    Args:
+        columns: those of K, at the predicted state.
+        A: rows at another state.
+        active_rows: rows to solve with; None for all.
+    """
+    turned = A @ columns.T
+    if active_rows is not None:
+        both = active_rows[:, None] & active_rows[None]
+        turned = jnp.where(both, turned, jnp.eye(*turned.shape, dtype=A.dtype))
+    return solve_general(turned, jnp.zeros(turned.shape[:1], A.dtype), 0.0)[1]
 
 
 def project(

@@ -49,7 +49,7 @@ class Sizes(NamedTuple):
 def row_sizes(
     rows: Callable[[Array], Array],
     q: Float[Array, " n"],
-    A: Float[Array, "m n"],
+    A: Float[Array, "m e"],
     sure: bool = False,
 ) -> Sizes:
     """The rows that are more than rounding, and the sizes of all rows.
@@ -58,7 +58,7 @@ def row_sizes(
     with a few roundings of the coordinates, and of all intermediate results.
 
     Args:
-        rows: A as a function of q.
+        rows: A as a function of q, all columns or those that may differ from zero.
         q: coordinates.
         A: rows(q).
         sure: whether no row is void, so that roundings of the coordinates are sufficient.

@@ -2,17 +2,27 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice
-from jaxlag._linalg._projection import ConstraintProjector
+from jaxlag._linalg._kkt import units_of
+from jaxlag._linalg._projection import ConstraintProjector, either, keeps_sense
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._quasi_equations import QuasiState
+from jaxlag._lowering._sparse_program import (
+    SparseConstants,
+    SparseEquations,
+    find_sparsity,
+    row_entries,
+    sparse_constants,
+)
 from jaxlag._lowering._terms import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._tracing import _params
@@ -46,6 +56,7 @@ class Choices(NamedTuple):
         time_direction: 1, or -1 backwards in time.
         definite: function that returns whether M is positive definite without the constraints, in
             all lanes; None if that is known while tracing.
+        at: (t, q, v) of the start; None if it is unknown.
     """
 
     sample: _params.Sample = _params.UNKNOWN
@@ -53,6 +64,7 @@ class Choices(NamedTuple):
     multiplier_rows: RowChoice | None = None
     time_direction: Array | float = 1.0
     definite: Callable[[], Array] | None = None
+    at: tuple[Array, Array, Array] | None = None
 
 
 AS_USUAL = Choices()
@@ -125,6 +137,35 @@ class AccelerationProgram(eqx.Module):
     ) -> ConstraintProjector:
         """The projection onto the constraints near a state; of positions with quasi-velocities."""
 
+    def row_entries(
+        self, terms: AbstractTerms, state: State, constants: Any = None
+    ) -> Callable[[Array], Array]:
+        """A as a function of q, without columns that are 0 where it is sparse.
+
+        Args:
+            terms: the result of `terms`.
+            state: at which it is needed.
+            constants: the result of `precompute`, if it exists already.
+        """
+        return terms.rows_of(state.t, state.w, state.params)
+
+    def clearly_independent(self, state: State, sample: _params.Sample) -> Bool[Array, ""] | None:
+        """Whether all rows are clearly independent, in all lanes; None if that takes long."""
+        return None
+
+    def first_rows(self, state: State, sample: _params.Sample) -> np.ndarray | None:
+        """Rows that are to be kept where others depend on them, shape (m,); None for no preference.
+
+        Args:
+            state: shapes and dtypes are used.
+            sample: values of the params if these are traced.
+        """
+        return None
+
+    def is_sparse(self, constants: Any) -> bool:
+        """Whether solves use the sparsity of M and A."""
+        return isinstance(constants, SparseConstants)
+
     def keyed_by_inputs(self, constants: Any) -> bool:
         """Whether velocities, determinants and projections need the inputs' shapes."""
         return False
@@ -148,13 +189,27 @@ class ArrayProgram(AccelerationProgram):
         self, q: Array, params: Any, inputs: Mapping[str, Any], choices: Choices = AS_USUAL
     ) -> Any:
         """M and its factor if M depends on params alone."""
-        return self.array.precompute(q, params, choices.time_direction)
+        direction = choices.time_direction
+        sparse = sparse_constants(self.array, q, params, direction, choices.at)
+        return self.array.precompute(q, params, direction) if sparse is None else sparse
 
     def acceleration(
         self, state: State, constants: Any = None, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " n"]:
         """Solve M a = Q - h, with constraints together with their rows."""
-        return self.array.acceleration(*state, constants, multiplier_rows)
+        if constants is None:
+            constants = self.precompute(state.q, state.params, state.inputs)
+        if not isinstance(constants, SparseConstants):
+            return self.array.acceleration(*state, constants, multiplier_rows)
+
+        def sparse() -> Array:
+            equations = SparseEquations(self.array, constants)
+            return equations.acceleration(*state, multiplier_rows)
+
+        if constants.definite is None:
+            return sparse()
+        dense = partial(self.acceleration, state, constants.dense, multiplier_rows)
+        return jax.lax.cond(constants.definite, sparse, dense)
 
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
         """The equations in quasi-velocities on arrays."""
@@ -174,6 +229,31 @@ class ArrayProgram(AccelerationProgram):
             return jnp.zeros((0,), q.dtype)
         return quasi.determinant(t, q, params)[None]
 
+    def row_entries(
+        self, terms: AbstractTerms, state: State, constants: Any = None
+    ) -> Callable[[Array], Array]:
+        """The entries of a sparse A; else all of A."""
+        t, q, v, params, _ = state
+        sparsity = find_sparsity(self.array, params, q.shape[0], q.dtype).sparsity
+        if sparsity is None or sparsity.constrained is None:
+            return terms.rows_of(t, v, params)
+        return partial(row_entries, self.array, sparsity.constrained, t, params)
+
+    def clearly_independent(self, state: State, sample: _params.Sample) -> Bool[Array, ""] | None:
+        """By the pivots of sparse solves, if there are any."""
+        t, q, v, params, _ = state
+        constants = sparse_constants(self.array, q, params, 1.0, (t, q, v))
+        if constants is None or not self.array.constraints:
+            return None
+        return SparseEquations(self.array, constants).clearly_independent(t, q, v, params)
+
+    def first_rows(self, state: State, sample: _params.Sample) -> np.ndarray | None:
+        """Rows inside of one block of a sparse M, which may make it definite."""
+        size, dtype = state.q.shape[0], state.q.dtype
+        sparsity = find_sparsity(self.array, state.params, size, dtype).sparsity
+        constrained = None if sparsity is None else sparsity.constrained
+        return None if constrained is None else constrained.rows.is_inside
+
     def multipliers(
         self, state: State, constants: Any, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " m"]:
@@ -190,6 +270,13 @@ class ArrayProgram(AccelerationProgram):
         """By M^-1 A^T (A M^-1 A^T)^-1 at the state; with holonomic rows alone for q."""
         t, q, _, params, _ = state
         v = self.velocities(state, constants)
+        if isinstance(constants, SparseConstants):
+            equations = SparseEquations(self.array, constants)
+            sparse = equations.projector(t, q, v, params, active_rows)
+            definite, dense = constants.definite, constants.dense
+            if definite is None:
+                return sparse
+            return either(definite, sparse, lambda: self.projector(state, dense, rows, active_rows))
         holonomic = np.flatnonzero(rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> tuple[Array, Array]:
@@ -210,6 +297,9 @@ class ArrayProgram(AccelerationProgram):
             lambda q, v: self.array.velocity(t, q, v, params),
             lambda c: K_of_position @ c,
             lambda c: K @ c,
-            K.T,
+            lambda: K.T,
             masses,
+            lambda t, q, v: keeps_sense(K.T, self.array.rows(t, q, v, params)[0], active_rows),
+            lambda x: jnp.sum(jnp.abs(self.array.rows(t, q, v, params)[0]) * x[None], axis=1),
+            lambda: units_of(self.array.mass(t, q, v, params), self.array.rows(t, q, v, params)[0]),
         )

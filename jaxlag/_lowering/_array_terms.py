@@ -67,6 +67,8 @@ class ArrayTerms(AbstractTerms):
         baumgarte: stabilization added to gamma.
         regular: whether M is known to be positive definite by itself; used by the scalar
             program.
+        blocks_definite: whether the blocks of a sparse M are known to be positive definite with the
+            rows inside of them; None if that is unknown.
         contact_rows_independent: whether rows whose multipliers forces read are known to be
             independent.
         quasi: quasi-velocities, if the state is (q, u) with the free ones.
@@ -80,6 +82,7 @@ class ArrayTerms(AbstractTerms):
     formulation: str = eqx.field(static=True, default="multipliers")
     baumgarte: Baumgarte | None = eqx.field(static=True, default=None)
     regular: bool = eqx.field(static=True, default=False)
+    blocks_definite: bool | None = eqx.field(static=True, default=None)
     contact_rows_independent: bool = eqx.field(static=True, default=False)
     quasi: QuasiVelocities | None = None
     in_u: Callable | None = eqx.field(static=True, default=None)
@@ -405,12 +408,24 @@ class ArrayTerms(AbstractTerms):
         terms: AbstractTerms | None = None,
     ) -> tuple[Array, Array]:
         """(M, Q - h)."""
-        terms = self if terms is None else terms
-        M = terms.mass(t, q, v, params) if constants.mass is None else constants.mass
-        right = jnp.zeros_like(q) if constants.bias_zero else -terms.bias(t, q, v, params)
-        if self.forces:
-            right = self.force(t, q, v, params, inputs) + right
-        return M, right
+        of = self if terms is None else terms
+        M = of.mass(t, q, v, params) if constants.mass is None else constants.mass
+        return M, self.effort(t, q, v, params, inputs, constants.bias_zero, terms)
+
+    def effort(
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        params: Any,
+        inputs: Mapping[str, Any],
+        bias_zero: bool = False,
+        terms: AbstractTerms | None = None,
+    ) -> Float[Array, " n"]:
+        """Q - h; a zero h and absent forces are skipped."""
+        of = self if terms is None else terms
+        right = jnp.zeros_like(q) if bias_zero else -of.bias(t, q, v, params)
+        return self.force(t, q, v, params, inputs) + right if self.forces else right
 
 
 @lru_cache(maxsize=256)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -264,7 +265,7 @@ class ScalarProgram(AccelerationProgram):
             return ConstraintProjector(position, None, times(kick), None)
         held = position if code.position.results else None
         return ConstraintProjector(
-            held, partial(run, "velocity"), times(shift), times(kick), kick, masses
+            held, partial(run, "velocity"), times(shift), times(kick), lambda: kick, masses
         )
 
     def _corrections(
@@ -300,6 +301,29 @@ class ScalarProgram(AccelerationProgram):
         if not isinstance(constants, ScalarSolveConstants):
             return self._on_arrays.multipliers(state, constants, multiplier_rows)
         return self._run("lam", state, constants)
+
+    def row_entries(
+        self, terms: AbstractTerms, state: State, constants: Any = None
+    ) -> Callable[[Array], Array]:
+        """On arrays, if there is no scalar program."""
+        scalar = isinstance(constants, ScalarSolveConstants)
+        if constants is None:
+            scalar = self.lowered(state.q, state.params, state.inputs).equations is not None
+        if not scalar:
+            return self._on_arrays.row_entries(terms, state)
+        return terms.rows_of(state.t, state.w, state.params)
+
+    def first_rows(self, state: State, sample: _params.Sample) -> np.ndarray | None:
+        """On arrays, if there is no scalar program."""
+        if self.lowered(state.q, state.params, state.inputs, sample).equations is not None:
+            return None
+        return self._on_arrays.first_rows(state, sample)
+
+    def clearly_independent(self, state: State, sample: _params.Sample) -> Bool[Array, ""] | None:
+        """On arrays."""
+        if self.lowered(state.q, state.params, state.inputs, sample).equations is not None:
+            return None
+        return self._on_arrays.clearly_independent(state, sample)
 
     def keyed_by_inputs(self, constants: Any) -> bool:
         """The scalar programs are."""

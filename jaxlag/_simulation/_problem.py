@@ -56,6 +56,7 @@ class ProgramKey(NamedTuple):
     stabilization: str | Baumgarte | None
     assemble: bool
     regular: bool | None
+    blocks_definite: bool | None
     contact_rows_independent: bool
     capacity: int
     change_points: str
@@ -175,6 +176,7 @@ def equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments,
         formulation=plan.formulation,
         stabilization=plan.stabilization,
         regular=plan.regular,
+        blocks_definite=plan.blocks_definite,
         contact_rows_independent=plan.contact_rows_independent,
     )
     args = dynamics.arguments(values.params, values.inputs, values.ts)
@@ -238,10 +240,14 @@ def _with_scales(dynamics: VectorField, start: Array, y0: Array, args: Arguments
     """The arguments with the scales for the detection of change points."""
     if not dynamics.crossing:
         return args
-    masses = dynamics.projector(*stop_gradient((start, y0, args))).masses
-    assert masses is not None
+    surface = dynamics.projector(*stop_gradient((start, y0, args)))
+    assert surface.masses is not None
+    lengths = lengths_of(surface.masses, args.active_rows)
+    if surface.sparse:
+        assert surface.units is not None
+        return args._replace(lengths=lengths, units=surface.units())
     units, slopes = scales_at(dynamics, *stop_gradient((start, y0, args)))
-    return args._replace(lengths=lengths_of(masses, args.active_rows), units=units, slopes=slopes)
+    return args._replace(lengths=lengths, units=units, slopes=slopes)
 
 
 def stepper_of(

@@ -270,6 +270,7 @@ def simulate(
         max_steps = most_steps(max_steps, ts, dt, knots)
     stepper_traced, stepper_static = _params.arrays_apart(stepper)
     sample, params = _params.sample(params_traced), _params.join(params_traced, params_static)
+    definite = mass_definite(system, params, ts[0], q0, v0, sample)
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -282,7 +283,8 @@ def simulate(
         formulation=formulation,
         stabilization=stabilization,
         assemble=assemble,
-        regular=mass_definite(system, params, ts[0], q0, v0, sample),
+        regular=definite.alone,
+        blocks_definite=definite.in_blocks,
         contact_rows_independent=not assemble
         and contact_rows_independent(system, params, ts[0], q0, v0, signals),
         capacity=capacity_for(

@@ -159,6 +159,7 @@ def step(
         params_traced, inputs_traced = warned(jumps, (params_traced, inputs_traced), ts)
     stepper_traced, stepper_static = _params.arrays_apart((solver, None))
     sample = _params.sample(params_traced)
+    definite = mass_definite(system, params, t, q, v, sample)
     plan = ProgramKey(
         system=system,
         params=_params.Static(params_static),
@@ -171,7 +172,8 @@ def step(
         formulation=formulation,
         stabilization=stabilization,
         assemble=False,
-        regular=mass_definite(system, params, t, q, v, sample),
+        regular=definite.alone,
+        blocks_definite=definite.in_blocks,
         contact_rows_independent=contact_rows_independent(system, params, t, q, v, signals),
         capacity=0,
         change_points="stop",

@@ -7,7 +7,15 @@ import jax
 from jaxlag._core import _xla
 from jaxlag._core._batching import LANES, MOST
 from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO
-from jaxlag._lowering import Equations, Lowered, Program, Structure, find
+from jaxlag._lowering import (
+    Compressed,
+    Equations,
+    Lowered,
+    Program,
+    SparsityFound,
+    Structure,
+    find,
+)
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._system._state_functions import AbstractQuantities
 from jaxlag.solvers import Dopri8
@@ -20,7 +28,11 @@ def _list(names: frozenset[str]) -> str:
 
 
 def explain(
-    system: AbstractQuantities, structure: Structure, lowered: Lowered | None, rows: ConstraintRows
+    system: AbstractQuantities,
+    structure: Structure,
+    lowered: Lowered | None,
+    rows: ConstraintRows,
+    sparse: SparsityFound | None,
 ) -> str:
     """The properties found in `system`, and their effects on the compiled program.
 
@@ -29,6 +41,7 @@ def explain(
         structure: dependencies of its terms.
         lowered: its scalar program, or why there is none; None if it was not requested.
         rows: its constraint rows.
+        sparse: which entries of M and A may differ from zero; None with a scalar program.
     """
     forces = [f"{force.name} ({type(force).__name__})" for force in system.forces]
     lines = [
@@ -46,7 +59,9 @@ def explain(
     if lowered is not None and lowered.equations is not None:
         lines += _scalar(system, lowered, lowered.equations)
     else:
-        lines += _array(system, structure, "as declared" if lowered is None else lowered.reason)
+        assert sparse is not None
+        reason = "as declared" if lowered is None else lowered.reason
+        lines += _array(system, structure, reason, sparse)
     return "\n".join([*lines, f"small loops   {_xla.report()}"])
 
 
@@ -179,14 +194,36 @@ def _factorization(n: int) -> str:
     return f"by library Cholesky (n > {LOOP_UP_TO})"
 
 
-def _array(system: AbstractQuantities, structure: Structure, reason: str) -> list[str]:
+def _array(
+    system: AbstractQuantities, structure: Structure, reason: str, sparse: SparsityFound
+) -> list[str]:
     often = "once per solve" if structure.mass_constant else "per evaluation"
-    ways = ["M by batched forward-over-reverse columns"]
+    found = sparse.sparsity
+    if found is None:
+        ways = ["M by batched forward-over-reverse columns"]
+        solves = f"one factorization {often}, {_factorization(system.size)}"
+        if system.size > LOOP_UP_TO:
+            solves += f"; matrices not sparse: {sparse.reason}"
+    else:
+        ways = [f"M by {_derivatives(found.of_mass)}"]
+        blocks = (
+            "M diagonal" if found.blocks.size == 1 else f"blocks of M of up to {found.blocks.size}"
+        )
+        solves = f"one factorization {often}, {blocks}"
     if not structure.bias_zero:
         ways.append("h by one forward derivative of (dL/dq, dL/dv)")
+    if found is not None and found.constrained is not None:
+        rows = found.constrained.rows
+        ways.append(f"A by {_derivatives(found.constrained.of_rows)}")
+        solves += f"; A M^-1 A^T banded, half bandwidth {rows.width} of {rows.count}"
     return [
         f"lowering      array program ({reason}): {', '.join(ways)}",
-        f"mass solve    one factorization {often}, {_factorization(system.size)}",
+        f"mass solve    {solves}",
         _steps(None),
         "batches       by jax.vmap: all trajectories in one loop",
     ]
+
+
+def _derivatives(entries: Compressed) -> str:
+    count, kind = len(entries.seeds), "reverse" if entries.of_rows else "directional"
+    return f"{count} {kind} derivative{'' if count == 1 else 's'}"

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._mass_solve import known_definite
+from jaxlag._lowering import Sparsity, find_sparsity, sparse_kkt
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import evaluate
 from jaxlag._model._states import named_states, state_names
@@ -24,6 +25,8 @@ from jaxlag._tracing._input_values import InputValues
 
 LEARNED = 64
 """Numbers in matrices of the params from which on a Lagrangian may be learned."""
+LARGE = 64
+"""Coordinates above which M is tested by its blocks first."""
 INDEPENDENT = 1e-3
 """Least singular value of clearly independent rows of unit length."""
 
@@ -40,15 +43,26 @@ def advice_on_mass(params: Any) -> str:
     )
 
 
+class Definite(NamedTuple):
+    """Whether M is positive definite without the constraints; None if the params are traced.
+
+    Attributes:
+        alone: it is.
+        in_blocks: the blocks of a sparse M are, with the rows inside of them.
+    """
+
+    alone: bool | None
+    in_blocks: bool | None
+
+
 def mass_definite(
     system: AbstractReactions, params: Any, t: Any, q: Any, v: Any, sample: _params.Sample
-) -> bool | None:
+) -> Definite:
     """Whether M is positive definite for these params without the constraints.
 
     Tested in the given state, if it is known, and in one other: the mass of a link is zero
     everywhere or nowhere. If the state is traced and M depends on it, it is also tested in states
-    where inertias vanish, as in polar coordinates at r = 0. None if the params are traced. Only
-    used with constraints.
+    where inertias vanish, as in polar coordinates at r = 0. Only used with constraints.
 
     Args:
         system: the mechanical system.
@@ -59,9 +73,26 @@ def mass_definite(
         sample: params for the check of code for M.
     """
     if not system.constraints:
-        return False
+        return Definite(False, False)
     if not concrete(params):
-        return None
+        return Definite(None, None)
+    states = _test_states(system, params, t, q, v)
+    if system.size > LARGE:
+        in_blocks = _in_blocks(system, params, states)
+        if in_blocks is not None:
+            return in_blocks
+    for at in states:
+        with jax.ensure_compile_time_eval():
+            M = _mass((system, sample), params, None, *at)
+        if not concrete(M):
+            return Definite(None, None)  # the Lagrangian closes over a traced value
+        if not known_definite(np.asarray(M, np.float64), q.dtype):
+            return _in_blocks(system, params, states) or Definite(False, False)
+    return Definite(True, True)
+
+
+def _test_states(system: AbstractReactions, params: Any, t: Any, q: Any, v: Any) -> list[tuple]:
+    """States where the mass matrix is tested, see `mass_definite`."""
     n = system.size
     states = [(0.0, *np.random.default_rng(0).uniform(-1.5, 1.5, (2, n)))]
     v = jnp.zeros_like(q) if v is None else v
@@ -69,16 +100,26 @@ def mass_definite(
         states.append((t, q, v))
     elif system._structure(params, q.dtype).mass & {"t", "q", "v"}:
         states += [(0.0, np.full(n, x), np.zeros(n)) for x in (0.0, np.pi / 2, np.pi)]
-    for state in states:
-        kinds = jnp.result_type(float), q.dtype, q.dtype
-        at = [np.asarray(x, kind) for x, kind in zip(state, kinds, strict=True)]
+    kinds = jnp.result_type(float), q.dtype, q.dtype
+    return [tuple(map(np.asarray, state, kinds)) for state in states]
+
+
+def _in_blocks(system: AbstractReactions, params: Any, states: list[tuple]) -> Definite | None:
+    """The same by blocks; None if M and A are not sparse."""
+    dtype = states[0][1].dtype
+    sparsity = find_sparsity(system._terms, params, system.size, dtype).sparsity
+    if sparsity is None:
+        return None
+    alone = in_blocks = True
+    for at in states:
         with jax.ensure_compile_time_eval():
-            M = _mass((system, sample), params, None, *at)
-        if not concrete(M):
-            return None  # the Lagrangian closes over a traced value
-        if not known_definite(np.asarray(M, np.float64), q.dtype):
-            return False
-    return True
+            found = _blocks((system, sparsity), params, None, *at)
+        if not concrete(found):
+            return Definite(None, None)
+        M, augmented = (np.asarray(x, np.float64) for x in found)
+        alone = alone and known_definite(M, dtype)
+        in_blocks = in_blocks and known_definite(augmented, dtype)
+    return Definite(alone, in_blocks)
 
 
 def contact_rows_independent(
@@ -171,6 +212,21 @@ def _mass(
     v: Array,
 ) -> Array:
     return system._program.terms(q, params, sample).mass(t, q, v, params)
+
+
+@Compiled
+def _blocks(
+    system: AbstractReactions,
+    sparsity: Sparsity,
+    params: Any,
+    _: None,
+    t: Array,
+    q: Array,
+    v: Array,
+) -> tuple[Array, Array]:
+    """The blocks of M, and of M + A^T W A by the rows inside of them."""
+    kkt = sparse_kkt(system._terms, sparsity, params, t, q, v)
+    return kkt.mass.entries, kkt.augmented()[0].entries
 
 
 def check_declaration(

@@ -21,6 +21,7 @@ from jaxlag._lowering import (
     ScalarProgram,
     Structure,
     check_kinematics,
+    find_sparsity,
     layout,
 )
 from jaxlag._model._constraints import (
@@ -357,14 +358,18 @@ class System(AbstractReactions):
         dtype = jnp.result_type(float)
         check_traceable(self, params, dtype, None)
         program, lowered = self._program, None
+        free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
+        whole = ArrayTerms(
+            self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self._in_u
+        )
         if isinstance(program, ScalarProgram):
-            free = tuple(f for f in self.forces if not getattr(f, "takes_inputs", False))
-            whole = ArrayTerms(
-                self.lagrangian, free, self.constraints, quasi=self.quasi, in_u=self._in_u
-            )
             program = ScalarProgram(whole, program.limit)
             lowered = program.lowered(jax.ShapeDtypeStruct((self.size,), dtype), params, {})
-        return explain(self, self._structure(params, dtype), lowered, self._rows(params, dtype))
+        sparse = None
+        if lowered is None or lowered.equations is None:
+            sparse = find_sparsity(whole, params, self.size, dtype)
+        rows = self._rows(params, dtype)
+        return explain(self, self._structure(params, dtype), lowered, rows, sparse)
 
     def _structure(self, params: Any, dtype: Any) -> Structure:
         """Dependencies of M, h and L, traced once per (Lagrangian, shapes, dtypes)."""

@@ -81,7 +81,7 @@ def test_corrections_are_those_of_the_array_program(
 
     def found(q, on_arrays):
         made = projector(system, q, v, *given, on_arrays)
-        results = [made.shift(c[:3]), made.kick(c), made.columns, made.position(q)]
+        results = [made.shift(c[:3]), made.kick(c), made.columns(), made.position(q)]
         return results + ([made.masses] if crossing else [])
 
     # The weights of rows for a singular M are constants of the array program, and in `masses`.

@@ -46,37 +46,46 @@ def move(graph: Graph, eqn: Any, operands: list) -> list:
     """Run the primitive on an array of positions of all elements."""
     count = MOVES[eqn.primitive.name]
     count = len(operands) if count is None else count
-    return _moved(graph, eqn, operands, range(count))
-
-
-def _moved(graph: Graph, eqn: Any, operands: list, data: Sequence[int]) -> list:
-    pool: list[Node] = []
-    positions = []
-    for i, array in enumerate(operands):
-        if i in data:
-            array = nodes(graph, array)
-            places = np.arange(len(pool), len(pool) + array.size, dtype=np.int32)
-            positions.append(places.reshape(array.shape))
-            pool.extend(array.ravel())
-        elif array.dtype == object:
-            raise Missing(f"{eqn.primitive.name} with an index that depends on values")
-        else:
-            positions.append(array)
-    params, nowhere = dict(eqn.params), None
-    if "fill_value" in params:  # value outside of the array; NaN by default
-        given, params["fill_value"] = params["fill_value"], len(pool)
-        nowhere = graph.const(np.nan if given is None else float(given))
+    data, indices = operands[:count], operands[count:]
+    if any(array.dtype == object for array in indices):
+        raise Missing(f"{eqn.primitive.name} with an index that depends on values")
+    pool = [node for array in data for node in nodes(graph, array).ravel()]
     row = np.empty(len(pool) + 1, object)
-    row[:] = [*pool, nowhere]
+    row[:-1] = pool
+    if "fill_value" in eqn.params:  # outside of the array; NaN by default
+        given = eqn.params["fill_value"]
+        row[-1] = graph.const(np.nan if given is None else float(given))
+    moved = moved_positions(eqn, [array.shape for array in data], indices)
+    return [row[index] if np.ndim(index) else scalar(row[int(index)]) for index in moved]
+
+
+def moved_positions(
+    eqn: Any, shapes: Sequence[tuple[int, ...]], indices: Sequence[Any]
+) -> list[np.ndarray]:
+    """The results of a primitive of `MOVES` on the positions of all elements.
+
+    Args:
+        eqn: the equation.
+        shapes: of the operands that have elements, which come first.
+        indices: the others.
+
+    Returns:
+        Positions in all elements, one operand after the other; their number stands for the value
+        outside of an array.
+    """
+    positions, size = [], 0
+    for shape in shapes:
+        count = int(np.prod(shape))
+        positions.append(np.arange(size, size + count, dtype=np.int32).reshape(shape))
+        size += count
+    params = dict(eqn.params)
+    if "fill_value" in params:
+        params["fill_value"] = size
     if eqn.primitive.name in SHIFTS:  # with numpy: JAX would compile each
-        moved = [NUMPY[eqn.primitive.name](eqn, *positions)]
-    else:
-        with jax.ensure_compile_time_eval():
-            moved = eqn.primitive.bind(*map(jnp.asarray, positions), **params)
-        moved = moved if eqn.primitive.multiple_results else [moved]
-    return [
-        row[np.asarray(index)] if np.ndim(index) else scalar(row[int(index)]) for index in moved
-    ]
+        return [np.asarray(NUMPY[eqn.primitive.name](eqn, *positions, *indices))]
+    with jax.ensure_compile_time_eval():
+        moved = eqn.primitive.bind(*map(jnp.asarray, (*positions, *indices)), **params)
+    return [np.asarray(x) for x in (moved if eqn.primitive.multiple_results else [moved])]
 
 
 def _scatter(graph: Graph, eqn: Any, operands: list) -> np.ndarray:

@@ -144,7 +144,7 @@ def _run(graph: Graph, jaxpr: Jaxpr, consts: list, args: list) -> list:
 def _equation(graph: Graph, eqn: Any, operands: list) -> list:
     name = eqn.primitive.name
     if not any(array.dtype == object for array in operands) and name != "while":
-        return _known(eqn, operands)
+        return known_results(eqn, operands)
     if name in _CONTROL:
         return _CONTROL[name](graph, eqn, operands)
     inner = None if name.startswith("custom_vjp_call") else called(eqn)
@@ -160,8 +160,11 @@ def _equation(graph: Graph, eqn: Any, operands: list) -> list:
     raise Missing(name)
 
 
-def _known(eqn: Any, operands: list) -> list:
-    """Known values, computed by JAX, which compiles each operation; exact ones by numpy."""
+def known_results(eqn: Any, operands: list) -> list:
+    """The results of one equation at known values.
+
+    JAX computes them and compiles each operation; exact ones are computed by numpy.
+    """
     name = eqn.primitive.name
     if name in SHIFTS:
         return [np.asarray(NUMPY[name](eqn, *operands))]
