@@ -314,9 +314,7 @@ class VectorField(eqx.Module):
         self, tau: Float[Array, ""], y: Float[Array, " m"], args: Arguments
     ) -> Float[Array, " n"]:
         """Q - h at (tau, y)."""
-        t, q, v, params, values = self.at(tau, y, args)
-        terms = self.terms
-        return terms.force(t, q, v, params, values) - terms.bias(t, q, v, params)
+        return self.terms.effort(*self.at(tau, y, args))
 
     def state_of(self, t: Array, q: Array, v: Array, x: Array | None, params: Any) -> Array:
         """The state of a motion from (q, v, x), with zero work."""

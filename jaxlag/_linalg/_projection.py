@@ -29,7 +29,7 @@ class ConstraintProjector(NamedTuple):
         masses: diagonal of (A M^-1 A^T)^-1, 0 for dependent rows; None if not needed.
         keeps_sense: (t, q, v) -> whether pivots of A M^-1 A0^T, or of A K, are positive as at the
             predicted state, whose rows are A0; None if the columns are to be used.
-        reach: x -> |A| x at the predicted state; None if it is not sparse.
+        reach: x -> |A| x at the predicted state; None of a scalar program.
         units: function that returns the units of the coordinates in which their inertias are 1;
             None likewise.
         sparse: whether A is sparse, so that the columns take many solves.
