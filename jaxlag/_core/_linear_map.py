@@ -247,7 +247,7 @@ def _lanes(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     mapped = [i is not None for i in axes]
     # x gets lanes in all cases: JAX then sums the cotangents of a shared x over them.
     x = [
-        leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *leaf.shape))
+        leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *jnp.shape(leaf)))
         for leaf, is_mapped in zip(args[count:], mapped[count:], strict=True)
     ]
     results = _bind(_batched(form, sizes[0], tuple(mapped[:count])), args[:count], x)

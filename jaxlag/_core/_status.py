@@ -108,3 +108,9 @@ ADVICE_SHARP = {
     ),
 }
 """Advice if forces change over a short distance, which a looser tolerance would miss."""
+
+ADVICE_SPARSE = (
+    "With traced params (jax.jit, jax.grad, jax.vmap), rows that couple this coordinate with "
+    "others do not replace inertia, as M is sparse."
+)
+"""Further advice if M is sparse and singular, and there are constraints."""

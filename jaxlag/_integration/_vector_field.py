@@ -187,7 +187,7 @@ class VectorField(eqx.Module):
         if self.regular is None and self.formulation != "null_space":
             definite = partial(self._definite, t, q, v, params)
         choices = Choices(
-            self.sample, args.active_rows, args.multiplier_rows, time_direction, definite, (t, q, v)
+            self.sample, args.active_rows, args.multiplier_rows, time_direction, definite
         )
         return args._replace(constants=self.program.precompute(q, params, values, choices))
 

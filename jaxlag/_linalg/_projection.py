@@ -1,7 +1,6 @@
 """Projection of a state onto its constraints, in the metric of M with one factorization."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -45,28 +44,6 @@ class ConstraintProjector(NamedTuple):
     reach: Callable | None = None
     units: Callable | None = None
     sparse: bool = False
-
-
-def either(
-    first: Bool[Array, ""], surface: ConstraintProjector, other: Callable[[], ConstraintProjector]
-) -> ConstraintProjector:
-    """One projector or another one, which is made only where it is used.
-
-    Args:
-        first: whether it is the first one.
-        surface: the first one.
-        other: makes the other one, for the same rows.
-    """
-
-    def chosen(name: str) -> Callable:
-        def of(made: Callable[[], ConstraintProjector]) -> Callable:
-            return lambda *args: getattr(made(), name)(*args)
-
-        return partial(jax.lax.cond, first, of(lambda: surface), of(other))
-
-    masses = jax.lax.cond(first, lambda: surface.masses, lambda: other().masses)
-    functions = "shift", "kick", "columns", "keeps_sense", "reach", "units"
-    return surface._replace(masses=masses, **{name: chosen(name) for name in functions})
 
 
 def keeps_sense(

@@ -13,11 +13,11 @@ from jaxlag._lowering._quasi_equations import QuasiState as QuasiState
 from jaxlag._lowering._row_layout import check_kinematics as check_kinematics
 from jaxlag._lowering._row_layout import layout as layout
 from jaxlag._lowering._scalar_program import ScalarProgram as ScalarProgram
-from jaxlag._lowering._sparse_program import SparsityFound as SparsityFound
 from jaxlag._lowering._sparse_program import find_sparsity as find_sparsity
 from jaxlag._lowering._sparse_program import sparse_kkt as sparse_kkt
 from jaxlag._lowering._sparsity import Compressed as Compressed
 from jaxlag._lowering._sparsity import Sparsity as Sparsity
+from jaxlag._lowering._sparsity import SparsityFound as SparsityFound
 from jaxlag._lowering._structure import Structure as Structure
 from jaxlag._lowering._structure import find_structure as find_structure
 from jaxlag._lowering._symbolic._symbolic_system import Equations as Equations

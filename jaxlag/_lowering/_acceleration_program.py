@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxlag._linalg._independent_rows import RowChoice
 from jaxlag._linalg._kkt import units_of
-from jaxlag._linalg._projection import ConstraintProjector, either, keeps_sense
+from jaxlag._linalg._projection import ConstraintProjector, keeps_sense
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._quasi_equations import QuasiState
 from jaxlag._lowering._sparse_program import (
@@ -56,7 +58,6 @@ class Choices(NamedTuple):
         time_direction: 1, or -1 backwards in time.
         definite: function that returns whether M is positive definite without the constraints, in
             all lanes; None if that is known while tracing.
-        at: (t, q, v) of the start; None if it is unknown.
     """
 
     sample: _params.Sample = _params.UNKNOWN
@@ -64,7 +65,6 @@ class Choices(NamedTuple):
     multiplier_rows: RowChoice | None = None
     time_direction: Array | float = 1.0
     definite: Callable[[], Array] | None = None
-    at: tuple[Array, Array, Array] | None = None
 
 
 AS_USUAL = Choices()
@@ -126,6 +126,20 @@ class AccelerationProgram(eqx.Module):
         self, state: State, constants: Any, multiplier_rows: RowChoice | None = None
     ) -> Float[Array, " m"]:
         """The multipliers as forces read them."""
+
+    def reactions(
+        self, state: State, sample: _params.Sample = _params.UNKNOWN
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]]:
+        """(a, lam, A^T lam), lam of least norm for dependent rows; NaN for contradictory rows.
+
+        Args:
+            state: any state; its rows are examined.
+            sample: values of the params if these are traced.
+        """
+        t, q, v, params, inputs = state
+        terms = self.terms(q, params, sample)
+        a, lam = self.array.reactions(t, q, v, params, inputs, terms)
+        return a, lam, lam @ terms.rows_of(t, v, params)(q)
 
     @abstractmethod
     def projector(
@@ -190,7 +204,7 @@ class ArrayProgram(AccelerationProgram):
     ) -> Any:
         """M and its factor if M depends on params alone."""
         direction = choices.time_direction
-        sparse = sparse_constants(self.array, q, params, direction, choices.at)
+        sparse = sparse_constants(self.array, q, params, direction)
         return self.array.precompute(q, params, direction) if sparse is None else sparse
 
     def acceleration(
@@ -199,17 +213,9 @@ class ArrayProgram(AccelerationProgram):
         """Solve M a = Q - h, with constraints together with their rows."""
         if constants is None:
             constants = self.precompute(state.q, state.params, state.inputs)
-        if not isinstance(constants, SparseConstants):
-            return self.array.acceleration(*state, constants, multiplier_rows)
-
-        def sparse() -> Array:
-            equations = SparseEquations(self.array, constants)
-            return equations.acceleration(*state, multiplier_rows)
-
-        if constants.definite is None:
-            return sparse()
-        dense = partial(self.acceleration, state, constants.dense, multiplier_rows)
-        return jax.lax.cond(constants.definite, sparse, dense)
+        if isinstance(constants, SparseConstants):
+            return SparseEquations(self.array, constants).acceleration(*state, multiplier_rows)
+        return self.array.acceleration(*state, constants, multiplier_rows)
 
     def quasi_rates(self, state: State, constants: Any) -> Float[Array, " m"]:
         """The equations in quasi-velocities on arrays."""
@@ -242,10 +248,28 @@ class ArrayProgram(AccelerationProgram):
     def clearly_independent(self, state: State, sample: _params.Sample) -> Bool[Array, ""] | None:
         """By the pivots of sparse solves, if there are any."""
         t, q, v, params, _ = state
-        constants = sparse_constants(self.array, q, params, 1.0, (t, q, v))
+        sparse = self._sparse(state)
+        return None if sparse is None else sparse.clearly_independent(t, q, v, params)
+
+    def reactions(
+        self, state: State, sample: _params.Sample = _params.UNKNOWN
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]]:
+        """By the entries of sparse M and A where all rows are clearly independent."""
+        sparse, of_all = self._sparse(state), super().reactions
+        if sparse is None:
+            return of_all(state, sample)
+        t, q, v, params, _ = state
+        entries = self.row_entries(self.array, state)
+        clear = eqxi.unvmap_all(jnp.all(row_sizes(entries, q, entries(q)).nonzero))
+        clear = clear & sparse.clearly_independent(t, q, v, params)
+        return jax.lax.cond(clear, lambda: sparse.reactions(*state), lambda: of_all(state, sample))
+
+    def _sparse(self, state: State) -> SparseEquations | None:
+        """The sparse equations with constraints, if there are any."""
+        constants = sparse_constants(self.array, state.q, state.params, 1.0)
         if constants is None or not self.array.constraints:
             return None
-        return SparseEquations(self.array, constants).clearly_independent(t, q, v, params)
+        return SparseEquations(self.array, constants)
 
     def first_rows(self, state: State, sample: _params.Sample) -> np.ndarray | None:
         """Rows inside of one block of a sparse M, which may make it definite."""
@@ -272,11 +296,7 @@ class ArrayProgram(AccelerationProgram):
         v = self.velocities(state, constants)
         if isinstance(constants, SparseConstants):
             equations = SparseEquations(self.array, constants)
-            sparse = equations.projector(t, q, v, params, active_rows)
-            definite, dense = constants.definite, constants.dense
-            if definite is None:
-                return sparse
-            return either(definite, sparse, lambda: self.projector(state, dense, rows, active_rows))
+            return equations.projector(t, q, v, params, active_rows)
         holonomic = np.flatnonzero(rows.holonomic).tolist()
 
         def corrections(chosen: list[int] | None) -> tuple[Array, Array]:

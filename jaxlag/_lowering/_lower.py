@@ -11,7 +11,7 @@ from jaxlag._linalg._mass_solve import known_definite
 from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._straight_line import assemble
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
-from jaxlag._lowering._symbolic._derive import Derivation, check_length, derivation, derive
+from jaxlag._lowering._symbolic._derive import Derivation, derivation, derive, shortest_solve
 from jaxlag._lowering._symbolic._program_key import Key
 from jaxlag._lowering._symbolic._read_system import read_scene, with_forces
 from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
@@ -199,9 +199,10 @@ def _read(key: Key) -> _Read:
     scene = read_scene(key)
     limit = None if key.limit is None else max(key.limit, OF_ARRAYS * scene.array_operations)
     reason = _too_long(scene, key, limit)
+    if reason is None and limit is not None and (least := shortest_solve(scene)) > limit:
+        reason = f"at least {least} operations, more than {limit}"
     if reason is not None:
         return _Read(scene, limit, reason=reason)
-    check_length(scene, limit)
     return _Read(scene, limit, None if key.quasi is not None else derivation(scene, limit))
 
 

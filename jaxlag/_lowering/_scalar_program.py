@@ -25,6 +25,7 @@ from jaxlag._lowering._emit import _emit
 from jaxlag._lowering._graph._straight_line import Program
 from jaxlag._lowering._interpreted_terms import interpreted_terms
 from jaxlag._lowering._lower import Lowered, lower, usually_definite
+from jaxlag._lowering._sparse_program import find_sparsity
 from jaxlag._lowering._symbolic._program_key import key_of
 from jaxlag._lowering._symbolic._symbolic_system import Equations
 from jaxlag._lowering._terms import AbstractTerms
@@ -150,7 +151,9 @@ class ScalarProgram(AccelerationProgram):
         )
 
     def terms(self, q: Any, params: Any, sample: _params.Sample = _params.UNKNOWN) -> AbstractTerms:
-        """Interpreted, if that is quicker to compile."""
+        """Interpreted, if that is quicker to compile; on arrays if M and A are sparse."""
+        if find_sparsity(self.array, params, q.shape[0], q.dtype).sparsity is not None:
+            return self.array
         key = key_of(self.array, q, params, {}, self.limit)
         sample = _params.sample(_params.split(params)[0], sample)
         found = interpreted_terms(self.array, key, sample, alone=not self.in_loop)
@@ -318,6 +321,16 @@ class ScalarProgram(AccelerationProgram):
         if self.lowered(state.q, state.params, state.inputs, sample).equations is not None:
             return None
         return self._on_arrays.first_rows(state, sample)
+
+    def reactions(
+        self, state: State, sample: _params.Sample = _params.UNKNOWN
+    ) -> tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]]:
+        """On arrays, if M and A are sparse and there is no scalar program."""
+        of_q = find_sparsity(self.array, state.params, state.q.shape[0], state.q.dtype)
+        given = state.q, state.params, state.inputs, sample
+        if of_q.sparsity is not None and self.lowered(*given).equations is None:
+            return self._on_arrays.reactions(state, sample)
+        return super().reactions(state, sample)
 
     def clearly_independent(self, state: State, sample: _params.Sample) -> Bool[Array, ""] | None:
         """On arrays."""

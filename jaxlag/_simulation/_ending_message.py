@@ -9,7 +9,15 @@ from jaxtyping import Array
 
 from jaxlag._core._arrays import stop_gradient
 from jaxlag._core._errors import shortened
-from jaxlag._core._status import ADVICE, ADVICE_FIXED, ADVICE_SHARP, CONCERNS_ROW, Status
+from jaxlag._core._status import (
+    ADVICE,
+    ADVICE_FIXED,
+    ADVICE_SHARP,
+    ADVICE_SPARSE,
+    CONCERNS_ROW,
+    Status,
+)
+from jaxlag._lowering import find_sparsity
 from jaxlag._model._states import named_states
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._methods import of_components
@@ -77,6 +85,10 @@ def _advice(motion: AbstractSolution, status: Status) -> str:
     message = (ADVICE | special).get(status, "")
     if status is Status.mass_singular:
         message = f"{message} {advice_on_mass(motion._given)}".rstrip()
+        system, dtype = motion.system, motion.q.dtype
+        of = find_sparsity(system._terms, motion._given, system.size, dtype)
+        if system.constraints and of.definite:
+            message = f"{message} {ADVICE_SPARSE}"
     if fixed:
         return message
     if status in (Status.max_steps, Status.step_below_resolution):

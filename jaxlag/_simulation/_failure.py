@@ -325,13 +325,22 @@ def _culprits(
     if dynamics.rows.size:
         A, _ = dynamics.terms.rows(*dynamics.state(tau, y, args))
         known = known & jnp.all(jnp.isfinite(A))
-        M, _ = augmented(M, masked(A, args.active_rows))
+        M, _ = augmented(M, masked(A, _inertial(dynamics, tau, y, args)))
     factor = factor_mass(M)
     a = solve_mass(M, effort, factor)
     lost = jnp.where(jnp.all(finite), -1, jnp.argmin(finite))
     worst = jnp.where(lost >= 0, lost, jnp.argmax(jnp.abs(a)))
     massless = jnp.where(known, first_unhealthy(M, factor), -1)
     return massless.astype(jnp.int32), lost.astype(jnp.int32), worst.astype(jnp.int32)
+
+
+def _inertial(dynamics: VectorField, tau: Array, y: Array, args: Arguments) -> Array | None:
+    """Active rows that may replace inertia: with a sparse M those inside of its blocks."""
+    if not dynamics.program.is_sparse(args.constants):
+        return args.active_rows
+    inside = dynamics.program.first_rows(dynamics.state_at(tau, y, args), dynamics.sample)
+    assert inside is not None
+    return jnp.asarray(inside) if args.active_rows is None else args.active_rows & inside
 
 
 def _worst_with_states(

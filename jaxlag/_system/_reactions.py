@@ -148,8 +148,7 @@ class AbstractReactions(AbstractQuantities):
         values = self._inputs_at(inputs, t, q, v, params)
         if not self.constraints:
             return jnp.zeros_like(q)
-        _, lam, A = self._reactions(t, q, v, params, values)
-        return lam @ A
+        return self._reactions(t, q, v, params, values)[2]
 
     def _quasi_reactions(
         self,
@@ -202,7 +201,7 @@ class AbstractReactions(AbstractQuantities):
     def _reactions(
         self, t: Array, q: Array, v: Array, params: Any, values: Mapping[str, Any]
     ) -> tuple[Array, Array, Array]:
-        """(a, lam, A), compiled as one program because of many small operations."""
+        """(a, lam, A^T lam), compiled as one program because of many small operations."""
         self._rows(params, q.dtype)
         sample = _params.sample(_params.halves(params)[0])
         return _reactions((self, sample), params, dict(values), t, q, v)
@@ -218,9 +217,7 @@ def _reactions(
     q: Array,
     v: Array,
 ) -> tuple[Array, Array, Array]:
-    terms = system._program.terms(q, params, sample)
-    a, lam = system._terms.reactions(t, q, v, params, InputValues(values), terms)
-    return a, lam, terms.rows_of(t, v, params)(q)
+    return system._program.reactions(State(t, q, v, params, InputValues(values)), sample)
 
 
 @Compiled

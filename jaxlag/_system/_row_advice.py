@@ -52,18 +52,28 @@ def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
     here = np.flatnonzero(rows.holonomic)
     if not len(here) or not np.all(np.isfinite(q)):
         return []
-    residuals = jax.jit(jax.vmap(lambda q: system._terms.position(t, q, params)))
-    ways = _ways(q)
-    vanish = np.zeros(len(here), bool)
-    for power in (0.0625, 0.125, 0.25):
-        far = float(jnp.finfo(q.dtype).eps) ** power * ways
-        places = jnp.concatenate([q[None], q[None] + far, q[None] - far])
-        found = np.asarray(residuals(places))
-        (middle,), ahead, behind = np.split(found, [1, 1 + len(far)])
-        both, largest = ahead + behind, np.max(np.abs(found), axis=0)
+
+    @jax.jit
+    def around(far: Array) -> tuple[Array, Array, Array, Array]:
+        """Residuals here, on both sides, and their first order."""
+
+        def position(q: Array) -> Array:
+            return system._terms.position(t, q, params)
+
+        ahead, behind = (jax.vmap(position)(q[None] + step) for step in (far, -far))
+        return position(q), ahead, behind, jax.vmap(jax.linearize(position, q)[1])(far)
+
+    vanish, regular = np.zeros((2, len(here)), bool)
+    for power in (0.25, 0.125, 0.0625):
+        far = float(jnp.finfo(q.dtype).eps) ** power * _ways(q)
+        middle, ahead, behind, first = map(np.asarray, around(far))
+        both = ahead + behind
+        largest = np.max(np.abs([*ahead, *behind, middle]), axis=0)
         one_sign = np.all(both >= 0, axis=0) | np.all(both <= 0, axis=0)
         even = np.all(np.abs(ahead - behind) <= EVEN * np.abs(both) + 1e-3 * largest, axis=0)
-        vanish |= one_sign & even & (largest > 0) & (np.abs(middle) <= EVEN * largest)
+        # Of (x + y)^2 the first order 2 x y is at most half of the even part, wherever x is.
+        regular |= np.any(np.abs(first) > np.abs(both), axis=0)
+        vanish |= one_sign & even & (largest > 0) & (np.abs(middle) <= EVEN * largest) & ~regular
     return [rows.labels[i] for i in here[vanish]]
 
 

@@ -416,7 +416,7 @@ def test_all_pairs_of_modes_agree_on_values(name, loop):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("name", "loop"), zip(["assembled", "resting", "assembled"], NESTED, strict=True)
+    ("name", "loop"), [*zip(["assembled", "resting", "assembled"], NESTED, strict=True)]
 )
 def test_all_pairs_of_modes_agree_on_searches(name, loop):
     check(CHEAP[name], [loop], PAIRS, 1e-10)

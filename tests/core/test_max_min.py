@@ -105,6 +105,13 @@ def test_lanes_of_a_scalar_are_no_components(of, axes, lanes):
             np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
+@pytest.mark.parametrize("of", [lambda x: lax.max(x, 0.5), lambda x: lax.min(0.5, x)])
+def test_lanes_beside_a_number(of):
+    """An interpreted program passes numbers that are no arrays."""
+    program, x = with_sound_extremes(jax.make_jaxpr(of)(0.3)), jnp.linspace(0.0, 1.0, 3)
+    np.testing.assert_allclose(jax.vmap(jaxpr_as_fun(program))(x)[0], of(x), rtol=0.0)
+
+
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
 def test_batches_of_a_param_beside_the_coordinates(lowering):
     force = jl.GeneralizedForce(lambda t, q, v, p: -jnp.maximum(q, p), "push")

@@ -9,8 +9,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag._core._jaxprs import equations
-from jaxlag._lowering import _sparse_program
-from jaxlag._lowering._acceleration_program import ArrayProgram, Choices, State
+from jaxlag._lowering._acceleration_program import ArrayProgram, State
 from jaxlag._lowering._array_terms import ArrayTerms
 from jaxlag._lowering._sparse_program import SparseConstants, find_sparsity
 from jaxlag._system._inspection import mass_definite
@@ -305,29 +304,81 @@ def test_a_motion_of_singular_blocks_keeps_its_energy_and_its_rows(fixed):
     assert max(float(jnp.max(jnp.abs(x))) for x in phi.values()) < 1e-12
 
 
-def test_unknown_params_use_the_sparse_program_only_where_blocks_are_definite(monkeypatch):
-    """A mass of 0 in the params: whole matrices, as M is positive on the constraints alone."""
-    monkeypatch.setattr(_sparse_program, "LARGE", 20)
-    system, (q, v) = rope(12), hanging(12)
+@pytest.mark.parametrize("name", ["rope", "rope with skates"])
+def test_reactions_are_those_of_whole_matrices(name):
+    """Accelerations and reactions of a state, along the nonzeros."""
+    system, params, _ = SCENES[name]
+    q, v = states(system, 1)[0]
+    a, lam = system._terms.reactions(T, q, v, params, {})
+    A = system._terms.rows(T, q, v, params)[0]
+    found = system.multipliers(q, v, params, t=T)
+    allowed = 1e-12 * np.max(np.abs(a))
+    np.testing.assert_allclose(system.acceleration(q, v, params, t=T), a, atol=allowed)
+    np.testing.assert_allclose(np.concatenate([*found.values()]), lam, atol=allowed)
+    force = system.constraint_force(q, v, params, t=T)
+    np.testing.assert_allclose(force, lam @ A, atol=allowed)
 
-    def acceleration(m, length):
-        program = ArrayProgram(system._terms)
-        state = State(T, q, v, {"m": m, "l": length}, {})
-        constants = program.precompute(q, state.params, {}, Choices(at=(T, q, v)))
-        return program.acceleration(state, constants), constants.definite
 
-    a, definite = jax.jit(acceleration)(1.3, 0.7)
-    assert bool(definite)
-    np.testing.assert_allclose(a, system.acceleration(q, v, HANGING, t=0.3), atol=1e-10)
-    _, definite = jax.jit(acceleration)(0.0, 0.7)
-    assert not bool(definite)
+def test_reactions_of_dependent_rows_and_of_a_mass_of_zero():
+    """Rows that are there twice share their multipliers; a row may replace inertia."""
+    twice = jl.Holonomic(lambda t, q, p: jnp.sum(q.reshape(-1, 2)[0] ** 2) - p["l"] ** 2, "twice")
+    q, v = hanging(12)
+    lam = rope(12, twice).multipliers(q, v, HANGING)
+    alone = rope(12).multipliers(q, v, HANGING)["length"]
+    np.testing.assert_allclose(lam["twice"], lam["length"][0], rtol=1e-10)
+    np.testing.assert_allclose(2.0 * lam["length"][0], alone[0], rtol=1e-10)
+    np.testing.assert_allclose(lam["length"][1:], alone[1:], rtol=1e-10)
+
+    system, m = midpoints(21), jnp.ones(21)
+    q = 0.1 * jnp.arange(21.0) ** 2
+    q = q.at[1::4].set(0.5 * (q[:-1:4] + q[2::4]))
+    params = {"m": m.at[5].set(0.0), "k": 2.0}
+    a = system.acceleration(q, 0.0 * q, params)
+    lam = system.multipliers(q, 0.0 * q, params)["halfway"]
+    loads = jnp.zeros(21).at[1::4].set(lam).at[:-1:4].add(-lam / 2).at[2::4].add(-lam / 2)
+    springs = jax.grad(lambda q: -0.5 * params["k"] * jnp.sum(jnp.diff(q) ** 2))(q)
+    np.testing.assert_allclose(params["m"] * a, springs + loads, atol=1e-12)
+    np.testing.assert_allclose(a[1::4], 0.5 * (a[:-1:4] + a[2::4]), atol=1e-12)
+
+
+def test_long_code_is_refused_before_it_is_derived():
+    """By the number of operations of the elimination alone."""
+    system = rope(60, lowering="auto")
+    lowered = system._program.lowered(jax.ShapeDtypeStruct((120,), float), HANGING, {})
+    assert lowered.reason.startswith("at least 2018 operations")
+
+
+def midpoints(count):
+    """Masses on springs; every fourth one is halfway between its neighbours."""
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * jnp.sum(p["m"] * v**2) - 0.5 * p["k"] * jnp.sum(jnp.diff(q) ** 2)
+
+    def halfway(t, q, p):
+        return q[1::4] - 0.5 * (q[:-1:4] + q[2::4])
+
+    row = jl.Holonomic(halfway, "halfway")
+    return jl.System(lagrangian, {"x": (count,)}, constraints=(row,), lowering="array")
+
+
+def test_a_mass_of_zero_among_traced_params_is_named():
+    """Known params: whole matrices, as M is positive definite on the constraints alone."""
+    system, q, m = midpoints(21), 0.1 * jnp.arange(21.0), jnp.ones(21)
+
+    def moved(m):
+        ts = jnp.array([0.0, 0.1])
+        return jl.simulate(system, q, -q, ts, {"m": m, "k": 2.0}, dt=0.1, throw=False)
+
+    traced, massless = jax.jit(moved), m.at[5].set(0.0)
+    np.testing.assert_allclose(traced(m).q, moved(m).q, atol=1e-13)
+    assert int(moved(massless).status) == 0
+    text = r"mass_singular \('x\[5\]'\).*rows that couple this coordinate with others"
+    with pytest.raises(jl.SimulationError, match=text):
+        traced(massless).check()
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("large", [20, 64])
-def test_gradients_of_a_motion_are_those_of_differences(monkeypatch, large):
-    """By both programs, and by whole matrices."""
-    monkeypatch.setattr(_sparse_program, "LARGE", large)
+def test_gradients_of_a_motion_are_those_of_differences():
     system, (q0, v0), ts = rope(12), hanging(12), jnp.array([0.0, 0.3])
 
     def reach(m, length):

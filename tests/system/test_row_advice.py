@@ -25,6 +25,7 @@ REGULAR = {
     "distance": (lambda t, q, params: jl.math.norm(q) - 1.0, [0.6, 0.8]),
     "lines that cross": (lambda t, q, params: q[0] * q[1], [0.0, 0.0]),
     "open": (lambda t, q, params: q[1] ** 2 - 1.0, [0.3, 0.0]),
+    "short rod far away": (lambda t, q, params: (q[1] - q[0]) ** 2 - 0.25, [600.0, 600.5]),
     "nothing": (lambda t, q, params: 0.0 * q[0], [0.3, 0.0]),
 }
 

@@ -142,6 +142,7 @@ class _Elimination:
         # Products of two entries of M overflow single precision in usual units.
         self.cramer = eps < DOUBLE
         self.entry = {(i, j): graph.let(matrix[i][j]) for i in block for j in block}
+        self.coupled = {i: {j for j in block if self._present(i, j)} for i in block}
         self.right = {i: [graph.let(side[i]) for side in right] for i in block}
         self.diagonal = {i: self.entry[i, i] for i in block}
         self.touched: set[int] = set()
@@ -158,9 +159,9 @@ class _Elimination:
         steps = []
         rows = bool(self.contains)
         while len(left) > (2 if self.cramer and not rows else 1):
-            k = min(self._ready(left), key=lambda i: (self._coupling(i, left), i))
+            k = min(self._ready(left), key=lambda i: (len(self.coupled[i]), i))
             left.remove(k)
-            steps.append((k, self._eliminate(k, left), self._pivot(k)))
+            steps.append((k, self._eliminate(k), self._pivot(k)))
         found: dict[int, list[Node]] = {}
         if len(left) == 1:
             (i,) = left
@@ -191,8 +192,8 @@ class _Elimination:
         remaining = set(left)
         return [i for i in left if remaining.isdisjoint(self.contains.get(i, ()))]
 
-    def _coupling(self, i: int, left: list[int]) -> int:
-        return sum(self.entry[i, j] is not self.graph.zero for j in left)
+    def _present(self, i: int, j: int) -> bool:
+        return self.entry[i, j] is not self.graph.zero
 
     def _pivot(self, i: int) -> Node:
         """D_i; NaN if it does not have its sign to working precision."""
@@ -217,9 +218,12 @@ class _Elimination:
         graph = self.graph
         return graph.scale(self.diagonal[i], self.floor) if i in self.touched else graph.zero
 
-    def _eliminate(self, k: int, left: list[int]) -> dict[int, Node]:
+    def _eliminate(self, k: int) -> dict[int, Node]:
         graph, pivot = self.graph, self._pivot(k)
-        row = {j: self.entry[k, j] for j in left if self.entry[k, j] is not graph.zero}
+        near = sorted(self.coupled.pop(k) - {k})
+        for j in near:
+            self.coupled[j].remove(k)
+        row = {j: self.entry[k, j] for j in near}
         for i, c in row.items():
             ratio = graph.let(graph.div(c, pivot))
             for j, d in row.items():
@@ -227,6 +231,11 @@ class _Elimination:
                     taken = graph.mul(ratio, d)
                     reduced = graph.let(graph.sub(self.entry[i, j], taken))
                     self.entry[i, j] = self.entry[j, i] = reduced
+                    for one, other in ((i, j), (j, i)):
+                        if self._present(i, j):
+                            self.coupled[one].add(other)
+                        else:
+                            self.coupled[one].discard(other)
                     if i == j and i >= self.coordinates > k:
                         # The pivot of a row from the coordinates alone, before other rows.
                         self.diagonal[i] = graph.sub(self.diagonal[i], taken)

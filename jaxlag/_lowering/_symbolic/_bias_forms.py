@@ -50,32 +50,34 @@ def christoffel_form(scene: SymbolicSystem, L: Node, M: Sequence[Sequence[Node]]
     at_rest = dict.fromkeys(scene.v, graph.zero)
     L_0 = substitute(graph, [L], at_rest)[0]
     c = substitute(graph, gradient(graph, L, scene.v), at_rest)
-    flat = [M[i][j] for i in range(n) for j in range(i + 1)]
+    moving = {(i, j): M[i][j] for i in range(n) for j in range(i + 1) if not M[i][j].fixed}
 
-    def full(packed: Sequence[Node]) -> list[list[Node]]:
-        rows: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
-        entries = iter(packed)
-        for i in range(n):
-            for j in range(i + 1):
-                rows[i][j] = rows[j][i] = next(entries)
-        return rows
+    def entries(packed: Sequence[Node]) -> Callable[[int, int], Node]:
+        lower = dict(zip(moving, packed, strict=True))
+        return lambda i, j: lower.get((max(i, j), min(i, j)), graph.zero)
 
-    slopes = [full(tangents(graph, flat, {q: graph.one})) for q in scene.q]  # [k][i][j]
-    M_t = full(tangents(graph, flat, {scene.t: graph.one}))
+    slopes, present = [], [set[tuple[int, int]]() for _ in range(n)]
+    for k, q in enumerate(scene.q):
+        packed = tangents(graph, list(moving.values()), {q: graph.one})
+        slopes.append(entries(packed))
+        for (i, j), slope in zip(moving, packed, strict=True):
+            if slope is not graph.zero:
+                present[i].add((min(j, k), max(j, k)))
+                present[j].add((min(i, k), max(i, k)))
+                present[k].add((j, i))
+    M_t = entries(tangents(graph, list(moving.values()), {scene.t: graph.one}))
     c_q = [tangents(graph, c, {q: graph.one}) for q in scene.q]  # [k][i]
     c_t = tangents(graph, c, {scene.t: graph.one})
     dL_dq = gradient(graph, L_0, scene.q)
     v, h = scene.v, []
     for i in range(n):
         terms: list[tuple[Node, float]] = [(dL_dq[i], -1.0), (c_t[i], 1.0)]
+        for j, k in sorted(present[i]):
+            gamma = [(slopes[k](i, j), 1.0), (slopes[j](i, k), 1.0), (slopes[i](j, k), -1.0)]
+            both = graph.scale(graph.sum(gamma), 0.5 if j == k else 1.0)
+            terms.append((graph.product([(both, 1), (v[j], 1), (v[k], 1)]), 1.0))
         for j in range(n):
-            symbol: list[tuple[Node, float]] = [(M_t[i][j], 1.0)]
-            symbol += [(c_q[j][i], 1.0), (c_q[i][j], -1.0)]
-            for k in range(j, n):
-                gamma = [(slopes[k][i][j], 1.0), (slopes[j][i][k], 1.0), (slopes[i][j][k], -1.0)]
-                weight = 0.5 if j == k else 1.0
-                both = graph.scale(graph.sum(gamma), weight)
-                terms.append((graph.product([(both, 1), (v[j], 1), (v[k], 1)]), 1.0))
+            symbol = [(M_t(i, j), 1.0), (c_q[j][i], 1.0), (c_q[i][j], -1.0)]
             terms.append((graph.mul(graph.sum(symbol), v[j]), 1.0))
         h.append(graph.sum(terms))
     return h

@@ -92,13 +92,9 @@ def derive(scene: SymbolicSystem, terms: Derivation | None, eps: float) -> tuple
     return best._replace(surface=surface(graph, best.mass, best.rows.A, bound, eps, lam)), form
 
 
-def check_length(scene: SymbolicSystem, limit: int | None) -> None:
-    """Raise `Unsupported` if the solve alone takes more operations than the limit."""
-    if limit is None:
-        return
-    least = least_operations(pattern(scene))
-    if least > limit:
-        raise Unsupported(f"at least {least} operations, more than {limit}")
+def shortest_solve(scene: SymbolicSystem) -> int:
+    """Operations of the elimination alone."""
+    return least_operations(pattern(scene))
 
 
 class _Form(NamedTuple):
@@ -269,9 +265,15 @@ def _solved(scene: SymbolicSystem, terms: TermForm, eps: float) -> Equations:
 
 
 def pattern(scene: SymbolicSystem) -> list[list[bool]]:
-    """Which entries of M may differ from zero: p_i depends on v_j (on u_j if L depends on u)."""
-    known = scene.kinematics
+    """Which entries of [M, A^T; A, 0] may differ from zero: p and A v + b depend on v_j.
+
+    On u_j if L depends on u; then of M alone.
+    """
+    known, bound = scene.kinematics, scene.constrained
     v = scene.v if known is None or not known.in_u else known.u
     momentum = gradient(scene.graph, scene.lagrangian, v)
-    reached = dependencies(momentum)
-    return [[x.data in reached[p] for x in v] for p in momentum]
+    residuals = [] if bound is None or v is not scene.v else bound.velocity
+    reached = dependencies([*momentum, *residuals])
+    M, A = ([[x.data in reached[p] for x in v] for p in part] for part in (momentum, residuals))
+    above = [[*row, *(a[i] for a in A)] for i, row in enumerate(M)]
+    return above + [[*a, *[False] * len(A)] for a in A]

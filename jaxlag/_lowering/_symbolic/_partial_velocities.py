@@ -156,12 +156,19 @@ def principle_of_dalembert(
         turn(x, c)
     _potential(scene, terms, functions, residues, loads, others)
 
+    def present(vector: Sequence[Node]) -> list[tuple[int, Node]]:
+        return [(i, x) for i, x in enumerate(vector) if x is not graph.zero]
+
+    entries: dict[tuple[int, int], list[tuple[Node, float]]] = defaultdict(list)
+    for x, of_x in momenta.items():
+        column = present([graph.sum(p) for p in of_x])
+        for i, partial in present(functions[x].partial):
+            for j, p in column:
+                if j >= i:
+                    entries[i, j].append((graph.mul(partial, p), 1.0))
     M: list[list[Node]] = [[graph.zero] * n for _ in range(n)]
-    columns = {x: [graph.sum(p) for p in of_x] for x, of_x in momenta.items()}
-    for i in range(n):
-        for j in range(i, n):
-            entry = [(graph.mul(functions[x].partial[i], p[j]), 1.0) for x, p in columns.items()]
-            M[i][j] = M[j][i] = graph.sum(entry)
+    for (i, j), entry in entries.items():
+        M[i][j] = M[j][i] = graph.sum(entry)
     whole = {x: graph.sum(load) for x, load in loads.items()}
     h = []
     for i in range(n):
