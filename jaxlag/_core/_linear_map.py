@@ -240,6 +240,12 @@ def _transpose(cotangents: Leaves, *args: Any, form: LinearMap, count: int) -> l
 ad.primitive_transposes[_linear_map] = _transpose
 
 
+def _repeated(x: Any, count: int) -> Any:
+    """x for every lane; a number of an interpreted program is no array."""
+    x = jnp.asarray(x, getattr(x, "dtype", None))
+    return jnp.broadcast_to(x, (count, *x.shape))
+
+
 def _lanes(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     sizes = [x.shape[i] for x, i in zip(args, axes, strict=True) if i is not None]
     pairs = zip(args, axes, strict=True)
@@ -247,7 +253,7 @@ def _lanes(args: Leaves, axes: Leaves, *, form: LinearMap, count: int) -> tuple:
     mapped = [i is not None for i in axes]
     # x gets lanes in all cases: JAX then sums the cotangents of a shared x over them.
     x = [
-        leaf if is_mapped else jnp.broadcast_to(leaf, (sizes[0], *jnp.shape(leaf)))
+        leaf if is_mapped else _repeated(leaf, sizes[0])
         for leaf, is_mapped in zip(args[count:], mapped[count:], strict=True)
     ]
     results = _bind(_batched(form, sizes[0], tuple(mapped[:count])), args[:count], x)

@@ -51,7 +51,9 @@ def _made(name: str, pair: Callable, order: Callable) -> Primitive:
         return ShapedArray(jnp.broadcast_shapes(*(x.shape for x in avals)), avals[0].dtype)
 
     def batched(args: Any, axes: Any) -> tuple[Any, int]:
-        pairs = [(jnp.asarray(x), axis) for x, axis in zip(args, axes, strict=True)]
+        (dtype, *_) = (x.dtype for x, axis in zip(args, axes, strict=True) if axis is not None)
+        # A number of an interpreted program is no array.
+        pairs = [(jnp.asarray(x, dtype), axis) for x, axis in zip(args, axes, strict=True)]
         rank = max(x.ndim - (axis is not None) for x, axis in pairs)
 
         def front(x: Any, axis: int | None) -> Any:

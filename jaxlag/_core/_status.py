@@ -113,4 +113,4 @@ ADVICE_SPARSE = (
     "With traced params (jax.jit, jax.grad, jax.vmap), rows that couple this coordinate with "
     "others do not replace inertia, as M is sparse."
 )
-"""Further advice if M is sparse and singular, and there are constraints."""
+"""Further advice if M is singular and is positive definite on the constraints."""

@@ -316,8 +316,10 @@ class ArrayTerms(AbstractTerms):
             inputs: values of the inputs.
             terms: the same terms in another form; by default these.
         """
-        terms = self if terms is None else terms
-        M, right = self._balance(t, q, v, params, inputs, self.precompute(q, params), terms)
+        terms, constants = self if terms is None else terms, SolveConstants(None, None, False)
+        if terms is self:  # else they are short code, and to trace arrays for constants is longer
+            constants = self.precompute(q, params)
+        M, right = self._balance(t, q, v, params, inputs, constants, terms)
         if not self.constraints:
             return solve_mass(M, right), jnp.zeros((0,), q.dtype)
         rows, gamma = terms.rows_of(t, v, params), terms.gamma_of(params)

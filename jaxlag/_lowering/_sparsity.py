@@ -227,7 +227,7 @@ def search_sparsity(
     found, definite = sparsity_of(blocks, mass, rows, holonomic), True
     for products, inertia in _samples(found, momentum, velocity, given):
         if not all(_equal(*pair) for pair in products):
-            reason = "products with the entries differ from directional derivatives"
+            reason = "products with the entries are not directional derivatives for random params"
             return SparsityFound(None, reason)
         definite = definite and known_definite(inertia, given[0].dtype)
     return SparsityFound(found, definite=definite)

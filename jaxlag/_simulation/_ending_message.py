@@ -17,7 +17,8 @@ from jaxlag._core._status import (
     CONCERNS_ROW,
     Status,
 )
-from jaxlag._lowering import find_sparsity
+from jaxlag._linalg._kkt import augmented
+from jaxlag._linalg._mass_solve import known_definite
 from jaxlag._model._states import named_states
 from jaxlag._simulation._abstract_solution import AbstractSolution
 from jaxlag._simulation._methods import of_components
@@ -85,9 +86,7 @@ def _advice(motion: AbstractSolution, status: Status) -> str:
     message = (ADVICE | special).get(status, "")
     if status is Status.mass_singular:
         message = f"{message} {advice_on_mass(motion._given)}".rstrip()
-        system, dtype = motion.system, motion.q.dtype
-        of = find_sparsity(system._terms, motion._given, system.size, dtype)
-        if system.constraints and of.definite:
+        if _definite_on_rows(motion):
             message = f"{message} {ADVICE_SPARSE}"
     if fixed:
         return message
@@ -115,6 +114,16 @@ def _advice(motion: AbstractSolution, status: Status) -> str:
                 f"{', '.join(resting)}: give atol > 0, or start elsewhere."
             )
     return message
+
+
+def _definite_on_rows(motion: AbstractSolution) -> bool:
+    """Whether M is positive definite on the constraints at the end, by whole matrices."""
+    system, params = motion.system, motion._given
+    if not system.constraints:
+        return False
+    at = stop_gradient((motion.last_time, *motion.last_state, params))
+    M, A = system._terms.mass(*at), system._terms.rows(*at)[0]
+    return known_definite(np.asarray(augmented(M, A)[0]), motion.q.dtype)
 
 
 def _fallen(motion: AbstractSolution, index: int) -> str:

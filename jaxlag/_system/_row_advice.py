@@ -64,7 +64,7 @@ def vanishing_rows(system: Any, params: Any, t: Any, q: Any) -> list[str]:
         return position(q), ahead, behind, jax.vmap(jax.linearize(position, q)[1])(far)
 
     vanish, regular = np.zeros((2, len(here)), bool)
-    for power in (0.25, 0.125, 0.0625):
+    for power in (0.375, 0.25, 0.125, 0.0625):
         far = float(jnp.finfo(q.dtype).eps) ** power * _ways(q)
         middle, ahead, behind, first = map(np.asarray, around(far))
         both = ahead + behind

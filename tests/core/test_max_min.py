@@ -105,10 +105,12 @@ def test_lanes_of_a_scalar_are_no_components(of, axes, lanes):
             np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
-@pytest.mark.parametrize("of", [lambda x: lax.max(x, 0.5), lambda x: lax.min(0.5, x)])
-def test_lanes_beside_a_number(of):
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("of", [lambda x: jnp.maximum(x, 0.5), lambda x: jnp.minimum(0.5, x)])
+def test_lanes_beside_a_number(of, dtype):
     """An interpreted program passes numbers that are no arrays."""
-    program, x = with_sound_extremes(jax.make_jaxpr(of)(0.3)), jnp.linspace(0.0, 1.0, 3)
+    x = jnp.linspace(0.0, 1.0, 3).astype(dtype)
+    program = with_sound_extremes(jax.make_jaxpr(of)(x[0]))
     np.testing.assert_allclose(jax.vmap(jaxpr_as_fun(program))(x)[0], of(x), rtol=0.0)
 
 

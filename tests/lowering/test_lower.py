@@ -203,3 +203,42 @@ def test_a_long_force_is_the_longest_part():
     force = jl.GeneralizedForce(push, name="push")
     text = jl.System(free, {"r": 9}, forces=[force]).explain({})
     assert re.search(r"array program \(\d+ operations.*: more than 1500; Q \d+\)", text)
+
+
+def test_an_entry_that_rounding_leaves_on_one_side_is_eliminated():
+    """B^T M B of columns that are orthogonal in M: 0 above the diagonal, 1e-17 below it."""
+    m, B = np.array([0.9, 0.9, 1.0, 1.0]), np.eye(4)
+    B[:2, :2] = [[1.1, 0.1], [0.6, -0.18333333333333335]]
+    B[2:, 1] = 0.5
+
+    def lagrangian(t, q, v, p):
+        return 0.5 * jnp.sum(m * v**2) - jnp.sum(jnp.cos(q))
+
+    modal = jl.QuasiVelocities(kinematics=lambda t, q, u, p: B @ u, names=("a", "b", "c", "d"))
+    system = jl.System(lagrangian, {"x": (4,)}, quasi=modal, lowering="scalar")
+    q, u = jnp.linspace(0.1, 0.4, 4), jnp.linspace(0.5, 0.2, 4)
+    assert "scalar program" in system.explain(None)
+    ts = jnp.array([0.0, 0.1])
+    found = jl.simulate(system, q, None, ts, u0=u).q[-1]
+    plain = jl.System(lagrangian, {"x": (4,)})
+    np.testing.assert_allclose(found, jl.simulate(plain, q, B @ u, ts).q[-1], atol=1e-9)
+
+
+def test_rows_of_quasi_velocities_do_not_count_as_operations():
+    """They satisfy the rows: no multipliers are eliminated."""
+
+    def kinematics(t, q, u, p):
+        arms = q.reshape(-1, 2) - q[:2]
+        return (u[:2] + u[2] * jnp.stack([-arms[:, 1], arms[:, 0]], axis=1)).reshape(-1)
+
+    def distances(t, q, p):
+        r = q.reshape(-1, 2)
+        return jnp.concatenate([jnp.sum((r[k:] - r[:-k]) ** 2, axis=1) - k**2 for k in (1, 2)])
+
+    system = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v,
+        {"r": (15, 2)},
+        constraints=(jl.Holonomic(distances, "distance"),),
+        quasi=jl.QuasiVelocities(kinematics=kinematics, names=("along", "across", "turn")),
+    )
+    assert "lowering      scalar program" in system.explain(None)

@@ -26,6 +26,7 @@ REGULAR = {
     "lines that cross": (lambda t, q, params: q[0] * q[1], [0.0, 0.0]),
     "open": (lambda t, q, params: q[1] ** 2 - 1.0, [0.3, 0.0]),
     "short rod far away": (lambda t, q, params: (q[1] - q[0]) ** 2 - 0.25, [600.0, 600.5]),
+    "short rod very far away": (lambda t, q, params: (q[1] - q[0]) ** 2 - 0.01, [1e4, 1e4 + 0.1]),
     "nothing": (lambda t, q, params: 0.0 * q[0], [0.3, 0.0]),
 }
 

@@ -221,8 +221,8 @@ class _Elimination:
     def _eliminate(self, k: int) -> dict[int, Node]:
         graph, pivot = self.graph, self._pivot(k)
         near = sorted(self.coupled.pop(k) - {k})
-        for j in near:
-            self.coupled[j].remove(k)
+        for others in self.coupled.values():  # rounding may leave an entry on one side alone
+            others.discard(k)
         row = {j: self.entry[k, j] for j in near}
         for i, c in row.items():
             ratio = graph.let(graph.div(c, pivot))

@@ -93,7 +93,7 @@ def derive(scene: SymbolicSystem, terms: Derivation | None, eps: float) -> tuple
 
 
 def shortest_solve(scene: SymbolicSystem) -> int:
-    """Operations of the elimination alone."""
+    """Operations of the elimination of (a, lam), or of the rates of quasi-velocities, alone."""
     return least_operations(pattern(scene))
 
 
@@ -267,12 +267,12 @@ def _solved(scene: SymbolicSystem, terms: TermForm, eps: float) -> Equations:
 def pattern(scene: SymbolicSystem) -> list[list[bool]]:
     """Which entries of [M, A^T; A, 0] may differ from zero: p and A v + b depend on v_j.
 
-    On u_j if L depends on u; then of M alone.
+    Of M alone with quasi-velocities, by p that depends on u_j if L depends on u.
     """
     known, bound = scene.kinematics, scene.constrained
     v = scene.v if known is None or not known.in_u else known.u
     momentum = gradient(scene.graph, scene.lagrangian, v)
-    residuals = [] if bound is None or v is not scene.v else bound.velocity
+    residuals = [] if bound is None or known is not None else bound.velocity
     reached = dependencies([*momentum, *residuals])
     M, A = ([[x.data in reached[p] for x in v] for p in part] for part in (momentum, residuals))
     above = [[*row, *(a[i] for a in A)] for i, row in enumerate(M)]
