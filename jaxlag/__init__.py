@@ -15,6 +15,8 @@ from jaxlag import rotation as rotation
 from jaxlag import solvers as solvers
 from jaxlag import testing as testing
 from jaxlag import transforms as transforms
+from jaxlag._analysis._linearization import Linearization as Linearization
+from jaxlag._analysis._linearize import linearize as linearize
 from jaxlag._core._arguments import former_names as _former_names
 from jaxlag._core._errors import AssemblyError as AssemblyError
 from jaxlag._core._errors import EquilibriumError as EquilibriumError

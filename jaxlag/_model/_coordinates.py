@@ -73,6 +73,12 @@ class Coordinates:
                 labels.append(f"{name}[{','.join(map(str, index))}]" if shape else name)
         return tuple(labels)
 
+    @property
+    def places(self) -> dict[str, list[int]]:
+        """The indices of every name in flat q."""
+        indices = self.unflatten(np.arange(self.size))
+        return {name: part.reshape(-1).tolist() for name, part in indices.items()}
+
     def unflatten(self, q: Any) -> dict[str, Any]:
         """Split the last axis of q, shape (..., n), into a dict of named arrays."""
         parts, start = {}, 0

@@ -1,0 +1,74 @@
+"""Whipple's bicycle, linearized from its bodies, against the published matrices.
+
+Source: Meijaard, Papadopoulos, Ruina, Schwab, Proc. R. Soc. A 463 (2007) 1955, tables 1 and 2.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from bench.mechanisms._bicycle import BICYCLE
+from bench.mechanisms._scenes import SCENES
+
+CYCLIC = ("x", "y", "yaw", "rear", "front")
+INDEPENDENT = (*CYCLIC, "lean", "steer", "lean'", "steer'", "rear'")
+KEPT = ("lean", "steer", "lean'", "steer'")
+
+M = np.array([[80.81722, 2.31941332208709], [2.31941332208709, 0.29784188199686]])
+C1 = np.array([[0.0, 33.86641391492494], [-0.85035641456978, 1.68540397397560]])
+K0 = np.array([[-80.95, -2.59951685249872], [-2.59951685249872, -0.80329488458618]])
+K2 = np.array([[0.0, 76.59734589573222], [0.0, 2.65431523794604]])
+
+WEAVE_5 = -0.77534188219585 + 4.46486771378823j
+REAL_5 = -14.07838969279822, -0.32286642900409
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope="module")
+def linear_at():
+    """Forward speed, trail -> A in the four published states."""
+    system = SCENES["bicycle"]().system()
+
+    @jax.jit
+    def of(speed, trail):
+        params = BICYCLE | {"c": trail}
+        v = jnp.zeros(8).at[0].set(speed)
+        v = v.at[6].set(-speed / params["r_rear"]).at[7].set(-speed / params["r_front"])
+        linear = jl.linearize(system, jnp.zeros(8), v, params, independent=INDEPENDENT, drop=CYCLIC)
+        at = np.array([linear.states.index(name) for name in KEPT])
+        return linear.A[at][:, at], linear.f0
+
+    return of
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0, 3.0, 5.0, 7.0, 10.0])
+def test_matrices_are_the_published_ones(linear_at, speed):
+    A, f0 = linear_at(speed, BICYCLE["c"])
+    stiffness = -np.linalg.solve(M, 9.81 * K0 + speed**2 * K2)
+    expected = np.block(
+        [[np.zeros((2, 2)), np.eye(2)], [stiffness, -np.linalg.solve(M, speed * C1)]]
+    )
+    np.testing.assert_allclose(A, expected, atol=1e-12 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(f0, 0.0, atol=1e-12)
+
+
+def test_eigenvalues_at_5_m_per_s_have_the_published_digits(linear_at):
+    found = np.sort_complex(np.linalg.eigvals(linear_at(5.0, BICYCLE["c"])[0]))
+    expected = np.sort_complex(np.array([*REAL_5, WEAVE_5, np.conj(WEAVE_5)]))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_derivatives_of_the_matrix_with_respect_to_the_trail(linear_at):
+    """Reverse and forward derivatives of A at 5 m/s, against central differences."""
+    at = 5.0, BICYCLE["c"]
+    forward = jax.jacfwd(lambda *x: linear_at(*x)[0], (0, 1))(*at)
+    reverse = jax.jacrev(lambda *x: linear_at(*x)[0], (0, 1))(*at)
+    for i, (one, other) in enumerate(zip(forward, reverse, strict=True)):
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.max(np.abs(one)))
+        h = np.eye(2)[i] * 1e-4 * at[i]
+        (above, _), (below, _) = linear_at(*np.add(at, h)), linear_at(*np.subtract(at, h))
+        slope = (above - below) / (2 * h[i])
+        np.testing.assert_allclose(one, slope, atol=1e-6 * np.max(np.abs(slope)))
