@@ -4,25 +4,8 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+from jaxlag._integration._row_selection import RowSelection
 from jaxlag._linalg._independent_rows import RowChoice
-
-
-class RowSelection(NamedTuple):
-    """The constraint rows used in solves: a largest independent set at the start.
-
-    Attributes:
-        active_rows: these rows, holonomic ones first; the others follow from them as long as the
-            rank does not change.
-        size: size of every row at the start and nearby.
-        void: rows that are 0 = 0 up to rounding.
-        multiplier_rows: an independent set with as many as possible of the rows whose multipliers
-            are read by forces.
-    """
-
-    active_rows: Bool[Array, " m"]
-    size: Float[Array, " m"]
-    void: Bool[Array, " m"]
-    multiplier_rows: RowChoice
 
 
 class KnotIntervals(NamedTuple):

@@ -12,12 +12,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._core._arrays import stop_gradient
-from jaxlag._core._errors import invalid
-from jaxlag._integration._step_arguments import Arguments, KnotIntervals, RowSelection
-from jaxlag._linalg._independent_rows import RowChoice, independent_rows
+from jaxlag._integration._row_selection import selected_rows
+from jaxlag._integration._step_arguments import Arguments, KnotIntervals
 from jaxlag._linalg._mass_solve import clearly_definite
 from jaxlag._linalg._projection import ConstraintProjector
-from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering import (
     AbstractTerms,
     AccelerationProgram,
@@ -177,7 +175,10 @@ class VectorField(eqx.Module):
     ) -> Arguments:
         """Add to the arguments the values for accelerations that depend on params alone."""
         t, q, v, params, values = self.at(tau, y, args)
-        args = args._replace(rows=self._choice(t, q, v, params, values))
+        if self.rows.chooses and (self.quasi is None or self.projects):
+            state = State(t, q, v, params, values)
+            given = self.program, self.terms, self.rows, self.stabilization, self.sample
+            args = args._replace(rows=selected_rows(*given, state))
         if slides := sliding(self.system.forces):
             speeds = [slide(t, q, v, params) for slide in slides]
             senses = jnp.stack([jnp.sign(jnp.asarray(s, q.dtype)) for s in speeds])
@@ -203,48 +204,6 @@ class VectorField(eqx.Module):
             M = self.program.terms(q, params, self.sample).mass(t, at, rates, params)
             found.append(clearly_definite(M) | ~jnp.all(jnp.isfinite(M)))
         return eqxi.unvmap_all(jnp.stack(found))
-
-    def _choice(
-        self, t: Array, q: Array, v: Array, params: Any, values: Any
-    ) -> RowSelection | None:
-        """The rows to solve with; None if all are used."""
-        if not self.rows.chooses or (self.quasi is not None and not self.projects):
-            return None
-        t, q, v, params, values = stop_gradient((t, q, v, params, values))
-        terms, state = self.program.terms(q, params, self.sample), State(t, q, v, params, values)
-        entries = self.program.row_entries(terms, state)
-        nonzero, void, size = row_sizes(entries, q, entries(q), all(self.rows.sure))
-        if self.rows.size == 1:  # left out only if it is void
-            return RowSelection(~void, size, void, RowChoice(~void, ~void))
-        velocity = np.array(self.rows.velocity)
-        unread = np.logical_not(self.terms.rows_read(t, q, v, params, values))
-        # If multipliers are read, the active rows determine which others are left out.
-        reads = not np.all(unread)
-
-        def search(priority: np.ndarray, mobile_first: bool) -> Array:
-            M, A = terms.mass(t, q, v, params), terms.rows_of(t, v, params)(q)
-            return independent_rows(M, A, priority, nonzero=nonzero, mobile_first=mobile_first)
-
-        priority, first = 2 * velocity + unread, self.program.first_rows(state, self.sample)
-        searched = partial(search, priority if first is None else 2 * priority + ~first, reads)
-        clear = self.program.clearly_independent(state, self.sample)
-        if clear is None:
-            active_rows = searched()
-        else:
-            clear = clear & eqxi.unvmap_all(jnp.all(nonzero))
-            active_rows = jax.lax.cond(clear, lambda: nonzero, searched)
-        if not np.any(velocity & ~unread):  # then the rows that are read already come first
-            return RowSelection(active_rows, size, void, RowChoice(active_rows, nonzero))
-        if isinstance(self.stabilization, Baumgarte) and not np.all(velocity):
-            label = self.rows.labels[int(np.argmax(velocity & ~unread))]
-            raise invalid(
-                "stabilization",
-                "be 'projection' if forces read multipliers of Pfaffian rows and there are also "
-                "holonomic rows (phi of a dependent holonomic row would not be damped)",
-                f"it was {self.stabilization!r}, and a force reads {label!r}",
-            )
-        for_multipliers = search(unread, True)
-        return RowSelection(active_rows, size, void, RowChoice(for_multipliers, nonzero))
 
     def clock(self, tau: Array, args: Arguments) -> Array:
         """The user's time t = t0 + sigma tau, bounded by the end in spite of rounding."""

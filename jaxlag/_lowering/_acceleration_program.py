@@ -258,11 +258,11 @@ class ArrayProgram(AccelerationProgram):
         sparse, of_all = self._sparse(state), super().reactions
         if sparse is None:
             return of_all(state, sample)
-        t, q, v, params, _ = state
         entries = self.row_entries(self.array, state)
-        clear = eqxi.unvmap_all(jnp.all(row_sizes(entries, q, entries(q)).nonzero))
-        clear = clear & sparse.clearly_independent(t, q, v, params)
-        return jax.lax.cond(clear, lambda: sparse.reactions(*state), lambda: of_all(state, sample))
+        nonzero = row_sizes(entries, state.q, entries(state.q)).nonzero
+        found, clear = sparse.reactions(*state)
+        clear = clear & eqxi.unvmap_all(jnp.all(nonzero))
+        return jax.lax.cond(clear, lambda: found, lambda: of_all(state, sample))
 
     def _sparse(self, state: State) -> SparseEquations | None:
         """The sparse equations with constraints, if there are any."""

@@ -326,9 +326,9 @@ class ScalarProgram(AccelerationProgram):
         self, state: State, sample: _params.Sample = _params.UNKNOWN
     ) -> tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]]:
         """On arrays, if M and A are sparse and there is no scalar program."""
-        of_q = find_sparsity(self.array, state.params, state.q.shape[0], state.q.dtype)
+        found = find_sparsity(self.array, state.params, state.q.shape[0], state.q.dtype)
         given = state.q, state.params, state.inputs, sample
-        if of_q.sparsity is not None and self.lowered(*given).equations is None:
+        if found.sparsity is not None and self.lowered(*given).equations is None:
             return self._on_arrays.reactions(state, sample)
         return super().reactions(state, sample)
 

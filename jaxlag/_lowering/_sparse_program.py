@@ -124,37 +124,38 @@ class SparseEquations(NamedTuple):
         kkt, active_rows = self.kkt(t, q, v, params), None
         if multiplier_rows is not None:
             active_rows = multiplier_rows.active_rows
-        return self._solved(kkt, t, q, v, params, inputs, active_rows)[0]
+        factor = self._factor(kkt, active_rows)
+        return self._solved(kkt, factor, t, q, v, params, inputs, active_rows)[0]
 
     def reactions(
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any]
-    ) -> tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]]:
-        """(a, lam, A^T lam) by all rows, which must be independent."""
+    ) -> tuple[tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]], Bool[Array, ""]]:
+        """(a, lam, A^T lam) by all rows, and whether they are clearly independent."""
         kkt = self.kkt(t, q, v, params)
-        a, lam = self._solved(kkt, t, q, v, params, inputs, None)
-        return a, lam, kkt.mass.blocks.join(kkt.loads(lam))
+        factor = self._factor(kkt, None)
+        a, lam = self._solved(kkt, factor, t, q, v, params, inputs)
+        return (a, lam, kkt.mass.blocks.join(kkt.loads(lam))), _clear(factor)
 
     def _solved(
         self,
         kkt: SparseKkt,
+        factor: SparseFactor,
         t: Array,
         q: Array,
         v: Array,
         params: Any,
         inputs: Mapping[str, Any],
-        active_rows: Bool[Array, " m"] | None,
+        active_rows: Bool[Array, " m"] | None = None,
     ) -> tuple[Array, Array]:
         """(a, lam)."""
         terms, constants = self.terms, self.constants
         right = terms.effort(t, q, v, params, inputs, constants.bias_zero)
         gamma = terms.gamma(t, q, v, params, constants.time_direction)
-        return solve_sparse(kkt, right, gamma, self._factor(kkt, active_rows), active_rows)
+        return solve_sparse(kkt, right, gamma, factor, active_rows)
 
     def clearly_independent(self, t: Array, q: Array, v: Array, params: Any) -> Bool[Array, ""]:
         """Whether the pivots of S are above eps^1/2, in all lanes."""
-        factor = self._factor(self.kkt(t, q, v, params), None)
-        clear = jnp.all(factor.schur.pivots > dependence_floor(q.dtype)) & factor.healthy
-        return eqxi.unvmap_all(clear & jnp.all(jnp.isfinite(factor.schur.pivots)))
+        return _clear(self._factor(self.kkt(t, q, v, params), None))
 
     def _factor(self, kkt: SparseKkt, active_rows: Bool[Array, " m"] | None) -> SparseFactor:
         terms = self.terms
@@ -194,6 +195,13 @@ class SparseEquations(NamedTuple):
             kkt.units,
             sparse=True,
         )
+
+
+def _clear(factor: SparseFactor) -> Bool[Array, ""]:
+    """Whether the pivots of S are above eps^1/2, in all lanes."""
+    pivots = factor.schur.pivots
+    clear = jnp.all(pivots > dependence_floor(pivots.dtype)) & factor.healthy
+    return eqxi.unvmap_all(clear & jnp.all(jnp.isfinite(pivots)))
 
 
 def row_entries(
