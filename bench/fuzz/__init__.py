@@ -24,6 +24,7 @@ motions is evaluated operation by operation, because the test is about the progr
 the compilers.
 """
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from time import perf_counter
@@ -127,7 +128,7 @@ def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
     while perf_counter() < end and found_kinds[EQUAL] < SYSTEMS:
         kind = kind_of(seed)
         drawn = kind.draw(seed)
-        found = kind.compared(drawn)
+        found = _compared(kind, drawn)
         found_kinds[found.kind] += 1
         if found.kind == DIFFERS:
             finds.append(_written_down(seed, *_smallest(kind, drawn, found)))
@@ -137,6 +138,7 @@ def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
         seed += 1
         if seed % TOGETHER == 0:
             jax.clear_caches()
+            print(f"{seed} seeds: {dict(found_kinds)}", file=sys.stderr, flush=True)
     rows = [_row(kind, number) for kind, number in found_kinds.most_common()]
     rows += [_row(f"equal, {kind}", number) for kind, number in of_kind.most_common()]
     rows.append(_row("worst of the equal, over the bound", worst))
@@ -145,6 +147,14 @@ def run(quick: bool, seconds: float | None = None, first: int = 0) -> Report:
         Target("systems compared", float(found_kinds[EQUAL]), ">=", 0.0 if quick else SYSTEMS),
     ]
     return Report(rows + finds, targets, [], rows)
+
+
+def _compared(kind: Kind, drawn: Any) -> Compared:
+    """The comparison; an exception counts as a difference."""
+    try:
+        return kind.compared(drawn)
+    except Exception as error:
+        return Compared(DIFFERS, float("inf"), f"{type(error).__name__}: {error},")
 
 
 def _smallest(kind: Kind, drawn: Any, found: Compared) -> tuple[Any, Compared]:

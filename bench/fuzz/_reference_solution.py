@@ -173,6 +173,8 @@ class Equations:
         if m:
             metric = M + A.T @ A
             S = A @ np.linalg.solve(metric, A.T)
+            if not np.all(np.diagonal(S) > 0.0):
+                raise Unclear("rows that vanish in the metric of M")
             scale = 1.0 / np.sqrt(np.diagonal(S))
             pivots = np.linalg.eigvalsh(S * np.outer(scale, scale))
             if np.min(pivots) < 1e3 * self.eps ** (2 / 3):
