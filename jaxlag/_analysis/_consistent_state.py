@@ -1,6 +1,6 @@
 """Whether a state satisfies the constraints, and whether their rank stays beside it."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._core._status import Status
 from jaxlag._linalg._kkt import units_of
 from jaxlag._linalg._mass_solve import dependence_floor
-from jaxlag._linalg._row_residuals import relative_residual, row_lengths
+from jaxlag._linalg._row_residuals import relative_residual, row_sizes
 from jaxlag._lowering import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._statics._assemble import assemble
@@ -25,20 +25,34 @@ NEARBY = 1e-3
 """Distance of the state whose rank is compared, over 1 + |q|."""
 
 
-def residuals(
+class Rows(NamedTuple):
+    """Constraint rows at a state.
+
+    Attributes:
+        A: with 0 in rows that are rounding.
+        off: |phi| and |A v + b| over the sizes of the rows and of q and v.
+    """
+
+    A: Float[Array, "m n"]
+    off: Float[Array, "2 m"]
+
+
+def rows_of_state(
     terms: AbstractTerms,
     rows: ConstraintRows,
     t: Float[Array, ""],
     q: Float[Array, " n"],
     v: Float[Array, " n"],
     params: Any,
-) -> Float[Array, "2 m"]:
-    """|phi| and |A v + b| over the lengths of the rows and the size of q and of v."""
-    size = row_lengths(terms.rows_of(t, v, params)(q))
-    size = jnp.where(size > 0, size, 1.0)
+) -> Rows:
+    """The rows without rounding, and the residuals."""
+    of_q = terms.rows_of(t, v, params)
+    A = of_q(q)
+    nonzero, _, size = row_sizes(of_q, q, A, all(rows.sure))
     phi = rows.of_all(terms.position(t, q, params))
     both = (phi, q), (terms.velocity(t, q, v, params), v)
-    return jnp.stack([relative_residual(c, size, x) for c, x in both])
+    off = jnp.stack([relative_residual(c, size, x) for c, x in both])
+    return Rows(jnp.where(nonzero[:, None], A, 0.0), off)
 
 
 def rows_at(
@@ -97,7 +111,7 @@ def _rank_beside(
 def _rows_and_residuals(
     system: System, sample: _params.Sample, params: Any, _: None, t: Array, q: Array, v: Array
 ) -> tuple[Array, Array]:
+    """(residuals, A in units of equal inertia)."""
     rows, terms = system._rows(params, q.dtype), system._program.terms(q, params, sample)
-    A = terms.rows_of(t, v, params)(q)
-    units = units_of(terms.mass(t, q, v, params), A)
-    return residuals(terms, rows, t, q, v, params), A * units
+    A, off = rows_of_state(terms, rows, t, q, v, params)
+    return off, A * units_of(terms.mass(t, q, v, params), A)

@@ -134,6 +134,14 @@ class Equations(NamedTuple):
         outputs = scene.outputs.of(Values(at.q, at.v, u, at.x, lam), t, params)
         return jnp.concatenate(found), outputs
 
+    def multipliers(self) -> Float[Array, " m"]:
+        """Those of the state that forces read; of length m = 0 if none are read."""
+        at, system = self.point(self.z), self.scene.system
+        if not any(map(reads_lam, system.forces)):
+            return jnp.zeros((0,), at.q.dtype)
+        state = State(self.t, at.q, at.v, self.params, at.values)
+        return system._program.reactions(state, self.scene.sample)[1]
+
     def _accelerations(self, at: Point) -> tuple[Array, Array]:
         """(w', lam)."""
         system, sample, outputs, _ = self.scene

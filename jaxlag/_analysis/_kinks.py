@@ -1,6 +1,7 @@
 """Kinks and jumps: declared functions that have no derivative at a state."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,50 +12,57 @@ from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._analysis._equations import Equations
-from jaxlag._core._jaxprs import equations
+from jaxlag._analysis._equations import Equations, Point
+from jaxlag._core._jaxprs import equations, within
 from jaxlag._lowering import ArrayTerms
+from jaxlag._model._forces import reads_lam
 from jaxlag._model._inputs import evaluate
-from jaxlag._system._closure_tracers import declared
 from jaxlag._tracing._nonsmooth_points import outcomes
 
 DISTANCES = (0.3, 0.45, 0.625)
 """Distances of both sides, over 1 + |z| of each entry, as powers of eps: 2e-5, 1e-7, 2e-10."""
-LEAST = 1e-6
-"""Least difference over the size of the slope: series that replace a function are closer."""
+LEAST, LEAST_JUMP = 1e-6, 1e-9
+"""Least differences of slopes and of values over their sizes: series that replace a function are
+usually closer."""
 LIKE = 0.5, 10.0
 """Change at the smaller of two distances over that at the larger one. Of a smooth function it is
-the ratio of the distances, 0.005 or 0.002, of rounding the inverse, or its square."""
+the ratio of the distances, 0.005 or 0.002, of a series that cancels the inverse, or its square."""
 ROUNDINGS = 64
 COMPARISONS = frozenset(
     (
-        *("abs", "and", "argmax", "argmin", "ceil", "clamp", "cond", "cummax", "cummin", "eq"),
+        *(
+            "abs",
+            "and",
+            "argmax",
+            "argmin",
+            "atan2",
+            "ceil",
+            "clamp",
+            "cond",
+            "cummax",
+            "cummin",
+            "eq",
+        ),
         *("floor", "ge", "gt", "is_finite", "largest", "le", "lt", "max", "min", "ne", "not", "or"),
         *("reduce_max", "reduce_min", "rem", "round", "select_n", "sign", "smallest", "sort"),
-        *("while", "xor"),
+        *("top_k", "while", "xor"),
     )
 )
 """Operations whose results may have kinks or jumps."""
 
 
 class _Declared(NamedTuple):
-    """A declared function of z, with its name in messages."""
+    """A declared function, with its name in messages.
+
+    Attributes:
+        name: in messages.
+        derived: what the linearized equations take derivatives of, as a function of (z, lam).
+        value: the declared function itself, if it is shorter.
+    """
 
     name: str
-    function: Callable
-
-
-def compares(around: Equations) -> bool:
-    """Whether declared functions compare values, so that they may have kinks."""
-    system, t, params = around.scene.system, around.t, around.params
-
-    def everything(z: Array) -> Any:
-        q, _, v, _, values = around.point(z)
-        functions = [x.function for x in around.scene.outputs.each if x.kind == "function"]
-        of_outputs = [function(t, q, v, params) for function in functions]
-        return declared(system, t, q, v, params, values, None), dict(values), of_outputs
-
-    return _has_comparisons(jax.make_jaxpr(everything)(around.z))
+    derived: Callable
+    value: Callable | None = None
 
 
 def kinks(around: Equations, directions: Float[Array, "m k"]) -> list[str]:
@@ -64,12 +72,14 @@ def kinks(around: Equations, directions: Float[Array, "m k"]) -> list[str]:
         around: the equations around a state.
         directions: of z, as columns.
     """
-    z, found = around.z, []
-    for name, function in _declared(around):
-        program = jax.make_jaxpr(function)(z)
-        if not _has_comparisons(program):
+    lam = around.multipliers()
+    z, found = jnp.concatenate([around.z, lam]), []
+    directions = jax.scipy.linalg.block_diag(directions, jnp.eye(lam.shape[0], dtype=z.dtype))
+    for name, derived, value in _declared(around):
+        program = jax.make_jaxpr(value or derived)(z)
+        if not _may_bend(program, z, directions):
             continue
-        bent = np.asarray(jax.jit(partial(bends, function))(z, directions))
+        bent = np.asarray(jax.jit(partial(bends, derived))(z, directions))
         if np.any(bent):
             line = _line(program, z, directions[:, int(np.argmax(bent))])
             found.append(f"{name} ({line})" if line else name)
@@ -78,6 +88,23 @@ def kinks(around: Equations, directions: Float[Array, "m k"]) -> list[str]:
     return found
 
 
+def _may_bend(program: ClosedJaxpr, z: Array, directions: Array) -> bool:
+    """Whether a comparison has another outcome near z, or is inside of a loop."""
+    compared = [eqn for eqn in equations(program) if _compares(eqn)]
+    if not compared:
+        return False
+    looped = (x for eqn in equations(program) if eqn.primitive.name in LOOPS for x in within(eqn))
+    if any(map(_compares, looped)):
+        return True
+    eps = float(jnp.finfo(z.dtype).eps)
+    size = jnp.max(jnp.abs(directions) / (1.0 + jnp.abs(z))[:, None], axis=0)
+    steps = [sign * eps**power * (directions / size).T for power in DISTANCES for sign in (1, -1)]
+    places = z + jnp.concatenate([jnp.zeros((1, z.shape[0]), z.dtype), *steps])
+    found = jax.vmap(lambda z: outcomes(program, [z], [True], guards=True))(places)
+    return found is not None and bool(jnp.any(found[1:] != found[:1]))
+
+
+LOOPS = "scan", "while"
 QUASI = "the quasi-velocities"
 
 
@@ -93,9 +120,12 @@ def _line(program: ClosedJaxpr, z: Array, d: Array) -> str:
 
 
 def _declared(around: Equations) -> Iterator[_Declared]:
-    """Whatever the linearized equations take derivatives of, as functions of z."""
+    """Whatever the linearized equations take derivatives of, as functions of (z, multipliers)."""
     system, t, params = around.scene.system, around.t, around.params
-    point, n = around.point, system.size
+    n, count = system.size, around.z.shape[0]
+
+    def point(z: Array) -> Point:
+        return around.point(z[:count])
 
     def of(function: Callable) -> Callable:
         return lambda z: jnp.ravel(jnp.asarray(function(point(z))))
@@ -110,15 +140,19 @@ def _declared(around: Equations) -> Iterator[_Declared]:
         L = jax.grad(lambda y: jnp.asarray(system.lagrangian(t, y[:n], y[n:], params)))
         return jnp.concatenate([L(jnp.concatenate([q, v])), terms.mass(t, q, v, params).ravel()])
 
-    yield _Declared("the Lagrangian", gradient)
+    def value(z: Array) -> Array:
+        q, _, v, _, _ = point(z)
+        return jnp.asarray(system.lagrangian(t, q, v, params))
+
+    yield _Declared("the Lagrangian", gradient, value)
     for force in system.forces:
-        alone = ArrayTerms(system.lagrangian, (force,), system.constraints)
+        alone = replace(system._terms, forces=(force,))
 
-        def effort(at: Any, alone: ArrayTerms = alone) -> Array:
-            rows = jnp.zeros((system._rows(params, at.q.dtype).size,), at.q.dtype)
-            return alone.force(t, at.q, at.v, params, at.values, rows)
+        def effort(z: Array, alone: ArrayTerms = alone) -> Array:
+            at, lam = point(z), z[count:] if any(map(reads_lam, alone.forces)) else None
+            return alone.force(t, at.q, at.v, params, at.values, lam)
 
-        yield _Declared(f"force {force.name!r}", of(effort))
+        yield _Declared(f"force {force.name!r}", effort)
     for constraint in system.constraints:
         rows = ArrayTerms(system.lagrangian, (), (constraint,))
 
@@ -136,10 +170,10 @@ def _declared(around: Equations) -> Iterator[_Declared]:
         )
     for name, signal in around.feedback.items():
 
-        def value(at: Any, name: str = name, signal: Any = signal) -> Array:
+        def signal_value(at: Any, name: str = name, signal: Any = signal) -> Array:
             return evaluate({name: signal}, t, at.q, at.v, params)[name]
 
-        yield _Declared(f"input {name!r}", of(value))
+        yield _Declared(f"input {name!r}", of(signal_value))
     for output in around.scene.outputs.each:
         if output.kind == "function":
             yield _Declared(
@@ -148,9 +182,12 @@ def _declared(around: Equations) -> Iterator[_Declared]:
             )
 
 
-def _has_comparisons(program: ClosedJaxpr) -> bool:
-    """Whether its results may have kinks or jumps."""
-    return any(eqn.primitive.name in COMPARISONS for eqn in equations(program))
+def _compares(eqn: Any) -> bool:
+    """Whether results of an operation may have kinks or jumps."""
+    if eqn.primitive.name == "convert_element_type":  # from numbers to their integral parts
+        given, made = eqn.invars[0].aval.dtype, eqn.params["new_dtype"]
+        return jnp.issubdtype(given, jnp.floating) and not jnp.issubdtype(made, jnp.inexact)
+    return eqn.primitive.name in COMPARISONS
 
 
 def bends(
@@ -188,9 +225,9 @@ def bends(
         return jax.vmap(around)(distances)
 
     turn, away, leap, steep, size = (jnp.abs(x) for x in jax.vmap(along, 1)(directions))
-    rounding = ROUNDINGS * eps * jnp.max(steep)
-    of_slopes = jnp.maximum(LEAST * steep, rounding)
-    of_values = jnp.maximum(LEAST * size, rounding + ROUNDINGS * eps * jnp.max(size))
+    steepest, largest = (jnp.max(x, initial=0.0, where=jnp.isfinite(x)) for x in (steep, size))
+    of_slopes = jnp.maximum(LEAST * steep, ROUNDINGS * eps * steepest)
+    of_values = jnp.maximum(LEAST_JUMP * size, ROUNDINGS * eps * (steepest + largest))
 
     def stays(change: Array, floor: Array, larger: int) -> Array:
         """Whether changes at a distance and at the next smaller one are alike."""

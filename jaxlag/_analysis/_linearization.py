@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._core._result import AbstractResult
@@ -60,6 +61,7 @@ class Linearization(AbstractResult):
         Raises:
             ValueError: a name that is no state; a kept state or an output that reads one of them.
         """
+        names = name_sequence("linearize: drop", names)
         for name in names:
             if name not in self.states:
                 must = f"name states among {list(self.states)}"

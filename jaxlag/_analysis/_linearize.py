@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlag._analysis._consistent_state import residuals, rows_at
+from jaxlag._analysis._consistent_state import rows_at, rows_of_state
 from jaxlag._analysis._equations import Scene, equations_around, scene_of
 from jaxlag._analysis._independent_columns import completed
-from jaxlag._analysis._kinks import bends, compares, examined, kinks
+from jaxlag._analysis._kinks import bends, examined, kinks
 from jaxlag._analysis._linearization import Linearization
 from jaxlag._analysis._minimal_states import MinimalStates, entries, minimal_states
 from jaxlag._analysis._outputs import outputs_of
@@ -19,10 +19,12 @@ from jaxlag._core._arguments import name_sequence
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._mass_solve import dependence_floor
+from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import state_vectors
 from jaxlag._model._inputs import check_inputs, check_range
+from jaxlag._model._quasi_velocities import QuasiVelocities, least_sine
 from jaxlag._model._states import state_names
 from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._inspection import check_declaration
@@ -40,7 +42,7 @@ def linearize(
     params: Any = None,
     *,
     t: Any = 0.0,
-    inputs: Mapping[str, Any] | Sequence[str] = (),
+    inputs: Mapping[str, Any] | Sequence[str] | None = (),
     outputs: Sequence[Any] | Mapping[str, Any] = (),
     independent: Sequence[str] | None = None,
     drop: Sequence[str] = (),
@@ -62,8 +64,8 @@ def linearize(
     determined. The derivatives, with respect to params and to the point, are exact, in every mode.
     Under `jax.jit`, `jax.grad` or `jax.vmap` of t, q or params, give `independent` if there are
     constraints, as their rows are then unknown. Then A, C and the basis are NaN off the
-    constraints, and if the named states do not determine the others. Kinks, and what depends on the
-    states in `drop`, are not looked for.
+    constraints, and if the named states do not determine the others. Kinks, places beside which
+    more rows are independent, and what depends on states in `drop` are not looked for.
 
     Args:
         system: the mechanical system with n coordinates.
@@ -108,11 +110,12 @@ def linearize(
     """
     if not isinstance(system, System):
         raise invalid("linearize: system", "be a jl.System", f"it was {system!r}")
-    q, v = state_vectors(system.coordinates, q, v)
+    with jax.ensure_compile_time_eval():  # under `jax.jit`, too, what is known stays known
+        q, v = state_vectors(system.coordinates, q, v)
+        t = number("linearize: t", "be a number", t, jnp.result_type(float))
     for name, x in (("q", q), ("v", v)):
         if concrete(x) and not np.all(np.isfinite(x)):
             raise invalid(f"linearize: {name}", "be finite", f"it was {x}")
-    t = number("linearize: t", "be a number", t, jnp.result_type(float))
     signals = _signals(inputs)
     missing = [name for name in state_names(system.states) if name not in signals]
     if missing:
@@ -129,19 +132,21 @@ def linearize(
                 "Inputs given by names are numbers. Give arrays as a dict: {name: array}."
             )
         raise
+    known = concrete(t, q, params)
     params = lift_closure_tracers(system, params, q, signals)
+    known = known and concrete(params)
+    if known and system.quasi is not None:
+        _check_regular(system.quasi, t, q, params)
     sample = _params.sample(_params.split(params)[0])
     rows = system._rows(params, q.dtype)
-    A = None
-    if rows.size and concrete(t, q, params):
-        A = rows_at(system, sample, params, t, q, v)
+    A = rows_at(system, sample, params, t, q, v) if rows.size and known else None
     states = minimal_states(system, rows, A, independent)
     wanted = outputs_of(system, outputs, rows.labels, (t, q, v, params))
-    scene = scene_of(system, sample, wanted, signals)
-    found = _linear((scene, states), params, signals, t, q, v)
+    scene, checked = scene_of(system, sample, wanted, signals), A is not None and concrete(v)
+    found = _linear((scene, states, checked), params, signals, t, q, v)
     if concrete(found):
         _check_finite(found, system, params, t, q)
-    if concrete(found, params, t, q, v):
+    if known and concrete(found, v):
         _check_derivatives(scene, params, signals, t, q, v, found.basis)
     drop = name_sequence("linearize: drop", drop)
     return found.dropped(entries(system.coordinates, drop, found.states)) if drop else found
@@ -149,6 +154,8 @@ def linearize(
 
 def _signals(inputs: Any) -> dict[str, Any]:
     """Inputs by name; those of a sequence of names are numbers, 0."""
+    if inputs is None:
+        return {}
     if not isinstance(inputs, Mapping):
         names = name_sequence("linearize: inputs", inputs)
         inputs = dict.fromkeys(names, jnp.zeros((), jnp.result_type(float)))
@@ -178,17 +185,24 @@ def _check_derivatives(
     v: Array,
     basis: Array,
 ) -> None:
-    """Refuse a kink or jump of the equations along any direction."""
+    """Refuse a kink or jump of declared functions that is one of the equations, too."""
     around = equations_around(scene, params, signals, t, q, v)
-    if not compares(around):
-        return
-    if not np.any(np.asarray(_bends((scene,), params, signals, t, q, v, basis))):
-        return
     bent = kinks(around, examined(around, basis))
-    must, was = "be a state where the equations have derivatives", "there is a kink or jump"
-    fix = "Move the state to one side of it, or make it smooth."
-    of = f" of {', '.join(bent)}" if bent else ""
-    raise invalid("linearize: q and v", must, f"{was}{of}", fix)
+    if bent and np.any(np.asarray(_bends((scene,), params, signals, t, q, v, basis))):
+        must, was = "be a state where the equations have derivatives", "there is a kink or jump"
+        fix = "Move the state to one side of it, or make it smooth."
+        raise invalid("linearize: q and v", must, f"{was} of {', '.join(bent)}", fix)
+
+
+def _check_regular(quasi: QuasiVelocities, t: Array, q: Array, params: Any) -> None:
+    """Refuse a place where the quasi-velocities do not determine the velocities."""
+    with jax.ensure_compile_time_eval():
+        sines = np.asarray(quasi.sines(t, q, params, q.dtype))
+    bad = [name for name, x in zip(quasi.names, sines, strict=True) if x <= least_sine(q.dtype)]
+    if bad:
+        must = "be a place where the quasi-velocities determine the velocities"
+        was = f"{bad[0]!r} depended on the others"
+        raise invalid("linearize: q", must, was, "Choose other quasi-velocities, or another place.")
 
 
 @Compiled
@@ -210,19 +224,20 @@ def _bends(
 def _linear(
     scene: Scene,
     states: MinimalStates,
+    checked: bool,
     params: Any,
     signals: dict[str, Any],
     t: Array,
     q: Array,
     v: Array,
 ) -> Linearization:
-    """NaN of states off the constraints, and of `states` that do not determine the others."""
+    """A is NaN off the constraints, unless checked, and if `states` do not determine the others."""
     system = scene.system
     around = equations_around(scene, params, signals, t, q, v)
     terms, rows = system._program.terms(q, params, scene.sample), system._rows(params, q.dtype)
     basis = _basis(terms, rows, states, system.quasi is None, t, q, v, params, around.size)
-    if rows.size:
-        off = residuals(terms, rows, t, q, v, params)
+    if rows.size and not checked:
+        off = rows_of_state(terms, rows, t, q, v, params).off
         basis = jnp.where(jnp.all(off <= dependence_floor(q.dtype)), basis, jnp.nan)
     (f, y0), slopes = jax.linearize(around.rates, around.z)
     slope, of_outputs = jax.vmap(slopes, 1, 1)(around.directions(basis))
@@ -258,14 +273,18 @@ def _basis(
     n = q.shape[0]
     c, r = len(states.coordinates), len(states.velocities)
     P = jnp.eye(n, dtype=q.dtype)
+    some = jnp.ones((rows.size,), q.dtype)
+    if not all(rows.sure):  # rows that may be rounding
+        of_q = terms.rows_of(t, v, params)
+        some = row_sizes(of_q, *jax.lax.stop_gradient((q, of_q(q)))).nonzero.astype(q.dtype)
     if any(rows.holonomic):
-        phi_q = terms.rows_of_position(t, params)(q)
+        phi_q = terms.rows_of_position(t, params)(q) * some[np.array(rows.holonomic), None]
         none = jnp.zeros((phi_q.shape[0], c), q.dtype)
         P = completed(phi_q, jnp.eye(c, dtype=q.dtype), none, states.coordinates)
     N, S = jnp.eye(r, dtype=q.dtype), jnp.zeros((r, c), q.dtype)
     if rows.size and in_v:
-        A = terms.rows_of(t, v, params)(q)
-        along = jax.linearize(lambda q: terms.velocity(t, q, v, params), q)[1]
+        A = terms.rows_of(t, v, params)(q) * some[:, None]
+        along = jax.linearize(lambda q: some * terms.velocity(t, q, v, params), q)[1]
         right = jnp.concatenate(
             [-jax.vmap(along, 1, 1)(P), jnp.zeros((rows.size, r), q.dtype)], axis=1
         )

@@ -126,7 +126,7 @@ def check_about_origin(argument: str, inertia: Array, mass: Array, center: Array
     if turning.size == 0:
         return
     at_center = _offset(np, float(mass), c)
-    moments, axes = np.linalg.eigh((J - at_center)[np.ix_(turning, turning)])
+    moments, axes = np.linalg.eigh((J - at_center)[turning][:, turning])
     eps = max(float(jnp.finfo(x.dtype).eps) for x in (inertia, mass, center))
     if moments[0] >= -64 * eps * max(np.max(np.abs(J)), np.max(np.abs(at_center))):
         return

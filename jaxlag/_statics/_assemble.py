@@ -364,12 +364,7 @@ def _held(system: System, hold: Any) -> tuple[tuple[bool, ...], tuple[bool, ...]
     """For every coordinate, whether it is held, and whether its velocity is held."""
     hold = name_sequence("assemble: hold", hold)
     coordinates = system.coordinates
-    index = {label: [i] for i, label in enumerate(coordinates.labels)}
-    start = 0
-    for name, shape in coordinates.shapes.items():
-        size = int(np.prod(shape))
-        index[name] = list(range(start, start + size))
-        start += size
+    index = {label: [i] for i, label in enumerate(coordinates.labels)} | coordinates.places
     held = np.zeros((2, system.size), bool)
     for name in hold:
         rate = isinstance(name, str) and name.endswith("'")

@@ -24,25 +24,36 @@ _GUARDS = ("eq", "ne", "is_finite", "lu")
 
 
 def outcomes(
-    program: ClosedJaxpr, args: Sequence[Array], moving: Sequence[bool], only: Any = None
+    program: ClosedJaxpr,
+    args: Sequence[Array],
+    moving: Sequence[bool],
+    only: Any = None,
+    guards: bool = False,
 ) -> Array | None:
     """Outcomes of the comparisons of moving values, as a row of numbers; None if there are none.
 
-    A comparison with == or != counts as the guard of a single point, and is not listed.
+    A comparison with == or != counts as the guard of a single point, and is not listed, nor is the
+    cut of an angle.
 
     Args:
         program: the traced program.
         args: its arguments.
         moving: which of these vary.
         only: the equation to examine; None for all.
+        guards: whether guards and cuts are listed, too.
     """
     found: list[Array] = []
-    _run(program, list(args), list(moving), found, only)
+    _run(program, list(args), list(moving), found, only, guards)
     return jnp.concatenate(found) if found else None
 
 
 def _run(
-    program: ClosedJaxpr, args: list[Any], moving: list[bool], found: list[Array], only: Any
+    program: ClosedJaxpr,
+    args: list[Any],
+    moving: list[bool],
+    found: list[Array],
+    only: Any,
+    guards: bool,
 ) -> tuple[list[Any], list[bool]]:
     """(results, which of them vary); outcomes of comparisons are added to `found`."""
     jaxpr = program.jaxpr
@@ -52,27 +63,25 @@ def _run(
     for eqn in jaxpr.eqns:
         given = [x.val if isinstance(x, Literal) else known[x] for x in eqn.invars]
         touched = [not isinstance(x, Literal) and x in moves for x in eqn.invars]
-        inner = called(eqn)
+        inner, listed = called(eqn), _SMOOTH not in str(eqn.source_info.name_stack)
         if inner is not None:
-            looks = found if _SMOOTH not in str(eqn.source_info.name_stack) else []
-            results, does = _run(inner, given, touched, looks, only)
+            results, does = _run(inner, given, touched, found if listed else [], only, guards)
         else:
             results = eqn.primitive.bind(*given, **eqn.params)
             results = results if eqn.primitive.multiple_results else [results]
             does = [any(touched)] * len(results)
-            looks = _SMOOTH not in str(eqn.source_info.name_stack) and only in (None, eqn)
-            if any(touched) and looks:
-                found.extend(_outcomes(eqn, given, results))
+            if any(touched) and listed and only in (None, eqn):
+                found.extend(_outcomes(eqn, given, results, guards))
         known.update(zip(eqn.outvars, results, strict=True))
         moves.update(x for x, moved in zip(eqn.outvars, does, strict=True) if moved)
     ends = [x.val if isinstance(x, Literal) else known[x] for x in jaxpr.outvars]
     return ends, [not isinstance(x, Literal) and x in moves for x in jaxpr.outvars]
 
 
-def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]:
+def _outcomes(eqn: Any, given: list[Any], results: list[Any], guards: bool) -> Iterator[Array]:
     """Outcomes of one operation."""
     name, first = eqn.primitive.name, given[0]
-    if name in _GUARDS or not any(_is_inexact(x) for x in given):
+    if (name in _GUARDS and not guards) or not any(_is_inexact(x) for x in given):
         return
     for x in results:
         if not _is_inexact(x):
@@ -88,6 +97,8 @@ def _outcomes(eqn: Any, given: list[Any], results: list[Any]) -> Iterator[Array]
         yield _row(jnp.sign(x - low) + jnp.sign(x - high))
     elif name in ("floor", "ceil", "round"):
         yield _row(results[0])
+    elif name == "atan2" and guards:
+        yield _row(jnp.where(given[1] < 0, jnp.sign(first), jnp.zeros_like(first)))
     elif name == "rem":
         yield _row(jnp.trunc(given[0] / given[1]))
     elif name in ("reduce_max", "reduce_min"):

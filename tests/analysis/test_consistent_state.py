@@ -1,5 +1,6 @@
 """States that do not satisfy the constraints, and places where rows become dependent."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,20 +37,45 @@ def loop(t, q, p):
     )
 
 
+TURN = 2.0 * np.pi  # whose sine is rounding, not 0
+
+
 @pytest.mark.parametrize(
-    "phi",
+    ("phi", "places"),
     [
-        loop,
-        lambda t, q, p: q[1] ** 2 - q[0] ** 3,
-        lambda t, q, p: q[0] ** 2 + q[1] ** 2 - q[2] ** 2,
+        (loop, [[0.0, 0.0, 0.0], [0.0, TURN, 0.0], [TURN, TURN, 0.0], [np.pi, 0.0, np.pi]]),
+        (lambda t, q, p: q[1] ** 2 - q[0] ** 3, [[0.0, 0.0, 0.0]]),
+        (lambda t, q, p: 1.0 - jnp.cos(q[0]) - q[1] ** 2, [[0.0, 0.0, 0.3], [TURN, 0.0, 0.0]]),
     ],
     ids=["flat linkage", "cusp", "cone"],
 )
-def test_places_beside_which_more_rows_are_independent_are_refused(phi):
+def test_places_beside_which_more_rows_are_independent_are_refused(phi, places):
     row = jl.Holonomic(phi, "row")
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v, ("a", "b", "c"), constraints=(row,))
-    with pytest.raises(ValueError, match=r"near which the rows have one rank.*a change point"):
-        jl.linearize(system, np.zeros(3), np.zeros(3))
+    for q in places:
+        with pytest.raises(ValueError, match=r"near which the rows have one rank.*a change point"):
+            jl.linearize(system, q, np.zeros(3))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_rows_that_are_rounding_everywhere_hold_nothing(angle):
+    """sin^2 + cos^2 - 1 has a gradient of 1e-17 at some angles."""
+
+    def rows(t, q, p):
+        return jnp.stack([q[0] - q[1], jnp.sin(q[2]) ** 2 + jnp.cos(q[2]) ** 2 - 1.0])
+
+    held = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - 0.5 * q[0] ** 2 - 2.0 * q[2] ** 2,
+        ("a", "b", "c"),
+        constraints=(jl.Holonomic(rows, "rows"),),
+    )
+    names = ("b", "c", "b'", "c'")
+    q = np.array([0.3, 0.3, angle])
+    linear = jl.linearize(held, q, np.zeros(3))
+    assert linear.states == names
+    traced = jax.jit(lambda q: jl.linearize(held, q, np.zeros(3), independent=names))(q)
+    for found in (linear, traced):
+        np.testing.assert_allclose(np.diagonal(found.A[2:, :2]), [-0.5, -4.0], rtol=1e-14)
 
 
 def test_a_dead_point_of_one_crank_is_no_such_place():

@@ -39,6 +39,12 @@ SMOOTH = {
     "maximum of smooth functions away from ties": (slope(lambda z: jnp.max(z) ** 2), [0.3, 0.1]),
 }
 BENT = {
+    "jump beside a large load": (lambda z: 1e6 - 0.3 * jnp.sign(z), [0.0]),
+    "domain that ends nearby": (
+        lambda z: jnp.stack([jnp.sign(z[0]), -jnp.sqrt(z[1])]),
+        [0.0, 1e-6],
+    ),
+    "cut of an angle": (lambda z: jnp.arctan2(z[1], z[0]), [-1.0, 0.0]),
     "Coulomb friction": (lambda z: -0.3 * jnp.sign(z), [0.0]),
     "stop": (lambda z: -jnp.maximum(z - 0.1, 0.0), [0.1]),
     "jump": (lambda z: 2.0 + jnp.sign(z - 1.0), [1.0]),
@@ -98,6 +104,17 @@ def force(function):
             {"inputs": {"u": jl.Feedback(lambda t, q, v, p: jnp.clip(q[0], 0.0, 1.0))}},
             r"force 'bump', input 'u'",
         ),
+        (
+            force(lambda t, q, v, p: v * jnp.arctan2(q[1], q[0] - 1.0)),
+            {"v": [0.5, 0.0]},
+            "force 'bump'",
+        ),
+        (
+            force(lambda t, q, v, p: (q + 1.0).astype(int).astype(float)),
+            {},
+            r"force 'bump' \(.*test_kinks.py",
+        ),
+        (force(lambda t, q, v, p: jax.lax.top_k(q, 2)[0]), {}, "force 'bump'"),
         ({}, {"outputs": {"gap": lambda t, q, v, p: jnp.abs(q[0])}}, r"output 'gap' \(.*test_kin"),
         (
             {
@@ -116,8 +133,9 @@ def test_the_function_and_its_line_are_named(kinds, change, named):
     kinds = dict(kinds)
     lagrangian = kinds.pop("L", lambda t, q, v, p: 0.5 * v @ v - q[1])
     system = jl.System(lagrangian, ("x", "y"), **kinds)
+    at = {"q": [0.0, 0.0], "v": [0.0, 0.0]} | change
     with pytest.raises(ValueError, match=rf"have derivatives.*a kink or jump of {named}"):
-        jl.linearize(system, [0.0, 0.0], [0.0, 0.0], **change)
+        jl.linearize(system, **at)
 
 
 def test_a_kink_across_the_constraints_is_none():
@@ -126,3 +144,34 @@ def test_a_kink_across_the_constraints_is_none():
     row = jl.Holonomic(lambda t, q, p: q[1], "floor")
     linear = jl.linearize(jl.System(lagrangian, ("x", "y"), constraints=(row,)), *np.zeros((2, 2)))
     np.testing.assert_allclose(linear.A, [[0.0, 1.0], [-2.0, 0.0]])
+
+
+def test_friction_by_a_multiplier_at_rest():
+    """The force is 0 wherever the multiplier is."""
+
+    def friction(t, q, v, p, lam):
+        return jnp.stack([-0.3 * lam["floor"] * jnp.sign(v[0]), 0.0 * q[0]])
+
+    row = jl.Holonomic(lambda t, q, p: q[1], "floor")
+    forces = [jl.GeneralizedForce(friction, "friction", reaction=True)]
+    block = jl.System(
+        lambda t, q, v, p: 0.5 * v @ v - q[1], ("x", "y"), forces=forces, constraints=(row,)
+    )
+    with pytest.raises(ValueError, match=r"a kink or jump of force 'friction' \(.*test_kinks"):
+        jl.linearize(block, [0.0, 0.0], [0.0, 0.0])
+    assert np.all(np.isfinite(jl.linearize(block, [0.0, 0.0], [1.0, 0.0]).A))
+
+
+def test_rounding_of_the_solve_is_no_kink():
+    """Links of unlike masses with quadratic drag at rest: M has a condition number of 1e7."""
+    masses = np.array([1e-3, 1e-3, 1e-3, 1e3])
+
+    def lagrangian(t, q, v, p):
+        angles, rates = jnp.cumsum(q), jnp.cumsum(v)
+        x = jnp.cumsum(rates * jnp.cos(angles)), jnp.cumsum(rates * jnp.sin(angles))
+        height = -jnp.cumsum(jnp.cos(angles))
+        return 0.5 * masses @ (x[0] ** 2 + x[1] ** 2) - 9.81 * masses @ height
+
+    drag = force(lambda t, q, v, p: -0.1 * v * jnp.abs(v))
+    chain = jl.System(lagrangian, {"angle": (4,)}, lowering="array", **drag)
+    assert np.all(np.isfinite(jl.linearize(chain, np.zeros(4), np.zeros(4)).A))

@@ -292,6 +292,15 @@ def test_arrays_as_inputs_need_their_values():
     assert jl.linearize(free, [0.0, 0.0], [0.0, 0.0], inputs={"load": np.ones(2)}).B.shape == (4, 2)
 
 
+def test_quasi_velocities_that_do_not_determine_the_velocities_are_named():
+    quasi = jl.QuasiVelocities(
+        lambda t, q, v, p: jnp.stack([v[0] * jnp.cos(q[1]), v[1]]), ("turn", "u")
+    )
+    system = jl.System(lambda t, q, v, p: 0.5 * v @ v, ("x", "y"), quasi=quasi)
+    with pytest.raises(ValueError, match=r"determine the velocities, but 'turn' depended on"):
+        jl.linearize(system, [0.0, np.pi / 2], [0.0, 0.0])
+
+
 def test_a_singular_mass_is_named():
     flat = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - q[1] ** 2, ("x", "y"))
     with pytest.raises(ValueError, match=r"must be a regular point, but .* not finite"):
@@ -302,8 +311,13 @@ def test_traced_velocities_need_none():
     """The rows depend on t, q and params alone."""
     q, _, params = LOW
     speeds = jnp.array([[0.1, 0.0], [0.7, 0.0]])
-    found = jax.vmap(lambda v: jl.linearize(HANGING, q, v, params).A[1, 0])(speeds)
-    np.testing.assert_allclose(found, -(G + speeds[:, 0] ** 2 / 0.7) / 0.7, rtol=1e-12)
+    expected = -(G + speeds[:, 0] ** 2 / 0.7) / 0.7
+
+    def of(v):
+        return jl.linearize(HANGING, q, v, params).A[1, 0]
+
+    np.testing.assert_allclose(jax.vmap(of)(speeds), expected, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(of)(speeds[0]), expected[0], rtol=1e-12)
 
 
 def test_states_in_single_precision_have_matrices_in_single_precision():
