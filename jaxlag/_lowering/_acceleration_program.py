@@ -260,9 +260,9 @@ class ArrayProgram(AccelerationProgram):
             return of_all(state, sample)
         entries = self.row_entries(self.array, state)
         nonzero = row_sizes(entries, state.q, entries(state.q)).nonzero
-        found, clear = sparse.reactions(*state)
+        clear, solved = sparse.reactions(*state)
         clear = clear & eqxi.unvmap_all(jnp.all(nonzero))
-        return jax.lax.cond(clear, lambda: found, lambda: of_all(state, sample))
+        return jax.lax.cond(clear, solved, lambda: of_all(state, sample))
 
     def _sparse(self, state: State) -> SparseEquations | None:
         """The sparse equations with constraints, if there are any."""

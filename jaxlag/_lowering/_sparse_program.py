@@ -129,12 +129,20 @@ class SparseEquations(NamedTuple):
 
     def reactions(
         self, t: Array, q: Array, v: Array, params: Any, inputs: Mapping[str, Any]
-    ) -> tuple[tuple[Float[Array, " n"], Float[Array, " m"], Float[Array, " n"]], Bool[Array, ""]]:
-        """(a, lam, A^T lam) by all rows, and whether they are clearly independent."""
+    ) -> tuple[Bool[Array, ""], Callable]:
+        """Whether all rows are clearly independent; () -> (a, lam, A^T lam) if they are.
+
+        The solution is a function for the branch that needs it: derivatives of one by dependent
+        rows are NaN, which would spread from a result that is not selected.
+        """
         kkt = self.kkt(t, q, v, params)
         factor = self._factor(kkt, None)
-        a, lam = self._solved(kkt, factor, t, q, v, params, inputs)
-        return (a, lam, kkt.mass.blocks.join(kkt.loads(lam))), _clear(factor)
+
+        def solved() -> tuple[Array, Array, Array]:
+            a, lam = self._solved(kkt, factor, t, q, v, params, inputs)
+            return a, lam, kkt.mass.blocks.join(kkt.loads(lam))
+
+        return _clear(factor), solved
 
     def _solved(
         self,
