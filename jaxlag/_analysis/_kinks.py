@@ -28,26 +28,11 @@ LIKE = 0.5, 10.0
 """Change at the smaller of two distances over that at the larger one. Of a smooth function it is
 the ratio of the distances, 0.005 or 0.002, of a series that cancels the inverse, or its square."""
 ROUNDINGS = 64
-COMPARISONS = frozenset(
-    (
-        *(
-            "abs",
-            "and",
-            "argmax",
-            "argmin",
-            "atan2",
-            "ceil",
-            "clamp",
-            "cond",
-            "cummax",
-            "cummin",
-            "eq",
-        ),
-        *("floor", "ge", "gt", "is_finite", "largest", "le", "lt", "max", "min", "ne", "not", "or"),
-        *("reduce_max", "reduce_min", "rem", "round", "select_n", "sign", "smallest", "sort"),
-        *("top_k", "while", "xor"),
-    )
-)
+ORDERS = frozenset(("eq", "ge", "gt", "is_finite", "le", "lt", "ne", "and", "not", "or", "xor"))
+BRANCHES = frozenset(("clamp", "cond", "max", "min", "select_n", "while"))
+PARTS = frozenset(("abs", "atan2", "ceil", "floor", "rem", "round", "sign"))
+EXTREMES = frozenset(("argmax", "argmin", "cummax", "cummin", "reduce_max", "reduce_min"))
+COMPARISONS = ORDERS | BRANCHES | PARTS | EXTREMES | {"sort", "top_k"}
 """Operations whose results may have kinks or jumps."""
 
 

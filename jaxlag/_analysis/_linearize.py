@@ -15,7 +15,7 @@ from jaxlag._analysis._kinks import bends, examined, kinks
 from jaxlag._analysis._linearization import Linearization
 from jaxlag._analysis._minimal_states import MinimalStates, entries, minimal_states
 from jaxlag._analysis._outputs import outputs_of
-from jaxlag._core._arguments import name_sequence
+from jaxlag._core._arguments import name_sequence, state_first
 from jaxlag._core._arrays import concrete, number
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._mass_solve import dependence_floor
@@ -35,6 +35,7 @@ from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
 
+@state_first
 def linearize(
     system: System,
     q: Any,

@@ -279,6 +279,12 @@ def test_bad_input_is_refused(change, text):
         jl.linearize(**given)
 
 
+def test_the_order_of_the_arguments_is_told():
+    q, v, params = LOW
+    with pytest.raises(ValueError, match=r"`linearize` must get t, inputs.* by name"):
+        jl.linearize(HANGING, 0.0, q, v, params)
+
+
 def test_arrays_as_inputs_need_their_values():
     def push(t, q, v, p, inputs):
         return inputs["load"][:2]
