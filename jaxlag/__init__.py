@@ -17,6 +17,8 @@ from jaxlag import testing as testing
 from jaxlag import transforms as transforms
 from jaxlag._analysis._linearization import Linearization as Linearization
 from jaxlag._analysis._linearize import linearize as linearize
+from jaxlag._analysis._modes import Modes as Modes
+from jaxlag._analysis._modes import modes as modes
 from jaxlag._core._arguments import former_names as _former_names
 from jaxlag._core._errors import AssemblyError as AssemblyError
 from jaxlag._core._errors import EquilibriumError as EquilibriumError

@@ -253,10 +253,26 @@ def _linear(
         f[places],
         y0,
         basis,
+        terms.mass(t, q, v, params),
+        None,
         states.names,
         around.labels,
         scene.outputs.labels,
+        system.coordinates.labels,
+        _layout(system),
     )
+
+
+def _layout(system: System) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Names and shapes of (q, w, x)."""
+    shapes, found = system.coordinates.shapes, list(system.coordinates.shapes.items())
+    if system.quasi is None:
+        found += [(f"{name}'", shape) for name, shape in shapes.items()]
+    else:
+        found += [(system.quasi.names[i], ()) for i in system.quasi.free]
+    if system.states is not None:
+        found += system.states.layout.shapes.items()
+    return tuple((name, tuple(shape)) for name, shape in found)
 
 
 def _basis(

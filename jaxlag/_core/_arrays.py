@@ -100,6 +100,11 @@ def reals(*given: tuple[str, Any, tuple[int, ...]]) -> list[Array]:
     return common(*arrays)
 
 
+def as_complex(x: Array) -> Array:
+    """`x` as a complex array of the same precision."""
+    return jax.lax.complex(x, jnp.zeros_like(x))
+
+
 def elements(array: Array) -> list[Array]:
     """All elements of an array as a list, by static slices."""
     flat = jnp.reshape(array, (-1,))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import jaxlag as jl
 from bench.mechanisms._bicycle import BICYCLE
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.full
 
 @pytest.fixture(scope="module")
 def linear_at():
-    """Forward speed, trail -> A in the four published states."""
+    """Forward speed, trail -> A in the four published states, f0, the linearization."""
     system = SCENES["bicycle"]().system()
 
     @jax.jit
@@ -39,14 +40,14 @@ def linear_at():
         v = v.at[6].set(-speed / params["r_rear"]).at[7].set(-speed / params["r_front"])
         linear = jl.linearize(system, jnp.zeros(8), v, params, independent=INDEPENDENT, drop=CYCLIC)
         at = np.array([linear.states.index(name) for name in KEPT])
-        return linear.A[at][:, at], linear.f0
+        return linear.A[at][:, at], linear.f0, linear
 
     return of
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 3.0, 5.0, 7.0, 10.0])
 def test_matrices_are_the_published_ones(linear_at, speed):
-    A, f0 = linear_at(speed, BICYCLE["c"])
+    A, f0, _ = linear_at(speed, BICYCLE["c"])
     stiffness = -np.linalg.solve(M, 9.81 * K0 + speed**2 * K2)
     expected = np.block(
         [[np.zeros((2, 2)), np.eye(2)], [stiffness, -np.linalg.solve(M, speed * C1)]]
@@ -69,6 +70,35 @@ def test_derivatives_of_the_matrix_with_respect_to_the_trail(linear_at):
     for i, (one, other) in enumerate(zip(forward, reverse, strict=True)):
         np.testing.assert_allclose(one, other, atol=1e-10 * np.max(np.abs(one)))
         h = np.eye(2)[i] * 1e-4 * at[i]
-        (above, _), (below, _) = linear_at(*np.add(at, h)), linear_at(*np.subtract(at, h))
+        (above, *_), (below, *_) = linear_at(*np.add(at, h)), linear_at(*np.subtract(at, h))
         slope = (above - below) / (2 * h[i])
         np.testing.assert_allclose(one, slope, atol=1e-6 * np.max(np.abs(slope)))
+
+
+def test_weave_and_capsize_speeds(linear_at):
+    """The published 4.292382536341109 and 6.02426201538837 m/s.
+
+    The derivative of the weave speed with respect to the trail is -(dRe/dtrail) / (dRe/dv).
+    """
+    trail = BICYCLE["c"]
+
+    @jax.jit
+    def growth(speed, trail):
+        values = jl.modes(linear_at(speed, trail)[2]).eigenvalues
+        return jnp.max(jnp.where(jnp.imag(values) > 0, jnp.real(values), -jnp.inf))
+
+    def weave(trail, guess=4.29):
+        return brentq(
+            lambda speed: float(growth(speed, trail)), guess - 0.1, guess + 0.1, xtol=1e-13
+        )
+
+    def determinant(speed):
+        return float(np.linalg.det(linear_at(speed, trail)[0]))
+
+    speed = weave(trail)
+    assert speed == pytest.approx(4.292382536341109, abs=1e-12)
+    assert brentq(determinant, 5.9, 6.1, xtol=1e-13) == pytest.approx(6.02426201538837, abs=1e-12)
+    of_speed, of_trail = jax.jit(jax.grad(growth, (0, 1)))(speed, trail)
+    h = 1e-4 * trail
+    slope = (weave(trail + h) - weave(trail - h)) / (2 * h)
+    assert -of_trail / of_speed == pytest.approx(slope, rel=1e-6)
