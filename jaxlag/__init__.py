@@ -15,6 +15,8 @@ from jaxlag import rotation as rotation
 from jaxlag import solvers as solvers
 from jaxlag import testing as testing
 from jaxlag import transforms as transforms
+from jaxlag._analysis._descriptor_form import DescriptorForm as DescriptorForm
+from jaxlag._analysis._descriptor_form import descriptor_form as descriptor_form
 from jaxlag._analysis._linearization import Linearization as Linearization
 from jaxlag._analysis._linearize import linearize as linearize
 from jaxlag._analysis._modes import Modes as Modes

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlag._analysis._consistent_state import rows_at, rows_of_state
+from jaxlag._analysis._declared_point import declared_point
 from jaxlag._analysis._equations import Scene, equations_around, scene_of
 from jaxlag._analysis._independent_columns import completed
 from jaxlag._analysis._kinks import bends, examined, kinks
@@ -16,23 +17,15 @@ from jaxlag._analysis._linearization import Linearization
 from jaxlag._analysis._minimal_states import MinimalStates, entries, minimal_states
 from jaxlag._analysis._outputs import outputs_of
 from jaxlag._core._arguments import name_sequence, state_first
-from jaxlag._core._arrays import concrete, number
+from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
 from jaxlag._linalg._mass_solve import dependence_floor
 from jaxlag._linalg._row_residuals import row_sizes
 from jaxlag._lowering import AbstractTerms
 from jaxlag._model._constraints import ConstraintRows
-from jaxlag._model._coordinates import state_vectors
-from jaxlag._model._inputs import check_inputs, check_range
-from jaxlag._model._quasi_velocities import QuasiVelocities, least_sine
-from jaxlag._model._states import state_names
-from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
-from jaxlag._system._inspection import check_declaration
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
-from jaxlag._tracing import _params
 from jaxlag._tracing._compiled import Compiled
-from jaxlag._tracing._traced_function import warn_of_changes
 
 
 @state_first
@@ -109,36 +102,8 @@ def linearize(
         >>> print(linear.states, linear.A.tolist())
         ('x', "x'") [[0.0, 1.0], [-9.81, 0.0]]
     """
-    if not isinstance(system, System):
-        raise invalid("linearize: system", "be a jl.System", f"it was {system!r}")
-    with jax.ensure_compile_time_eval():  # under `jax.jit`, too, what is known stays known
-        q, v = state_vectors(system.coordinates, q, v)
-        t = number("linearize: t", "be a number", t, jnp.result_type(float))
-    for name, x in (("q", q), ("v", v)):
-        if concrete(x) and not np.all(np.isfinite(x)):
-            raise invalid(f"linearize: {name}", "be finite", f"it was {x}")
-    signals = _signals(inputs)
-    missing = [name for name in state_names(system.states) if name not in signals]
-    if missing:
-        must = f"have values of the states, {list(state_names(system.states))}"
-        raise invalid("linearize: inputs", must, f"{missing[0]!r} was missing")
-    check_params(system, params, q, signals)
-    warn_of_changes(system)
-    check_range(signals, t, "t")
-    try:
-        check_declaration(system, params, signals, t, q, v)
-    except ValueError as error:
-        if signals and not isinstance(inputs, Mapping):
-            error.add_note(
-                "Inputs given by names are numbers. Give arrays as a dict: {name: array}."
-            )
-        raise
-    known = concrete(t, q, params)
-    params = lift_closure_tracers(system, params, q, signals)
-    known = known and concrete(params)
-    if known and system.quasi is not None:
-        _check_regular(system.quasi, t, q, params)
-    sample = _params.sample(_params.split(params)[0])
+    point = declared_point("linearize", system, q, v, params, t, inputs)
+    system, sample, params, signals, t, q, v, known = point
     rows = system._rows(params, q.dtype)
     A = rows_at(system, sample, params, t, q, v) if rows.size and known else None
     states = minimal_states(system, rows, A, independent)
@@ -151,16 +116,6 @@ def linearize(
         _check_derivatives(scene, params, signals, t, q, v, found.basis)
     drop = name_sequence("linearize: drop", drop)
     return found.dropped(entries(system.coordinates, drop, found.states)) if drop else found
-
-
-def _signals(inputs: Any) -> dict[str, Any]:
-    """Inputs by name; those of a sequence of names are numbers, 0."""
-    if inputs is None:
-        return {}
-    if not isinstance(inputs, Mapping):
-        names = name_sequence("linearize: inputs", inputs)
-        inputs = dict.fromkeys(names, jnp.zeros((), jnp.result_type(float)))
-    return check_inputs(inputs)
 
 
 def _check_finite(found: Linearization, system: System, params: Any, t: Array, q: Array) -> None:
@@ -193,17 +148,6 @@ def _check_derivatives(
         must, was = "be a state where the equations have derivatives", "there is a kink or jump"
         fix = "Move the state to one side of it, or make it smooth."
         raise invalid("linearize: q and v", must, f"{was} of {', '.join(bent)}", fix)
-
-
-def _check_regular(quasi: QuasiVelocities, t: Array, q: Array, params: Any) -> None:
-    """Refuse a place where the quasi-velocities do not determine the velocities."""
-    with jax.ensure_compile_time_eval():
-        sines = np.asarray(quasi.sines(t, q, params, q.dtype))
-    bad = [name for name, x in zip(quasi.names, sines, strict=True) if x <= least_sine(q.dtype)]
-    if bad:
-        must = "be a place where the quasi-velocities determine the velocities"
-        was = f"{bad[0]!r} depended on the others"
-        raise invalid("linearize: q", must, was, "Choose other quasi-velocities, or another place.")
 
 
 @Compiled
