@@ -17,6 +17,8 @@ from jaxlag._core._by_name import ByName
 from jaxlag._core._errors import invalid
 from jaxlag._core._result import AbstractResult
 
+ALIKE = 1e-3
+"""Relative difference of amplitudes that count as equal, of which the first is scaled to 1."""
 NEITHER = "Neither stable nor unstable."
 
 
@@ -285,7 +287,8 @@ def _modes(linear: Linearization) -> Modes:
     weights = jnp.sqrt(jnp.maximum(jax.lax.stop_gradient(inertias), 0.0))
     weights = jnp.concatenate([weights, jnp.zeros_like(size[weights.size :, 0].real)])
     moved = jnp.abs(size) * weights[:, None]
-    largest = jnp.argmax(jnp.where(jnp.any(moved > 0, 0), moved, jnp.abs(size)), 0)
+    moved = jnp.where(jnp.any(moved > 0, 0), moved, jnp.abs(size))
+    largest = jnp.argmax(moved >= (1.0 - ALIKE) * jnp.max(moved, 0), 0)  # the first of equal ones
     scale = jnp.take_along_axis(deviations, largest[None], 0)
     return Modes(
         pairs.values,
