@@ -19,6 +19,8 @@ from jaxlag._analysis._descriptor_form import DescriptorForm as DescriptorForm
 from jaxlag._analysis._descriptor_form import descriptor_form as descriptor_form
 from jaxlag._analysis._linearization import Linearization as Linearization
 from jaxlag._analysis._linearize import linearize as linearize
+from jaxlag._analysis._linearize_along import LinearizedMotion as LinearizedMotion
+from jaxlag._analysis._linearize_along import linearize_along as linearize_along
 from jaxlag._analysis._modes import Modes as Modes
 from jaxlag._analysis._modes import modes as modes
 from jaxlag._core._arguments import former_names as _former_names

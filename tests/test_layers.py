@@ -39,7 +39,7 @@ ALLOWED = {
     "_integration": _TO_SYSTEM,
     "_gradient": ("_core", "_integration"),
     "_simulation": (*_TO_SYSTEM, "_statics", "_integration", "_gradient"),
-    "_analysis": (*_TO_SYSTEM, "_statics"),
+    "_analysis": (*_TO_SYSTEM, "_statics", "_simulation"),
     "_fit": ("_core", "_tracing", "_model", "_system", "_simulation"),
     "transforms": ("_fit",),
 }

@@ -6,23 +6,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from jaxlag._analysis._consistent_state import rows_at, rows_of_state
+from jaxlag._analysis._consistent_state import rows_at
 from jaxlag._analysis._declared_point import declared_point
 from jaxlag._analysis._equations import Scene, equations_around, scene_of
-from jaxlag._analysis._independent_columns import completed
 from jaxlag._analysis._kinks import bends, examined, kinks
 from jaxlag._analysis._linearization import Linearization
 from jaxlag._analysis._minimal_states import MinimalStates, entries, minimal_states
 from jaxlag._analysis._outputs import outputs_of
+from jaxlag._analysis._tangent_space import tangent_basis
 from jaxlag._core._arguments import name_sequence, state_first
 from jaxlag._core._arrays import concrete
 from jaxlag._core._errors import invalid
-from jaxlag._linalg._mass_solve import dependence_floor
-from jaxlag._linalg._row_residuals import row_sizes
-from jaxlag._lowering import AbstractTerms
-from jaxlag._model._constraints import ConstraintRows
 from jaxlag._system._row_advice import advice_on_rows
 from jaxlag._system._system import System
 from jaxlag._tracing._compiled import Compiled
@@ -179,11 +175,8 @@ def _linear(
     """A is NaN off the constraints, unless checked, and if `states` do not determine the others."""
     system = scene.system
     around = equations_around(scene, params, signals, t, q, v)
-    terms, rows = system._program.terms(q, params, scene.sample), system._rows(params, q.dtype)
-    basis = _basis(terms, rows, states, system.quasi is None, t, q, v, params, around.size)
-    if rows.size and not checked:
-        off = rows_of_state(terms, rows, t, q, v, params).off
-        basis = jnp.where(jnp.all(off <= dependence_floor(q.dtype)), basis, jnp.nan)
+    terms = system._program.terms(q, params, scene.sample)
+    basis = tangent_basis(system, scene.sample, states, checked, params, t, q, v)
     (f, y0), slopes = jax.linearize(around.rates, around.z)
     slope, of_outputs = jax.vmap(slopes, 1, 1)(around.directions(basis))
     n, k = system.size, basis.shape[1]
@@ -217,39 +210,3 @@ def _layout(system: System) -> tuple[tuple[str, tuple[int, ...]], ...]:
     if system.states is not None:
         found += system.states.layout.shapes.items()
     return tuple((name, tuple(shape)) for name, shape in found)
-
-
-def _basis(
-    terms: AbstractTerms,
-    rows: ConstraintRows,
-    states: MinimalStates,
-    in_v: bool,
-    t: Array,
-    q: Array,
-    v: Array,
-    params: Any,
-    size: int,
-) -> Float[Array, "s k"]:
-    """Deviations of (q, w, x) for a unit of each state; with `in_v` w = v."""
-    n = q.shape[0]
-    c, r = len(states.coordinates), len(states.velocities)
-    P = jnp.eye(n, dtype=q.dtype)
-    some = jnp.ones((rows.size,), q.dtype)
-    if not all(rows.sure):  # rows that may be rounding
-        of_q = terms.rows_of(t, v, params)
-        some = row_sizes(of_q, *jax.lax.stop_gradient((q, of_q(q)))).nonzero.astype(q.dtype)
-    if any(rows.holonomic):
-        phi_q = terms.rows_of_position(t, params)(q) * some[np.array(rows.holonomic), None]
-        none = jnp.zeros((phi_q.shape[0], c), q.dtype)
-        P = completed(phi_q, jnp.eye(c, dtype=q.dtype), none, states.coordinates)
-    N, S = jnp.eye(r, dtype=q.dtype), jnp.zeros((r, c), q.dtype)
-    if rows.size and in_v:
-        A = terms.rows_of(t, v, params)(q) * some[:, None]
-        along = jax.linearize(lambda q: some * terms.velocity(t, q, v, params), q)[1]
-        right = jnp.concatenate(
-            [-jax.vmap(along, 1, 1)(P), jnp.zeros((rows.size, r), q.dtype)], axis=1
-        )
-        both = completed(A, jnp.eye(r, c + r, c, dtype=q.dtype), right, states.velocities)
-        S, N = both[:, :c], both[:, c:]
-    moving = jnp.block([[P, jnp.zeros((n, r), q.dtype)], [S, N]])
-    return jax.scipy.linalg.block_diag(moving, jnp.eye(size - moving.shape[0], dtype=q.dtype))
