@@ -23,6 +23,8 @@ from jaxlag._analysis._linearize_along import LinearizedMotion as LinearizedMoti
 from jaxlag._analysis._linearize_along import linearize_along as linearize_along
 from jaxlag._analysis._modes import Modes as Modes
 from jaxlag._analysis._modes import modes as modes
+from jaxlag._analysis._steady import steady as steady
+from jaxlag._analysis._steady_motion import SteadyMotion as SteadyMotion
 from jaxlag._core._arguments import former_names as _former_names
 from jaxlag._core._errors import AssemblyError as AssemblyError
 from jaxlag._core._errors import EquilibriumError as EquilibriumError

@@ -72,9 +72,7 @@ def rows_at(
     """
     rows = system._rows(params, q.dtype)
     moving = concrete(v)
-    with jax.ensure_compile_time_eval():
-        at = t, q, v if moving else jnp.zeros_like(q)
-        off, A = (np.asarray(x) for x in _rows_and_residuals((system, sample), params, None, *at))
+    off, A = rows_near(system, sample, params, t, q, v if moving else jnp.zeros_like(q))
     for kind, size in zip(("phi", "A v + b") if moving else ("phi",), off, strict=False):
         worst = int(np.argmax(size))
         if not size[worst] <= dependence_floor(off.dtype):
@@ -92,6 +90,20 @@ def rows_at(
     return A
 
 
+def rows_near(
+    system: System,
+    sample: _params.Sample,
+    params: Any,
+    t: Float[Array, ""],
+    q: Float[Array, " n"],
+    v: Float[Array, " n"],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(residuals, A in units of equal inertia) at any state."""
+    with jax.ensure_compile_time_eval():
+        found = _rows_and_residuals((system, sample), params, None, t, q, v)
+        return np.asarray(found[0]), np.asarray(found[1])
+
+
 def _rank_beside(
     system: System, sample: _params.Sample, params: Any, t: Array, q: Array, v: Array
 ) -> int:
@@ -101,9 +113,7 @@ def _rank_beside(
     found = assemble(system, near, v, params, t=t, throw=False)
     if int(found.status) != int(Status.ok):
         return 0
-    with jax.ensure_compile_time_eval():
-        at = t, found.q, found.v
-        A = np.asarray(_rows_and_residuals((system, sample), params, None, *at)[1])
+    A = rows_near(system, sample, params, t, found.q, found.v)[1]
     return rank_of(unit_rows(A), dependence_floor(A.dtype))
 
 

@@ -15,7 +15,7 @@ from jaxlag._model._coordinates import Coordinates
 from jaxlag._model._forces import reads_lam
 from jaxlag._model._input_signals import Feedback
 from jaxlag._model._inputs import evaluate
-from jaxlag._model._states import state_names, with_states
+from jaxlag._model._states import named_states, state_names, with_states
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 
@@ -101,6 +101,33 @@ class Equations(NamedTuple):
         shapes = {name: jnp.shape(x) for name, x in self.opened.items()}
         return Coordinates(shapes, "linearize: inputs").labels if shapes else ()
 
+    @property
+    def places(self) -> dict[str, list[tuple[int, ...]]]:
+        """Names of the entries of z, and the places of every quantity of this name.
+
+        Those of arrays have all of their entries.
+        """
+        system, found = self.scene.system, {}
+        coordinates, end = system.coordinates, 0
+        velocities = {f"{name}'": places for name, places in coordinates.places.items()}
+        parts = [(coordinates.labels, coordinates.places)]
+        if system.quasi is None:
+            parts.append((tuple(f"{x}'" for x in coordinates.labels), velocities))
+        else:
+            parts.append((tuple(system.quasi.names[i] for i in system.quasi.free), {}))
+        if system.states is not None:
+            parts.append((system.states.layout.labels, system.states.layout.places))
+        if self.opened:
+            shapes = {name: jnp.shape(x) for name, x in self.opened.items()}
+            inputs = Coordinates(shapes, "linearize: inputs")
+            parts.append((inputs.labels, inputs.places))
+        for labels, names in parts:
+            every = {label: (i,) for i, label in enumerate(labels)} | dict(names)
+            for name, entries in every.items():
+                found.setdefault(name, []).append(tuple(end + i for i in entries))
+            end += len(labels)
+        return found
+
     def directions(self, basis: Float[Array, "s k"]) -> Float[Array, "m j"]:
         """Those of the states, then those of the inputs."""
         inputs = jnp.eye(self.z.shape[0] - self.size, dtype=basis.dtype)
@@ -120,6 +147,15 @@ class Equations(NamedTuple):
             v = system.quasi.velocities(t, q, system.quasi.full(w), params)
         values = evaluate({**self.feedback, **opened}, t, q, v, params)
         return Point(q, w, v, x, with_states(values, system.states, x))
+
+    def given(self, z: Float[Array, " m"]) -> dict[str, Array]:
+        """Values of the inputs that are varied and of the states of the system, by name."""
+        values, end = {}, self.size
+        for name, value in self.opened.items():
+            size = jnp.size(value)
+            values[name] = z[end : end + size].reshape(jnp.shape(value))
+            end += size
+        return values | named_states(self.scene.system.states, self.point(z).x)
 
     def rates(self, z: Float[Array, " m"]) -> tuple[Array, Array]:
         """(rates of (q, w, x), outputs)."""

@@ -11,6 +11,7 @@ from jaxlag._core._errors import invalid
 from jaxlag._linalg._mass_solve import dependence_floor
 from jaxlag._model._constraints import ConstraintRows
 from jaxlag._model._coordinates import Coordinates
+from jaxlag._model._quasi_velocities import QuasiVelocities
 from jaxlag._system._system import System
 
 
@@ -29,7 +30,13 @@ class MinimalStates(NamedTuple):
 
 
 def minimal_states(
-    system: System, rows: ConstraintRows, A: np.ndarray | None, independent: Any
+    system: System,
+    rows: ConstraintRows,
+    A: np.ndarray | None,
+    independent: Any,
+    function: str = "linearize",
+    first: Sequence[int] = (),
+    last: tuple[Sequence[int], Sequence[int]] = ((), ()),
 ) -> MinimalStates:
     """The independent coordinates and velocities, by pivoting or as they are named.
 
@@ -38,42 +45,67 @@ def minimal_states(
         rows: of its constraints.
         A: the rows in units of equal inertia; None if they are unknown.
         independent: names; None for pivoting.
+        function: the public function, for errors.
+        first: velocities that are taken as dependent ones before others.
+        last: coordinates, and velocities, that are taken as such only if others do not suffice.
 
     Raises:
         ValueError: names that are unknown, too few or too many, or do not determine the others;
             traced values that decide it.
     """
-    quasi, labels = system.quasi, system.coordinates.labels
+    argument, quasi = f"{function}: independent", system.quasi
+    labels = system.coordinates.labels
     rates = tuple(f"{label}'" for label in labels)
     if quasi is not None:
         rates = tuple(quasi.names[i] for i in quasi.free)
     n, k = len(labels), len(rates)
     named = None
     if independent is not None:
-        named = _named(system.coordinates, rates, independent, fixed=quasi is not None)
+        named = _named(argument, system.coordinates, rates, independent, quasi is not None)
+    if quasi is not None:
+        _check_satisfied(function, quasi, rows, n)
     holonomic = [i for i in range(rows.size) if rows.holonomic[i]]
     free = tuple(range(n)), tuple(range(k))
     if named is not None and not holonomic:
         named = named[0] or free[0], named[1]
     if not rows.size or (quasi is not None and not holonomic):
-        chosen = _all_of(free, named, (labels, rates))
+        chosen = _all_of(argument, free, named, (labels, rates))
     elif A is None:
         most = len(holonomic), rows.size if quasi is None else 0
-        chosen = _trusted(named, free, most, (labels, rates))
+        chosen = _trusted(argument, named, free, most, (labels, rates))
     else:
         A, floor = unit_rows(A), dependence_floor(A.dtype)
-        coordinates = _chosen("coordinates", A[holonomic], floor, labels, named and named[0])
+        own = named and named[0]
+        kind = argument, "coordinates"
+        coordinates = _chosen(kind, A[holonomic], floor, labels, own, last=last[0])
         if quasi is not None:
             speeds = None if named is None else (free[0], named[1] or free[1])
-            chosen = coordinates, _all_of(free, speeds, (labels, rates))[1]
+            chosen = coordinates, _all_of(argument, free, speeds, (labels, rates))[1]
         else:
             bound = [i for i in range(n) if i not in coordinates]
             of_rates = named[1] if named and named[1] else None
-            velocities = _chosen("velocities", A, floor, rates, of_rates, bound)
+            before = [*bound, *(i for i in first if i not in bound)]
+            after = [i for i in last[1] if i not in before]
+            kind = argument, "velocities"
+            velocities = _chosen(kind, A, floor, rates, of_rates, before, after)
             chosen = coordinates, velocities
     states = () if system.states is None else system.states.layout.labels
     names = (*(labels[i] for i in chosen[0]), *(rates[i] for i in chosen[1]), *states)
     return MinimalStates(*chosen, names)
+
+
+def _check_satisfied(function: str, quasi: QuasiVelocities, rows: ConstraintRows, n: int) -> None:
+    """Refuse quasi-velocities that leave rows to multipliers: they are not independent."""
+    left = [label for label in rows.labels if label not in quasi.constrained]
+    if quasi.kinematics is not None:
+        left = left if len(quasi.free) + rows.size > n else []
+    if left:
+        must = "have quasi-velocities that satisfy all rows"
+        fix = (
+            "Pass the names of quasi-velocities that are zero as constrained=, or declare the "
+            "system without quasi-velocities."
+        )
+        raise invalid(f"{function}: system", must, f"they leave {left}", fix)
 
 
 def entries(coordinates: Coordinates, names: Sequence[str], states: Sequence[str]) -> list[str]:
@@ -87,10 +119,9 @@ def entries(coordinates: Coordinates, names: Sequence[str], states: Sequence[str
 
 
 def _named(
-    coordinates: Coordinates, rates: tuple[str, ...], independent: Any, fixed: bool
+    argument: str, coordinates: Coordinates, rates: tuple[str, ...], independent: Any, fixed: bool
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Indices of the named coordinates and velocities."""
-    argument = "linearize: independent"
     of_q = {label: [i] for i, label in enumerate(coordinates.labels)} | coordinates.places
     of_w = {rate: [i] for i, rate in enumerate(rates)}
     if not fixed:
@@ -109,7 +140,7 @@ _Indices = tuple[tuple[int, ...], tuple[int, ...]]
 _Labels = tuple[Sequence[str], Sequence[str]]
 
 
-def _all_of(free: _Indices, named: _Indices | None, labels: _Labels) -> _Indices:
+def _all_of(argument: str, free: _Indices, named: _Indices | None, labels: _Labels) -> _Indices:
     """All coordinates and velocities, where no row determines any of them."""
     for kind, every, some, names in zip(
         ("coordinates", "velocities"), free, named or free, labels, strict=True
@@ -117,22 +148,22 @@ def _all_of(free: _Indices, named: _Indices | None, labels: _Labels) -> _Indices
         if some != every and (some or kind == "coordinates"):
             must = f"name all {kind}, as no row determines one of them"
             was = f"they were {[names[i] for i in some]}"
-            raise invalid("linearize: independent", must, was, "Leave it out; see drop=.")
+            raise invalid(argument, must, was, "Leave it out; see drop=.")
     return free
 
 
 def _trusted(
-    named: _Indices | None, free: _Indices, most: tuple[int, int], labels: _Labels
+    argument: str, named: _Indices | None, free: _Indices, most: tuple[int, int], labels: _Labels
 ) -> _Indices:
     """The named ones where values are traced; only their numbers are checked.
 
     Args:
+        argument: its name in errors.
         named: indices of q and w; None if there are no names.
         free: all of them.
         most: largest numbers that rows determine.
         labels: of q and w.
     """
-    argument = "linearize: independent"
     if named is not None and not most[1]:
         named = named[0], named[1] or free[1]
     if named is None or not named[1]:
@@ -151,19 +182,20 @@ def _trusted(
 
 
 def _chosen(
-    kind: str,
+    argument_and_kind: tuple[str, str],
     A: np.ndarray,
     floor: float,
     labels: Sequence[str],
     named: tuple[int, ...] | None,
     first: Sequence[int] = (),
+    last: Sequence[int] = (),
 ) -> tuple[int, ...]:
     """Independent columns of A: those named, or the others of the dependent ones."""
     every = range(A.shape[1])
     if named is None:
-        bound = dependent_columns(A, floor, first)
+        bound = dependent_columns(A, floor, first, last)
         return tuple(i for i in every if i not in bound)
-    rank, argument = rank_of(A, floor), "linearize: independent"
+    rank, (argument, kind) = rank_of(A, floor), argument_and_kind
     if len(named) != len(every) - rank:
         must = f"name {len(every) - rank} {kind}, as the rank of the rows is {rank}"
         was = f"they were {[labels[i] for i in named]}"

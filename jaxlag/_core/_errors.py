@@ -26,10 +26,11 @@ class SimulationError(RuntimeError):
 
 
 class EquilibriumError(RuntimeError):
-    """A search for a state of rest found none.
+    """A search for a state of rest, or for a steady motion, found none.
 
     Attributes:
-        equilibrium: the `Equilibrium` with the nearest point and its unbalanced forces.
+        equilibrium: the `Equilibrium` with the nearest point and its unbalanced forces, or the
+            `SteadyMotion` with the nearest state and what does not hold.
     """
 
     def __init__(self, message: str, equilibrium: object = None) -> None:

@@ -50,7 +50,7 @@ def newton(forces: Forces, q: Float[Array, " n"]) -> Newton:
 def _newton(F: Array, J: Array, noise: Array) -> Newton:
     c = units(J, F)
     floor = 4 * jnp.linalg.norm(c[:, None] * noise * c[None])
-    return Newton(F, J, c, *_decompose(c[:, None] * J * c[None], floor))
+    return Newton(F, J, c, *decomposed(c[:, None] * J * c[None], floor))
 
 
 def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -75,10 +75,10 @@ def units(J: Float[Array, "n n"], F: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.where(free, others / jnp.where(F != 0, jnp.abs(F), others), c)
 
 
-def _decompose(J: Array, floor: Any = 0.0) -> tuple[Array, Array, Array, Array]:
+def decomposed(J: Array, floor: Any = 0.0) -> tuple[Array, Array, Array, Array]:
     """(U, s, V, regular) with J = U diag(s) V^T; regular values exceed rounding and `floor`."""
-    left, sizes, right = jnp.linalg.svd(J)
-    rounding = 16 * J.shape[0] * float(jnp.finfo(J.dtype).eps) * sizes[0]
+    left, sizes, right = jnp.linalg.svd(J, full_matrices=False)
+    rounding = 16 * J.shape[0] * float(jnp.finfo(J.dtype).eps) * jnp.max(sizes, initial=0.0)
     return left, sizes, right.T, (sizes > rounding) & (sizes > floor)
 
 
@@ -114,7 +114,7 @@ class RelativeDamping(optx.AbstractDescent):
         J, r = f_info.jac.as_matrix(), f_info.residual
         norms = jnp.linalg.norm(J, axis=0)
         c = 1 / jnp.where(norms > 0, norms, 1)
-        left, sizes, right, regular = _decompose(J * c[None])
+        left, sizes, right, regular = decomposed(J * c[None])
         part, sizes = jnp.where(regular, left.T @ r, 0), jnp.where(regular, sizes, 1)
         length = jnp.linalg.norm(part / sizes)
         gain = jnp.linalg.norm(r) / jnp.where(length > 0, length, 1)
@@ -187,14 +187,18 @@ def _first_damping(forces: Forces, q0: Array, start: Newton) -> Array:
 
 
 def solve_tangent(linear: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The x of least norm with linear(x) = y, for `jax.lax.custom_root`; linear in y.
+    """The x of least norm with linear(x) = y, for `jax.lax.custom_root`; linear in y."""
+    return solve_regular(jax.jacfwd(linear)(y), y)
+
+
+def solve_regular(A: Float[Array, "n n"], y: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The x of least norm with A x = y; linear in y.
 
     Singular directions are projected out by matrices that are not differentiated.
     """
-    A = jax.jacfwd(linear)(y)
     fixed = jax.lax.stop_gradient(A)
     c = units(fixed, jnp.zeros_like(y))
-    left, _, right, regular = _decompose(c[:, None] * fixed * c[None])
+    left, _, right, regular = decomposed(c[:, None] * fixed * c[None])
     left, right = jnp.where(regular, 0, left), jnp.where(regular, 0, right)
     scaled = c[:, None] * A * c[None] + left @ right.T
     y = c * y

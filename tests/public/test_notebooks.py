@@ -8,10 +8,22 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LONG = {"bicycle_stability"}
+"""Those that take a minute to compile."""
+RUN = [
+    pytest.param(path, marks=[pytest.mark.full] * (path.stem in LONG), id=path.stem)
+    for path in NOTEBOOKS
+]
 
 
 def test_there_are_notebooks():
-    names = {"learned_lagrangian", "measured_pendulum", "neural_residual", "tricycle"}
+    names = {
+        "bicycle_stability",
+        "learned_lagrangian",
+        "measured_pendulum",
+        "neural_residual",
+        "tricycle",
+    }
     assert names <= {path.stem for path in NOTEBOOKS}
 
 
@@ -23,7 +35,7 @@ def test_notebook_is_stored_without_outputs(path):
             assert cell.execution_count is None
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", RUN)
 def test_notebook_runs(path):
     notebook = nbformat.read(path, as_version=4)
     resources = {"metadata": {"path": str(path.parent)}}
