@@ -72,7 +72,9 @@ def rows_at(
     """
     rows = system._rows(params, q.dtype)
     moving = concrete(v)
-    off, A = rows_near(system, sample, params, t, q, v if moving else jnp.zeros_like(q))
+    with jax.ensure_compile_time_eval():
+        v_known = v if moving else jnp.zeros_like(q)
+    off, A = rows_near(system, sample, params, t, q, v_known)
     for kind, size in zip(("phi", "A v + b") if moving else ("phi",), off, strict=False):
         worst = int(np.argmax(size))
         if not size[worst] <= dependence_floor(off.dtype):

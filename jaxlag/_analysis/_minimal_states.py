@@ -63,7 +63,7 @@ def minimal_states(
     if independent is not None:
         named = _named(argument, system.coordinates, rates, independent, quasi is not None)
     if quasi is not None:
-        _check_satisfied(function, quasi, rows, n)
+        _check_satisfied(function, quasi, rows, n, A)
     holonomic = [i for i in range(rows.size) if rows.holonomic[i]]
     free = tuple(range(n)), tuple(range(k))
     if named is not None and not holonomic:
@@ -94,18 +94,20 @@ def minimal_states(
     return MinimalStates(*chosen, names)
 
 
-def _check_satisfied(function: str, quasi: QuasiVelocities, rows: ConstraintRows, n: int) -> None:
+def _check_satisfied(
+    function: str, quasi: QuasiVelocities, rows: ConstraintRows, n: int, A: np.ndarray | None
+) -> None:
     """Refuse quasi-velocities that leave rows to multipliers: they are not independent."""
+    rank = rows.size if A is None else rank_of(unit_rows(A), dependence_floor(A.dtype))
     left = [label for label in rows.labels if label not in quasi.constrained]
-    if quasi.kinematics is not None:
-        left = left if len(quasi.free) + rows.size > n else []
-    if left:
+    if left and len(quasi.free) > n - rank:
         must = "have quasi-velocities that satisfy all rows"
         fix = (
             "Pass the names of quasi-velocities that are zero as constrained=, or declare the "
             "system without quasi-velocities."
         )
-        raise invalid(f"{function}: system", must, f"they leave {left}", fix)
+        was = f"{len(quasi.free)} are free beside {rank} independent rows, with {left}"
+        raise invalid(f"{function}: system", must, was, fix)
 
 
 def entries(coordinates: Coordinates, names: Sequence[str], states: Sequence[str]) -> list[str]:

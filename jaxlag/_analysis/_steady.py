@@ -178,7 +178,9 @@ def _states(
     rows, n = system._rows(params, q.dtype), system.size
     if not rows.size or not known:
         return minimal_states(system, rows, None, independent, "steady")
-    A = rows_near(system, sample, params, t, q, jnp.zeros_like(v))[1]
+    with jax.ensure_compile_time_eval():
+        rest = jnp.zeros_like(q)
+    A = rows_near(system, sample, params, t, q, rest)[1]
     last = [i for i in unknowns if i < n], [i - n for i in unknowns if n <= i < 2 * n]
 
     def chosen(first: Sequence[int]) -> MinimalStates:
