@@ -16,6 +16,7 @@ BENCHMARKS = (
     "gradient",
     "lowering",
     "mechanisms",
+    "analysis",
     "constraints",
     "stability",
     "accuracy",

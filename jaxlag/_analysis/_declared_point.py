@@ -19,6 +19,7 @@ from jaxlag._system._closure_tracers import check_params, lift_closure_tracers
 from jaxlag._system._inspection import check_declaration
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
+from jaxlag._tracing._compiled import Compiled
 from jaxlag._tracing._traced_function import warn_of_changes
 
 
@@ -83,7 +84,7 @@ def declared_point(
     params = lift_closure_tracers(system, params, q, signals)
     known = known and concrete(params)
     if known and system.quasi is not None:
-        _check_regular(function, system.quasi, t, q, params)
+        _check_regular(function, system, system.quasi, t, q, params)
     sample = _params.sample(_params.split(params)[0])
     return DeclaredPoint(system, sample, params, signals, t, q, v, known)
 
@@ -98,13 +99,21 @@ def _signals(function: str, inputs: Mapping[str, Any] | Sequence[str] | None) ->
     return check_inputs(inputs)
 
 
-def _check_regular(function: str, quasi: QuasiVelocities, t: Array, q: Array, params: Any) -> None:
+def _check_regular(
+    function: str, system: System, quasi: QuasiVelocities, t: Array, q: Array, params: Any
+) -> None:
     """Refuse a place where the quasi-velocities do not determine the velocities."""
     with jax.ensure_compile_time_eval():
-        sines = np.asarray(quasi.sines(t, q, params, q.dtype))
+        sines = np.asarray(_sines((system,), params, None, t, q))
     bad = [name for name, x in zip(quasi.names, sines, strict=True) if x <= least_sine(q.dtype)]
     if bad:
         must = "be a place where the quasi-velocities determine the velocities"
         was = f"{bad[0]!r} depended on the others"
         fix = "Choose other quasi-velocities, or another place."
         raise invalid(f"{function}: q", must, was, fix)
+
+
+@Compiled
+def _sines(system: System, params: Any, _: None, t: Array, q: Array) -> Float[Array, " k"]:
+    assert system.quasi is not None
+    return system.quasi.sines(t, q, params, q.dtype)

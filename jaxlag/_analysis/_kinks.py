@@ -85,7 +85,8 @@ def _may_bend(program: ClosedJaxpr, z: Array, directions: Array) -> bool:
     size = jnp.max(jnp.abs(directions) / (1.0 + jnp.abs(z))[:, None], axis=0)
     steps = [sign * eps**power * (directions / size).T for power in DISTANCES for sign in (1, -1)]
     places = z + jnp.concatenate([jnp.zeros((1, z.shape[0]), z.dtype), *steps])
-    found = jax.vmap(lambda z: outcomes(program, [z], [True], guards=True))(places)
+    of = jax.vmap(lambda z: outcomes(program, [z], [True], guards=True))
+    found = jax.jit(of)(places)  # compiled: one operation after the other takes seconds
     return found is not None and bool(jnp.any(found[1:] != found[:1]))
 
 
