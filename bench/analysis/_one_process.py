@@ -79,20 +79,17 @@ def of_jaxlag(scene: str) -> Calls:
 
     import jaxlag as jl
 
-    found = {}
+    found, state = {}, (jnp.asarray(q), jnp.asarray(v))
 
     def first() -> Any:
         linear = jl.linearize(system, q, v, params, independent=independent)
-        found["states"] = linear.states
+        names = linear.states
+        of = lambda q, v: jl.linearize(system, q, v, params, independent=names).A  # noqa: E731
+        found["program"] = jax.jit(of)
         return np.asarray(linear.A)
 
     def later() -> Any:
-        if "program" not in found:
-            names = found["states"]
-            of = lambda q, v: jl.linearize(system, q, v, params, independent=names).A  # noqa: E731
-            found["program"] = jax.jit(of)
-            found["program"](jnp.asarray(q), jnp.asarray(v)).block_until_ready()
-        return found["program"](jnp.asarray(q), jnp.asarray(v)).block_until_ready()
+        return found["program"](*state).block_until_ready()
 
     return first, later
 
