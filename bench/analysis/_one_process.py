@@ -79,7 +79,8 @@ def of_jaxlag(scene: str) -> Calls:
 
     import jaxlag as jl
 
-    found, state = {}, (jnp.asarray(q), jnp.asarray(v))
+    found: dict[str, Any] = {}
+    state = jnp.asarray(q), jnp.asarray(v)
 
     def first() -> Any:
         linear = jl.linearize(system, q, v, params, independent=independent)
