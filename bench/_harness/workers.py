@@ -23,6 +23,31 @@ from jaxlag._core import _xla
 ROOT = Path(__file__).parents[2]
 
 
+def fresh_process(
+    script: str | Path, *arguments: str, limit_s: float | None = None, **settings: str
+) -> subprocess.CompletedProcess[str]:
+    """A script that has run in its own process, without the settings of XLA and JAX of this one.
+
+    Args:
+        script: its path. As a module of a package it would import jax before timing starts.
+        *arguments: of its command line.
+        limit_s: bound on its time.
+        **settings: variables of its environment.
+
+    Raises:
+        TimeoutExpired: it took longer.
+    """
+    kept = {k: x for k, x in os.environ.items() if k != "XLA_FLAGS" and not k.startswith("JAX_")}
+    return subprocess.run(
+        [sys.executable, str(script), *arguments],
+        env={**kept, "PYTHONPATH": str(ROOT), **settings},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=limit_s,
+    )
+
+
 class Worker:
     """A process that has compiled the cases of a benchmark under `settings`.
 

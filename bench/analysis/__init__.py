@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from bench._harness.timing import Reference, Report, Target
-from bench._harness.workers import ROOT
+from bench._harness.workers import fresh_process
 from bench.analysis._scenes import BICYCLE, SCENES
 
 ONE_PROCESS = str(Path(__file__).with_name("_one_process.py"))
@@ -41,31 +41,18 @@ def _of(scene: str) -> list[dict[str, Any]]:
     answers = {side: _answer(side, scene) for side in SIDES if (side, scene) != ("sympy", BICYCLE)}
     A, rows = np.asarray(answers["jaxlag"]["A"]), []
     for side, answer in answers.items():
-        apart = np.nan
+        apart = None
         if answer:
-            apart = np.max(np.abs(np.asarray(answer["A"]) - A)) / np.max(np.abs(A))
-        figures = {key: answer.get(key, np.nan) for key in ("first_s", "later_us")}
-        rows.append({"scene": scene, "side": side, **figures, "apart": float(apart)})
+            apart = float(np.max(np.abs(np.asarray(answer["A"]) - A)) / np.max(np.abs(A)))
+        figures = {key: answer.get(key) for key in ("first_s", "later_us")}
+        rows.append({"scene": scene, "side": side, **figures, "apart": apart})
     return rows
 
 
 def _answer(side: str, scene: str) -> dict[str, Any]:
     """What the process prints; nothing if it fails or is too slow."""
-    environment = {
-        key: value
-        for key, value in os.environ.items()
-        if key != "XLA_FLAGS" and not key.startswith("JAX_")
-    }
-    environment["PYTHONPATH"] = str(ROOT)
     try:
-        done = subprocess.run(
-            [sys.executable, ONE_PROCESS, side, scene],
-            env=environment,
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST_S,
-        )
+        done = fresh_process(ONE_PROCESS, side, scene, limit_s=LONGEST_S)
     except subprocess.TimeoutExpired:
         if side != "sympy":
             raise
@@ -78,7 +65,7 @@ def _answer(side: str, scene: str) -> dict[str, Any]:
 def _by(rows: list[dict[str, Any]], side: str, key: str) -> dict[str, float]:
     """Figures of one side, by scene."""
     found = {row["scene"]: row[key] for row in rows if row["side"] == side}
-    return {scene: x for scene, x in found.items() if not np.isnan(x)}
+    return {scene: x for scene, x in found.items() if x is not None}
 
 
 def _targets(rows: list[dict[str, Any]]) -> list[Target]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from bench._harness.timing import Reference, Report, Target
-from bench._harness.workers import ROOT
+from bench._harness.workers import fresh_process
 from bench.first_result._one_process import CASES
 
 SMALL = ("simple pendulum", "double pendulum", "cart pendulum", "rotating body")
@@ -52,22 +52,10 @@ def run(quick: bool) -> Report:
 
 def first(side: str, scene: str, case: str, cache: str | None) -> dict[str, Any]:
     """The times and the result of one program, measured in its own process."""
-    environment = {
-        key: value
-        for key, value in os.environ.items()
-        if key != "XLA_FLAGS" and not key.startswith("JAX_")
-    }
-    environment["PYTHONPATH"] = str(ROOT)
-    if cache is not None:
-        environment |= {"JAX_COMPILATION_CACHE_DIR": cache, **CACHE}
-    done = subprocess.run(
-        [sys.executable, ONE_PROCESS, side, scene, case],
-        env=environment,
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
+    settings = {} if cache is None else {"JAX_COMPILATION_CACHE_DIR": cache, **CACHE}
+    done = fresh_process(ONE_PROCESS, side, scene, case, **settings)
+    if done.returncode:
+        raise RuntimeError(f"{case} of {scene!r} on {side} failed:\n{done.stderr}")
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from bench._harness.timing import Reference, Report, Target
-from bench._harness.workers import ROOT
+from bench._harness.workers import fresh_process
 from bench.mechanisms._scene import Scene
 from bench.mechanisms._scenes import SCENES
 
@@ -108,21 +108,8 @@ def _residuals(scene: Scene) -> list[Any]:
 
 def first(name: str, case: str) -> dict[str, Any]:
     """The figures of one program, measured in its own process."""
-    environment = {
-        key: value
-        for key, value in os.environ.items()
-        if key != "XLA_FLAGS" and not key.startswith("JAX_")
-    }
-    environment["PYTHONPATH"] = str(ROOT)
     try:
-        done = subprocess.run(
-            [sys.executable, ONE_PROCESS, name, case],
-            env=environment,
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT_S,
-        )
+        done = fresh_process(ONE_PROCESS, name, case, limit_s=LIMIT_S)
     except subprocess.TimeoutExpired:
         return {"first_s": LIMIT_S, "note": f"stopped after {LIMIT_S:g} s"}
     if done.returncode != 0:

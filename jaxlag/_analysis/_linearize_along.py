@@ -90,7 +90,8 @@ def linearize_along(
 
     They are not integrated from A(t) but are the derivatives of the solution at the accepted steps:
     exact for these steps. Eigenvalues of Phi after one period are the Floquet multipliers of a
-    periodic motion.
+    periodic motion. As inside of all transforms, "auto" does not continue a stiff motion by an
+    implicit method: name one.
 
     Derivatives with respect to params and the start are exact, in the modes of `jl.simulate`; see
     there for kinks of forces. Under `jax.jit`, `jax.grad` or `jax.vmap` of them give `independent`

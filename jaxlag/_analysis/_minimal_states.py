@@ -76,8 +76,8 @@ def minimal_states(
     else:
         A, floor = unit_rows(A), dependence_floor(A.dtype)
         own = named and named[0]
-        kind = argument, "coordinates"
-        coordinates = _chosen(kind, A[holonomic], floor, labels, own, last=last[0])
+        kind = "coordinates"
+        coordinates = _chosen(argument, kind, A[holonomic], floor, labels, own, last=last[0])
         if quasi is not None:
             speeds = None if named is None else (free[0], named[1] or free[1])
             chosen = coordinates, _all_of(argument, free, speeds, (labels, rates))[1]
@@ -86,8 +86,8 @@ def minimal_states(
             of_rates = named[1] if named and named[1] else None
             before = [*bound, *(i for i in first if i not in bound)]
             after = [i for i in last[1] if i not in before]
-            kind = argument, "velocities"
-            velocities = _chosen(kind, A, floor, rates, of_rates, before, after)
+            kind = "velocities"
+            velocities = _chosen(argument, kind, A, floor, rates, of_rates, before, after)
             chosen = coordinates, velocities
     states = () if system.states is None else system.states.layout.labels
     names = (*(labels[i] for i in chosen[0]), *(rates[i] for i in chosen[1]), *states)
@@ -184,7 +184,8 @@ def _trusted(
 
 
 def _chosen(
-    argument_and_kind: tuple[str, str],
+    argument: str,
+    kind: str,
     A: np.ndarray,
     floor: float,
     labels: Sequence[str],
@@ -197,7 +198,7 @@ def _chosen(
     if named is None:
         bound = dependent_columns(A, floor, first, last)
         return tuple(i for i in every if i not in bound)
-    rank, (argument, kind) = rank_of(A, floor), argument_and_kind
+    rank = rank_of(A, floor)
     if len(named) != len(every) - rank:
         must = f"name {len(every) - rank} {kind}, as the rank of the rows is {rank}"
         was = f"they were {[labels[i] for i in named]}"

@@ -42,16 +42,16 @@ class LeastSquares(NamedTuple):
     right: Float[Array, "k l"]
     regular: Bool[Array, " l"]
 
-    def solve(self, F: Float[Array, " e"]) -> Float[Array, " k"]:
-        """The x of least norm with J x nearest to F, in these units."""
-        part = self.left.T @ (F / self.r) / jnp.where(self.regular, self.sizes, 1)
-        return self.c * (self.right @ jnp.where(self.regular, part, 0))
-
     @property
     def inverse(self) -> Float[Array, "k e"]:
-        """The matrix of `solve`."""
-        part = self.left.T / self.r / jnp.where(self.regular, self.sizes, 1)[:, None]
-        return self.c[:, None] * (self.right @ jnp.where(self.regular[:, None], part, 0))
+        """The pseudo-inverse of J in these units."""
+        part = self.left.T / jnp.where(self.regular, self.sizes, 1)[:, None]
+        return self.c[:, None] * (self.right @ jnp.where(self.regular[:, None], part, 0)) / self.r
+
+    @property
+    def step(self) -> Float[Array, " k"]:
+        """The Newton step: the x of least norm with J x nearest to -F, in these units."""
+        return self.inverse @ -self.F
 
     @property
     def beside(self) -> Float[Array, " e"]:
@@ -116,7 +116,7 @@ def least_squares(
 
     def searched(z: Array, near: LeastSquares) -> tuple[Array, Array]:
         size = jnp.linalg.norm(near.F / near.r)
-        length = jnp.linalg.norm(near.solve(near.F) / near.c)
+        length = jnp.linalg.norm(near.step / near.c)
         size, length = (jnp.where((x > 0) & jnp.isfinite(x), x, 1) for x in (size, length))
         fill = jnp.zeros((max(0, m - near.F.shape[0]),), wide)
 
@@ -190,7 +190,7 @@ def assessed(
     sizes, eps = scale(jnp.abs(z) + jnp.abs(z - z0), F, J), float(jnp.finfo(z.dtype).eps)
     near = decomposed_at(F, jnp.where(free, J, 0), sizes)
     slack = rounding + 8 * sum(J.shape) * eps * sizes
-    step, reach = jnp.abs(near.solve(F)), jnp.abs(z) + jnp.abs(z - z0)
+    step, reach = jnp.abs(near.step), jnp.abs(z) + jnp.abs(z - z0)
     settled = jnp.all((step <= rtol * reach) | (step <= jnp.abs(near.inverse) @ slack))
     finite = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(J))
     left = jnp.linalg.norm(near.beside / near.r) <= jnp.linalg.norm(slack / near.r)

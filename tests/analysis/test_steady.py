@@ -145,6 +145,7 @@ def test_disk_on_a_circle(psi, free):
     assert all(motion[name] == given[name] for name in given.keys() - {free})
 
 
+@pytest.mark.full
 def test_named_velocities_that_cannot_be_constant():
     independent = ("x", "y", "psi", "theta", "phi", "x'", "psi'", "theta'")
     guess = [0.0, 0.0, 0.4, 0.4, 0.0], [3.0, 1.0, -2.0, 0.0, 7.0]
