@@ -9,9 +9,7 @@ singular), and the bicycle is too long for it.
 """
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 

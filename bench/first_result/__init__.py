@@ -8,9 +8,6 @@ has the shortest time of all rounds. Final states are compared with those of dif
 """
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path

@@ -13,7 +13,6 @@ A case over 90 s is stopped: its first_s is then a lower bound.
 """
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
