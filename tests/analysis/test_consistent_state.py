@@ -40,6 +40,7 @@ def loop(t, q, p):
 TURN = 2.0 * np.pi  # whose sine is rounding, not 0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("phi", "places"),
     [
@@ -57,6 +58,7 @@ def test_places_beside_which_more_rows_are_independent_are_refused(phi, places):
             jl.linearize(system, q, np.zeros(3))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_rows_that_are_rounding_everywhere_hold_nothing(angle):
     """sin^2 + cos^2 - 1 has a gradient of 1e-17 at some angles."""

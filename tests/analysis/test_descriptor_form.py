@@ -80,6 +80,7 @@ def minimal():
     return of
 
 
+@pytest.mark.full
 def test_finite_eigenvalues_are_those_in_minimal_coordinates(minimal):
     """A holonomic row: 7 variables and a multiplier, 5 finite eigenvalues."""
     form = jl.descriptor_form(hanging(), REST, [0.0] * 3, PARAMS, inputs=INPUTS)
@@ -92,6 +93,7 @@ def test_finite_eigenvalues_are_those_in_minimal_coordinates(minimal):
     np.testing.assert_allclose(order(found), order(expected), atol=5e-14)  # measured 5e-15
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("redundant", [False, True])
 def test_solutions_in_minimal_coordinates_satisfy_it(redundant, minimal):
     """E z' = A z + B u along x' = A x + B u, with multipliers as outputs; redundant rows, too."""
@@ -135,6 +137,7 @@ def edge_of(q):
     return np.array([-np.sin(q[2]), np.cos(q[2]), 0.0])
 
 
+@pytest.mark.full
 def test_derivatives_and_batches():
     """d/dm and d/dl of all entries: forward, reverse, differences."""
     system = hanging()

@@ -29,6 +29,7 @@ def of_participation(A):
     return jnp.sum(jnp.real(left_vectors(A, pairs).T * pairs.vectors) * WEIGHTS)
 
 
+@pytest.mark.full
 def test_pairs_satisfy_their_equations():
     pairs = eigenpairs(jnp.array(A))
     values, x = np.asarray(pairs.values), np.asarray(pairs.vectors)
@@ -57,6 +58,7 @@ def derivatives(function, at):
     return of(jnp.array(at))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("function", [of_values, of_vectors, of_participation])
 def test_derivatives_in_every_mode(function):
     """Forward, reverse, central differences; second derivatives in four orders."""
@@ -77,6 +79,7 @@ JORDAN = np.array([[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, -3, 1], [0, 0, -1, -3]])
 CRITICAL = np.array([[0.0, 1, 0], [-1, -2, 0], [0, 0, -5]])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("matrix", "simple"),
     [(DIAGONAL, [1, 0, 0, 1]), (JORDAN, [0, 0, 1, 1])],
@@ -98,6 +101,7 @@ def test_repeated_eigenvalues_leave_derivatives_of_simple_ones(matrix, simple):
     np.testing.assert_allclose([np.trace(x) for x in first], traces, rtol=20 * EPS)
 
 
+@pytest.mark.full
 def test_second_derivatives_of_repeated_eigenvalues_are_nan():
     assert not np.any(eigenpairs(jnp.array(CRITICAL)).simple[:2])
     values = lambda A: jnp.sum(jnp.real(eigenpairs(A).values)[:2] ** 2)  # noqa: E731
@@ -167,6 +171,7 @@ def test_sizes_do_not_overflow():
     assert np.all(eigenpairs(A).simple)
 
 
+@pytest.mark.full
 def test_batches_and_single_precision():
     batch = jnp.stack([jnp.array(A), jnp.array(A.T)])
     found = jax.vmap(eigenpairs)(batch)

@@ -90,6 +90,7 @@ def force(function):
     return {"forces": [jl.GeneralizedForce(function, "bump")]}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("kinds", "change", "named"),
     [
@@ -146,6 +147,7 @@ def test_a_kink_across_the_constraints_is_none():
     np.testing.assert_allclose(linear.A, [[0.0, 1.0], [-2.0, 0.0]])
 
 
+@pytest.mark.full
 def test_friction_by_a_multiplier_at_rest():
     """The force is 0 wherever the multiplier is."""
 
@@ -162,6 +164,7 @@ def test_friction_by_a_multiplier_at_rest():
     assert np.all(np.isfinite(jl.linearize(block, [0.0, 0.0], [1.0, 0.0]).A))
 
 
+@pytest.mark.full
 def test_rounding_of_the_solve_is_no_kink():
     """Links of unlike masses with quadratic drag at rest: M has a condition number of 1e7."""
     masses = np.array([1e-3, 1e-3, 1e-3, 1e3])

@@ -100,6 +100,7 @@ def moved(scene, states, at, t, x):
     return jl.assemble(scene.system, q, v, scene.params, t=t, hold=states)
 
 
+@pytest.mark.full
 def test_columns_are_differences_along_the_constraints(skate):
     """Central differences of accelerations and multipliers of assembled states."""
     at, linear = skate
@@ -166,6 +167,7 @@ def test_the_basis_is_tangent_to_the_constraints(skate):
     assert len(linear.states) == 2 * n - 1 - 2  # a rod and an edge; velocities also the rod
 
 
+@pytest.mark.full
 def test_quasi_velocities_and_rows_give_the_same_motion():
     """A sleigh straight ahead turns back by m a V / (I + m a^2) per s (its centre leads)."""
     found = []
@@ -195,6 +197,7 @@ HANGING = jl.System(
 )
 
 
+@pytest.mark.full
 def test_derivatives_with_respect_to_params_and_the_point():
     """A pendulum at the angle s: theta'' = -g sin(theta)/l, in x = l sin(theta)."""
     names = ("x", "x'")
@@ -247,6 +250,7 @@ def test_feedback_closes_the_loop_and_states_follow():
     np.testing.assert_allclose(linear.y0, [0.5])
 
 
+@pytest.mark.full
 def test_cyclic_coordinates_are_dropped_and_others_refused():
     scene = sleigh()
     free = jl.System(lambda t, q, v, p: 0.5 * v @ v - q[1] ** 2, {"x": (), "z": ()}, constraints=())
@@ -334,6 +338,7 @@ def test_states_in_single_precision_have_matrices_in_single_precision():
     np.testing.assert_allclose(linear.A, [[0.0, 1.0], [-G / 0.7, 0.0]], rtol=1e-6)
 
 
+@pytest.mark.full
 def test_forces_that_read_multipliers_in_quasi_velocities():
     """Friction on a floor, by its row alone and in u = 2 x'."""
 

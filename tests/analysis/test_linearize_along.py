@@ -90,6 +90,7 @@ def test_mathieu_characteristic_values_have_floquet_multipliers_of_one(order, mu
     assert abs(trace_after_period(a) - 2 * multiplier) <= 100 * TIGHT["rtol"]  # 5e-10 at worst
 
 
+@pytest.mark.full
 def test_derivative_of_a_floquet_trace():
     slope = jax.jit(jax.grad(trace_after_period))(0.9)
     forward = jax.jit(jax.jacfwd(trace_after_period))(0.9)
@@ -129,6 +130,7 @@ def pendulums():
     return moved, jl.linearize_along(ANGLE, [THETA], [SPEED], ts, **TIGHT)
 
 
+@pytest.mark.full
 def test_constrained_motion_in_two_sets_of_coordinates():
     """delta x = l cos(theta) delta theta, whose rate gives delta x'; T(t) Phi T(0)^-1."""
     moved, angle = pendulums()
@@ -231,6 +233,7 @@ def test_failed_motion_raises():
         jl.linearize_along(system, [3.0], [3.0], jnp.array([0.0, 5.0]))
 
 
+@pytest.mark.full
 def test_states_that_do_not_determine_the_others_later():
     """Of a full turn x does not determine y at the horizontal, which is saved exactly."""
     with pytest.raises(ValueError, match=r"along the whole motion, but x, x' did not at t = 0.5"):

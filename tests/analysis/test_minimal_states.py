@@ -62,6 +62,7 @@ def test_traced_constraints_need_names():
         jax.jit(lambda p: jl.linearize(ROD, *LOW[:2], p, independent=("x'",)).A)(0.7)
 
 
+@pytest.mark.full
 def test_traced_states_that_would_be_refused_give_nan():
     """Off the constraints, with too many states, and with some that do not determine the others."""
 

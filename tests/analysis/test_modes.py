@@ -126,6 +126,7 @@ def test_sensitivity_of_frequencies_to_the_length(pendulums):
         np.testing.assert_allclose(found, expected, rtol=100 * EPS)
 
 
+@pytest.mark.full
 def test_chain_of_masses():
     """omega_j = 2 sqrt(k / m) sin(j pi / (2 (n + 1))), shapes sin(i j pi / (n + 1))."""
 
@@ -167,6 +168,7 @@ def test_damped_and_gyroscopic_modes_are_complex():
     np.testing.assert_allclose(modes.mac(modes)[0], [1, 0, 0, 1], atol=50 * EPS)
 
 
+@pytest.mark.full
 def test_amplitudes_of_dropped_coordinates():
     """As without drop; x drifts in the rigid mode. Derivatives of the others stay finite."""
     system, params, at = cart(), {"m": 1.5, "c": 0.2}, jnp.zeros(2)
@@ -251,6 +253,7 @@ def test_dropped_coordinates_that_are_not_driven_do_not_drift():
     np.testing.assert_allclose(modes.shapes["y"], [1.0, 0.0, 1.0], atol=20 * EPS)
 
 
+@pytest.mark.full
 def test_participation_beside_repeated_eigenvalues():
     """The rigid mode is kept: derivatives in both modes."""
 
@@ -280,6 +283,7 @@ def test_modes_of_states_without_motion():
     assert str(modes).splitlines()[2].endswith("z 1")
 
 
+@pytest.mark.full
 def test_batches_are_root_loci():
     """One call for all points; every one as alone."""
     system, at = cart(), jnp.zeros(2)

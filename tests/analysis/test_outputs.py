@@ -14,6 +14,7 @@ ROD = jl.System(
 AT = [0.6, 0.48, -0.64], [0.0, 0.0, 0.0]
 
 
+@pytest.mark.full
 def test_labels_and_values():
     def height(t, q, v, p):
         return q[2]
@@ -30,6 +31,7 @@ def test_labels_and_values():
     assert found.outputs == ("r[1]'", "rod", "height", *(f"outputs[3][{i}]" for i in range(3)))
 
 
+@pytest.mark.full
 def test_quantities_of_constrained_quasi_velocities_are_multipliers():
     def along(t, q, v, p):
         return jnp.stack([v[0] + q[1] * v[1], v[1] - q[0] * v[0]])

@@ -55,6 +55,7 @@ def disk_eigenvalues(speeds, m, R, I_d, I_a, g):
     return np.stack([pair, -pair, 0 * pair, 0 * pair], axis=-1)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", FORMS)
 def test_eigenvalues_of_an_upright_rolling_disk(form):
     """A lean mode and two zeros: changes of speed, and steady rolling in large circles.
@@ -132,6 +133,7 @@ def top_eigenvalues(spins, m, g, l, I1, I3):  # noqa: E741
     return np.stack([nutation, precession, nutation.conj(), precession.conj()], axis=-1)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", ["cardan", "axis"])
 def test_eigenvalues_and_stability_limit_of_the_sleeping_top(form):
     """Fast and slow precession about the vertical; stable for (I3 w)^2 > 4 I1 m g l.

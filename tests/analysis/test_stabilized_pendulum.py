@@ -50,6 +50,7 @@ def test_matrices_of_the_upright_furuta_pendulum(upright):
     np.testing.assert_allclose(upright.B[:, 0], [0, 0, about / size, -both / size], rtol=8 * EPS)
 
 
+@pytest.mark.full
 def test_stabilized_furuta_pendulum(upright):
     """Feedback of a linear-quadratic regulator moves the nonlinear pendulum upright."""
     control = pytest.importorskip("control")

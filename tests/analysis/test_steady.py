@@ -49,6 +49,7 @@ def test_slow_and_fast_precession_of_a_top(guess, which):
     assert motion.equations == ("rate of phi'", "rate of theta'", "rate of psi'")
 
 
+@pytest.mark.full
 def test_first_and_second_derivatives():
     def rate(x):
         return precession(mgl=x[0], theta=x[1]).v[0]
@@ -67,6 +68,7 @@ def test_first_and_second_derivatives():
     np.testing.assert_allclose(second, np.stack(rows), rtol=1e-7)
 
 
+@pytest.mark.full
 def test_batch_and_failed_lanes():
     """Below a spin there is no precession at this angle; its derivative is NaN."""
 
@@ -131,6 +133,7 @@ def balance_of_disk(theta, turn, spin):
     return along + MASS * G * RADIUS * s
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("psi", [0.0, 0.7, 0.5 * np.pi])
 @pytest.mark.parametrize("free", ["phi'", "theta", "psi'"])
 def test_disk_on_a_circle(psi, free):
@@ -205,6 +208,7 @@ BEAD = jl.System(
 )
 
 
+@pytest.mark.full
 def test_dependent_coordinates_follow():
     """cos = g / w^2: from a guess off the ring, whose z follows."""
     found = jl.steady(BEAD, [0.6, -0.7, 0.0], [0.0, 0.0, 3.0], free=("phi'",))
@@ -212,6 +216,7 @@ def test_dependent_coordinates_follow():
     assert abs(found["phi'"] ** 2 * 0.8 - G) <= 20 * EPS * G
 
 
+@pytest.mark.full
 def test_quasi_velocities_are_constant():
     """A skate on a circle, in its speed along the edge and its rate of turn."""
 
@@ -290,6 +295,7 @@ def test_a_slow_part_beside_a_fast_one():
         jl.steady(both, [1.0, 0.0, 0.0], [0.0, 1e3, 1.0], free=("r",))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stiffness", [1e2, 1e8])
 def test_derivative_of_a_stiff_system(stiffness):
     def lagrangian(t, q, v, p):
@@ -301,6 +307,7 @@ def test_derivative_of_a_stiff_system(stiffness):
     assert np.max(np.abs(jax.jacfwd(of)(1.0) - exact)) <= 20 * EPS * stiffness
 
 
+@pytest.mark.full
 def test_single_precision():
     """Small units, and both modes of derivatives."""
     with jax.enable_x64(False):
@@ -332,6 +339,7 @@ def test_none_is_found():
         jl.steady(lost, [-1.0], [0.0], free=())
 
 
+@pytest.mark.full
 def test_bad_input():
     with pytest.raises(ValueError, match=r"steady: `free` must be names among \['x', \"x'\"\]"):
         jl.steady(CUBIC, [0.0], [1.0], free=("y",))

@@ -227,6 +227,7 @@ def test_workers_start_with_their_own_settings_only(monkeypatch):
     assert started[0]["JAXLAG_XLA_FLAGS"] == "0"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("field", [pendulum.by_hand, pendulum.naive])
 def test_compared_equations_equal_those_of_the_system(field):
     y = jnp.array([0.7, -1.1, 0.4, 1.3])

@@ -24,6 +24,7 @@ def recorded(position, energy=0.0, steps=1_000_000):
     return constraints.Record(np.linspace(0, steps, len(zero)), position, zero, energy + zero)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", mostly_full([*LINKAGES, *ROLLING], *ROLLING))
 def test_mechanisms_start_consistent(name):
     mechanism = (LINKAGES | ROLLING)[name]()

@@ -24,6 +24,7 @@ def expected(motion, y):
     return jnp.concatenate([v, jax.jvp(motion.turning, (q, v), (v, a))[1]])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", mostly_full(BEGINNINGS, "cart pendulum", "quadcopter", "rotating body", "5 bodies")
 )
@@ -74,6 +75,7 @@ def test_different_ends_stop_the_benchmark(monkeypatch):
         first_result.run(quick=True)
 
 
+@pytest.mark.full
 def test_process_reports_its_times():
     found = first_result.first("jaxlag", "simple pendulum", "2 rows", None)
     for part in ("derive_s", "lower_s", "compile_s"):  # they overlap

@@ -61,6 +61,7 @@ def test_smaller_systems_are_valid():
         check_traceable(other.system, params, jnp.float64, InputValues({}))
 
 
+@pytest.mark.full
 def test_wrong_program_is_detected_and_reported(monkeypatch):
     right = ScalarProgram.acceleration
 
@@ -204,6 +205,7 @@ CALLED = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("case", CALLED, ids=lambda case: case[0].__name__.strip("_"))
 def test_operations_equal_those_of_jax(case):
     f, *args = case

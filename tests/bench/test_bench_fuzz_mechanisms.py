@@ -49,6 +49,7 @@ IN_QUASI = mechanism(quasi=TURNED, **AT)
 # ---- Drawn systems -------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("module", [_random_mechanisms, _random_quasi, _random_bodies])
 def test_every_seed_draws_a_different_mechanism(module):
     drawn = [module.draw(seed) for seed in range(40)]
@@ -133,6 +134,7 @@ def test_derivatives_of_the_reference_agree_with_differences():
         np.testing.assert_allclose((one - other) / (2 * step), rate, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("changed", "outcome"),
     [
@@ -201,6 +203,7 @@ def found_in(*kinds):
     return [x.what for x in results]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_sound_programs_are_equal(dtype):
     for sound in (DOUBLED, BENT, IN_QUASI):
@@ -209,11 +212,13 @@ def test_sound_programs_are_equal(dtype):
         assert found.worst < 0.5
 
 
+@pytest.mark.full
 def test_multipliers_without_least_norm_are_detected(monkeypatch):
     monkeypatch.setattr(_array_terms, "shared", lambda A, lam, *_: lam)
     assert found_in(DOUBLED) == ["arrays: lam"]
 
 
+@pytest.mark.full
 def test_bias_of_the_other_sign_is_detected(monkeypatch):
     right = ArrayTerms.gamma
     monkeypatch.setattr(ArrayTerms, "gamma", lambda self, *args: -right(self, *args))
@@ -231,6 +236,7 @@ def test_refused_solution_is_detected(monkeypatch):
     assert found_in(DOUBLED) == ["arrays: a is no number"]
 
 
+@pytest.mark.full
 def test_void_row_that_counts_is_detected(monkeypatch):
     """Its rounding is solved with, or it has a multiplier."""
 
@@ -242,6 +248,7 @@ def test_void_row_that_counts_is_detected(monkeypatch):
     found_in(DOUBLED)
 
 
+@pytest.mark.full
 def test_wrong_scalars_are_detected(monkeypatch):
     right = ScalarProgram._run
     monkeypatch.setattr(
@@ -266,6 +273,7 @@ def test_wrong_scalars_of_rigid_bodies_are_detected(monkeypatch):
     assert "scalars" in found_in(bodies)[0]
 
 
+@pytest.mark.full
 def test_wrong_rates_of_quasi_velocities_are_detected(monkeypatch):
     """The part of v' at u' = 0 is omitted."""
 
@@ -334,6 +342,7 @@ def test_motions_are_compared_by_their_ends_and_statuses(monkeypatch):
     assert _mechanism_motions.compared(DOUBLED).kind == "differs"
 
 
+@pytest.mark.full
 def test_weight_of_a_row_of_rounding_may_overflow():
     """In float32, 1 over the square of its rounding: omitted rows are not multiplied by 0."""
     drawn = _random_mechanisms.draw(294)

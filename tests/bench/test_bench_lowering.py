@@ -36,6 +36,7 @@ def test_hand_written_equations_equal_those_of_the_scene(name):
     assert off(name, contenders) < lowering.AGREEMENT
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["pendulum", "cart_pole", "kepler", "top", "chain_3"])
 def test_equations_by_sympy_equal_those_of_the_scene(name, monkeypatch):
     pytest.importorskip("sympy")
@@ -74,6 +75,7 @@ def test_the_loop_of_evaluations_integrates():
     assert abs(v[0][()] + 20.0 * math.sin(phase)) < 2e-11
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", LIBRARIES)
 @pytest.mark.parametrize("n", [2, 5])
 def test_libraries_compute_the_accelerations_of_the_chain(name, n):

@@ -17,6 +17,7 @@ EPS = np.finfo(float).eps
 UP = np.array([0.0, 0.0, 1.0])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SCENES)
 def test_starts_are_consistent(name):
     scene = SCENES[name]()
@@ -112,6 +113,7 @@ def test_a_rope_keeps_its_length_and_swings():
 # ---- Peers ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["2 four-bars", "governor"])
 def test_equations_by_sympy_equal_those_by_hand(name, tmp_path):
     sympy = pytest.importorskip("sympy")

@@ -85,6 +85,7 @@ def test_derivatives_of_batches_equal_single_ones(derivative):
         np.testing.assert_allclose(own, mapped[i], rtol=0, atol=1e5 * EPS * scale)
 
 
+@pytest.mark.full
 def test_failed_lanes_do_not_affect_others():
     """Lanes that diverge, in a full chunk and in the padded last one, do not affect others."""
 
@@ -106,6 +107,7 @@ def test_failed_lanes_do_not_affect_others():
     np.testing.assert_allclose(motion.q[~failed], np.broadcast_to(alone.q, (31, 3, 2)), atol=1e-9)
 
 
+@pytest.mark.full
 def test_compiled_program_loops_over_chunks(lowering):
     """37 trajectories: a loop over 3 chunks of 16 lanes; on arrays one loop of 37."""
     program = operations(jax.vmap(lambda q0: run(q0).q), starts(37), iterations=1)

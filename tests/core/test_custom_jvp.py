@@ -65,6 +65,7 @@ def of_pairs(fs, pairs):
     return dict(zip(itertools.product(range(len(fs)), pairs), map(float, found), strict=True))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("loop", LOOPS)
 def test_rules_survive_loops(loop):
     """Rules of `CustomJVP`, and of `jax.custom_jvp` under `keeping_rules`."""
@@ -73,6 +74,7 @@ def test_rules_survive_loops(loop):
     assert not {pair: x for pair, x in found.items() if abs(x - wanted) > 1e-15}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("outer", LOOPS)
 def test_rules_survive_loops_within_loops(outer):
     inner = [LOOPS[outer](LOOPS[inner](sine)) for inner in LOOPS]
@@ -94,6 +96,7 @@ def _(primals, tangents):
     return z, quotient(dx - z * dy, y)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("loop", ["fori_loop", "jit", "checkpoint", "vmap"])
 @pytest.mark.parametrize("mode", ["grad", "jacrev"])
 def test_rules_may_call_functions_linear_in_tangents(mode, loop):
@@ -110,6 +113,7 @@ def test_rules_may_call_functions_linear_in_tangents(mode, loop):
         np.testing.assert_allclose(twice(pair, looped)(x), second, rtol=1e-13)
 
 
+@pytest.mark.full
 def test_float32_derivatives_in_loops_equal_float64():
     """Equations with a division, compared with double precision."""
     system = jl.System(
@@ -369,6 +373,7 @@ def check(function, loops, pairs, rtol):
         assert jnp.max(jnp.abs(x - wanted)) <= rtol * scale, (name, x, wanted)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", CHEAP)
 def test_second_derivatives_of_values_are_right_in_loops(name):
     check(CHEAP[name], ["map"], [("jvp", "grad"), ("grad", "grad")], 1e-10)
@@ -391,6 +396,7 @@ def check_motion(angle, rtol):
     np.testing.assert_allclose(found, wanted, rtol=rtol)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lowering", ["auto", "array"])
 def test_second_derivatives_of_motions_are_right_in_loops(lowering):
     check_motion(end(pendulum(users, lowering), method="bosh3", dt=0.25), 1e-13)

@@ -74,6 +74,7 @@ def test_unclosed_brackets_stay_unchanged(piece):
     assert shortened(piece * 10_000) == piece * 10_000
 
 
+@pytest.mark.full
 def test_messages_of_results_shorten_their_states():
     n = 12
     system = jl.System(lambda t, q, v, p: 0.5 * v @ v, {"x": n})

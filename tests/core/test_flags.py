@@ -96,6 +96,7 @@ def check(flag, job):
     assert np.all(np.isfinite(found))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("flag", "job"), [(f, job) for f, jobs in PLAIN.items() for job in jobs])
 def test_main_jobs_run_under_each_flag(flag, job):
     check(flag, job)

@@ -20,6 +20,7 @@ def smaller(x):
     return jnp.minimum(1.0 + x**2, 3.0 + x) * x
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lowering", ["scalar", "array"])
 @pytest.mark.parametrize("of", [larger, smaller])
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev, "jvp"])
@@ -81,6 +82,7 @@ def test_operands_with_axes_of_size_one_are_broadcast():
     np.testing.assert_allclose(each, jax.vmap(function)(x + jnp.arange(2.0)[:, None]), rtol=1e-14)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lanes", [2, 3])
 @pytest.mark.parametrize("axes", [(None, 0), (0, 0), (0, None), (1, 0)])
 @pytest.mark.parametrize("of", [jnp.maximum, jnp.minimum])

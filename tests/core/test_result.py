@@ -92,6 +92,7 @@ def test_traced_index_selects():
     np.testing.assert_array_equal(found, FOUR.x[2])
 
 
+@pytest.mark.full
 def test_motions_equilibria_and_assemblies_are_sequences():
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p * q[0] ** 2, ("x",))
     starts = jnp.arange(1.0, 4.0)[:, None]

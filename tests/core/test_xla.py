@@ -76,12 +76,14 @@ def test_solver_loop_is_one_native_function():
     assert "Warning" not in done.stderr
 
 
+@pytest.mark.full
 def test_loop_with_interpreted_code_is_one_native_function():
     """With XLA's emitters of fusions, which the tests switch off, a scatter would prevent that."""
     lines = child(code=INTERPRETED).stdout.splitlines()
     assert lines == ["entry loops left: 0", "functions chosen by a number: True"]
 
 
+@pytest.mark.full
 def test_existing_options_stay_set():
     done = child(
         XLA_FLAGS="--xla_backend_extra_options=xla_cpu_enable_concurrency_optimized_scheduler=false"
@@ -92,6 +94,7 @@ def test_existing_options_stay_set():
 OLD = pytest.mark.skipif(not _xla.needed(), reason="this jax raised the bound itself")
 
 
+@pytest.mark.full
 @OLD
 def test_switches_disable_the_setting():
     done = child(JAXLAG_XLA_FLAGS="0", JAXLAG_XLA_ATTRIBUTES="0")
@@ -100,6 +103,7 @@ def test_switches_disable_the_setting():
     assert "Warning" not in done.stderr
 
 
+@pytest.mark.full
 @OLD
 def test_compilation_before_import_warns_once():
     done = child(first="jax.jit(lambda x: x + 1)(1.0)", JAXLAG_XLA_ATTRIBUTES="0")

@@ -34,6 +34,7 @@ def test_descent_agrees_with_least_squares():
     assert down.cost < 1.02 * squares.cost
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("segments", [1, 5])
 def test_estimate_of_the_cost_is_unbiased(segments):
     """The mean over all parts of equal size is the cost of least squares, including gaps."""

@@ -26,6 +26,7 @@ RAYLEIGH = jl.Rayleigh(lambda t, q, v, p: 0.5 * p["c"] * v[0] ** 2, "friction")
 DRAG = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * v, "drag")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("force", "c0"), [(RAYLEIGH, -0.01), (DRAG, 0.1), (DRAG, 0.0)])
 def test_negative_friction_is_named(force, c0):
     found, texts = fitted(force, 0.05, c0)
@@ -36,12 +37,14 @@ def test_negative_friction_is_named(force, c0):
     assert f"adds energy: {force.name}" in str(found)
 
 
+@pytest.mark.full
 def test_positive_friction_and_driving_forces_are_not_named():
     assert fitted(RAYLEIGH, -0.05)[0].feeding == {}
     drive = jl.GeneralizedForce(lambda t, q, v, p: -p["c"] * (q**2 - 0.01) * v, "drive")
     assert fitted(drive, 0.05)[0].feeding == {}
 
 
+@pytest.mark.full
 def test_insignificant_friction_and_powerless_forces_are_not_named():
     """Zero within two standard deviations; normal to the velocity, with a power of rounding."""
     undamped, texts = fitted(DRAG, 0.0)

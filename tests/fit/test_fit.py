@@ -126,6 +126,7 @@ def test_driven_motion_is_fitted_by_its_rate_and_a_channel():
     within(found, ("l", "m"))
 
 
+@pytest.mark.full
 def test_unidentifiable_parameters_are_named():
     """L is m times a function of l and g/l: a free swing determines g/l and c/(m l^2)."""
     found = fit(experiment(), ("m", "l", "g"), TRUE | {"c": 0.05})
@@ -167,12 +168,14 @@ def test_search_stopped_by_errors_of_the_solver_gives_a_warning():
         assert abs(found.params[name] - true[name]) < 3.5 * found.std[name]
 
 
+@pytest.mark.full
 def test_motions_are_counted():
     data = experiment(sigma={"x": NOISE})
     found = fit(data.windows(1.0))
     assert found.solves == 3 * found.iterations
 
 
+@pytest.mark.full
 def test_known_start_is_fixed_and_uncertain_one_is_weighted():
     exact = fit(experiment(q0=[1.0], v0=[0.0], start_sigma=0.0))
     assert exact.starts[0].tolist() == [1.0, 0.0]

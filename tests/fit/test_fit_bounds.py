@@ -65,6 +65,7 @@ def test_bounded_least_squares_are_compiled_only_for_bounds(monkeypatch):
 BOUNDS = [jl.transforms.Bounded(0.1, 1.0), jl.transforms.Bounded(0.1, np.inf)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "bounds", [BOUNDS[0], pytest.param(BOUNDS[1], marks=pytest.mark.full)], ids=["both", "one"]
 )

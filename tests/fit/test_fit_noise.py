@@ -98,6 +98,7 @@ def test_starts_on_a_rod_take_two_degrees_of_freedom_each():
     np.testing.assert_allclose(found.noise["r"], 5e-3, rtol=0.25)
 
 
+@pytest.mark.full
 def test_degrees_of_freedom_account_for_priors():
     """A nearly exact prior leaves nothing to estimate."""
     data = experiment(sigma={"x": NOISE})
@@ -116,6 +117,7 @@ def test_estimate_of_the_noise_excludes_outliers(loss):
     assert abs(found.params["l"] - TRUE["l"]) < 4 * found.std["l"]
 
 
+@pytest.mark.full
 def test_intervals_of_few_measurements_follow_students_distribution():
     found = fit(experiment().part(slice(0, 150, 30)), ("l",))
     np.testing.assert_allclose(found.freedom, 2.0, atol=1e-6)

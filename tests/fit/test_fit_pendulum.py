@@ -48,6 +48,7 @@ def test_accelerations_obey_the_equation_of_motion():
         np.testing.assert_allclose(driven, [(torque + u + 0.05) / 0.2], rtol=1e-13)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("truth", "torque"), [(FREE, False), (DRIVEN, True)])
 def test_regression_gives_an_initial_guess(truth, torque):
     # Only q'' has noise. Measured: within 0.5 %; J and u0 within 4 % and 0.05 N m.

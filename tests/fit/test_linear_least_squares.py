@@ -53,6 +53,7 @@ def close(found, matrix, right):
     np.testing.assert_allclose(found, expected, rtol=0, atol=bound)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("weights", [None, np.array([1.0, 0.3, 0.1])], ids=["alike", "weighed"])
 @pytest.mark.parametrize("chained", [False, True])
 def test_solution_equals_that_of_the_dense_problem(chained, weights):

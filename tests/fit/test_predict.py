@@ -12,6 +12,7 @@ def predict(data, params=TRUE, **options):
     return jl.predict(pendulum, data, params, **(OPTIONS | options))
 
 
+@pytest.mark.full
 def test_the_truth_predicts_to_the_noise_and_wrong_params_do_not():
     """Starts are fitted to the first half second of two recordings of unequal length."""
     short = jl.Experiment(TS[:100], {"x": angles(TS[:100], seed=1)}, name="short")
@@ -57,6 +58,7 @@ def test_predictions_of_a_fit_equal_those_of_its_params():
     assert own.rms("x")[0] < 1.5 * NOISE
 
 
+@pytest.mark.full
 def test_search_that_does_not_converge_gives_a_warning():
     with pytest.warns(
         UserWarning, match=r"search for initial states did not converge in 1 iterations: raise"
@@ -80,6 +82,7 @@ def test_failed_motion_gives_a_warning():
     assert 0.8 * NOISE < found.rms("x")[0] < 1.2 * NOISE
 
 
+@pytest.mark.full
 def test_figures_show_measurements_and_motions(tmp_path):
     many = [experiment(name=f"run {k}") for k in range(6)]
     found = predict(many, settle=0.5)

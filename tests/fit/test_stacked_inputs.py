@@ -118,12 +118,14 @@ def recorded(signal):
     return jl.Experiment(TS, {"x": motion["x"]}, inputs=inputs, sigma={"x": 1e-3}, **start)
 
 
+@pytest.mark.full
 def test_experiments_with_separate_functions_are_fitted():
     records = [recorded(x) for x in (*JUMPS, jl.TimeFunction(ramp))]
     found = jl.fit(SYSTEM, records, {"m": 1.0}, free=("m",))
     np.testing.assert_allclose(found.params["m"], 2.0, rtol=1e-8)
 
 
+@pytest.mark.full
 def test_predictions_and_descents_accept_feedback():
     records = [recorded(x) for x in (jl.Feedback(held_back), jl.TimeFunction(jnp.sin))]
     np.testing.assert_allclose(jl.predict(SYSTEM, records, {"m": 2.0}).rms("x"), 0.0, atol=1e-8)

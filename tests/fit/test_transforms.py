@@ -23,6 +23,7 @@ CASES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
 def test_start_inverts_the_transform(name):
     transform, value = CASES[name]

@@ -43,6 +43,7 @@ def test_a_motion_at_rest_has_the_derivatives_of_its_linear_equations(form):
     assert list(counts) == [count, end(moving)[1]]
 
 
+@pytest.mark.full
 def test_pendulum_at_rest_beside_a_steady_motion_has_derivatives():
     """Error estimates of a uniform motion vanish, too."""
     system = jl.System(lambda t, q, v, p: 0.5 * (v @ v) + 9.0 * jnp.cos(q[1]), ("x", "a"))

@@ -210,6 +210,7 @@ def test_lanes_that_reach_saves_in_different_iterations_have_gradients(mode):
         np.testing.assert_allclose(batch[1][j][3].sum(), (up - down) / (2 * h), rtol=1e-6)
 
 
+@pytest.mark.full
 def test_gradients_are_traced_once():
     """New values of start, params and tolerance trace nothing again."""
     count = []
@@ -266,6 +267,7 @@ def test_fixed_steps_bound_the_record(ts, dt, knots, most):
     assert most_steps(50, np.array(ts), dt, knots) == 50
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("options", [{}, {"gradient_memory": 5000}])
 def test_a_bounded_record_changes_no_digit(options):
     """The steps end at a knot and at a save time, and the last one is shorter."""
@@ -337,6 +339,7 @@ def test_memory_counts_the_terms_of_work():
         solve(gradient_memory=400_000, save=("work",))
 
 
+@pytest.mark.full
 def test_an_integer_has_no_derivative():
     """JAX refuses it; an integer in params is not differentiated."""
     spring = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - p["k"] * q[0] ** p["n"], ("x",))

@@ -114,6 +114,7 @@ def recorded(motion: Motion, x):
     return jax.jit(lambda x: on_grid(outcome, x))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", NAMES)
 def test_derivative_equals_that_of_the_recorded_grid(derivatives, name):
     """Central differences of the steps, repeated on the grid recorded at x."""
@@ -209,6 +210,7 @@ def test_saves_have_derivatives_by_their_own_time():
     np.testing.assert_allclose(by_knot, -5 * 0.5 / 6, rtol=1e-12)  # x = 5 t^3 / (6 knot)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", mostly_full(("recorded", "checkpoints", "forward"), "recorded"))
 def test_derivative_by_the_start_time_under_a_table_is_exact(mode):
     """x'' = 1 + 2 t from rest at t0: dx(t1)/dt0 = -(1 + 2 t0) (t1 - t0).
@@ -234,6 +236,7 @@ def test_derivative_by_end_given_in_a_list():
     np.testing.assert_allclose(slope, 2.0, rtol=1e-14)
 
 
+@pytest.mark.full
 def test_derivative_by_switching_time():
     """d theta(t1) / d t_switch = (Q_before - Q_after) / J (t1 - t_switch) for a free rotor."""
     rotor = jl.System(
@@ -267,6 +270,7 @@ def test_forward_equals_reverse_for_every_kind_of_solver(method, dt):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.full
 def test_hessian_of_a_short_program_is_right():
     """All orders of the two modes, against differences of the gradient; sines are polynomials."""
     pendulum = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 + p * jnp.cos(q[0]), ("x",))

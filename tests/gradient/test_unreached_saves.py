@@ -49,6 +49,7 @@ def found():
     return jax.tree.map(np.asarray, jax.jit(everything)(P))
 
 
+@pytest.mark.full
 def test_saves_that_are_not_reached_have_nan_derivatives(found):
     assert np.all(np.isnan(found["lost"])), found["lost"]
     assert np.isnan(found["second, forwards"])

@@ -122,6 +122,7 @@ def test_dependent_rows_are_accepted_for_a_limited_distance():
 # ---- Rows that are left out ----------------------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize(("n", "m"), mostly_full([(3, 2), (6, 4), (12, 9)], (6, 4)))
 def test_a_row_that_depends_on_those_before_it_is_left_out(formulation, n, m):

@@ -59,6 +59,7 @@ def exact(speed, ts):
     return jnp.sin(jl.simulate(PENDULUM, jnp.zeros(1), speed[None], ts, **tight).q[:, 0])
 
 
+@pytest.mark.full
 def test_flat_configurations_are_passed_at_every_tolerance():
     """Three revolutions, with saves along the whole motion, also near the change points."""
     ts = jnp.linspace(0.0, 4.0, 161)
@@ -95,6 +96,7 @@ def test_flat_configurations_in_float32_are_passed_or_reported():
         np.testing.assert_allclose(found.q[passed, :, 0], expected[passed], atol=5e-3)
 
 
+@pytest.mark.full
 def test_option_stop_ends_motions_before_change_points():
     """At every tolerance, with status rank_change; the last time is the change point within it."""
     run = jax.jit(jax.vmap(lambda s, e: moved(s, jnp.linspace(0, 2, 3), e, change_points="stop")))
@@ -161,6 +163,7 @@ def flat_at(speed):
     return np.pi / 4 * np.sum(w / rate(angle))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", mostly_full(["auto", "tsit5"], "auto"))
 def test_states_at_and_near_a_change_point_are_accurate(method):
     """Saved there, and at the end of a motion there, at every tolerance."""
@@ -208,6 +211,7 @@ def angles_of_a_parallelogram(speeds, starts, ts, rtol):
     return jax.vmap(both)(speeds, starts)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rtol", mostly_full([1e-6, 1e-9, 1e-11, 1e-12, 1e-13], 1e-12))
 def test_rounding_does_not_shorten_the_steps(rtol):
     """One coordinate and its velocity are only the rounding of the others."""
@@ -385,6 +389,7 @@ def motion_of_a_bead(curve, q0, v0):
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(TOLERANCES, UNITS)
 
 
+@pytest.mark.full
 def test_bead_passes_a_node_along_its_tangent():
     """A figure eight, a quarter of which is 1.311 long: twice through its node."""
     eight = lambda q: (q @ q) ** 2 - q[0] ** 2 + q[1] ** 2  # noqa: E731
@@ -411,6 +416,7 @@ CURVES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", mostly_full(list(CURVES), "cusp"))
 def test_bead_stops_at_cusps_and_contact_points(name):
     """At a cusp, and where two curves touch: at every tolerance, shortly before the point."""

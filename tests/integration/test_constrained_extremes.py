@@ -28,6 +28,7 @@ def diverging(t, q, params):
     return jnp.stack([q[0], q[0] + q[1] ** 3])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "stabilization", mostly_full(["projection", None, jl.Baumgarte(5.0, 5.0)], "projection")
 )
@@ -46,6 +47,7 @@ def test_rows_that_become_inconsistent_are_reported(stabilization):
     assert motion.last_time < 0.05
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("gap", mostly_full([1e-6, 1e-9, 1e-11, 1e-13], 1e-9, 1e-13))
 def test_small_contradictions_are_reported(gap):
     """Two lengths of one rod; differences below rounding do not count."""
@@ -157,6 +159,7 @@ def almost(t, q, angle):
     return jnp.stack([q[0], q[0] * jnp.cos(angle) + q[1] * jnp.sin(angle)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("angle", [1e-2, 2e-4, 5e-5])
 def test_reactions_of_almost_dependent_rows_are_accurate(angle):
     """Both rows hold x and y; sin(angle)^2 gives the lost digits."""
@@ -180,6 +183,7 @@ def polar(t, q, v, params):
     return 0.5 * params * (v[0] ** 2 + (q[0] * v[1]) ** 2) - 0.5 * q[0] ** 2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("traced", mostly_full([False, True], False))
 def test_start_with_singular_inertia_is_solved(traced):
     """A slot through the center of polar coordinates: r = sin(t)."""
@@ -193,6 +197,7 @@ def test_start_with_singular_inertia_is_solved(traced):
     np.testing.assert_allclose(found, sin(1.0), atol=1e-10)
 
 
+@pytest.mark.full
 def test_traced_start_with_singular_inertia_is_solved():
     """A slot that rotates at rate 2: r = cosh(2 t) r0 + sinh(2 t)/2, also from the center."""
     rotation = jl.Pfaffian(lambda t, q, v, params: v[1] - 2.0, "turn")
@@ -237,6 +242,7 @@ def test_rows_without_inertia_have_an_effective_mass(formulation):
     np.testing.assert_allclose(masses, [0.2, 1.0], rtol=1e-14)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("formulation", "lowering"),
     [
@@ -282,6 +288,7 @@ def test_complete_state_may_be_held():
 PARALLELOGRAM = FOUR_BAR | {"a": 0.5, "b": 1.0, "c": 0.5, "d": 1.0}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("crank", [0.0, np.pi])
 def test_rows_of_rounding_do_not_count(crank):
     """Only y of the pin holds; no forces along x are computed from a row of 1e-16."""
@@ -310,6 +317,7 @@ def once_more(t, q, v, params):
     return jnp.stack([(1.5 + jnp.sin(q[0])) * row, row])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_rounding_of_one_row_does_not_contradict_another(dtype):
     """The factor's rate times the rounding of the row: the row itself requires 0."""
@@ -329,6 +337,7 @@ def test_rounding_of_one_row_does_not_contradict_another(dtype):
 # ---- Starts that cannot be solved ----------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_a_row_that_vanishes_at_the_start_is_named():
     """The user's state is returned; it is finite."""
     system = jl.System(
@@ -340,6 +349,7 @@ def test_a_row_that_vanishes_at_the_start_is_named():
     np.testing.assert_array_equal(motion.last_state[0], [0.0, 1.0])
 
 
+@pytest.mark.full
 def test_residual_that_is_not_finite_is_reported_as_nonfinite():
     system = jl.System(
         free, ("x", "y"), constraints=(jl.Holonomic(lambda t, q, p: jnp.log(q[0]), "log"),)
@@ -348,6 +358,7 @@ def test_residual_that_is_not_finite_is_reported_as_nonfinite():
     assert motion.status == jl.Status.nonfinite
 
 
+@pytest.mark.full
 def test_lane_without_a_start_does_not_affect_derivatives():
     """Neither a NaN lane nor one off the constraint affects derivatives by shared params."""
     system = jl.System(pendulum, ("x", "y"), constraints=(jl.Holonomic(rod, "rod"),))

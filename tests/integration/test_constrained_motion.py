@@ -96,6 +96,7 @@ def test_constraints_hold_at_every_save(motion, formulation):
     assert largest_residuals(motion(formulation)) <= 1e-13
 
 
+@pytest.mark.full
 def test_constraints_hold_only_with_projection():
     """To rounding with projection; without it the drift is visible."""
     system, q0, v0, params = double_pendulum()
@@ -231,6 +232,7 @@ def test_contradictory_rows_are_named(rows, row):
 # ---- Starts --------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_inconsistent_starts_are_refused_or_assembled():
     """Refused by name, or moved to the nearest consistent state."""
     system, q0, v0, params = double_pendulum()

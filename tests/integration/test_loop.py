@@ -30,6 +30,7 @@ def error(motion, reference):
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "order", "h"), [("midpoint", 2, 2e-3), ("bosh3", 3, 1e-2), ("tsit5", 5, 5e-2)]
 )
@@ -254,6 +255,7 @@ def test_float32_state_has_float64_time(reference):
     np.testing.assert_allclose(motion.q, reference.q, rtol=0, atol=3e-4)
 
 
+@pytest.mark.full
 def test_motion_far_from_time_zero_is_accurate(reference):
     """t0 = 1e6: times have a resolution of 1e-10 s; saves lose no more than that."""
     motion = run(1e6 + np.asarray(reference.ts), rtol=1e-9, atol=1e-9)
@@ -281,6 +283,7 @@ def test_derivatives_of_multistep_methods_are_right():
         np.testing.assert_allclose(slope, expected, rtol=1e-8)
 
 
+@pytest.mark.full
 def test_driven_system_matches_scipy():
     """Another integrator and derivation: explicit theta'', restarts at knots."""
     from scipy.integrate import solve_ivp

@@ -46,6 +46,7 @@ OPTIONS = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("options", OPTIONS)
@@ -96,6 +97,7 @@ def test_failure_of_a_controller_is_reported():
     assert np.isnan(motion.q[-1, 0])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize(
     "options",
@@ -169,6 +171,7 @@ def test_saves_far_from_time_zero_stay_distinct(options):
     np.testing.assert_array_equal(motion.last_time, ts[-1])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "options",
     [{"gradient": "checkpoints", "max_steps": 256}, {"max_steps": 1024}],
@@ -203,6 +206,7 @@ def test_adjacent_knots_and_saves_far_from_the_start_are_distinct():
     np.testing.assert_allclose(motion.v[-1, 0], v + 0.5, rtol=8 * EPS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("options", [{}, {"dt": 0.1}], ids=["adaptive", "fixed"])
 @pytest.mark.parametrize("ts", [[-2.0, 0.6], [0.3, 0.1], [0.1, 0.7]])
 def test_no_time_beyond_the_last_is_evaluated(ts, options):
@@ -266,6 +270,7 @@ def test_motion_that_cannot_start_has_nan_saves():
     assert np.isnan(motion.q[1:]).all()
 
 
+@pytest.mark.full
 def test_steps_of_a_gradient_by_a_table_do_not_depend_on_its_size():
     """Its loops compute no array of the size of the table; they only write into one."""
     size = 777

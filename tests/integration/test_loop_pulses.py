@@ -27,6 +27,7 @@ def pulse(t):
     return jnp.where((t >= START) & (t < END), 1000.0, 0.0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["forwards", "backwards"])
 @pytest.mark.parametrize("options", [{}, {"dt": 0.4, "method": "tsit5"}], ids=["adaptive", "fixed"])
 def test_pulse_with_knots_is_resolved(options, time_direction):
@@ -38,6 +39,7 @@ def test_pulse_with_knots_is_resolved(options, time_direction):
     np.testing.assert_allclose(motion.q[-1, 0], distance, rtol=1e-12)
 
 
+@pytest.mark.full
 def test_derivatives_by_knots_of_a_pulse_are_exact():
     """d x/d start of a pulse of given length: minus its impulse, for any steps."""
 
@@ -55,6 +57,7 @@ def test_derivatives_by_knots_of_a_pulse_are_exact():
     np.testing.assert_allclose(slope, -1.0, rtol=1e-10)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     # At 1e-7, largest errors of solution and derivatives: 4.3e-8 and 1.1e-7. With f constant beyond
     # its knot, and time constant beyond its end, derivatives were wrong by 1e-4.
@@ -110,6 +113,7 @@ def test_save_at_a_singular_force_is_nan(derivatives):
     assert motion.status == jl.Status.step_below_resolution
 
 
+@pytest.mark.full
 def test_pulse_between_steps_is_resolved_by_bounded_steps():
     """Skipped without a warning; resolved by steps no longer than the pulse."""
     wide = jl.TimeFunction(lambda t: jnp.where((t >= 3.0) & (t < 3.2), 5.0, 0.0))

@@ -17,6 +17,7 @@ EPS = np.finfo(float).eps
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 
+@pytest.mark.full
 def test_gamma_of_body_rates_is_the_cross_product():
     """B^T Gamma = [w]x at all angles: I w' + w x I w = 0; no small-angle approximation."""
     system = angles()
@@ -52,6 +53,7 @@ def tumbling(**options):
     )
 
 
+@pytest.mark.full
 def test_the_norm_of_a_quaternion_has_no_reaction():
     """T in body rates does not change if q and q' are scaled: to the rounding of |I| |w|^2."""
     system, rng = tumbling(), np.random.default_rng(2)

@@ -33,6 +33,7 @@ def test_tall_kinematics_equal_constrained_square_ones():
     np.testing.assert_allclose(motions[1].lam["v_n"], m * (v * omega + a * slowing), atol=1e-10)
 
 
+@pytest.mark.full
 def test_motion_does_not_depend_on_the_heading():
     """Rotated by 90 degrees the motion is the same; a fixed pivot cos(theta) would be 0 there."""
     _, square = sleighs()
@@ -77,6 +78,7 @@ def along_x(t, q, u, params):
     return jnp.stack([u[0], 0.0 * u[0], u[1]])
 
 
+@pytest.mark.full
 def test_kinematics_that_violate_a_row_later_are_reported():
     """At theta = 0 the x axis is along the blade; as the sleigh rotates it no longer is."""
     astray = jl.QuasiVelocities(kinematics=along_x, names=("v", "omega"))
@@ -85,6 +87,7 @@ def test_kinematics_that_violate_a_row_later_are_reported():
         jl.simulate(system, [0.0, 0.0, 0.0], None, u0=[1.0, 0.4], ts=[0.0, 2.0])
 
 
+@pytest.mark.full
 def test_quasi_velocities_that_omit_a_freedom_are_reported():
     """Two equivalent rows leave two freedoms, one of which has no quasi-velocity."""
 

@@ -35,6 +35,7 @@ def test_equations_equal_those_of_lagrange(lagrangian, written_in):
         assert norm(a - right) <= 64 * EPS * kappa * (1.0 + norm(right))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "lagrangian", mostly_full([in_v, in_u, of_u], in_u), ids=["v", "same", "u"]
 )

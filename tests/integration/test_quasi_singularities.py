@@ -118,6 +118,7 @@ def test_motion_ends_just_before_a_singularity():
     assert np.all(np.isnan(saves[:2, 2]))
 
 
+@pytest.mark.full
 def test_auto_continues_with_multipliers_and_reports_it():
     """Also from u0 and with saved quasi-velocities; formulation="quasi" fails instead."""
     ts, steps = np.array([0.0, 1.0, 3.0]), {"method": "dopri5", "dt": 0.05}
@@ -308,6 +309,7 @@ def constant(t, q, v, params):
     return jnp.stack([2.0 * v[0] + params["k"] * v[1], v[1]]) + q[0]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("U", "lowering", "computed"),
     mostly_full(

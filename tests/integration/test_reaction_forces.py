@@ -75,6 +75,7 @@ def test_derivative_of_the_distance_by_friction_is_exact():
     np.testing.assert_allclose(jax.grad(height)(MU), expected, rtol=1e-12)
 
 
+@pytest.mark.full
 def test_motion_ends_when_sliding_ends():
     """Friction would go on pushing: beyond, it is another system."""
     motion = slid(MU, np.array([0.0, 2 * STOP]), throw=False)
@@ -169,6 +170,7 @@ def test_motion_ends_when_a_sledge_tips_over():
 # ---- No solution ---------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_painleve_paradox_has_no_reaction_solution():
     """A stick pushed ahead by its lower end: no solution for mu >= (1/3 + cos^2)/(sin cos)."""
     entry = falling_stick_friction.entry
@@ -229,6 +231,7 @@ CONTACTS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lowering", mostly_full(["scalar", "array"], "scalar"))
 @pytest.mark.parametrize("kind", mostly_full(list(CONTACTS), "both", "rate"))
 def test_contact_declared_twice_has_friction_once(kind, lowering):
@@ -277,6 +280,7 @@ def turned_drag(t, q, v, params, lam):
     return jnp.stack([-0.1 * jnp.sum(lam["c"]), 0.0 * q[1], 0.0 * q[2]])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("lowering", "psi"),
     mostly_full(
@@ -397,6 +401,7 @@ def test_forces_that_are_not_affine_use_the_array_program():
     assert "not affine in multipliers" in str(system.explain(MU))
 
 
+@pytest.mark.full
 def test_uncoupled_contacts_are_checked_separately():
     """Two uncoupled sticks, each without solution: the determinant of both is positive."""
     one = falling_stick_friction.entry.system

@@ -54,6 +54,7 @@ def test_singular_mass_gives_nan_accelerations(name, lowering):
     assert np.all(np.isnan(system.acceleration(q, v, params)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "method", "options", "lowering"),
     [

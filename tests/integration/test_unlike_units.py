@@ -83,6 +83,7 @@ def plainly(q, u):
     return b @ du + turning @ u
 
 
+@pytest.mark.full
 def test_kinematics_of_unlike_units_equal_those_of_equal_units():
     """u from v, and L written in u: every program gives the result in units of 1."""
     quasi = jl.QuasiVelocities(kinematics=crossed, names=("a", "b"))

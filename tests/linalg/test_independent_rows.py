@@ -27,6 +27,7 @@ def row_of(function):
     return lambda q: jax.jacrev(function)(q)[None]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.parametrize(
     ("function", "q", "nonzero"),
@@ -51,6 +52,7 @@ def test_rows_of_rounding_count_as_zero(function, q, nonzero, dtype):
         assert float(size[0]) > 0.1  # the rate at which it grows
 
 
+@pytest.mark.full
 def test_zero_rows_have_no_multiplier_and_no_derivative():
     """A row of 1e-16 parallel to the first row, and a zero row."""
     A = jnp.array([[1.0, 0.0], [1e-16, 0.0], [0.0, 0.0]])
@@ -133,6 +135,7 @@ def on_the_graph(A, units, active_rows, lam):
     return np.reshape(flat, (m, m)) @ lam
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", list(ROLLERS))
 def test_least_norm_on_the_graph_is_as_accurate(kind):
     eps = float(np.finfo(float).eps)
@@ -151,6 +154,7 @@ def test_least_norm_on_the_graph_is_as_accurate(kind):
         assert left.max() < 8 * eps
 
 
+@pytest.mark.full
 def test_derivatives_of_the_least_norm_agree_for_short_levers():
     """Along a family of constant rank: both modes and central differences."""
 

@@ -35,6 +35,7 @@ def dense(M, A, r, c):
     return z[:n], z[n:], np.linalg.cond(K)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("singular", [False, True])
 @pytest.mark.parametrize(("n", "m"), mostly_full(SIZES, *SIZES[::2]))
@@ -48,6 +49,7 @@ def test_solve_equals_the_dense_solve(n, m, singular, formulation):
     np.testing.assert_allclose(found[1], lam, atol=allowed)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_dependent_rows_are_left_out(formulation):
     """Copies, multiples and sums of rows change x and A^T lam only by rounding."""
@@ -73,6 +75,7 @@ def test_dependent_rows_are_left_out(formulation):
     np.testing.assert_allclose(shortest, expected, atol=allowed)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_derivatives_agree_with_differences(formulation):
     """Forward, reverse and central differences in all arguments, with one row left out."""

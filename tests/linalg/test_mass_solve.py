@@ -52,6 +52,7 @@ def test_all_ways_of_solving_are_tested():
     assert WAYS[0] <= UNROLL_UP_TO < WAYS[1] <= LOOP_UP_TO < WAYS[2] <= max(SIZES)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", SIZES)
 def test_solve_is_backward_stable(n):
     rng = np.random.default_rng(n)
@@ -176,6 +177,7 @@ def curve(rng, n):
     return M, rng.normal(size=(3, n)), rng.normal(size=n)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", WAYS)
 def test_derivatives_are_those_of_the_inverse(n):
     """x' = y(r' - M' x) and x'' = y(r'' - M'' x - 2 M' x') with y = M^-1, forward and reverse."""
@@ -209,6 +211,7 @@ def test_derivatives_are_those_of_the_inverse(n):
     np.testing.assert_allclose(second, [w @ expected2] * 4, rtol=0, atol=atol2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", WAYS)
 def test_second_derivatives_agree_with_differences(n):
     """Central differences of the first derivative, error h^2 + eps/h: 1e-10 at h = 1e-5."""

@@ -107,6 +107,7 @@ def test_derivative_without_sweeps_is_wrong(monkeypatch):
     assert np.abs(forward - slope).max() > 1e-3
 
 
+@pytest.mark.full
 def test_saved_states_are_projected():
     """Also saves inside a step."""
     system, q0, v0, params = double_pendulum()

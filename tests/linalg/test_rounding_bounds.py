@@ -51,6 +51,7 @@ def test_rounding_bound_has_the_size_of_the_terms(function, size, dtype):
         assert abs(float(value) - exact) < 4.0 * float(rounding)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_rows_that_are_rounding_everywhere_are_void(dtype):
     """Rows that vanish at one state only, and small or scaled rows, are not void."""
@@ -118,6 +119,7 @@ OPTIONS = (
 DECLARED = [(kind, alone) for kind in VOID for alone in (False, True)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("kind", "alone", "options", "dtype"),
     mostly_full(
@@ -141,6 +143,7 @@ def test_void_rows_change_nothing(kind, alone, options, dtype):
     assert lam["void"] == 0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("gap", mostly_full([1e-3, 1e-9], 1e-9))
 @pytest.mark.parametrize(
     ("kind", "alone"),
@@ -157,6 +160,7 @@ def test_contradictory_rows_are_reported(kind, alone, gap):
     assert "('void')" in found.message()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stabilization", mostly_full(["projection", None], "projection"))
 def test_rows_that_become_contradictory_are_reported(stabilization):
     late = jl.Holonomic(lambda t, q, p: identity(q) + jnp.maximum(t - 0.05, 0.0) ** 2, "late")
@@ -166,6 +170,7 @@ def test_rows_that_become_contradictory_are_reported(stabilization):
     assert 0.03 < found.last_time < 0.07
 
 
+@pytest.mark.full
 def test_closure_in_a_tilted_plane_has_one_void_row():
     """Assembly, equilibrium and a batch: the third row is 0 = 0."""
 
@@ -194,6 +199,7 @@ def test_closure_in_a_tilted_plane_has_one_void_row():
     np.testing.assert_allclose(energy[:, 1], energy[:, 0], atol=1e-6)
 
 
+@pytest.mark.full
 def test_canceling_terms_are_not_contradictory():
     """gamma is 2e3 (v_z^2 - v_y^2): its terms cancel to rounding."""
 

@@ -94,6 +94,7 @@ def test_block_solve_and_its_derivatives_are_those_of_the_whole_matrix():
     assert np.all(np.isnan(solve_blocks(negative, jnp.array(r))))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("singular", [False, True])
 def test_solution_is_that_of_the_whole_matrix(singular):
     M, A = chain(singular)
@@ -145,6 +146,7 @@ def test_a_dependent_row_is_left_out_or_gives_nan(crossing):
     np.testing.assert_allclose(x, z[: len(M)], atol=50 * EPS * condition * np.linalg.norm(z))
 
 
+@pytest.mark.full
 def test_derivatives_of_the_solution_are_those_of_the_whole_matrix():
     """In M, A, r and c at once."""
     M, A = chain()

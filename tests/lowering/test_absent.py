@@ -174,6 +174,7 @@ def test_systems_without_constraints_evaluate_no_rows(chosen, monkeypatch):
 # ---- Values of params ----------------------------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "special",
     [

@@ -119,6 +119,7 @@ def worst(written, program, params, n):
     return max(ratios), max(errors), max(apart)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     mostly_full([*HARD, *SCENES, *FREE], "bead", "quartic", "top", "double_pendulum_positions"),
@@ -186,6 +187,7 @@ def out_of_range(written, program, given):
     return float(np.max(np.where(np.isnan(off), np.inf, off)[compared], initial=0.0))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", mostly_full(SINGLE, "lennard_jones", "kepler", "top", "double_pendulum")
 )

@@ -55,6 +55,7 @@ def test_program_contains_equations_once_in_its_loop_and_once_before():
     assert copies("array", partial(motion_of, save=("a", "energy"))) == 3
 
 
+@pytest.mark.full
 def test_gradient_contains_equations_once_per_loop():
     """One copy for each loop, and two before the loops.
 

@@ -65,6 +65,7 @@ def lowered(system, limit=None):
     return array, program, program.lowered(STATE[0], PARAMS, {})
 
 
+@pytest.mark.full
 def test_projection_of_dalembert_is_that_of_arrays(monkeypatch):
     """v and u', where no other form exists. U depends on time and has an affine part."""
     monkeypatch.setattr(_derive_quasi, "_written", lambda *_: [])

@@ -39,6 +39,7 @@ def test_differences_of_coordinates_and_params_keep_their_digits(a):
     np.testing.assert_allclose(found, [-3.0 / 1.25], rtol=16 * EPS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("theta", [1.0, 1e-2, 1e-4, 1e-6])
 def test_squares_of_small_sines_keep_their_digits(theta):
     """A bead on r = R sin(theta)^2 that rotates about the axis, by its position: M ~ sin^6.
@@ -114,6 +115,7 @@ IN_SI_UNITS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", IN_SI_UNITS)
 def test_single_precision_suffices_for_si_units(name):
     """Accelerations and their Jacobian against double precision; products would overflow."""

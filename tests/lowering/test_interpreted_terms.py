@@ -104,6 +104,7 @@ CHAIN = {"m": 1.3, "l": 0.7}
 START = np.array([0.2, 0.5, -0.7 * np.cos(0.5)]), np.array([0.1, 0.3, 0.7 * 0.3 * np.sin(0.5)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_accelerations(mode, all_interpreted):
     """In the state as on arrays, in the mass against differences."""
@@ -125,6 +126,7 @@ def test_derivatives_of_accelerations(mode, all_interpreted):
     np.testing.assert_allclose(by_mass, (ahead - back) / (2 * h), rtol=0, atol=1e-8)
 
 
+@pytest.mark.full
 def test_multipliers_share_the_reaction_of_dependent_rows(all_interpreted):
     system, (q, v) = fresh(closed_chain()), map(jnp.asarray, START)
     array = ArrayTerms(system.lagrangian, (), system.constraints)
@@ -179,6 +181,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", mostly_full(list(OPTIONS), "plain", "assembled"))
 def test_motions_do_not_depend_on_it(name, monkeypatch):
     """Started off the constraints by 1e-3 where it is assembled."""
@@ -198,12 +201,14 @@ def test_motions_do_not_depend_on_it(name, monkeypatch):
     np.testing.assert_allclose(found.v, expected.v, rtol=0, atol=1e-8)
 
 
+@pytest.mark.full
 def test_an_inconsistent_start_is_named(all_interpreted):
     q, v = START
     with pytest.raises(jl.SimulationError, match="closure"):
         jl.simulate(fresh(closed_chain()), q + np.array([0.0, 0.0, 0.1]), v, [0.0, 1.0], CHAIN)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_gradients_through_the_start_and_assembly(mode, all_interpreted):
     """Of the state assembled from a guess, and of the motion from there, against differences."""

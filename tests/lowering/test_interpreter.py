@@ -54,6 +54,7 @@ def interpreted(code):
     return lambda x: function(*x)
 
 
+@pytest.mark.full
 def test_results_are_those_of_the_lines():
     body, x, by_jax = code()
     function = interpreted(body)
@@ -114,6 +115,7 @@ def test_rows_of_numbers_are_the_numbers():
     np.testing.assert_array_equal(function(*parts), interpreted(body)(x))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_are_those_of_the_lines(mode):
     body, x, by_jax = code()
@@ -154,6 +156,7 @@ def test_derivatives_of_divisions_stay_in_range(times, m, mode):
 PAIRS = [(a, b) for a in (jax.grad, jax.jacfwd) for b in (jax.grad, jax.jacfwd)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("outer", "inner"), PAIRS)
 def test_numbers_that_do_not_move_have_no_tangents(outer, inner):
     """q^2 + q sqrt(p) at p = 0, where the root has an infinite slope."""
@@ -207,6 +210,7 @@ def test_the_prelude_is_a_function_of_params():
     np.testing.assert_allclose(found, x[: len(program.carried)], rtol=4 * EPS)
 
 
+@pytest.mark.full
 def test_size_does_not_grow_with_the_code():
     """The same kinds of lines in chains of 3 and of 6 links."""
 
@@ -294,6 +298,7 @@ def in_steps(monkeypatch, system, interpreted_from):
     return accelerations
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("argument", [0, 1, (0, 1)])
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_columns_are_the_single_tangents(monkeypatch, mode, argument):
@@ -327,6 +332,7 @@ def test_columns_are_the_single_tangents(monkeypatch, mode, argument):
             np.testing.assert_allclose(columns, np.stack(singles, 1), rtol=0, atol=atol)
 
 
+@pytest.mark.full
 def test_second_derivatives_beside_columns(monkeypatch):
     function = in_steps(monkeypatch, chain(4), -1)
     q, params = jnp.array([0.3, -0.4, 0.9, 0.1]), {"m": jnp.array(1.2), "g": jnp.array(9.8)}
@@ -337,6 +343,7 @@ def test_second_derivatives_beside_columns(monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
 
 
+@pytest.mark.full
 def test_columns_of_long_code_are_not_compiled_line_by_line(monkeypatch):
     params = {"m": 1.2, "g": 9.8}
 
@@ -352,6 +359,7 @@ def test_columns_of_long_code_are_not_compiled_line_by_line(monkeypatch):
     assert products(6, 10**6) > 1.5 * products(4, 10**6) > 6 * products(4, -1)
 
 
+@pytest.mark.full
 def test_single_tangents_and_explicit_methods_use_compiled_derivatives(monkeypatch):
     """Code for Jacobians is made only where they are computed."""
 

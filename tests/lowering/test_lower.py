@@ -77,6 +77,7 @@ def test_small_inertias_and_domains_are_usual(mass):
     assert usually_definite(key, _params.UNKNOWN)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("massless", [False, True])
 def test_only_the_usual_program_is_written_out(massless):
     """The other one is a table for a loop; if masses vanish in every case, there is no other."""
@@ -102,6 +103,7 @@ def test_only_the_usual_program_is_written_out(massless):
     assert any("cond" in o.inside for o in either) is not massless
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("params", [PARAMS, WITHOUT], ids=["masses", "one without mass"])
 def test_both_programs_give_the_same_accelerations_and_derivatives(params):
     a = evaluation(chain(False))
@@ -179,6 +181,7 @@ def test_part_without_scalar_form_is_named_with_its_line(part):
     assert re.search(rf"array program \({reason}\)", system.explain({}))
 
 
+@pytest.mark.full
 def test_longest_parts_of_long_code_are_named():
     """Rows of 81 products, M = 1 and h = 0."""
 
@@ -196,6 +199,7 @@ def test_longest_parts_of_long_code_are_named():
     )
 
 
+@pytest.mark.full
 def test_a_long_force_is_the_longest_part():
     def push(t, q, v, p):
         return jnp.sum(jnp.sin(jnp.outer(q, v) + q[:, None, None]), axis=(0, 1))
@@ -205,6 +209,7 @@ def test_a_long_force_is_the_longest_part():
     assert re.search(r"array program \(\d+ operations.*: more than 1500; Q \d+\)", text)
 
 
+@pytest.mark.full
 def test_an_entry_that_rounding_leaves_on_one_side_is_eliminated():
     """B^T M B of columns that are orthogonal in M: 0 above the diagonal, 1e-17 below it."""
     m, B = np.array([0.9, 0.9, 1.0, 1.0]), np.eye(4)
@@ -224,6 +229,7 @@ def test_an_entry_that_rounding_leaves_on_one_side_is_eliminated():
     np.testing.assert_allclose(found, jl.simulate(plain, q, B @ u, ts).q[-1], atol=1e-9)
 
 
+@pytest.mark.full
 def test_rows_of_quasi_velocities_do_not_count_as_operations():
     """They satisfy the rows: no multipliers are eliminated."""
 

@@ -123,6 +123,7 @@ def values_of(roots, seed):
     return {node.data: rng.uniform(-1.5, 1.5) for node in order(roots) if node.op == "input"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SCENES)
 def test_equal_to_derivatives_of_the_momentum(name):
     scene = scene_of(name)
@@ -206,6 +207,7 @@ def test_no_polynomial_of_degree_two(L):
     assert principle_of_dalembert(scene, scene.lagrangian, Residues()) is None
 
 
+@pytest.mark.full
 def test_the_cheapest_form_is_chosen():
     """A body by a quaternion in a third of the 2087 operations of the others; a pendulum not."""
 
@@ -226,6 +228,7 @@ def test_the_cheapest_form_is_chosen():
     assert pendulum.equations.form != "d'Alembert's principle"
 
 
+@pytest.mark.full
 def test_inertia_is_used_from_one_side():
     """w.Iw with a traced I: the same operations as with known numbers."""
 

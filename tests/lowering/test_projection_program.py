@@ -63,6 +63,7 @@ CASES = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("rolling", "left_out", "crossing", "regular"),
     mostly_full(CASES, (True, True, True, True), (False, False, False, True)),
@@ -93,6 +94,7 @@ def test_corrections_are_those_of_the_array_program(
             np.testing.assert_allclose(one, other, rtol=0, atol=512 * EPS * np.max(np.abs(other)))
 
 
+@pytest.mark.full
 def test_lines_of_a_long_rope_grow_with_its_length(monkeypatch):
     """Columns are a full matrix: their lines grow with the cube of the length or faster."""
     monkeypatch.setattr(_projection_program, "LINES", 0)
@@ -125,6 +127,7 @@ def test_parts_of_expressions_are_computed_before():
     np.testing.assert_allclose(found, evaluate(roots, state), rtol=4 * EPS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "lines", mostly_full([0, 10**9, BETWEEN], BETWEEN), ids={0: "factors", 10**9: "columns"}.get
 )

@@ -64,6 +64,7 @@ def test_constraints_may_read_random_numbers_and_empty_maxima():
     np.testing.assert_allclose(a @ A, 0.0, atol=1e-15)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("formulation", ["multipliers", "null_space"])
 def test_programs_with_rows_exist_in_both_formulations(formulation):
     """An error of the lowering falls back to the array program, and only `explain` reports it."""

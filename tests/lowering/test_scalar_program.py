@@ -157,6 +157,7 @@ def test_canceled_terms_stay_canceled():
     assert np.isnan(array.acceleration([0.0], [0.0]))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
 def test_a_mass_matrix_that_is_not_positive_definite_gives_nan(n):
     """Singular, indefinite and negative matrices, with the wrong sign at any pivot."""
@@ -273,6 +274,7 @@ CEILINGS = {  # operations, sines and cosines, divisions
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"}))
 )
@@ -287,6 +289,7 @@ def test_operations_of_one_evaluation_stay_below_ceilings(name):
     assert {"custom", "dot_general", "cholesky"}.isdisjoint(names)
 
 
+@pytest.mark.full
 def test_structure_is_found():
     """Through rotation matrices and positions, for any values of params."""
 
@@ -345,6 +348,7 @@ def inertia_by_products(t, q, v, p):
     return 0.5 * v @ whole.T @ whole @ v
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("lagrangian", "n", "reason"),
     [
@@ -365,6 +369,7 @@ def test_long_derivations_fall_back_with_a_reason(lagrangian, n, reason):
     assert re.fullmatch(reason, found.reason)
 
 
+@pytest.mark.full
 def test_factors_of_products_are_shared():
     """Each product lacks one of 20 factors: 18 multiplications separately, 4 with sharing."""
     system = jl.System(sines_of_differences, ("a", "b", "c", "d", "e"))

@@ -72,6 +72,7 @@ QUASI = {  # the same in quasi-velocities: v and u', no rows; a constant or diag
 # ---- Ceilings ------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     mostly_full(CEILINGS, *(CEILINGS.keys() - {"aircraft", "chain_8"})),  # long to derive
@@ -86,6 +87,7 @@ def test_an_evaluation_stays_below_its_ceilings(name):
     assert max(len(shape) for o in program for shape in o.shapes) <= 1
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_an_evaluation_with_constraints_stays_below_its_ceilings(name):
     """Every row costs one division if M is known to be regular."""
@@ -120,6 +122,7 @@ def test_traced_params_use_the_shorter_program_for_definite_mass(definite):
     np.testing.assert_allclose(program.acceleration(state, either), expected, rtol=1e-12)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", mostly_full(QUASI, "chaplygin_sleigh", "nonholonomic_particle", "heavy_symmetric_top")
 )
@@ -145,6 +148,7 @@ def test_an_evaluation_in_quasi_velocities_stays_below_its_ceilings(name):
     assert count(program, *arithmetic) < count(with_multipliers, *arithmetic)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name", mostly_full(["chaplygin_sleigh", "rolling_disk"], "chaplygin_sleigh")
 )
@@ -245,6 +249,7 @@ def instructions(lines):
     return {m[1] for line in lines if (m := re.search(r"\s([a-z][a-z\-]*)\(", line))}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     mostly_full((*CEILINGS, *CONSTRAINED), "pendulum", "top", "cart_pendulum"),

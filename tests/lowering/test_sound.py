@@ -165,6 +165,7 @@ def by_array_program(system, q, v):
     return np.linalg.solve(M, -h)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SCALAR)
 def test_the_graph_agrees_with_jax(name):
     system = declared(name)
@@ -343,6 +344,7 @@ TIES = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", TIES)
 def test_ties_have_the_derivative_of_jax(name):
     """At exactly equal arguments: q = (1, 1)."""

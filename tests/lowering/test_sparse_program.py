@@ -126,6 +126,7 @@ def programs(system, params, regular):
     return terms, sparse, terms.precompute(q, params)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SCENES)
 def test_accelerations_are_those_of_whole_matrices(name):
     """Compared by their residuals: bodies have condition numbers of 1e5."""
@@ -141,6 +142,7 @@ def test_accelerations_are_those_of_whole_matrices(name):
         )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["rope with skates", "bodies"])
 def test_projectors_are_those_of_whole_matrices(name):
     """Corrections, effective masses and the sense of rows elsewhere."""
@@ -169,6 +171,7 @@ def test_projectors_are_those_of_whole_matrices(name):
     assert bool(senses[2]) == bool(others[2])
 
 
+@pytest.mark.full
 def test_no_array_is_as_large_as_a_whole_matrix():
     """Neither M, A nor A M^-1 A^T: the largest arrays hold a few numbers for each coordinate."""
     system = rope(200)
@@ -275,6 +278,7 @@ def test_a_rule_that_reaches_further_than_its_values_is_noticed():
     assert found.sparsity is None or found.sparsity.blocks.size > 1
 
 
+@pytest.mark.full
 def test_motion_is_that_of_the_scalar_program():
     system, (q0, v0), ts = rope(9), hanging(9), jnp.linspace(0.0, 0.4, 3)
     found = jl.simulate(system, q0, v0, ts, HANGING)
@@ -304,6 +308,7 @@ def test_a_motion_of_singular_blocks_keeps_its_energy_and_its_rows(fixed):
     assert max(float(jnp.max(jnp.abs(x))) for x in phi.values()) < 1e-12
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["rope", "rope with skates"])
 def test_reactions_are_those_of_whole_matrices(name):
     """Accelerations and reactions of a state, along the nonzeros."""
@@ -319,6 +324,7 @@ def test_reactions_are_those_of_whole_matrices(name):
     np.testing.assert_allclose(force, lam @ A, atol=allowed)
 
 
+@pytest.mark.full
 def test_reactions_of_dependent_rows_and_of_a_mass_of_zero():
     """Rows that are there twice share their multipliers; a row may replace inertia."""
     twice = jl.Holonomic(lambda t, q, p: jnp.sum(q.reshape(-1, 2)[0] ** 2) - p["l"] ** 2, "twice")
@@ -368,6 +374,7 @@ def midpoints(count):
     return jl.System(lagrangian, {"x": (count,)}, constraints=(row,), lowering="array")
 
 
+@pytest.mark.full
 def test_a_mass_of_zero_among_traced_params_is_named():
     """Known params: whole matrices, as M is positive definite on the constraints alone."""
     system, q, m = midpoints(21), 0.1 * jnp.arange(21.0), jnp.ones(21)

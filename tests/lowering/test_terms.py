@@ -340,6 +340,7 @@ def test_derivatives_with_a_constant_factor_are_right(derivative):
         assert np.any(b)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("n", [3, UNROLL_UP_TO + 1])
 def test_derivatives_of_one_acceleration_with_a_factor_are_right(n):
     """To third order, reverse and forward, batched, for both kinds of factor."""
@@ -400,6 +401,7 @@ def test_terms_without_constraints_have_no_rows(chosen):
     assert (A.shape, b.shape, system._terms.gamma(t, q, v, params).shape) == ((0, 2), (0,), (0,))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("chosen", ["scalar", "array"])
 def test_terms_equal_those_of_public_methods(chosen):
     entry = ENTRIES["cart_pendulum"]

@@ -47,6 +47,7 @@ def accelerations(reduced, lowering):
 PLAIN = {"max", "axis 0", "nested", "the same twice", "constants", "cummin", "scatter"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "name",
     [name if name in PLAIN else pytest.param(name, marks=pytest.mark.full) for name in REDUCED],
@@ -61,6 +62,7 @@ def test_derivatives_at_ties_equal_those_of_jax_to_second_order(name):
         np.testing.assert_allclose(found, right, rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["max", "cummax"])
 def test_reverse_derivatives_of_both_programs_agree_at_ties(name):
     reduced = REDUCED[name]
@@ -70,6 +72,7 @@ def test_reverse_derivatives_of_both_programs_agree_at_ties(name):
         np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("primitive", "whole"), [(largest_p, jnp.max), (smallest_p, jnp.min)])
 def test_primitive_equals_the_reduction(primitive, whole):
     """Under transforms, in a loop whose derivatives JAX splits, and with a partly batched input."""

@@ -114,6 +114,7 @@ def _wrong_rates(equations, part, graph):
     return equations._replace(**{part: _off(getattr(equations, part), graph)})
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("shape", "part"),
     [
@@ -173,6 +174,7 @@ def test_an_error_of_1e_9_in_a_residual_or_force_is_found(part, monkeypatch):
     assert found.reason.startswith("differs from")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("module", [rigid_aircraft, lamina_on_parabola], ids=["u", "constraint"])
 def test_traced_params_have_a_scalar_program(module):
     """Random params are not inertias of a body; under jit over params a scalar program is used."""
@@ -225,6 +227,7 @@ def test_constrained_states_of_indefinite_mass_are_not_compared():
     assert "scalar program" in system.explain({"I": 9.0, "m": 1.0, "a": 0.2})
 
 
+@pytest.mark.full
 def test_given_params_are_compared():
     """An inertia that random params would make indefinite."""
     declared, params, q0, _ = case("lamina_two_forces_fixed_direction")

@@ -8,7 +8,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-LONG = {"bicycle_stability"}
+LONG = {"bicycle_stability", "learned_lagrangian", "measured_pendulum", "neural_residual"}
 """Those that take a minute to compile."""
 RUN = [
     pytest.param(path, marks=[pytest.mark.full] * (path.stem in LONG), id=path.stem)

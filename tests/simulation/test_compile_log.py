@@ -49,6 +49,7 @@ def slowest(t, q, p):
     return jnp.linalg.eigvalsh(jnp.array([[q[0], q[1]], [q[1], 2.0]]))[0] - 1.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("declaration", "reason"),
     [

@@ -93,6 +93,7 @@ def test_jumps_are_found(name):
     assert leaves(system, PARAMS) == unknown(system, PARAMS) == {"params['b']"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", KINKED)
 def test_kinks_are_not_reported_as_jumps(name):
     system = pushed(KINKED[name])
@@ -192,6 +193,7 @@ MESSAGE = (
 )
 
 
+@pytest.mark.full
 def test_derivatives_by_a_jump_time_give_a_warning():
     with pytest.warns(UserWarning, match=MESSAGE + r".* Make that time a knot: .*ZeroOrderHold"):
         jax.grad(jax.jit(last))(1.0)
@@ -226,6 +228,7 @@ DRIVEN = jl.System(
 )
 
 
+@pytest.mark.full
 def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     """Within its standard deviations, in segments; the first guess is the end of a segment."""
     ts, true = np.linspace(0.0, 3.0, 61), {"b": 1.2, "k": 4.0}
@@ -251,6 +254,7 @@ def test_a_fit_finds_the_time_of_a_jump_by_a_knot():
     assert list(found.jumps) == ["b"]
 
 
+@pytest.mark.full
 def test_signals_of_one_function_may_close_over_params():
     ts = np.linspace(0.0, 1.0, 11)
 

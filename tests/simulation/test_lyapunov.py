@@ -80,6 +80,7 @@ def test_kappa_is_the_largest_scaled_norm(params, start, span):
     np.testing.assert_allclose(ratio.kappa, growth.kappa, rtol=1e-12)
 
 
+@pytest.mark.full
 def test_rotation_has_no_growth():
     """x'' = -x in fixed units: Phi is a rotation."""
     motion = linear_motion({"k": 1.0, "c": 0.0}, [0.7, -0.3], np.linspace(0.0, 20.0, 41))
@@ -125,6 +126,7 @@ def test_inverted_pendulum_has_its_exponent_and_horizon():
     np.testing.assert_allclose(backward.horizon, growth.horizon, rtol=1e-7)
 
 
+@pytest.mark.full
 def test_a_motion_beyond_its_horizon_warns():
     """exp(RATE t) reaches 1e9 after 6.4 s."""
     beyond = linear_motion(INVERTED, [0.0, 0.0], np.linspace(0.0, 10.0, 41))
@@ -307,6 +309,7 @@ def test_float32_has_separate_default_tolerances():
     np.testing.assert_allclose(growth.horizon, expected, rtol=1e-2)  # extrapolated
 
 
+@pytest.mark.full
 def test_unsupported_arguments_are_refused(unchecked):  # noqa: F811
     ts = np.linspace(0.0, 10.0, 41)
     motion = linear_motion(INVERTED, [0.0, 0.0], ts)

@@ -67,6 +67,7 @@ def test_traced_tolerance_does_not_affect_the_method():
     assert jax.jit(solve)(1e-3).method == "dopri8"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("system", "options", "name"),
     [
@@ -229,6 +230,7 @@ def test_implicit_methods_solve_every_kind_of_system(name):
 # ---- Tolerances of coordinates -------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_coordinates_may_have_separate_tolerances():
     """Of two uncoupled springs only the one with a tight tolerance limits the step."""
 

@@ -89,6 +89,7 @@ def test_a_motor_with_an_electrical_time_constant(right, method, most):
     assert jnp.max(jnp.abs(whole(motion) - right)) < most * 1e-9
 
 
+@pytest.mark.full
 def test_what_a_motion_says_of_its_states(right):
     motion = swing(save=("work", "state_rates"))
     np.testing.assert_array_equal(motion["current"], motion.x[:, 0])
@@ -108,6 +109,7 @@ def test_what_a_motion_says_of_its_states(right):
     assert "current" in motion.explain() or "d(angle)/dt" in motion.explain()
 
 
+@pytest.mark.full
 def test_derivatives_in_params_and_the_start_of_states():
     """Forward, reverse, and those of diffrax through its own steps at 1e-12."""
 
@@ -128,6 +130,7 @@ def test_derivatives_in_params_and_the_start_of_states():
         np.testing.assert_allclose(b, c, rtol=5e-9, atol=1e-11)
 
 
+@pytest.mark.full
 def test_a_batch_over_the_start_of_states(right):
     starts = jnp.array([[0.0], [0.2], [1.0]])
     motions = jax.vmap(lambda x0: swing(ARM, x0))(starts)
@@ -247,6 +250,7 @@ warm = jl.System(
 )
 
 
+@pytest.mark.full
 def test_a_motor_that_warms_up():
     """In a batch of one direction and the other; backwards it returns to its start."""
 
@@ -296,6 +300,7 @@ sleigh = jl.System(
 )
 
 
+@pytest.mark.full
 def test_states_in_quasi_velocities_and_by_multipliers():
     def field(t, y, p):
         _, _, angle, forward, turn, i = y

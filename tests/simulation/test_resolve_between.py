@@ -15,6 +15,7 @@ def spring(t, q, v, params):
 SYSTEM = jl.System(spring, ("x",))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("time_direction", [1.0, -1.0])
 def test_states_between_saves_are_as_accurate_as_saves(time_direction):
     """cos(2 t), in any order, including saves and repeated times."""
@@ -28,6 +29,7 @@ def test_states_between_saves_are_as_accurate_as_saves(time_direction):
     np.testing.assert_array_equal(motion.at(ts[1])["x"], motion["x"][1:2])
 
 
+@pytest.mark.full
 def test_constrained_motions_stay_on_their_constraints():
     rod = jl.Holonomic(lambda t, q, params: q @ q - 1.0, "rod")
     system = jl.System(

@@ -54,6 +54,7 @@ def test_unrequested_quantities_are_not_computed():
     assert count(("potential",)) > count(())
 
 
+@pytest.mark.full
 def test_array_coordinates():
     """Two masses in the plane on springs to the origin: names return arrays of their shapes."""
     system = jl.System(
@@ -144,6 +145,7 @@ def ends(t, q, v):
     return jnp.sqrt(0.8 - q[1])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("law", "options"),
     [
@@ -203,6 +205,7 @@ def test_collision_is_a_status_with_a_time():
     assert np.isnan(motion.q[2]).all()
 
 
+@pytest.mark.full
 def test_traced_invalid_values_become_statuses():
     def status(q0=PENDULUM.q0, ts=(0.0, 1.0), **options):
         go = jax.jit(lambda q0, ts, o: run(q0=q0, ts=ts, **o).status)
@@ -344,6 +347,7 @@ def test_solvers_agree_to_the_tolerance():
         np.testing.assert_allclose(motion.q, truth.q, rtol=0, atol=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
 def test_failure_under_an_eager_derivative_raises_an_error(mode):
     system = jl.System(lambda t, q, v, p: 0.5 * v[0] ** 2 - 0.5 * p["k"] * q[0] ** 2, ("x",))

@@ -81,6 +81,7 @@ class Heun(jl.solvers.AbstractExplicit):
         return diffrax.Heun()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("time_direction", [1.0, -1.0], ids=["onwards", "backwards"])
 @pytest.mark.parametrize("second_order", [True, False], ids=["nystrom", "first_order"])
 @pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "alone"])

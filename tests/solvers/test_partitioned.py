@@ -109,6 +109,7 @@ def test_lagrangians_that_are_not_quadratic_have_full_order():
         np.testing.assert_allclose(found, 4, atol=0.15)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["gauss4", "variational4"])
 def test_momentum_of_a_symmetry_is_conserved(method):
     """A charge in a magnetic field: x p_y - y p_x, p with the vector potential."""

@@ -54,6 +54,7 @@ def test_consistent_states_are_unchanged():
     np.testing.assert_allclose(state.v, v, atol=4 * EPS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("wrong", [(1.0, 1.2, 0.8), (1.0, 0.8, 1.2), (1.0, 1.2, 1.2)])
 def test_four_bar_is_assembled_from_a_wrong_guess(wrong):
     """20 % off in two angles, with the crank held; compared with the law of cosines."""
@@ -101,6 +102,7 @@ def test_rows_that_follow_from_others_are_named():
     assert "dependent rows" in state.message()
 
 
+@pytest.mark.full
 def test_derivative_equals_that_of_the_implicit_function():
     """Forward, reverse and central differences, by the guess and by a length."""
 
@@ -180,6 +182,7 @@ def test_impossible_assembly_without_held_coordinates_is_reported():
     assert state.where >= 0
 
 
+@pytest.mark.full
 def test_a_velocity_that_cannot_be_held_is_named():
     with pytest.raises(jl.AssemblyError, match="release x' or y'"):
         jl.assemble(skate, [0, 0, 0.3], [1.0, 0.0, 0.0], SKATE, hold=("x'", "y'"))

@@ -100,6 +100,7 @@ def test_the_stiffness_is_the_hessian_of_the_potential():
     assert rest.stable == bool(np.linalg.eigvalsh(hessian)[0] > 0)
 
 
+@pytest.mark.full
 def test_derivatives_equal_those_of_the_implicit_function():
     """theta = atan(W/(m g)): first and second derivatives in every mode, by closed form."""
 
@@ -118,6 +119,7 @@ def test_derivatives_equal_those_of_the_implicit_function():
         np.testing.assert_allclose(outer(inner(theta))(W, m), second, rtol=64 * EPS)
 
 
+@pytest.mark.full
 def test_batch_equals_single_searches():
     """Starts, params and a failure in one batch; the failed lane does not affect others."""
     starts = jnp.array([[0.4], [3.0], [jnp.nan]])
@@ -195,6 +197,7 @@ def test_follower_forces_are_not_conservative():
     np.testing.assert_allclose(rest.stiffness, [[1.5, -0.5], [-1.0, 1.0]], atol=8 * EPS)
 
 
+@pytest.mark.full
 def test_failed_search_reports_the_nearest_point():
     """A constant force has no equilibrium, nor has sin(x) = 2, whose nearest point is pi/2."""
     pushed = jl.System(lambda t, q, v, params: 0.5 * v @ v + q[1], ("x", "y"))

@@ -64,6 +64,7 @@ def unbalanced(q, params):
     return jnp.abs(tangent @ F) / jnp.max(jnp.abs(F)), jnp.max(jnp.abs(opening(0.0, q, params)))
 
 
+@pytest.mark.full
 def test_four_bars_come_to_rest_from_any_configuration():
     """The search for a root of the forces alone fails on 4 of 24, in minima of their norm."""
     params, q0 = four_bars(24)

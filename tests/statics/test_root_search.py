@@ -109,6 +109,7 @@ def test_a_root_does_not_depend_on_units():
     np.testing.assert_allclose(q, np.broadcast_to(q[0], q.shape), rtol=32 * EPS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_weak_springs_and_small_forces_are_resolved(dtype):
     spring = one(lambda x, params: 0.5 * params["k"] * x**2 - params["F"] * x)
@@ -136,6 +137,7 @@ def test_weak_gravity_and_wide_orbits_are_resolved():
 # ---- Roots of higher order, kinks, rings ---------------------------------------------------------
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("order", [3, 4, 6])
 def test_root_of_higher_order_is_found_and_not_stable(order):
     """V = q^n from 1: Newton's step q/(n - 1) ends below tol = 1e-10 of 1 + q."""
@@ -169,6 +171,7 @@ def test_ring_of_equilibria_is_found_and_not_stable():
     assert not rest.stable
 
 
+@pytest.mark.full
 def test_zero_length_is_stable_only_for_springs_without_free_length():
     """Otherwise V is the tip of a cone: the force points away in all directions."""
     pivot = plane(lambda q, params: jl.energy.spring(100.0, q, params))
@@ -293,6 +296,7 @@ def test_free_carts_on_a_spring_have_the_derivative_of_least_norm():
     np.testing.assert_allclose(jax.hessian(q)(0.7), [1.0, -1.0], rtol=16 * EPS)
 
 
+@pytest.mark.full
 def test_failed_search_has_nan_derivatives():
     def q(p):
         return jl.equilibrium(EXPONENTIAL, [0.3], p, throw=False, max_steps=8).q[0]
@@ -302,6 +306,7 @@ def test_failed_search_has_nan_derivatives():
     assert np.isnan(jax.jvp(q, (0.7,), (1.0,))[1])
 
 
+@pytest.mark.full
 def test_failed_lane_does_not_affect_derivatives_of_others():
     well = one(lambda x, params: jnp.exp(-x) + params * x)
 

@@ -201,6 +201,7 @@ def test_the_quadcopter_obeys_the_body_axis_equations():
         close(u_rate, expected, ROUNDING)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "torques"),
     [

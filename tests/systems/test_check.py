@@ -131,6 +131,7 @@ def test_prescribed_motion_of_the_file_is_the_input():
     )
 
 
+@pytest.mark.full
 def test_missing_equilibrium_fails_the_check(tmp_path, capsys):
     """Without a spring the sleeve falls: the file cannot be right."""
     entry = ENTRIES["sleeve_pendulum_equilibrium"]
@@ -151,6 +152,7 @@ def test_a_right_file_passes(tmp_path, capsys):
     assert summary == "files 1, cases 1: all within tolerance"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "path", list(places(harmonic())), ids=lambda path: ".".join(map(str, path[2:]))
 )
@@ -171,6 +173,7 @@ def test_a_wrong_number_fails_the_command(path, tmp_path, capsys):
         assert f"in {field}, row {index}; out of tolerance: {field}\n" in out
 
 
+@pytest.mark.full
 def test_other_cases_of_a_known_system_pass(tmp_path):
     """Any parameters, start, times and number of saves: a late start, backward, a single save."""
     variants = [

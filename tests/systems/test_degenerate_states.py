@@ -50,6 +50,7 @@ SINGULAR = {
 SYSTEMS = [name for name, entry in ENTRIES.items() if isinstance(entry, Entry)]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "place"),
     [

@@ -99,6 +99,7 @@ def flat(tree):
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("derivative", mostly_full((jax.jacrev, jax.jacfwd), jax.jacrev))
 @pytest.mark.parametrize("name", mostly_full(EXACT, "simple_pendulum"))
 def test_gradients_equal_those_of_the_exact_motion(name, derivative):

@@ -123,6 +123,7 @@ def cross(r, F):
 # ---- Assembly ------------------------------------------------------------------------------------
 
 
+@pytest.mark.full
 def test_the_four_bar_is_assembled_from_a_guess_that_is_20_percent_wrong():
     """Compared with the law of cosines; the crank is held; errors of either sign."""
     module, chart = CLOSED["four_bar"]

@@ -240,6 +240,7 @@ def test_multipliers_and_reactions_have_the_order_of_the_rows(files):
     assert case.fields["constraint_force"].shape == (1, 4)
 
 
+@pytest.mark.full
 def test_quasi_velocities_include_vanishing_ones_in_order(files):
     raw = files["chaplygin_sleigh"]
     assert raw["quasi_velocities"] == ["v", "v_n", "omega"]

@@ -52,6 +52,7 @@ TRANSFORMS = {
 }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_traced_closure_values_act_like_params(transform):
     by_closure, expected = (TRANSFORMS[transform](f)(2.0) for f in (swing, by_params))

@@ -68,6 +68,7 @@ def ended(f, method):
     return jax.jit(lambda k: [at(k), jax.jacfwd(at)(k)])(1.0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["bosh3", pytest.param("gauss2", marks=pytest.mark.full)])
 def test_motions_have_forward_derivatives(method):
     # Rounding of some hundred operations on numbers of order one.

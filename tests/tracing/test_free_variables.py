@@ -320,6 +320,7 @@ OUTSIDE = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("declared", OUTSIDE)
 def test_changed_free_variables_are_named_and_have_no_effect(declared):
     lagrangian, change, name = declared()
