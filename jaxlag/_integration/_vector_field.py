@@ -408,6 +408,18 @@ class VectorField(eqx.Module):
         _, q, _, params, values = self.at(tau, y, args)
         return self.program.lines(q, params, values)
 
+    def variables(self, tau: Array, y: Array, args: Arguments) -> frozenset[str] | None:
+        """Those of (t, q, v) that accelerations read; None if that is not known."""
+        if self.rows.size or self.quasi is not None or self.system.states is not None:
+            return None
+        _, q, _, params, values = self.at(tau, y, args)
+        return self.program.variables(q, params, values)
+
+    def is_analytic(self, tau: Array, y: Array, args: Arguments) -> bool:
+        """Whether the scalar program of accelerations has no comparisons or unusual functions."""
+        _, q, _, params, values = self.at(tau, y, args)
+        return self.program.is_analytic(q, params, values)
+
     def why_on_arrays(self, tau: Array, y: Array, args: Arguments) -> str | None:
         """Why there is no scalar program; None if there is one, or none is wanted."""
         _, q, _, params, values = self.at(tau, y, args)

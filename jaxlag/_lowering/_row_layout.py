@@ -12,7 +12,9 @@ from jax import Array
 from jax.extend.core import ClosedJaxpr
 
 from jaxlag._core._errors import invalid
-from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._expression import Graph, Node, order
+from jaxlag._lowering._graph._straight_line import ANALYTIC
+from jaxlag._lowering._graph._traversal import substitute
 from jaxlag._lowering._jaxpr._differentiate import gradient
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported, read
 from jaxlag._lowering._jaxpr._node_arrays import nodes
@@ -314,8 +316,6 @@ def _contents(graph: Graph, row: Node, at_rest: Node, q: set[Node], v: set[Node]
 SMALL = 1e-3
 """Smaller numbers may be rounding of larger ones."""
 
-_ANALYTIC = frozenset(["sin", "cos", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "atan"])
-
 
 def _moving(slopes: Sequence[Node], q: set[Node]) -> dict[Node, frozenset[Node]]:
     """For every node the coordinates on which it certainly depends, at almost every state.
@@ -335,7 +335,7 @@ def _moving(slopes: Sequence[Node], q: set[Node]) -> dict[Node, frozenset[Node]]
         if node.op == "sum":
             telling = [arg for arg, factor in node.data[1] if _counts(factor)]
         whole = all(_counts(arg.constant) or moving[arg] for arg in node.args)
-        analytic = node.op == "call" and node.data.name in _ANALYTIC
+        analytic = node.op == "call" and node.data.name in ANALYTIC
         if node.op in ("sum", "let") or (node.op == "product" and whole) or analytic:
             moving[node] = frozenset(x for x in once if any(x in moving[arg] for arg in telling))
     return moving

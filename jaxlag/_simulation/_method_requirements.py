@@ -1,4 +1,4 @@
-"""Requirements of structure-preserving methods on a system."""
+"""Requirements of methods on a system."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +13,7 @@ from jaxlag._model._inputs import evaluate
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
 from jaxlag._tracing._dependence import outputs_depend_on
-from jaxlag.solvers import AbstractPartitioned, GaussLegendre, Splitting
+from jaxlag.solvers import AbstractPartitioned, GaussLegendre, Nystrom12, Splitting
 
 
 def check_requirements(
@@ -24,7 +24,7 @@ def check_requirements(
     inputs: Mapping[str, Any],
     dtype: Any,
 ) -> None:
-    """Raise if a structure-preserving method does not apply to this system.
+    """Raise if a method does not apply to this system.
 
     Args:
         system: the mechanical system.
@@ -37,19 +37,19 @@ def check_requirements(
     Raises:
         ValueError: with the requirement of the method, and the property of the system.
     """
-    if not isinstance(solver, Splitting | AbstractPartitioned):
+    if not isinstance(solver, Nystrom12 | Splitting | AbstractPartitioned):
         return
     name = f"method {type(solver).__name__}"
     if system.states is not None:
         must, was = "be used without states=", f"there were the states {list(system.states.names)}"
-        fix = "Choose another method: its map keeps the structure of mechanical equations alone."
+        fix = "Choose another method: this one is made for second-order equations alone."
         raise invalid(name, must, was, fix)
     if formulation != "multipliers":
         was = f"formulation was {formulation!r}"
         fix = "Pass formulation='multipliers', or another method."
         raise invalid(name, "have a state (q, v) and multipliers", was, fix)
-    if isinstance(solver, Splitting):
-        _separable(system, name, params, inputs, dtype)
+    if isinstance(solver, Splitting | Nystrom12):
+        _separable(system, name, params, inputs, dtype, isinstance(solver, Splitting))
         return
     for force in filter(reads_lam, system.forces):
         must = "be used without forces that depend on multipliers"
@@ -73,17 +73,21 @@ def splits(system: System, formulation: str, params: Any, dtype: Any) -> bool:
 
 
 def _separable(
-    system: System, name: str, params: Any, inputs: Mapping[str, Any], dtype: Any
+    system: System, name: str, params: Any, inputs: Mapping[str, Any], dtype: Any, splits: bool
 ) -> None:
     """Raise unless M is constant and accelerations do not depend on v."""
-    fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
+    verb = "split" if splits else "be used for"
+    fix = "Choose 'dopri8', which takes any Lagrangian."
+    if splits:
+        fix = "Choose 'variational2', 'variational4' or 'gauss4', which take any Lagrangian."
     if system.constraints:
         was = f"it has constraints ({', '.join(map(repr, system._rows(params, dtype).labels))})"
-        fix = "Choose 'variational2' or 'variational4', which satisfy holonomic constraints."
-        raise invalid(name, "split a system without constraints", was, fix)
+        if splits:
+            fix = "Choose 'variational2' or 'variational4', which satisfy holonomic constraints."
+        raise invalid(name, f"{verb} a system without constraints", was, fix)
     traced, static = _params.split(params)
     structure = system._structure(params, dtype)
-    must = "split a Lagrangian T(v) - V(t, q) with constant mass matrix"
+    must = f"{verb} a Lagrangian T(v) - V(t, q) with constant mass matrix"
     for what, found in (("mass matrix", structure.mass), ("bias", structure.bias)):
         depends = sorted(found & ({"t", "q", "v"} if what == "mass matrix" else {"v"}))
         if depends:
@@ -101,4 +105,5 @@ def _separable(
         given += [frozenset()] * (len(program.invars) - 3)
         if "v" in frozenset().union(*outputs_depend_on(program, given)):
             was = f"the force {force.name!r} depends on v"
-            raise invalid(name, "split a system whose forces do not depend on velocities", was, fix)
+            must = f"{verb} a system whose forces do not depend on velocities"
+            raise invalid(name, must, was, fix)

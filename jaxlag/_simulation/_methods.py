@@ -22,6 +22,7 @@ from jaxlag.solvers import (
     Dopri8,
     GaussLegendre,
     LobattoIIIAB,
+    Nystrom12,
     Prince9,
     Splitting,
     Tsit5,
@@ -38,6 +39,7 @@ METHODS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "dopri5": Dopri5,
     "dopri8": Dopri8,
     "prince9": Prince9,
+    "nystrom12": Nystrom12,
     "implicit_euler": diffrax.ImplicitEuler,
     "kvaerno3": diffrax.Kvaerno3,
     "kvaerno4": diffrax.Kvaerno4,
@@ -73,10 +75,17 @@ HABITS = {
 }
 """Names of methods in other libraries, and the nearest method here."""
 LOOSE, TIGHT = 1e-3, 1e-12  # rtol: order 5 from the first upwards, order 9 up to the second
+SMOOTH = 1e-8  # rtol: up to here order 12 where accelerations do not depend on v
 IMPLICIT = "kvaerno5"  # if explicit steps run out
-FINER = {"bosh3": "tsit5", "tsit5": "dopri8", "dopri5": "dopri8", "dopri8": "prince9"}
-# For steps of order 8 and 9, whose errors grow by 1.1^9 if a step is 10 % too long.
-SAFETY = {Dopri8: 0.8, Prince9: 0.8}
+FINER = {
+    "bosh3": "tsit5",
+    "tsit5": "dopri8",
+    "dopri5": "dopri8",
+    "dopri8": "prince9",
+    "nystrom12": "prince9",
+}
+# For steps of order 8 to 12, whose errors grow by 1.1^9 to 1.1^13 if a step is 10 % too long.
+SAFETY = {Dopri8: 0.8, Prince9: 0.8, Nystrom12: 0.8}
 
 
 def choose(
@@ -110,9 +119,7 @@ def choose(
                 f"it was {type(controller).__name__}",
                 "Give dt= for fixed steps.",
             )
-    # rtol has no unit; atol has those of the coordinates.
-    known = adaptive and concrete((rtol, atol))
-    solver = _solver(method, (rtol if rtol > 0 else np.min(atol)) if known else None)
+    solver = _solver(method, _tolerance(rtol, atol) if adaptive else None)
     if adaptive and isinstance(solver, AbstractFixedStep):
         raise invalid(
             "dt",
@@ -158,6 +165,31 @@ def automatic(tolerance: Any) -> str:
     return "prince9" if tolerance <= TIGHT else "dopri8"
 
 
+def of_structure(method: Any, adaptive: bool, rtol: Any, atol: Any) -> str | None:
+    """The method that "auto" is for systems of a certain structure; None if it is the same for all.
+
+    With fixed steps that is splitting for L = T(v) - V(t, q). With adaptive ones it is Nystrom's
+    method of order 12 for accelerations a(q): to errors of 1e-9 it takes 0.6 of order 8 on Kepler
+    orbits of e = 0.6 and 0.9, on a spring pendulum and on three oscillators, 0.8 on the system of
+    Henon and Heiles, 0.45 on four bodies; at equal tolerances as long, and its errors are a
+    hundredth. At 1e-6 they are alike. Not for a(t, q): its longer steps pass a pulse in t more
+    easily.
+    """
+    if method != "auto":
+        return None
+    if not adaptive:
+        return "splitting8"
+    tolerance = _tolerance(rtol, atol)
+    return "nystrom12" if tolerance is not None and tolerance <= SMOOTH else None
+
+
+def _tolerance(rtol: Any, atol: Any) -> Any:
+    """The tolerance; None while tracing. rtol has no unit; atol has those of the coordinates."""
+    if not concrete((rtol, atol)):
+        return None
+    return rtol if rtol > 0 else np.min(atol)
+
+
 def name_of(solver: diffrax.AbstractSolver) -> str:
     """The name of a solver in METHODS, or else that of its class."""
     default = type(solver).__name__
@@ -184,7 +216,7 @@ def _nearest(name: str) -> str:
 
 
 @lru_cache
-def _named(name: str) -> diffrax.AbstractSolver:
+def solver_named(name: str) -> diffrax.AbstractSolver:
     """The solver of this name."""
     return with_stages(METHODS[name](), "lax")
 
@@ -199,7 +231,7 @@ def _solver(method: Any, tolerance: Any) -> diffrax.AbstractSolver:
                 f"it was {method!r}",
                 _nearest(method),
             )
-        return _named(name)
+        return solver_named(name)
     if not isinstance(method, diffrax.AbstractSolver):
         raise invalid("method", "be a name or a diffrax solver instance", f"it was {method!r}")
     if not (

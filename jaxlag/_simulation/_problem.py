@@ -31,12 +31,12 @@ from jaxlag._model._constraints import Baumgarte
 from jaxlag._model._inputs import all_knots, common_range, knots_increase
 from jaxlag._model._states import named_states
 from jaxlag._simulation._method_requirements import check_requirements, splits
-from jaxlag._simulation._methods import for_state
+from jaxlag._simulation._methods import for_state, solver_named
 from jaxlag._statics._assemble import assembled
 from jaxlag._system._inspection import check_declaration
 from jaxlag._system._system import System
 from jaxlag._tracing import _params
-from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Splitting
+from jaxlag.solvers import AbstractExplicit, AbstractPartitioned, Nystrom12, Splitting
 from jaxlag.solvers._explicit import in_loop_over_stages
 from jaxlag.solvers._stage_chord import for_long_code
 
@@ -60,7 +60,7 @@ class ProgramKey(NamedTuple):
     contact_rows_independent: bool
     capacity: int
     change_points: str
-    auto: bool  # whether the structure of the system may select the method
+    structured: str | None  # the method that a system of a certain structure selects
 
 
 class Values(NamedTuple):
@@ -183,13 +183,38 @@ def equations(plan: ProgramKey, values: Values) -> tuple[VectorField, Arguments,
     params, inputs = dynamics.given(args)
     dynamics = replace(dynamics, rows=plan.system._rows(params, values.q0.dtype))
     solver, controller = eqx.combine(values.stepper, plan.stepper.tree)
-    if plan.auto and controller is None:
-        splitting = splits(plan.system, plan.formulation, params, values.q0.dtype)
-        solver = Splitting(8) if splitting else solver
+    if plan.structured is not None and _has_structure(plan, values, dynamics, args):
+        solver = solver_named(plan.structured)
+    elif not (isinstance(solver, Nystrom12) and "v" not in _variables(values, dynamics, args)):
+        given = plan.formulation, params, inputs, values.q0.dtype
+        check_requirements(plan.system, solver, *given)
     crossing = plan.change_points == "pass" and may_cross(dynamics)
     dynamics = replace(dynamics, crossing=crossing, extrapolates=looks_ahead(solver))
-    check_requirements(plan.system, solver, plan.formulation, params, inputs, values.q0.dtype)
     return dynamics, args, (solver, controller)
+
+
+def _has_structure(
+    plan: ProgramKey, values: Values, dynamics: VectorField, args: Arguments
+) -> bool:
+    """Whether the system has the structure that the method `plan.structured` requires."""
+    if isinstance(solver_named(plan.structured), Splitting):
+        params, _ = dynamics.given(args)
+        return splits(plan.system, plan.formulation, params, values.q0.dtype)
+    return _variables(values, dynamics, args) <= {"q"} and dynamics.is_analytic(
+        *_at_zero(values, dynamics, args)
+    )
+
+
+def _variables(values: Values, dynamics: VectorField, args: Arguments) -> frozenset[str]:
+    """Those of (t, q, v) that accelerations read; all of them if that is not known."""
+    found = dynamics.variables(*_at_zero(values, dynamics, args))
+    return frozenset({"t", "q", "v"}) if found is None else found
+
+
+def _at_zero(values: Values, dynamics: VectorField, args: Arguments) -> tuple[Any, ...]:
+    """(tau, y, args) of the types of the motion."""
+    size = dynamics.system.size + dynamics.speeds + dynamics.state_count
+    return jnp.zeros_like(args.origin), jnp.zeros(size, values.q0.dtype), args
 
 
 def _initial_state(

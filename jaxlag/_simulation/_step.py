@@ -177,7 +177,7 @@ def step(
         contact_rows_independent=contact_rows_independent(system, params, t, q, v, signals),
         capacity=0,
         change_points="stop",
-        auto=False,
+        structured=None,
     )
     warn_of_changes(system, inputs)
     start = q, v, None, ts, params_traced, inputs_traced, x

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import diffrax
 
-from jaxlag.solvers._explicit import AbstractExplicit
+from jaxlag.solvers._explicit import AbstractRungeKutta
 
 
-class Dopri5(AbstractExplicit):
+class Dopri5(AbstractRungeKutta):
     """Order 5 with an embedded method of order 4, 7 stages of which two steps share one.
 
     Source: Dormand, Prince, A family of embedded Runge-Kutta formulae, J. Comp. Appl. Math. 6

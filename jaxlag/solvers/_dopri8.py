@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import diffrax
 
-from jaxlag.solvers._explicit import AbstractExplicit
+from jaxlag.solvers._explicit import AbstractRungeKutta
 
 
-class Dopri8(AbstractExplicit):
+class Dopri8(AbstractRungeKutta):
     """Order 8 with an embedded method of order 7, 14 stages of which two steps share one.
 
     `diffrax` interpolates between steps with order 5: in the middle of a step of 0.8 s on a driven

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxlag.solvers._explicit import AbstractExplicit
+from jaxlag.solvers._explicit import AbstractRungeKutta
 
 # fmt: off
 
@@ -158,7 +158,7 @@ class _Stock(diffrax.AbstractERK):
         return 8
 
 
-class Prince9(AbstractExplicit):
+class Prince9(AbstractRungeKutta):
     """Order 9 with an embedded method of order 7, 18 stages of which two steps share one.
 
     For tolerances of 1e-12 and below. Comparison on a double pendulum for 10 s from

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import diffrax
 
-from jaxlag.solvers._explicit import AbstractExplicit
+from jaxlag.solvers._explicit import AbstractRungeKutta
 
 
-class Tsit5(AbstractExplicit):
+class Tsit5(AbstractRungeKutta):
     """Order 5 with an embedded method of order 4, 7 stages of which two steps share one.
 
     Source: Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying

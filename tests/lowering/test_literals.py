@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxlag._lowering._graph._expression import Graph, dependencies
+from jaxlag._lowering._graph._expression import Graph
 from jaxlag._lowering._graph._literals import NAME, Literals
 from jaxlag._lowering._graph._residues import Residues
+from jaxlag._lowering._graph._traversal import dependencies
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def test_normal_motion_is_described():
     motion = jl.simulate(ANGLE, [1e-3], [0.0], TS, {"g": 9.0})
     text = motion.explain()
     h = 2.0 / int(motion.stats["accepted"])
-    assert line(text, "method") == "dopri8, rtol 1e-09, atol 1e-09, multipliers"
+    assert line(text, "method") == "nystrom12, rtol 1e-09, atol 1e-09, multipliers"
     assert line(text, "rates") == (
         f"fastest oscillation of period 2.09 s, {2 * np.pi / 3 / h:.3g} steps each"
     )

@@ -71,7 +71,7 @@ class Halves(diffrax.ODETerm):
         return jax.tree.map(lambda x: self.time_direction * x, x)
 
 
-class Heun(jl.solvers.AbstractExplicit):
+class Heun(jl.solvers.AbstractRungeKutta):
     """A method whose steps do not share a stage."""
 
     interpolation_cls = diffrax.Heun.interpolation_cls

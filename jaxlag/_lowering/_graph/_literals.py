@@ -8,7 +8,8 @@ powers of two remain.
 from collections.abc import Sequence
 from math import frexp, isfinite
 
-from jaxlag._lowering._graph._expression import Graph, Node, order, rebuilt, substitute
+from jaxlag._lowering._graph._expression import Graph, Node, order
+from jaxlag._lowering._graph._traversal import rebuilt, substitute
 
 NAME = "literal"
 BITS = 12  # of a number whose products with a few others are exact

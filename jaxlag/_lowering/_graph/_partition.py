@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from jaxlag._lowering._graph._expression import KNOWN, Graph, Node, order, rebuilt
+from jaxlag._lowering._graph._expression import KNOWN, Graph, Node, order
+from jaxlag._lowering._graph._traversal import rebuilt
 
 
 def partitioned(

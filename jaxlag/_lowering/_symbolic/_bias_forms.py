@@ -3,9 +3,10 @@
 import math
 from collections.abc import Callable, Sequence
 
-from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._expression import Graph, Node, order
 from jaxlag._lowering._graph._simplify import TooLong
 from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._graph._traversal import substitute
 from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
 from jaxlag._lowering._symbolic._symbolic_system import SymbolicSystem
 

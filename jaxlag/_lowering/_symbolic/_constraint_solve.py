@@ -9,7 +9,8 @@ from jax import Array
 
 from jaxlag._linalg._kkt import TangentSpace, row_weights, tangent_space, units_of
 from jaxlag._lowering._graph._eliminate import GREATER, bordered, solve_general
-from jaxlag._lowering._graph._expression import Graph, Node, dependencies, substitute
+from jaxlag._lowering._graph._expression import Graph, Node
+from jaxlag._lowering._graph._traversal import dependencies, substitute
 from jaxlag._lowering._graph._vectors import dot, products
 from jaxlag._lowering._jaxpr._differentiate import tangents
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported

@@ -5,11 +5,12 @@ from functools import partial
 from typing import NamedTuple
 
 from jaxlag._lowering._graph._eliminate import least_operations, solve
-from jaxlag._lowering._graph._expression import Node, dependencies, order
+from jaxlag._lowering._graph._expression import Node, order
 from jaxlag._lowering._graph._literals import Literals
 from jaxlag._lowering._graph._residues import Residues
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._graph._traversal import dependencies
 from jaxlag._lowering._jaxpr._differentiate import gradient
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported
 from jaxlag._lowering._symbolic._bias_forms import (

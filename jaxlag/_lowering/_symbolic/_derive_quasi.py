@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlag._lowering._graph._eliminate import solve
-from jaxlag._lowering._graph._expression import Graph, Node, order, substitute
+from jaxlag._lowering._graph._expression import Graph, Node, order
 from jaxlag._lowering._graph._literals import Literals
 from jaxlag._lowering._graph._residues import Residues
 from jaxlag._lowering._graph._simplify import Expansion
 from jaxlag._lowering._graph._straight_line import assemble
+from jaxlag._lowering._graph._traversal import substitute
 from jaxlag._lowering._graph._vectors import products
 from jaxlag._lowering._jaxpr._differentiate import gradient, tangents
 from jaxlag._lowering._jaxpr._from_jaxpr import Unsupported

@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from jaxlag._lowering._graph._eliminate import blocks
-from jaxlag._lowering._graph._expression import Node, dependencies
+from jaxlag._lowering._graph._expression import Node
+from jaxlag._lowering._graph._traversal import dependencies
 from jaxlag._lowering._symbolic._bias_forms import degree
 from jaxlag._lowering._symbolic._symbolic_system import Equations, SymbolicSystem
 

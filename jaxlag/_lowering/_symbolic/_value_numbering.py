@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlag._lowering._graph._expression import COS, SIN, Graph, Node, order, rebuilt
+from jaxlag._lowering._graph._expression import COS, SIN, Graph, Node, order
 from jaxlag._lowering._graph._residues import PRIME, ZERO, Residue, Residues
 from jaxlag._lowering._graph._straight_line import operations
+from jaxlag._lowering._graph._traversal import rebuilt
 from jaxlag._lowering._symbolic._running_error import running_errors
 
 Cost = tuple[float, float]
