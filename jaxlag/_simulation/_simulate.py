@@ -131,18 +131,16 @@ def simulate(
             dict by name.
         inputs: dict from names to `ZeroOrderHold`, `LinearInterpolation`, `TimeFunction`,
             `Feedback` or arrays (constant), read by the forces. Steps end on the knots of tables.
-        method: "auto", a name such as "tsit5", any diffrax solver, or a pair (solver, step-size
+        method: "auto", a name such as "tsit5", any diffrax solver, or (solver, step-size
             controller). "auto" is "dopri8"; "tsit5" if rtol is known and at least 1e-3;
             "prince9" if it is at most 1e-12; "nystrom12" if it is at most 1e-8 and accelerations
-            are functions of q and params alone, without comparisons (0.45 to 0.8 of the time of
-            "dopri8" at equal error; up to 1.5 times with more times in ts than steps);
-            with fixed steps "splitting8" for T(v) - V(t, q) without forces and constraints (a
-            fifth of the time of "dopri8", and as accurate or better in orbits and pendulums, but
-            not at steps beyond 1 / omega); and "kvaerno5", outside of transforms, if a stiff
-            motion took max_steps explicit steps.
-            `Solution.method` is the method used. Implicit methods by name solve their equations to
-            a tenth of the tolerance; diffrax instances keep their own settings. "kvaerno4" and
-            "kvaerno5" read forces up to a quarter of a step beyond the last time.
+            are functions of q and params alone, without comparisons (faster, unless ts has more
+            times than there are steps); with fixed steps "splitting8" for T(v) - V(t, q) without
+            forces and constraints (a fifth of the time of "dopri8", and as accurate or better, but
+            not at steps beyond 1 / omega); and "kvaerno5", outside of transforms, if a stiff motion
+            took max_steps explicit steps. `Solution.method` is the method used. Implicit methods by
+            name solve their equations to a tenth of the tolerance; diffrax instances keep their own
+            settings. "kvaerno4" and "kvaerno5" read forces to a quarter step beyond the last time.
             Structure-preserving methods, for long runs with fixed steps dt: "splitting2",
             "splitting4", "splitting6", "splitting8" (`solvers.Splitting`) if M is constant and
             accelerations do not depend on v; "gauss2" to "gauss8" (`solvers.GaussLegendre`) for any

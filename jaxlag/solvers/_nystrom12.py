@@ -121,7 +121,7 @@ class Nystrom12(AbstractExplicit):
     ) -> Attempt:
         """One step."""
         if not getattr(terms, "second_order", not hasattr(terms, "sections")):
-            was = "there were quasi-velocities, work, or states beside (q, v)"
-            raise invalid("Nystrom12: state", "be (q, v) alone", was, "Choose 'dopri8'.")
+            was = "it contained quasi-velocities, work or states of its own"
+            raise invalid("Nystrom12: y", "be (q, v) alone", was, "Choose 'dopri8'.")
         stages = nystrom_in_loop if self.looped else nystrom
         return stages(tableau_of(type(self)), terms, t0, t1, y0, None, True, args)

@@ -125,20 +125,16 @@ def nystrom(
         y, kick = tuple(map(_kept, y)), _kept(kick)
     kicks, rates, last = [kick], [first], None
 
-    def gain(row: np.ndarray | None, squared: np.ndarray, c: float) -> Any:
-        """The changes of q and v, over h; that of v is None without a row."""
+    def gain(row: np.ndarray, squared: np.ndarray, c: float) -> Any:
+        """The changes of q and v, over h."""
         drifts = [] if c == 0.0 else [_scaled(c, y[1])]
         if np.any(squared):
             drifts.append(_scaled(h, _sum(squared, kicks)))
-        drift = form.signed(reduce(_added, drifts), args)
-        return drift, None if row is None else _sum(row, kicks)
+        return form.signed(reduce(_added, drifts), args), _sum(row, kicks)
 
     def whole(gain: Any) -> Any:
         """h times it. The results of a step have many uses: XLA computes divisions once."""
         return jax.tree.map(lambda x: x / per_step, gain)
-
-    def moved(drift: Any, kick: Any) -> Any:
-        return _added(y[0], drift), y[1] if kick is None else _added(y[1], kick)
 
     def soon(squared: np.ndarray, c: float) -> Any:
         """A stage without velocity. The last acceleration comes in by one product and sum."""
@@ -152,17 +148,17 @@ def nystrom(
     rows = [None] * len(tableau.c) if tableau.rows is None else tableau.rows
     for i, (row, squared, c) in enumerate(zip(rows, tableau.rows_squared, tableau.c, strict=True)):
         t = t1 if c == 1.0 else t0 + float(c) * (t1 - t0)
-        if tableau.fsal and i + 1 == len(tableau.c):
-            stage = moved(*whole(gain(row, squared, 1.0)))
-        elif row is None:
+        if row is None:
             stage = soon(squared, float(c))
+        elif tableau.fsal and i + 1 == len(tableau.c):
+            stage = _added(y, whole(gain(row, squared, 1.0)))
         else:
-            stage = moved(*_scaled(h, gain(row, squared, float(c))))
+            stage = _added(y, _scaled(h, gain(row, squared, float(c))))
         last = terms.vf(t, joined(*stage), args)
         kicks.append(parts(last)[1])
         rates.append(last)
     if not tableau.fsal:
-        stage, last = moved(*whole(gain(tableau.b, tableau.b_squared, 1.0))), None
+        stage, last = _added(y, whole(gain(tableau.b, tableau.b_squared, 1.0))), None
     if tableau.rows is None:  # the rates at the end of the step
         rates[-1] = joined(form.signed(stage[1], args), kicks[-1])
     # The weights of the error estimate have the sum 0: the velocity at the start drops out.
@@ -184,28 +180,21 @@ def nystrom_in_loop(
     nodes = np.concatenate([[0.0], tableau.c])
     q, v = form.parts(y0)
 
-    def sums(weights: Any, kicks: Any) -> Any:
-        return jax.tree.map(lambda x: h * _weighted(weights, x), kicks)
-
-    def moved(weights: Any, kicks: Any, c: Any) -> Any:
+    def drift(weights: Any, kicks: Any, c: Any) -> Any:
         """h (c v + h sum_j weights_j kicks_j)."""
-        drift = jax.tree.map(lambda v, x: h * (c * v + x), v, sums(weights, kicks))
-        return form.signed(drift, args)
+        sums = _sums(h, weights, kicks)
+        return form.signed(jax.tree.map(lambda v, x: h * (c * v + x), v, sums), args)
 
     def stage(i: Array, kicks: Any) -> Any:
-        at = lambda x: lax.dynamic_index_in_dim(jnp.asarray(x), i, keepdims=False)  # noqa: E731
-        c = at(nodes).astype(t0.dtype)
-        y = form.joined(_added(q, moved(at(rows), kicks, c.astype(h.dtype))), v)
-        kick = form.parts(terms.vf(t0 + c * (t1 - t0), y, args))[1]
-        put = lambda k, x: lax.dynamic_update_index_in_dim(k, x, i, 0)  # noqa: E731
-        return jax.tree.map(put, kicks, kick)
+        c = _entry(nodes, i).astype(t0.dtype)
+        y = form.joined(_added(q, drift(_entry(rows, i), kicks, c.astype(h.dtype))), v)
+        return _put(kicks, i, form.parts(terms.vf(t0 + c * (t1 - t0), y, args))[1])
 
     none = jax.tree.map(lambda v: jnp.zeros((size, *v.shape), v.dtype), v)
     kicks = lax.fori_loop(0, size, stage, none)
-    q1 = _added(q, moved(jnp.asarray(tableau.b_squared), kicks, 1.0))
-    v1 = _added(v, sums(jnp.asarray(tableau.b), kicks))
-    errors = (jnp.asarray(x) for x in (tableau.e_squared, tableau.e))
-    error_q, error_v = moved(next(errors), kicks, 0.0), sums(next(errors), kicks)
+    q1 = _added(q, drift(tableau.b_squared, kicks, 1.0))
+    v1 = _added(v, _sums(h, tableau.b, kicks))
+    error = form.joined(drift(tableau.e_squared, kicks, 0.0), _sums(h, tableau.e, kicks))
     changes = jax.tree.map(lambda x: h * x, kicks)
     beside = unseen(unstacked(changes), tableau.unweighted) if tableau.unweighted else None
     if beside is not None:
@@ -213,7 +202,7 @@ def nystrom_in_loop(
     drifts = jax.tree.map(lambda v, v1: jnp.stack([*[v] * (size - 1), v1]), v, v1)
     drifts = jax.tree.map(lambda x: h * x, form.signed(drifts, args))
     k = jax.vmap(form.joined)(drifts, changes)
-    return Attempt(form.joined(q1, v1), form.joined(error_q, error_v), beside, k, None)
+    return Attempt(form.joined(q1, v1), error, beside, k, None)
 
 
 def in_loop(
@@ -225,18 +214,13 @@ def in_loop(
     nodes = np.concatenate([[0.0], tableau.c])
     traced = not isinstance(fresh, bool)
 
-    def sums(weights: Array, k: Any) -> Any:
-        return jax.tree.map(lambda x: h * _weighted(weights, x), k)
-
     def stage(i: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
         k, _ = carry
-        at = lambda x: lax.dynamic_index_in_dim(jnp.asarray(x), i, keepdims=False)  # noqa: E731
-        y = _added(y0, sums(at(rows), k))
-        rates = terms.vf(t0 + at(nodes).astype(t0.dtype) * (t1 - t0), y, args)
+        y = _added(y0, _sums(h, _entry(rows, i), k))
+        rates = terms.vf(t0 + _entry(nodes, i).astype(t0.dtype) * (t1 - t0), y, args)
         if traced:
             rates = jax.tree.map(lambda x, k: jnp.where((i > 0) | fresh, x, k), rates, known)
-        put = lambda k, x: lax.dynamic_update_index_in_dim(k, x, i, 0)  # noqa: E731
-        return jax.tree.map(put, k, rates), y
+        return _put(k, i, rates), y
 
     k = jax.tree.map(lambda y: jnp.zeros((size, *y.shape), y.dtype), y0)
     begin: Any = 0
@@ -248,13 +232,27 @@ def in_loop(
     if tableau.fsal:
         y1, last = last_stage, jax.tree.map(lambda x: x[-1], k)
     else:
-        y1, last = _added(y0, sums(jnp.asarray(tableau.b), k)), None
+        y1, last = _added(y0, _sums(h, tableau.b, k)), None
     increments = jax.tree.map(lambda x: h * x, k)
     beside = unseen(unstacked(increments), tableau.unweighted) if tableau.unweighted else None
-    return Attempt(y1, sums(jnp.asarray(tableau.e), k), beside, increments, last)
+    return Attempt(y1, _sums(h, tableau.e, k), beside, increments, last)
 
 
-def _weighted(weights: Array, x: Array) -> Array:
-    """sum_i weights_i x_i along the first axis."""
-    wide = weights.reshape((-1,) + (1,) * (x.ndim - 1)).astype(x.dtype)
-    return jnp.sum(wide * x, axis=0)
+def _entry(table: np.ndarray, i: Array) -> Array:
+    """Entry i along the first axis."""
+    return lax.dynamic_index_in_dim(jnp.asarray(table), i, keepdims=False)
+
+
+def _put(k: Any, i: Array, stage: Any) -> Any:
+    """The stages with stage i written."""
+    return jax.tree.map(lambda k, x: lax.dynamic_update_index_in_dim(k, x, i, 0), k, stage)
+
+
+def _sums(h: Array, weights: Any, k: Any) -> Any:
+    """h sum_j weights_j k_j, along the first axes."""
+
+    def total(x: Array) -> Array:
+        wide = jnp.asarray(weights).reshape((-1,) + (1,) * (x.ndim - 1)).astype(x.dtype)
+        return h * jnp.sum(wide * x, axis=0)
+
+    return jax.tree.map(total, k)

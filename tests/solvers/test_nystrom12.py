@@ -406,3 +406,10 @@ def test_its_name_is_accepted_wherever_auto_selects_it():
 def test_other_systems_are_refused(system, text):
     with pytest.raises(ValueError, match=text):
         jl.simulate(system, [1.0, 0.0], [0.0, 0.1], [0.0, 0.1], method="nystrom12")
+
+
+def test_work_beside_the_state_is_refused():
+    system = jl.System(flat, ("x", "y"), forces=(jl.GeneralizedForce(push, "push"),))
+    options = {"method": "nystrom12", "save": ("work",)}
+    with pytest.raises(ValueError, match=r"`y` must be \(q, v\) alone, but it contained .*work"):
+        jl.simulate(system, [1.0, 0.0], [0.0, 0.1], [0.0, 0.1], **options)
