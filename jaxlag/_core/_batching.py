@@ -3,6 +3,8 @@
 On CPU, XLA compiles a loop over a few numbers to vector instructions. A loop over thousands of
 numbers traverses memory for every operation. A vmapped solve therefore runs in chunks of
 trajectories, one chunk after another. Each chunk is one loop that ends with its last trajectory.
+Where a step has a form on numbers, larger chunks share the lanes of a vectorized loop
+(`_integration._vector_loop`).
 
 XLA splits large operations among threads. A loop that solves equations for thousands of
 trajectories can deadlock on its own threads (jaxlib 0.10.2; never seen on one thread, nor with
@@ -10,7 +12,7 @@ matrices of 1e5 numbers in all). Chunks of implicit methods stay far below that.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +24,12 @@ from jaxtyping import PyTree
 from jaxlag._core._custom_jvp import CustomJVP
 
 LANES = 16
-MOST = 64  # trajectories of an implicit method
+VECTORIZED = 1024  # trajectories that share a vectorized loop
+# XLA allocates memory for every operation of such a loop when a program is called: 0.3 to 0.5 ms.
+# A turn of a trajectory is shorter by 0.1 to 0.2 us. So many trajectories, and turns of all:
+VECTORIZED_FROM = 64
+TURNS = 4096
+MOST = 64  # trajectories of any method that takes several at once
 NUMBERS = 2**14  # of all their Jacobians of the vector field
 
 
@@ -31,19 +38,39 @@ def at_once_implicit(size: int) -> int:
     return max(1, min(MOST, NUMBERS // size**2))
 
 
-def in_lanes(
-    single: Callable, vmapped: Callable, *args: PyTree, at_once: int = LANES, even: bool = False
-) -> PyTree:
-    """single(*args), and under `jax.vmap` chunks of `vmapped`.
+def is_faster_vectorized(count: Any, max_steps: int) -> bool:
+    """Whether a vectorized loop is faster.
+
+    Args:
+        count: number of trajectories, which may be a symbol of `jax.export`.
+        max_steps: bound on the steps of each.
+    """
+    return at_most(VECTORIZED_FROM, count) and at_most(TURNS, count * max_steps)
+
+
+class Chunks(NamedTuple):
+    """How a batch of trajectories is divided.
+
+    Attributes:
+        function: of one trajectory, in the form to be vmapped.
+        at_once: the largest number of trajectories in a chunk.
+        even: whether chunks may be smaller to be equal.
+    """
+
+    function: Callable
+    at_once: int = LANES
+    even: bool = False
+
+
+def in_lanes(single: Callable, chunks: Callable[[Any], Chunks], *args: PyTree) -> PyTree:
+    """single(*args), and under `jax.vmap` one chunk of trajectories after another.
 
     Results have zero derivatives.
 
     Args:
         single: of arrays, returns arrays.
-        vmapped: the same function, in the form to be vmapped over up to `at_once` trajectories.
+        chunks: number of trajectories -> how they are divided.
         args: pytrees of arrays.
-        at_once: the largest chunk.
-        even: whether chunks may be smaller to be equal.
     """
 
     @CustomJVP
@@ -61,13 +88,13 @@ def in_lanes(
     @batched.def_vmap
     def _(size: Any, mapped: list, args: tuple) -> tuple:
         own, shared = eqx.partition(args, mapped[0])
-        results = _batch(vmapped, size, at_once, even)(own, shared)
+        results = _batch(chunks, size)(own, shared)
         return results, jax.tree.map(lambda _: True, results)
 
     return constant(args)
 
 
-def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
+def _batch(chunks: Callable[[Any], Chunks], size: Any) -> Callable:
     """(own, shared) -> results of `size` trajectories; own leaves have one lane for each.
 
     A further vmap multiplies the number of lanes.
@@ -75,10 +102,12 @@ def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
 
     @custom_vmap
     def lanes(own: PyTree, shared: PyTree) -> PyTree:
-        def one(own: PyTree) -> PyTree:
-            return vmapped(*eqx.combine(own, shared))
+        divided = chunks(size)
 
-        return in_batches(one, own, size, at_once, even)
+        def one(own: PyTree) -> PyTree:
+            return divided.function(*eqx.combine(own, shared))
+
+        return in_batches(one, own, size, divided.at_once, divided.even)
 
     @lanes.def_vmap
     def _(outer: Any, mapped: list, own: PyTree, shared: PyTree) -> tuple:
@@ -91,7 +120,7 @@ def _batch(vmapped: Callable, size: Any, at_once: Any, even: bool) -> Callable:
 
         more, fewer = eqx.partition(shared, mapped[1])
         own = eqx.combine(jax.tree.map(flat, own, mapped[0]), jax.tree.map(spread, more))
-        results = _batch(vmapped, outer * size, at_once, even)(own, fewer)
+        results = _batch(chunks, outer * size)(own, fewer)
         results = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), results)
         return results, jax.tree.map(lambda _: True, results)
 

@@ -81,7 +81,7 @@ def _places(shared: int) -> Callable:
         count = indices.shape[0]
         if count == 1:
             return one(buffers[0], entries[0], indices[0])[None]
-        if not at_most(count, LANES) or jax.default_backend() != "cpu":
+        if not at_most(count, 2 * LANES) or jax.default_backend() != "cpu":
             return jax.vmap(one)(buffers, entries, indices)
 
         def write(k: Array, buffers: Array) -> Array:

@@ -8,6 +8,10 @@ system. There are two ways to raise that bound:
 * if that came too late or is switched off, attributes on the call of a function that holds the
   loop. They are internal to XLA. They are used only on the versions that the tests run on, and
   only around loops of operations that XLA emits code for itself.
+
+A second global setting is for LLVM: how many pairs of arrays a loop may compare for overlap before
+it runs vectorized. A loop over lanes with many results has hundreds. LLVM ends the process at an
+option that it does not know: it is set only on the versions that the tests run on.
 """
 
 import os
@@ -31,6 +35,8 @@ SWITCH = "JAXLAG_XLA_FLAGS"
 ATTRIBUTE_SWITCH = "JAXLAG_XLA_ATTRIBUTES"
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 TESTED = ("0.10.2",)  # versions of jaxlib
+COMPARISONS = "-vectorize-memory-check-threshold=4000"
+COMPARISONS_TESTED = ("0.10.2", "0.12.0.1")  # versions of jaxlib
 EXTRA = "--xla_backend_extra_options="
 
 
@@ -40,37 +46,57 @@ def needed() -> bool:
 
 
 def merged(flags: str) -> str:
-    """XLA_FLAGS with the bound added to the extra backend options.
+    """XLA_FLAGS with the settings added to the extra backend options.
 
     A bound set by the user is kept.
     """
     if OPTION in flags:
         return flags
+    options = [f"{OPTION}={BYTES}"]
+    if jaxlib.__version__ in COMPARISONS_TESTED:
+        options.append(COMPARISONS)
     words = flags.split()
     for i, word in enumerate(words):
         if word.startswith(EXTRA):
             present = word.removeprefix(EXTRA)
-            options = [present] if present else []
-            words[i] = EXTRA + ",".join([*options, f"{OPTION}={BYTES}"])
+            words[i] = EXTRA + ",".join([present, *options] if present else options)
             return " ".join(words)
-    return " ".join([*words, f"{EXTRA}{OPTION}={BYTES}"])
+    return " ".join([*words, EXTRA + ",".join(options)])
 
 
 def configure() -> None:
-    """Set the bound, unless JAXLAG_XLA_FLAGS=0 or jax has raised it itself."""
-    if needed() and os.environ.get(SWITCH) != "0":
+    """Set both, unless JAXLAG_XLA_FLAGS=0 or jax has raised the bound itself and is not tested."""
+    wanted = needed() or jaxlib.__version__ in COMPARISONS_TESTED
+    if wanted and os.environ.get(SWITCH) != "0":
         os.environ["XLA_FLAGS"] = merged(os.environ.get("XLA_FLAGS", ""))
 
 
 @lru_cache(maxsize=1)
 def in_force() -> bool:
     """Whether loops beyond the old bound compile to one function, tested by a compilation."""
+    return _is_native(1000)
+
+
+@lru_cache(maxsize=1)
+def vectorizes() -> bool:
+    """Whether loops over lanes with many results are vectorized, tested by compilations.
+
+    XLA reads both settings at once. Later versions take larger loops without them.
+    """
+    if jax.default_backend() != "cpu" or jaxlib.__version__ not in COMPARISONS_TESTED:
+        return False
+    is_set = f"{OPTION}={BYTES},{COMPARISONS}" in os.environ.get("XLA_FLAGS", "")
+    return is_set and in_force() and not _is_native(BYTES)
+
+
+def _is_native(size: int) -> bool:
+    """Whether a loop over an array of this size compiles to one function."""
 
     def loop(x: jax.Array) -> jax.Array:
         body_fun = lambda c: (c[0] + 1, c[1] * c[1][::-1])  # noqa: E731
         return jax.lax.while_loop(lambda c: c[0] < 3, body_fun, (0, x))[1]
 
-    compiled = jax.jit(loop).lower(jax.ShapeDtypeStruct((1000,), jnp.float32)).compile()
+    compiled = jax.jit(loop).lower(jax.ShapeDtypeStruct((size,), jnp.float32)).compile()
     return "small_call" in (compiled.as_text() or "")
 
 
@@ -214,6 +240,17 @@ _PLAIN = frozenset(
     scatter scatter-add scatter_add select_and_gather_add select_n shift_left sign sin sinh
     slice smallest split sqrt square squeeze stack stop_gradient sub symbolic_zeros tan tanh
     transpose unstack unvmap_all unvmap_any unvmap_max while xor""".split()  # noqa: SIM905
+)
+
+
+# On numbers XLA emits code for these that LLVM vectorizes, or calls of functions within it. For erf
+# it emits a call that prevents both.
+ELEMENTWISE = frozenset(
+    """abs acos acosh add and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp
+    convert_element_type copy copy_p cos cosh div eq erfc exp exp2 expm1 floor ge gt integer_pow
+    is_finite largest le log log1p logistic lt max min mul ne neg nextafter not or pow rem round
+    rsqrt select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh smallest sqrt
+    square stop_gradient sub tan tanh xor""".split()  # noqa: SIM905
 )
 
 

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxlag._core import _xla
-from jaxlag._core._batching import LANES, at_once_implicit, in_lanes
+from jaxlag._core import _batching, _xla
+from jaxlag._core._batching import LANES, Chunks, at_once_implicit, in_lanes
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._status import Status
 from jaxlag._gradient._modes import GradientMode
@@ -25,6 +25,7 @@ from jaxlag._gradient._unreached_saves import unreached
 from jaxlag._integration._loop import integrate
 from jaxlag._integration._record import Outcome
 from jaxlag._integration._tableaus import remembers
+from jaxlag._integration._vector_loop import NotVectorizable, may_vectorize
 
 
 class SavedStates(NamedTuple):
@@ -122,25 +123,42 @@ def _integrated(problem: SplitProblem, record: bool) -> Outcome:
     """The loop of steps; scalar programs and implicit methods are vmapped in chunks."""
     static = problem.static
 
-    def single(*traced: Any, lanes: bool = False) -> Outcome:
+    def single(*traced: Any, form: str = "alone") -> Outcome:
         problem = SplitProblem._make((*traced, static))
         (y0, args, times), setup, stepper = problem.motion, problem.setup, problem.stepper
         if record:
             stepper = stepper.for_derivatives(y0, args)
-        fast = stepper.on_scalars(lanes)
-        if record and lanes:  # unrolled, this part would take most of the compile time
+        fast = stepper.on_scalars(lanes=form == "lanes")
+        if record and form == "lanes":  # unrolled, this part would take most of the compile time
             fast = None if fast is None else in_loops(fast)
         bounds = setup.first_step, setup.allowed, static.max_steps, record, static.capacity
         native = None if fast is None else _xla.native
-        return integrate(fast or stepper, y0, args, times, *bounds, native)
+        vectorized = form == "vectorized"
+        return integrate(fast or stepper, y0, args, times, *bounds, native, vectorized)
 
     y0, stepper = problem.motion[0], problem.stepper
     on_scalars = stepper.on_scalars() is not None
     if jax.default_backend() != "cpu" or not (on_scalars or stepper.implicit):
         return single(*problem.traced)
+    in_rows = partial(single, form="lanes")
     at_once = LANES if on_scalars else at_once_implicit(y0.size)
-    vmapped = partial(single, lanes=True)
-    return in_lanes(single, vmapped, *problem.traced, at_once=at_once, even=not on_scalars)
+    chunks = Chunks(in_rows, at_once, even=not on_scalars)
+
+    def vectorized(*traced: Any) -> Outcome:
+        try:
+            return single(*traced, form="vectorized")
+        except NotVectorizable:
+            return in_lanes(single, lambda _: chunks, *traced)
+
+    large = Chunks(vectorized, _batching.VECTORIZED, even=True)
+    suits = not record and may_vectorize(stepper)
+
+    def divided(count: Any) -> Chunks:
+        return (
+            large if suits and _batching.is_faster_vectorized(count, static.max_steps) else chunks
+        )
+
+    return in_lanes(single, divided, *problem.traced)
 
 
 def _replay(problem: SplitProblem, outcome: Outcome, differentiable: Any) -> SavedStates:

@@ -34,6 +34,7 @@ from jaxlag._integration._loop_state import (
 from jaxlag._integration._record import Outcome, Record, Times
 from jaxlag._integration._stepper import Stepper
 from jaxlag._integration._tableaus import remembers
+from jaxlag._integration._vector_loop import lane_loop
 
 # The record is a whole number of chunks of this many steps.
 CHUNK = 64
@@ -50,6 +51,7 @@ def integrate(
     record: bool,
     room: int = 0,
     native: Callable | None = None,
+    vectorized: bool = False,
 ) -> Outcome:
     """Integrate from tau = 0 to `times.stop`.
 
@@ -65,6 +67,8 @@ def integrate(
         room: capacity for states on the way, an even number. When it is full, every second state is
             dropped, and from then on half as many are stored.
         native: function that calls the loop with its initial state.
+        vectorized: whether this is vmapped, and the loop is one vectorized loop over the lanes; not
+            with a record.
     """
     t0 = jnp.zeros_like(times.stop)
     count = times.saves.shape[0]
@@ -126,8 +130,11 @@ def integrate(
         c = iterate(loop, eqx.combine(dynamic, static))
         return eqx.partition(c, eqx.is_array)[0]
 
+    def goes_on(c: Any) -> Array:
+        return ~c.done | is_due(loop, c)
+
     def cond_fun(c: Any) -> Array:
-        return eqxi.unvmap_any(~c.done | is_due(loop, c))
+        return eqxi.unvmap_any(goes_on(c))
 
     def run(dynamic: Any) -> Any:
         if room in (0, size):
@@ -136,8 +143,13 @@ def integrate(
         fill = lambda c: jax.lax.while_loop(until_full, body_fun, c)  # noqa: E731
         return jax.lax.while_loop(cond_fun, lambda c: fill(thin(c, room)), dynamic)
 
+    def ended(dynamic: Any) -> Outcome:
+        return _outcome(eqx.combine(dynamic, static), times, y0, allowed)
+
+    if vectorized:
+        return lane_loop(goes_on, body_fun, ended, dynamic)
     final = run(dynamic) if native is None else native(run, dynamic)
-    return _outcome(eqx.combine(final, static), times, y0, allowed)
+    return ended(final)
 
 
 def _outcome(c: LoopState, times: Times, y0: PyTree, allowed: Array) -> Outcome:

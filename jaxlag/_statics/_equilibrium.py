@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlag._core._arguments import positive_integer, renamed
 from jaxlag._core._arrays import concrete, number, of_state, stop_gradient
-from jaxlag._core._batching import at_once_implicit, in_lanes
+from jaxlag._core._batching import Chunks, at_once_implicit, in_lanes
 from jaxlag._core._by_name import no_attribute
 from jaxlag._core._custom_jvp import keeping_rules
 from jaxlag._core._errors import EquilibriumError, invalid, shortened
@@ -346,7 +346,8 @@ def _search(key: Any, values: Any) -> Equilibrium:
 
     constant = jax.lax.stop_gradient((q0, rtol, idle, t, *given))
     if jax.default_backend() == "cpu":
-        found = in_lanes(searched, searched, *constant, at_once=at_once_implicit(n + rows.size))
+        chunks = Chunks(searched, at_once_implicit(n + rows.size))
+        found = in_lanes(searched, lambda _: chunks, *constant)
     else:
         found = searched(*constant)
     z, balance, steps = jax.lax.stop_gradient(found)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import jax
 
 from jaxlag._core import _xla
-from jaxlag._core._batching import LANES, MOST
+from jaxlag._core._batching import LANES, MOST, VECTORIZED_FROM
 from jaxlag._linalg._mass_solve import LOOP_UP_TO, UNROLL_UP_TO
 from jaxlag._lowering import (
     Compressed,
@@ -134,7 +134,7 @@ def _scalar(system: AbstractQuantities, lowered: Lowered, equations: Equations) 
         + (" and A" if system.constraints else "")
         + ", on scalars",
         _steps(len(program.body)),
-        _batches(),
+        *_batches(program, projects=bool(system.constraints)),
     ]
 
 
@@ -152,7 +152,7 @@ def _in_quasi(lowered: Lowered, equations: Equations) -> list[str]:
         f"              equations {equations.form}; {lowered.reason}",
         "mass solve    along the nonzeros of B^T M B, on scalars",
         _steps(len(equations.program.body)),
-        _batches(),
+        *_batches(equations.program),
     ]
 
 
@@ -174,13 +174,31 @@ def _steps(lines: int | None) -> str:
     return f"steps         written out stage by stage: {size}, of up to {WRITTEN_OUT}"
 
 
-def _batches() -> str:
-    return "batches       by jax.vmap: " + (
-        f"{LANES} trajectories at a time in one loop (explicit methods of jaxlag, without work), "
-        f"up to {MOST} by implicit methods"
-        if jax.default_backend() == "cpu"
-        else "all trajectories in one loop"
-    )
+def _batches(program: Program, projects: bool = False) -> list[str]:
+    if jax.default_backend() != "cpu":
+        return ["batches       by jax.vmap: all trajectories in one loop"]
+    first = f"{LANES} trajectories at a time in one loop"
+    last = f"up to {MOST} by implicit methods"
+    without = _why_not_vectorized(program, projects)
+    if without is None:
+        first += f", from {VECTORIZED_FROM} on in the lanes of a vectorized loop"
+    lines = [
+        f"batches       by jax.vmap: {first} (explicit methods of jaxlag, without work), {last}"
+    ]
+    return lines if without is None else [*lines, f"              not vectorized: {without}"]
+
+
+def _why_not_vectorized(program: Program, projects: bool) -> str | None:
+    """Why larger batches do not run as vectorized loops; None if they do."""
+    if not _xla.vectorizes():
+        return "LLVM's option for it is not in force, or not tested with this jaxlib"
+    if projects:
+        return "the projection onto the constraints is a loop"
+    if in_loop_over_stages(len(program.body), Dopri8().stages):
+        return "a step is a loop over stages"
+    called = {line.data.name for line in program.body if line.op == "call"}
+    unknown = ", ".join(sorted(called - _xla.ELEMENTWISE))
+    return f"no vector code for {unknown}" if unknown else None
 
 
 _ARITHMETIC = ("add", "sub", "mul", "div", "neg", "select", "gt", "ge", "lt", "le", "eq", "ne")

@@ -7,7 +7,7 @@ import pytest
 from _jaxprs import operations
 
 import jaxlag as jl
-from jaxlag._core import _batching
+from jaxlag._core import _batching, _xla
 from jaxlag._core._buffer_entries import set_entry
 from systems import double_pendulum
 
@@ -132,7 +132,7 @@ def test_implicit_methods_run_in_larger_chunks():
     assert all(shape[0] == 44 for shape in shapes if len(shape) > 2)
 
 
-@pytest.mark.parametrize("lanes", [3, _batching.LANES + 1])
+@pytest.mark.parametrize("lanes", [3, 2 * _batching.LANES + 1])
 @pytest.mark.parametrize("dtype", [float, np.int32])
 def test_set_entry_writes_at_the_index_of_each_lane(lanes, dtype):
     rng = np.random.default_rng(0)
@@ -162,7 +162,8 @@ def test_set_entry_writes_at_the_index_of_each_lane(lanes, dtype):
 
 def test_explain_states_the_chunk_size():
     line = "batches       by jax.vmap: 16 trajectories at a time in one loop"
-    assert line in double_pendulum.system.explain(PARAMS)
+    vectorized = ", from 64 on in the lanes of a vectorized loop"
+    assert line + vectorized * _xla.vectorizes() in double_pendulum.system.explain(PARAMS)
     arrays = jl.System(double_pendulum.system.lagrangian, ("a", "b"), lowering="array")
     assert "batches       by jax.vmap: all trajectories in one loop" in arrays.explain(PARAMS)
 

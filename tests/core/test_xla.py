@@ -245,12 +245,14 @@ def test_scalar_programs_are_plain():
         assert _xla._plain(traced.jaxpr)
 
 
-def test_merged_flags_extend_existing_ones():
-    flag = f"{_xla.EXTRA}{_xla.OPTION}={_xla.BYTES}"
+def test_merged_flags_extend_existing_ones(monkeypatch):
+    monkeypatch.setattr(_xla, "COMPARISONS_TESTED", (jaxlib.__version__,))
+    options = f"{_xla.OPTION}={_xla.BYTES},{_xla.COMPARISONS}"
+    flag = _xla.EXTRA + options
     assert _xla.merged("") == flag
     assert _xla.merged("--a=1") == f"--a=1 {flag}"
-    assert (
-        _xla.merged(f"{_xla.EXTRA}x=1 --a=1") == f"{_xla.EXTRA}x=1,{_xla.OPTION}={_xla.BYTES} --a=1"
-    )
+    assert _xla.merged(f"{_xla.EXTRA}x=1 --a=1") == f"{_xla.EXTRA}x=1,{options} --a=1"
     own = f"{_xla.EXTRA}{_xla.OPTION}=5"
     assert _xla.merged(own) == own
+    monkeypatch.setattr(_xla, "COMPARISONS_TESTED", ())
+    assert _xla.merged("") == f"{_xla.EXTRA}{_xla.OPTION}={_xla.BYTES}"

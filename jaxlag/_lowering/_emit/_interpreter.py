@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxlag._core import _xla
 from jaxlag._core._arrays import elements
-from jaxlag._core._batching import in_lanes
+from jaxlag._core._batching import Chunks, in_lanes
 from jaxlag._core._custom_jvp import CustomJVP
 from jaxlag._core._linear_map import LinearMap, linear
 from jaxlag._linalg._rounding_bounds import RUNS, STRENGTH, random_signs
@@ -191,7 +191,7 @@ def interpreted(code: Code, dtype: Any, alone: bool) -> Callable[..., Float[Arra
 
     @CustomJVP
     def call(*given: Array) -> Array:
-        return in_lanes(single, single, *given)
+        return in_lanes(single, lambda _: Chunks(single), *given)
 
     @partial(call.defjvp, symbolic_zeros=True)
     def _(given: tuple[Array, ...], dots: tuple[Array | None, ...]) -> tuple[Array, Array]:
@@ -307,4 +307,4 @@ def with_changes(
         bounds = jnp.max(jnp.abs(found[:, 1:] - found[:, :1]), axis=1) / STRENGTH
         return found[:, 0], bounds
 
-    return in_lanes(single, single, *given)
+    return in_lanes(single, lambda _: Chunks(single), *given)
